@@ -1,9 +1,11 @@
-"""Build the sdist from a copy of the checkout and the wheel from the sdist, check what is in them, and print the wheel's path.
+"""Build the sdist from a copy of the checkout and the wheel from the sdist, check what is in them, and print the
+wheel's path.
 
     package.py DIR        DIR is made; it ends up with the sdist and the wheel
 
-Needs Python with pip and setuptools. The copy holds what git tracks, or without git all but what builds and tests leave behind: setuptools
-would take up files that an earlier list of sources names, and so hide that a fresh checkout lacks them.
+Needs Python with pip and setuptools. The copy holds what git tracks, or without git all but what builds and tests leave
+behind: setuptools would take up files that an earlier list of sources names, and so hide that a fresh checkout lacks
+them.
 """
 
 from __future__ import annotations
@@ -43,7 +45,11 @@ def files(folder: Path) -> set[str]:
 def copy_checkout(target: Path) -> None:
     """The files of the checkout as somebody else would get them."""
     try:
-        listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout.decode().split("\0")
+        listed = (
+            subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True)
+            .stdout.decode()
+            .split("\0")
+        )
     except (OSError, subprocess.CalledProcessError):  # no git here, or no repository
         shutil.copytree(ROOT, target, ignore=shutil.ignore_patterns(*LEFTOVERS))
         return
@@ -63,7 +69,17 @@ def build_sdist(source: Path, target: Path) -> Path:
 
 def build_wheel(sdist: Path, target: Path) -> Path:
     """The wheel of an sdist, in ``target``; no other package is asked for."""
-    pip = [sys.executable, "-m", "pip", "wheel", "-q", "--disable-pip-version-check", "--no-deps", "--no-index", "--no-build-isolation"]
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "-q",
+        "--disable-pip-version-check",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+    ]
     subprocess.run([*pip, "-w", str(target), str(sdist)], cwd=target, check=True, stdout=subprocess.DEVNULL)
     (made,) = target.glob("*.whl")
     return made

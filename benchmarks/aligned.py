@@ -1,10 +1,12 @@
-"""How much of the error of held-out photographs is their cameras': each is moved to where a finished run's model fits it best.
+"""How much of the error of held-out photographs is their cameras': each is moved to where a finished run's model fits
+it best.
 
     python benchmarks/aligned.py RUN_DIR [--views NAME …] [--steps 60]
 
-A small rotation about the camera and a shift follow the gradient of the image's squared error; focal lengths stay. A camera's motion is the opposite motion of the
-whole model, so any backend has its gradient. Colours keep the directions that they were learned for. A PSNR after aligning is no measure of a model, as it has looked at the
-photograph; it says whether cameras or the model are to blame. Masked pixels do not count.
+A small rotation about the camera and a shift follow the gradient of the image's squared error; focal lengths stay. A
+camera's motion is the opposite motion of the whole model, so any backend has its gradient. Colours keep the directions
+that they were learned for. A PSNR after aligning is no measure of a model, as it has looked at the photograph; it says
+whether cameras or the model are to blame. Masked pixels do not count.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ def moved(model: Primitives, eye: Tensor, rotation: Tensor, shift: Tensor) -> Pr
 def align(
     model: Primitives, view: View, pixels: Pixels, background: Tensor, settings: RenderSettings, steps: int
 ) -> tuple[float, float, float, float]:
-    """PSNR before and after, and how far the camera went: pixels that the rotation alone moves the image's middle by, and scene units."""
+    """PSNR before and after, and how far the camera went: pixels that the rotation alone moves the image's middle by,
+    and scene units."""
     truth, eye = pixels.over(background), view.camera.position.float()
     mask = torch.ones(truth.shape[:2], dtype=torch.bool) if pixels.mask is None else pixels.mask
     rotation, shift = torch.zeros(3, requires_grad=True), torch.zeros(3, requires_grad=True)
@@ -72,8 +75,17 @@ def main() -> None:
         view = data.test.view(place)
         if args.views is None or view.name in args.views:
             settings = replace(config.renderer, backend="cpu")
-            before, after, turned, shifted = align(model, view, data.test.pixels(place), data.background.float(), settings, args.steps)
-            made.row(view.name, f"{before:.2f}", f"{after:.2f}", f"{after - before:+.2f} dB", f"{turned:.2f} pixels", f"{shifted:.3f}")
+            before, after, turned, shifted = align(
+                model, view, data.test.pixels(place), data.background.float(), settings, args.steps
+            )
+            made.row(
+                view.name,
+                f"{before:.2f}",
+                f"{after:.2f}",
+                f"{after - before:+.2f} dB",
+                f"{turned:.2f} pixels",
+                f"{shifted:.3f}",
+            )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,14 @@
 """Whether a change made an earlier number worse: the same runs by this checkout and by an earlier one, in one go.
 
     git worktree add ../before COMMIT
-    python benchmarks/before.py ../before [--runs chair_2000 chair_5000 fire lit_solids] [--chair DIR] [--fire DIR] [--seeds 1] [--record FILE]
+    python benchmarks/before.py ../before [--runs chair_2000 chair_5000 fire lit_solids] [--chair DIR] [--fire DIR]
+    [--seeds 1] [--record FILE]
 
-Every run is its preset `quick` at a budget that the documentation has quoted, in steps, on one thread; both checkouts train it one after the other from the
-same seed, in processes of their own, and test views judge. Where nothing was meant to change the numbers are the same to the last digit. Seconds are those that the
-thread computed while the model learned. Results go to --record (default benchmarks/results/before.json) after every run, with both commits; only what is missing is run.
+Every run is its preset `quick` at a budget that the documentation has quoted, in steps, on one thread; both checkouts
+train it one after the other from the same seed, in processes of their own, and test views judge. Where nothing was
+meant to change the numbers are the same to the last digit. Seconds are those that the thread computed while the model
+learned. Results go to --record (default benchmarks/results/before.json) after every run, with both commits; only what
+is missing is run.
 """
 
 from __future__ import annotations
@@ -36,7 +39,8 @@ RUNS: dict[str, tuple[tuple[str, ...], int, str, tuple[str, ...]]] = {
         ("psnr_linear_clamped", "psnr_pooled_cast_shadow", "psnr_pooled_highlight"),
     ),
 }  # fmt: skip
-"""Words, steps, the data, and the measures. As many primitives as have the bytes of 2,000 or 5,000 of the paper's in `chair_*`."""
+"""Words, steps, the data, and the measures. As many primitives as have the bytes of 2,000 or 5,000 of the paper's in
+`chair_*`."""
 
 FOLDERS = {"chair": "scene.path", "fire": "scene.vdb"}
 
@@ -59,13 +63,22 @@ print(json.dumps({"cpu_seconds": seconds, "primitives": fitted.model.count, **nu
 
 def commit(folder: Path) -> str:
     """Of a checkout, with a plus where files differ from it."""
-    done = subprocess.run(["git", "-C", folder, "describe", "--always", "--dirty=+"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        ["git", "-C", folder, "describe", "--always", "--dirty=+"], capture_output=True, text=True, check=True
+    )
     return done.stdout.strip()
 
 
 def one(folder: Path, words: list[str]) -> dict[str, Any]:
     environment = {**os.environ, "PYTHONPATH": str(folder.resolve())}
-    done = subprocess.run([sys.executable, "-c", CHILD, *words], env=environment, cwd=folder, stdout=subprocess.PIPE, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, *words],
+        env=environment,
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 
@@ -104,10 +117,15 @@ def main() -> None:
             if data:
                 every.append(f"{FOLDERS[data]}='{getattr(args, data).resolve()}'")
             kept = ("cpu_seconds", "primitives", *measures)
-            found = {which: {key: value for key, value in one(folder, every).items() if key in kept} for which, folder in both.items()}
+            found = {
+                which: {key: value for key, value in one(folder, every).items() if key in kept}
+                for which, folder in both.items()
+            }
             whole["runs"].append({"run": name, "seed": seed, "steps": steps, **found})
             args.record.write_text(json.dumps(whole, indent=1) + "\n")
-    made = Table("run", "steps", "seed", "measure", commits["before"], commits["now"], "difference", "time, now / before")
+    made = Table(
+        "run", "steps", "seed", "measure", commits["before"], commits["now"], "difference", "time, now / before"
+    )
     for run in whole["runs"]:
         pace = run["now"]["cpu_seconds"] / run["before"]["cpu_seconds"]
         for place, measure in enumerate(RUNS[run["run"]][3]):

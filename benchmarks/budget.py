@@ -1,15 +1,19 @@
-"""Does more training make a better model? Every scene at budgets that double, counted in steps, each a run of its own from the beginning.
+"""Does more training make a better model? Every scene at budgets that double, counted in steps, each a run of its own
+from the beginning.
 
-    python benchmarks/budget.py [--scenes chair smoke_fire fire lit_solids] [--chair DIR] [--fire DIR] [--doublings 5] [--seeds 3]
+    python benchmarks/budget.py [--scenes chair smoke_fire fire lit_solids] [--chair DIR] [--fire DIR] [--doublings 5]
+    [--seeds 3]
         [--set KEY=VALUE ...] [--record FILE] [--jobs 2] [--docs] [--print]
 
-The first budget is about what 15 seconds of one core were when the presets were chosen, the last with --doublings 5 about eight minutes. Schedules
-run on the used share of a budget, so that each point is what a user gets who asks for so much, not an early look at a longer run. All is the preset
-`quick` but the budget; one thread each. The last checkpoint is judged on the test views. --seeds are for the first four budgets, the longer ones have
-one. Results go to benchmarks/results/budget.json after every run, and only what is missing is run; --set changes every run, and wants another --record.
+The first budget is about what 15 seconds of one core were when the presets were chosen, the last with --doublings 5
+about eight minutes. Schedules run on the used share of a budget, so that each point is what a user gets who asks for so
+much, not an early look at a longer run. All is the preset `quick` but the budget; one thread each. The last checkpoint
+is judged on the test views. --seeds are for the first four budgets, the longer ones have one. Results go to
+benchmarks/results/budget.json after every run, and only what is missing is run; --set changes every run, and wants
+another --record.
 
-A *fall* is a doubling after which a measure is more than 0.1 dB worse. --docs puts the tables between the markers of docs/budgets.md and draws
-docs/pictures/budgets.png; --print runs nothing.
+A *fall* is a doubling after which a measure is more than 0.1 dB worse. --docs puts the tables between the markers of
+docs/budgets.md and draws docs/pictures/budgets.png; --print runs nothing.
 """
 
 from __future__ import annotations
@@ -51,7 +55,12 @@ MEASURES = {
     "fire": _VOLUME,
     "lit_solids": _LIT,
 }
-KEYS = (*dict.fromkeys(key for measures in MEASURES.values() for key in measures), "ssim", "primitives", "parameters_per_primitive")
+KEYS = (
+    *dict.fromkeys(key for measures in MEASURES.values() for key in measures),
+    "ssim",
+    "primitives",
+    "parameters_per_primitive",
+)
 
 
 def main() -> None:
@@ -74,7 +83,14 @@ def main() -> None:
         if folder and not getattr(args, name):
             parser.error(f"--{name}: wants the folder of its data ({folder}); or leave it out of --scenes")
     if not args.only_print:
-        run_all(trials(args), args.record, KEYS, args.jobs, lambda row: f"{row[SCENES[row['scene']].judged]:.2f} dB", {"cpu": cpu_name()})
+        run_all(
+            trials(args),
+            args.record,
+            KEYS,
+            args.jobs,
+            lambda row: f"{row[SCENES[row['scene']].judged]:.2f} dB",
+            {"cpu": cpu_name()},
+        )
     rows = recorded(args.record)
     tables = {name: table(name, rows) for name in FIRST if any(row["scene"] == name for row in rows)}
     found = falls(rows)
@@ -101,7 +117,10 @@ def trials(args: argparse.Namespace) -> list[Trial]:
 def values(rows: Sequence[Mapping[str, Any]], scene: str, measure: str) -> dict[int, list[float]]:
     """Of every budget in steps, one number per seed."""
     own = sorted((row for row in rows if row["scene"] == scene), key=lambda row: (row["iterations"], row["seed"]))
-    return {steps: [row[measure] for row in own if row["iterations"] == steps] for steps in dict.fromkeys(r["iterations"] for r in own)}
+    return {
+        steps: [row[measure] for row in own if row["iterations"] == steps]
+        for steps in dict.fromkeys(r["iterations"] for r in own)
+    }
 
 
 def gains(rows: Sequence[Mapping[str, Any]], scene: str, measure: str) -> list[tuple[int, int, float]]:
@@ -116,7 +135,10 @@ def gains(rows: Sequence[Mapping[str, Any]], scene: str, measure: str) -> list[t
 
 def table(scene: str, rows: Sequence[Mapping[str, Any]]) -> Table:
     budgets = list(values(rows, scene, next(iter(MEASURES[scene]))))
-    seconds = {n: statistics.mean(r["cpu_seconds"] for r in rows if r["scene"] == scene and r["iterations"] == n) for n in budgets}
+    seconds = {
+        n: statistics.mean(r["cpu_seconds"] for r in rows if r["scene"] == scene and r["iterations"] == n)
+        for n in budgets
+    }
     made = Table("steps (seconds of a core)", *(f"{n:,} ({seconds[n]:.0f} s)" for n in budgets), "last doubling")
     for measure, title in MEASURES[scene].items():
         last = gains(rows, scene, measure)
@@ -148,14 +170,20 @@ def draw(rows: Sequence[Mapping[str, Any]]) -> None:
     from matplotlib import pyplot
 
     scenes = [name for name in FIRST if any(row["scene"] == name for row in rows)]
-    figure, axes = pyplot.subplots(1, len(scenes), figsize=(3.3 * len(scenes), 3.4), constrained_layout=True, squeeze=False)
+    figure, axes = pyplot.subplots(
+        1, len(scenes), figsize=(3.3 * len(scenes), 3.4), constrained_layout=True, squeeze=False
+    )
     for axis, scene in zip(axes[0], scenes, strict=True):
         for measure, title in MEASURES[scene].items():
             found = values(rows, scene, measure)
             means = [statistics.mean(v) for v in found.values()]
             (line,) = axis.plot(list(found), means, marker="o", markersize=3.5, label=title)
             axis.fill_between(
-                list(found), [min(v) for v in found.values()], [max(v) for v in found.values()], color=line.get_color(), alpha=0.2
+                list(found),
+                [min(v) for v in found.values()],
+                [max(v) for v in found.values()],
+                color=line.get_color(),
+                alpha=0.2,
             )
         axis.set_xscale("log", base=2)
         axis.set_xticks(list(found), [f"{n:,}" for n in found], rotation=45, fontsize=7)

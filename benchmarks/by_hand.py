@@ -2,8 +2,9 @@
 
     python benchmarks/by_hand.py [--rounds N]
 
-Best of N rounds in which both take turns, in one process. ``plyfile`` and ``pydantic`` are no dependencies: measured where they are installed,
-else left out. The reader of a damaged file runs in a process of its own, as a library may take all memory before it gives up.
+Best of N rounds in which both take turns, in one process. ``plyfile`` and ``pydantic`` are no dependencies: measured
+where they are installed, else left out. The reader of a damaged file runs in a process of its own, as a library may
+take all memory before it gives up.
 """
 
 from __future__ import annotations
@@ -95,7 +96,10 @@ def point_files(rounds: int, folder: Path) -> None:
         from plyfile import PlyData
 
         work["plyfile"] = lambda: np.array(PlyData.read(path)["vertex"].data)
-    print("100,000 Gaussians of 62 numbers: " + ", ".join(f"{name} {s * 1e3:.0f} ms" for name, s in best(rounds, work).items()))
+    print(
+        "100,000 Gaussians of 62 numbers: "
+        + ", ".join(f"{name} {s * 1e3:.0f} ms" for name, s in best(rounds, work).items())
+    )
     for name in installed:
         code = f"path = {str(damaged)!r}\ntry:\n    {READERS[name]}\n    print('read it')\nexcept Exception as error:\n    print(type(error).__name__, error)"
         limited = f"import resource; resource.setrlimit(resource.RLIMIT_AS, (16 << 30,) * 2)\n{code}"
@@ -113,7 +117,8 @@ def started(rounds: int, work: dict[str, list[str]]) -> dict[str, float]:
 
 
 def settings(rounds: int) -> None:
-    """Start-up, a check of every field, and what lax and strict pydantic make of what the tests of the settings demand."""
+    """Start-up, a check of every field, and what lax and strict pydantic make of what the tests of the settings
+    demand."""
     work = {"neuprim --help": ["-m", "neuprim", "--help"], "settings": ["-c", "import neuprim.core.settings"]}
     if importlib.util.find_spec("pydantic") is not None:
         work["pydantic"] = ["-c", "from pydantic import TypeAdapter; from pydantic.dataclasses import dataclass"]
@@ -148,7 +153,14 @@ def settings(rounds: int) -> None:
         except ConfigError as error:
             return str(error)
 
-    for values in ({"samples": True}, {"samples": 4.0}, {"near": "1e-3"}, {"near": math.nan}, {"depth": "yes"}, {"sampels": 4}):
+    for values in (
+        {"samples": True},
+        {"samples": 4.0},
+        {"near": "1e-3"},
+        {"near": math.nan},
+        {"depth": "yes"},
+        {"sampels": 4},
+    ):
         found = {
             "here": ours(values),
             "lax": verdict(lambda v=values: lax(**v)),

@@ -1,11 +1,14 @@
-"""What a seam costs: sequences fitted in one run and in chunks of time, at the same views and primitives, judged by held-out cameras.
+"""What a seam costs: sequences fitted in one run and in chunks of time, at the same views and primitives, judged by
+held-out cameras.
 
-    python benchmarks/chunks.py DIR            # measures, into benchmarks/results/chunks.json; runs stay below DIR, and what is recorded is kept
-    python benchmarks/chunks.py DIR --fire VDB # with frames 1 to 40 of the EmberGen fire in the folder VDB, too
-    python benchmarks/chunks.py --docs         # writes the table of docs/dynamic.md from that file, and measures nothing
+    python benchmarks/chunks.py DIR            # measures, into benchmarks/results/chunks.json; runs stay below DIR, and
+    what is recorded is kept python benchmarks/chunks.py DIR --fire VDB # with frames 1 to 40 of the EmberGen fire in
+    the folder VDB, too python benchmarks/chunks.py --docs         # writes the table of docs/dynamic.md from that file,
+    and measures nothing
 
-The change from one frame to the next is the mean absolute difference of the two images, over that of the true ones; of a seam the largest of the
-steps over which one chunk hands over to the next. Beside windows of 12 frames stand those of 0.3 of the sequence, however many frames that is.
+The change from one frame to the next is the mean absolute difference of the two images, over that of the true ones; of
+a seam the largest of the steps over which one chunk hands over to the next. Beside windows of 12 frames stand those of
+0.3 of the sequence, however many frames that is.
 """
 
 from __future__ import annotations
@@ -76,7 +79,8 @@ def words(case: Case, fire: Path | None, out: Path) -> list[str]:
 
 
 def film(folder: Path) -> dict[str, float]:
-    """Changes from frame to frame on held-out cameras, over the truth's: the largest over seams, and elsewhere; and primitives alive in a frame."""
+    """Changes from frame to frame on held-out cameras, over the truth's: the largest over seams, and elsewhere; and
+    primitives alive in a frame."""
     config, task, model, _ = load_run(folder)
     dataset = load_dataset(config, task, run_dir=folder)
     recording, density = recording_of(dataset), model.density
@@ -90,7 +94,9 @@ def film(folder: Path) -> dict[str, float]:
             image = draw(model, dataset.test.view(index), config.renderer, dataset.background)
             truth = dataset.test.pixels(index).over(dataset.background)
             if before is not None:
-                change, true = (float((now - then).abs().mean()) for now, then in zip((image, truth), before, strict=True))
+                change, true = (
+                    float((now - then).abs().mean()) for now, then in zip((image, truth), before, strict=True)
+                )
                 seam = any(begin <= times[number - 1] and time <= end for begin, end in density.seams)
                 (over if seam else elsewhere).append(change / true)
                 absolute[seam].append(change)
@@ -136,14 +142,18 @@ def table(found: dict[str, Any]) -> str:
             f"{own['psnr_pooled_mask']:.2f} dB", sigma, seam, f"{own['change_elsewhere']:.2f}",
         )  # fmt: skip
     cpu = next(iter(found.values()))["cpu"]
-    return f"{made}\n\n{STEPS[FIRE]:,} views in all, {STEPS[LONG]:,} of the long sequence; one seed, one thread of {cpu}."
+    return (
+        f"{made}\n\n{STEPS[FIRE]:,} views in all, {STEPS[LONG]:,} of the long sequence; one seed, one thread of {cpu}."
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?", metavar="DIR", help="for the runs")
     parser.add_argument("--fire", type=Path, metavar="VDB", help="folder of the EmberGen fire's frames")
-    parser.add_argument("--docs", action="store_true", help="write the table of the page from the results, and measure nothing")
+    parser.add_argument(
+        "--docs", action="store_true", help="write the table of the page from the results, and measure nothing"
+    )
     args = parser.parse_args()
     found = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     if args.docs:

@@ -2,10 +2,11 @@
 
     python benchmarks/compress.py RUN_DIR ... [--levels 1 2 3 4 5] [--bits NAME=BITS ...] [--each] [--record]
 
-Each run's model is compressed, read again and measured on all of the run's own held-out views, as `neuprim compress` does it. A row is a run at a
-level: bytes of its numbers in float32 and of the file, their ratio, PSNR and SSIM before and after. ``--each`` adds a row per parameter:
-what the level's bits cost if this parameter alone has them and the others 16. ``--record`` writes all of it to
-benchmarks/results/compress.json, run by run; runs that differ in their seed alone are one row of the table, mean and half the spread.
+Each run's model is compressed, read again and measured on all of the run's own held-out views, as `neuprim compress`
+does it. A row is a run at a level: bytes of its numbers in float32 and of the file, their ratio, PSNR and SSIM before
+and after. ``--each`` adds a row per parameter: what the level's bits cost if this parameter alone has them and the
+others 16. ``--record`` writes all of it to benchmarks/results/compress.json, run by run; runs that differ in their seed
+alone are one row of the table, mean and half the spread.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ class Run:
         with tempfile.TemporaryDirectory() as scratch:
             path = Path(scratch) / "model.neuprim"
             begin = time.process_time()
-            stored = save_compressed(path, self.model, self.task.name, {}, bit_table(level, words, self.model.specs), self.text)
+            stored = save_compressed(
+                path, self.model, self.task.name, {}, bit_table(level, words, self.model.specs), self.text
+            )
             seconds = time.process_time() - begin
             again, size = load_model(path, self.task)[0], path.stat().st_size
         after, numbers = self.measured(again), 4 * self.model.count
@@ -75,7 +78,12 @@ class Run:
         for spec in self.model.specs:
             if spec.size:
                 own = ",".join(map(str, table.named.get(spec.name, (table.others,))))
-                found.append((spec.name, [f"{spec.name}={own}", *(f"{s.name}=16" for s in self.model.specs if s.name != spec.name)]))
+                found.append(
+                    (
+                        spec.name,
+                        [f"{spec.name}={own}", *(f"{s.name}=16" for s in self.model.specs if s.name != spec.name)],
+                    )
+                )
         return found
 
 
@@ -101,7 +109,8 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         first = own[0]
         made.row(
             f"{first['scene']}, {first['primitives']:,} primitives",
-            f"{first['level']}" + (f", {first['alone']} alone" if first["alone"] else "".join(f" {w}" for w in first["bits"])),
+            f"{first['level']}"
+            + (f", {first['alone']} alone" if first["alone"] else "".join(f" {w}" for w in first["bits"])),
             " / ".join(f"{sum(r[k] for r in own) / len(own) / 1000:,.0f}" for k in ("float32_bytes", "bytes")),
             spread([r["float32_bytes"] / r["bytes"] for r in own], 2),
             f"{spread([r['psnr'][0] for r in own], 2)} dB",

@@ -1,12 +1,16 @@
-"""What a training step costs, as a sum of a few terms that are fitted to measured times; and what that says about scenes that were never trained.
+"""What a training step costs, as a sum of a few terms that are fitted to measured times; and what that says about
+scenes that were never trained.
 
     python benchmarks/cost_model.py [--rounds 5] [--docs] [--print]
 
-Two ranks of a torchrun measure at the same time, each on one thread: steps of random scenes of many sizes, by turns; Adam's step alone; ground truth of
-volumes; and exchanges of many sizes: in seconds of the processor, which other work on a shared machine is not in. Non-negative least squares of relative errors gives a coefficient for each term. What is judged was not fitted:
-other scenes alone, by two ranks, and by two ranks with half of the primitives each. Then two scenes on paper: a long sequence and a city, here and, by the
-times that benchmarks/gpu.py recorded, on a card. Results go to benchmarks/results/cost_model.json; --docs puts the tables into docs/scaling.md, and
---print only prints what was recorded.
+Two ranks of a torchrun measure at the same time, each on one thread: steps of random scenes of many sizes, by turns;
+Adam's step alone; ground truth of volumes; and exchanges of many sizes: in seconds of the processor, which other work
+on a shared machine is not in. Non-negative least squares of relative errors gives a coefficient for each term. What is
+judged was not fitted:
+other scenes alone, by two ranks, and by two ranks with half of the primitives each. Then two scenes on paper: a long
+sequence and a city, here and, by the times that benchmarks/gpu.py recorded, on a card. Results go to
+benchmarks/results/cost_model.json; --docs puts the tables into docs/scaling.md, and --print only prints what was
+recorded.
 """
 
 from __future__ import annotations
@@ -46,7 +50,14 @@ TERMS = ("a step", "a primitive", "a number of a primitive", "a pixel", "a tile'
 
 def features(point: dict[str, Any]) -> list[float]:
     """How often a step has each term; Adam's part is apart."""
-    return [1.0, point["primitives"], point["numbers"], point["pixels"], point["pairs"], point["overlap"] * point["pixels"]]
+    return [
+        1.0,
+        point["primitives"],
+        point["numbers"],
+        point["pixels"],
+        point["pairs"],
+        point["overlap"] * point["pixels"],
+    ]
 
 
 def fitted(rows: list[list[float]], seconds: list[float]) -> list[float]:
@@ -60,7 +71,8 @@ def fitted(rows: list[list[float]], seconds: list[float]) -> list[float]:
 
 
 def timed(work: Callable[[], object], least: float = 0.04) -> float:
-    """Seconds that a call keeps this process's processor busy, of as many calls as take a while: other work on the machine is not in it."""
+    """Seconds that a call keeps this process's processor busy, of as many calls as take a while: other work on the
+    machine is not in it."""
     start, used, count = time.perf_counter(), time.process_time(), 0
     while time.perf_counter() - start < least or not count:
         work()
@@ -76,9 +88,17 @@ def described(trainer: Any, size: int, overlap: float) -> dict[str, Any]:
 
     views = trainer.dataset.train
     with torch.no_grad():
-        pairs = statistics.mean(render(trainer.model, views.view(i).camera, {}, trainer.renderer).stats.pairs for i in range(6))
+        pairs = statistics.mean(
+            render(trainer.model, views.view(i).camera, {}, trainer.renderer).stats.pairs for i in range(6)
+        )
     numbers = sum(value.numel() for value in trainer.model.params.values())
-    return {"primitives": trainer.model.count, "numbers": numbers, "pixels": size * size, "pairs": pairs, "overlap": overlap}
+    return {
+        "primitives": trainer.model.count,
+        "numbers": numbers,
+        "pixels": size * size,
+        "pairs": pairs,
+        "overlap": overlap,
+    }
 
 
 def volumes() -> list[tuple[dict[str, float], Callable[[], object], Callable[[], object]]]:
@@ -110,7 +130,13 @@ def volumes() -> list[tuple[dict[str, float], Callable[[], object], Callable[[],
         def draw(medium: Any = medium, camera: Any = camera) -> Any:
             return integrate(medium, camera, samples=2, threads=1)
 
-        found.append(({"voxels": voxels**3, "lit": voxels**4, "rays": 4 * size * size, "cells": 4.0 * size * size * voxels}, prepare, draw))
+        found.append(
+            (
+                {"voxels": voxels**3, "lit": voxels**4, "rays": 4 * size * size, "cells": 4.0 * size * size * voxels},
+                prepare,
+                draw,
+            )
+        )
     return found
 
 
@@ -161,7 +187,11 @@ def measure(rounds: int, group: Any) -> dict[str, Any]:
                 found.clear()  # the first round is for caches
             for point, trainer in alone.items():
                 keep("step", point, timed(trainer.train_step))
-                keep("adam", point, timed(lambda trainer=trainer: trainer.optimizer.step(trainer.model.params, trainer.rates())))
+                keep(
+                    "adam",
+                    point,
+                    timed(lambda trainer=trainer: trainer.optimizer.step(trainer.model.params, trainer.rates())),
+                )
             for i, (_, prepare, draw) in enumerate(solids):
                 keep("prepare", i, timed(prepare))
                 keep("draw", i, timed(draw))
@@ -181,7 +211,9 @@ def measure(rounds: int, group: Any) -> dict[str, Any]:
                 keep("two views", point, timed(two[point].train_step))
                 together("ranks", point, ranks[point])
                 together("parts", point, parts[point])
-    fastest = {kind: [min(times) for times in values.values()] for kind, values in found.items()}  # noise of a shared machine only adds
+    fastest = {
+        kind: [min(times) for times in values.values()] for kind, values in found.items()
+    }  # noise of a shared machine only adds
     return {"points": points, "volumes": [amounts for amounts, _, _ in solids], "sent": sent, **fastest}
 
 
@@ -255,14 +287,29 @@ def judged(record: dict[str, Any]) -> list[dict[str, Any]]:
             sent = record["sent"].get(f"{kind} {name}", 0)
             clock = record.get(f"{kind}, by the clock")
             rows.append(
-                {"point": JUDGED[i], "kind": kind, "said": seconds, "measured": measured, "sent": sent, "clock": clock and clock[i]}
+                {
+                    "point": JUDGED[i],
+                    "kind": kind,
+                    "said": seconds,
+                    "measured": measured,
+                    "sent": sent,
+                    "clock": clock and clock[i],
+                }
             )
     amounts = record["volumes"][-1]
     for kind, said in (
-        ("prepare", sum(c * x for c, x in zip(model["frame"].values(), (1.0, amounts["voxels"], amounts["lit"]), strict=True))),
-        ("draw", sum(c * x for c, x in zip(model["image"].values(), (1.0, amounts["rays"], amounts["cells"]), strict=True))),
+        (
+            "prepare",
+            sum(c * x for c, x in zip(model["frame"].values(), (1.0, amounts["voxels"], amounts["lit"]), strict=True)),
+        ),
+        (
+            "draw",
+            sum(c * x for c, x in zip(model["image"].values(), (1.0, amounts["rays"], amounts["cells"]), strict=True)),
+        ),
     ):
-        rows.append({"point": JUDGED_VOLUME, "kind": kind, "said": said, "measured": record[kind][-1], "sent": 0, "clock": None})
+        rows.append(
+            {"point": JUDGED_VOLUME, "kind": kind, "said": said, "measured": record[kind][-1], "sent": 0, "clock": None}
+        )
     return rows
 
 
@@ -295,7 +342,15 @@ KINDS = {
 
 
 def table_of_judged(record: dict[str, Any]) -> str:
-    rows = Table("not fitted", "what", "predicted", "measured", "predicted / measured", "predicted / by the clock", "a rank sends")
+    rows = Table(
+        "not fitted",
+        "what",
+        "predicted",
+        "measured",
+        "predicted / measured",
+        "predicted / by the clock",
+        "a rank sends",
+    )
     for row in judged(record):
         if len(row["point"]) == 4:
             primitives, size, overlap, _ = row["point"]
@@ -305,7 +360,12 @@ def table_of_judged(record: dict[str, Any]) -> str:
         times = [f"{1e3 * row[key]:.1f} ms" for key in ("said", "measured")]
         clock = f"{row['said'] / row['clock']:.2f}" if row["clock"] else ""
         rows.row(
-            name, KINDS[row["kind"]], *times, f"{row['said'] / row['measured']:.2f}", clock, f"{row['sent']:,} B" if row["sent"] else ""
+            name,
+            KINDS[row["kind"]],
+            *times,
+            f"{row['said'] / row['measured']:.2f}",
+            clock,
+            f"{row['sent']:,} B" if row["sent"] else "",
         )
     note = (
         f"Processor seconds are those of a quiet machine. By the clock two ranks also wait for other work, and for each other: while this was measured there was "
@@ -330,9 +390,17 @@ def main() -> None:
     if not args.print:
         out = RESULTS.with_suffix(".part")
         words = ["--rounds", str(args.rounds), "--worker", str(out)]
-        subprocess.run([sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", __file__, *words], check=True)
+        subprocess.run(
+            [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", __file__, *words], check=True
+        )
         busy = os.getloadavg()[1] / core_count()
-        record = {"cpu": cpu_name(), "cores": core_count(), "busy": busy, "rounds": args.rounds, **json.loads(out.read_text())}
+        record = {
+            "cpu": cpu_name(),
+            "cores": core_count(),
+            "busy": busy,
+            "rounds": args.rounds,
+            **json.loads(out.read_text()),
+        }
         RESULTS.write_text(json.dumps({**record, "model": model_of(record)}, indent=1) + "\n")
         out.unlink()
     record = json.loads(RESULTS.read_text())

@@ -1,9 +1,10 @@
 """How fast a model's extinction is put on a grid, against plain torch in float64 on some of the same points.
 
-    python benchmarks/density_grid.py [RUN_DIR] [--grid 256] [--primitives 5000] [--points 2000] [--threads 0] [--time 0.5]
+    python benchmarks/density_grid.py [RUN_DIR] [--grid 256] [--primitives 5000] [--points 2000] [--threads 0] [--time
+    0.5]
 
-Without a run, a made-up model of primitives that overlap about twenty-fold. Prints both times, their ratio per point, and the largest
-difference in units of the largest extinction.
+Without a run, a made-up model of primitives that overlap about twenty-fold. Prints both times, their ratio per point,
+and the largest difference in units of the largest extinction.
 """
 
 from __future__ import annotations
@@ -74,7 +75,9 @@ def main() -> None:
         f"{geometry.count} primitives on {' x '.join(map(str, shape))} points, about {overlap:.0f} per point, {args.threads or core_count()} threads"
     )
     print(f"grid   {seconds:8.2f} s   {1e9 * seconds / grid.numel():10.1f} ns per point")
-    print(f"torch  {plain:8.2f} s   {1e9 * plain / args.points:10.1f} ns per point, float64, {args.points} of the points")
+    print(
+        f"torch  {plain:8.2f} s   {1e9 * plain / args.points:10.1f} ns per point, float64, {args.points} of the points"
+    )
     print(f"ratio  {ratio:8.0f}     largest difference {error:.1e} of the largest extinction")
     print(f"peak memory of the process {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
 

@@ -1,22 +1,25 @@
 """Quality of the dynamic task on a real sequence, and which way of varying in time is worth its parameters.
 
-    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 13500x4000] [--presets quick equations hard] [--seeds 3]
+    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 13500x4000] [--presets quick equations hard]
+    [--seeds 3]
         [--parts main variants control between equations] [--edges 0 2] [--neurons 0 8] [--jobs 2] [--readme] [--docs]
 
 DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40). Parts:
 
-    main       presets by primitives and steps (--rows); presets other than quick get as many primitives as have its bytes; `hard` is the
+    main       presets by primitives and steps (--rows); presets other than quick get as many primitives as have its
+    bytes; `hard` is the
                paper's primitive, learned from images alone, with quick's windows and motion
-    variants   ways of varying in time, 2,000 primitives of the paper's, the same iterations; a table of parameters and quality; so are the next
-    control    times shuffled among the training images: a model of time must lose by it
-    between    every second frame is learned; the others are compared with the real ones, and steps between frames are measured
-    equations  the form of preset quick, that of the paper's equations 10 to 13 and their union, for each of --edges and --neurons, all at
+    variants   ways of varying in time, 2,000 primitives of the paper's, the same iterations; a table of parameters and
+    quality; so are the next control    times shuffled among the training images: a model of time must lose by it
+    between    every second frame is learned; the others are compared with the real ones, and steps between frames are
+    measured equations  the form of preset quick, that of the paper's equations 10 to 13 and their union, for each of
+    --edges and --neurons, all at
                the bytes of --primitives of quick's; the same iterations. Without
                neurons equation 13 changes nothing, and the equations' colour alone varies
 
-Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds +- half the
-spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json, part by part; of main and equations only what is missing is
-run, --jobs at a time, one thread each. --docs puts the recorded tables
+Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds
++- half the spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json, part by part; of main
+and equations only what is missing is run, --jobs at a time, one thread each. --docs puts the recorded tables
 between the markers of docs/dynamic.md, --readme a short one into README.md; without DIR nothing is run.
 """
 
@@ -52,7 +55,10 @@ RESULTS = Path(__file__).parent / "results" / "dynamic_quality.json"
 SIZE = 96
 COLOUR = ("model.colour.powers=4", "model.colour.waves=4")
 VARIANTS = {
-    **{time: (f"model.density.time={time}",) for time in ("phase", "offset", "window", "phase+offset", "phase+motion", "window+motion")},
+    **{
+        time: (f"model.density.time={time}",)
+        for time in ("phase", "offset", "window", "phase+offset", "phase+motion", "window+motion")
+    },
     "phase, colour in time": ("model.density.time=phase", *COLOUR),
     "window+motion, colour in time": ("model.density.time=window+motion", *COLOUR),
 }
@@ -62,7 +68,13 @@ FORMS = {
     "equations 10 to 13, degree 0": ("preset=equations", "model.sh_degree=0"),
     "union: phase, window, motion, colour in time": ("model.density.time=phase+window+motion", *COLOUR),
 }
-HARD = ("model.neurons=8", "model.density.edge=0", "model.density.gain=false", "train.supervision=images", "train.rates.log_scales=0.02")
+HARD = (
+    "model.neurons=8",
+    "model.density.edge=0",
+    "model.density.gain=false",
+    "train.supervision=images",
+    "train.rates.log_scales=0.02",
+)
 """The paper's primitive from images alone."""
 EVERY = "train.population.every=400"  # as the preset has it, however short
 PRESETS = {"quick": (), "equations": ("preset=equations",), "hard": HARD}
@@ -90,7 +102,10 @@ def fit(words: list[str], change: Callable[[Trainer], None] = lambda trainer: No
 def numbers(*words: str) -> int:
     """Numbers per primitive of a form whose colours are red, green and blue."""
     model = compose(["task=dynamic", *words], check_output=False).model
-    fields = TimeDensity(model.neurons, **model.density), TimeHarmonics(model.sh_degree, 3, model.sh_every, **model.colour)
+    fields = (
+        TimeDensity(model.neurons, **model.density),
+        TimeHarmonics(model.sh_degree, 3, model.sh_every, **model.colour),
+    )
     return sum(spec.size for spec in (*GEOMETRY_SPECS, *fields[0].parameters(), *fields[1].parameters()))
 
 
@@ -145,10 +160,12 @@ def recorded_in(trainer: Trainer) -> tuple[Dataset, Recording]:
 
 
 def between_frames(trainer: Trainer) -> dict[str, float]:
-    """PSNR inside the mask of test frames that were learned from and of those between them, and the largest step between frames.
+    """PSNR inside the mask of test frames that were learned from and of those between them, and the largest step
+    between frames.
 
-    The steps: the image at every quarter of a frame's interval. ``largest_step`` is the largest mean absolute difference of two such
-    neighbours over that of the two whole frames around them; smooth motion gives about 1/4, a jump 1 or more.
+    The steps: the image at every quarter of a frame's interval. ``largest_step`` is the largest mean absolute
+    difference of two such neighbours over that of the two whole frames around them; smooth motion gives about 1/4, a
+    jump 1 or more.
     """
     data, recording = recorded_in(trainer)
     frames, every = len(recording.test.times), recording.every
@@ -156,13 +173,21 @@ def between_frames(trainer: Trainer) -> dict[str, float]:
     worst = 0.0
     for index in range(len(data.test)):
         view, t = data.test.view(index), index % frames
-        rendered, truth = draw(trainer.model, view, trainer.renderer, data.background), data.test.pixels(index).over(data.background)
+        rendered, truth = (
+            draw(trainer.model, view, trainer.renderer, data.background),
+            data.test.pixels(index).over(data.background),
+        )
         error = (rendered - truth)[recording.track(index)].double().square().mean().item()
         errors[t % every == 0].append(-10 * math.log10(error))
         if t + 1 < frames and index < frames:
             after = data.test.view(index + 1)
-            steps = [view.conditions["time"] + q / 4 * (after.conditions["time"] - view.conditions["time"]) for q in range(5)]
-            images = [draw(trainer.model, type(view)("", view.camera, {"time": s}), trainer.renderer, data.background) for s in steps]
+            steps = [
+                view.conditions["time"] + q / 4 * (after.conditions["time"] - view.conditions["time"]) for q in range(5)
+            ]
+            images = [
+                draw(trainer.model, type(view)("", view.camera, {"time": s}), trainer.renderer, data.background)
+                for s in steps
+            ]
             whole = (images[4] - images[0]).abs().mean().item()
             worst = max(worst, *((b - a).abs().mean().item() / max(whole, 1e-9) for a, b in itertools.pairwise(images)))
     found = {"learned": statistics.mean(errors[True]), "largest_step": worst}
@@ -170,7 +195,8 @@ def between_frames(trainer: Trainer) -> dict[str, float]:
 
 
 def repeat_neighbour(trainer: Trainer) -> float:
-    """PSNR inside the mask of showing, for each frame that was not learned, the real frame before it: what interpolation must beat."""
+    """PSNR inside the mask of showing, for each frame that was not learned, the real frame before it: what
+    interpolation must beat."""
     data, recording = recorded_in(trainer)
     frames, every, values = len(recording.test.times), recording.every, []
     for index in range(len(data.test)):
@@ -211,8 +237,12 @@ def main() -> None:
 
         def keep(part: str, entry: dict[str, Any]) -> None:
             recorded.setdefault(part, []).append(entry)
-            RESULTS.write_text(json.dumps(recorded, indent=1) + "\n")  # after every run: a long benchmark may be cut short
-            print(part, json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in entry.items()}), flush=True)
+            RESULTS.write_text(
+                json.dumps(recorded, indent=1) + "\n"
+            )  # after every run: a long benchmark may be cut short
+            print(
+                part, json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in entry.items()}), flush=True
+            )
 
         for part in {"control", "between"} & set(args.parts):
             recorded[part] = []
@@ -360,7 +390,8 @@ def variants_table(recorded: dict[str, Any]) -> str:
 
 
 def equations_table(recorded: dict[str, Any]) -> str:
-    """The forms of quick, of the paper's equations and their union by edge and neurons, all at equal bytes; nothing where none was measured."""
+    """The forms of quick, of the paper's equations and their union by edge and neurons, all at equal bytes; nothing
+    where none was measured."""
     runs = _part(recorded, "equations")
     if not runs:
         return ""
@@ -389,13 +420,18 @@ def control_table(recorded: dict[str, Any]) -> str:
     for name in dict.fromkeys(r["name"] for r in runs):
         own = [r for r in runs if r["name"] == name]
         lines.append(f"| {name} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB |")
-    lines += ["", "| learned from | learned frames, inside the mask | frames between | real frame before instead | largest step |"]
+    lines += [
+        "",
+        "| learned from | learned frames, inside the mask | frames between | real frame before instead | largest step |",
+    ]
     lines.append("| --- | --- | --- | --- | --- |")
     for every in dict.fromkeys(r["every"] for r in recorded.get("between", [])):
         own = [r for r in recorded["between"] if r["every"] == every]
         what = "every frame" if every == 1 else f"every {every}nd frame"
         between, repeat = (_spread(own, k) + " dB" if every > 1 else "–" for k in ("between", "repeat"))
-        lines.append(f"| {what} | {_spread(own, 'learned')} dB | {between} | {repeat} | {_spread(own, 'largest_step')} |")
+        lines.append(
+            f"| {what} | {_spread(own, 'learned')} dB | {between} | {repeat} | {_spread(own, 'largest_step')} |"
+        )
     return "\n".join(lines)
 
 

@@ -1,9 +1,10 @@
-"""What a soft edge costs: nanoseconds a lane of edge = 1 and 2 over those of edge = 0, forward and backward, in one run.
+"""What a soft edge costs: nanoseconds a lane of edge = 1 and 2 over those of edge = 0, forward and backward, in one
+run.
 
     python benchmarks/edges.py [--scenes 5000x400 ...] [--rounds N] [--record]
 
-The scene of benchmarks/render.py, each edge with weights scaled so that a central chord is as opaque. All take turns; best of N rounds.
---record writes the table to docs/performance.md and the rows to benchmarks/results/edges.json.
+The scene of benchmarks/render.py, each edge with weights scaled so that a central chord is as opaque. All take turns;
+best of N rounds. --record writes the table to docs/performance.md and the rows to benchmarks/results/edges.json.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ RESULTS = Path(__file__).parent / "results" / "edges.json"
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="*", default=["5000x400", "20000x400"], help="PRIMITIVESxSIZE")
-    parser.add_argument("--rates", nargs="*", type=float, default=[4.0, 10.0], help="largest phase rates per axis, radians per m")
+    parser.add_argument(
+        "--rates", nargs="*", type=float, default=[4.0, 10.0], help="largest phase rates per axis, radians per m"
+    )
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--record", action="store_true")
     args = parser.parse_args()

@@ -1,13 +1,16 @@
-"""What is the best use of so much time? The levels `effort=1` to `9` of every task: how many primitives, and how many views.
+"""What is the best use of so much time? The levels `effort=1` to `9` of every task: how many primitives, and how many
+views.
 
     python benchmarks/effort.py [--scenes chair smoke_fire lit_solids] [--chair DIR] [--write] [--docs] [--print]
 
-A level is a share of the time that the preset `quick` takes, from a sixteenth of it to four times as much, on any machine. Level by level the number of
-primitives that was best so far is tried, and at most levels twice as many, while that is better: they share the time at paces measured side by side. Each is
-trained once, one thread, all else as the preset has it, and judged by views held out of the training ones (volumes: by the two test cameras of a rig of 38,
-as those of the usual 40 must not decide). The level is the smallest model within TIE dB of the best of so much time or less. Results go to benchmarks/results/effort/SCENE.json after
-every run, and only what is missing is run. --write freezes the levels in the tasks' `effort/NAME.yaml`, --docs puts the tables between the markers of
-docs/tradeoffs.md and draws docs/pictures/effort.png; --print runs nothing.
+A level is a share of the time that the preset `quick` takes, from a sixteenth of it to four times as much, on any
+machine. Level by level the number of primitives that was best so far is tried, and at most levels twice as many, while
+that is better: they share the time at paces measured side by side. Each is trained once, one thread, all else as the
+preset has it, and judged by views held out of the training ones (volumes: by the two test cameras of a rig of 38, as
+those of the usual 40 must not decide). The level is the smallest model within TIE dB of the best of so much time or
+less. Results go to benchmarks/results/effort/SCENE.json after
+every run, and only what is missing is run. --write freezes the levels in the tasks' `effort/NAME.yaml`, --docs puts the
+tables between the markers of docs/tradeoffs.md and draws docs/pictures/effort.png; --print runs nothing.
 """
 
 from __future__ import annotations
@@ -42,7 +45,8 @@ TIMES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 1.5, 2, 3, 4)
 FIRST = 0.5
 """Of the preset's own number of primitives, where the first level begins, and half of which it tries as well."""
 DOUBLED = {1: 4, 2: 4, 3: 4, 4: 4, 5: 4, 7: 1}
-"""Levels that try twice as many, and so many times twice as many again while that is better; the others take what the one before found."""
+"""Levels that try twice as many, and so many times twice as many again while that is better; the others take what the
+one before found."""
 TIE = 0.05
 PACED = 320
 """Steps of the short runs that tell the paces; a whole one each, as primitives are born on the way."""
@@ -115,14 +119,23 @@ class Climb:
         hold_out = 0 if SCENES[self.scene].task == "dynamic" else HOLD_OUT
         name, judged = f"{self.scene}-{level}-{share:g}", SCENES[self.scene].judged
         trial = Trial(name, words, steps, 0, hold_out, facts, interventions=None)
-        run_all([trial], file_of(self.scene), KEYS, 1, lambda row: f"{row[judged]:.2f} dB", {"cpu": cpu_name(), "paces": self.paces})
+        run_all(
+            [trial],
+            file_of(self.scene),
+            KEYS,
+            1,
+            lambda row: f"{row[judged]:.2f} dB",
+            {"cpu": cpu_name(), "paces": self.paces},
+        )
         return float(next(row[judged] for row in recorded(file_of(self.scene)) if row["trial"] == name))
 
     def pace(self, share: float) -> float:
         """Time of a step, as a multiple of the preset's."""
         if f"{share:g}" not in self.paces:
             words = {s: (*self.words, f"model.primitives={round(s * self.own.model.primitives)}") for s in (1.0, share)}
-            took = paces_of({f"{s:g}": begin(Trial("", w, PACED, interventions=None)).trainer for s, w in words.items()}, PACED)
+            took = paces_of(
+                {f"{s:g}": begin(Trial("", w, PACED, interventions=None)).trainer for s, w in words.items()}, PACED
+            )
             self.paces[f"{share:g}"] = took[f"{share:g}"] / took["1"]
         return self.paces[f"{share:g}"]
 
@@ -143,7 +156,8 @@ def of_level(rows: Sequence[Mapping[str, Any]], level: int) -> list[Mapping[str,
 
 
 def chosen(rows: Sequence[Mapping[str, Any]], scene: str, level: int) -> Mapping[str, Any]:
-    """The smallest model, and of these the soonest trained, that is about as good as the best of the level's time or less: more of it is no use of its own."""
+    """The smallest model, and of these the soonest trained, that is about as good as the best of the level's time or
+    less: more of it is no use of its own."""
     tried, judged = [row for at in LEVELS if at <= level for row in of_level(rows, at)], SCENES[scene].judged
     best = max(row[judged] for row in tried)
     return min((row for row in tried if row[judged] >= best - TIE), key=lambda row: (row["asked"], row["iterations"]))
@@ -167,7 +181,17 @@ def frozen(rows: Sequence[Mapping[str, Any]], scene: str) -> str:
 def table(rows: Sequence[Mapping[str, Any]], scene: str) -> Table:
     """Levels down, with what else was tried."""
     judged = SCENES[scene].judged
-    made = Table("`effort=`", "time", "primitives", "views", f"dB, {JUDGED[scene]}", "SSIM", "bytes", "seconds of a core", "also tried")
+    made = Table(
+        "`effort=`",
+        "time",
+        "primitives",
+        "views",
+        f"dB, {JUDGED[scene]}",
+        "SSIM",
+        "bytes",
+        "seconds of a core",
+        "also tried",
+    )
     for level in LEVELS:
         best = chosen(rows, scene, level)
         others = ", ".join(f"{r['asked']:,}: {r[judged]:.2f}" for r in of_level(rows, level) if r is not best) or "–"
@@ -192,16 +216,34 @@ def draw(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, len(found), figsize=(4.2 * len(found), 3.3), constrained_layout=True, squeeze=False)
+    figure, axes = pyplot.subplots(
+        1, len(found), figsize=(4.2 * len(found), 3.3), constrained_layout=True, squeeze=False
+    )
     for axis, (scene, rows) in zip(axes[0], found.items(), strict=True):
         judged = SCENES[scene].judged
         levels = [chosen(rows, scene, level) for level in LEVELS]
         others = [row for row in rows if row not in levels]
-        axis.scatter([r["cpu_seconds"] for r in others], [r[judged] for r in others], s=14, color="0.7", label="also tried", zorder=2)
-        axis.plot([r["cpu_seconds"] for r in levels], [r[judged] for r in levels], marker="o", markersize=4.5, label="levels", zorder=3)
+        axis.scatter(
+            [r["cpu_seconds"] for r in others],
+            [r[judged] for r in others],
+            s=14,
+            color="0.7",
+            label="also tried",
+            zorder=2,
+        )
+        axis.plot(
+            [r["cpu_seconds"] for r in levels],
+            [r[judged] for r in levels],
+            marker="o",
+            markersize=4.5,
+            label="levels",
+            zorder=3,
+        )
         for row in {row["trial"]: row for row in levels}.values():
             name = ", ".join(str(level) for level, other in zip(LEVELS, levels, strict=True) if other is row)
-            axis.annotate(name, (row["cpu_seconds"], row[judged]), (-3, 5), textcoords="offset points", fontsize=8, ha="right")
+            axis.annotate(
+                name, (row["cpu_seconds"], row[judged]), (-3, 5), textcoords="offset points", fontsize=8, ha="right"
+            )
         axis.set_xscale("log", base=2)
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axis.set_title(TITLES[scene].replace("`", ""), fontsize=9)

@@ -1,21 +1,25 @@
-"""What one primitive can express, and what its bytes are worth: the forms of the family, the paper's and a Gaussian, at equal bytes and equal seconds.
+"""What one primitive can express, and what its bytes are worth: the forms of the family, the paper's and a Gaussian, at
+equal bytes and equal seconds.
 
     python benchmarks/expressivity.py [--scenes solids chair fire smoke_fire lit_solids] [--chair DIR] [--fire DIR]
         [--parts forms slope gaussian] [--sizes 100 400 2000] [--seeds 3] [--docs] [--print]
 
-Each run is its task's preset `quick`, cut to a number of steps, with all primitives from the start and rates without a cool-down. A size is the bytes of so many of the paper's primitives; every form gets as many primitives
-as these bytes hold. Parts:
+Each run is its task's preset `quick`, cut to a number of steps, with all primitives from the start and rates without a
+cool-down. A size is the bytes of so many of the paper's primitives; every form gets as many primitives as these bytes
+hold. Parts:
 
-    forms     every form at every size, for as many steps as fit into the seconds that the paper's form takes for its own: the forms take turns
+    forms     every form at every size, for as many steps as fit into the seconds that the paper's form takes for its
+    own: the forms take turns
               on this machine first, over a whole run, and each has its pace in seconds that its thread computes
     slope     the same with half the steps, first seed: what the last doubling of the budget still brought
-    gaussian  a true Gaussian has no fast kernel and runs on the reference backend: small images of the static scenes and few steps, equal count
+    gaussian  a true Gaussian has no fast kernel and runs on the reference backend: small images of the static scenes
+    and few steps, equal count
               and equal bytes, beside the other forms in the same conditions
 
-Each form learns at the best rates of `screening.py`, which sees no test view. Means over seeds +- half the spread, of the last
-checkpoint, on the test views. Results go to benchmarks/results/expressivity.json after every run, and only what is missing is run; models to
-outputs/expressivity, from which docs/pictures/expressivity.png is drawn (Figure 9 of the paper). --docs puts the tables between the markers in
-docs/expressivity.md; --print runs nothing.
+Each form learns at the best rates of `screening.py`, which sees no test view. Means over seeds +- half the spread, of
+the last checkpoint, on the test views. Results go to benchmarks/results/expressivity.json after every run, and only
+what is missing is run; models to outputs/expressivity, from which docs/pictures/expressivity.png is drawn (Figure 9 of
+the paper). --docs puts the tables between the markers in docs/expressivity.md; --print runs nothing.
 """
 
 from __future__ import annotations
@@ -45,23 +49,37 @@ KEYS = (
     "parameters", "parameters_per_primitive", "primitives", "backend",
 )  # fmt: skip
 
-# The presets' rates are those that `screening.py` found, in dB of (solids, chair) at the bytes of 400 and 1,500 steps, and they are the same for each form:
-# K = 8 hard: as before 27.60, 29.88; b2, w2 0.03 28.16, 30.08; 0.1 28.08, 30.26; 0.03 and log_scales 0.06 *28.29, 30.22*; 0.03 and means 1e-3 28.01, -.
-# K = 2 p = 2: b2, w2 0.01 29.64, 30.82; 0.03 29.68, 30.78; 0.1 29.71, 30.74; 0.03 and log_scales 0.02 29.29, 30.63; and 0.06 *29.96, 30.92*;
-# and log_gain 0.05 29.49, 30.69; and 0.5 29.59, 30.91; and W1, b1 0.02 29.73, 30.88; and means 1e-3 29.77, 30.83; and model.init.scale 1.4 29.41, 30.70;
-# log_scales 0.06 and W1, b1 0.02 29.92, 30.90. K = 0 p = 2: 0.01 29.32, 30.58; 0.03 29.35, 30.54; 0.1 29.21, 30.56; 0.03 and log_scales 0.06
+# The presets' rates are those that `screening.py` found, in dB of (solids, chair) at the bytes of 400 and 1,500 steps,
+# and they are the same for each form:
+# K = 8 hard: as before 27.60, 29.88; b2, w2 0.03 28.16, 30.08; 0.1 28.08, 30.26; 0.03 and log_scales 0.06 *28.29,
+# 30.22*; 0.03 and means 1e-3 28.01, -.
+# K = 2 p = 2: b2, w2 0.01 29.64, 30.82; 0.03 29.68, 30.78; 0.1 29.71, 30.74; 0.03 and log_scales 0.02 29.29, 30.63; and
+# 0.06 *29.96, 30.92*;
+# and log_gain 0.05 29.49, 30.69; and 0.5 29.59, 30.91; and W1, b1 0.02 29.73, 30.88; and means 1e-3 29.77, 30.83; and
+# model.init.scale 1.4 29.41, 30.70;
+# log_scales 0.06 and W1, b1 0.02 29.92, 30.90. K = 0 p = 2: 0.01 29.32, 30.58; 0.03 29.35, 30.54; 0.1 29.21, 30.56;
+# 0.03 and log_scales 0.06
 # *29.51, 30.66*; and log_gain 0.5 29.22, 30.51; and means 1e-3 29.30, 30.59.
-# The fire, inside the mask, images alone, bytes of 2,000: K = 0 p = 2 38.09, log_scales 0.04 *38.63*, b2 0.01 37.91; with log_scales 0.04 and b2, w2 0.01
+# The fire, inside the mask, images alone, bytes of 2,000: K = 0 p = 2 38.09, log_scales 0.04 *38.63*, b2 0.01 37.91;
+# with log_scales 0.04 and b2, w2 0.01
 # K = 2 p = 2 37.92 to 38.31 and K = 8 hard 37.44 to 37.62.
-# lit_solids, clamped, held-out training views, bytes of 2,000, 2,000 steps: K = 2 p = 2 28.96; log_scales 0.04 29.31; 0.06 and b2, w2 0.03 *29.37*; half
-# the network's rates 28.90; only idle primitives moved 28.84. With those of 29.37 K = 0 p = 2 29.27, K = 8 hard 28.47 (at the old rates 28.8 on the test views).
-# smoke_fire, 10,000 steps, K = 0 p = 2, bytes of 2,000: the least used moved 47.74 dB, only the idle *48.65*; on the fire, 7,000 steps, level.
-# Voxels beside images on the fire at equal seconds, inside the mask and relative L2 of sigma: images 40.52 .148 .222 .312; 8,192 points in every
-# fourth step 40.62 .102 .189 .281, in every sixteenth *40.64 .114 .198 .290*; the first with four times the weight 40.19 .097 .188 .279; 4,096 in every
-# second 40.55 .095 .187 .276. On smoke_fire with quick's 13,500 primitives: images 45.74 .251 .322 .328; every sixteenth 44.89 .285 .294 .309; every
+# lit_solids, clamped, held-out training views, bytes of 2,000, 2,000 steps: K = 2 p = 2 28.96; log_scales 0.04 29.31;
+# 0.06 and b2, w2 0.03 *29.37*; half
+# the network's rates 28.90; only idle primitives moved 28.84. With those of 29.37 K = 0 p = 2 29.27, K = 8 hard 28.47
+# (at the old rates 28.8 on the test views).
+# smoke_fire, 10,000 steps, K = 0 p = 2, bytes of 2,000: the least used moved 47.74 dB, only the idle *48.65*; on the
+# fire, 7,000 steps, level.
+# Voxels beside images on the fire at equal seconds, inside the mask and relative L2 of sigma: images 40.52 .148 .222
+# .312; 8,192 points in every
+# fourth step 40.62 .102 .189 .281, in every sixteenth *40.64 .114 .198 .290*; the first with four times the weight
+# 40.19 .097 .188 .279; 4,096 in every
+# second 40.55 .095 .187 .276. On smoke_fire with quick's 13,500 primitives: images 45.74 .251 .322 .328; every
+# sixteenth 44.89 .285 .294 .309; every
 # fourth 44.15 .330 .273 .300; every step 42.70 .323 .288 .295.
-# smoke_fire again, judged by another rig (scene.cameras=38), K = 0 p = 2, bytes of 1,000, at equal seconds (6,000, 5,249 and 3,855 steps), two seeds, inside
-# the mask: images 42.36 and 42.92, every sixteenth 41.15 and 41.43, every fourth 40.57 and 41.38. The fire gets its voxels for nothing and smoke does not.
+# smoke_fire again, judged by another rig (scene.cameras=38), K = 0 p = 2, bytes of 1,000, at equal seconds (6,000,
+# 5,249 and 3,855 steps), two seeds, inside
+# the mask: images 42.36 and 42.92, every sixteenth 41.15 and 41.43, every fourth 40.57 and 41.38. The fire gets its
+# voxels for nothing and smoke does not.
 FORMS = {
     "static": ("8:0", "0:2", "2:2", "4:2"),
     "dynamic": ("8:0@images", "0:2@images", "0:2", "2:2"),
@@ -134,7 +152,9 @@ def plan(args: argparse.Namespace, paces: dict[str, float]) -> list[Trial]:
     """Every run; the first seed of everything first, so that an early end leaves whole rows."""
     trials = []
 
-    def add(part: str, scene: str, size: int, form: str, count: int, steps: int, seed: int, further: tuple[str, ...] = ()) -> None:
+    def add(
+        part: str, scene: str, size: int, form: str, count: int, steps: int, seed: int, further: tuple[str, ...] = ()
+    ) -> None:
         facts = (("part", part), ("scene", scene), ("form", form), ("size", size))
         name = f"{part}-{scene}-{size}-{form}-{count}-{steps}-{seed}"
         kept = args.models / name if seed == 0 and part != "slope" and SCENES[scene].task == "static" else None
@@ -145,7 +165,10 @@ def plan(args: argparse.Namespace, paces: dict[str, float]) -> list[Trial]:
             task = SCENES[scene].task
             for size in sizes(scene, args) if paces else []:
                 for form in forms_of(scene, args):
-                    count, steps = Form.named(form).equal_bytes(size, task), round(STEPS[scene][size] / paces[f"{scene} {size} {form}"])
+                    count, steps = (
+                        Form.named(form).equal_bytes(size, task),
+                        round(STEPS[scene][size] / paces[f"{scene} {size} {form}"]),
+                    )
                     if "forms" in args.parts:
                         add("forms", scene, size, form, count, steps, seed)
                     if "slope" in args.parts and seed == 0:
@@ -173,12 +196,18 @@ def forms_table(found: dict[str, Any]) -> str:
         if run["part"] == "forms":
             groups.setdefault((run["scene"], run["size"], run["form"]), []).append(run)
     order = list(SCENES)
-    for (scene, size, form), runs in sorted(groups.items(), key=lambda g: (order.index(g[0][0]), g[0][1], -_mean(g[1]))):
+    for (scene, size, form), runs in sorted(
+        groups.items(), key=lambda g: (order.index(g[0][0]), g[0][1], -_mean(g[1]))
+    ):
         judged = SCENES[scene].judged
         top = max((own for key, own in groups.items() if key[:2] == (scene, size)), key=_mean)
         values = [r[judged] for r in top]
         text = f"{spread([r[judged] for r in runs], 2)} dB"
-        half = [r[judged] for r in trials if r["part"] == "slope" and (r["scene"], r["size"], r["form"]) == (scene, size, form)]
+        half = [
+            r[judged]
+            for r in trials
+            if r["part"] == "slope" and (r["scene"], r["size"], r["form"]) == (scene, size, form)
+        ]
         first = next(r[judged] for r in runs if r["seed"] == 0)
         lines.append(
             f"| {scene} | {size} | {Form.named(form).label} | {runs[0]['primitives']} | {runs[0]['parameters_per_primitive']} | {runs[0]['iterations']} "
@@ -221,13 +250,18 @@ def short_table(trials: list[dict[str, Any]]) -> str:
 
 def gaussian_table(trials: list[dict[str, Any]]) -> str:
     """Equal count and equal bytes in the conditions that a Gaussian can be trained in."""
-    lines = ["| scene | primitive | primitives | parameters | PSNR | worst view | backend |", "| --- | --- | --- | --- | --- | --- | --- |"]
+    lines = [
+        "| scene | primitive | primitives | parameters | PSNR | worst view | backend |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
     groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for run in trials:
         if run["part"] == "gaussian":
             groups.setdefault((run["scene"], run["form"], run["primitives"]), []).append(run)
     size = SMALL["primitives"]
-    for (scene, form, count), runs in sorted(groups.items(), key=lambda g: (g[0][0] != "solids", g[0][0], g[0][2] != size, -_mean(g[1]))):
+    for (scene, form, count), runs in sorted(
+        groups.items(), key=lambda g: (g[0][0] != "solids", g[0][0], g[0][2] != size, -_mean(g[1]))
+    ):
         same = "" if count == size and form != str(PAPER) else " (equal bytes)" if count != size else " (both)"
         lines.append(
             f"| {scene} | {Form.named(form).label} | {count}{same} | {runs[0]['parameters']} | {spread([r['psnr'] for r in runs], 2)} dB "
@@ -254,7 +288,9 @@ def _pictured(trials: list[dict[str, Any]], scene: str) -> list[dict[str, Any]]:
     own = [r for r in trials if r["scene"] == scene and r["seed"] == 0]
     rows = [r for r in own if r["part"] == "forms" and r["size"] == 400]
     rows.sort(key=lambda r: r["form"] != str(PAPER))
-    gaussians = [r for r in own if r["part"] == "gaussian" and r["form"] == "gaussian" and r["primitives"] != SMALL["primitives"]]
+    gaussians = [
+        r for r in own if r["part"] == "gaussian" and r["form"] == "gaussian" and r["primitives"] != SMALL["primitives"]
+    ]
     return [*rows, *gaussians]
 
 
@@ -263,12 +299,16 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
     parser.add_argument("--chair", type=Path, help="a NeRF-synthetic folder")
     parser.add_argument("--fire", type=Path, help="a folder of EmberGen's .vdb files")
-    parser.add_argument("--parts", nargs="*", default=["forms", "slope", "gaussian"], choices=("forms", "slope", "gaussian"))
+    parser.add_argument(
+        "--parts", nargs="*", default=["forms", "slope", "gaussian"], choices=("forms", "slope", "gaussian")
+    )
     parser.add_argument("--forms", nargs="*", default=[], metavar="K:EDGE", help="instead of the task's")
     parser.add_argument("--sizes", nargs="*", type=int, default=[], help="some of the scenes' sizes")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
-    parser.add_argument("--models", type=Path, default=Path("outputs") / "expressivity", help="folder for the fitted models")
+    parser.add_argument(
+        "--models", type=Path, default=Path("outputs") / "expressivity", help="folder for the fitted models"
+    )
     parser.add_argument("--print", action="store_true", help="train nothing")
     parser.add_argument("--docs", action="store_true", help="write tables and picture into docs")
     parser.add_argument("--readme", action="store_true", help="write a short table into README.md")

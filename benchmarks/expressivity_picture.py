@@ -2,8 +2,8 @@
 
     python benchmarks/expressivity_picture.py TARGET.png ROWS RUN_DIR [RUN_DIR ...]
 
-The run directories are those of benchmarks/expressivity.py, ROWS of each scene one after another. A fitted model has no resolution, so one that was
-trained on smaller images is drawn as large as the others, beside the truth at that size.
+The run directories are those of benchmarks/expressivity.py, ROWS of each scene one after another. A fitted model has no
+resolution, so one that was trained on smaller images is drawn as large as the others, beside the truth at that size.
 """
 
 from __future__ import annotations
@@ -34,9 +34,11 @@ from neuprim.runs.open import load_dataset, load_run
 SIZE = 200
 """Pixels on a side of every panel; chair_200's own size, and what solids is ray-cast at for the truth."""
 LIGHT = (0.3, -0.5, -0.8)
-"""Direction towards the light in camera axes, for the shaded ellipsoids: from above, behind the camera's right shoulder."""
+"""Direction towards the light in camera axes, for the shaded ellipsoids: from above, behind the camera's right
+shoulder."""
 GAUSSIAN_REACH = 0.5
-"""Share of a Gaussian's support that is drawn: its density has fallen to a third there, at 1.5 of 3 standard deviations."""
+"""Share of a Gaussian's support that is drawn: its density has fallen to a third there, at 1.5 of 3 standard
+deviations."""
 COLUMNS = ("ground truth", "render", f"error, 0 to {ERROR_SCALE}", "slice through σ", "one colour each", "ellipsoids")
 
 
@@ -78,7 +80,9 @@ def panels(run_dir: Path) -> Panels:
     with torch.no_grad():
         random = torch.rand(model.count, 3, generator=torch.Generator().manual_seed(0)) * 0.85 + 0.1
         lowered = model.lower(view.camera, view.conditions)
-        coloured = render_lowered(Lowered(lowered.geometry, lowered.density, Constant(random)), view.camera, settings, torch.ones(3)).rgb
+        coloured = render_lowered(
+            Lowered(lowered.geometry, lowered.density, Constant(random)), view.camera, settings, torch.ones(3)
+        ).rgb
         sigma = density_slice(model, view, dataset.center)
         reach = GAUSSIAN_REACH if isinstance(model.density, GaussianDensity) else 1.0
         shaded = ellipsoids(model.geometry, view, random, reach)
@@ -90,7 +94,8 @@ def panels(run_dir: Path) -> Panels:
 def density_slice(model: Primitives, view: View, center: Tensor) -> Tensor:
     """(H, W) sum of all primitives' density, 1/scene unit, on the plane through ``center`` that faces the camera.
 
-    Each pixel shows the point where its ray meets the plane, so the slice lies on top of the render. Sums below zero are drawn as zero.
+    Each pixel shows the point where its ray meets the plane, so the slice lies on top of the render. Sums below zero
+    are drawn as zero.
     """
     camera = view.camera
     world_to_camera = camera.viewmat.double()
@@ -98,7 +103,9 @@ def density_slice(model: Primitives, view: View, center: Tensor) -> Tensor:
     d = pixel_directions(camera).reshape(-1, 3)
     points = camera.position.double() + (d * (depth / d[:, 2:])) @ world_to_camera[:3, :3]
     wide = {k: v.detach().double() for k, v in model.of(model.density).items()}
-    g = Geometry(*(t.detach().double() for t in (model.geometry.means, model.geometry.log_scales, model.geometry.quats)))
+    g = Geometry(
+        *(t.detach().double() for t in (model.geometry.means, model.geometry.log_scales, model.geometry.quats))
+    )
     sigma = torch.zeros(len(points), dtype=torch.float64)
     for row in range(g.count):
         local = (points - g.means[row]) @ g.rotations[row] / g.scales[row]
@@ -109,7 +116,8 @@ def density_slice(model: Primitives, view: View, center: Tensor) -> Tensor:
 
 
 def ellipsoids(geometry: Geometry, view: View, colors: Tensor, reach: float) -> Tensor:
-    """(H, W, 3) the ellipsoids, ``reach`` times their support, as opaque shaded solids: the nearest one at every pixel, on white."""
+    """(H, W, 3) the ellipsoids, ``reach`` times their support, as opaque shaded solids: the nearest one at every pixel,
+    on white."""
     camera = view.camera
     rotation = camera.viewmat[:3, :3].double()
     d = pixel_directions(camera).reshape(-1, 3) @ rotation
@@ -135,14 +143,17 @@ def ellipsoids(geometry: Geometry, view: View, colors: Tensor, reach: float) -> 
 
 
 def draw_figure(runs: list[Path], target: Path, per_scene: int) -> None:
-    """``per_scene`` rows of each scene. Error maps share the report's scale; slices share one scale per scene, printed beside them."""
+    """``per_scene`` rows of each scene. Error maps share the report's scale; slices share one scale per scene, printed
+    beside them."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
     rows = [panels(run) for run in runs]
-    figure, axes = plt.subplots(len(rows), len(COLUMNS), figsize=(12.6, 2.05 * len(rows) + 0.35), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(
+        len(rows), len(COLUMNS), figsize=(12.6, 2.05 * len(rows) + 0.35), squeeze=False, layout="constrained"
+    )
     for r, row in enumerate(rows):
         scene = rows[per_scene * (r // per_scene) : per_scene * (r // per_scene + 1)]
         top = max(float(torch.quantile(p.slice[p.slice > 0], 0.9)) for p in scene if bool((p.slice > 0).any()))

@@ -2,9 +2,10 @@
 
     python benchmarks/factors.py [--chair DIR] [--seeds 2] [--jobs 1] [--docs] [--print]
 
-`model.density.omega0` on the chair, `model.colour.boost` on `lit_solids`, and `model.colour.frequencies` on `smoke_fire` with the paper's dynamic form
-(`preset=equations`, whose colour has waves in time). All else is the scene's preset, at a budget in steps; test views judge, and decide nothing. Results go to
-benchmarks/results/factors.json as they come, and only what is missing is run; --docs puts the table between the markers of docs/tradeoffs.md.
+`model.density.omega0` on the chair, `model.colour.boost` on `lit_solids`, and `model.colour.frequencies` on
+`smoke_fire` with the paper's dynamic form (`preset=equations`, whose colour has waves in time). All else is the scene's
+preset, at a budget in steps; test views judge, and decide nothing. Results go to benchmarks/results/factors.json as
+they come, and only what is missing is run; --docs puts the table between the markers of docs/tradeoffs.md.
 """
 
 from __future__ import annotations
@@ -45,7 +46,10 @@ def trials(chair: Path, seeds: int) -> list[Trial]:
         data = (f"scene.path='{chair.resolve()}'",) if scene == CHAIR else ()
         for value in values:
             facts = (("scene", scene), ("value", str(value)))
-            made += [Trial(f"{knob}={value}-{seed}", (*words, *data, f"{knob}={value}"), steps, seed, facts=facts) for seed in range(seeds)]
+            made += [
+                Trial(f"{knob}={value}-{seed}", (*words, *data, f"{knob}={value}"), steps, seed, facts=facts)
+                for seed in range(seeds)
+            ]
     return made
 
 

@@ -1,8 +1,10 @@
-"""Fit the even polynomials in turns that the kernels use for cos, sinc, the profiles of soft edges, and their derivatives; print float32 errors.
+"""Fit the even polynomials in turns that the kernels use for cos, sinc, the profiles of soft edges, and their
+derivatives; print float32 errors.
 
     python benchmarks/fit_polynomials.py
 
-Lawson-weighted least squares on Chebyshev nodes in z = r^2, |r| up to 1/2 or 3/2 turn: close to minimax, reproducible, no tables.
+Lawson-weighted least squares on Chebyshev nodes in z = r^2, |r| up to 1/2 or 3/2 turn: close to minimax, reproducible,
+no tables.
 """
 
 from __future__ import annotations
@@ -59,7 +61,8 @@ def dprofile_turns(p: int) -> Callable[[F64], F64]:
 
 
 def fit(function, degree: int, reach: float, centred: bool) -> tuple[F64, float]:  # type: ignore[no-untyped-def]
-    """Coefficients in z = r^2, |r| <= reach, or in t = 2 z / reach^2 - 1 (long polynomials cancel less there), and the worst error."""
+    """Coefficients in z = r^2, |r| <= reach, or in t = 2 z / reach^2 - 1 (long polynomials cancel less there), and the
+    worst error."""
     t = -np.cos(np.pi * (np.arange(4000) + 0.5) / 4000)
     target, weight = function((t + 1) / 2 * reach**2), np.ones(4000)
     vander = chebyshev.chebvander(t, degree)

@@ -2,8 +2,9 @@
 
     python benchmarks/form_checks.py [--primitives 5000] [--size 200] [--steps 60]
 
-Every function of neuprim.core.model.checks that a step calls is timed in the steps themselves, so both times come from one process and one
-mood of the machine; the clock's own cost counts as the checks'. Exits with an error where the share reaches --most (1 %).
+Every function of neuprim.core.model.checks that a step calls is timed in the steps themselves, so both times come from
+one process and one mood of the machine; the clock's own cost counts as the checks'. Exits with an error where the share
+reaches --most (1 %).
 """
 
 from __future__ import annotations
@@ -72,7 +73,9 @@ class Clock:
         return run
 
 
-def share(density: DensityField, colour: ColourField, data: Dataset, count: int, steps: int, clock: Clock) -> tuple[float, float, float]:
+def share(
+    density: DensityField, colour: ColourField, data: Dataset, count: int, steps: int, clock: Clock
+) -> tuple[float, float, float]:
     """Medians over steps: milliseconds of a step, microseconds of its checks, and their ratio."""
     model = initial_model(density, colour, data, ModelSettings(primitives=count), 0)
     settings = TrainSettings(iterations=steps + 5)

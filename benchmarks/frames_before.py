@@ -1,10 +1,12 @@
-"""Whether a change made frames of finished runs faster or slower: the same frames by this checkout and by an earlier one, in turns.
+"""Whether a change made frames of finished runs faster or slower: the same frames by this checkout and by an earlier
+one, in turns.
 
     git worktree add ../before COMMIT
     python benchmarks/frames_before.py ../before RUN_DIR... [--rounds 20] [--record]
 
-A process of each checkout draws five held-out views of a run on one thread, one process at a time, round by round in another order. The ratio is that of the times of a
-round, whose median and quartiles are printed; images are compared. Results go to benchmarks/results/frames_before.json.
+A process of each checkout draws five held-out views of a run on one thread, one process at a time, round by round in
+another order. The ratio is that of the times of a round, whose median and quartiles are printed; images are compared.
+Results go to benchmarks/results/frames_before.json.
 """
 
 from __future__ import annotations
@@ -58,7 +60,9 @@ class Checkout:
     def __init__(self, folder: Path, run: Path) -> None:
         environment = {**os.environ, "PYTHONPATH": str(folder.resolve())}
         command = [sys.executable, "-c", CHILD, str(run.resolve())]
-        self.process = subprocess.Popen(command, env=environment, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            command, env=environment, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
         self.count, self.images = json.loads(self._line())
         self.milliseconds: list[float] = []
 
@@ -110,7 +114,10 @@ def main() -> None:
     for run in args.runs:
         name = "/".join(run.resolve().parts[-3::2])  # a set and its model
         one = found["runs"][name] = compare(args.before, run, args.rounds)
-        quartiles, same = "{:.3f} to {:.3f}".format(*one["quartiles"]), "the same bits" if one["same_images"] else "differ"
+        quartiles, same = (
+            "{:.3f} to {:.3f}".format(*one["quartiles"]),
+            "the same bits" if one["same_images"] else "differ",
+        )
         table.row(name, f"{one['primitives']:,}", f"{one['ms']:.2f}", f"{one['ratio']:.3f}", quartiles, same)
         if args.record:
             write_json(RESULTS, found)

@@ -1,10 +1,13 @@
-"""How far the fronts of models reach, in time of a frame and in bytes: one scene of each task, models of very different size trained equally long.
+"""How far the fronts of models reach, in time of a frame and in bytes: one scene of each task, models of very different
+size trained equally long.
 
-    python benchmarks/fronts.py [--scenes chair fire lit_solids] [--chair DIR] [--fire DIR] [--out DIR] [--docs] [--print]
+    python benchmarks/fronts.py [--scenes chair fire lit_solids] [--chair DIR] [--fire DIR] [--out DIR] [--docs]
+    [--print]
 
-It is `neuprim tradeoff task=… scene=…` with the words below: every model trains for the same time, on one thread, and times of frames are taken in rounds
-that take turns between all of them. What is trained is kept in --out and gone on with. Results go to benchmarks/results/fronts.json; --docs puts
-the tables between the markers of docs/tradeoffs.md and draws docs/pictures/fronts.png; --print runs nothing.
+It is `neuprim tradeoff task=… scene=…` with the words below: every model trains for the same time, on one thread, and
+times of frames are taken in rounds that take turns between all of them. What is trained is kept in --out and gone on
+with. Results go to benchmarks/results/fronts.json; --docs puts the tables between the markers of docs/tradeoffs.md and
+draws docs/pictures/fronts.png; --print runs nothing.
 """
 
 from __future__ import annotations
@@ -32,7 +35,8 @@ PICTURE = ROOT / "docs" / "pictures" / "fronts.png"
 
 @dataclass(frozen=True)
 class Scene:
-    """What is trained: words, knobs and budget of `neuprim tradeoff`; ``data`` is the word that gets the folder, if it wants one."""
+    """What is trained: words, knobs and budget of `neuprim tradeoff`; ``data`` is the word that gets the folder, if it
+    wants one."""
 
     title: str
     words: tuple[str, ...]
@@ -153,15 +157,29 @@ def draw(found: Mapping[str, Any]) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     names = [name for name in SCENES if name in found]
-    figure, axes = pyplot.subplots(2, len(names), figsize=(4.2 * len(names), 5.6), constrained_layout=True, squeeze=False)
+    figure, axes = pyplot.subplots(
+        2, len(names), figsize=(4.2 * len(names), 5.6), constrained_layout=True, squeeze=False
+    )
     for column, name in enumerate(names):
         models = found[name]["models"]
         kinds = (("speed", "ms_per_frame", 1.0, "ms a frame, one thread"), ("size", "bytes", 1e-6, "MB"))
         for axis, (front, cost, unit, label) in zip(axes[:, column], kinds, strict=True):
             line = sorted(found[name][front], key=lambda i: models[i][cost])
             others = [i for i in range(len(models)) if i not in line]
-            axis.plot([unit * models[i][cost] for i in line], [models[i]["psnr"] for i in line], marker="o", markersize=4.5, label="front")
-            axis.plot([unit * models[i][cost] for i in others], [models[i]["psnr"] for i in others], ".", color="0.65", label="behind it")
+            axis.plot(
+                [unit * models[i][cost] for i in line],
+                [models[i]["psnr"] for i in line],
+                marker="o",
+                markersize=4.5,
+                label="front",
+            )
+            axis.plot(
+                [unit * models[i][cost] for i in others],
+                [models[i]["psnr"] for i in others],
+                ".",
+                color="0.65",
+                label="behind it",
+            )
             for i in line:
                 axis.annotate(
                     f"{models[i]['primitives']:,}" + (", no shadows" if "visibility=none" in models[i]["name"] else ""),

@@ -1,15 +1,18 @@
 """How well Gaussians become primitives, and primitives Gaussians, for each edge.
 
-    python benchmarks/gaussians.py [RUN_DIR ...] [--parts rule import export] [--edges 0 1 2] [--iterations 600] [--docs]
+    python benchmarks/gaussians.py [RUN_DIR ...] [--parts rule import export] [--edges 0 1 2] [--iterations 600]
+    [--docs]
 
-    rule     the support and the depth that a Gaussian gets, and how far its footprint and a primitive's are apart, both ways
-    import   a cloud of random Gaussians, drawn as the 3DGS rasteriser draws them and exactly, as densities in space, against the primitives
+    rule     the support and the depth that a Gaussian gets, and how far its footprint and a primitive's are apart, both
+    ways import   a cloud of random Gaussians, drawn as the 3DGS rasteriser draws them and exactly, as densities in
+    space, against the primitives
              (K = 0) that a PLY file of it starts a model from; by the former rule, semi-axes of sqrt 5 deviations, too
-    export   trained models against their gaussian-ply, by its option `size`; given run directories, or the static task's `solids` trained for
+    export   trained models against their gaussian-ply, by its option `size`; given run directories, or the static
+    task's `solids` trained for
              --iterations with K = 8 and K = 0
 
-PSNR in dB over all pixels, on black for the clouds, on the scene's background for the models. --docs puts the tables between the markers of
-docs/export.md.
+PSNR in dB over all pixels, on black for the clouds, on the scene's background for the models. --docs puts the tables
+between the markers of docs/export.md.
 """
 
 from __future__ import annotations
@@ -100,7 +103,9 @@ def imported(c: dict[str, Tensor], camera: Camera, edge: int, rule: str) -> Tens
     b2 = depth / NORMS[edge] / (1.0 if rule == "former" else thickness(axes))
     none = torch.zeros(len(b2), 0, dtype=torch.float64)
     form = Cosine(none[:, :, None].expand(-1, 0, 3), none, none, b2[:, None], edge=edge)
-    return render_lowered(Lowered(Geometry(c["means"], axes.log(), c["quats"]), form, Constant(c["colors"])), camera, REFERENCE).rgb.float()
+    return render_lowered(
+        Lowered(Geometry(c["means"], axes.log(), c["quats"]), form, Constant(c["colors"])), camera, REFERENCE
+    ).rgb.float()
 
 
 RADII = (torch.arange(4000, dtype=torch.float64) + 0.5) / 4000 * 6
@@ -128,10 +133,14 @@ def rule_table(edges: Sequence[int]) -> str:
     for edge in edges:
         support, depth = gaussian_support(edge, opacities)
         bells = [o * (-RADII.square() / 2).exp() for o in opacities]
-        apart = [remains(footprint(float(t), float(c), edge), bell) for t, c, bell in zip(depth, support, bells, strict=True)]
+        apart = [
+            remains(footprint(float(t), float(c), edge), bell) for t, c, bell in zip(depth, support, bells, strict=True)
+        ]
         shares = depth / -torch.log1p(-opacities)
         cells = [", ".join(f"{x:.2f}" for x in values) for values in (support, shares)]
-        percent = [", ".join(f"{100 * x:.0f} %" for x in values) for values in (apart, [ball(edge, 0.1), ball(edge, 3.0)])]
+        percent = [
+            ", ".join(f"{100 * x:.0f} %" for x in values) for values in (apart, [ball(edge, 0.1), ball(edge, 3.0)])
+        ]
         table.row(edge, *cells, *percent)
     return str(table)
 
@@ -139,8 +148,18 @@ def rule_table(edges: Sequence[int]) -> str:
 def ball(edge: int, depth: float) -> float:
     """How far the footprint of a ball of this depth and its Gaussian's are apart."""
     density = CosineDensity(0, edge=edge)
-    params = {"means": torch.zeros(1, 3), "log_scales": torch.zeros(1, 3), "quats": torch.eye(4)[:1], "sh_dc": torch.zeros(1, 3)}
-    params |= {"W1": torch.zeros(1, 0, 3), "b1": torch.zeros(1, 0), "w2": torch.zeros(1, 0), "b2": torch.full((1, 1), depth / NORMS[edge])}
+    params = {
+        "means": torch.zeros(1, 3),
+        "log_scales": torch.zeros(1, 3),
+        "quats": torch.eye(4)[:1],
+        "sh_dc": torch.zeros(1, 3),
+    }
+    params |= {
+        "W1": torch.zeros(1, 0, 3),
+        "b1": torch.zeros(1, 0),
+        "w2": torch.zeros(1, 0),
+        "b2": torch.full((1, 1), depth / NORMS[edge]),
+    }
     run: Any = SimpleNamespace(model=Primitives(density, SphericalHarmonics(0), params))
     found = fit_gaussians(run, {}, "profile")
     bell = float(found.opacities[0]) * (-RADII.square() / 2 / float(found.covariances[0, 0, 0])).exp()
@@ -158,11 +177,20 @@ def import_table(edges: Sequence[int]) -> str:
             truth = [draw(c, camera) for camera in cameras]
             for rule in rules:
                 scores = [
-                    np.mean([psnr(imported(c, camera, edge, rule), image) for camera, image in zip(cameras, truth, strict=True)])
+                    np.mean(
+                        [
+                            psnr(imported(c, camera, edge, rule), image)
+                            for camera, image in zip(cameras, truth, strict=True)
+                        ]
+                    )
                     for edge in edges
                 ]
-                words = {"former": "√5 deviations", "ply": "least squares", "volume": "least squares, of densities"}[rule]
-                table.row(f"{name}, {bounds[0]:g} to {bounds[1]:g}", drawn, words, *(f"{score:.1f} dB" for score in scores))
+                words = {"former": "√5 deviations", "ply": "least squares", "volume": "least squares, of densities"}[
+                    rule
+                ]
+                table.row(
+                    f"{name}, {bounds[0]:g} to {bounds[1]:g}", drawn, words, *(f"{score:.1f} dB" for score in scores)
+                )
     return str(table)
 
 

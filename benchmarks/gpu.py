@@ -1,17 +1,23 @@
 """The CUDA backend on a card: parity with the float64 reference, times, frames per second, peak memory.
 
-    python benchmarks/gpu.py [--parts parity times kernels train race] [--scenes 5000 20000 100000 300000 1000000] [--sizes 800x800 1920x1080]
+    python benchmarks/gpu.py [--parts parity times kernels train race] [--scenes 5000 20000 100000 300000 1000000]
+    [--sizes 800x800 1920x1080]
         [--chair DIR] [--fire DIR] [--trained chair fire lit_solids] [--record]
 
-    parity    images and all gradients of small scenes (thin, deep, around the camera) for several forms against the reference, and reruns bit
+    parity    images and all gradients of small scenes (thin, deep, around the camera) for several forms against the
+    reference, and reruns bit
               for bit; needs no card with --device cpu, on Warp's CPU blocks
-    times     random scenes whose primitives shrink as they multiply, 8 neurons and the default form: ms for a forward pass without gradients, a
-              forward and backward pass, and a whole training step (L1 loss, Adam on every parameter), medians by CUDA events; frames per second, peak
-              memory, primitive-pixel hits
+    times     random scenes whose primitives shrink as they multiply, 8 neurons and the default form: ms for a forward
+    pass without gradients, a
+              forward and backward pass, and a whole training step (L1 loss, Adam on every parameter), medians by CUDA
+              events; frames per second, peak memory, primitive-pixel hits
     kernels   where a training step's time goes, kernel by kernel, of the scene with the most primitives up to 100,000
-    race      gsplat, if it is installed (pip install gsplat), on chair: as many Gaussians as neuprim has primitives, then twice as many again and
-              again up to neuprim's PSNR; the same steps, ms a step and a frame, bytes. Needs the part train, or its record
-    train     preset quick of each task with its usual steps on the card: ms a step of the second half, PSNR on the test views
+    race      gsplat, if it is installed (pip install gsplat), on chair: as many Gaussians as neuprim has primitives,
+    then twice as many again and
+              again up to neuprim's PSNR; the same steps, ms a step and a frame, bytes. Needs the part train, or its
+              record
+    train     preset quick of each task with its usual steps on the card: ms a step of the second half, PSNR on the test
+    views
 
 --record writes benchmarks/results/gpu/DEVICE.json. Times are absolute, of the device named there.
 """
@@ -62,7 +68,9 @@ def scene_on(count: int, neurons: int, edge: int) -> tuple[Lowered, list[torch.T
     g, d, c = low.geometry, low.density, low.colour
     assert isinstance(d, Cosine) and isinstance(c, Constant)
     tensors = [g.means, g.log_scales, g.quats, d.W1[:, :neurons], d.b1[:, :neurons], d.w2[:, :neurons], d.b2, c.rgb]
-    means, log_scales, quats, W1, b1, w2, b2, rgb = leaves = [t.detach().cuda().contiguous().requires_grad_() for t in tensors]
+    means, log_scales, quats, W1, b1, w2, b2, rgb = leaves = [
+        t.detach().cuda().contiguous().requires_grad_() for t in tensors
+    ]
     return Lowered(Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, 1.0, edge), Constant(rgb)), leaves
 
 
@@ -98,7 +106,18 @@ def step_of(
 
 def times(counts: list[int], sizes: list[tuple[int, int]]) -> list[dict[str, Any]]:
     table, rows = (
-        Table("form", "primitives", "size", "pairs", "hits", "forward ms", "forward + backward", "step", "frames/s", "peak MB"),
+        Table(
+            "form",
+            "primitives",
+            "size",
+            "pairs",
+            "hits",
+            "forward ms",
+            "forward + backward",
+            "step",
+            "frames/s",
+            "peak MB",
+        ),
         [],
     )
     settings = RenderSettings(backend="cuda")
@@ -118,7 +137,16 @@ def times(counts: list[int], sizes: list[tuple[int, int]]) -> list[dict[str, Any
                 }  # fmt: skip
                 rows.append(row)
                 shown = [f"{x:.2f}" for x in ms]
-                table.row(name, count, f"{width}x{height}", stats.pairs, stats.extra["hits"], *shown, f"{1000 / ms[0]:.0f}", f"{peak:.0f}")
+                table.row(
+                    name,
+                    count,
+                    f"{width}x{height}",
+                    stats.pairs,
+                    stats.extra["hits"],
+                    *shown,
+                    f"{1000 / ms[0]:.0f}",
+                    f"{peak:.0f}",
+                )
             del lowered, leaves
     return rows
 
@@ -131,7 +159,9 @@ def kernels(count: int, width: int, height: int) -> dict[str, dict[str, float]]:
         _, _, step = step_of(lowered, leaves, camera(width, height), RenderSettings(backend="cuda"))
         for _ in range(3):
             step()
-        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA, torch.profiler.ProfilerActivity.CPU]) as seen:
+        with torch.profiler.profile(
+            activities=[torch.profiler.ProfilerActivity.CUDA, torch.profiler.ProfilerActivity.CPU]
+        ) as seen:
             for _ in range(5):
                 step()
             torch.cuda.synchronize()
@@ -182,7 +212,9 @@ def train(names: list[str], folders: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def race(folders: dict[str, Any], trained: list[dict[str, Any]], steps: int | None = None, where: str = "cuda") -> dict[str, Any] | None:
+def race(
+    folders: dict[str, Any], trained: list[dict[str, Any]], steps: int | None = None, where: str = "cuda"
+) -> dict[str, Any] | None:
     """gsplat against what was trained on chair; None where it is not installed."""
     from dataclasses import asdict
 
@@ -196,7 +228,9 @@ def race(folders: dict[str, Any], trained: list[dict[str, Any]], steps: int | No
         return None
     own = next((row for row in trained if row["scene"] == "chair"), None)
     if own is None:
-        raise SystemExit("--parts race: nothing was trained on chair; expected the part train with --trained chair, before or in a record")
+        raise SystemExit(
+            "--parts race: nothing was trained on chair; expected the part train with --trained chair, before or in a record"
+        )
     steps = own["steps"] if steps is None else steps
     dataset = begin(Trial("chair", SCENES["chair"].all_words(folders, "chair"), steps)).dataset
     counts = [own["primitives"] << n for n in range(DOUBLINGS)]

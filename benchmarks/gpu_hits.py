@@ -1,11 +1,15 @@
-"""What a hit costs on a card, counted without one: instructions, operations and bytes, and the time that they take at full issue.
+"""What a hit costs on a card, counted without one: instructions, operations and bytes, and the time that they take at
+full issue.
 
-    python benchmarks/gpu_hits.py [--count 100000] [--size 800] [--neurons 8 2 0] [--nvdisasm FILE] [--record | --from-record]
+    python benchmarks/gpu_hits.py [--count 100000] [--size 800] [--neurons 8 2 0] [--nvdisasm FILE] [--record |
+    --from-record]
 
-The rule. *Instructions* are those of the innermost loop that draws hits, as compiled for sm_90 and listed by nvdisasm, every branch of the loop
-counted once; neurons take the polynomial up to half a turn, and what one beyond that takes more is counted apart. *Operations* are those of
-its FFMA (two), FMUL and FADD. *Lanes* are the share of a warp's threads that draw a hit while it is in the loop: a frame of the random scene of the
-other benchmarks, drawn on Warp's CPU blocks, says how many warps enter it. *At full issue* is the time of instructions times warps at an instruction a cycle of every
+The rule. *Instructions* are those of the innermost loop that draws hits, as compiled for sm_90 and listed by nvdisasm,
+every branch of the loop counted once; neurons take the polynomial up to half a turn, and what one beyond that takes
+more is counted apart. *Operations* are those of its FFMA (two), FMUL and FADD. *Lanes* are the share of a warp's
+threads that draw a hit while it is in the loop: a frame of the random scene of the other benchmarks, drawn on Warp's
+CPU blocks, says how many warps enter it. *At full issue* is the time of instructions times warps at an instruction a
+cycle of every
 lane of an H100; what is done once a pair or a pixel is not in it, and what was measured stands beside it.
 
 --record        writes benchmarks/results/gpu_hits.json and the table in docs/gpu.md
@@ -160,10 +164,17 @@ def lanes(count: int, size: int, neurons: int) -> Lanes:
     spans = drawn.spans.int() & 0xFFFF
     counts = drawn.offsets.diff()
     starts = spans >> 8
-    rows = torch.cat([starts[:, 1:], counts[:, None]], 1) - starts  # pixels of each row of a pair; rows without any end where they begin
+    rows = (
+        torch.cat([starts[:, 1:], counts[:, None]], 1) - starts
+    )  # pixels of each row of a pair; rows without any end where they begin
     which = torch.repeat_interleave(torch.arange(rows.numel(), dtype=torch.int32), rows.reshape(-1).clamp_min(0))
     pair, y = which // L.TILE, which % L.TILE
-    x = (spans.reshape(-1)[which] & 15) + torch.arange(len(which), dtype=torch.int32) - drawn.offsets[pair] - starts.reshape(-1)[which]
+    x = (
+        (spans.reshape(-1)[which] & 15)
+        + torch.arange(len(which), dtype=torch.int32)
+        - drawn.offsets[pair]
+        - starts.reshape(-1)[which]
+    )
     assert len(which) == len(alpha) and int(x.min()) >= 0 and int(x.max()) < L.TILE
     patch = pair * 8 + (y // 4) * 2 + x // 8
     entered = torch.bincount(patch[before >= settings.transmittance_min], minlength=1) > 0
@@ -180,7 +191,16 @@ def predicted(name: str, loop: Row, seen: Lanes) -> tuple[float, float]:
 
 def document(record: dict[str, Any]) -> str:
     """The table of docs/gpu.md."""
-    head = ["form", "kernel", "instructions a hit", "and a faster neuron", "operations", "lanes", "ms at full issue", "measured ms"]
+    head = [
+        "form",
+        "kernel",
+        "instructions a hit",
+        "and a faster neuron",
+        "operations",
+        "lanes",
+        "ms at full issue",
+        "measured ms",
+    ]
     lines = ["| " + " | ".join(head) + " |", "| --- |" + " --- |" * (len(head) - 1)]
     for row in record["rows"]:
         faster = str(row["faster_neuron"]) if row["neurons"] and row["kernel"] != "pixels" else "–"
@@ -208,7 +228,10 @@ def _measured(neurons: int, kernel: str) -> float | None:
 
 
 def measure(count: int, size: int, neurons: list[int], nvdisasm: str) -> dict[str, Any]:
-    table, rows = Table("neurons", "kernel", "instructions", "operations", "lanes", "ms at full issue", "measured ms"), []
+    table, rows = (
+        Table("neurons", "kernel", "instructions", "operations", "lanes", "ms at full issue", "measured ms"),
+        [],
+    )
     scene: Row = {}
     for K in neurons:
         seen = lanes(count, size, K)

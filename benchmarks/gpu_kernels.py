@@ -1,15 +1,18 @@
-"""What every kernel of the CUDA backend takes of a card, compiled ahead of time on any machine: registers, stack, shared memory, code.
+"""What every kernel of the CUDA backend takes of a card, compiled ahead of time on any machine: registers, stack,
+shared memory, code.
 
-    python benchmarks/gpu_kernels.py [--archs 80 89 90] [--forms "K=8 p=0" ...] [--kernels forward ...] [--record | --check | --from-record]
+    python benchmarks/gpu_kernels.py [--archs 80 89 90] [--forms "K=8 p=0" ...] [--kernels forward ...] [--record |
+    --check | --from-record]
 
-Compiled are the kernels of K = 0, 2, 8 and 16 neurons, hard edges and p = 2, with constant colours and with colour networks of 8 units, those
-that every frame needs, and those beside frames: of training, of volumes, of lights. No driver is needed. A stack of a frame's kernel means
-spilled registers, but for kernels in float64, which keep their neurons there; one at K <= 8 exits with status 1. Beside frames it means lists of
-arguments (Adam) and cosines of large angles (grid). "Capped" are kernels that ask for fewer registers than they could use, as more warps hide more.
+Compiled are the kernels of K = 0, 2, 8 and 16 neurons, hard edges and p = 2, with constant colours and with colour
+networks of 8 units, those that every frame needs, and those beside frames: of training, of volumes, of lights. No
+driver is needed. A stack of a frame's kernel means spilled registers, but for kernels in float64, which keep their
+neurons there; one at K <= 8 exits with status 1. Beside frames it means lists of arguments (Adam) and cosines of large
+angles (grid). "Capped" are kernels that ask for fewer registers than they could use, as more warps hide more.
 
 --record        writes benchmarks/results/gpu_kernels.json and the table in docs/gpu.md
---check         compares with what is recorded there: exits with status 1 when registers, stack or shared memory have grown
---from-record   writes the table from the file and compiles nothing
+--check         compares with what is recorded there: exits with status 1 when registers, stack or shared memory have
+grown --from-record   writes the table from the file and compiles nothing
 """
 
 from __future__ import annotations
@@ -95,7 +98,14 @@ def measure(archs: list[int], forms: list[str], names: list[str] | None = None) 
                 for arch in archs:
                     found = resources(compiled(compiles, arch, block, Path(place) / str(len(rows))))
                     capped = compiles.options.get("launch_bounds") is not None
-                    row = {"form": form, "kernel": kernel, "arch": arch, "threads": block, "capped": capped, **asdict(found)}
+                    row = {
+                        "form": form,
+                        "kernel": kernel,
+                        "arch": arch,
+                        "threads": block,
+                        "capped": capped,
+                        **asdict(found),
+                    }
                     rows.append(row)
                     table.row(*row.values())
     return rows
@@ -122,7 +132,11 @@ def grown(rows: list[Row], recorded: list[Row]) -> list[str]:
         if old is None:
             found.append(f"{where} is not recorded")
             continue
-        found += [f"{where}: {key} {old[key]} -> {row[key]}" for key in ("registers", "stack", "shared") if row[key] > old[key]]
+        found += [
+            f"{where}: {key} {old[key]} -> {row[key]}"
+            for key in ("registers", "stack", "shared")
+            if row[key] > old[key]
+        ]
     return found
 
 
@@ -135,7 +149,10 @@ def document(record: dict[str, Any]) -> str:
         cells = []
         for kernel in columns:
             rows = [found[form, kernel, arch] for arch in ARCHS if (form, kernel, arch) in found]
-            texts = [str(r["registers"]) + (f" + {r['stack']} B" if r["stack"] else "") + (" capped" if r["capped"] else "") for r in rows]
+            texts = [
+                str(r["registers"]) + (f" + {r['stack']} B" if r["stack"] else "") + (" capped" if r["capped"] else "")
+                for r in rows
+            ]
             cells.append(texts[0] if len(set(texts)) == 1 else " / ".join(texts))
         lines.append(f"| {form} | {' | '.join(cells)} |")
     shared = max(r["shared"] for r in record["kernels"])

@@ -1,13 +1,15 @@
 """What every knob costs and brings, on one scene of each task: the tables of docs/tradeoffs.md.
 
-    python benchmarks/knobs.py [--scenes chair smoke_fire lit_solids] [--chair DIR] [--parts drawing model] [--budget 15m] [--out DIR] [--docs] [--print]
+    python benchmarks/knobs.py [--scenes chair smoke_fire lit_solids] [--chair DIR] [--parts drawing model] [--budget
+    15m] [--out DIR] [--docs] [--print]
 
-drawing   the scene trained as its preset has it (into --out, once), then `neuprim tradeoff RUN_DIR`: every knob of drawing turned alone
-model     `neuprim tradeoff task=… scene=… budget=…`: every knob of the model turned alone, all models trained for about the same time
+drawing   the scene trained as its preset has it (into --out, once), then `neuprim tradeoff RUN_DIR`: every knob of
+drawing turned alone model     `neuprim tradeoff task=… scene=… budget=…`: every knob of the model turned alone, all
+models trained for about the same time
 
-Both take times in rounds that take turns with the run's own settings, or with the model in the middle, so that they are ratios that survive other work on
-the machine. What was measured is kept in --out and gone on with; results go to benchmarks/results/knobs.json. --docs puts the tables between the markers
-of docs/tradeoffs.md; --print runs nothing.
+Both take times in rounds that take turns with the run's own settings, or with the model in the middle, so that they are
+ratios that survive other work on the machine. What was measured is kept in --out and gone on with; results go to
+benchmarks/results/knobs.json. --docs puts the tables between the markers of docs/tradeoffs.md; --print runs nothing.
 """
 
 from __future__ import annotations
@@ -60,7 +62,11 @@ def main() -> None:
                 keep(scene, part, {"drawing": drawing, "model": models}[part](scene, args))
     found: dict[str, Any] = json.loads(RESULTS.read_text())
     for part in args.parts:
-        text = f"{drawing_table(found['drawing'])}\n\n{drawing_caption(found)}" if part == "drawing" else model_tables(found)
+        text = (
+            f"{drawing_table(found['drawing'])}\n\n{drawing_caption(found)}"
+            if part == "drawing"
+            else model_tables(found)
+        )
         if args.docs:
             between_markers(ROOT / "docs" / "tradeoffs.md", f"knobs-{part}", text)
 
@@ -79,18 +85,27 @@ def drawing(scene: str, args: argparse.Namespace) -> dict[str, Any]:
         run(compose([*words, f"output_dir='{folder.resolve()}'", "resume=true", "train.eval_every=0"]))
     record = tradeoff_run(Request(folder, VIEWS, ROUNDS, budget=DRAWING_SECONDS), print)
     return {
-        "points": [point_of(point) for point in record.points if isinstance(point, Measured) and point.knob != COMBINED],
+        "points": [
+            point_of(point) for point in record.points if isinstance(point, Measured) and point.knob != COMBINED
+        ],
         "left_out": [{"words": list(one.words), "reason": one.reason} for one in record.left_out],
     }
 
 
 def models(scene: str, args: argparse.Namespace) -> dict[str, Any]:
-    words = [*SCENES[scene].all_words(vars(args), scene), "renderer.threads=1", f"output_dir='{(args.out / f'{scene}-models').resolve()}'"]
+    words = [
+        *SCENES[scene].all_words(vars(args), scene),
+        "renderer.threads=1",
+        f"output_dir='{(args.out / f'{scene}-models').resolve()}'",
+    ]
     _, record = design_run(DesignRequest(words, seconds_of(args.budget), VIEWS, ROUNDS), print)
     made = [point for point in record.points if isinstance(point, Model) and point.knob != COMBINED]
     return {
         "length": record.facts["length"],
-        "points": [{**point_of(point), "word": point.name, "steps": point.steps, "ms_per_step": point.ms_per_step} for point in made],
+        "points": [
+            {**point_of(point), "word": point.name, "steps": point.steps, "ms_per_step": point.ms_per_step}
+            for point in made
+        ],
         "left_out": [{"words": list(one.words) or [one.knob], "reason": one.reason} for one in record.left_out],
     }
 
@@ -151,7 +166,9 @@ def drawing_caption(found: Mapping[str, Any]) -> str:
     parts = []
     for scene, one in found["drawing"].items():
         reference = reference_of(one["points"])
-        parts.append(f"{NAMES[scene]}: {reference['psnr']:.2f} dB, {reference['bytes']:,} bytes, {reference['ms']:.1f} ms a frame")
+        parts.append(
+            f"{NAMES[scene]}: {reference['psnr']:.2f} dB, {reference['bytes']:,} bytes, {reference['ms']:.1f} ms a frame"
+        )
     return f"Times and bytes are multiples of the run's own. As the runs draw: {'; '.join(parts)} ({found['cpu']}). {VIEWS} held-out views, one training each."
 
 

@@ -1,7 +1,9 @@
-"""What launchers cost and bring: eight one-thread runs in two processes against one after the other, and what Ray adds to a run.
+"""What launchers cost and bring: eight one-thread runs in two processes against one after the other, and what Ray adds
+to a run.
 
     python benchmarks/launching.py            # measures, into benchmarks/results/launching.json
-    python benchmarks/launching.py --docs     # writes the table of docs/launching.md from that file, and measures nothing
+    python benchmarks/launching.py --docs     # writes the table of docs/launching.md from that file, and measures
+    nothing
 
 Both sides of a ratio are measured in turns, so that they meet the same noise of the machine.
 """
@@ -28,7 +30,14 @@ from neuprim.runs.sweep.one import job_of
 
 RESULTS = Path(__file__).parent / "results" / "launching.json"
 PAGE = Path(__file__).parents[1] / "docs" / "launching.md"
-WORDS = ["task=static", "scene=solids", "scene.size=128", "scene.train_views=40", "scene.test_views=8", "model.primitives=1000"]
+WORDS = [
+    "task=static",
+    "scene=solids",
+    "scene.size=128",
+    "scene.train_views=40",
+    "scene.test_views=8",
+    "model.primitives=1000",
+]
 
 
 def nothing(data: None, attempt: int, events: object) -> float:
@@ -50,7 +59,8 @@ def seconds(settings: LauncherSettings, runs: int, steps: int) -> float:
 
 
 def overhead_of_ray(runs: int, steps: int) -> dict[str, float]:
-    """Seconds that a run takes in Ray beyond those of its own, once Ray and its worker are there; and those of beginning."""
+    """Seconds that a run takes in Ray beyond those of its own, once Ray and its worker are there; and those of
+    beginning."""
     import ray
 
     begun = time.perf_counter()
@@ -79,7 +89,9 @@ def measure(runs: int, steps: int, rounds: int) -> dict[str, Any]:
             "processes": seconds(LauncherSettings("processes", workers=2, threads=1), runs, steps),
         }
         pairs.append(pair)
-        print(f"round {number + 1}: {pair['inline']:.1f} s inline, {pair['processes']:.1f} s in two processes", flush=True)
+        print(
+            f"round {number + 1}: {pair['inline']:.1f} s inline, {pair['processes']:.1f} s in two processes", flush=True
+        )
     found: dict[str, Any] = {"runs": runs, "steps": steps, "rounds": pairs, "cpu": cpu_name(), "cores": core_count()}
     try:
         found["ray"] = overhead_of_ray(4, steps)
@@ -113,7 +125,9 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=8)
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--docs", action="store_true", help="write the table of the page from the results, and measure nothing")
+    parser.add_argument(
+        "--docs", action="store_true", help="write the table of the page from the results, and measure nothing"
+    )
     args = parser.parse_args()
     if not args.docs:
         RESULTS.write_text(json.dumps(measure(args.runs, args.steps, args.rounds), indent=1) + "\n")

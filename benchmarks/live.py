@@ -2,11 +2,13 @@
 
     python benchmarks/live.py [--steps 1000] [--block 25] [--rounds 3] [WORD ...]
 
-Three trainings of one configuration (words as for ``neuprim run``; default: task=static scene=solids) go on in turns in one process, a block of
-steps each: two plain ones, and one with the page of ``viewer=true`` open and nobody there. All do the same work in every block, so its times
-are compared one by one; the order changes. Times are the processor's, on one thread, so that other work on the machine counts less. Printed are
-the median ratio of steps/s over all blocks with its quartiles: of the plain trainings to each other, which is what chance makes, and of a plain
-one to the one with a viewer; what the page's server uses while nothing happens; what the viewer's own code takes per step, timed alone; and whether all parameters are equal
+Three trainings of one configuration (words as for ``neuprim run``; default: task=static scene=solids) go on in turns in
+one process, a block of steps each: two plain ones, and one with the page of ``viewer=true`` open and nobody there. All
+do the same work in every block, so its times are compared one by one; the order changes. Times are the processor's, on
+one thread, so that other work on the machine counts less. Printed are the median ratio of steps/s over all blocks with
+its quartiles: of the plain trainings to each other, which is what chance makes, and of a plain one to the one with a
+viewer; what the page's server uses while nothing happens; what the viewer's own code takes per step, timed alone; and
+whether all parameters are equal
 to the bit.
 """
 
@@ -68,7 +70,12 @@ def main() -> None:
     args = parser.parse_args()
     seconds: list[list[float]] = []
     with tempfile.TemporaryDirectory() as folder:
-        own = [f"train.iterations={args.steps}", "train.eval_every=0", "renderer.threads=1", f"output_dir={Path(folder) / 'out'}"]
+        own = [
+            f"train.iterations={args.steps}",
+            "train.eval_every=0",
+            "renderer.threads=1",
+            f"output_dir={Path(folder) / 'out'}",
+        ]
         config = compose([*args.words, *own])
         dataset = start(config).dataset
         for number in range(args.rounds):
@@ -80,14 +87,20 @@ def main() -> None:
                 time.sleep(_IDLE)
                 idle = (time.process_time() - begun) / _IDLE
                 own_code = alone_with(live, viewed)
-                all_three = [stepper(plain, silent, alone), stepper(again, silent, alone), stepper(viewed, live, live.between)]
+                all_three = [
+                    stepper(plain, silent, alone),
+                    stepper(again, silent, alone),
+                    stepper(viewed, live, live.between),
+                ]
                 for block in range(args.steps // args.block):
                     turn = [(block + i) % 3 for i in range(3)]
                     took = {which: all_three[which](args.block) for which in turn}
                     seconds.append([took[which] for which in range(3)])
             equal = all(torch.equal(value, viewed.model.params[name]) for name, value in plain.model.params.items())
             times = np.array(seconds)
-            print(f"round {number + 1}, {len(times)} blocks of {args.block} steps; parameters {'equal to the bit' if equal else 'DIFFER'}")
+            print(
+                f"round {number + 1}, {len(times)} blocks of {args.block} steps; parameters {'equal to the bit' if equal else 'DIFFER'}"
+            )
             for name, which in (("plain, against plain", 1), ("with a viewer that nobody looks at, against plain", 2)):
                 low, middle, high = np.percentile(times[:, which] / times[:, 0], (25, 50, 75))
                 print(f"  {name}: a step takes {middle:.4f} times as long (quartiles {low:.4f} to {high:.4f})")

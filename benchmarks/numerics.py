@@ -3,17 +3,19 @@
     python benchmarks/numerics.py [--coarse] [--cases N] [--regions NAME ...] [--edges 0 1 2] [--markdown FILE]
     python benchmarks/numerics.py --run RUN_DIR [--near 0.01 3 3.5 4]
 
-Prints one line per region, backend and precision, with the edges' numbers side by side; exits with status 1 when a bound is broken. A
-backend and precision is "cpu float32", "reference float32" (float32 parameters, float64 inside) or "reference float64". The oracle runs in
-extended precision and shares no code with the backends; gradients are compared with the float64 reference's.
+Prints one line per region, backend and precision, with the edges' numbers side by side; exits with status 1 when a
+bound is broken. A backend and precision is "cpu float32", "reference float32" (float32 parameters, float64 inside) or
+"reference float64". The oracle runs in extended precision and shares no code with the backends; gradients are compared
+with the float64 reference's.
 
-- error/S: of the optical depth of a chord, S = (N_p h/m)(|b2| + sum |w2|), N = 2, 4/3, 16/15, on chords of at least 0.45 of the central one.
+- error/S: of the optical depth of a chord, S = (N_p h/m)(|b2| + sum |w2|), N = 2, 4/3, 16/15, on chords of at least
+  0.45 of the central one.
 - thin: on shorter chords, misses included, error/S_c (S_c/S)^(2p - 1), S_c the central chord's S.
 - gradient: error of a parameter's gradient over the gradient's norm, over four random functionals of the image.
 
---markdown writes the table with an introduction; docs/numerical_limits.md is made that way. --run looks at a trained model instead: from a dozen
-of its held-out views, with the near plane at each of --near, how many primitives the cpu backend draws in float64, and the largest error of
-three small images against the reference backend.
+--markdown writes the table with an introduction; docs/numerical_limits.md is made that way. --run looks at a trained
+model instead: from a dozen of its held-out views, with the near plane at each of --near, how many primitives the cpu
+backend draws in float64, and the largest error of three small images against the reference backend.
 """
 
 from __future__ import annotations
@@ -43,14 +45,19 @@ def trained(folder: Path, planes: Sequence[float]) -> None:
     dataset = load_dataset(config, task)
     picks = sorted({i * len(dataset.test) // VIEWS for i in range(VIEWS)})
     for near in planes:
-        fast, slow = (RenderSettings(backend=b, near=near, alpha_min=0.0, transmittance_min=0.0) for b in ("cpu", "reference"))
+        fast, slow = (
+            RenderSettings(backend=b, near=near, alpha_min=0.0, transmittance_min=0.0) for b in ("cpu", "reference")
+        )
         counts, worst = [], 0.0
         for i in picks:
             view = dataset.test.view(i)
-            counts.append(int(render(model, view.camera, view.conditions, fast, dataset.background).stats.extra["float64"]))
+            counts.append(
+                int(render(model, view.camera, view.conditions, fast, dataset.background).stats.extra["float64"])
+            )
             if len(counts) <= COMPARED:
                 images = [
-                    render(model, view.camera.resized(SMALL, SMALL), view.conditions, s, dataset.background).rgb for s in (fast, slow)
+                    render(model, view.camera.resized(SMALL, SMALL), view.conditions, s, dataset.background).rgb
+                    for s in (fast, slow)
                 ]
                 worst = max(worst, (images[0] - images[1]).abs().max().item())
         mean = sum(counts) / len(counts)

@@ -1,12 +1,14 @@
 """What each of the settings for photographs does, one at a time and together.
 
-    python benchmarks/photographs.py [--scenes cup room_80 room_20] [--cup DIR] [--primitives 5000] [--steps 800] [--seeds 1] [--only ROW …] [--jobs 2] [--docs] [--print]
+    python benchmarks/photographs.py [--scenes cup room_80 room_20] [--cup DIR] [--primitives 5000] [--steps 800]
+    [--seeds 1] [--only ROW …] [--jobs 2] [--docs] [--print]
 
-``cup`` is a COLMAP reconstruction of photographs of a cup before walls without texture (--cup), averaged down to 200 x 150; ``room_80`` and ``room_20`` are
-the built-in `scene=room` with as many photographs. All is the preset `quick` but what the row names. Held-out photographs, last checkpoint; *a gain away* is the
-PSNR after the best gain per channel of each view, as no model can know how a photograph that it has not seen was exposed. Times are those that one thread
-computed. Results go to benchmarks/results/photographs.json after every run, and only what is missing is run. --docs puts the table between the markers of
-docs/static.md.
+``cup`` is a COLMAP reconstruction of photographs of a cup before walls without texture (--cup), averaged down to 200 x
+150; ``room_80`` and ``room_20`` are the built-in `scene=room` with as many photographs. All is the preset `quick` but
+what the row names. Held-out photographs, last checkpoint; *a gain away* is the
+PSNR after the best gain per channel of each view, as no model can know how a photograph that it has not seen was
+exposed. Times are those that one thread computed. Results go to benchmarks/results/photographs.json after every run,
+and only what is missing is run. --docs puts the table between the markers of docs/static.md.
 """
 
 from __future__ import annotations
@@ -94,9 +96,7 @@ def caption(rows: Sequence[Mapping[str, Any]]) -> str:
     counts, steps = ({row[key] for row in rows} for key in ("primitives", "iterations"))
     seeds = sorted(Counter((row["scene"], row["row"]) for row in rows).values())
     said = " to ".join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1])))
-    return (
-        f"{' or '.join(f'{n:,}' for n in sorted(counts))} primitives, {' or '.join(f'{n:,}' for n in sorted(steps))} steps, {said} seed(s)."
-    )
+    return f"{' or '.join(f'{n:,}' for n in sorted(counts))} primitives, {' or '.join(f'{n:,}' for n in sorted(steps))} steps, {said} seed(s)."
 
 
 def main() -> None:
@@ -107,7 +107,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=800)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument(
-        "--only", nargs="*", default=[], choices=[*PIECES, TOGETHER], metavar="ROW", help="these rows alone, as the table calls them"
+        "--only",
+        nargs="*",
+        default=[],
+        choices=[*PIECES, TOGETHER],
+        metavar="ROW",
+        help="these rows alone, as the table calls them",
     )
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--docs", action="store_true")

@@ -1,18 +1,21 @@
 """Ways to control the population at equal time: who moves, where to, and whether the count grows.
 
-    python benchmarks/population.py [--scenes chair smoke_fire fire] [--chair DIR] [--fire DIR] [--steps 2500] [--seeds 3] [--docs] [--print]
+    python benchmarks/population.py [--scenes chair smoke_fire fire] [--chair DIR] [--fire DIR] [--steps 2500] [--seeds
+    3] [--docs] [--print]
 
-Each is its task's preset `quick` with another population and no cool-down of the rates; all end with the same number of primitives, and each trains for as long as the
-preset takes for --steps, at paces measured in turns over whole runs of one thread. Variants:
+Each is its task's preset `quick` with another population and no cool-down of the rates; all end with the same number of
+primitives, and each trains for as long as the preset takes for --steps, at paces measured in turns over whole runs of
+one thread. Variants:
 
     fixed       nobody moves
     always      `relocate`: the least used move, however much they do
     idle        `relocate` of the idle alone (weight below 0.05 of the mean); what dynamic's `quick` does
-    weight      as `idle`, but split are those drawn at random in proportion to their weight in the images, as in MCMC (Kheradmand et al. 2024)
-    grown       half of the primitives at first, the others are born where the error is largest; then as `idle`; static's `quick` does so
+    weight      as `idle`, but split are those drawn at random in proportion to their weight in the images, as in MCMC
+    (Kheradmand et al. 2024) grown       half of the primitives at first, the others are born where the error is
+    largest; then as `idle`; static's `quick` does so
 
-Results on the test views go to benchmarks/results/population.json after every run, and only what is missing is run; --docs puts the table between the
-markers of docs/budgets.md.
+Results on the test views go to benchmarks/results/population.json after every run, and only what is missing is run;
+--docs puts the table between the markers of docs/budgets.md.
 """
 
 from __future__ import annotations
@@ -56,7 +59,8 @@ TITLES = {
 
 
 class ByWeight(Relocate):
-    """Primitives that split are drawn in proportion to their weight; the errors that :class:`Relocate` sorts by become the draw's order."""
+    """Primitives that split are drawn in proportion to their weight; the errors that :class:`Relocate` sorts by become
+    the draw's order."""
 
     def __init__(self, settings: PopulationSettings) -> None:
         super().__init__(settings)
@@ -82,7 +86,10 @@ def run(args: argparse.Namespace) -> None:
     for scene in args.scenes:
         words = {variant: words_of(args, scene, variant) for variant in VARIANTS}
         if not all(f"{scene} {variant}" in kept["paces"] for variant in VARIANTS):
-            took = paces_of({v: begin(Trial("", own, args.steps, interventions=None)).trainer for v, own in words.items()}, args.steps)
+            took = paces_of(
+                {v: begin(Trial("", own, args.steps, interventions=None)).trainer for v, own in words.items()},
+                args.steps,
+            )
             own_pace = took["idle" if SCENES[scene].task == "dynamic" else "always"]
             kept["paces"] |= {f"{scene} {variant}": seconds / own_pace for variant, seconds in took.items()}
         for seed in range(args.seeds):
@@ -94,8 +101,19 @@ def run(args: argparse.Namespace) -> None:
                 fitted = begin(Trial(name, own, steps, seed, interventions=None))
                 compile_kernels(fitted.trainer)
                 metrics = complete(fitted).metrics()
-                row = {"trial": name, "scene": scene, "variant": variant, "seed": seed, "steps": args.steps, "iterations": steps}
-                row |= {k: metrics[k] for k in ("psnr", "psnr_worst", "psnr_mask", "psnr_linear_clamped", "primitives") if k in metrics}
+                row = {
+                    "trial": name,
+                    "scene": scene,
+                    "variant": variant,
+                    "seed": seed,
+                    "steps": args.steps,
+                    "iterations": steps,
+                }
+                row |= {
+                    k: metrics[k]
+                    for k in ("psnr", "psnr_worst", "psnr_mask", "psnr_linear_clamped", "primitives")
+                    if k in metrics
+                }
                 kept["trials"].append(row)
                 RESULTS.write_text(json.dumps(kept, indent=1) + "\n")
                 print(f"{name}: {row[SCENES[scene].judged]:.2f} dB, {row['primitives']} primitives", flush=True)

@@ -1,11 +1,14 @@
 """Two ranks of one thread against one process of two threads and of one: views per second, and bytes that a step sends.
 
-    python benchmarks/ranks.py [--parts pace steps] [--scenes solids smoke_fire lit_solids large] [--rounds 15] [--seconds 0.5] [--docs] [--print]
+    python benchmarks/ranks.py [--parts pace steps] [--scenes solids smoke_fire lit_solids large] [--rounds 15]
+    [--seconds 0.5] [--docs] [--print]
 
-Both ranks of a torchrun hold the same trainer, in the middle of its budget, with a fixed population. They train in turns: together; the first one
-alone with the same views a step, on two threads and on one; and alone with one view a step. So all meet the same noise of a shared machine, and the
-ratios are medians of those of each round, and ratios of the fastest turns. `steps` trains with as many views in fewer, larger steps.
-Results go to benchmarks/results/ranks.json; --docs puts the tables between the markers of docs/scaling.md, --print only prints what was recorded.
+Both ranks of a torchrun hold the same trainer, in the middle of its budget, with a fixed population. They train in
+turns: together; the first one alone with the same views a step, on two threads and on one; and alone with one view a
+step. So all meet the same noise of a shared machine, and the ratios are medians of those of each round, and ratios of
+the fastest turns. `steps` trains with as many views in fewer, larger steps.
+Results go to benchmarks/results/ranks.json; --docs puts the tables between the markers of docs/scaling.md, --print only
+prints what was recorded.
 """
 
 from __future__ import annotations
@@ -55,7 +58,10 @@ def trainers(scene: str, group: Any) -> dict[str, Any]:
         config = compose(words, check_output=False)
         views = 2 if way in ("two threads", "one thread") else 1
         config = replace(config, train=replace(config.train, views_per_step=views))
-        config = replace(config, renderer=replace(config.renderer, device="cpu", threads=1 if way in ("together", "one thread") else 2))
+        config = replace(
+            config,
+            renderer=replace(config.renderer, device="cpu", threads=1 if way in ("together", "one thread") else 2),
+        )
         fitted = start(config, dataset=dataset)
         dataset = fitted.dataset
         trainer = fitted.trainer
@@ -96,7 +102,9 @@ def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, An
                         before = group.sent
                     took, worked = turn(way, steps)
                     times[way].append(took / (1 if way == "single view" else 2))
-                    used[way].append(worked / (1 if way in ("single view", "together") else 2))  # a rank works for one view a step
+                    used[way].append(
+                        worked / (1 if way in ("single view", "together") else 2)
+                    )  # a rank works for one view a step
                     if way == "together":
                         sent = (group.sent - before) // steps
     trainer = made["together"]
@@ -138,7 +146,9 @@ def table(record: dict[str, Any]) -> str:
             middle = statistics.median(other / own for own, other in zip(times["together"], times[way], strict=True))
             return f"{middle:.2f}; {min(times[way]) / min(times['together']):.2f}"
 
-        work = statistics.median(a / b for a, b in zip(found["processor"]["together"], found["processor"]["two threads"], strict=True))
+        work = statistics.median(
+            a / b for a, b in zip(found["processor"]["together"], found["processor"]["two threads"], strict=True)
+        )
         width, height = found["size"]
         formula = 4 * (found["numbers"] + 2 * found["primitives"]) + 2048
         rows.row(
@@ -150,13 +160,19 @@ def table(record: dict[str, Any]) -> str:
 
 
 def larger_steps(seeds: int) -> dict[str, Any]:
-    """PSNR on the test views after as many views in fewer, larger steps, by one process: several ranks train the same."""
+    """PSNR on the test views after as many views in fewer, larger steps, by one process: several ranks train the
+    same."""
     from neuprim.config import compose
     from neuprim.runs.fit import fit
 
     found: dict[str, Any] = {"words": list(BUDGET), "views": VIEWS, "psnr": {}}
     for views in (1, 2, 4, 8):
-        words = [*BUDGET, f"train.iterations={VIEWS // views}", f"train.views_per_step={views}", f"train.population.every={200 // views}"]
+        words = [
+            *BUDGET,
+            f"train.iterations={VIEWS // views}",
+            f"train.views_per_step={views}",
+            f"train.population.every={200 // views}",
+        ]
         runs = [fit(compose([*words, f"seed={seed}"], check_output=False)).metrics()["psnr"] for seed in range(seeds)]
         found["psnr"][str(views)] = runs
         print(f"{views} views a step: {spread(runs, 2)} dB", flush=True)
@@ -195,8 +211,19 @@ def main() -> None:
     if "pace" in args.parts and not args.print:
         out = RESULTS.with_suffix(".part")
         out.unlink(missing_ok=True)
-        more = ["--scenes", *args.scenes, "--rounds", str(args.rounds), "--seconds", str(args.seconds), "--worker", str(out)]
-        subprocess.run([sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", __file__, *more], check=True)
+        more = [
+            "--scenes",
+            *args.scenes,
+            "--rounds",
+            str(args.rounds),
+            "--seconds",
+            str(args.seconds),
+            "--worker",
+            str(out),
+        ]
+        subprocess.run(
+            [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", __file__, *more], check=True
+        )
         record |= {
             "cpu": cpu_name(),
             "cores": core_count(),

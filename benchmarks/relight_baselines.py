@@ -2,7 +2,8 @@
 
     python benchmarks/relight_baselines.py [--record]
 
-Draws the scene at its default settings on first use and says how long that took. --record writes the table to docs/relighting.md.
+Draws the scene at its default settings on first use and says how long that took. --record writes the table to
+docs/relighting.md.
 """
 
 from __future__ import annotations

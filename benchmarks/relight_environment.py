@@ -1,15 +1,18 @@
-"""How well a relighting run of lit_solids shows light from all around, against the ray caster under the same and under more lights.
+"""How well a relighting run of lit_solids shows light from all around, against the ray caster under the same and under
+more lights.
 
-    python benchmarks/relight_environment.py RUN_DIR [--lights 16 64 256] [--views N] [--record] [--picture FILE.png] [--keep DIR]
+    python benchmarks/relight_environment.py RUN_DIR [--lights 16 64 256] [--views N] [--record] [--picture FILE.png]
+    [--keep DIR]
 
-- same lights: the model's image against the ray-cast sum over the very point lights that stand for the environment, so that only the
+- same lights: the model's image against the ray-cast sum over the very point lights that stand for the environment, so
+  that only the
   model is wrong;
 - seen lights: both without the lights more than 15 degrees off every training light;
 - distant: against 1024 lights at 1e4 units, so that the lights' number and finite distance count too;
 - lights alone: the ray caster under the few lights against the distant ones, what a perfect model would score there.
 
-PSNR of linear light clamped to 0..1, means over views of the test split. --record writes the table to docs/relighting.md, --keep the
-environments as OpenEXR files.
+PSNR of linear light clamped to 0..1, means over views of the test split. --record writes the table to
+docs/relighting.md, --keep the environments as OpenEXR files.
 """
 
 from __future__ import annotations
@@ -62,7 +65,9 @@ def environments(height: int = 128) -> dict[str, Tensor]:
     z = d[..., 2:].clamp_min(0)
     blue = torch.tensor([0.22, 0.36, 0.62]) * z + torch.tensor([0.45, 0.45, 0.42]) * (1 - z)
     ground = torch.tensor([0.10, 0.08, 0.06]).expand_as(blue)
-    sky = torch.where(d[..., 2:] > 0, blue, ground) + torch.tensor([150.0, 130.0, 100.0]) * lobe(d, (1.0, 0.6, 1.3), 2.0)
+    sky = torch.where(d[..., 2:] > 0, blue, ground) + torch.tensor([150.0, 130.0, 100.0]) * lobe(
+        d, (1.0, 0.6, 1.3), 2.0
+    )
     warm = torch.tensor([8.0, 4.4, 1.6]) * lobe(d, (1.0, -0.8, 1.0), 14.0)
     cold = torch.tensor([0.9, 2.6, 6.0]) * lobe(d, (-1.0, 0.2, 0.9), 18.0)
     return {"sky and sun": sky, "two softboxes": 0.02 + warm + cold, "white": torch.ones_like(sky)}
@@ -70,7 +75,9 @@ def environments(height: int = 128) -> dict[str, Tensor]:
 
 def truth(scene: Scene, camera: Camera, lights: list[dict[str, Tensor]], supersampling: int = 2) -> Tensor:
     """(H, W, 3) sum of ray-cast images, float64."""
-    pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(
+        torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
+    )
     total = np.zeros((camera.height, camera.width, 3))
     for light in lights:
         shot = picture(scene, pose.numpy(), light["light"].double().numpy(), camera.width, supersampling)
@@ -84,7 +91,9 @@ def main() -> None:
     parser.add_argument("--lights", type=int, nargs="*", default=[16, 64, 256])
     parser.add_argument("--views", type=int, default=3)
     parser.add_argument("--record", action="store_true", help="write the table to docs/relighting.md")
-    parser.add_argument("--picture", type=Path, help="environment; truth and model under those of 64 lights that are near trained ones")
+    parser.add_argument(
+        "--picture", type=Path, help="environment; truth and model under those of 64 lights that are near trained ones"
+    )
     parser.add_argument("--keep", type=Path, help="write the environments here")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -109,7 +118,10 @@ def main() -> None:
                 drawn = draw_sum(model, view, lights, config.renderer, torch.zeros(3)).double()
                 cast = truth(scene, view.camera, lights, 2)
                 seen = list(around.frames(False))
-                fair = draw_sum(model, view, seen, config.renderer, torch.zeros(3)).double(), truth(scene, view.camera, seen, 2)
+                fair = (
+                    draw_sum(model, view, seen, config.renderer, torch.zeros(3)).double(),
+                    truth(scene, view.camera, seen, 2),
+                )
                 pairs = ((drawn, cast), fair, (drawn, reference), (cast, reference))
                 scores.append([psnr(a.clamp(0, 1), b.clamp(0, 1)) for a, b in pairs])
             means = [f"{x:.2f} dB" for x in np.mean(scores, axis=0)]
@@ -122,13 +134,17 @@ def main() -> None:
             lights = list(around.frames(False))
             drawn = draw_sum(model, View("picture", camera), lights, config.renderer, torch.zeros(3))
             planes = radiance.clamp(0, 1).movedim(-1, 0)[None]
-            small = torch.nn.functional.interpolate(planes, size=(PIXELS // 2, PIXELS), mode="bilinear", antialias=True)[0].movedim(0, -1)
+            small = torch.nn.functional.interpolate(
+                planes, size=(PIXELS // 2, PIXELS), mode="bilinear", antialias=True
+            )[0].movedim(0, -1)
             images = [small, truth(scene, camera, lights, 3).float(), drawn]
             columns.append(torch.cat([Channels(color_space="linear").display(x).clamp(0, 1) for x in images]))
     if args.picture:
         write_png(args.picture, torch.cat(columns, 1))
     if args.record:
-        rate = f"{len(views)} test views of {views[0].camera.width}x{views[0].camera.height}, {model.count} primitives, "
+        rate = (
+            f"{len(views)} test views of {views[0].camera.width}x{views[0].camera.height}, {model.count} primitives, "
+        )
         between_markers(PAGE, "relight-environment", f"{table}\n\n{rate}{header['train_seconds']:.0f} s of training.")
 
 

@@ -1,18 +1,22 @@
-"""Quality of the relighting task on `lit_solids`: ways of colouring at equal training time, where shadows come from, and losses.
+"""Quality of the relighting task on `lit_solids`: ways of colouring at equal training time, where shadows come from,
+and losses.
 
-    python benchmarks/relight_quality.py [--steps 2600] [--seeds 3] [--parts forms losses] [--variants ...] [--once ...] [--continue] [--tune] [--readme] [--docs]
+    python benchmarks/relight_quality.py [--steps 2600] [--seeds 3] [--parts forms losses] [--variants ...] [--once ...]
+    [--continue] [--tune] [--readme] [--docs]
 
 Parts:
 
-    forms      a constant colour, spherical harmonics of the light (a baseline with the network's number of parameters), equation 14 as
+    forms      a constant colour, spherical harmonics of the light (a baseline with the network's number of parameters),
+    equation 14 as
                printed, and equation 14 or its multiplicative form with a light visibility per primitive or per pixel
     losses     the default form under every loss
 
-Equal seconds are counted in steps: all variants take turns with the default on this machine first, and each then trains for as many steps as
-it makes while the default makes --steps, so that neither other work on the machine nor its speed disturbs the comparisons. Images are 128 x 128, 500 for training,
-100 held out (new lights, new views, both), linear light over the exposure, clamped to 0..1, black background; means over seeds +- half
-the spread, of the last checkpoint. --tune tests on every eighth training view instead. Results go to
-benchmarks/results/relight_quality.json. --docs puts the table between the markers of docs/relighting.md, --readme a short one into
+Equal seconds are counted in steps: all variants take turns with the default on this machine first, and each then trains
+for as many steps as it makes while the default makes --steps, so that neither other work on the machine nor its speed
+disturbs the comparisons. Images are 128 x 128, 500 for training, 100 held out (new lights, new views, both), linear
+light over the exposure, clamped to 0..1, black background; means over seeds +- half the spread, of the last checkpoint.
+--tune tests on every eighth training view instead. Results go to benchmarks/results/relight_quality.json. --docs puts
+the table between the markers of docs/relighting.md, --readme a short one into
 README.md; with --parts none nothing is run, and both are made of the recorded results.
 """
 
@@ -44,7 +48,10 @@ FORMS = {
     "equation 14, visibility per primitive": ("model.colour.visibility=primitive",),
     "equation 14, visibility per pixel": ("model.colour.visibility=pixel",),
     "multiplicative, visibility per pixel": ("model.colour.form=multiplicative", "model.colour.visibility=pixel"),
-    "multiplicative, visibility per primitive": ("model.colour.form=multiplicative", "model.colour.visibility=primitive"),
+    "multiplicative, visibility per primitive": (
+        "model.colour.form=multiplicative",
+        "model.colour.visibility=primitive",
+    ),
 }
 LOSSES = {loss: (f"train.loss={loss}",) for loss in ("l1", "compressed", "relative")}
 BASELINES = {
@@ -65,7 +72,14 @@ KEYS = (
 
 def prepared(words: list[str], dataset: Dataset | None) -> Fitted:
     config = compose(
-        ["task=relight", "scene=lit_solids", f"scene.size={SIZE}", "train.eval_every=0", "train.max_seconds=null", *words],
+        [
+            "task=relight",
+            "scene=lit_solids",
+            f"scene.size={SIZE}",
+            "train.eval_every=0",
+            "train.max_seconds=null",
+            *words,
+        ],
         check_output=False,
     )
     fitted = start(config, dataset=dataset)
@@ -91,7 +105,9 @@ def main() -> None:
     parser.add_argument("--variants", nargs="*", default=list(FORMS))
     parser.add_argument("--once", nargs="*", default=[], help="variants that run with the first seed only")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="further settings of every run")
-    parser.add_argument("--continue", dest="go_on", action="store_true", help="keep recorded runs and paces; add what is missing")
+    parser.add_argument(
+        "--continue", dest="go_on", action="store_true", help="keep recorded runs and paces; add what is missing"
+    )
     parser.add_argument("--tune", action="store_true", help="held-out training views; nothing is recorded")
     parser.add_argument("--readme", action="store_true")
     parser.add_argument("--docs", action="store_true")
@@ -107,8 +123,14 @@ def main() -> None:
     if wanted:
         dataset = prepared(common, None).dataset
         everything = {(part, name): words for part, own in wanted.items() for name, words in own.items()}
-        known = {f"{part}: {e['name']}": e["pace"] for part in wanted for e in recorded.get(part, []) if "pace" in e} if args.go_on else {}
-        missing = {f"{part}: {name}": words for (part, name), words in everything.items() if f"{part}: {name}" not in known}
+        known = (
+            {f"{part}: {e['name']}": e["pace"] for part in wanted for e in recorded.get(part, []) if "pace" in e}
+            if args.go_on
+            else {}
+        )
+        missing = {
+            f"{part}: {name}": words for (part, name), words in everything.items() if f"{part}: {name}" not in known
+        }
         took = pace({"": [*FORMS[DEFAULT], *common], **missing}, dataset) if missing else {}
         paces = {**{name: took[name] / took[""] for name in missing}, **known}
         recorded |= {"cpu": cpu_name(), "cores": core_count(), "steps": args.steps, "baselines": baselines(dataset)}
@@ -122,9 +144,15 @@ def main() -> None:
                 each = paces[f"{part}: {name}"]
                 found = fit([*words, f"train.iterations={round(args.steps / each)}", f"seed={seed}"], dataset)
                 recorded[part].append({"name": name, "pace": each, **found})
-                print(part, json.dumps({k: round(v, 3) if isinstance(v, float) else v for k, v in recorded[part][-1].items()}), flush=True)
+                print(
+                    part,
+                    json.dumps({k: round(v, 3) if isinstance(v, float) else v for k, v in recorded[part][-1].items()}),
+                    flush=True,
+                )
                 if not args.tune:
-                    RESULTS.write_text(json.dumps(recorded, indent=1) + "\n")  # after every run: a long benchmark may be cut short
+                    RESULTS.write_text(
+                        json.dumps(recorded, indent=1) + "\n"
+                    )  # after every run: a long benchmark may be cut short
     table = quality_table(recorded)
     print(f"\n{table}")
     if args.docs:
@@ -134,7 +162,8 @@ def main() -> None:
 
 
 def short_table(recorded: dict[str, Any]) -> str:
-    """The default, the paper's form and a baseline; of the classes of pixels the shadows and the one that the default draws worst."""
+    """The default, the paper's form and a baseline; of the classes of pixels the shadows and the one that the default
+    draws worst."""
     own = {name: [e for e in recorded["forms"] if e["name"] == name] for name in HEADLINES}
     hardest = min(CLASSES, key=lambda c: statistics.mean(e[f"psnr_pooled_{c}"] for e in own[DEFAULT]))
     classes = [("cast shadows", "cast_shadow"), (f"hardest: {hardest.replace('_', ' ')}s", hardest)]

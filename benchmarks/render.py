@@ -1,10 +1,13 @@
-"""Speed of the cpu backend: time per evaluated lane, lanes per true hit, arithmetic rate, memory; and ratios against another program.
+"""Speed of the cpu backend: time per evaluated lane, lanes per true hit, arithmetic rate, memory; and ratios against
+another program.
 
-    python benchmarks/render.py [--scenes 5000x400 20000x400 20000x800] [--threads 1 2] [--rounds 9] [--against DIR] [--record]
+    python benchmarks/render.py [--scenes 5000x400 20000x400 20000x800] [--threads 1 2] [--rounds 9] [--against DIR]
+    [--record]
 
-DIR holds the numba study this backend grew out of (common.py, numk_fi.py): both draw the same primitives from the same camera,
-alternating in one process, and the ratio of their fastest rounds is printed (below 1 this backend is faster). Preparation and
-binning are inside on both sides; a step is forward, backward and Adam on all parameters; three colours, no depth. Absolute times are of this machine in its present mood: only ratios travel.
+DIR holds the numba study this backend grew out of (common.py, numk_fi.py): both draw the same primitives from the same
+camera, alternating in one process, and the ratio of their fastest rounds is printed (below 1 this backend is faster).
+Preparation and binning are inside on both sides; a step is forward, backward and Adam on all parameters; three colours,
+no depth. Absolute times are of this machine in its present mood: only ratios travel.
 
 Flops are counted by one rule: 420 per evaluated lane forward, 1,100 backward (K = 8). --record writes the result to
 benchmarks/results/render.json and docs/performance.md.
@@ -58,7 +61,8 @@ def _count_hits(E0, EX, EY, XA, tc, anchor, boxes):  # type: ignore[no-untyped-d
 
 
 def true_hits(lowered: Lowered, camera: Camera) -> int:
-    """Rays that really meet a primitive within its silhouette, of all (pixel, primitive) pairs; counted in the frame that a forward pass keeps."""
+    """Rays that really meet a primitive within its silhouette, of all (pixel, primitive) pairs; counted in the frame
+    that a forward pass keeps."""
     node = render_lowered(lowered, camera, RenderSettings(backend="cpu"), torch.zeros(3)).rgb.grad_fn
     while not hasattr(node, "frame"):
         assert node is not None, "the backend keeps its frame in the graph"
@@ -75,7 +79,16 @@ def ours(lowered: Lowered, camera: Camera, threads: int) -> tuple[Passes, dict[s
     kept = render_lowered(lowered, camera, settings, background)
     g, d, c = lowered.geometry, lowered.density, lowered.colour
     assert isinstance(d, Cosine) and isinstance(c, Constant)
-    params = {"means": g.means, "log_scales": g.log_scales, "quats": g.quats, "W1": d.W1, "b1": d.b1, "w2": d.w2, "b2": d.b2, "rgb": c.rgb}
+    params = {
+        "means": g.means,
+        "log_scales": g.log_scales,
+        "quats": g.quats,
+        "W1": d.W1,
+        "b1": d.b1,
+        "w2": d.w2,
+        "b2": d.b2,
+        "rgb": c.rgb,
+    }
     specs = [ParameterSpec(n, tuple(v.shape[1:]), 0.0, lambda context: torch.empty(0)) for n, v in params.items()]
     adam = RowAdam(specs, params)
 
@@ -138,7 +151,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--scenes", nargs="*", default=["5000x400", "20000x400", "20000x800"], help="PRIMITIVESxSIZE")
     parser.add_argument("--threads", nargs="*", type=int, default=[1, 2])
-    parser.add_argument("--rate", type=float, default=4.0, help="largest phase rate per axis, radians per m (trained models: about 10)")
+    parser.add_argument(
+        "--rate", type=float, default=4.0, help="largest phase rate per axis, radians per m (trained models: about 10)"
+    )
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--against", type=Path)
     parser.add_argument("--record", action="store_true")
@@ -161,19 +176,33 @@ def main() -> None:
             other = study(args.against, p, size, threads) if args.against else None
             for i, name in enumerate((*FLOPS, "step")):
                 times = fastest([mine[i], *([other[i]] if other else [])], args.rounds)
-                row: dict[str, Any] = {"scene": text, "rate": args.rate, "threads": threads, "pass": name, "ms": times[0] * 1e3}
+                row: dict[str, Any] = {
+                    "scene": text,
+                    "rate": args.rate,
+                    "threads": threads,
+                    "pass": name,
+                    "ms": times[0] * 1e3,
+                }
                 row["ratio"] = times[0] / times[1] if other else None
                 lanes = counts["forward"] + counts["backward"] if name == "step" else counts[name]
                 flops = sum(counts[k] * FLOPS[k] for k in FLOPS) if name == "step" else lanes * FLOPS[name]
                 row |= {"ns_per_lane": times[0] / lanes * 1e9 * threads, "lanes_per_hit": counts["forward"] / hits}
                 row["gflops"] = flops / times[0] / 1e9
                 ratio = "" if row["ratio"] is None else f"{row['ratio']:.2f}"
-                cells = (f"{row['ms']:.1f}", f"{row['ns_per_lane']:.1f}", f"{row['lanes_per_hit']:.2f}", f"{row['gflops']:.0f}", ratio)
+                cells = (
+                    f"{row['ms']:.1f}",
+                    f"{row['ns_per_lane']:.1f}",
+                    f"{row['lanes_per_hit']:.2f}",
+                    f"{row['gflops']:.0f}",
+                    ratio,
+                )
                 table.row(text, f"{args.rate:g}", threads, name, *cells)
                 rows.append(row)
     if args.record:
         RESULTS.parent.mkdir(exist_ok=True)
-        RESULTS.write_text(json.dumps({"cpu": cpu_name(), "against": bool(args.against), "rows": rows}, indent=1) + "\n")
+        RESULTS.write_text(
+            json.dumps({"cpu": cpu_name(), "against": bool(args.against), "rows": rows}, indent=1) + "\n"
+        )
         between_markers(PERFORMANCE, "render", f"{table}\n\n{cpu_name()}. {memory}")
 
 

@@ -2,9 +2,10 @@
 
     python benchmarks/scaling.py [--most 1000000] [--threads 0] [--record]
 
-Random scenes whose primitives shrink as they multiply, so that a ray meets about the same number of them ("overlap": how many
-times they would cover the unit cube's face). Every point is the fastest of a few frames. Times are of this machine; the shape of
-the curves is what travels. --record writes benchmarks/results/scaling.json, docs/performance.md and docs/pictures/scaling.png.
+Random scenes whose primitives shrink as they multiply, so that a ray meets about the same number of them ("overlap":
+how many times they would cover the unit cube's face). Every point is the fastest of a few frames. Times are of this
+machine; the shape of the curves is what travels. --record writes benchmarks/results/scaling.json, docs/performance.md
+and docs/pictures/scaling.png.
 """
 
 from __future__ import annotations
@@ -62,7 +63,8 @@ def one_frame(count: int, size: int, backward: bool, threads: int) -> None:
 
 
 def _peak() -> int:
-    """Peak resident bytes of this process. Linux's ru_maxrss starts at the parent's peak, so the kernel's own mark is read there."""
+    """Peak resident bytes of this process. Linux's ru_maxrss starts at the parent's peak, so the kernel's own mark is
+    read there."""
     status = Path("/proc/self/status")
     if status.exists():
         (kilobytes,) = (line.split()[1] for line in status.read_text().splitlines() if line.startswith("VmHWM"))
@@ -78,7 +80,15 @@ def series(points: list[tuple[int, int, float]], label: str, threads: int, table
         row["forward_ms"], row["pairs"] = milliseconds(lowered, size, threads, backward=False)
         row["both_ms"], _ = milliseconds(lowered, size, threads, backward=True)
         rows.append(row)
-        table.row(label, count, f"{size}x{size}", f"{overlap:g}", row["pairs"], f"{row['forward_ms']:.1f}", f"{row['both_ms']:.1f}")
+        table.row(
+            label,
+            count,
+            f"{size}x{size}",
+            f"{overlap:g}",
+            row["pairs"],
+            f"{row['forward_ms']:.1f}",
+            f"{row['both_ms']:.1f}",
+        )
     return rows
 
 
@@ -89,7 +99,9 @@ def draw(rows: list[dict[str, Any]]) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(1, 3, figsize=(12, 3.6), constrained_layout=True)
-    for axis, label, key in zip(axes, ("primitives", "pixels", "overlap"), ("primitives", "size", "overlap"), strict=True):
+    for axis, label, key in zip(
+        axes, ("primitives", "pixels", "overlap"), ("primitives", "size", "overlap"), strict=True
+    ):
         mine = [r for r in rows if r["series"] == label]
         x = [r[key] ** 2 if key == "size" else r[key] for r in mine]
         for name, text in (("forward_ms", "forward"), ("both_ms", "forward and backward")):
@@ -133,7 +145,9 @@ def main() -> None:
         RESULTS.parent.mkdir(exist_ok=True)
         RESULTS.write_text(json.dumps({"rows": rows, "peak_bytes": peaks}, indent=1) + "\n")
         draw(rows)
-        between_markers(PERFORMANCE, "scaling", f"{memories}\n\nTimes on {core_count()} threads of {cpu_name()}.\n\n{table}")
+        between_markers(
+            PERFORMANCE, "scaling", f"{memories}\n\nTimes on {core_count()} threads of {cpu_name()}.\n\n{table}"
+        )
     worst = max(peaks.values())
     if worst > MEMORY_BOUND:
         raise SystemExit(f"peak memory {worst / 1e9:.2f} GB exceeds {MEMORY_BOUND / 1e9:g} GB")

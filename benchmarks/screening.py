@@ -1,12 +1,15 @@
-"""Which primitive is worth its bytes: every K and edge at the bytes of so many of the paper's primitives, judged by what no test view shows.
+"""Which primitive is worth its bytes: every K and edge at the bytes of so many of the paper's primitives, judged by
+what no test view shows.
 
     python benchmarks/screening.py --scenes solids [chair fire smoke_fire lit_solids] [--chair DIR] [--fire DIR]
         [--forms 8:0 2:2 ...] [--rates default ...] [--primitives 400] [--iterations 1500] [--set KEY=VALUE ...]
 
-A form is K:EDGE; a soft edge has a gain. --rates tries further learning rates, each "KEY=VALUE+KEY=VALUE" of train.rates; `amplitude` stands for b2 and w2,
-`frequency` for W1 and b1, a key with a dot for any setting. One seed, one thread each. Test views stay unseen: every eighth training view is held out
-of a static scene or a relit one, a volume takes another rig of cameras. Rows are kept in benchmarks/results/screening.json, and only what is
-missing is trained. --docs puts the tables of the recorded grid between the markers of docs/expressivity.md; without --scenes nothing is trained.
+A form is K:EDGE; a soft edge has a gain. --rates tries further learning rates, each "KEY=VALUE+KEY=VALUE" of
+train.rates; `amplitude` stands for b2 and w2, `frequency` for W1 and b1, a key with a dot for any setting. One seed,
+one thread each. Test views stay unseen: every eighth training view is held out of a static scene or a relit one, a
+volume takes another rig of cameras. Rows are kept in benchmarks/results/screening.json, and only what is missing is
+trained. --docs puts the tables of the recorded grid between the markers of docs/expressivity.md; without --scenes
+nothing is trained.
 """
 
 from __future__ import annotations
@@ -44,7 +47,9 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="*", default=[], choices=sorted(SCENES))
     parser.add_argument("--chair", type=Path, help="a NeRF-synthetic folder")
     parser.add_argument("--fire", type=Path, help="a folder of EmberGen's .vdb files")
-    parser.add_argument("--forms", nargs="+", default=[f"{k}:{p}" for k in (0, 1, 2, 4, 8, 16) for p in (0, 1, 2)], metavar="K:EDGE")
+    parser.add_argument(
+        "--forms", nargs="+", default=[f"{k}:{p}" for k in (0, 1, 2, 4, 8, 16) for p in (0, 1, 2)], metavar="K:EDGE"
+    )
     parser.add_argument("--rates", nargs="+", default=["default"])
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="further settings of every run")
     parser.add_argument("--primitives", type=int, default=400, help="of the paper's form: K = 8, hard edge")
@@ -64,7 +69,9 @@ def main() -> None:
                     words = (
                         *scene.all_words(vars(args), name), *AS_RECORDED, *scene.tuning, *Form.named(text).words, f"model.primitives={count}", *rate_words(rates), *args.set
                     )  # fmt: skip
-                    title = "-".join([name, text, rates, str(count), str(args.iterations), str(seed), *sorted(args.set)])
+                    title = "-".join(
+                        [name, text, rates, str(count), str(args.iterations), str(seed), *sorted(args.set)]
+                    )
                     facts = (
                         ("scene", name),
                         ("form", text),
@@ -76,7 +83,8 @@ def main() -> None:
     run_all(trials, args.record, KEYS, args.jobs, lambda row: f"{row['psnr']:.2f} dB")
     wanted = {trial.name for trial in trials}
     for row in sorted(
-        (r for r in recorded(args.record) if r["trial"] in wanted), key=lambda r: (r["scene"], -r[SCENES[r["scene"]].judged])
+        (r for r in recorded(args.record) if r["trial"] in wanted),
+        key=lambda r: (r["scene"], -r[SCENES[r["scene"]].judged]),
     ):
         judged = row[SCENES[row["scene"]].judged]
         print(
@@ -96,7 +104,10 @@ def grid_table(rows: list[dict[str, Any]]) -> str:
     found = {(r["scene"], r["form"]): r[SCENES[r["scene"]].judged] for r in own if r["seed"] == 0}
     best = {scene: max(value for (name, _), value in found.items() if name == scene) for scene in scenes}
     edges = sorted({Form.named(form).edge for _, form in found})
-    lines = [f"| {' / '.join(scenes)} | " + " | ".join(f"p = {p}" for p in edges) + " |", "| --- |" + " --- |" * len(edges)]
+    lines = [
+        f"| {' / '.join(scenes)} | " + " | ".join(f"p = {p}" for p in edges) + " |",
+        "| --- |" + " --- |" * len(edges),
+    ]
 
     def cell(scene: str, form: str) -> str:
         if (scene, form) not in found:
@@ -105,8 +116,12 @@ def grid_table(rows: list[dict[str, Any]]) -> str:
         return f"**{value:.2f}**" if value > best[scene] - 0.1 else f"{value:.2f}"
 
     for k in sorted({Form.named(form).neurons for _, form in found}):
-        lines.append(f"| K = {k} | " + " | ".join(" / ".join(cell(scene, f"{k}:{p}") for scene in scenes) for p in edges) + " |")
-    lines.append("\nPSNR in dB; bold: within 0.1 dB of the best. b2 and w2 learn at 0.03 throughout; a soft edge has a gain.")
+        lines.append(
+            f"| K = {k} | " + " | ".join(" / ".join(cell(scene, f"{k}:{p}") for scene in scenes) for p in edges) + " |"
+        )
+    lines.append(
+        "\nPSNR in dB; bold: within 0.1 dB of the best. b2 and w2 learn at 0.03 throughout; a soft edge has a gain."
+    )
     return "\n".join(lines)
 
 

@@ -1,10 +1,13 @@
-"""What silhouettes of what can be seen are worth (neuprim/core/render/cpu/seen.py): runs drawn with them and with whole ones, in turns.
+"""What silhouettes of what can be seen are worth (neuprim/core/render/cpu/seen.py): runs drawn with them and with whole
+ones, in turns.
 
     python benchmarks/seen.py RUN_DIR... [--views 8] [--rounds 7] [--record]
 
-Forward is a training view without gradients, step one with them and its backward pass; the colours' lowering is inside, the optimiser is not. Times are the fastest
-rounds of all views, on one thread. *pairs* of tiles and primitives and *lanes*, rays against primitives, are shares of those of whole silhouettes; *backward* are the
-lanes that the backward pass evaluates, of those drawn. *image*, *gradient*: the largest difference, of a gradient relative to its parameter's largest.
+Forward is a training view without gradients, step one with them and its backward pass; the colours' lowering is inside,
+the optimiser is not. Times are the fastest rounds of all views, on one thread. *pairs* of tiles and primitives and
+*lanes*, rays against primitives, are shares of those of whole silhouettes; *backward* are the lanes that the backward
+pass evaluates, of those drawn. *image*, *gradient*: the largest difference, of a gradient relative to its parameter's
+largest.
 --record writes benchmarks/results/seen.json and the table in docs/performance.md.
 """
 
@@ -53,9 +56,17 @@ def main() -> None:
     torch.set_num_threads(1)
     rows = [measured(run, args.views, args.rounds) for run in args.runs]
     shares = ("pairs", "lanes", "backward", "forward", "step")
-    table = Table("run", "primitives", "pairs", "lanes", "backward", "time forward", "time of a step", "image", "gradient")
+    table = Table(
+        "run", "primitives", "pairs", "lanes", "backward", "time forward", "time of a step", "image", "gradient"
+    )
     for r in rows:
-        table.row(r["run"], f"{r['primitives']:,}", *(f"{r[name]:.2f}" for name in shares), f"{r['image']:.0e}", f"{r['gradient']:.0e}")
+        table.row(
+            r["run"],
+            f"{r['primitives']:,}",
+            *(f"{r[name]:.2f}" for name in shares),
+            f"{r['image']:.0e}",
+            f"{r['gradient']:.0e}",
+        )
     if args.record:
         RESULTS.write_text(json.dumps({"cpu": cpu_name(), "rows": rows}, indent=1) + "\n")
         between_markers(PERFORMANCE, "seen", f"{table}\n\n{cpu_name()}, one thread.")
@@ -119,7 +130,9 @@ def drawn(model: Primitives, dataset: Dataset, views: list[View], settings: Rend
         found["pairs"] += output.stats.pairs
         for way in ("forward_lanes", "backward_lanes"):
             found[way] += output.stats.extra[way]
-    found["gradients"] = [torch.zeros(0) if value.grad is None else value.grad.clone() for value in model.params.values()]
+    found["gradients"] = [
+        torch.zeros(0) if value.grad is None else value.grad.clone() for value in model.params.values()
+    ]
     return found
 
 

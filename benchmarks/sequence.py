@@ -1,10 +1,12 @@
 """Long sequences: what the memory of a run does with their length, and what two workers bring to ground truth.
 
-    python benchmarks/sequence.py DIR          # DIR: a folder of .vdb frames; measures, into benchmarks/results/sequence.json
-    python benchmarks/sequence.py --docs       # writes the tables of docs/dynamic.md and docs/launching.md from that file, and measures nothing
+    python benchmarks/sequence.py DIR          # DIR: a folder of .vdb frames; measures, into
+    benchmarks/results/sequence.json python benchmarks/sequence.py --docs       # writes the tables of docs/dynamic.md
+    and docs/launching.md from that file, and measures nothing
 
-A long sequence is the real frames forwards and backwards, as often as needed, as links to them. Every number is of a process of its own: the peak of
-its resident set, as the system has it (VmHWM), so on Linux alone. Both sides of a ratio are measured in turns.
+A long sequence is the real frames forwards and backwards, as often as needed, as links to them. Every number is of a
+process of its own: the peak of its resident set, as the system has it (VmHWM), so on Linux alone. Both sides of a ratio
+are measured in turns.
 """
 
 from __future__ import annotations
@@ -69,7 +71,9 @@ def child(what: str, words: list[str]) -> dict[str, float]:
     with sharing(1):
         if what.startswith("truth"):
             workers = int(what.removeprefix("truth") or 0)
-            make_truth(config, LauncherSettings("processes", workers=workers, threads=1) if workers else LauncherSettings())
+            make_truth(
+                config, LauncherSettings("processes", workers=workers, threads=1) if workers else LauncherSettings()
+            )
         else:
             steps: list[float] = []
 
@@ -88,7 +92,9 @@ def apart(what: str, words: list[str]) -> dict[str, float]:
     """The same in a process of its own."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, __file__, "--child", what, *words]
-    return json.loads(subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True, text=True).stdout.splitlines()[-1])
+    return json.loads(
+        subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True, text=True).stdout.splitlines()[-1]
+    )
 
 
 def memory(scene: list[str], folder: Path, steps: int) -> dict[str, Any]:
@@ -121,13 +127,17 @@ def speed(source: Path, frames: int, rounds: int) -> list[dict[str, float]]:
                 make_truth(compose(words), LauncherSettings("processes", workers=workers, threads=1))
                 pair[str(workers)] = time.perf_counter() - begun
         pairs.append(pair)
-        print(f"round {number + 1}: {pair['1']:.1f} s with one worker, {pair['2']:.1f} s with two", file=sys.stderr, flush=True)
+        print(
+            f"round {number + 1}: {pair['1']:.1f} s with one worker, {pair['2']:.1f} s with two",
+            file=sys.stderr,
+            flush=True,
+        )
     return pairs
 
 
 def together(source: Path, frames: int, rounds: int) -> list[float]:
-    """Frames that two workers make for each that one makes beside them, from their start until the two are done; whatever else the machine does,
-    it does beside both."""
+    """Frames that two workers make for each that one makes beside them, from their start until the two are done;
+    whatever else the machine does, it does beside both."""
     found = []
     for number in range(rounds):
         with tempfile.TemporaryDirectory() as folder:
@@ -163,13 +173,17 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     found |= {"cpu": cpu_name(), "cores": core_count(), "memory": MEMORY}
     if {"memory", "simulation"} & set(args.parts):  # kernels are compiled, which takes memory
         with tempfile.TemporaryDirectory() as folder:
-            memory(["scene=vdb", f"scene.vdb='{args.folder.resolve()}'", "scene.frames='1:3'"], Path(folder) / "work", 5)
+            memory(
+                ["scene=vdb", f"scene.vdb='{args.folder.resolve()}'", "scene.frames='1:3'"], Path(folder) / "work", 5
+            )
     if "memory" in args.parts:
         found |= {"steps": args.steps, "frames": {}}
         for count in LENGTHS:
             with tempfile.TemporaryDirectory() as folder:
                 made = long_sequence(args.folder, count, Path(folder))
-                found["frames"][str(count)] = memory(["scene=vdb", f"scene.vdb='{made}'"], Path(folder) / "work", args.steps)
+                found["frames"][str(count)] = memory(
+                    ["scene=vdb", f"scene.vdb='{made}'"], Path(folder) / "work", args.steps
+                )
             print(count, found["frames"][str(count)], file=sys.stderr, flush=True)
     if "simulation" in args.parts:
         for count in (40, 300):
@@ -186,13 +200,18 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 
 def tables(found: dict[str, Any]) -> dict[str, str]:
     """Page and marker -> text."""
-    lines = ["| frames | ground truth, peak | run, peak while training | run, peak in all | ms a step |", "| --- | --- | --- | --- | --- |"]
+    lines = [
+        "| frames | ground truth, peak | run, peak while training | run, peak in all | ms a step |",
+        "| --- | --- | --- | --- | --- |",
+    ]
     rows = [(f"{int(n):,}", row) for n, row in found["frames"].items()] + [
         (f"{n}, simulated", row) for n, row in found["simulated"].items()
     ]
     for name, row in rows:
         made, ran = row["truth"], row["run"]
-        lines.append(f"| {name} | {made['peak']:.0f} MiB | {ran['training']:.0f} MiB | {ran['peak']:.0f} MiB | {ran['ms_a_step']:.1f} |")
+        lines.append(
+            f"| {name} | {made['peak']:.0f} MiB | {ran['training']:.0f} MiB | {ran['peak']:.0f} MiB | {ran['ms_a_step']:.1f} |"
+        )
     modules = next(iter(found["frames"].values()))["truth"]["modules"]
     text = (
         "\n".join(lines)

@@ -2,10 +2,13 @@
 
     python benchmarks/shards.py [--primitives 500000] [--size 64] [--docs] [--print]
 
-Random primitives of 70 numbers in the unit cube, seen from around it (a view shows nearly all) and from within (a few in a hundred), a fixed population, two
-views a step: by one process, by two ranks that hold all primitives each, and by two ranks that hold half. Every way has processes of its own. "State" is
-counted: parameters, their gradients, both moments, ages. Memory is the kernel's: resident bytes above those of a process that has imported everything, the most while
-the model is made and while steps are taken. Results go to benchmarks/results/shards.json; --docs puts the table into docs/scaling.md.
+Random primitives of 70 numbers in the unit cube, seen from around it (a view shows nearly all) and from within (a few
+in a hundred), a fixed population, two views a step: by one process, by two ranks that hold all primitives each, and by
+two ranks that hold half. Every way has processes of its own. "State" is counted: parameters, their gradients, both
+moments, ages. Memory is the kernel's: resident bytes above those of a process that has imported everything, the most
+while
+the model is made and while steps are taken. Results go to benchmarks/results/shards.json; --docs puts the table into
+docs/scaling.md.
 """
 
 from __future__ import annotations
@@ -48,7 +51,9 @@ def measure(way: str, inside: bool, primitives: int, size: int, group: Any) -> d
     random_trainer(100, size, 10).train_step()  # what it needs at all: code and kernels
     base = resident("VmRSS")
     forget()
-    trainer = random_trainer(primitives, size, 30, views=2 if way == "alone" else 1, inside=inside, shard=way == "parts")
+    trainer = random_trainer(
+        primitives, size, 30, views=2 if way == "alone" else 1, inside=inside, shard=way == "parts"
+    )
     if way == "parts":
         trainer.join(Shards(group, trainer.renderer.near))
     elif way == "whole":
@@ -60,7 +65,12 @@ def measure(way: str, inside: bool, primitives: int, size: int, group: Any) -> d
     for _ in range(STEPS):
         trainer.train_step()
     seconds, processor = (time.perf_counter() - start) / STEPS, (time.process_time() - used) / STEPS
-    tensors = [*trainer.model.params.values(), *trainer.optimizer.m.values(), *trainer.optimizer.v.values(), trainer.optimizer.age]
+    tensors = [
+        *trainer.model.params.values(),
+        *trainer.optimizer.m.values(),
+        *trainer.optimizer.v.values(),
+        trainer.optimizer.age,
+    ]
     tensors += [value.grad for value in trainer.model.params.values() if value.grad is not None]
     return {
         "state": sum(value.nbytes for value in tensors),
@@ -128,7 +138,16 @@ def main() -> None:
         for place in ("around", "within"):
             for way in WAYS:
                 launcher = [] if way == "alone" else ["-m", "torch.distributed.run", "--nproc-per-node", "2"]
-                words = ["--primitives", str(args.primitives), "--size", str(args.size), "--worker", way, place, str(out)]
+                words = [
+                    "--primitives",
+                    str(args.primitives),
+                    "--size",
+                    str(args.size),
+                    "--worker",
+                    way,
+                    place,
+                    str(out),
+                ]
                 subprocess.run([sys.executable, *launcher, __file__, *words], check=True)
                 record.setdefault(place, {})[way] = json.loads(out.read_text())
         out.unlink()

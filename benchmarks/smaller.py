@@ -1,20 +1,24 @@
 """What a scene requires: models of the presets, pruned, in few bits, and both.
 
     python benchmarks/smaller.py --orders RUN_DIR
-    python benchmarks/smaller.py [--chair DIR] [--fire DIR] [--scenes chair chair_5000 fire fire_half lit_solids smoke_fire] [--seeds 3] [--jobs 2] [--docs] [--print]
+    python benchmarks/smaller.py [--chair DIR] [--fire DIR] [--scenes chair chair_5000 fire fire_half lit_solids
+    smoke_fire] [--seeds 3] [--jobs 2] [--docs] [--print]
 
-Every model is its preset's own (`quick`, the preset's number of views), but for `fire_half`, half as large as the preset's and with the 4,000 views of docs/dynamic.md, and
-`chair_5000`, two and a half times as large. Then, as `neuprim prune` and `neuprim compress` do it:
+Every model is its preset's own (`quick`, the preset's number of views), but for `fire_half`, half as large as the
+preset's and with the 4,000 views of docs/dynamic.md, and `chair_5000`, two and a half times as large. Then, as `neuprim
+prune` and `neuprim compress` do it:
 
     trained as long   the whole model, fine-tuned for the steps that pruning has: what they bring without pruning
     pruned            `neuprim prune --tolerance 0.1dB --steps 4000`
     level 3           `neuprim compress --level 3 --steps 1000`: as many bits for a parameter in every model
     few bits, T dB    `neuprim compress --tolerance T --steps 1000` of the whole and of the pruned model
 
-PSNR and SSIM are means over all held-out views, which decide nothing; bytes are those of the files, of a whole model its numbers in float32.
-Rows go to benchmarks/results/smaller.json as they come, and only what is missing is run; runs stay in outputs/smaller. --docs puts the table
-between the markers of docs/tradeoffs.md; --print runs nothing. --orders RUN_DIR prints what the held-back training views of a run lose without the 5 % of its primitives
-that are worth least, by several ways to say so.
+PSNR and SSIM are means over all held-out views, which decide nothing; bytes are those of the files, of a whole model
+its numbers in float32.
+Rows go to benchmarks/results/smaller.json as they come, and only what is missing is run; runs stay in outputs/smaller.
+--docs puts the table between the markers of docs/tradeoffs.md; --print runs nothing. --orders RUN_DIR prints what the
+held-back training views of a run lose without the 5 % of its primitives that are worth least, by several ways to say
+so.
 """
 
 from __future__ import annotations
@@ -84,7 +88,14 @@ SHOWN = {
 
 def words(scene: str, data: Path | None, seed: int) -> list[str]:
     where = [] if data is None else [f"scene.{'vdb' if scene.startswith('fire') else 'path'}='{data.resolve()}'"]
-    return [*SCENES[scene], *where, f"seed={seed}", "renderer.threads=1", "train.eval_every=0", f"output_dir='{RUNS / f'{scene}-{seed}'}'"]
+    return [
+        *SCENES[scene],
+        *where,
+        f"seed={seed}",
+        "renderer.threads=1",
+        "train.eval_every=0",
+        f"output_dir='{RUNS / f'{scene}-{seed}'}'",
+    ]
 
 
 def scene_of(scene: str, data: Path | None, seed: int, known: list[str], send: Any) -> None:
@@ -109,7 +120,15 @@ def scene_of(scene: str, data: Path | None, seed: int, known: list[str], send: A
     begun, metrics = time.process_time(), read_metrics(folder)
     if "as trained" not in known:
         whole = 4 * metrics["parameters"]
-        tell("as trained", whole, metrics["psnr"], metrics["ssim"], begun, primitives=metrics["primitives"], steps=metrics["iterations"])
+        tell(
+            "as trained",
+            whole,
+            metrics["psnr"],
+            metrics["ssim"],
+            begun,
+            primitives=metrics["primitives"],
+            steps=metrics["iterations"],
+        )
     small = folder.with_name(f"{folder.name}-pruned")
     if "pruned" not in known or not (small / "metrics.json").exists():
         begun = time.process_time()
@@ -149,7 +168,8 @@ def scene_of(scene: str, data: Path | None, seed: int, known: list[str], send: A
 
 
 def orders(folder: Path, share: float = 0.05) -> None:
-    """What a run's judged training views lose without a share of its primitives, least first, by three measures of what they are worth."""
+    """What a run's judged training views lose without a share of its primitives, least first, by three measures of what
+    they are worth."""
     torch.set_num_threads(1)
     config, task, model, _ = load_run(folder)
     dataset = load_dataset(config, task, run_dir=folder)
@@ -170,7 +190,9 @@ def weight_in(model: Primitives, dataset: Dataset, index: int, settings: Any) ->
     """(N,) sums of weights in a training view."""
     view = dataset.train.view(index)
     params = {name: value.detach().requires_grad_() for name, value in model.params.items()}
-    output = render(Primitives(model.density, model.colour, params), view.camera, view.conditions, settings, dataset.background)
+    output = render(
+        Primitives(model.density, model.colour, params), view.camera, view.conditions, settings, dataset.background
+    )
     tally = output.watch(torch.ones(output.rgb.shape[:2]))
     output.rgb.sum().backward()
     return tally.of_all(model.count)[0]
@@ -186,13 +208,21 @@ def table(rows: list[dict[str, Any]], cpu: str) -> str:
             if not own:
                 continue
             first = base[own[0]["seed"]]
-            named = f"**{SHOWN[scene]}**, {first['primitives']:,} primitives, {first['steps']:,} views" if what == "as trained" else what
+            named = (
+                f"**{SHOWN[scene]}**, {first['primitives']:,} primitives, {first['steps']:,} views"
+                if what == "as trained"
+                else what
+            )
             made.row(
                 named,
                 f"{np.mean([r['bytes'] for r in own]):,.0f}",
-                "" if what in ("as trained", "trained as long") else spread([base[r["seed"]]["bytes"] / r["bytes"] for r in own], 2),
+                ""
+                if what in ("as trained", "trained as long")
+                else spread([base[r["seed"]]["bytes"] / r["bytes"] for r in own], 2),
                 f"{spread([r['psnr'] for r in own], 2)} dB",
-                "" if what == "as trained" else f"{np.mean([r['psnr'] - base[r['seed']]['psnr'] for r in own]):+.3f} dB",
+                ""
+                if what == "as trained"
+                else f"{np.mean([r['psnr'] - base[r['seed']]['psnr'] for r in own]):+.3f} dB",
                 spread([r["ssim"] for r in own], 4),
             )
     seeds = {scene: len({r["seed"] for r in rows if r["scene"] == scene}) for scene in SCENES}
@@ -225,7 +255,12 @@ def main() -> None:
         context = multiprocessing.get_context("spawn")
         queue = context.Manager().Queue()
         with ProcessPoolExecutor(args.jobs, context) as pool:
-            asked = [(scene, seed) for seed in range(args.seeds) for scene in args.scenes if scene not in data or data[scene] is not None]
+            asked = [
+                (scene, seed)
+                for seed in range(args.seeds)
+                for scene in args.scenes
+                if scene not in data or data[scene] is not None
+            ]
             waiting = set()
             for scene, seed in asked:
                 known = [r["what"] for r in rows if (r["scene"], r["seed"]) == (scene, seed)]
@@ -235,9 +270,15 @@ def main() -> None:
             while waiting or not queue.empty():
                 while not queue.empty():
                     rows.append(queue.get())
-                    cpu = cpu if cpu_name() in cpu.split("; ") else "; ".join(filter(None, (cpu, cpu_name())))  # rows may be of several
+                    cpu = (
+                        cpu if cpu_name() in cpu.split("; ") else "; ".join(filter(None, (cpu, cpu_name())))
+                    )  # rows may be of several
                     RESULTS.write_text(
-                        json.dumps({"cpu": cpu, "rows": sorted(rows, key=lambda r: (r["scene"], r["seed"], r["what"]))}, indent=1) + "\n"
+                        json.dumps(
+                            {"cpu": cpu, "rows": sorted(rows, key=lambda r: (r["scene"], r["seed"], r["what"]))},
+                            indent=1,
+                        )
+                        + "\n"
                     )
                     print({k: v for k, v in rows[-1].items() if k != "kept"}, flush=True)
                 done = {future for future in waiting if future.done()}

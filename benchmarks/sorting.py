@@ -1,11 +1,14 @@
-"""What the order of compositing costs and gains: sort=entry and samples=2 against sort=center, and both orders against the joint volume.
+"""What the order of compositing costs and gains: sort=entry and samples=2 against sort=center, and both orders against
+the joint volume.
 
-    python benchmarks/sorting.py [--scene 2000x400] [--run RUN_DIR] [--view 0] [--size 128] [--steps 64] [--rounds 7] [--threads 0] [--record]
+    python benchmarks/sorting.py [--scene 2000x400] [--run RUN_DIR] [--view 0] [--size 128] [--steps 64] [--rounds 7]
+    [--threads 0] [--record]
 
-Draws a random scene of overlapping primitives (benchmarks/render.py) and, with --run, the model of a finished run from one of its
-test views. Errors are those of an image ``size`` pixels wide against the marched sum of densities (neuprim.core.render.joint):
-"order" keeps every primitive's opacity, so that only the order differs; "field" is the sum of the densities as they are, clamped
-at zero, so that it also counts the renderer's clamps and cuts. Times are ratios to sort=center at the full size, the fastest of
+Draws a random scene of overlapping primitives (benchmarks/render.py) and, with --run, the model of a finished run from
+one of its test views. Errors are those of an image ``size`` pixels wide against the marched sum of densities
+(neuprim.core.render.joint): "order" keeps every primitive's opacity, so that only the order differs; "field" is the sum
+of the densities as they are, clamped at zero, so that it also counts the renderer's clamps and cuts. Times are ratios
+to sort=center at the full size, the fastest of
 ``rounds``, taken in turns in one process; the backward column is the backward pass alone. --record writes the table to
 benchmarks/results/sorting.json and docs/performance.md.
 """
@@ -40,7 +43,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def from_run(folder: Path, index: int) -> tuple[str, tuple[Lowered, Camera, Tensor]]:
-    """The model of a finished run, as leaves that take gradients, one of its test cameras, and its background; named."""
+    """The model of a finished run, as leaves that take gradients, one of its test cameras, and its background;
+    named."""
     from neuprim.runs.open import load_dataset, load_run
 
     config, task, model, _ = load_run(folder)
@@ -52,7 +56,9 @@ def from_run(folder: Path, index: int) -> tuple[str, tuple[Lowered, Camera, Tens
     return name, (model.lower(shot.camera, shot.conditions), shot.camera, dataset.background)
 
 
-def ratios(lowered: Lowered, camera: Camera, background: Tensor, settings: RenderSettings, rounds: int) -> dict[str, list[float]]:
+def ratios(
+    lowered: Lowered, camera: Camera, background: Tensor, settings: RenderSettings, rounds: int
+) -> dict[str, list[float]]:
     """Seconds of the forward pass and of the backward pass of every variant, in the order of VARIANTS."""
     forward: list[Callable[[], Any]] = []
     backward: list[Callable[[], Any]] = []
@@ -79,7 +85,12 @@ def main() -> None:
     parser.add_argument("--run", type=Path, help="a finished run's directory")
     parser.add_argument("--view", type=int, default=0, help="which of the run's test views")
     parser.add_argument("--size", type=int, default=128, help="width of the images whose errors are measured")
-    parser.add_argument("--steps", type=int, default=64, help="even divisions per ray of the joint volume, beside the ends of all chords")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=64,
+        help="even divisions per ray of the joint volume, beside the ends of all chords",
+    )
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--record", action="store_true")
@@ -94,7 +105,9 @@ def main() -> None:
     table = Table("scene", "drawn with", "order: PSNR, mean abs", "field: PSNR, mean abs", "forward", "backward")
     for name, (lowered, camera, background) in scenes.items():
         small = camera.resized(args.size, max(1, round(camera.height * args.size / camera.width)))
-        order, field = (sorting_errors(lowered, small, settings, background, args.steps, keep) for keep in ("opacity", "density"))
+        order, field = (
+            sorting_errors(lowered, small, settings, background, args.steps, keep) for keep in ("opacity", "density")
+        )
         times = ratios(lowered, camera, background, settings, args.rounds)
         for i, (variant, knobs) in enumerate(VARIANTS.items()):
             row: dict[str, Any] = {"scene": name, "variant": variant, **{k: v[i] / v[0] for k, v in times.items()}}
@@ -102,7 +115,9 @@ def main() -> None:
             if "samples" not in knobs:
                 found = [e[settings.sort if "sort" not in knobs else knobs["sort"]] for e in (order, field)]
                 cells = [f"{e.psnr:.2f} dB, {e.mean_abs:.5f}" for e in found]
-                row |= {k: {"psnr": e.psnr, "mean_abs": e.mean_abs} for k, e in zip(("order", "field"), found, strict=True)}
+                row |= {
+                    k: {"psnr": e.psnr, "mean_abs": e.mean_abs} for k, e in zip(("order", "field"), found, strict=True)
+                }
             table.row(name, variant, *cells, f"{row['forward']:.2f}", f"{row['backward']:.2f}")
             rows.append(row)
     if args.record:

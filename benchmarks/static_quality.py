@@ -1,11 +1,14 @@
-"""Quality of the static task on a NeRF-synthetic scene: PSNR by primitives and steps, of the preset and of the paper's form.
+"""Quality of the static task on a NeRF-synthetic scene: PSNR by primitives and steps, of the preset and of the paper's
+form.
 
-    python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2800x2500 2000x2500x8:0 ...] [--jobs 2] [--readme] [--docs]
+    python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2800x2500 2000x2500x8:0 ...] [--jobs 2] [--readme]
+    [--docs]
 
-DIR holds the scene (transforms_train.json, ...). Every run is the preset `quick`, its own form or another, K:EDGE, for so many steps, one view
-each, on one thread: budgets in steps are the same on every machine. Numbers are means over seeds
-+- half the spread, on the test views, of the last checkpoint. Results go to benchmarks/results/static_quality.json after every run, and only what
-is missing is run. --docs puts the table between the markers in docs/static.md, --readme a short one in README.md; without DIR nothing is run.
+DIR holds the scene (transforms_train.json, ...). Every run is the preset `quick`, its own form or another, K:EDGE, for
+so many steps, one view each, on one thread: budgets in steps are the same on every machine. Numbers are means over
+seeds +- half the spread, on the test views, of the last checkpoint. Results go to
+benchmarks/results/static_quality.json after every run, and only what is missing is run. --docs puts the table between
+the markers in docs/static.md, --readme a short one in README.md; without DIR nothing is run.
 """
 
 from __future__ import annotations
@@ -39,7 +42,13 @@ def group_of(text: str) -> Group:
 
 def trial(scene: Path, group: Group, seed: int) -> Trial:
     primitives, steps, form = group
-    words = ["task=static", "scene=blender", f"scene.path='{scene}'", "train.background=white", f"model.primitives={primitives}"]
+    words = [
+        "task=static",
+        "scene=blender",
+        f"scene.path='{scene}'",
+        "train.background=white",
+        f"model.primitives={primitives}",
+    ]
     words += [*Form.named(form).words, "train.population.every=200"]  # as the preset has it, however short
     return Trial(f"{primitives}-{steps}-{form}-{seed}", tuple(words), steps, seed, 0, (("form", form),))
 
@@ -48,7 +57,12 @@ def described(scene: Path) -> dict[str, Any]:
     """Name, image width and test views of the scene."""
     frames = json.loads((scene / "transforms_test.json").read_text())["frames"]
     with Image.open(scene / f"{frames[0]['file_path']}.png") as image:
-        return {"scene": scene.name, "name": "NeRF-synthetic " + scene.name.partition("_")[0], "size": image.width, "views": len(frames)}
+        return {
+            "scene": scene.name,
+            "name": "NeRF-synthetic " + scene.name.partition("_")[0],
+            "size": image.width,
+            "views": len(frames),
+        }
 
 
 def groups(results: dict[str, Any]) -> dict[Group, list[dict[str, Any]]]:
@@ -109,7 +123,14 @@ def main() -> None:
     if args.scene:
         scene = args.scene.resolve()
         trials = [trial(scene, group_of(row), seed) for seed in range(args.seeds) for row in args.rows]
-        run_all(trials, RESULTS, KEYS, args.jobs, lambda row: f"{row['psnr']:.2f} dB", {"cpu": cpu_name(), **described(scene)})
+        run_all(
+            trials,
+            RESULTS,
+            KEYS,
+            args.jobs,
+            lambda row: f"{row['psnr']:.2f} dB",
+            {"cpu": cpu_name(), **described(scene)},
+        )
     results = json.loads(RESULTS.read_text())
     print(table(results))
     if args.readme:

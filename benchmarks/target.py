@@ -1,16 +1,20 @@
-"""Does `neuprim run … target.psnr=DB budget=…` find the smallest model? A grid search of sizes against target runs of the same scene.
+"""Does `neuprim run … target.psnr=DB budget=…` find the smallest model? A grid search of sizes against target runs of
+the same scene.
 
-    python benchmarks/target.py [--scenes solids chair fire lit_solids] [--chair DIR] [--fire DIR] [--seeds 3] [--work DIR] [--grid] [--docs] [--print]
+    python benchmarks/target.py [--scenes solids chair fire lit_solids] [--chair DIR] [--fire DIR] [--seeds 3] [--work
+    DIR] [--grid] [--docs] [--print]
 
-The grid trains every size at full length, as the preset has it and with less of what most of a primitive's numbers hang on, judged by the training views that
-a target run holds out; once, with seed 0. Between its points the bytes that a PSNR takes are interpolated (log of bytes over PSNR), so the smallest model is
-that of a continuous grid. Target runs search the same scene with every seed. *ratio* is bytes of the full run that a target run chose over those of the grid's
-smallest that has the target, both stored at the usual level. *first full run* is what was expected of it, from trials alone, and what it had; *stored* what the
+The grid trains every size at full length, as the preset has it and with less of what most of a primitive's numbers hang
+on, judged by the training views that a target run holds out; once, with seed 0. Between its points the bytes that a
+PSNR takes are interpolated (log of bytes over PSNR), so the smallest model is that of a continuous grid. Target runs
+search the same scene with every seed. *ratio* is bytes of the full run that a target run chose over those of the grid's
+smallest that has the target, both stored at the usual level. *first full run* is what was expected of it, from trials
+alone, and what it had; *stored* what the
 model has, pruned and in as few bits as still meet the target; *bytes* are of that.
 
-It is a reduced comparison: half of the presets' views, one thread, some minutes of one core a search. Trainings are kept in --work, so that a
-benchmark that is cut short goes on; --grid trains the grid alone. Results go to benchmarks/results/target.json; --docs puts the tables between the markers
-of docs/tradeoffs.md, --print runs nothing.
+It is a reduced comparison: half of the presets' views, one thread, some minutes of one core a search. Trainings are
+kept in --work, so that a benchmark that is cut short goes on; --grid trains the grid alone. Results go to
+benchmarks/results/target.json; --docs puts the tables between the markers of docs/tradeoffs.md, --print runs nothing.
 """
 
 from __future__ import annotations
@@ -95,10 +99,17 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as temporary:
             for name in args.scenes:
                 work = args.work or Path(temporary)
-                where = [] if data.get(name) is None else [f"scene.{'vdb' if name == 'fire' else 'path'}='{data[name].resolve()}'"]
+                where = (
+                    []
+                    if data.get(name) is None
+                    else [f"scene.{'vdb' if name == 'fire' else 'path'}='{data[name].resolve()}'"]
+                )
                 grid = gridded(name, where, work)
                 if not args.grid:
-                    found[name] = {**grid, "runs": [r for seed in range(args.seeds) for r in searched(name, where, work, seed)]}
+                    found[name] = {
+                        **grid,
+                        "runs": [r for seed in range(args.seeds) for r in searched(name, where, work, seed)],
+                    }
                     write_json(RESULTS, {**found, "cpu": cpu_name()})
     if args.grid:
         return
@@ -108,7 +119,14 @@ def main() -> None:
 
 
 def words(name: str, where: Sequence[str], out: Path) -> list[str]:
-    return [*SCENES[name].words, *where, "renderer.threads=1", "train.eval_every=0", "resume=true", f"output_dir='{out}'"]
+    return [
+        *SCENES[name].words,
+        *where,
+        "renderer.threads=1",
+        "train.eval_every=0",
+        "resume=true",
+        f"output_dir='{out}'",
+    ]
 
 
 def searched(name: str, where: Sequence[str], work: Path, seed: int) -> list[dict[str, Any]]:
@@ -159,10 +177,17 @@ def gridded(name: str, where: Sequence[str], work: Path) -> dict[str, Any]:
             packed, text = out / "packed.neuprim", (out / "config.yaml").read_text(encoding="utf-8")
             save_compressed(packed, model, task.name, {}, bit_table(USUAL_LEVEL, (), model.specs), text)
             grid.append(
-                {"less": less, "primitives": size, "psnr": outcome.psnr, "bytes": packed.stat().st_size, "seconds": outcome.seconds}
+                {
+                    "less": less,
+                    "primitives": size,
+                    "psnr": outcome.psnr,
+                    "bytes": packed.stat().st_size,
+                    "seconds": outcome.seconds,
+                }
             )
             print(
-                f"{name}: {size} primitives {less}: {outcome.psnr:.2f} dB, {grid[-1]['bytes']} bytes, {outcome.seconds:.0f} s", flush=True
+                f"{name}: {size} primitives {less}: {outcome.psnr:.2f} dB, {grid[-1]['bytes']} bytes, {outcome.seconds:.0f} s",
+                flush=True,
             )
     return {"words": scene.words, "hold_out": every, "grid": grid}
 
@@ -189,7 +214,19 @@ def report(name: str, result: Mapping[str, Any]) -> str:
         own = {g["less"]: g for g in result["grid"] if g["primitives"] == size}
         sizes.row(f"{size:,} primitives", *(f"{own[w]['psnr']:.2f} dB, {own[w]['bytes']:,} bytes" for w in less))
     print()
-    table = Table("target", "seed", "found", "time", "trained", "first full run", "held out", "stored", "test views", "bytes", "ratio")
+    table = Table(
+        "target",
+        "seed",
+        "found",
+        "time",
+        "trained",
+        "first full run",
+        "held out",
+        "stored",
+        "test views",
+        "bytes",
+        "ratio",
+    )
     for run in result["runs"]:
         (value, doubt), had = run["first"]
         turned = "".join(f", {key.rpartition('.')[2]} {v}" for key, v in run["words"].items())

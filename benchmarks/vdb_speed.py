@@ -2,8 +2,9 @@
 
     python benchmarks/vdb_speed.py DIR [--against DIR_OF_ANOTHER_READER] [--rounds N]
 
-``--against`` names a folder with a module ``purevdb`` whose ``read(path)`` returns ``({name: {"values": …}}, …)``; both readers
-then take turns in the same process, over the same files and grids, and the ratio of their best rounds is printed.
+``--against`` names a folder with a module ``purevdb`` whose ``read(path)`` returns ``({name: {"values": …}}, …)``; both
+readers then take turns in the same process, over the same files and grids, and the ratio of their best rounds is
+printed.
 """
 
 from __future__ import annotations
@@ -35,14 +36,19 @@ def main() -> None:
     parser.add_argument("--against", type=Path)
     parser.add_argument("--rounds", type=int, default=3)
     args = parser.parse_args()
-    files = [(p, [g.name for g in read_header(p).grids if g.undecodable() is None]) for p in sorted(args.folder.glob("*.vdb"))]
+    files = [
+        (p, [g.name for g in read_header(p).grids if g.undecodable() is None])
+        for p in sorted(args.folder.glob("*.vdb"))
+    ]
     readers: dict[str, Callable[[], int]] = {"neuprim": lambda: sum(leaves(path, names) for path, names in files)}
     if args.against:
         sys.path.insert(0, str(args.against))
         other = importlib.import_module("purevdb")
 
         def compare() -> int:
-            return sum(grid["values"].nbytes for path, names in files for grid in other.read(str(path), names)[0].values())
+            return sum(
+                grid["values"].nbytes for path, names in files for grid in other.read(str(path), names)[0].values()
+            )
 
         readers["other"] = compare
     best: dict[str, float] = {}
@@ -54,7 +60,9 @@ def main() -> None:
     if len(set(sizes.values())) != 1:
         raise SystemExit(f"the readers decoded different amounts: {sizes}")
     stored = sum(path.stat().st_size for path, _ in files)
-    print(f"{len(files)} files, {stored / 1e6:.1f} MB on disk, {sizes['neuprim'] / 1e6:.1f} MB of float32 leaves, best of {args.rounds}")
+    print(
+        f"{len(files)} files, {stored / 1e6:.1f} MB on disk, {sizes['neuprim'] / 1e6:.1f} MB of float32 leaves, best of {args.rounds}"
+    )
     for name, seconds in best.items():
         print(f"{name:8} {sizes[name] / 1e6 / seconds:7.0f} MB/s")
     if args.against:

@@ -1,16 +1,20 @@
-"""What a volume model is worth in voxels: images, voxels or both to learn from, several densities, at equal bytes and equal steps.
+"""What a volume model is worth in voxels: images, voxels or both to learn from, several densities, at equal bytes and
+equal steps.
 
-    python benchmarks/voxels.py DIR [--frames 1:40] [--iterations 2500] [--seeds 3] [--kilobytes 1240] [--forms ...] [--from ...] [--docs]
+    python benchmarks/voxels.py DIR [--frames 1:40] [--iterations 2500] [--seeds 3] [--kilobytes 1240] [--forms ...]
+    [--from ...] [--docs]
 
-DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40), seen by 40 cameras at
-96 x 96, two of them held out. Each form gets as many primitives as fit into the bytes in float32. Errors of sigma are those of
-metrics.json: on all of the files' own voxels in the sequence's box, means over three frames of each third. Images are judged by
-held-out cameras, inside the union mask. All runs take equally many steps; --seconds gives each as many seconds instead.
+DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40), seen by
+40 cameras at 96 x 96, two of them held out. Each form gets as many primitives as fit into the bytes in float32. Errors
+of sigma are those of metrics.json: on all of the files' own voxels in the sequence's box, means over three frames of
+each third. Images are judged by held-out cameras, inside the union mask. All runs take equally many steps; --seconds
+gives each as many seconds instead.
 
-Eight bits: every column of every parameter in 256 even steps between two of its quantiles, those of 0, 0.0001, 0.001 and 0.01 at each end
-that leave the least mean square; primitives along a Morton curve, columns one by one through zlib. The numbers after them are measured on
-what comes back. Everything runs on one thread. Results go to benchmarks/results/voxels.json, run by run; --docs puts the table between the
-markers of docs/dynamic.md. Without DIR nothing is run. Time is that of the processor, as a machine may be busy with other things.
+Eight bits: every column of every parameter in 256 even steps between two of its quantiles, those of 0, 0.0001, 0.001
+and 0.01 at each end that leave the least mean square; primitives along a Morton curve, columns one by one through zlib.
+The numbers after them are measured on what comes back. Everything runs on one thread. Results go to
+benchmarks/results/voxels.json, run by run; --docs puts the table between the markers of docs/dynamic.md. Without DIR
+nothing is run. Time is that of the processor, as a machine may be busy with other things.
 """
 
 from __future__ import annotations
@@ -57,7 +61,11 @@ COMPARED = {
     "K = 2, p = 2, gain": ("both, every step",),
 }
 THIRDS = ("early", "middle", "late")
-KEYS = ("psnr_mask", "psnr_pooled_mask", *(f"sigma_{k}_{t}" for k in ("relative_l2", "psnr_active", "max_error") for t in THIRDS))
+KEYS = (
+    "psnr_mask",
+    "psnr_pooled_mask",
+    *(f"sigma_{k}_{t}" for k in ("relative_l2", "psnr_active", "max_error") for t in THIRDS),
+)
 CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
 
 
@@ -141,7 +149,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--kilobytes", type=float, nargs="*", default=[1240.0], help="of a model in float32")
     parser.add_argument("--forms", nargs="*", default=list(FORMS), choices=list(FORMS))
-    parser.add_argument("--from", dest="sources", nargs="*", default=[], choices=list(SOURCES), help="for every form, instead of the usual")
+    parser.add_argument(
+        "--from",
+        dest="sources",
+        nargs="*",
+        default=[],
+        choices=list(SOURCES),
+        help="for every form, instead of the usual",
+    )
     parser.add_argument("--docs", action="store_true")
     args = parser.parse_args()
     recorded: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"runs": []}
@@ -162,9 +177,13 @@ def main() -> None:
                             "asked": kilobytes,
                             "budget": budget[0] + budget[1],
                         }
-                        recorded |= json.loads(RESULTS.read_text()) if RESULTS.exists() else {}  # another process may add to it
+                        recorded |= (
+                            json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+                        )  # another process may add to it
                         recorded["runs"] = [r for r in recorded["runs"] if _key(r) != _key(entry)] + [entry]
-                        RESULTS.write_text(json.dumps(recorded, indent=1) + "\n")  # after every run: a long benchmark may be cut short
+                        RESULTS.write_text(
+                            json.dumps(recorded, indent=1) + "\n"
+                        )  # after every run: a long benchmark may be cut short
                         print(json.dumps(entry), flush=True)
     text = table(recorded)
     if args.docs:
@@ -200,9 +219,13 @@ def table(recorded: Mapping[str, Any]) -> str:
             cells("max_error", 2),
             f"{spread([r['float32']['psnr_mask'] for r in own], 2)} dB",
             f"{spread([r['8bit']['psnr_mask'] for r in own], 2)} dB",
-            f"{1e3 * np.mean([r['cpu_seconds'] / r['iterations'] for r in own]):.0f}" if all("cpu_seconds" in r for r in own) else "–",
+            f"{1e3 * np.mean([r['cpu_seconds'] / r['iterations'] for r in own]):.0f}"
+            if all("cpu_seconds" in r for r in own)
+            else "–",
         )
-    steps = " to ".join(f"{n:,}" for n in sorted({min(r["iterations"] for r in runs), max(r["iterations"] for r in runs)}))
+    steps = " to ".join(
+        f"{n:,}" for n in sorted({min(r["iterations"] for r in runs), max(r["iterations"] for r in runs)})
+    )
     return f"{made}\n\n{steps} steps, {len({r['seed'] for r in runs})} seed(s), one thread of {recorded['cpu']}."
 
 

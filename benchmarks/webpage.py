@@ -4,16 +4,21 @@
     python benchmarks/webpage.py --prepare [--docs]
     python benchmarks/webpage.py --print [--docs]
 
-ROW=RUN_DIR: a name in the table, and a finished run whose data are at hand. Held-out views of it, evenly spread, are drawn by its page, with every bit of its numbers, in headless Chromium
-and read back as floats, and by the run's backend, without a limit of transmittance (blending cannot stop a ray) and with the run's own: largest differences, colours
-as the model has them. Sizes and errors are those of pages at levels 0, 1 and 3, pictures of held-out views among them. Chords are the pixels of the silhouettes
-in the first view at 1280 x 720. Instructions of a chord are those of the page's own fragment shader after inlining and simplification (glslangValidator and
-spirv-opt; without them the column stays empty).
+ROW=RUN_DIR: a name in the table, and a finished run whose data are at hand. Held-out views of it, evenly spread, are
+drawn by its page, with every bit of its numbers, in headless Chromium and read back as floats, and by the run's
+backend, without a limit of transmittance (blending cannot stop a ray) and with the run's own: largest differences,
+colours
+as the model has them. Sizes and errors are those of pages at levels 0, 1 and 3, pictures of held-out views among them.
+Chords are the pixels of the silhouettes in the first view at 1280 x 720. Instructions of a chord are those of the
+page's own fragment shader after inlining and simplification (glslangValidator and spirv-opt; without them the column
+stays empty).
 
---prepare: milliseconds of the worker, preparation and sort, for models of 5,000 and 20,000 primitives where the trainings of `solids`, `smoke_fire` and
-`lit_solids` begin: the median of 60 frames after 60, while the camera moves, and while time or the light moves, too.
+--prepare: milliseconds of the worker, preparation and sort, for models of 5,000 and 20,000 primitives where the
+trainings of `solids`, `smoke_fire` and `lit_solids` begin: the median of 60 frames after 60, while the camera moves,
+and while time or the light moves, too.
 
-Needs a Chromium and the package playwright. Results go to benchmarks/results/webpage.json, by row and scene; --docs puts both tables into docs/export.md.
+Needs a Chromium and the package playwright. Results go to benchmarks/results/webpage.json, by row and scene; --docs
+puts both tables into docs/export.md.
 """
 
 from __future__ import annotations
@@ -107,10 +112,19 @@ def differences(tab: Tab, run: TrainedModel, count: int) -> Iterator[dict[str, A
 
 
 def chords(tab: Tab, run: TrainedModel) -> int:
-    """Pixels of all silhouettes of the first held-out view: ellipses of half axes hx and hy on sheared axes, none more than the screen."""
+    """Pixels of all silhouettes of the first held-out view: ellipses of half axes hx and hy on sheared axes, none more
+    than the screen."""
     view = run.dataset().test.view(0)
     scale = HIGH / view.camera.height
-    camera = replace(view.camera, fx=scale * view.camera.fx, fy=scale * view.camera.fy, cx=WIDE / 2, cy=HIGH / 2, width=WIDE, height=HIGH)
+    camera = replace(
+        view.camera,
+        fx=scale * view.camera.fx,
+        fy=scale * view.camera.fy,
+        cx=WIDE / 2,
+        cy=HIGH / 2,
+        width=WIDE,
+        height=HIGH,
+    )
     halves = tab.page.evaluate(_HALVES, [camera_numbers(camera), plain(view.conditions)])
     return round(sum(min(math.pi * hx * hy, WIDE * HIGH) if hx >= 0 else WIDE * HIGH for hx, hy in halves))
 
@@ -131,12 +145,19 @@ def plain(conditions: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def prepared(chromium: Any, scene: str, count: int, folder: Path) -> dict[str, Any]:
-    """Milliseconds of the worker. The model has not learned yet: how much work it is does not depend on what it would have."""
+    """Milliseconds of the worker. The model has not learned yet: how much work it is does not depend on what it would
+    have."""
     words, sweep = STARTS[scene]
     fitted = start(compose([*words, f"model.primitives={count}", "train.population.grow_from=1"], check_output=False))
     fitted.unlock()
     model, view, specs = fitted.model, fitted.dataset.test.view(0), fitted.task.conditions
-    page = web_page(scene, model, (0, 1, 2), fitted.config.renderer, conditions=[Condition(s, view.conditions[s.name]) for s in specs])
+    page = web_page(
+        scene,
+        model,
+        (0, 1, 2),
+        fitted.config.renderer,
+        conditions=[Condition(s, view.conditions[s.name]) for s in specs],
+    )
     path = folder / f"{scene}_{count}.html"
     path.write_text(page.text, encoding="utf-8")
     middle = model.params["means"].detach().mean(0)
@@ -144,7 +165,9 @@ def prepared(chromium: Any, scene: str, count: int, folder: Path) -> dict[str, A
     around = orbit(view.camera, middle, fitted.dataset.up, away, 0.3, FRAMES)
     still = [dict(view.conditions) for _ in around]
     moved = read_conditions(specs, sweep)
-    moving = [values | {name: found[k] for name, found in moved.items()} for k, values in enumerate(still)] if moved else []
+    moving = (
+        [values | {name: found[k] for name, found in moved.items()} for k, values in enumerate(still)] if moved else []
+    )
     result: dict[str, Any] = {"scene": scene, "primitives": model.count}
     with open_tab(chromium, path) as tab:
         for key, values in (("camera", still), ("conditions", moving)):
@@ -159,7 +182,11 @@ def timed(tab: Tab, cameras: Sequence[Camera], conditions: Sequence[Mapping[str,
     frames = [[camera_numbers(camera), plain(values)] for camera, values in zip(cameras, conditions, strict=True)]
     rounds = [tab.page.evaluate(_TIMES, frames) for _ in range(2)]
     times = [one["milliseconds"] for one in rounds[-1]]
-    return {"median": statistics.median(times), "fastest": min(times), "drawn": statistics.median(one["count"] for one in rounds[-1])}
+    return {
+        "median": statistics.median(times),
+        "fastest": min(times),
+        "drawn": statistics.median(one["count"] for one in rounds[-1]),
+    }
 
 
 _TIMES = """async frames => {
@@ -184,7 +211,10 @@ def page_table(runs: Mapping[str, dict[str, Any]]) -> Table:
     for name, run in runs.items():
         worst = [f"{max(view[key] for view in run['views']):.1e}" for key in ("whole", "configured")]
         brightest = max(view["brightest"] for view in run["views"])
-        sizes = [f"{one['bytes'] / 1e6:.2f} MB" + (f", {one['psnr']:.1f} dB" if "psnr" in one else "") for one in run["levels"].values()]
+        sizes = [
+            f"{one['bytes'] / 1e6:.2f} MB" + (f", {one['psnr']:.1f} dB" if "psnr" in one else "")
+            for one in run["levels"].values()
+        ]
         work, chord = run["instructions"], run["chords"]
         low, high = (1e3 * chord * work["arithmetic"] / rate for rate in reversed(RATES)) if work else (0.0, 0.0)
         spent = (f"{work['arithmetic']}, {work['texels']}", f"{low:.0f}–{high:.0f} ms") if work else ("", "")
@@ -222,7 +252,9 @@ def main() -> None:
             for row, run in args.runs:
                 known["runs"][row] = measured(chromium, Path(run), args.views, Path(name))
             if args.prepare:
-                known["prepare"] = [prepared(chromium, scene, count, Path(name)) for scene in STARTS for count in COUNTS]
+                known["prepare"] = [
+                    prepared(chromium, scene, count, Path(name)) for scene in STARTS for count in COUNTS
+                ]
         write_json(RESULTS, known | {"cpu": cpu_name()})
     tables = {"webpage": page_table(known["runs"]), "webpage-prepare": prepare_table(known["prepare"])}
     if args.docs:

@@ -23,7 +23,8 @@ INCLUDES = {"changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"
 OUTWARD = re.compile(r"\]\(((?:\.\./)+)([^)#\s]+)\)")
 ROLE = re.compile(r":(?:class|func|meth|mod|data|attr|exc):<code[^>]*>(~?)([\w.]+)(?:\(\))?</code>")
 LOADED = re.compile(
-    r"<(?:script|link|img|iframe|source|video|audio|embed|object)\b[^>]*?\b(?:src|href|data)=[\"']?((?:https?:)?//[^\"'>\s]+)", re.I
+    r"<(?:script|link|img|iframe|source|video|audio|embed|object)\b[^>]*?\b(?:src|href|data)=[\"']?((?:https?:)?//[^\"'>\s]+)",
+    re.I,
 )
 
 
@@ -46,7 +47,9 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
             if uri == source:
                 return f"]({'../' * len(folder.parts)}{name})"
         if files.get_file_from_path(uri) is None:
-            files.append(File(uri, str(ROOT), config.site_dir, config.use_directory_urls, inclusion=InclusionLevel.INCLUDED))
+            files.append(
+                File(uri, str(ROOT), config.site_dir, config.use_directory_urls, inclusion=InclusionLevel.INCLUDED)
+            )
         return f"]({'../' * len(folder.parts)}{uri})"
 
     return OUTWARD.sub(inside, markdown)

@@ -31,8 +31,12 @@ def primitive() -> tuple[Geometry, Cosine]:
     """An ellipsoid in the plane z = 0, with four neurons."""
     turn = math.radians(25.0)
     quats = torch.tensor([[math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]], dtype=torch.float64)
-    geometry = Geometry(torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[1.0, 0.55, 0.55]], dtype=torch.float64).log(), quats)
-    W1 = torch.tensor([[[0.20, 0.05, 0.0], [0.02, 0.26, 0.0], [0.12, -0.16, 0.0], [0.30, 0.22, 0.0]]], dtype=torch.float64)
+    geometry = Geometry(
+        torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[1.0, 0.55, 0.55]], dtype=torch.float64).log(), quats
+    )
+    W1 = torch.tensor(
+        [[[0.20, 0.05, 0.0], [0.02, 0.26, 0.0], [0.12, -0.16, 0.0], [0.30, 0.22, 0.0]]], dtype=torch.float64
+    )
     b1 = torch.tensor([[0.02, 0.05, -0.01, 0.08]], dtype=torch.float64)
     w2 = torch.tensor([[0.50, 0.42, 0.34, 0.24]], dtype=torch.float64)
     return geometry, Cosine(W1, b1, w2, torch.tensor([0.75], dtype=torch.float64))
@@ -71,7 +75,11 @@ def chord(target: Path) -> None:
 
     def sigma(x: np.ndarray) -> np.ndarray:
         points = torch.from_numpy(x.reshape(-1, 3))
-        return cosine_density(form, geometry, torch.zeros(len(points), dtype=torch.int64), points).numpy().reshape(x.shape[:-1])
+        return (
+            cosine_density(form, geometry, torch.zeros(len(points), dtype=torch.int64), points)
+            .numpy()
+            .reshape(x.shape[:-1])
+        )
 
     t = np.linspace(t_m - h, t_m + h, 4001)
     along = sigma(origin + t[:, None] * d)
@@ -79,16 +87,32 @@ def chord(target: Path) -> None:
 
     viewmat = look_at(torch.from_numpy(origin), torch.from_numpy(aim), torch.tensor([0.0, 0.0, 1.0]))
     K = torch.tensor([[[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]])  # one pixel whose centre looks along d
-    tensors = (geometry.means, geometry.log_scales, geometry.quats, form.W1, form.b1, form.w2, form.b2, torch.ones(1, 1).double())
+    tensors = (
+        geometry.means,
+        geometry.log_scales,
+        geometry.quats,
+        form.W1,
+        form.b1,
+        form.w2,
+        form.b2,
+        torch.ones(1, 1).double(),
+    )
     drawn = neuprim.rasterize(*tensors, viewmat[None], K, 1, 1, omega0=OMEGA0, backend="reference", alpha_max=0.9999)
     closed = -math.log1p(-float(drawn.alpha))
 
     plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.3), width_ratios=(1.15, 1), layout="constrained")
-    grid = np.stack([*np.meshgrid(np.linspace(-1.15, 1.15, 460), np.linspace(-0.85, 0.85, 340)), np.zeros((340, 460))], -1)
+    grid = np.stack(
+        [*np.meshgrid(np.linspace(-1.15, 1.15, 460), np.linspace(-0.85, 0.85, 340)), np.zeros((340, 460))], -1
+    )
     inside = np.sum((grid @ R / s) ** 2, -1) < 1
     shown = left.imshow(
-        np.where(inside, sigma(grid), np.nan), extent=(-1.15, 1.15, -0.85, 0.85), origin="lower", cmap="RdBu_r", vmin=-2.3, vmax=2.3
+        np.where(inside, sigma(grid), np.nan),
+        extent=(-1.15, 1.15, -0.85, 0.85),
+        origin="lower",
+        cmap="RdBu_r",
+        vmin=-2.3,
+        vmax=2.3,
     )
     ends = origin + np.array([[t_m - h], [t_m + h]]) * d
     left.plot(*np.stack([origin, origin + 4.2 * d])[:, :2].T, color="0.45", lw=1, ls="--")
@@ -97,7 +121,9 @@ def chord(target: Path) -> None:
     left.annotate("x$_m$", (origin + t_m * d)[:2], (6, -12), textcoords="offset points")
     for label, end, shift in (("t$_0$", ends[0], (-14, 5)), ("t$_1$", ends[1], (2, 9))):
         left.annotate(label, end[:2], shift, textcoords="offset points")
-    left.set(xlim=(-1.3, 1.3), ylim=(-0.85, 0.85), title="density of one primitive, a ray, their chord", xticks=[], yticks=[])
+    left.set(
+        xlim=(-1.3, 1.3), ylim=(-0.85, 0.85), title="density of one primitive, a ray, their chord", xticks=[], yticks=[]
+    )
     left.spines[:].set_visible(False)
     figure.colorbar(shown, ax=left, shrink=0.8, label="σ (1/scene unit)")
     right.plot(t - t_m, along, color="black", lw=1.5)
@@ -106,7 +132,9 @@ def chord(target: Path) -> None:
     right.axhline(0, color="0.6", lw=0.8)
     right.set_xticks([-1, -0.5, 0, 0.5, 1])
     right.set(xlabel="t − t$_m$ along the ray (scene units)", ylabel="σ", title="its integral")
-    text = f"closed form  I = {closed:.6f}\n4,000 steps  I = {summed:.6f}\nα = 1 − exp(−I) = {1 - math.exp(-closed):.4f}"
+    text = (
+        f"closed form  I = {closed:.6f}\n4,000 steps  I = {summed:.6f}\nα = 1 − exp(−I) = {1 - math.exp(-closed):.4f}"
+    )
     right.text(0.03, 0.03, text, transform=right.transAxes, va="bottom", family="monospace", fontsize=8)
     right.set_ylim(min(along.min(), 0) - 1.0, along.max() + 0.2)
     if abs(closed - summed) > 1e-5:

@@ -33,7 +33,9 @@ def reduce(path: Path) -> None:
 def main(run: Path, against: str = "scene", time: str = "0.62") -> None:
     for name, (show, beside, size) in PICTURES.items():
         out = FOLDER / f"inspect_{name}.png"
-        inspect_run(Request(run, show, {"time": time}, against=against if beside else None, out=out, size=size, overwrite=True))
+        inspect_run(
+            Request(run, show, {"time": time}, against=against if beside else None, out=out, size=size, overwrite=True)
+        )
         reduce(out)
 
 

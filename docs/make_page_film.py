@@ -47,7 +47,10 @@ def moments(page: dict[str, Any], side: int, count: int) -> Iterator[tuple[Camer
     for k in range(count):
         phase = k / count
         turned = phase if not conditions else 0.5 * _SWING * math.sin(2 * math.pi * phase)
-        yield around[round(turned * fine) % fine], {name: moved(name, value, phase) for name, value in conditions.items()}
+        yield (
+            around[round(turned * fine) % fine],
+            {name: moved(name, value, phase) for name, value in conditions.items()},
+        )
 
 
 def moved(name: str, value: Tensor, phase: float) -> Tensor:
@@ -85,7 +88,13 @@ def main() -> None:
         for k, image in enumerate(images):
             film[-1].paste(image, (k * args.side, 0))
     film[0].save(
-        args.target, save_all=True, append_images=film[1:], duration=round(1000 * _SECONDS / len(film)), loop=0, quality=60, method=6
+        args.target,
+        save_all=True,
+        append_images=film[1:],
+        duration=round(1000 * _SECONDS / len(film)),
+        loop=0,
+        quality=60,
+        method=6,
     )
     print(f"{args.target}: {len(film)} frames, {args.target.stat().st_size / 1e3:.0f} kB")
 

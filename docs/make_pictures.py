@@ -33,13 +33,19 @@ def columns_of(run: Path, views: int) -> list[list[Image.Image]]:
             return columns
     truths = sorted((run / "renders").glob("test_*_truth.png"))
     picks = [truths[round(i * (len(truths) - 1) / max(views - 1, 1))] for i in range(min(views, len(truths)))]
-    return [[Image.open(p).convert("RGB"), Image.open(p.with_name(p.name.replace("_truth", ""))).convert("RGB")] for p in picks]
+    return [
+        [Image.open(p).convert("RGB"), Image.open(p.with_name(p.name.replace("_truth", ""))).convert("RGB")]
+        for p in picks
+    ]
 
 
 def main(run: Path, target: Path, views: int = 4, side: int | None = None) -> None:
     columns = columns_of(run, views)
     if side:
-        columns = [[im.resize((side, side * im.height // im.width), Image.Resampling.BICUBIC) for im in pair] for pair in columns]
+        columns = [
+            [im.resize((side, side * im.height // im.width), Image.Resampling.BICUBIC) for im in pair]
+            for pair in columns
+        ]
     w, h = columns[0][0].size
     label = 18
     sheet = Image.new("RGB", (len(columns) * w, 2 * (h + label)), "white")

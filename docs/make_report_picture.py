@@ -27,7 +27,9 @@ def main(run: Path, target: Path, height: int = 1500) -> None:
         flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--window-size={WIDTH},{height}"]
         address = (run if run.is_file() else run / "report.html").resolve().as_uri()
         subprocess.run(
-            [browser, *flags, f"--user-data-dir={folder}/user", f"--screenshot={shot}", address], check=True, capture_output=True
+            [browser, *flags, f"--user-data-dir={folder}/user", f"--screenshot={shot}", address],
+            check=True,
+            capture_output=True,
         )
         with Image.open(shot) as image:
             small = image.convert("RGB").resize((WIDTH * 3 // 4, height * 3 // 4), Image.Resampling.LANCZOS)

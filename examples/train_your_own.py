@@ -34,8 +34,19 @@ def train(steps: int = 200) -> list[float]:
         "W1": (torch.rand(COUNT, NEURONS, 3) - 0.5) / 3, "b1": torch.rand(COUNT, NEURONS), "w2": 0.1 * torch.randn(COUNT, NEURONS),
         "b2": torch.full((COUNT, 1), 0.3), "colors": torch.rand(COUNT, 3),
     }  # fmt: skip
-    rates = {"means": 3e-3, "log_scales": 1e-2, "quats": 1e-2, "W1": 1e-3, "b1": 1e-3, "w2": 1e-2, "b2": 1e-2, "colors": 2e-2}
-    optimizer = torch.optim.Adam([{"params": [p.requires_grad_()], "lr": rates[name]} for name, p in primitives.items()])
+    rates = {
+        "means": 3e-3,
+        "log_scales": 1e-2,
+        "quats": 1e-2,
+        "W1": 1e-3,
+        "b1": 1e-3,
+        "w2": 1e-2,
+        "b2": 1e-2,
+        "colors": 2e-2,
+    }
+    optimizer = torch.optim.Adam(
+        [{"params": [p.requires_grad_()], "lr": rates[name]} for name, p in primitives.items()]
+    )
     losses = []
     for step in range(steps):
         frames = neuprim.rasterize(*primitives.values(), viewmats, Ks, SIZE, SIZE, backgrounds=torch.ones(3))

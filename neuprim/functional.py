@@ -39,7 +39,8 @@ class Rasterized:
     stats: tuple[RenderStats, ...]
 
     def watch(self, error: Tensor) -> tuple[Tally, ...]:
-        """Let the backward pass tell which primitives each camera saw, and which had a part in an error; call it before ``backward()``.
+        """Let the backward pass tell which primitives each camera saw, and which had a part in an error; call it before
+        ``backward()``.
 
         Args:
             error: (C, H, W) any measure of what is wrong at each pixel; no gradient reaches it.
@@ -81,52 +82,66 @@ def rasterize(
 
     Inside its ellipsoid, of semi-axes ``s = exp(log_scales)``, a primitive has the density (1 / scene unit)
 
-        sigma(x) = g (1 - |y|^2)^p f((x - mu) / m) / m,   m = max(s),   y = diag(1 / s) R^T (x - mu),   g = exp(log_gain),
-        f(u) = sum_k w2_k cos(omega0 (W1_k . u + b1_k)) + b2
+        sigma(x) = g (1 - |y|^2)^p f((x - mu) / m) / m,   m = max(s),   y = diag(1 / s) R^T (x - mu),   g =
+        exp(log_gain), f(u) = sum_k w2_k cos(omega0 (W1_k . u + b1_k)) + b2
 
-    and outside none. With I the integral of sigma along a pixel's ray, in closed form, and primitives sorted front to back,
+    and outside none. With I the integral of sigma along a pixel's ray, in closed form, and primitives sorted front to
+    back,
 
         alpha_i = min(alpha_max, 1 - exp(-max(I_i, 0))),   T_i = prod_{j<i} (1 - alpha_j),
         rgb = sum_i colors_i alpha_i T_i + T background.
 
     Gradients reach every primitive tensor, ``viewmats`` (poses) and ``backgrounds`` on every backend, and ``Ks`` with
-    ``backend="reference"``. A pose is best optimised through a parametrisation of rigid transforms: the gradient is that of
-    all twelve matrix entries.
+    ``backend="reference"``. A pose is best optimised through a parametrisation of rigid transforms: the gradient is
+    that of all twelve matrix entries.
 
     Args:
         means: (N, 3) centres, scene units.
         log_scales: (N, 3) natural logarithms of the semi-axes, scene units.
         quats: (N, 4) wxyz, any non-zero norm.
-        W1: (N, K, 3) frequencies, as stored: before the factor omega0. K = 0 to 256; 0 is an ellipsoid of constant density.
-        b1: (N, K) phases, before the factor omega0.
+        W1: (N, K, 3) frequencies, as stored: before the factor omega0. K = 0 to 256; 0 is an ellipsoid of constant
+        density. b1: (N, K) phases, before the factor omega0.
         w2: (N, K) amplitudes.
         b2: (N, 1) or (N,) offsets.
         colors: (N, channels), or (C, N, channels) for colours that depend on the camera. Any number of channels.
         viewmats: (C, 4, 4) world-to-camera, OpenCV axes (x right, y down, z forward). float64 is best.
-        Ks: (C, 3, 3) intrinsics in pixels, ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``; pixel centres lie at +0.5. Pixels need
+        Ks: (C, 3, 3) intrinsics in pixels, ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``; pixel centres lie at +0.5. Pixels
+        need
             not be square, nor the principal point central.
         width, height: size of every image in pixels.
         omega0: factor on the whole phase.
         edge: p; 0 is the hard edge of the paper's primitive, 1 and 2 are soft (:mod:`neuprim.core.model.edge`).
         log_gain: (N, 1) or (N,); None: g = 1. Beyond +-20 it counts as that and has no gradient.
         backgrounds: (channels,) or (C, channels); None is black.
-        **settings: fields of :class:`neuprim.core.settings.RenderSettings`: ``backend``, ``near``, ``depth``, ``alpha_min``, …
+        **settings: fields of :class:`neuprim.core.settings.RenderSettings`: ``backend``, ``near``, ``depth``,
+        ``alpha_min``, …
 
     The primitive tensors share one dtype, float32 or float64; images have that dtype too. The cpu backend computes
-    pixels in float32 even so, the reference everything in float64. They share one device, which images are on too; cameras and
-    backgrounds may be on the processor all the same.
+    pixels in float32 even so, the reference everything in float64. They share one device, which images are on too;
+    cameras and backgrounds may be on the processor all the same.
 
     Returns:
         :class:`Rasterized`; no cameras (C = 0) and no primitives (N = 0) are fine.
 
     Raises:
-        DataError: a tensor of the wrong type, dtype, device or shape; a camera that is not finite, rigid and free of skew.
+        DataError: a tensor of the wrong type, dtype, device or shape; a camera that is not finite, rigid and free of
+        skew.
             The message names the argument, what was found and what was expected.
         ConfigError: an unknown setting, or an impossible value.
         NonFiniteError: a primitive tensor or background holds NaN or infinity, or a quaternion is zero.
-        BackendUnavailable: ``Ks`` requires a gradient, and the backend, or any that "auto" may choose, does not compute it.
+        BackendUnavailable: ``Ks`` requires a gradient, and the backend, or any that "auto" may choose, does not compute
+        it.
     """
-    primitives = {"means": means, "log_scales": log_scales, "quats": quats, "W1": W1, "b1": b1, "w2": w2, "b2": b2, "colors": colors}
+    primitives = {
+        "means": means,
+        "log_scales": log_scales,
+        "quats": quats,
+        "W1": W1,
+        "b1": b1,
+        "w2": w2,
+        "b2": b2,
+        "colors": colors,
+    }
     if log_gain is not None:
         primitives["log_gain"] = log_gain
     knobs = _settings(settings)
@@ -134,9 +149,13 @@ def rasterize(
     cameras = _check_cameras(viewmats, Ks, width, height)
     views = len(viewmats)
     if colors.dim() == 3 and len(colors) != views:
-        raise _wrong("colors", f"shape {tuple(colors.shape)}", f"({views}, {count}, channels), one set per camera of viewmats")
+        raise _wrong(
+            "colors", f"shape {tuple(colors.shape)}", f"({views}, {count}, channels), one set per camera of viewmats"
+        )
     backdrop = _check_backgrounds(backgrounds, views, channels)
-    if Ks.requires_grad and not all(backend.differentiates_intrinsics for backend in backends.candidates(knobs, means.device.type)):
+    if Ks.requires_grad and not all(
+        backend.differentiates_intrinsics for backend in backends.candidates(knobs, means.device.type)
+    ):
         able = " or ".join(f'backend="{b.name}"' for b in backends.available() if b.differentiates_intrinsics)
         raise BackendUnavailable(
             f'rasterize: Ks requires a gradient, which backend="{knobs.backend}" does not compute; pass {able} or Ks.detach()'
@@ -206,12 +225,16 @@ def _check_primitives(t: dict[str, Tensor], omega0: float, edge: int) -> tuple[i
     if "log_gain" in t and not bool((finite := torch.isfinite(t["log_gain"].detach()).reshape(-1)).all()):
         raise NonFiniteError(f"rasterize: log_gain of primitive {int((~finite).nonzero()[0])} is not finite")
     if len(colors) not in (2, 3) or colors[-2] != n or colors[-1] < 1:
-        raise _wrong("colors", f"shape {colors}", f"(N, channels) or (C, N, channels) with N={n} as in means and channels >= 1")
+        raise _wrong(
+            "colors", f"shape {colors}", f"(N, channels) or (C, N, channels) with N={n} as in means and channels >= 1"
+        )
     for name, row, numbers in _non_finite(t):
         raise NonFiniteError(f"rasterize: {name} of primitive {row} is not finite: {numbers}")
     zero = ~t["quats"].detach().any(-1)
     if bool(zero.any()):
-        raise NonFiniteError(f"rasterize: quats of primitive {int(zero.nonzero()[0])} is zero; expected a non-zero quaternion")
+        raise NonFiniteError(
+            f"rasterize: quats of primitive {int(zero.nonzero()[0])} is zero; expected a non-zero quaternion"
+        )
     return n, colors[-1]
 
 
@@ -228,7 +251,8 @@ def _non_finite(tensors: dict[str, Tensor]) -> Iterator[tuple[str, int, list[flo
 
 
 def _check_cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Camera]:
-    """One camera per matrix; intrinsics that require a gradient stay tensors, which the reference backend differentiates."""
+    """One camera per matrix; intrinsics that require a gradient stay tensors, which the reference backend
+    differentiates."""
     for name, size in (("width", width), ("height", height)):
         if isinstance(size, bool) or not isinstance(size, int) or size < 1:
             raise _wrong(name, f"value {size!r}", "a positive int")

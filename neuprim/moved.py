@@ -1,6 +1,7 @@
 """Modules under the names they had before; imported under one, the module of today answers, with a DeprecationWarning.
 
-Only names that the documentation has given are here. The table is all that is needed: no file stands where a module used to be.
+Only names that the documentation has given are here. The table is all that is needed: no file stands where a module
+used to be.
 """
 
 from __future__ import annotations
@@ -55,7 +56,9 @@ MOVED = {
 class _Finder(MetaPathFinder, Loader):
     """Asked last, so that a module which is there always wins."""
 
-    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
         if fullname not in MOVED:
             return None
         return ModuleSpec(fullname, self, is_package=any(name.startswith(f"{fullname}.") for name in MOVED))

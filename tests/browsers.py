@@ -31,7 +31,10 @@ _PATIENCE = 120.0
 
 def executable() -> str:
     """The browser: $CHROMIUM, or one of the names that systems give it; skips the test without one."""
-    names = [os.environ.get("CHROMIUM"), *map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"))]
+    names = [
+        os.environ.get("CHROMIUM"),
+        *map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")),
+    ]
     found = next((name for name in names if name), None)
     if found is None:
         pytest.skip("no Chromium on this machine ($CHROMIUM, chromium, google-chrome)")
@@ -55,14 +58,20 @@ class Tab:
     def __init__(self, page: Any) -> None:
         self.page, self.faults = page, []
         page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.on("console", lambda message: self.faults.append(message.text) if message.type in ("error", "warning") else None)
+        page.on(
+            "console",
+            lambda message: self.faults.append(message.text) if message.type in ("error", "warning") else None,
+        )
         page.on("dialog", lambda dialog: self.faults.append(f"dialog: {dialog.message}"))
 
     def wait(self, condition: str, patience: float = _PATIENCE) -> None:
-        """Until a JavaScript expression is true; the page's policy forbids the driver's own way, which evaluates texts inside of it."""
+        """Until a JavaScript expression is true; the page's policy forbids the driver's own way, which evaluates texts
+        inside of it."""
         end = time.monotonic() + patience
         while not self.page.evaluate(condition):
-            assert time.monotonic() < end, f"{condition}: not within {patience} s; {self.faults} {self.page.inner_text('#fault')}"
+            assert time.monotonic() < end, (
+                f"{condition}: not within {patience} s; {self.faults} {self.page.inner_text('#fault')}"
+            )
             time.sleep(0.02)
 
     def numbers(
@@ -70,7 +79,9 @@ class Tab:
     ) -> np.ndarray:
         """(H, W, 4) float64: colour before the background (of DEPTH, sum of w z), and transmittance."""
         values = {name: value.double().tolist() for name, value in (conditions or {}).items()}
-        found = self.page.evaluate("([c, v, m, p]) => probe.numbers(c, v, m, p)", [camera_numbers(camera), values, mode, plane])
+        found = self.page.evaluate(
+            "([c, v, m, p]) => probe.numbers(c, v, m, p)", [camera_numbers(camera), values, mode, plane]
+        )
         assert found["exact"], "this browser blends 16-bit floats only"
         pixels = np.frombuffer(base64.b64decode(found["pixels"]), np.float32)
         return pixels.reshape(camera.height, camera.width, 4).astype(np.float64)
@@ -96,8 +107,11 @@ class Tab:
 
 
 @contextmanager
-def open_tab(started: Any, path: Path, width: int = 900, height: int = 640, script: str = "", draws: bool = True) -> Iterator[Tab]:
-    """A page from disk, drawn once. ``script`` runs before the page's own; with ``draws=False`` nobody waits for a picture."""
+def open_tab(
+    started: Any, path: Path, width: int = 900, height: int = 640, script: str = "", draws: bool = True
+) -> Iterator[Tab]:
+    """A page from disk, drawn once. ``script`` runs before the page's own; with ``draws=False`` nobody waits for a
+    picture."""
     page = started.new_page(viewport={"width": width, "height": height})
     if script:
         page.add_init_script(script)

@@ -27,7 +27,8 @@ def field(task: str, name: str, **settings: object) -> DensityField | ColourFiel
 
 
 def random_model(density: DensityField, colour: ColourField, count: int = 40, seed: int = 0) -> Primitives:
-    """Primitives whose every parameter is spread out, as after training: phases of several turns, weights of both signs."""
+    """Primitives whose every parameter is spread out, as after training: phases of several turns, weights of both
+    signs."""
     generator = torch.Generator().manual_seed(seed)
 
     def u(*shape: int) -> Tensor:
@@ -60,7 +61,10 @@ FIELDS: dict[str, tuple[str, Callable[[], tuple[DensityField, ColourField]]]] = 
         ),
     ),
     "additive": ("relight", lambda: (CosineDensity(2), field("relight", "LightNetwork", hidden=4))),
-    "multiplicative": ("relight", lambda: (CosineDensity(2), field("relight", "LightNetwork", hidden=3, form="multiplicative"))),
+    "multiplicative": (
+        "relight",
+        lambda: (CosineDensity(2), field("relight", "LightNetwork", hidden=3, form="multiplicative")),
+    ),
     "harmonics": ("relight", lambda: (CosineDensity(2), field("relight", "LightHarmonics", degree=4))),
 }  # type: ignore[dict-item]
 """Name -> task, and a density and a colour."""
@@ -75,7 +79,9 @@ def example(name: str, count: int = 40) -> tuple[TaskSpec, Primitives]:
 def goners(model: Primitives) -> dict[str, tuple[Piece, Tensor]]:
     """Of every piece of a model, every k-th primitive, with another k for each."""
     pieces = pieces_by_name(model.density, model.colour)
-    return {name: (piece, torch.arange(model.count) % (2 + i % 3) == 0) for i, (name, piece) in enumerate(pieces.items())}
+    return {
+        name: (piece, torch.arange(model.count) % (2 + i % 3) == 0) for i, (name, piece) in enumerate(pieces.items())
+    }
 
 
 def without_pieces(model: Primitives) -> Primitives:

@@ -26,7 +26,8 @@ def either_way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.fixture(params=["processor", "card"])
 def either_kernel(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Once by the processor's kernels, once by those of a card, on Warp's CPU blocks: where both begin and end in the processor's memory."""
+    """Once by the processor's kernels, once by those of a card, on Warp's CPU blocks: where both begin and end in the
+    processor's memory."""
     if request.param == "card":
         pytest.importorskip("warp", reason="the kernels of a card are written in Warp: pip install 'neuprim[cuda]'")
         monkeypatch.setattr(device, "computes", lambda where: True)

@@ -23,7 +23,8 @@ def modules() -> list[ModuleType]:
 
 
 def compiled_by(program: str) -> dict[str, list[str]]:
-    """Kernel -> types of arguments for which a process of its own compiled it, or found it on disk, while it ran ``program``."""
+    """Kernel -> types of arguments for which a process of its own compiled it, or found it on disk, while it ran
+    ``program``."""
     listing = (
         "import json, sys\n"
         "from numba.core.dispatcher import Dispatcher\n"
@@ -35,7 +36,9 @@ def compiled_by(program: str) -> dict[str, list[str]]:
         "            found[f'{value.py_func.__module__}.{value.py_func.__name__}'] = sorted(map(str, value.signatures))\n"
         "print(json.dumps(found))\n"
     )
-    done = subprocess.run([sys.executable, "-c", f"{program}\n{listing}"], capture_output=True, text=True, cwd=PACKAGE.parent, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", f"{program}\n{listing}"], capture_output=True, text=True, cwd=PACKAGE.parent, check=False
+    )
     assert done.returncode == 0, done.stderr
     found: dict[str, list[str]] = json.loads(done.stdout.splitlines()[-1])
     return found
@@ -54,7 +57,9 @@ class Source:
             if isinstance(node, ast.ImportFrom):
                 self.imported |= {alias.asname or alias.name: (node.module or "", alias.name) for alias in node.names}
             elif isinstance(node, ast.FunctionDef):
-                self.made_of[node.name] = set().union(*(_names(part) for part in node.body))  # not the decorators: they only compile it
+                self.made_of[node.name] = set().union(
+                    *(_names(part) for part in node.body)
+                )  # not the decorators: they only compile it
             elif isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
                 targets = node.targets if isinstance(node, ast.Assign) else [node.target]
                 for name in set().union(*(_names(target) for target in targets)):

@@ -17,7 +17,9 @@ def features(network: str) -> nn.Sequential:
         a, b, c = nn.Conv2d(3, 64, 11, 4, 2), nn.Conv2d(64, 192, 5, 1, 2), nn.Conv2d(192, 384, 3, 1, 1)
         d, e = nn.Conv2d(384, 256, 3, 1, 1), nn.Conv2d(256, 256, 3, 1, 1)
         pools = [nn.MaxPool2d(3, 2) for _ in range(3)]
-        return nn.Sequential(a, nn.ReLU(), pools[0], b, nn.ReLU(), pools[1], c, nn.ReLU(), d, nn.ReLU(), e, nn.ReLU(), pools[2])
+        return nn.Sequential(
+            a, nn.ReLU(), pools[0], b, nn.ReLU(), pools[1], c, nn.ReLU(), d, nn.ReLU(), e, nn.ReLU(), pools[2]
+        )
     layers: list[nn.Module] = []
     inputs = 3
     for word in VGG:

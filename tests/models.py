@@ -15,7 +15,8 @@ RED, GREEN, BLUE, YELLOW = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0)
 
 
 def quarters(size: int = 16, alpha: int | None = None) -> Image.Image:
-    """Red and green above, blue and yellow below; with ``alpha``, the red quarter has that one and the others are opaque."""
+    """Red and green above, blue and yellow below; with ``alpha``, the red quarter has that one and the others are
+    opaque."""
     pixels = np.zeros((size, size, 4 if alpha is not None else 3), np.uint8)
     half = size // 2
     for rows, columns, colour in (
@@ -32,14 +33,19 @@ def quarters(size: int = 16, alpha: int | None = None) -> Image.Image:
 
 
 def cube() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (24, 3), faces (12, 3) and texture coordinates (24, 2) of [-1, 1]^3, outward, all of the texture on every side.
+    """Vertices (24, 3), faces (12, 3) and texture coordinates (24, 2) of [-1, 1]^3, outward, all of the texture on
+    every side.
 
     Seen from +x and +z with y up, the texture is upright.
     """
     vertices, faces, uv = [], [], []
     # of each side: its normal, what is to the right and what is up for whoever looks at it
     sides = [((1, 0, 0), (0, 0, -1), (0, 1, 0)), ((-1, 0, 0), (0, 0, 1), (0, 1, 0)), ((0, 0, 1), (1, 0, 0), (0, 1, 0))]
-    sides += [((0, 0, -1), (-1, 0, 0), (0, 1, 0)), ((0, 1, 0), (1, 0, 0), (0, 0, -1)), ((0, -1, 0), (1, 0, 0), (0, 0, 1))]
+    sides += [
+        ((0, 0, -1), (-1, 0, 0), (0, 1, 0)),
+        ((0, 1, 0), (1, 0, 0), (0, 0, -1)),
+        ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
+    ]
     for normal, right, up in sides:
         first = len(vertices)
         for u, v in ((0, 0), (1, 0), (1, 1), (0, 1)):
@@ -67,7 +73,9 @@ def write_glb(path: Path, *parts: tuple[trimesh.Trimesh, np.ndarray]) -> Path:
 
 def write_obj(path: Path, texture: str = "skin.png") -> Path:
     """A square z = 0 with a texture and a triangle behind it without, an .mtl and a .png beside it."""
-    path.with_suffix(".mtl").write_text(f"newmtl skin\nKd 0 0 0\nmap_Kd -s 1 1 1 {texture}\n\nnewmtl back\nKd 1.0 0.5 0.0\n")
+    path.with_suffix(".mtl").write_text(
+        f"newmtl skin\nKd 0 0 0\nmap_Kd -s 1 1 1 {texture}\n\nnewmtl back\nKd 1.0 0.5 0.0\n"
+    )
     quarters().save(path.parent / "skin.png")
     path.write_text(
         f"mtllib {path.stem}.mtl\nv -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nv 0 -1 -1\nv 0 1 -1\n"

@@ -59,7 +59,11 @@ def camera_at(eye: Sequence[float], size: tuple[int, int] = (72, 56), focal: flo
 
 
 def page_of(
-    model: Primitives, path: Path, conditions: Mapping[str, Tensor] | None = None, settings: RenderSettings = SETTINGS, **more: Any
+    model: Primitives,
+    path: Path,
+    conditions: Mapping[str, Tensor] | None = None,
+    settings: RenderSettings = SETTINGS,
+    **more: Any,
 ) -> WebPage:
     """A page with one view, written to ``path``."""
     given = [Condition(_SPECS[name], value) for name, value in (conditions or {}).items()]

@@ -1,8 +1,8 @@
 """A card that is not there: tensors that say they are on another device, with their numbers in the processor's memory.
 
-What a card refuses, this refuses: tensors of both devices in one operation, other than a single number or an index, and reading a tensor as a
-numpy array. What makes a processor wait for a card is counted. The device is torch's "meta", which no operation of torch takes for the
-processor's.
+What a card refuses, this refuses: tensors of both devices in one operation, other than a single number or an index, and
+reading a tensor as a numpy array. What makes a processor wait for a card is counted. The device is torch's "meta",
+which no operation of torch takes for the processor's.
 """
 
 from __future__ import annotations
@@ -79,13 +79,29 @@ class Card(TorchDispatchMode):
             pointwise = torch.Tag.pointwise in func.tags
             for other in tensors:
                 allowed = isinstance(other, _OnCard) or (other.dim() == 0 and (pointwise or name in _INDEXED))
-                if not allowed and not (name in _INDEXED and isinstance(args[0], _OnCard) and other.dtype in (torch.int64, torch.bool)):
-                    raise RuntimeError(f"{name}: expected all tensors to be on the same device, found {[str(x.device) for x in tensors]}")
-        if cards and (name in _WAITS or (name == "aten::_to_copy" and asked is not None and torch.device(asked).type == "cpu")):
+                if not allowed and not (
+                    name in _INDEXED and isinstance(args[0], _OnCard) and other.dtype in (torch.int64, torch.bool)
+                ):
+                    raise RuntimeError(
+                        f"{name}: expected all tensors to be on the same device, found {[str(x.device) for x in tensors]}"
+                    )
+        if cards and (
+            name in _WAITS or (name == "aten::_to_copy" and asked is not None and torch.device(asked).type == "cpu")
+        ):
             self.waits["copy to the host" if name == "aten::_to_copy" else name.removeprefix("aten::")] += 1
-        if name == "aten::_to_copy" and not cards and asked is not None and torch.device(asked) == CARD and not kwargs.get("non_blocking"):
+        if (
+            name == "aten::_to_copy"
+            and not cards
+            and asked is not None
+            and torch.device(asked) == CARD
+            and not kwargs.get("non_blocking")
+        ):
             self.waits["copy to the card"] += 1
-        if name in _INDEXED and any(isinstance(x, Tensor) and x.dtype == torch.bool for x in tree_iter(args[1])) and cards:
+        if (
+            name in _INDEXED
+            and any(isinstance(x, Tensor) and x.dtype == torch.bool for x in tree_iter(args[1]))
+            and cards
+        ):
             self.waits["index by a mask"] += 1
         if asked is not None:
             kwargs = {**kwargs, "device": torch.device("cpu")}
@@ -116,7 +132,8 @@ def _held(value: Any) -> Any:
 
 @contextmanager
 def pretended(monkeypatch: pytest.MonkeyPatch, memory: int = 1 << 30) -> Iterator[Card]:
-    """Inside, this machine has a card with some bytes of memory, and a backend that draws on it: the processor's, with what it takes and makes moved."""
+    """Inside, this machine has a card with some bytes of memory, and a backend that draws on it: the processor's, with
+    what it takes and makes moved."""
     with monkeypatch.context() as patch:
         patch.setattr(device, "CARD", CARD.type)
         patch.setattr(device, "KINDS", ("cpu", CARD.type))
@@ -138,7 +155,9 @@ def pretended(monkeypatch: pytest.MonkeyPatch, memory: int = 1 << 30) -> Iterato
 
             return draw
 
-        row = Backend("card", load, backends.kernels_refuse, lambda: "a pretended card", checks=True, devices=(CARD.type,))
+        row = Backend(
+            "card", load, backends.kernels_refuse, lambda: "a pretended card", checks=True, devices=(CARD.type,)
+        )
         patch.setattr(backends, "TABLE", (row, *backends.TABLE))
         with _Written(), card:
             yield card

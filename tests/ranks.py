@@ -1,4 +1,5 @@
-"""Ranks that are threads of one process, so that trainings of several can be tried in a second: all is as between processes, but for the wire."""
+"""Ranks that are threads of one process, so that trainings of several can be tried in a second: all is as between
+processes, but for the wire."""
 
 from __future__ import annotations
 

@@ -17,7 +17,9 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 
 
-def camera(width: int = 64, height: int = 48, distance: float = 3.0, fov: float = 40.0, shift: tuple[float, float] = (0.0, 0.0)) -> Camera:
+def camera(
+    width: int = 64, height: int = 48, distance: float = 3.0, fov: float = 40.0, shift: tuple[float, float] = (0.0, 0.0)
+) -> Camera:
     """A camera on the diagonal, looking at the origin; ``shift`` moves the principal point off centre, in pixels."""
     eye = torch.tensor([0.5, -0.4, 0.77], dtype=torch.float64)
     view = look_at(eye / eye.norm() * distance, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))

@@ -14,7 +14,12 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import neuprim
 from neuprim.core.checked import Range, Unbounded, hints_of
 
-REQUIRED: dict[str, Any] = {"path": Path("folder"), "simulation": "smoke_fire", "direction": (0.0, 0.0, 1.0), "irradiance": (1.0, 1.0, 1.0)}
+REQUIRED: dict[str, Any] = {
+    "path": Path("folder"),
+    "simulation": "smoke_fire",
+    "direction": (0.0, 0.0, 1.0),
+    "irradiance": (1.0, 1.0, 1.0),
+}
 """What a dataclass needs beside its defaults."""
 
 
@@ -22,10 +27,16 @@ def settings_classes() -> list[type]:
     """All classes of the package whose name ends in Settings, and dataclasses that verify themselves."""
     found: dict[str, type] = {}
     for module in pkgutil.walk_packages(neuprim.__path__, "neuprim."):
-        if module.name.startswith(("neuprim.plugins.template", "neuprim.cli.__main__")) or module.name.endswith("__main__"):
+        if module.name.startswith(("neuprim.plugins.template", "neuprim.cli.__main__")) or module.name.endswith(
+            "__main__"
+        ):
             continue
         for name, value in vars(importlib.import_module(module.name)).items():
-            if isinstance(value, type) and value.__module__ == module.name and (name.endswith("Settings") or _verifies(value)):
+            if (
+                isinstance(value, type)
+                and value.__module__ == module.name
+                and (name.endswith("Settings") or _verifies(value))
+            ):
                 found[f"{module.name}.{name}"] = value
     return [found[name] for name in sorted(found)]
 
@@ -52,11 +63,16 @@ def leaves(hint: Any) -> Iterator[tuple[Any, tuple[Any, ...]]]:
 
 def unbounded_numbers(hint: Any) -> list[Any]:
     """The numbers of an annotation that say neither bounds nor why there are none."""
-    return [plain for plain, notes in leaves(hint) if plain in (int, float) and not any(isinstance(n, Range | Unbounded) for n in notes)]
+    return [
+        plain
+        for plain, notes in leaves(hint)
+        if plain in (int, float) and not any(isinstance(n, Range | Unbounded) for n in notes)
+    ]
 
 
 def bad_values(hint: Any) -> list[Any]:
-    """Values that a field must refuse: wrong types, beyond its bounds, and no numbers; none for a field that takes anything."""
+    """Values that a field must refuse: wrong types, beyond its bounds, and no numbers; none for a field that takes
+    anything."""
     options = list(leaves(hint))
     kinds = [plain for plain, _ in options]
     if Any in kinds and not _mapping(hint):
@@ -70,7 +86,15 @@ def bad_values(hint: Any) -> list[Any]:
     if type(None) not in kinds:
         found.append(None)
     if int in kinds or float in kinds:
-        found += [True, math.nan, math.inf, -math.inf, "nan", "many", *(v for plain, notes in options for v in beyond(plain, notes))]
+        found += [
+            True,
+            math.nan,
+            math.inf,
+            -math.inf,
+            "nan",
+            "many",
+            *(v for plain, notes in options for v in beyond(plain, notes)),
+        ]
     if kinds == [bool]:
         found += [1, 0, "yes", 1.0]
     if int in kinds:
@@ -93,4 +117,6 @@ def beyond(plain: Any, notes: tuple[Any, ...]) -> Iterator[float]:
 
 def _mapping(hint: Any) -> bool:
     origin = get_origin(hint)
-    return (isinstance(origin, type) and issubclass(origin, dict | types.MappingProxyType)) or getattr(origin, "__name__", "") == "Mapping"
+    return (isinstance(origin, type) and issubclass(origin, dict | types.MappingProxyType)) or getattr(
+        origin, "__name__", ""
+    ) == "Mapping"

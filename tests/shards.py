@@ -35,4 +35,8 @@ def whole_of(trainers: Sequence[Trainer]) -> dict[str, Tensor]:
 def different(found: dict[str, Tensor], expected: dict[str, Tensor]) -> list[str]:
     """Names of tensors whose bits differ."""
     assert found.keys() == expected.keys()
-    return [name for name, value in expected.items() if found[name].dtype != value.dtype or not torch.equal(found[name], value)]
+    return [
+        name
+        for name, value in expected.items()
+        if found[name].dtype != value.dtype or not torch.equal(found[name], value)
+    ]

@@ -6,4 +6,6 @@ import sys
 
 import pytest
 
-posix = pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX: signals between processes, permissions, links or a shell")
+posix = pytest.mark.skipif(
+    sys.platform == "win32", reason="needs POSIX: signals between processes, permissions, links or a shell"
+)

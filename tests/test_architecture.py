@@ -14,7 +14,9 @@ from neuprim.core.model.schema import ParameterSpec
 
 ROOT = Path(neuprim.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
-MODULES = {".".join((ROOT.name, *f.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__"): f for f in FILES}
+MODULES = {
+    ".".join((ROOT.name, *f.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__"): f for f in FILES
+}
 LONGEST = 400
 
 
@@ -30,7 +32,10 @@ def imported(path: Path) -> set[str]:
             if node.level:
                 base = ".".join([*package[: len(package) - node.level + 1], *([node.module] if node.module else [])])
             names |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
-        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in ("import_module", "__import__"):
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in (
+            "import_module",
+            "__import__",
+        ):
             names |= {a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)}
     return names
 
@@ -76,7 +81,18 @@ CORE: dict[str, set[str]] = {
     "conditions": {"errors", "model"},
     "channels": {"data", "errors", "io", "task"},
     "checkpoint": {"compressed", "errors", "io", "model", "task"},
-    "extensions": {"cameras", "channels", "checked", "conditions", "data", "errors", "model", "settings", "task", "volumes"},
+    "extensions": {
+        "cameras",
+        "channels",
+        "checked",
+        "conditions",
+        "data",
+        "errors",
+        "model",
+        "settings",
+        "task",
+        "volumes",
+    },
     "render": {"cameras", "compute", "errors", "metrics", "model", "notices", "settings"},
     "train": {"checked", "compute", "data", "errors", "model", "render", "task", "volumes"},
     "uses": {"checked", "errors", "extensions", "task", "train"},
@@ -96,13 +112,15 @@ MODULES = {".".join(parts(f)): f for f in FILES}
 
 
 def edges(path: Path) -> set[str]:
-    """The modules of the package that a file imports from, anywhere in it; of ``from package import module`` the module."""
+    """The modules of the package that a file imports from, anywhere in it; of ``from package import module`` the
+    module."""
     names = {name for name in imported(path) if name in MODULES} - {".".join(parts(path)), ROOT.name}
     return {name for name in names if not any(other.startswith(name + ".") for other in names)}
 
 
 def between(depth: int, allowed: dict[str, set[str]], inside: tuple[str, ...]) -> list[str]:
-    """Imports from one room to another that the list does not have, of the rooms ``depth`` names down from ``inside``."""
+    """Imports from one room to another that the list does not have, of the rooms ``depth`` names down from
+    ``inside``."""
     wrong = []
     for file in FILES:
         own = parts(file)
@@ -128,7 +146,11 @@ def circles(graph: dict[str, set[str]]) -> list[list[str]]:
                     seen.add(other)
                     todo.append(other)
         reach[node] = seen
-    found = {tuple(sorted(n for n in graph if n in reach[node] and node in reach[n])) for node in graph if node in reach[node]}
+    found = {
+        tuple(sorted(n for n in graph if n in reach[node] and node in reach[n]))
+        for node in graph
+        if node in reach[node]
+    }
     return [list(circle) for circle in sorted(found)]
 
 
@@ -138,15 +160,24 @@ def test_every_room_imports_only_what_the_list_allows() -> None:
 
 
 def test_the_lists_name_what_is_there_and_run_down() -> None:
-    there = {p.stem if p.suffix == ".py" else p.name for p in ROOT.iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()}
+    there = {
+        p.stem if p.suffix == ".py" else p.name
+        for p in ROOT.iterdir()
+        if p.suffix == ".py" or (p / "__init__.py").exists()
+    }
     assert set(ROOMS) == there - {"__init__", "__main__"} and len(ROOMS) <= MOST_ROOMS
-    core = {p.stem if p.suffix == ".py" else p.name for p in (ROOT / "core").iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()}
+    core = {
+        p.stem if p.suffix == ".py" else p.name
+        for p in (ROOT / "core").iterdir()
+        if p.suffix == ".py" or (p / "__init__.py").exists()
+    }
     assert set(CORE) == core - {"__init__"}
     assert circles(ROOMS) == [] and circles(CORE) == []
 
 
 def test_no_module_imports_itself_by_a_detour() -> None:
-    """Imports for types only and imports inside functions count too; packages that only re-export are the door of their room."""
+    """Imports for types only and imports inside functions count too; packages that only re-export are the door of their
+    room."""
     assert circles({name: edges(file) for name, file in MODULES.items()}) == []
 
 
@@ -224,7 +255,8 @@ def needed_at_run_time(path: Path) -> set[str]:
 
 
 def test_no_module_imports_itself_by_way_of_others() -> None:
-    """Imports inside functions count: a cycle that they hide is still one. The root package is left out, being behind every import."""
+    """Imports inside functions count: a cycle that they hide is still one. The root package is left out, being behind
+    every import."""
     graph = {name: needed_at_run_time(file) - {ROOT.name, name} for name, file in MODULES.items() if name != ROOT.name}
     size = len(graph) + 1
     while len(graph) < size:  # leave out what needs nothing, and what nothing needs
@@ -246,11 +278,18 @@ def test_files_stay_small() -> None:
 
 
 def test_tests_do_not_import_tests() -> None:
-    """What several of them need is in a module without ``test_`` in its name: else a change of one test is a change of others."""
+    """What several of them need is in a module without ``test_`` in its name: else a change of one test is a change of
+    others."""
     folder = Path(__file__).parent
     wrong = [
         f"{f.relative_to(folder)}:{node.lineno}"
-        for f in sorted([*folder.rglob("*.py"), *(folder.parent / "examples").rglob("*.py"), *(folder.parent / "benchmarks").rglob("*.py")])
+        for f in sorted(
+            [
+                *folder.rglob("*.py"),
+                *(folder.parent / "examples").rglob("*.py"),
+                *(folder.parent / "benchmarks").rglob("*.py"),
+            ]
+        )
         for node in ast.walk(ast.parse(f.read_text(encoding="utf-8")))
         if isinstance(node, ast.Import | ast.ImportFrom)
         for name in [getattr(node, "module", None) or "", *(alias.name for alias in node.names)]
@@ -263,9 +302,14 @@ def test_what_says_that_it_returns_something_does() -> None:
     silent = []
     for f in FILES:
         for node in ast.walk(ast.parse(f.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.FunctionDef) or not re.search(r"(?:^|[.;:] )returns\b", ast.get_docstring(node) or "", re.I):
+            if not isinstance(node, ast.FunctionDef) or not re.search(
+                r"(?:^|[.;:] )returns\b", ast.get_docstring(node) or "", re.I
+            ):
                 continue
-            gives = any(isinstance(n, ast.Yield | ast.YieldFrom) or (isinstance(n, ast.Return) and n.value) for n in ast.walk(node))
+            gives = any(
+                isinstance(n, ast.Yield | ast.YieldFrom) or (isinstance(n, ast.Return) and n.value)
+                for n in ast.walk(node)
+            )
             abstract = any(ast.unparse(d).endswith("abstractmethod") for d in node.decorator_list)
             silent += [f"{f.relative_to(ROOT)}:{node.lineno} {node.name}"] * (not gives and not abstract)
     assert silent == []
@@ -296,13 +340,16 @@ def test_every_module_says_what_it_is_for() -> None:
 
 
 def test_nothing_unpickles_or_evaluates() -> None:
-    """No file of a user's is ever executed; torch's own unpickler may read one where it is told to take nothing but tensors."""
+    """No file of a user's is ever executed; torch's own unpickler may read one where it is told to take nothing but
+    tensors."""
     wrong = []
     for f in FILES:
         for node in ast.walk(ast.parse(f.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("eval", "exec"):
                 wrong.append(f"{f.relative_to(ROOT)}:{node.lineno}")
-            tensors_alone = isinstance(node, ast.Call) and "weights_only=True" in [ast.unparse(k) for k in node.keywords]
+            tensors_alone = isinstance(node, ast.Call) and "weights_only=True" in [
+                ast.unparse(k) for k in node.keywords
+            ]
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "torch.load" and not tensors_alone:
                 wrong.append(f"{f.relative_to(ROOT)}:{node.lineno}")
             if isinstance(node, ast.Call) and ast.unparse(node.func) in (

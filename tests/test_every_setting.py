@@ -47,7 +47,15 @@ def refusal(cls: type, values: dict[str, Any]) -> str:
 
 def test_they_are_found() -> None:
     names = {cls.__name__ for cls in CLASSES}
-    assert names >= {"RenderSettings", "TrainSettings", "VolumeSettings", "OlatSettings", "SolidsSettings", "SolverSettings", "Look"}
+    assert names >= {
+        "RenderSettings",
+        "TrainSettings",
+        "VolumeSettings",
+        "OlatSettings",
+        "SolidsSettings",
+        "SolverSettings",
+        "Look",
+    }
     assert all(dataclasses.is_dataclass(cls) for cls in CLASSES) and len(FIELDS) > 100
 
 
@@ -78,7 +86,10 @@ def test_python_code_is_told_the_same(cls: type, field: str) -> None:
     """The dataclass itself, and ``dataclasses.replace``, refuse what users may not type."""
     made = cls(**required(cls))
     for value in bad_values(hints_of(cls)[field]):
-        for make in (lambda v=value: cls(**{**required(cls), field: v}), lambda v=value: dataclasses.replace(made, **{field: v})):
+        for make in (
+            lambda v=value: cls(**{**required(cls), field: v}),
+            lambda v=value: dataclasses.replace(made, **{field: v}),
+        ):
             with pytest.raises(ConfigError) as caught:
                 make()
             assert str(caught.value) == refusal(cls, {**required(cls), field: value})

@@ -1,4 +1,5 @@
-"""Tests lie where the code does: whoever changes a folder of the package finds its tests in the folder of the same name."""
+"""Tests lie where the code does: whoever changes a folder of the package finds its tests in the folder of the same
+name."""
 
 from __future__ import annotations
 
@@ -15,14 +16,18 @@ def folders(tests: Path, package: Path) -> list[str]:
     """Folders with tests that no folder of the package has the name of."""
     found = {file.parent.relative_to(tests) for file in tests.rglob("test_*.py")} - {Path()}
     return sorted(
-        f.as_posix() for f in found if f.parts[0] not in OTHERS and not any("-" in p for p in f.parts) and not (package / f).is_dir()
+        f.as_posix()
+        for f in found
+        if f.parts[0] not in OTHERS and not any("-" in p for p in f.parts) and not (package / f).is_dir()
     )
 
 
 def misplaced(tests: Path, package: Path) -> list[str]:
     """Tests named after a room that lie beside the folder of its tests."""
     found = [file.relative_to(tests) for room in (tests, tests / "core") for file in room.glob("test_*.py")]
-    return sorted(f.as_posix() for f in found if (package / f.parent / f.stem.removeprefix("test_") / "__init__.py").exists())
+    return sorted(
+        f.as_posix() for f in found if (package / f.parent / f.stem.removeprefix("test_") / "__init__.py").exists()
+    )
 
 
 def test_no_two_files_of_tests_have_one_name() -> None:
@@ -41,7 +46,12 @@ def test_tests_of_a_room_are_in_its_own_folder() -> None:
 
 
 def test_both_are_noticed(tmp_path: Path) -> None:
-    for place in ("package/core/io/__init__.py", "tests/core/test_io.py", "tests/gone/test_x.py", "tests/docs/test_y.py"):
+    for place in (
+        "package/core/io/__init__.py",
+        "tests/core/test_io.py",
+        "tests/gone/test_x.py",
+        "tests/docs/test_y.py",
+    ):
         (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / place).touch()
     assert folders(tmp_path / "tests", tmp_path / "package") == ["gone"]

@@ -29,7 +29,9 @@ def script() -> ModuleType:
 
 
 def test_the_wheel_holds_the_whole_package(tmp_path: Path) -> None:
-    done = subprocess.run([sys.executable, str(SCRIPT), str(tmp_path / "dist")], capture_output=True, text=True, cwd=tmp_path, check=False)
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), str(tmp_path / "dist")], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
     assert done.returncode == 0, done.stderr
     wheel = Path(done.stdout.strip())
     assert wheel.name == f"neuprim-{neuprim.__version__}-py3-none-any.whl"
@@ -46,18 +48,28 @@ def test_the_wheel_holds_the_whole_package(tmp_path: Path) -> None:
         assert any(n.endswith(suffix) for n in names), suffix
     assert not any(n.startswith(("tests", "docs", "examples")) for n in names)
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert {g: dict(points[g]) for g in points.sections()} == declared["entry-points"] | {"console_scripts": declared["scripts"]}
+    assert {g: dict(points[g]) for g in points.sections()} == declared["entry-points"] | {
+        "console_scripts": declared["scripts"]
+    }
 
 
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
-        pytest.param("pyproject.toml", ', "**/*.html"', "", "none-any.whl lacks neuprim/report/template.html", marks=pytest.mark.slow),
+        pytest.param(
+            "pyproject.toml",
+            ', "**/*.html"',
+            "",
+            "none-any.whl lacks neuprim/report/template.html",
+            marks=pytest.mark.slow,
+        ),
         ("pyproject.toml", 'include = ["neuprim*"]', 'include = ["neuprim*", "tests"]', "which is not the package's"),
         ("MANIFEST.in", "graft tests\n", "", ".tar.gz lacks tests/conftest.py"),
     ],
 )
-def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, old: str, new: str, message: str) -> None:
+def test_what_is_missing_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, old: str, new: str, message: str
+) -> None:
     builder = script()
     checkout = tmp_path / "checkout"
     builder.copy_checkout(checkout)

@@ -147,12 +147,16 @@ def test_the_workflow_s_commands_exist() -> None:
         assert words[2] in ("pip", "pytest", "neuprim"), words
         for path in (words[i + 1] for i, word in enumerate(words) if word == "-c"):
             assert (ROOT / path).is_file()
-        for extra in itertools.chain(*(re.findall(r"\w+", group) for group in re.findall(r"\.\[([\w,]+)\]", " ".join(words)))):
+        for extra in itertools.chain(
+            *(re.findall(r"\w+", group) for group in re.findall(r"\.\[([\w,]+)\]", " ".join(words)))
+        ):
             assert extra in EXTRAS
 
 
 def test_the_workflow_tests_as_the_readme_says() -> None:
-    (line,) = [line for line in text("README.md").splitlines() if line.startswith("python3 -m venv") and "pytest" in line]
+    (line,) = [
+        line for line in text("README.md").splitlines() if line.startswith("python3 -m venv") and "pytest" in line
+    ]
     _, install, pytest_words = (shlex.split(part) for part in line.split("&&"))
     said = {tuple(words[2:]) for job, words in steps() if job == "tests"}
     assert ("pip", *(word for word in install[1:] if word != "-q")) in said
@@ -166,7 +170,9 @@ def test_the_workflow_s_systems_and_versions() -> None:
     matrix = workflow["jobs"]["tests"]["strategy"]["matrix"]
     assert set(matrix["os"]) == {"macos-latest", "windows-latest"}
     allowed = SpecifierSet(PROJECT["project"]["requires-python"])
-    assert matrix["python"] == ["3.11", "3.12", "3.13"] and all(isinstance(v, str) and v in allowed for v in matrix["python"])
+    assert matrix["python"] == ["3.11", "3.12", "3.13"] and all(
+        isinstance(v, str) and v in allowed for v in matrix["python"]
+    )
     assert workflow["jobs"]["everything"]["runs-on"] == "ubuntu-latest"
     for job in workflow["jobs"].values():
         assert all(re.fullmatch(r"[\w-]+/[\w-]+@v\d+", step["uses"]) for step in job["steps"] if "uses" in step)
@@ -179,7 +185,9 @@ def test_the_script_s_commands_are_in_the_readme() -> None:
     assert sorted(asked) == ["neuprim run", "pytest"]
     commands = [line for line in text("README.md").splitlines() if line.startswith("python3 -m venv")]
     assert all(any(words in line for line in commands) for words in asked)
-    assert " constraints.txt . " in next(line for line in commands if "neuprim run" in line), "what it installs is replaced by the wheel"
+    assert " constraints.txt . " in next(line for line in commands if "neuprim run" in line), (
+        "what it installs is replaced by the wheel"
+    )
 
 
 @posix

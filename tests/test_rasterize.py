@@ -50,9 +50,15 @@ def test_equals_the_renderer_camera_by_camera(backend: str, channels: int) -> No
     for c, camera in enumerate(CAMERAS):
         one = render_lowered(scenes.lowered(a), camera, settings, backgrounds[c])
         assert one.alpha.max() > 0.3
-        assert torch.equal(out.rgb[c], one.rgb) and torch.equal(out.alpha[c], one.alpha) and torch.equal(out.depth[c], one.depth)  # type: ignore[arg-type]
+        assert (
+            torch.equal(out.rgb[c], one.rgb)
+            and torch.equal(out.alpha[c], one.alpha)
+            and torch.equal(out.depth[c], one.depth)
+        )  # type: ignore[arg-type]
     shared = neuprim.rasterize(**a, backgrounds=backgrounds[0], **by(backend), near=0.05)
-    assert torch.equal(shared.rgb[0], out.rgb[0]) and not torch.equal(shared.rgb[1], out.rgb[1]) and shared.depth is None
+    assert (
+        torch.equal(shared.rgb[0], out.rgb[0]) and not torch.equal(shared.rgb[1], out.rgb[1]) and shared.depth is None
+    )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -137,7 +143,9 @@ def test_poses_intrinsics_and_backgrounds_against_finite_differences() -> None:
     bottom = a["viewmats"][:, 3:]
     backgrounds = torch.tensor([[0.3, 0.5, 0.1], [0.9, 0.2, 0.4]], dtype=torch.float64)
     inputs = [x.requires_grad_() for x in (free, numbers, backgrounds)]
-    assert torch.autograd.gradcheck(lambda v, k, b: functional(torch.cat([v, bottom], 1), k, b), inputs, eps=1e-7, atol=5e-6, rtol=1e-5)
+    assert torch.autograd.gradcheck(
+        lambda v, k, b: functional(torch.cat([v, bottom], 1), k, b), inputs, eps=1e-7, atol=5e-6, rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("backend", ["cpu", "auto"])
@@ -158,7 +166,10 @@ def test_no_cameras_and_no_primitives(backend: str) -> None:
     none.rgb.sum().backward()
     assert a["means"].grad is not None and a["means"].grad.abs().max() == 0
     empty = neuprim.rasterize(**arguments(0), **by(backend), backgrounds=torch.tensor([0.5, 0.25, 1.0]))
-    assert torch.equal(empty.rgb, torch.tensor([0.5, 0.25, 1.0]).expand(3, HEIGHT, WIDTH, 3)) and empty.alpha.abs().max() == 0
+    assert (
+        torch.equal(empty.rgb, torch.tensor([0.5, 0.25, 1.0]).expand(3, HEIGHT, WIDTH, 3))
+        and empty.alpha.abs().max() == 0
+    )
 
 
 def test_population_statistics_come_back_per_camera() -> None:
@@ -172,7 +183,10 @@ def test_population_statistics_come_back_per_camera() -> None:
     for c, tally in enumerate(tallies):
         assert tally.weight.sum().item() == pytest.approx(out.alpha[c].sum().item(), rel=1e-4)
         assert torch.allclose(tally.error_weight, tally.weight * (0.5 if c == 1 else 1.0))
-    with pytest.raises(DataError, match=rf"^rasterize: watch: error has shape \(2, 3\); expected \(3, {HEIGHT}, {WIDTH}\), that of alpha$"):
+    with pytest.raises(
+        DataError,
+        match=rf"^rasterize: watch: error has shape \(2, 3\); expected \(3, {HEIGHT}, {WIDTH}\), that of alpha$",
+    ):
         out.watch(torch.ones(2, 3))
 
 

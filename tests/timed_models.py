@@ -12,7 +12,9 @@ from tests import scenes
 COUNT = 30
 
 
-def model(time: str, neurons: int = 4, count: int = COUNT, dtype: torch.dtype = torch.float64, divide_above: float = 0.0) -> Primitives:
+def model(
+    time: str, neurons: int = 4, count: int = COUNT, dtype: torch.dtype = torch.float64, divide_above: float = 0.0
+) -> Primitives:
     """Random primitives whose every time parameter is at work."""
     generator = torch.Generator().manual_seed(7)
     t = scenes.tensors(count, neurons, seed=3, dtype=dtype)

@@ -1,4 +1,5 @@
-"""Visitors of a viewer without a browser: an HTTP request, and a WebSocket that speaks as much of viser's language as a page must."""
+"""Visitors of a viewer without a browser: an HTTP request, and a WebSocket that speaks as much of viser's language as a
+page must."""
 
 from __future__ import annotations
 
@@ -61,7 +62,9 @@ class Visitor:
 
     def control(self, label: str) -> str:
         """The number of the control of that name."""
-        return next(m["uuid"] for m in self.messages if m["type"].startswith("Gui") and m.get("props", {}).get("label") == label)
+        return next(
+            m["uuid"] for m in self.messages if m["type"].startswith("Gui") and m.get("props", {}).get("label") == label
+        )
 
     def set(self, label: str, value: Any) -> None:
         """What a page says when its user has moved a control."""
@@ -78,13 +81,18 @@ def visit(address: str, **headers: str) -> Any:
     token = parse_qs(parts.query).get("token", [""])[0]
     own = {"Cookie": f"neuprim-{parts.port}={token}", "Origin": f"http://{parts.netloc}", **headers}
     with connect(
-        f"ws://{parts.netloc}/", subprotocols=[f"viser-v{viser.__version__}"], additional_headers=own, max_size=None, compression=None
+        f"ws://{parts.netloc}/",
+        subprotocols=[f"viser-v{viser.__version__}"],
+        additional_headers=own,
+        max_size=None,
+        compression=None,
     ) as socket:  # type: ignore[list-item]
         yield Visitor(socket)
 
 
 def _decoded(data: Any) -> list[dict[str, Any]]:
-    """The messages of one frame: sizes, zstd-compressed msgpack, and the binary arrays after it, each on a multiple of eight bytes."""
+    """The messages of one frame: sizes, zstd-compressed msgpack, and the binary arrays after it, each on a multiple of
+    eight bytes."""
     import msgspec
     import zstandard
 
@@ -98,7 +106,11 @@ def _decoded(data: Any) -> list[dict[str, Any]]:
 
     def restored(value: Any) -> Any:
         if isinstance(value, dict):
-            return buffers[value["__binary_index"]] if "__binary_index" in value else {k: restored(v) for k, v in value.items()}
+            return (
+                buffers[value["__binary_index"]]
+                if "__binary_index" in value
+                else {k: restored(v) for k, v in value.items()}
+            )
         return [restored(v) for v in value] if isinstance(value, list | tuple) else value
 
     return [restored(message) for message in plain["messages"]]

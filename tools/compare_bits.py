@@ -1,7 +1,8 @@
 """Compare the results of this checkout with those of another commit, bit by bit.
 
-``python tools/compare_bits.py COMMIT`` makes three short trainings (one per task, both sort orders, population control on), a quantised
-model, a web page, a VDB sequence and a PLY file in both checkouts, on this machine with one thread, and compares SHA-256 sums.
+``python tools/compare_bits.py COMMIT`` makes three short trainings (one per task, both sort orders, population control
+on), a quantised model, a web page, a VDB sequence and a PLY file in both checkouts, on this machine with one thread,
+and compares SHA-256 sums.
 Sums differ between processors, so none is stored. Text that names a version, a duration or a path does not count.
 ``--make DIR`` makes the files of this checkout alone. It exits with status 1 when anything differs.
 """
@@ -61,7 +62,11 @@ def _run(checkout: Path, folder: Path, arguments: str) -> None:
     environment = {**os.environ, **threads, "PYTHONPATH": str(checkout)}
     print(f"{checkout.name}: neuprim {arguments}", file=sys.stderr)
     result = subprocess.run(
-        [sys.executable, "-m", "neuprim", *arguments.split()], cwd=folder, env=environment, capture_output=True, text=True
+        [sys.executable, "-m", "neuprim", *arguments.split()],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
     )
     if result.returncode:
         sys.exit(f"{checkout}: neuprim {arguments} failed:\n{result.stderr[-2000:]}")
@@ -76,7 +81,11 @@ def sums(folder: Path) -> dict[str, str]:
     for path in sorted(folder.glob("*")) + sorted((folder / "dynamic_vdb").rglob("*.vdb")):
         if path.suffix == ".npz":
             with np.load(path) as arrays:
-                found |= {f"{path.name}: {name}": _sum(arrays[name].tobytes()) for name in arrays if arrays[name].dtype.kind != "U"}
+                found |= {
+                    f"{path.name}: {name}": _sum(arrays[name].tobytes())
+                    for name in arrays
+                    if arrays[name].dtype.kind != "U"
+                }
         elif path.suffix in (".ply", ".html", ".vdb"):
             found[path.name] = _sum(VOLATILE.sub(b"", path.read_bytes()))
     return found
@@ -98,9 +107,16 @@ def main() -> int:
         parser.error("expected a commit, or --make DIR")
     with tempfile.TemporaryDirectory() as temporary:
         other = Path(temporary) / "checkout"
-        subprocess.run(["git", "worktree", "add", "--detach", str(other), options.commit], cwd=CHECKOUT, check=True, capture_output=True)
+        subprocess.run(
+            ["git", "worktree", "add", "--detach", str(other), options.commit],
+            cwd=CHECKOUT,
+            check=True,
+            capture_output=True,
+        )
         try:
-            maker = other / "tools" / Path(__file__).name  # the other commit's own names of settings, where it has this command
+            maker = (
+                other / "tools" / Path(__file__).name
+            )  # the other commit's own names of settings, where it has this command
             if maker.exists():
                 subprocess.run([sys.executable, str(maker), "--make", f"{temporary}/other"], check=True)
             else:

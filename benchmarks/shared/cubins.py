@@ -1,6 +1,7 @@
 """Registers, stack and shared memory of a kernel, read from its cubin: no driver and no tool of CUDA's is needed.
 
-A cubin is an ELF file; ``.nv.info`` holds what a driver has to know, as attributes whose numbers are those that ``cuobjdump -res-usage`` prints.
+A cubin is an ELF file; ``.nv.info`` holds what a driver has to know, as attributes whose numbers are those that
+``cuobjdump -res-usage`` prints.
 """
 
 from __future__ import annotations
@@ -69,12 +70,15 @@ def resources(cubin: Path) -> Resources:
         raise ValueError(f"{cubin}: no kernel in it")
     shared = sum(len(content) for name, content in sections.items() if name.startswith(".nv.shared."))
     for meta in cubin.parent.glob("*.meta"):  # what Warp asks for at a launch
-        shared += max((int(n) for key, n in ast.literal_eval(meta.read_text()).items() if key.endswith("_smem_bytes")), default=0)
+        shared += max(
+            (int(n) for key, n in ast.literal_eval(meta.read_text()).items() if key.endswith("_smem_bytes")), default=0
+        )
     return Resources(max(numbers[_REGISTERS]), sum(numbers[_FRAME]), shared, sum(code))
 
 
 def compiled(kernel: Any, arch: int, block: int, folder: Path) -> Path:
-    """The cubin of a kernel that is alone in its module, for blocks of so many threads; in ``folder``, which is empty."""
+    """The cubin of a kernel that is alone in its module, for blocks of so many threads; in ``folder``, which is
+    empty."""
     folder.mkdir(parents=True, exist_ok=True)
     kernel.module.options["block_dim"] = block
     wp.compile_aot_module(kernel.module, arch=arch, module_dir=folder, use_ptx=False)

@@ -1,4 +1,5 @@
-"""The family of primitives, as benchmarks name it, how many of each make equal bytes, and the scenes on which they are compared."""
+"""The family of primitives, as benchmarks name it, how many of each make equal bytes, and the scenes on which they are
+compared."""
 
 from __future__ import annotations
 
@@ -36,7 +37,9 @@ class Form:
         return cls(int(neurons), int(edge), source=source)
 
     def __str__(self) -> str:
-        return "gaussian" if self.gaussian else f"{self.neurons}:{self.edge}" + (f"@{self.source}" if self.source else "")
+        return (
+            "gaussian" if self.gaussian else f"{self.neurons}:{self.edge}" + (f"@{self.source}" if self.source else "")
+        )
 
     @property
     def label(self) -> str:
@@ -54,7 +57,12 @@ class Form:
             return ("model.density.form=gaussian", "train.rates.log_amplitude=0.2")
         gain = "true" if self.edge else "false"
         source = (f"train.supervision={self.source}",) if self.source else ()
-        return (f"model.neurons={self.neurons}", f"model.density.edge={self.edge}", f"model.density.gain={gain}", *source)
+        return (
+            f"model.neurons={self.neurons}",
+            f"model.density.edge={self.edge}",
+            f"model.density.gain={gain}",
+            *source,
+        )
 
     def equal_bytes(self, primitives: int, task: str, words: Sequence[str] = ()) -> int:
         """As many of these as have the parameters of ``primitives`` of the paper's form, all else equal."""
@@ -71,8 +79,8 @@ class Scene:
     Attributes:
         words: of task, scene and what is done alike to all.
         folder: the setting that names the data, None for embedded scenes.
-        tuning: words for tuning, which keep the test views unseen: other cameras, or views held out of the training ones.
-        judged: the metric that decides.
+        tuning: words for tuning, which keep the test views unseen: other cameras, or views held out of the training
+        ones. judged: the metric that decides.
     """
 
     task: str
@@ -87,8 +95,8 @@ class Scene:
 
 
 AS_RECORDED = ("train.population.grow_from=1", "train.cooldown=0")
-"""How all presets trained when forms and populations were compared: all primitives there from the start, rates without a cool-down. What is added to
-those records must train alike."""
+"""How all presets trained when forms and populations were compared: all primitives there from the start, rates without
+a cool-down. What is added to those records must train alike."""
 
 _FIRE = ("scene=vdb", "scene.frames='1:40'", "scene.look=embergen_fire", "scene.size=96")
 SCENES = {
@@ -96,7 +104,9 @@ SCENES = {
     "chair": Scene("static", ("scene=blender", "train.background=white"), "scene.path"),
     "fire": Scene("dynamic", _FIRE, "scene.vdb", ("scene.cameras=38",), "psnr_mask"),
     "smoke_fire": Scene("dynamic", ("scene=smoke_fire", "scene.size=64"), None, ("scene.cameras=38",), "psnr_mask"),
-    "lit_solids": Scene("relight", ("scene=lit_solids", "scene.size=128"), None, ("scene.hold_out=8",), "psnr_linear_clamped"),
+    "lit_solids": Scene(
+        "relight", ("scene=lit_solids", "scene.size=128"), None, ("scene.hold_out=8",), "psnr_linear_clamped"
+    ),
 }
 
 
@@ -108,7 +118,9 @@ def parameters(form: Form, task: str, words: tuple[str, ...] = ()) -> int:
     own = [word for word in words if not word.startswith("scene.")]
     config = compose([f"task={task}", f"scene={scene}", *small, *form.words, *own], check_output=False)
     spec = task_of(config)
-    data = replace(load_dataset(config, spec), points=None)  # forms alone, without what only some of them learn from voxels
+    data = replace(
+        load_dataset(config, spec), points=None
+    )  # forms alone, without what only some of them learn from voxels
     density, colour = spec.build(build_settings(spec, config.model, config.options), data)
     geometry = 3 + 3 + 4
     return geometry + sum(parameter.size for parameter in (*density.parameters(), *colour.parameters()))

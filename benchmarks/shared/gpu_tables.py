@@ -36,7 +36,10 @@ def _tables(records: list[Record], part: str, head: list[str], row: Any) -> str:
     parts = []
     for record in records:
         if part in record:
-            parts.append(f"{record['device']}, torch {record['torch']}:\n\n" + _rows(head, [row(entry) for entry in record[part]]))
+            parts.append(
+                f"{record['device']}, torch {record['torch']}:\n\n"
+                + _rows(head, [row(entry) for entry in record[part]])
+            )
     return "\n\n".join(parts)
 
 
@@ -46,7 +49,10 @@ def parity_table(records: list[Record]) -> str:
 
     def row(entry: Record) -> list[str]:
         # a gradient of nothing, such as of no neurons, is no number
-        grads = [f"{entry['gradients'][name]:.0e}" if entry["neurons"] or name not in ("W1", "b1", "w2") else "–" for name in names]
+        grads = [
+            f"{entry['gradients'][name]:.0e}" if entry["neurons"] or name not in ("W1", "b1", "w2") else "–"
+            for name in names
+        ]
         same = "yes" if entry["same"] else "**no**"
         return [f"{entry['neurons']}, {entry['edge']}", entry["scene"], f"{entry['image']:.0e}", *grads, same]
 
@@ -60,9 +66,28 @@ def times_table(records: list[Record]) -> str:
         ms = [entry[key] for key in ("forward_ms", "both_ms", "step_ms")]
         size = f"{entry['width']}×{entry['height']}"
         counts = [f"{entry[key]:,}" for key in ("primitives", "pairs", "slots")]
-        return [entry["form"], counts[0], size, *counts[1:], *(f"{x:.2f}" for x in ms), f"{1000 / ms[0]:.0f}", f"{entry['peak_mb']:,.0f}"]
+        return [
+            entry["form"],
+            counts[0],
+            size,
+            *counts[1:],
+            *(f"{x:.2f}" for x in ms),
+            f"{1000 / ms[0]:.0f}",
+            f"{entry['peak_mb']:,.0f}",
+        ]
 
-    head = ["form", "primitives", "size", "pairs", "slots", "forward, ms", "and backward", "training step", "frames/s", "peak MB"]
+    head = [
+        "form",
+        "primitives",
+        "size",
+        "pairs",
+        "slots",
+        "forward, ms",
+        "and backward",
+        "training step",
+        "frames/s",
+        "peak MB",
+    ]
     text = _tables(records, "times", head, row)
     before = _tables(records, "times_before", head, row)
     return f"{text}\n\nThe first version that ran there, up to a million primitives:\n\n{before}" if before else text
@@ -73,7 +98,13 @@ def training_table(records: list[Record]) -> str:
 
     def row(entry: Record) -> list[str]:
         score = f"{entry['psnr']:.2f} ({entry['of']})"
-        return [entry["scene"].replace("_", " "), f"{entry['primitives']:,}", f"{entry['steps']:,}", f"{entry['step_ms']:.2f}", score]
+        return [
+            entry["scene"].replace("_", " "),
+            f"{entry['primitives']:,}",
+            f"{entry['steps']:,}",
+            f"{entry['step_ms']:.2f}",
+            score,
+        ]
 
     return _tables(records, "train", ["scene", "primitives", "steps", "ms a step", "PSNR, dB"], row)
 

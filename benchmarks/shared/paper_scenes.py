@@ -1,6 +1,7 @@
 """Two scenes that nobody trained here: what the cost model says that they would take, and what runs out first.
 
-Amounts follow from the scene alone; seconds here are the fitted coefficients'; seconds on a card are computed from what was recorded on it, and were not measured.
+Amounts follow from the scene alone; seconds here are the fitted coefficients'; seconds on a card are computed from what
+was recorded on it, and were not measured.
 """
 
 from __future__ import annotations
@@ -70,7 +71,9 @@ def amounts(scene: Paper) -> dict[str, float]:
 def seconds_here(scene: Paper, model: dict[str, Any], ranks: int, parts: bool) -> dict[str, float]:
     """Terms of a step of one view a rank, on one thread each."""
     a, view = amounts(scene), model["step"]
-    alive = a["drawn"] if scene.frames else scene.primitives  # of a sequence, others are left out before anything is computed
+    alive = (
+        a["drawn"] if scene.frames else scene.primitives
+    )  # of a sequence, others are left out before anything is computed
     in_view = a["drawn"] if parts else alive
     numbers = scene.primitives * scene.numbers / (ranks if parts else 1)
     sent = (a["parts send"] if parts else a["whole sends"]) * (ranks - 1) / ranks
@@ -86,7 +89,8 @@ def seconds_here(scene: Paper, model: dict[str, Any], ranks: int, parts: bool) -
 
 
 def seconds_on_card(scene: Paper, ranks: int, parts: bool) -> tuple[float, float]:
-    """(seconds of a step on a card without what is sent, bytes that drawing takes), from the recorded times of the form K = 2, p = 2."""
+    """(seconds of a step on a card without what is sent, bytes that drawing takes), from the recorded times of the form
+    K = 2, p = 2."""
     card = json.loads(CARD.read_text())
     row = max((r for r in card["times"] if r["form"] == "K=2 p=2"), key=lambda r: r["primitives"])
     hits = scene.overlap * scene.pixels
@@ -126,7 +130,11 @@ def _ways(scene: Paper, model: dict[str, Any]) -> Table:
 def _truth(scene: Paper, model: dict[str, Any]) -> str:
     rays = 4 * scene.pixels
     frame = sum(c * n for c, n in zip(model["frame"].values(), (1, scene.voxels**3, scene.voxels**4), strict=True))
-    image = model["image"]["an image"] + model["image"]["a ray"] * rays + model["image"]["a cell of a ray"] * rays * scene.voxels
+    image = (
+        model["image"]["an image"]
+        + model["image"]["a ray"] * rays
+        + model["image"]["a cell of a ray"] * rays * scene.voxels
+    )
     hours = scene.frames * (frame + scene.cameras * image) / 3600
     light = model["frame"]["a cell on a voxel's way to the light"] * scene.voxels**4 * scene.frames / 3600
     return (

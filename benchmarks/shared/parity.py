@@ -37,11 +37,16 @@ def small_scene(kind: str, neurons: int) -> list[Tensor]:
     quats = uniform(count, 4) * 2 - 1
     W1 = (uniform(count, neurons, 3) - 0.5) * (1.2 if kind == "inside" else 2 / 3)
     b1, w2 = (uniform(count, neurons) - 0.5) * 2 / 3, (uniform(count, neurons) - 0.5) * 1.2
-    return [t.float().double() for t in (means, scales, quats, W1, b1, w2, uniform(count) * 2.5 + 0.6, uniform(count, 3))]
+    return [
+        t.float().double() for t in (means, scales, quats, W1, b1, w2, uniform(count) * 2.5 + 0.6, uniform(count, 3))
+    ]
 
 
-def drawn(values: list[Tensor], edge: int, settings: RenderSettings, device: str, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
-    """Image with its alpha and depth, (H, W, 5), and the gradients of NAMES under random weights on all five; float64, on the processor."""
+def drawn(
+    values: list[Tensor], edge: int, settings: RenderSettings, device: str, dtype: torch.dtype
+) -> tuple[Tensor, list[Tensor]]:
+    """Image with its alpha and depth, (H, W, 5), and the gradients of NAMES under random weights on all five; float64,
+    on the processor."""
     leaves = [t.to(device, dtype).requires_grad_() for t in values]
     view = torch.eye(4, dtype=torch.float64)
     view[0, 3], view[1, 3] = 0.1, -0.05
@@ -51,7 +56,12 @@ def drawn(values: list[Tensor], edge: int, settings: RenderSettings, device: str
     lowered = Lowered(Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, 30.0, edge), Constant(colours))
     out = render_lowered(lowered, Camera(view, 70.0, 72.0, 31.0, 33.0, SIZE, SIZE), settings, background)
     image = torch.cat(
-        [out.rgb, out.alpha[..., None], torch.zeros_like(out.alpha[..., None]) if out.depth is None else out.depth[..., None]], -1
+        [
+            out.rgb,
+            out.alpha[..., None],
+            torch.zeros_like(out.alpha[..., None]) if out.depth is None else out.depth[..., None],
+        ],
+        -1,
     )
     weights = torch.randn(SIZE, SIZE, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     weights[..., 4] *= 0.1
@@ -61,7 +71,8 @@ def drawn(values: list[Tensor], edge: int, settings: RenderSettings, device: str
 
 
 def parity(device: str) -> list[dict[str, Any]]:
-    """Print and return errors of the CUDA backend: of images, absolute; of each gradient over its largest number; and whether a rerun is the same."""
+    """Print and return errors of the CUDA backend: of images, absolute; of each gradient over its largest number; and
+    whether a rerun is the same."""
     table, rows = Table("K, p", "scene", "image", *NAMES, "same bits"), []
     for neurons, edge in ((8, 0), (8, 2), (2, 1), (2, 2), (0, 2), (16, 0)):
         for kind in KINDS:
@@ -70,7 +81,9 @@ def parity(device: str) -> list[dict[str, Any]]:
             own = replace(settings, backend="cuda", device=device)
             image, found = drawn(values, edge, own, device, torch.float32)
             again, refound = drawn(values, edge, own, device, torch.float32)
-            same = bool((image == again).all()) and all(bool((a == b).all()) for a, b in zip(found, refound, strict=True))
+            same = bool((image == again).all()) and all(
+                bool((a == b).all()) for a, b in zip(found, refound, strict=True)
+            )
             worst = [
                 float((a - b).abs().max() / b.abs().max().clamp_min(1e-9)) if b.numel() else 0.0
                 for a, b in zip(found, expected, strict=True)

@@ -1,7 +1,8 @@
 """gsplat's 3D Gaussians on the data set that a run of neuprim trains on, by its documented interface alone.
 
-A population of fixed size starts where neuprim's does and is kept alive by gsplat's own MCMCStrategy; losses, rates and degrees are those that
-gsplat's example of it uses, and the budget is neuprim's: as many steps, one view each. Nothing of gsplat is imported before it is asked for.
+A population of fixed size starts where neuprim's does and is kept alive by gsplat's own MCMCStrategy; losses, rates and
+degrees are those that gsplat's example of it uses, and the budget is neuprim's: as many steps, one view each. Nothing
+of gsplat is imported before it is asked for.
 """
 
 from __future__ import annotations
@@ -65,10 +66,13 @@ class Lap:
 
 
 def gaussians(dataset: Dataset, count: int, device: torch.device, seed: int = 0) -> dict[str, torch.nn.Parameter]:
-    """What gsplat's strategies call them: logarithms of scales and log odds of opacities; as wide as the mean distance to three neighbours."""
+    """What gsplat's strategies call them: logarithms of scales and log odds of opacities; as wide as the mean distance
+    to three neighbours."""
     cloud = dataset.initial_points(count, torch.Generator().manual_seed(seed))
     near = min(_NEIGHBOURS + 1, count)
-    distances = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=near)[0]).reshape(count, near)[:, 1:]
+    distances = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=near)[0]).reshape(
+        count, near
+    )[:, 1:]
     width = distances.square().mean(1).sqrt().clamp_min(1e-6).log()
     generator = torch.Generator().manual_seed(seed)
     values = {
@@ -82,7 +86,9 @@ def gaussians(dataset: Dataset, count: int, device: torch.device, seed: int = 0)
     return {name: torch.nn.Parameter(value.float().contiguous().to(device)) for name, value in values.items()}
 
 
-def _drawn(gsplat: Any, params: dict[str, torch.nn.Parameter], camera: Camera, background: Tensor, degree: int) -> tuple[Tensor, Any]:
+def _drawn(
+    gsplat: Any, params: dict[str, torch.nn.Parameter], camera: Camera, background: Tensor, degree: int
+) -> tuple[Tensor, Any]:
     """(H, W, 3) colours and what the strategy wants to know."""
     device = params["means"].device
     K = torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], device=device)
@@ -113,7 +119,9 @@ def lap(gsplat: Any, dataset: Dataset, count: int, steps: int, device: torch.dev
     params = gaussians(dataset, count, device, seed)
     rates = {**_RATES, "means": _RATES["means"] * dataset.extent}
     adams = {name: torch.optim.Adam([value], lr=rates[name], eps=1e-15) for name, value in params.items()}
-    strategy = gsplat.MCMCStrategy(cap_max=count, refine_start_iter=min(500, steps // 5), refine_stop_iter=steps - steps // 10)
+    strategy = gsplat.MCMCStrategy(
+        cap_max=count, refine_start_iter=min(500, steps // 5), refine_stop_iter=steps - steps // 10
+    )
     strategy.check_sanity(params, adams)
     state = strategy.initialize_state()
     background = dataset.background.float().to(device)
@@ -144,7 +152,9 @@ def lap(gsplat: Any, dataset: Dataset, count: int, steps: int, device: torch.dev
     return Lap(len(params["means"]), 4 * FLOATS * len(params["means"]), score, step_ms, frame_ms)
 
 
-def judged(gsplat: Any, params: dict[str, torch.nn.Parameter], views: ViewSet, background: Tensor) -> tuple[float, float]:
+def judged(
+    gsplat: Any, params: dict[str, torch.nn.Parameter], views: ViewSet, background: Tensor
+) -> tuple[float, float]:
     """Mean PSNR in dB, and the median milliseconds of a frame."""
     scores, times = [], []
     with torch.no_grad():

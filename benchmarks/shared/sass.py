@@ -38,7 +38,8 @@ def _name(instruction: str) -> str:
 
 
 def hot_loop(text: str, of: str) -> tuple[Loop, int]:
-    """The innermost loop with the most instructions called ``of``, from the target of a backward jump to the jump; and how many there are in all.
+    """The innermost loop with the most instructions called ``of``, from the target of a backward jump to the jump; and
+    how many there are in all.
 
     Raises:
         ValueError: no loop has any.

@@ -22,7 +22,11 @@ WebGL2RenderingContext.prototype.shaderSource = function (shader, text) {
 """Run before a page's own scripts: keeps the texts of its shaders in ``sources``."""
 
 _TOOLS = ("glslangValidator", "spirv-opt", "spirv-dis")
-_STATED = {"#version 300 es": "#version 450", "uniform int mode;": "const int mode = COLOUR;", "if (cut > tm - h)": "if (false)"}
+_STATED = {
+    "#version 300 es": "#version 450",
+    "uniform int mode;": "const int mode = COLOUR;",
+    "if (cut > tm - h)": "if (false)",
+}
 """What is known of a chord that is drawn for its colour, away from the near plane."""
 
 _FREE = frozenset(
@@ -33,7 +37,8 @@ _FREE = frozenset(
 
 
 def instructions(sources: Sequence[str]) -> dict[str, int] | None:
-    """{arithmetic, texels} of one chord that is drawn for its colour; both sides of choices count. None without the compilers."""
+    """{arithmetic, texels} of one chord that is drawn for its colour; both sides of choices count. None without the
+    compilers."""
     if not all(map(shutil.which, _TOOLS)):
         return None
     (text,) = {source for source in sources if "float profile(float v)" in source}

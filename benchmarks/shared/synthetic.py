@@ -48,9 +48,17 @@ class _Views(ViewSet):
 
 
 def random_trainer(
-    primitives: int, size: int, overlap: float, degree: int = 3, views: int = 1, inside: bool = False, threads: int = 1, shard: bool = False
+    primitives: int,
+    size: int,
+    overlap: float,
+    degree: int = 3,
+    views: int = 1,
+    inside: bool = False,
+    threads: int = 1,
+    shard: bool = False,
 ) -> Trainer:
-    """A fixed population of two neurons with a soft edge in the unit cube, in the middle of an endless budget, which nothing moves.
+    """A fixed population of two neurons with a soft edge in the unit cube, in the middle of an endless budget, which
+    nothing moves.
 
     Args:
         size: edge of the images in pixels.
@@ -72,9 +80,17 @@ def random_trainer(
     context = InitContext(means, torch.full((primitives,), radius), colours, g, {"alpha": 0.1}, axes=axes, quats=quats)
     model = Primitives.initialise(CosineDensity(2, edge=2, gain=True), SphericalHarmonics(degree, 3, 0.0), context)
     dataset = Dataset(
-        name="random", train=sets[0], test=sets[1], start=start, extent=1.0, background=torch.zeros(3), data_source="generated"
+        name="random",
+        train=sets[0],
+        test=sets[1],
+        start=start,
+        extent=1.0,
+        background=torch.zeros(3),
+        data_source="generated",
     )
-    still = {spec.name: 0.0 for spec in model.specs}  # a step costs the same and leaves the scene as it is, however many are taken
+    still = {
+        spec.name: 0.0 for spec in model.specs
+    }  # a step costs the same and leaves the scene as it is, however many are taken
     population = PopulationSettings(strategy="fixed")
     settings = TrainSettings(iterations=10**9, views_per_step=views, shard=shard, rates=still, population=population)
     loss = photometric({"ssim_weight": settings.ssim_weight})

@@ -36,7 +36,8 @@ class Trial:
         hold_out: n > 1: judge by every n-th training view instead of the test views.
         facts: what the record says of it besides its numbers.
         keep: folder for configuration and model, or None.
-        interventions: into the population, spread evenly, so that short runs have as many as one of the preset's own length;
+        interventions: into the population, spread evenly, so that short runs have as many as one of the preset's own
+        length;
             None leaves the steps between two of them to the preset.
     """
 
@@ -83,7 +84,12 @@ def train(trial: Trial, wanted: Wanted) -> dict[str, Any]:
     if trial.keep is not None:
         trial.keep.mkdir(parents=True, exist_ok=True)
         (trial.keep / "config.yaml").write_text(fitted.config.to_yaml())
-        save_model(trial.keep / "model.safetensors", fitted.model, fitted.config.task, {"color_space": fitted.dataset.color_space})
+        save_model(
+            trial.keep / "model.safetensors",
+            fitted.model,
+            fitted.config.task,
+            {"color_space": fitted.dataset.color_space},
+        )
     return {
         "trial": trial.name,
         "seed": trial.seed,
@@ -108,7 +114,8 @@ def run_all(
     shown: Callable[[dict[str, Any]], str],
     beside: Mapping[str, Any] = {},
 ) -> None:
-    """Train what ``path`` does not have yet, ``jobs`` at a time, and write it after every one, with what stands ``beside`` the trials."""
+    """Train what ``path`` does not have yet, ``jobs`` at a time, and write it after every one, with what stands
+    ``beside`` the trials."""
     known = {row["trial"] for row in recorded(path)}
     waiting = [trial for trial in trials if trial.name not in known]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -141,10 +148,12 @@ def train_one(data: tuple[Trial, Wanted], attempt: int, events: Events) -> dict[
 
 
 def paces_of(trainers: Mapping[str, Trainer], steps: int = 480) -> dict[str, float]:
-    """Seconds a step of each, taking turns so that all meet the same noise; a mean over ``steps``, as a run pays for every one of them.
+    """Seconds a step of each, taking turns so that all meet the same noise; a mean over ``steps``, as a run pays for
+    every one of them.
 
-    Primitives grow, move and shrink as a run goes on, so the fairest pace is that of a whole one. Turns are as long as the rarest look at voxels
-    is apart. Of trainers with one thread the clock counts what it computes, and not what others on the machine do meanwhile.
+    Primitives grow, move and shrink as a run goes on, so the fairest pace is that of a whole one. Turns are as long as
+    the rarest look at voxels is apart. Of trainers with one thread the clock counts what it computes, and not what
+    others on the machine do meanwhile.
     """
     for trainer in trainers.values():
         compile_kernels(trainer)
@@ -152,7 +161,9 @@ def paces_of(trainers: Mapping[str, Trainer], steps: int = 480) -> dict[str, flo
             generator = torch.Generator().manual_seed(0)
             for _ in range(_DRAWS):
                 trainer.dataset.points.draw(8, generator)
-    clock = time.thread_time if all(trainer.renderer.threads == 1 for trainer in trainers.values()) else time.perf_counter
+    clock = (
+        time.thread_time if all(trainer.renderer.threads == 1 for trainer in trainers.values()) else time.perf_counter
+    )
     took, turns = dict.fromkeys(trainers, 0.0), max(steps // _TURN, 1)
     for _ in range(turns):
         for name, trainer in trainers.items():

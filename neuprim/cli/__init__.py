@@ -1,7 +1,8 @@
 """The ``neuprim`` command: parse, call, print.
 
-Exit status: 0 done, 1 no backend works (``doctor``), 2 the input's fault (one line on standard error), 130 interrupted. A bug in
-neuprim keeps its traceback. Heavy modules are imported by the subcommands that need them, so that help stays fast.
+Exit status: 0 done, 1 no backend works (``doctor``), 2 the input's fault (one line on standard error), 130 interrupted.
+A bug in neuprim keeps its traceback. Heavy modules are imported by the subcommands that need them, so that help stays
+fast.
 """
 
 from __future__ import annotations
@@ -93,22 +94,35 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[str, argparse.ArgumentParser]]:
-    parser = Parser(prog="neuprim", description="Radiance fields made of splattable neural primitives.", allow_abbrev=False)
+    parser = Parser(
+        prog="neuprim", description="Radiance fields made of splattable neural primitives.", allow_abbrev=False
+    )
     parser.add_argument("--version", action="version", version=f"neuprim {__version__}")
     sub = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
-    def command(name: str, call: Callable[[argparse.Namespace], int], summary: str, epilog: str = "") -> argparse.ArgumentParser:
+    def command(
+        name: str, call: Callable[[argparse.Namespace], int], summary: str, epilog: str = ""
+    ) -> argparse.ArgumentParser:
         raw = argparse.RawDescriptionHelpFormatter
-        made = sub.add_parser(name, help=summary, description=summary, epilog=epilog, formatter_class=raw, allow_abbrev=False)
+        made = sub.add_parser(
+            name, help=summary, description=summary, epilog=epilog, formatter_class=raw, allow_abbrev=False
+        )
         made.set_defaults(call=call)
         arguments.for_stored(made, name)
         return made
 
-    run = command("run", _run, "fit a scene", "\n\n".join([COMMON_KEYS, *([_task_names()] if with_tasks else []), EXAMPLES]))
+    run = command(
+        "run", _run, "fit a scene", "\n\n".join([COMMON_KEYS, *([_task_names()] if with_tasks else []), EXAMPLES])
+    )
     run.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings, in Hydra's grammar")
-    run.add_argument("-m", "--multirun", action="store_true", help="run every combination of values separated by commas")
     run.add_argument(
-        "--config", type=Path, metavar="FILE", help="start with the settings of RUN_DIR/config.yaml; words beside it come first"
+        "-m", "--multirun", action="store_true", help="run every combination of values separated by commas"
+    )
+    run.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="start with the settings of RUN_DIR/config.yaml; words beside it come first",
     )
     run.add_argument("--cfg", action="store_true", help="print the resolved configuration and stop")
 
@@ -116,7 +130,9 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 
     evaluate = command("eval", _eval, "measure a run on its test views", OPERATING)
     evaluate.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    evaluate.add_argument("--lpips", type=Path, metavar="FILE", help="measure LPIPS with these weights of your own, a file or a folder")
+    evaluate.add_argument(
+        "--lpips", type=Path, metavar="FILE", help="measure LPIPS with these weights of your own, a file or a folder"
+    )
 
     render = command(
         "render",
@@ -129,20 +145,32 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     add_environment_flags(render)
 
     trade = command(
-        "tradeoff", _tradeoff, "measure what speed and size cost in accuracy: how a run is drawn, or what is trained", FORMS + OPERATING
+        "tradeoff",
+        _tradeoff,
+        "measure what speed and size cost in accuracy: how a run is drawn, or what is trained",
+        FORMS + OPERATING,
     )
     trade.usage = "neuprim tradeoff RUN_DIR | KEY=VALUE ... [KEY=VALUE ...] [--views N] [--repeats N] [--knobs NAME ...] [--budget TIME] [--seeds N] [--lpips FILE]"
     for_tradeoff(trade)
 
     export = command("export", _export, "write a run's model in another format", export_help(asked))
-    export.usage = "neuprim export RUN_DIR --format NAME [KEY=VALUE ...] [--CONDITION TEXT ...] [--out PATH] [--force] [--json]"
+    export.usage = (
+        "neuprim export RUN_DIR --format NAME [KEY=VALUE ...] [--CONDITION TEXT ...] [--out PATH] [--force] [--json]"
+    )
     export.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    export.add_argument("--format", required=True, metavar="NAME", help="which format; all of them, those of plugins too, are listed below")
+    export.add_argument(
+        "--format",
+        required=True,
+        metavar="NAME",
+        help="which format; all of them, those of plugins too, are listed below",
+    )
     export.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR/export)")
     export.add_argument("--force", action="store_true", help="replace files that exist")
     export.add_argument("--json", action="store_true", help="print JSON")
 
-    arguments.for_compress(command("compress", _compress, "write a run's model in few bits, as one file that every command reads"))
+    arguments.for_compress(
+        command("compress", _compress, "write a run's model in few bits, as one file that every command reads")
+    )
 
     for_prune(command("prune", _prune, "remove what a run's scene does not require, and write the rest as a run"))
 
@@ -158,9 +186,16 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     )
     arguments.for_inspect(inspect)
 
-    for_view(command("view", _view, "look at a run in the browser: turn it, play it, move its light, edit a camera path"))
+    for_view(
+        command("view", _view, "look at a run in the browser: turn it, play it, move its light, edit a camera path")
+    )
 
-    vdb = command("vdb", _vdb, "look into OpenVDB files", "`info` lists grids: type, transform, bounds, active voxels, values, memory.")
+    vdb = command(
+        "vdb",
+        _vdb,
+        "look into OpenVDB files",
+        "`info` lists grids: type, transform, bounds, active voxels, values, memory.",
+    )
     vdb.add_argument("action", choices=("info",), metavar="info", help="what to do")
     vdb.add_argument("path", type=Path, metavar="FILE|DIR", help="a .vdb file, or a folder of frames")
     vdb.add_argument("--json", action="store_true", help="print JSON")
@@ -202,7 +237,9 @@ def _run(args: argparse.Namespace) -> int:
     elsewhere = launcher != LauncherSettings()
     beside = {"-m": args.multirun, "target": wanted is not None, "launcher": elsewhere}
     if viewer is not None and any(beside.values()):
-        raise ConfigError(f"viewer=true: shows one run; expected no {next(word for word, on in beside.items() if on)} beside it")
+        raise ConfigError(
+            f"viewer=true: shows one run; expected no {next(word for word, on in beside.items() if on)} beside it"
+        )
     if wanted is not None and args.multirun:
         raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
     if args.multirun and not without_place(words):
@@ -247,7 +284,9 @@ def _eval(args: argparse.Namespace) -> int:
 
 def _render(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
-    if args.camera not in ("orbit", "test") and not any(Path(name).exists() for name in (args.camera, args.camera.partition("#")[0])):
+    if args.camera not in ("orbit", "test") and not any(
+        Path(name).exists() for name in (args.camera, args.camera.partition("#")[0])
+    ):
         raise ConfigError(f"--camera {args.camera}: no such file; expected orbit, test, or a file or folder of cameras")
     environment = environment_of(args)
     from neuprim.cli.console import plain_console
@@ -286,7 +325,10 @@ def _export(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import LineProgress
     from neuprim.runs.export import export_run
 
-    print_report(export_run(run_dir, args.format, args.out, args.options, args.force, LineProgress(plain_console(stderr=True))), args.json)
+    print_report(
+        export_run(run_dir, args.format, args.out, args.options, args.force, LineProgress(plain_console(stderr=True))),
+        args.json,
+    )
     return 0
 
 
@@ -318,8 +360,17 @@ def _inspect(args: argparse.Namespace) -> int:
     names = [name.strip() for name in args.show.split(",") if name.strip()]
     names += ["primitives"] * args.primitives + ["primitive"] * (args.primitive is not None)
     options, box = ViewOptions(tuple(args.level), args.primitive), None if args.box is None else corners(args.box)
-    more = {"options": options, "against": args.against, "out": args.out, "size": args.size, "up": args.up, "overwrite": args.force}
-    for path in inspect_run(Request(run_dir, names or ["volume"], args.conditions, args.grid, box, **more), print_notes):
+    more = {
+        "options": options,
+        "against": args.against,
+        "out": args.out,
+        "size": args.size,
+        "up": args.up,
+        "overwrite": args.force,
+    }
+    for path in inspect_run(
+        Request(run_dir, names or ["volume"], args.conditions, args.grid, box, **more), print_notes
+    ):
         print(path)
     return 0
 
@@ -365,7 +416,9 @@ def _doctor(args: argparse.Namespace) -> int:
 # ---------------------------------------------------------------- arguments
 
 
-def _conditions(run_dir: Path, words: list[str], command: str, known: argparse.ArgumentParser) -> tuple[dict[str, str], list[str]]:
+def _conditions(
+    run_dir: Path, words: list[str], command: str, known: argparse.ArgumentParser
+) -> tuple[dict[str, str], list[str]]:
     """Condition name -> text, from the flags that the run's task defines, and the words that are none of them."""
     if not words:
         return {}, []
@@ -401,7 +454,9 @@ def _task_of(run_dir: Path) -> TaskSpec:
 def _no_such(word: str, command: str, known: argparse.ArgumentParser, task: TaskSpec) -> ConfigError:
     from neuprim.core.conditions import flag
 
-    flags = [f for f in (*known._option_string_actions, *(flag(spec.name) for spec in task.conditions)) if f.startswith("--")]
+    flags = [
+        f for f in (*known._option_string_actions, *(flag(spec.name) for spec in task.conditions)) if f.startswith("--")
+    ]
     return ConfigError(f"{word}: no such argument of `neuprim {command}` for task {task.name!r}{nearest(word, flags)}")
 
 

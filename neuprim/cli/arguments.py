@@ -29,14 +29,29 @@ __all__ = [
 def for_bench(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of ``neuprim bench``."""
     parser.add_argument("what", choices=["paper"], help="which tables")
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings over the protocol's, e.g. scene.downsample=4")
-    parser.add_argument("--tables", default="3-7", metavar="N", help="numbers of the paper's tables, e.g. 3-5 or 6,7 (default: 3-7)")
+    parser.add_argument(
+        "overrides", nargs="*", metavar="KEY=VALUE", help="settings over the protocol's, e.g. scene.downsample=4"
+    )
+    parser.add_argument(
+        "--tables", default="3-7", metavar="N", help="numbers of the paper's tables, e.g. 3-5 or 6,7 (default: 3-7)"
+    )
     parser.add_argument("--data", type=Path, metavar="DIR", help="a folder per scene; without it the tables are listed")
-    parser.add_argument("--scenes", metavar="NAME", help="some of them, e.g. chair,lego; chair=FOLDER where the folder has another name")
+    parser.add_argument(
+        "--scenes", metavar="NAME", help="some of them, e.g. chair,lego; chair=FOLDER where the folder has another name"
+    )
     parser.add_argument("--rows", metavar="NAME", help="some of the rows: 200, 5k, nolimit, real")
-    parser.add_argument("--budget", default="full", metavar="TIME", help="training time of a run, e.g. 10m; full: 100,000 steps (default)")
-    parser.add_argument("--seeds", type=count, default=1, metavar="N", help="runs of each, with seeds from 0 (default: 1)")
-    parser.add_argument("--out", type=Path, default=Path("outputs/paper"), metavar="DIR", help="gets a run directory each")
+    parser.add_argument(
+        "--budget",
+        default="full",
+        metavar="TIME",
+        help="training time of a run, e.g. 10m; full: 100,000 steps (default)",
+    )
+    parser.add_argument(
+        "--seeds", type=count, default=1, metavar="N", help="runs of each, with seeds from 0 (default: 1)"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("outputs/paper"), metavar="DIR", help="gets a run directory each"
+    )
     parser.add_argument("--estimate", action="store_true", help="only say what would run, and for how long")
 
 
@@ -45,10 +60,13 @@ _STORED = ("run", "eval", "render", "tradeoff", "export", "compress", "prune", "
 
 
 def for_stored(parser: argparse.ArgumentParser, name: str) -> None:
-    """Adds the user's word for what a stored configuration would reach (:mod:`neuprim.config.trust`), to the commands that read one."""
+    """Adds the user's word for what a stored configuration would reach (:mod:`neuprim.config.trust`), to the commands
+    that read one."""
     if name in _STORED:
         parser.add_argument(
-            FLAG, action="store_true", help="use addresses, and write to folders outside of it, that a stored config.yaml names"
+            FLAG,
+            action="store_true",
+            help="use addresses, and write to folders outside of it, that a stored config.yaml names",
         )
 
 
@@ -60,12 +78,18 @@ def for_render(parser: argparse.ArgumentParser) -> None:
     space = "coordinates of a file's cameras, of lights, and in .exr files: those of the run's data (default), or of the model (volumes: its unit box)"
     parser.add_argument("--space", choices=("world", "scene"), help=space)
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the data set's)")
-    parser.add_argument("--format", choices=("png", "exr", "npy", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
+    parser.add_argument(
+        "--format", choices=("png", "exr", "npy", "webp", "gif", "mp4"), help="default: png, or webp for an animation"
+    )
     layers = "of an .exr: beauty, alpha, depth, density, and what the run's task adds (an unknown name lists them); default: all"
     parser.add_argument("--layers", metavar="NAME,...", help=layers)
-    datatype = "light and alpha of an .exr in 16 or 32 bits (default: float); depth and other numbers are float in either"
+    datatype = (
+        "light and alpha of an .exr in 16 or 32 bits (default: float); depth and other numbers are float in either"
+    )
     parser.add_argument("--datatype", choices=("half", "float"), help=datatype)
-    parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)")
+    parser.add_argument(
+        "--fps", type=rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)"
+    )
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
     parser.add_argument("--frames", type=count, default=60, metavar="N", help="frames of an orbit (default: 60)")
     parser.add_argument("--force", action="store_true", help="replace pictures of the run's report")
@@ -74,21 +98,34 @@ def for_render(parser: argparse.ArgumentParser) -> None:
 def for_inspect(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of ``neuprim inspect``."""
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    parser.add_argument("--show", default="", metavar="NAME,...", help="volume, isosurface, slices, primitives, primitive, difference, ...")
-    parser.add_argument("--primitives", action="store_true", help="the ellipsoids in their own colours; as --show primitives")
+    parser.add_argument(
+        "--show",
+        default="",
+        metavar="NAME,...",
+        help="volume, isosurface, slices, primitives, primitive, difference, ...",
+    )
+    parser.add_argument(
+        "--primitives", action="store_true", help="the ellipsoids in their own colours; as --show primitives"
+    )
     parser.add_argument("--primitive", type=row, metavar="INDEX", help="look into this one; as --show primitive")
     parser.add_argument("--against", metavar="FILE.vdb|DIR|scene", help="ground truth to compare with")
-    parser.add_argument("--grid", type=count, default=128, metavar="N", help="points along the box's longest side (default: 128)")
+    parser.add_argument(
+        "--grid", type=count, default=128, metavar="N", help="points along the box's longest side (default: 128)"
+    )
     parser.add_argument(
         "--box",
         type=numbers,
         metavar="X,Y,Z,X,Y,Z",
         help="two corners, in the coordinates of the run's data, as --box=-1,-1,-1,1,1,1 (default: around all matter)",
     )
-    parser.add_argument("--level", type=numbers, default=[], metavar="S,...", help="extinctions of isosurfaces, 1/scene unit")
+    parser.add_argument(
+        "--level", type=numbers, default=[], metavar="S,...", help="extinctions of isosurfaces, 1/scene unit"
+    )
     parser.add_argument("--up", choices=("x", "y", "z"), help="the upward axis (default: the scene's, or z)")
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels of the picture or window")
-    parser.add_argument("--out", type=Path, metavar="FILE", help=".png, .webp, .gif, .mp4, .html or .vdb (default: a window)")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help=".png, .webp, .gif, .mp4, .html or .vdb (default: a window)"
+    )
     parser.add_argument("--force", action="store_true", help="replace files that exist")
 
 
@@ -97,13 +134,22 @@ def for_compress(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     parser.add_argument("--tolerance", type=decibels, metavar="DB", help="how much worse it may get (default: 0.1dB)")
     parser.add_argument(
-        "--level", type=count, metavar="1-5", help="so many bits instead, whatever that costs: 1 keeps nearly everything, 5 very little"
+        "--level",
+        type=count,
+        metavar="1-5",
+        help="so many bits instead, whatever that costs: 1 keeps nearly everything, 5 very little",
     )
     words = "bits of a parameter, or of all others, over a level's (3 unless given): means=16 sh_rest=6,5 others=8"
     parser.add_argument("--bits", nargs="+", default=[], metavar="NAME=BITS", help=words)
-    parser.add_argument("--seconds", type=duration, default=30.0, metavar="S", help="of training for few bits; 0 for none (default: 30)")
-    parser.add_argument("--steps", type=whole, metavar="N", help="of training instead, for the same file on every machine")
-    parser.add_argument("--out", "--output", type=Path, metavar="FILE", help="where to write (default: RUN_DIR/model.neuprim)")
+    parser.add_argument(
+        "--seconds", type=duration, default=30.0, metavar="S", help="of training for few bits; 0 for none (default: 30)"
+    )
+    parser.add_argument(
+        "--steps", type=whole, metavar="N", help="of training instead, for the same file on every machine"
+    )
+    parser.add_argument(
+        "--out", "--output", type=Path, metavar="FILE", help="where to write (default: RUN_DIR/model.neuprim)"
+    )
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
 
 

@@ -70,7 +70,9 @@ def _named(word: str) -> tuple[str, str]:
 
 
 def _number(value: float | None, kind: str) -> str:
-    return "–" if value is None else f"{value:,.0f}" if kind == "primitives" else f"{value:.{2 if kind == 'PSNR' else 4}f}"
+    return (
+        "–" if value is None else f"{value:,.0f}" if kind == "primitives" else f"{value:.{2 if kind == 'PSNR' else 4}f}"
+    )
 
 
 def _listing(chosen: Sequence[Table]) -> Iterator[str]:
@@ -86,7 +88,8 @@ def _listing(chosen: Sequence[Table]) -> Iterator[str]:
 
 
 def _estimate(planned: Sequence[Planned]) -> Iterator[str]:
-    """What would run, and for how long: seconds of a budget, else steps at the pace of the first ones in the first scene of each row."""
+    """What would run, and for how long: seconds of a budget, else steps at the pace of the first ones in the first
+    scene of each row."""
     total, paces, grows = 0.0, dict[tuple[str, str], float](), False
     for one in planned:
         train, key = one.config.train, (one.table.title, one.row.name)
@@ -128,7 +131,8 @@ def _others(one: Planned) -> str:
 
 
 def _means(results: Sequence[tuple[Planned, Mapping[str, Any]]]) -> Iterator[str]:
-    """Per row, over scenes and seeds that have both numbers; the paper's are of its best checkpoint on the test views, ours of the last."""
+    """Per row, over scenes and seeds that have both numbers; the paper's are of its best checkpoint on the test views,
+    ours of the last."""
     rows = dict.fromkeys((one.table.title, one.row.name) for one, _ in results)
     for title, name in rows:
         own = [(one, metrics) for one, metrics in results if (one.table.title, one.row.name) == (title, name)]
@@ -136,7 +140,11 @@ def _means(results: Sequence[tuple[Planned, Mapping[str, Any]]]) -> Iterator[str
         yield f"{title}, {name}: means over {len({one.scene for one, _ in own})} scenes, {seeds} seed{'s' * (seeds > 1)}; ours of the last checkpoint, the paper's of the best"
         pairs = [pair for one, metrics in own for pair in compared(one, metrics) if pair[0] != "primitives"]
         for kind in ("PSNR", "SSIM", "LPIPS"):
-            both = [(ours, theirs) for what, ours, theirs, _ in pairs if what == kind and ours is not None and theirs is not None]
+            both = [
+                (ours, theirs)
+                for what, ours, theirs, _ in pairs
+                if what == kind and ours is not None and theirs is not None
+            ]
             if both:
                 ours, theirs = (statistics.mean(column) for column in zip(*both, strict=True))
                 yield f"  {kind:10} {_number(ours, kind):>9}   paper {_number(theirs, kind)}"

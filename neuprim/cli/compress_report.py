@@ -16,7 +16,9 @@ def compress(args: argparse.Namespace, run_dir: Path) -> int:
     """Writes the file and prints what became of the model."""
     progress = LineProgress(plain_console(stderr=True))
     print_compression(
-        compress_run(run_dir, args.level, args.bits, args.out, args.force, progress, args.seconds, args.steps, args.tolerance)
+        compress_run(
+            run_dir, args.level, args.bits, args.out, args.force, progress, args.seconds, args.steps, args.tolerance
+        )
     )
     return 0
 
@@ -29,10 +31,16 @@ def print_compression(made: Compression) -> None:
     cells += [("all, and the header", "", f"{made.before:,}", f"{made.after:,}", _times(made.before, made.after))]
     widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
     for name, *numbers in cells:
-        print("  ".join([f"{name:{widths[0]}}", *(f"{n:>{w}}" for n, w in zip(numbers, widths[1:], strict=True))]).rstrip())
+        print(
+            "  ".join(
+                [f"{name:{widths[0]}}", *(f"{n:>{w}}" for n, w in zip(numbers, widths[1:], strict=True))]
+            ).rstrip()
+        )
     for name, (before, after) in made.measured.items():
         unit, digits = (" dB", 3) if name == "psnr" else ("", 4)
-        print(f"{name:5} {before:.{digits}f} -> {after:.{digits}f}{unit} ({after - before:+.{digits}f}), mean of the held-out views")
+        print(
+            f"{name:5} {before:.{digits}f} -> {after:.{digits}f}{unit} ({after - before:+.{digits}f}), mean of the held-out views"
+        )
     for note in made.notes:
         print(f"note: {note}")
     trained = f", with {made.steps:,} steps of training" if made.steps else ""

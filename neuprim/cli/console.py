@@ -1,7 +1,8 @@
 """The terminal, for text that is printed as it is.
 
-rich reads ``[name]`` as markup and ``:name:`` as an emoji, and leaves out what it takes for either: ``pip install 'neuprim[video]'``
-would lose its extra, and a path its folder. Names, paths and commands come from outside, so nothing here is markup.
+rich reads ``[name]`` as markup and ``:name:`` as an emoji, and leaves out what it takes for either: ``pip install
+'neuprim[video]'`` would lose its extra, and a path its folder. Names, paths and commands come from outside, so nothing
+here is markup.
 """
 
 from __future__ import annotations

@@ -69,7 +69,11 @@ def _simd() -> str:
     from llvmlite import binding
 
     features = binding.get_host_cpu_features()
-    found = [name for name in ("sse4.2", "neon", "avx", "avx2", "fma", "avx512f", "avx512vl", "avx512dq") if features.get(name)]
+    found = [
+        name
+        for name in ("sse4.2", "neon", "avx", "avx2", "fma", "avx512f", "avx512vl", "avx512dq")
+        if features.get(name)
+    ]
     return ", ".join(found) or "none known"
 
 
@@ -92,7 +96,9 @@ def _packages() -> Rows:
     for text in metadata.requires("neuprim") or []:
         requirement = Requirement(text)
         extra = _extra_of(requirement)
-        if extra in NOT_FOR_USERS or not (requirement.marker is None or requirement.marker.evaluate({"extra": extra or ""})):
+        if extra in NOT_FOR_USERS or not (
+            requirement.marker is None or requirement.marker.evaluate({"extra": extra or ""})
+        ):
             continue
         wanted = f"'neuprim[{extra}]'" if extra else f"'{requirement.name}{requirement.specifier}'"
         needed.setdefault(requirement.name, []).append((requirement, wanted))
@@ -103,7 +109,8 @@ def _packages() -> Rows:
 
 
 def _state(name: str, needed: list[tuple[Requirement, str]]) -> str:
-    """The version of an installed package, and what to install where it is missing or does not suit all that need it."""
+    """The version of an installed package, and what to install where it is missing or does not suit all that need
+    it."""
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -140,11 +147,16 @@ def _cuda() -> Rows:
     if torch.version.cuda is None:
         return [("none", f"torch {torch.__version__} is a CPU build"), used]
     if not torch.cuda.is_available():
-        return [("none", f"torch {torch.__version__} has CUDA {torch.version.cuda}, but no device or driver is usable"), used]
+        return [
+            ("none", f"torch {torch.__version__} has CUDA {torch.version.cuda}, but no device or driver is usable"),
+            used,
+        ]
     rows: Rows = [used]
     for i in range(torch.cuda.device_count()):
         p = torch.cuda.get_device_properties(i)
-        rows.append((f"cuda:{i}", f"{p.name}, {p.total_memory / 2**30:.1f} GiB, compute capability {p.major}.{p.minor}"))
+        rows.append(
+            (f"cuda:{i}", f"{p.name}, {p.total_memory / 2**30:.1f} GiB, compute capability {p.major}.{p.minor}")
+        )
     return rows
 
 

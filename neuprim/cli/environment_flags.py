@@ -18,9 +18,16 @@ __all__ = ["add_environment_flags", "environment_of"]
 def add_environment_flags(parser: argparse.ArgumentParser) -> None:
     """Adds them as a group of their own."""
     group = parser.add_argument_group("light from all around, for tasks with a light")
-    group.add_argument("--environment", type=Path, metavar="FILE.exr", help="radiance by latitude and longitude, twice as wide as high")
+    group.add_argument(
+        "--environment", type=Path, metavar="FILE.exr", help="radiance by latitude and longitude, twice as wide as high"
+    )
     group.add_argument("--environment-samples", type=_count, metavar="N", help="lights that stand for it (default: 64)")
-    group.add_argument("--environment-rotation", type=_degrees, metavar="DEG", help="anticlockwise about up, seen from above (default: 0)")
+    group.add_argument(
+        "--environment-rotation",
+        type=_degrees,
+        metavar="DEG",
+        help="anticlockwise about up, seen from above (default: 0)",
+    )
     group.add_argument("--environment-scale", type=_factor, metavar="X", help="multiplies its radiance (default: 1)")
     unseen = "light from where the model never saw any: draw what it guesses, or leave it out (default: keep)"
     group.add_argument("--environment-unseen", choices=("keep", "drop"), help=unseen)

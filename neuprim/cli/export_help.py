@@ -1,4 +1,5 @@
-"""What ``neuprim export --help`` says about formats: which there are, and the options of the one that ``--format`` names."""
+"""What ``neuprim export --help`` says about formats: which there are, and the options of the one that ``--format``
+names."""
 
 from __future__ import annotations
 

@@ -15,7 +15,12 @@ def print_report(report: ExportReport, as_json: bool) -> None:
     """The report on standard output, for people or for programs."""
     if as_json:
         errors = {name: value if math.isfinite(value) else None for name, value in report.errors.items()}
-        record = {"files": [str(p) for p in report.files], "lossless": report.lossless, "errors": errors, "notes": list(report.notes)}
+        record = {
+            "files": [str(p) for p in report.files],
+            "lossless": report.lossless,
+            "errors": errors,
+            "notes": list(report.notes),
+        }
         print(json.dumps(record, indent=1, allow_nan=False))
         return
     print(*report.files, sep="\n")
@@ -37,4 +42,7 @@ def _table(errors: Mapping[str, float]) -> list[str]:
         return [f"{name:{width}}  {value:.4f}" for name, value in errors.items()]
     first, widths = max(map(len, rows)), [max(len(key), 9) for key in columns]
     lines = [("", columns), *((thing, [row.get(key, "") for key in columns]) for thing, row in rows.items())]
-    return ["  ".join([f"{thing:{first}}", *(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True))]) for thing, cells in lines]
+    return [
+        "  ".join([f"{thing:{first}}", *(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True))])
+        for thing, cells in lines
+    ]

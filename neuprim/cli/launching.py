@@ -33,14 +33,20 @@ class LaunchProgress:
         self._statuses = [Status()] * len(names)
         self._begun: dict[int, float] = {}
         self._said: dict[int, tuple[object, ...]] = {}
-        self._shown = Live(self, console=console, refresh_per_second=4, transient=False, redirect_stdout=True) if self.live else None
+        self._shown = (
+            Live(self, console=console, refresh_per_second=4, transient=False, redirect_stdout=True)
+            if self.live
+            else None
+        )
 
     def __enter__(self) -> Self:
         if self._shown is not None:
             self._shown.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self._shown is not None:
             self._shown.stop()
 
@@ -64,7 +70,11 @@ class LaunchProgress:
             status.text.startswith("no sign"),
             status.attempt,
         )
-        if self._said.get(number) == said or status.state in ("starting", "failed", "interrupted"):  # of which the command speaks
+        if self._said.get(number) == said or status.state in (
+            "starting",
+            "failed",
+            "interrupted",
+        ):  # of which the command speaks
             return
         self._said[number] = said
         if status.state == "done" and not status.step:
@@ -85,7 +95,14 @@ class LaunchProgress:
         order = sorted(range(len(self.names)), key=lambda n: (_ORDER.index(self._statuses[n].state), n))
         for number in sorted(order[:room]):
             status = self._statuses[number]
-            cells = (self.names[number], _state(status), _steps(status), _psnr(status), self._seconds(number), status.text)
+            cells = (
+                self.names[number],
+                _state(status),
+                _steps(status),
+                _psnr(status),
+                self._seconds(number),
+                status.text,
+            )
             table.add_row(*(Text(cell, style=_style(status)) for cell in cells))
         yield table
         counts = Counter(status.state for status in self._statuses)

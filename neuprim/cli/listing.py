@@ -79,7 +79,9 @@ def _task(spec: TaskSpec, added: list[PluginReport[SceneExtension]]) -> list[str
     if spec.conditions:
         found.append(("conditions", ", ".join(f"{c.name} [{c.unit}]" for c in spec.conditions)))
     found += [("options", line) for line in _options(spec)]
-    return [f"{title if i == 0 or title != found[i - 1][0] else '':10}  {text}" for i, (title, text) in enumerate(found)]
+    return [
+        f"{title if i == 0 or title != found[i - 1][0] else '':10}  {text}" for i, (title, text) in enumerate(found)
+    ]
 
 
 def _options(spec: TaskSpec | LossExtension) -> list[str]:

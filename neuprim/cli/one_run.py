@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 __all__ = ["one_run"]
 
 
-def one_run(config: RunConfig, typed: Typed, viewer: ViewerSettings | None = None, launcher: LauncherSettings | None = None) -> Path:
+def one_run(
+    config: RunConfig, typed: Typed, viewer: ViewerSettings | None = None, launcher: LauncherSettings | None = None
+) -> Path:
     """The run's directory; an interruption says where it is and what goes on with it.
 
     Args:
@@ -29,7 +31,11 @@ def one_run(config: RunConfig, typed: Typed, viewer: ViewerSettings | None = Non
 
     try:
         with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}") as events:
-            return run(config, events, launcher=launcher or LauncherSettings()) if viewer is None else run_viewed(config, events, viewer)
+            return (
+                run(config, events, launcher=launcher or LauncherSettings())
+                if viewer is None
+                else run_viewed(config, events, viewer)
+            )
     except KeyboardInterrupt:
         begun = any((config.output_dir / file).exists() for file in ("checkpoint.safetensors", "chunks.json"))
         there = "has the run up to here" if begun else "has no checkpoint yet"

@@ -1,4 +1,5 @@
-"""Words of an operating point on the command line: ``renderer.alpha_min=0.01``, ``store.colour=float16``, ``resolution=0.5``."""
+"""Words of an operating point on the command line: ``renderer.alpha_min=0.01``, ``store.colour=float16``,
+``resolution=0.5``."""
 
 from __future__ import annotations
 
@@ -9,7 +10,13 @@ __all__ = ["DRAWN", "OPERATING", "operating_words"]
 DRAWN = ("eval", "render", "tradeoff")
 """Commands that take them."""
 
-_HEADS = ("renderer", "resolution", "density", "colour", "store")  # neuprim.runs.operating.HEADS, without loading what draws
+_HEADS = (
+    "renderer",
+    "resolution",
+    "density",
+    "colour",
+    "store",
+)  # neuprim.runs.operating.HEADS, without loading what draws
 
 OPERATING = """\
 KEY=VALUE words draw the run otherwise than it says itself:

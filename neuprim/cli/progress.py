@@ -1,4 +1,5 @@
-"""What commands show while they work: a bar with ETA, PSNR and primitive count on a terminal, a line now and then elsewhere."""
+"""What commands show while they work: a bar with ETA, PSNR and primitive count on a terminal, a line now and then
+elsewhere."""
 
 from __future__ import annotations
 
@@ -23,7 +24,9 @@ class _Shown:
         self.bar.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.bar.stop()
 
 
@@ -94,7 +97,8 @@ class RunProgress(_Shown):
 
 
 class DrawProgress(_Shown):
-    """Context manager around the drawing of images: a bar on a terminal that is gone afterwards, a line now and then elsewhere."""
+    """Context manager around the drawing of images: a bar on a terminal that is gone afterwards, a line now and then
+    elsewhere."""
 
     def __init__(self, console: Console) -> None:
         self.console = console

@@ -18,10 +18,18 @@ def for_prune(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments."""
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     parser.add_argument(
-        "--tolerance", type=arguments.decibels, default=0.1, metavar="DB", help="how much worse it may get (default: 0.1dB)"
+        "--tolerance",
+        type=arguments.decibels,
+        default=0.1,
+        metavar="DB",
+        help="how much worse it may get (default: 0.1dB)",
     )
-    parser.add_argument("--seconds", type=arguments.duration, default=60.0, metavar="S", help="of fine-tuning; 0 for none (default: 60)")
-    parser.add_argument("--steps", type=arguments.whole, metavar="N", help="of fine-tuning instead, for the same model on every machine")
+    parser.add_argument(
+        "--seconds", type=arguments.duration, default=60.0, metavar="S", help="of fine-tuning; 0 for none (default: 60)"
+    )
+    parser.add_argument(
+        "--steps", type=arguments.whole, metavar="N", help="of fine-tuning instead, for the same model on every machine"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="the new run's directory (default: RUN_DIR-pruned)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
 

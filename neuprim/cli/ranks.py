@@ -43,7 +43,9 @@ def run_as_rank(place: Place, words: list[str], more: bool) -> int:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         raise group.cause(RankError("ended by SIGTERM"))
 
-    before = signal.signal(signal.SIGTERM, terminated)  # torchrun sends it where another rank died; a training listens for it itself
+    before = signal.signal(
+        signal.SIGTERM, terminated
+    )  # torchrun sends it where another rank died; a training listens for it itself
     try:
         with sharing(max(machine_cores() // place.local_size, 1)):
             _fit(_composed(words, more, group), words, group)
@@ -128,13 +130,22 @@ def _fit(config: RunConfig, words: Sequence[str], group: Group) -> bool:
                 warnings.simplefilter("ignore")  # the first rank warns
                 run(config, silent, ranks=group)
             return False
-        with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}, {group.size} ranks") as events:
+        with RunProgress(
+            plain_console(stderr=True), f"{config.task}/{config.scene_name}, {group.size} ranks"
+        ) as events:
             print(run(config, events, ranks=group))
     except RankError as error:
         raise RankError(f"{error}; to go on: {command}", error.told) from error
     except KeyboardInterrupt:
         if not group.first:
-            return False  # torchrun takes any other status for a failure, and ends the first rank, which has the rest to do
-        there = "has the run up to here" if (config.output_dir / "checkpoint.safetensors").exists() else "has no checkpoint yet"
-        raise KeyboardInterrupt(f"; {config.output_dir} {there}; to go on, with any number of processes:\n  {command}") from None
+            # torchrun takes any other status for a failure, and ends the first rank, which has the rest to do
+            return False
+        there = (
+            "has the run up to here"
+            if (config.output_dir / "checkpoint.safetensors").exists()
+            else "has no checkpoint yet"
+        )
+        raise KeyboardInterrupt(
+            f"; {config.output_dir} {there}; to go on, with any number of processes:\n  {command}"
+        ) from None
     return False

@@ -85,7 +85,11 @@ def _told(configs: Sequence[RunConfig], results: Sequence[Result | None], live: 
         if live:
             _print_error(config.output_dir, result.line)
         status = 1 if result.trace or status == 1 else 2
-    left = [config for config, result in zip(configs, results, strict=True) if result is None or result.state == "interrupted"]
+    left = [
+        config
+        for config, result in zip(configs, results, strict=True)
+        if result is None or result.state == "interrupted"
+    ]
     if left:
         raise KeyboardInterrupt(_to_go_on(configs, left, typed))
     return status
@@ -97,5 +101,7 @@ def _to_go_on(configs: Sequence[RunConfig], left: Sequence[RunConfig], typed: Ty
         where = f"{left[0].output_dir} {'has the run up to here' if begun else 'has no checkpoint yet'}"
     else:
         over = len(configs) - len(left)
-        where = f"{left[0].output_dir.parent} has {over} of {len(configs)} runs, and {len(begun)} of the others up to here"
+        where = (
+            f"{left[0].output_dir.parent} has {over} of {len(configs)} runs, and {len(begun)} of the others up to here"
+        )
     return f"; {where}; to go on:\n  {shlex.join(['neuprim', 'run', *typed.resuming(left[0].output_dir)])}"

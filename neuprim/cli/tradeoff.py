@@ -33,14 +33,24 @@ def of_words(first: str) -> bool:
 def for_tradeoff(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments."""
     parser.add_argument("run_dir", metavar="RUN_DIR|KEY=VALUE", help="a finished run, or words of `neuprim run`")
-    parser.add_argument("--views", type=arguments.count, default=5, metavar="N", help="held-out views, evenly spread (default: 5)")
-    parser.add_argument("--repeats", type=arguments.count, default=15, metavar="N", help="rounds of timing (default: 15)")
-    parser.add_argument("--knobs", nargs="+", default=[], metavar="NAME", help="some of them, e.g. alpha_min sort (default: all)")
     parser.add_argument(
-        "--budget", metavar="TIME", help="about how long, e.g. 90s or 10m; what does not fit is left out (default: 5m, 20m of trainings)"
+        "--views", type=arguments.count, default=5, metavar="N", help="held-out views, evenly spread (default: 5)"
+    )
+    parser.add_argument(
+        "--repeats", type=arguments.count, default=15, metavar="N", help="rounds of timing (default: 15)"
+    )
+    parser.add_argument(
+        "--knobs", nargs="+", default=[], metavar="NAME", help="some of them, e.g. alpha_min sort (default: all)"
+    )
+    parser.add_argument(
+        "--budget",
+        metavar="TIME",
+        help="about how long, e.g. 90s or 10m; what does not fit is left out (default: 5m, 20m of trainings)",
     )
     parser.add_argument("--seeds", type=arguments.count, metavar="N", help="trainings of every model (default: 1)")
-    parser.add_argument("--lpips", type=Path, metavar="FILE", help="measure LPIPS with these weights of your own, a file or a folder")
+    parser.add_argument(
+        "--lpips", type=Path, metavar="FILE", help="measure LPIPS with these weights of your own, a file or a folder"
+    )
 
 
 def tradeoff(args: argparse.Namespace) -> int:
@@ -53,7 +63,9 @@ def tradeoff(args: argparse.Namespace) -> int:
     words = [*args.words, *(word for word in args.knobs if "=" in word)]  # after --knobs they look like names
     knobs = [word for word in args.knobs if "=" not in word]
     if args.seeds is not None:
-        raise ConfigError("--seeds: of models that are trained (neuprim tradeoff task=NAME ...); a finished run has one")
+        raise ConfigError(
+            "--seeds: of models that are trained (neuprim tradeoff task=NAME ...); a finished run has one"
+        )
     request = Request(args.run_dir, args.views, args.repeats, knobs, seconds_of(args.budget or "5m"), words, args.lpips)
     folder = args.run_dir / FOLDER
     try:
@@ -62,7 +74,9 @@ def tradeoff(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         if not (folder / "tradeoff.json").exists():
             raise
-        raise KeyboardInterrupt(f"; {folder / 'tradeoff.json'} has the points up to here; the same command goes on") from None
+        raise KeyboardInterrupt(
+            f"; {folder / 'tradeoff.json'} has the points up to here; the same command goes on"
+        ) from None
     console = plain_console()
     for title, numbers in (("front of speed", record.speed), ("front of size", record.size)):
         console.print(_table(title, record, numbers))
@@ -92,7 +106,11 @@ def _cells(point: Measured) -> tuple[str, ...]:
     q = point.quality
     about = "" if point.spread is None else f" ± {point.spread:.3f}"
     return (
-        *((f"{point.ratio:.3f}{about}", f"{point.time:.2f}", f"{1e3 / point.time:.1f}") if point.ms else ("–", "–", "–")),
+        *(
+            (f"{point.ratio:.3f}{about}", f"{point.time:.2f}", f"{1e3 / point.time:.1f}")
+            if point.ms
+            else ("–", "–", "–")
+        ),
         *(f"{q['psnr']:.2f}", f"{q['ssim']:.4f}", f"{q['psnr_exact']:.1f}", f"{point.bytes:,}"),
         "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e6:.1f}",
     )

@@ -28,7 +28,11 @@ def tradeoff_models(args: argparse.Namespace) -> int:
     from neuprim.runs.design.run import DesignRequest, design_run
     from neuprim.runs.tradeoff.run import seconds_of
 
-    words = [args.run_dir, *args.words, *(word for word in args.knobs if "=" in word)]  # after --knobs they look like names
+    words = [
+        args.run_dir,
+        *args.words,
+        *(word for word in args.knobs if "=" in word),
+    ]  # after --knobs they look like names
     knobs = [word for word in args.knobs if "=" not in word]
     launcher, words = launcher_words(words)
     said = [str(a.value) for a in parse(words) if a.key == "budget"]
@@ -78,5 +82,9 @@ def _cells(model: Model) -> tuple[str, ...]:
     return (
         *(f"{q['psnr']:.2f}{seeds}", f"{q['ssim']:.4f}", f"{q['psnr_exact']:.0f}"),
         *((f"{model.ratio:.3f}{about}", f"{1e3 / model.time:.1f}") if model.ms else ("–", "–")),
-        *(f"{model.ms_per_step:.1f}", f"{model.bytes:,}", "–" if model.peak_bytes is None else f"{model.peak_bytes / 1e6:.1f}"),
+        *(
+            f"{model.ms_per_step:.1f}",
+            f"{model.bytes:,}",
+            "–" if model.peak_bytes is None else f"{model.peak_bytes / 1e6:.1f}",
+        ),
     )

@@ -17,8 +17,12 @@ Prints where they are."""
 
 def for_truth(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of ``neuprim truth``."""
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings of the scene and of the launcher, as of neuprim run")
-    parser.add_argument("-m", "--multirun", action="store_true", help="of every combination of values separated by commas")
+    parser.add_argument(
+        "overrides", nargs="*", metavar="KEY=VALUE", help="settings of the scene and of the launcher, as of neuprim run"
+    )
+    parser.add_argument(
+        "-m", "--multirun", action="store_true", help="of every combination of values separated by commas"
+    )
 
 
 def truth(args: argparse.Namespace) -> int:

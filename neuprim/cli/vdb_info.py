@@ -52,12 +52,15 @@ def _files(path: Path) -> tuple[list[Path], list[str]]:
             raise
         return files, [f"not one sequence: {error}"]
     missing = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in frames.gaps)
-    note = f"{len(frames)} frames, {frames.frames[0].number} to {frames.frames[-1].number}; missing: {missing or 'none'}"
+    note = (
+        f"{len(frames)} frames, {frames.frames[0].number} to {frames.frames[-1].number}; missing: {missing or 'none'}"
+    )
     return [frame.path for frame in frames.frames], [note]
 
 
 def describe_file(path: Path) -> dict[str, Any]:
-    """Everything the report shows, as JSON-ready values: lengths in world units, bounds in voxel indices (upper ones excluded)."""
+    """Everything the report shows, as JSON-ready values: lengths in world units, bounds in voxel indices (upper ones
+    excluded)."""
     header = read_header(path)
     grids = read_grids(path, level_sets=True)  # in the same order, one in memory at a time
     return {

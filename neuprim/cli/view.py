@@ -20,8 +20,12 @@ __all__ = ["for_view", "run_viewed", "view"]
 def for_view(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments."""
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    parser.add_argument("--port", type=_port, default=8080, metavar="N", help="of the page's address; 0 for any (default: 8080)")
-    parser.add_argument("--host", metavar="ADDRESS", help="to listen on (default: 127.0.0.1, which this machine alone reaches)")
+    parser.add_argument(
+        "--port", type=_port, default=8080, metavar="N", help="of the page's address; 0 for any (default: 8080)"
+    )
+    parser.add_argument(
+        "--host", metavar="ADDRESS", help="to listen on (default: 127.0.0.1, which this machine alone reaches)"
+    )
 
 
 def view(args: argparse.Namespace) -> int:
@@ -39,7 +43,13 @@ def view(args: argparse.Namespace) -> int:
         print(f"{address}\nopen it in a browser; Ctrl-C ends the viewer", flush=True)
 
     try:
-        view_run(args.run_dir, settings, opened, lambda text: console.print(f"neuprim: {text}", markup=False), LineProgress(console))
+        view_run(
+            args.run_dir,
+            settings,
+            opened,
+            lambda text: console.print(f"neuprim: {text}", markup=False),
+            LineProgress(console),
+        )
     except KeyboardInterrupt:
         print("neuprim: the viewer is closed", file=sys.stderr)
     return 0

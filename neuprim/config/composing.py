@@ -1,7 +1,8 @@
 """From the words after ``neuprim run`` to a :class:`RunConfig`.
 
-Values win in this order: what the user typed, the level of effort, the preset, the defaults of the settings dataclasses. Hydra finds and composes
-the YAML files (its ``compose``, so nothing changes directory or writes files); the settings dataclasses say which keys exist.
+Values win in this order: what the user typed, the level of effort, the preset, the defaults of the settings
+dataclasses. Hydra finds and composes the YAML files (its ``compose``, so nothing changes directory or writes files);
+the settings dataclasses say which keys exist.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ __all__ = ["compose", "compose_all", "preset_settings"]
 CHOICES = ("task", "scene", "preset", EFFORT)
 PRESET_KEYS = ("model", "train", "renderer")
 PATHS = "_paths_"
-"""Key of a scene's YAML that lists which of its settings are paths: ``~`` is expanded and they are made absolute; URLs stay."""
+"""Key of a scene's YAML that lists which of its settings are paths: ``~`` is expanded and they are made absolute; URLs
+stay."""
 
 Files = dict[tuple[str, ...], Any]
 """Hydra's compositions by packages and group, so that a sweep reads each file once."""
@@ -89,7 +91,12 @@ def _compose(overrides: Sequence[str], check_output: bool, files: Files, stored:
 
 
 def _resumed(
-    begun: RunConfig, overrides: Sequence[str], chosen: Mapping[str, str | None], check_output: bool, files: Files, stored: RunConfig | None
+    begun: RunConfig,
+    overrides: Sequence[str],
+    chosen: Mapping[str, str | None],
+    check_output: bool,
+    files: Files,
+    stored: RunConfig | None,
 ) -> RunConfig:
     """The configuration of a run that goes on: its own, under what is typed now and not what was typed then."""
     assert begun.source is not None, "it was read from its directory"
@@ -125,7 +132,11 @@ def _composed(
         raise ConfigError(f"preset={preset}: task {spec.name!r} has no such preset{nearest(preset, presets(spec))}")
 
     base, declared_paths = _base(spec, scene_name, preset, own.options, files, package)
-    again = () if begun is None else (a for a in settings_below(begun, scene_word, values) if a.key not in of_launch(overrides))
+    again = (
+        ()
+        if begun is None
+        else (a for a in settings_below(begun, scene_word, values) if a.key not in of_launch(overrides))
+    )
     files_settings = (*again, *(() if stored is None else settings_below(stored, scene_word, values)))
     below = (*files_settings, *(() if level is None else level.settings))
     for assignment in (*below, *values):
@@ -170,8 +181,11 @@ def _composed(
     return made
 
 
-def compose_all(overrides: Sequence[str], check_output: bool = True, stored: RunConfig | None = None) -> list[RunConfig]:
-    """The configurations of a sweep, each in its own sub-directory of one output directory; all are valid before one runs.
+def compose_all(
+    overrides: Sequence[str], check_output: bool = True, stored: RunConfig | None = None
+) -> list[RunConfig]:
+    """The configurations of a sweep, each in its own sub-directory of one output directory; all are valid before one
+    runs.
 
     Arguments and errors are those of :func:`compose`.
     """
@@ -180,7 +194,9 @@ def compose_all(overrides: Sequence[str], check_output: bool = True, stored: Run
         return [compose(overrides, check_output, stored)]
     combinations = expand_sweep(overrides)
     files: Files = {}
-    resume = [word for word in overrides if key_of(word) == "resume"]  # of each run below, not of one in the sweep's directory
+    resume = [
+        word for word in overrides if key_of(word) == "resume"
+    ]  # of each run below, not of one in the sweep's directory
     alone = [[word for word in c if key_of(word) != "resume"] for c in combinations]
     configs = [_compose([*c, "output_dir=null"], False, files, stored) for c in alone]
     first = configs[0]
@@ -196,7 +212,9 @@ def compose_all(overrides: Sequence[str], check_output: bool = True, stored: Run
     for config, words_alone, name in zip(configs, alone, names, strict=True):
         begun = begun_as(base / name, words_alone) if goes_on else None
         if begun is True or (begun is False and not recorded):  # else the record of the sweep refuses other words
-            config = _compose([*words_alone, "resume=true", assigned("output_dir", str(base / name))], False, files, stored)
+            config = _compose(
+                [*words_alone, "resume=true", assigned("output_dir", str(base / name))], False, files, stored
+            )
         own = [*(word for word in config.overrides if key_of(word) != "resume"), *resume]
         own = [word for word in own if word not in ("output_dir=null", assigned("output_dir", str(base / name)))]
         made.append(dataclasses.replace(config, output_dir=base / name, resume=goes_on, overrides=own))
@@ -242,13 +260,18 @@ def _hydra_compose(spec: TaskSpec, packages: Sequence[str], groups: Sequence[str
             places = ",".join(f"pkg://{p}" for p in dict.fromkeys(packages))
             return hydra_compose("config", [f"hydra.searchpath=[{places}]", *groups])
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        raise ConfigError(f"task {spec.name!r}: its YAML files do not compose ({' '.join(str(error).split())})") from error
+        raise ConfigError(
+            f"task {spec.name!r}: its YAML files do not compose ({' '.join(str(error).split())})"
+        ) from error
 
 
-def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], files: Files, package: str) -> tuple[dict[str, Any], list[str]]:
+def _base(
+    spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], files: Files, package: str
+) -> tuple[dict[str, Any], list[str]]:
     """Everything but the user's words, unresolved, and the names of the scene's settings that are paths.
 
-    ``package`` holds the scene's file. A scene cannot replace a preset of the task, nor the task a scene of that package.
+    ``package`` holds the scene's file. A scene cannot replace a preset of the task, nor the task a scene of that
+    package.
     """
     from omegaconf import OmegaConf
 
@@ -257,7 +280,10 @@ def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], file
     if package == spec.config_package:
         composed = of_scene = _hydra(spec, task_first, (scene_group, preset_group), files)
     else:
-        composed, of_scene = _hydra(spec, task_first, (preset_group,), files), _hydra(spec, task_first[::-1], (scene_group,), files)
+        composed, of_scene = (
+            _hydra(spec, task_first, (preset_group,), files),
+            _hydra(spec, task_first[::-1], (scene_group,), files),
+        )
     place, scene_place = f"preset/{spec.name}/{preset}.yaml", f"scene/{spec.name}/{scene}.yaml"
     scene_node = _plain(of_scene.get("from_scene"), resolve=False, place=scene_place)
     preset_node = _plain(composed.get("from_preset"), resolve=False, place=place)
@@ -279,7 +305,8 @@ def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], file
 
 
 def preset_settings(spec: TaskSpec, preset: str, scene: str, level: Level | None = None) -> RunSettings:
-    """Settings of a preset, or of a level of effort over it, and a scene of a task, with nothing typed; the task need not be registered.
+    """Settings of a preset, or of a level of effort over it, and a scene of a task, with nothing typed; the task need
+    not be registered.
 
     Raises:
         ConfigError: its files lack something, do not compose, or hold an impossible value.
@@ -292,7 +319,8 @@ def preset_settings(spec: TaskSpec, preset: str, scene: str, level: Level | None
 def _merge(
     base: Mapping[str, Any], values: Sequence[Assignment], below: Sequence[Assignment] = ()
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The resolved configuration without and with the user's values; ``below`` stand under them, and are not said by the user."""
+    """The resolved configuration without and with the user's values; ``below`` stand under them, and are not said by
+    the user."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
@@ -308,7 +336,11 @@ def _merge(
     if seconds and seconds[-1] is not None and not _said(values, "iterations"):
         OmegaConf.update(tree, "train.iterations", None)  # a budget in seconds is used up, however fast the machine
     strategy = _said(values, "strategy", "train.population")
-    if strategy and strategy[-1] != base["train"]["population"]["strategy"] and not _said(values, "grow_from", "train.population"):
+    if (
+        strategy
+        and strategy[-1] != base["train"]["population"]["strategy"]
+        and not _said(values, "grow_from", "train.population")
+    ):
         OmegaConf.update(tree, "train.population.grow_from", 1.0)  # the preset's is for populations that grow that way
     return _plain(OmegaConf.create(dict(base))), as_data(_plain(tree), back=True)
 
@@ -320,7 +352,8 @@ def _said(values: Sequence[Assignment], name: str, group: str = "train") -> list
 
 
 def _another_form(base: Mapping[str, Any], values: Sequence[Assignment]) -> bool:
-    """Whether the user chose another form of the density than the one whose settings the preset has; they would mean nothing to it."""
+    """Whether the user chose another form of the density than the one whose settings the preset has; they would mean
+    nothing to it."""
     own = (base["model"].get("density") or {}).get("form")
     typed = [a.value if a.key == "model.density.form" else a.value.get("form") for a in values if _says_form(a)]
     return own is not None and bool(typed) and typed[-1] not in (None, own)

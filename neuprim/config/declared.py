@@ -56,7 +56,10 @@ def complete_options(declared: Options, given: Any, owner: str, where: str = "ta
     for key in given:
         if key not in declared:
             raise ConfigError(f"{where}.{key}: {owner} has no such option{_hint(str(key), declared)}")
-    return {key: converted(given.get(key, option[0]), option_type(option), f"{where}.{key}") for key, option in declared.items()}
+    return {
+        key: converted(given.get(key, option[0]), option_type(option), f"{where}.{key}")
+        for key, option in declared.items()
+    }
 
 
 def _hint(key: str, declared: Options) -> str:
@@ -89,7 +92,8 @@ def check_typed(spec: TaskSpec, loss: LossExtension | None, values: Sequence[Ass
 
 
 def check_preset(spec: TaskSpec, loss: LossExtension | None, preset: Mapping[str, Any]) -> None:
-    """As :func:`check_typed`, for what a preset sets; it may also set what the task's own loss reads while another one is chosen."""
+    """As :func:`check_typed`, for what a preset sets; it may also set what the task's own loss reads while another one
+    is chosen."""
     missing = set(unused(spec, loss)) & set(unused(spec, None))
     for name in _dotted("", preset):
         if name in missing:
@@ -116,7 +120,8 @@ def _dotted(where: str, value: Any) -> Iterator[str]:
 
 
 def check_names(spec: TaskSpec, settings: RunSettings) -> None:
-    """Refuse names under ``model.init``, ``train.rates`` and ``train.rate_units`` that no field of the task has, as far as the task lists its fields.
+    """Refuse names under ``model.init``, ``train.rates`` and ``train.rate_units`` that no field of the task has, as far
+    as the task lists its fields.
 
     The model itself may have fewer; what it lacks is refused when it is made.
     """

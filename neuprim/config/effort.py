@@ -58,7 +58,9 @@ def chosen_level(spec: TaskSpec, chosen: str | None, preset: str | None, presets
         raise ConfigError(f"{EFFORT}={chosen}: expected a level from {LEVELS[0]} (fast) to {LEVELS[-1]} (good)")
     levels = levels_of(spec, presets)
     if levels is None:
-        raise ConfigError(f"{EFFORT}={chosen}: task {spec.name!r} has no levels; set model.primitives=N and train.iterations=N instead")
+        raise ConfigError(
+            f"{EFFORT}={chosen}: task {spec.name!r} has no levels; set model.primitives=N and train.iterations=N instead"
+        )
     level = levels[int(chosen)]
     if preset not in (None, level.preset):
         raise ConfigError(
@@ -93,5 +95,7 @@ def levels_of(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, Level] | N
 
 def _settings(given: Any, who: str) -> tuple[Assignment, ...]:
     if not isinstance(given, Mapping) or not all(isinstance(key, str) and key.startswith(_GROUPS) for key in given):
-        raise ConfigError(f"{who}: found {shown(given)}; expected settings of model, train and renderer by their dotted keys")
+        raise ConfigError(
+            f"{who}: found {shown(given)}; expected settings of model, train and renderer by their dotted keys"
+        )
     return tuple(Assignment(key, value, word(key, value)) for key, value in given.items())

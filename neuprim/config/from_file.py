@@ -32,7 +32,11 @@ def stored_config(path: Path) -> RunConfig:
 def choices_of(stored: RunConfig) -> dict[str, str]:
     """Task, scene and preset of a stored run, as words."""
     made = stored.made_by
-    return {"task": _word(stored.task, made and made.task), "scene": _word(stored.scene_name, made and made.scene), "preset": stored.preset}
+    return {
+        "task": _word(stored.task, made and made.task),
+        "scene": _word(stored.scene_name, made and made.scene),
+        "preset": stored.preset,
+    }
 
 
 def chosen_beside(stored: RunConfig, chosen: Mapping[str, str | None]) -> dict[str, str | None]:
@@ -55,7 +59,8 @@ def chosen_beside(stored: RunConfig, chosen: Mapping[str, str | None]) -> dict[s
 def settings_below(stored: RunConfig, scene: str | None, values: Sequence[Assignment]) -> Iterator[Assignment]:
     """Every setting of a stored run as an assignment that stands under the user's ``values``.
 
-    Left out are those that the user's make void: of another scene, of another form of density, and the other kind of budget.
+    Left out are those that the user's make void: of another scene, of another form of density, and the other kind of
+    budget.
     """
     typed = {a.key for a in values}
     if split(scene or "")[1] == stored.scene_name:
@@ -71,7 +76,8 @@ def settings_below(stored: RunConfig, scene: str | None, values: Sequence[Assign
 def as_data(value: Any, back: bool = False) -> Any:
     """A stored value with every ``${`` hidden from OmegaConf, which would look up what follows; or shown again.
 
-    Rule: what a file says is data, and only what is typed or comes with a package may refer to something. No YAML text has the character 0.
+    Rule: what a file says is data, and only what is typed or comes with a package may refer to something. No YAML text
+    has the character 0.
     """
     if isinstance(value, Mapping):
         return {as_data(key, back): as_data(item, back) for key, item in value.items()}

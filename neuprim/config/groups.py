@@ -1,7 +1,7 @@
 """A task's YAML files: which scenes and presets it has, and what its own ``task/NAME.yaml`` says.
 
-A task's ``config_package`` holds ``task/NAME.yaml``, ``scene/NAME/*.yaml`` and ``preset/NAME/*.yaml``. Scenes and presets lie
-under the task's name because several tasks have a scene of the same name with other settings.
+A task's ``config_package`` holds ``task/NAME.yaml``, ``scene/NAME/*.yaml`` and ``preset/NAME/*.yaml``. Scenes and
+presets lie under the task's name because several tasks have a scene of the same name with other settings.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ DEFAULT_PRESET = "quick"
 
 @dataclass(frozen=True)
 class TaskChoices:
-    """What ``task/NAME.yaml`` says: the scene and preset of a run that names none, and defaults of the task's own options.
+    """What ``task/NAME.yaml`` says: the scene and preset of a run that names none, and defaults of the task's own
+    options.
 
     Attributes:
         options: all that the task declares; those that the file does not name at their defaults.
@@ -39,7 +40,8 @@ def task_choices(spec: TaskSpec) -> TaskChoices:
     """Reads ``task/NAME.yaml``, which is a plain file without a defaults list.
 
     Raises:
-        ConfigError: it is not YAML, has a key other than ``scene``, ``preset`` and ``options``, or sets an option that the task does
+        ConfigError: it is not YAML, has a key other than ``scene``, ``preset`` and ``options``, or sets an option that
+        the task does
             not declare.
     """
     file = f"task/{spec.name}.yaml"

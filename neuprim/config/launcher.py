@@ -1,7 +1,7 @@
 """The words that say where runs work: ``launcher=processes launcher.workers=4``.
 
-Like the words of a target they stand among those after ``neuprim run`` and are taken out of them here: where a run works changes nothing of
-what it makes, so that its configuration does not know.
+Like the words of a target they stand among those after ``neuprim run`` and are taken out of them here: where a run
+works changes nothing of what it makes, so that its configuration does not know.
 """
 
 from __future__ import annotations
@@ -31,9 +31,11 @@ class LauncherSettings:
         workers: runs at once; None: as many as there are, and as the cores of this machine or the cluster allow.
         threads: of each run; None: the cores are shared out.
         retries: how often a run goes on from its checkpoint after its worker died.
-        address: of Ray, as ``ray.init`` takes it: ``auto``, ``HOST:PORT``, ``ray://HOST:PORT``; of Slurm, submitit's name of an executor: ``slurm`` or
+        address: of Ray, as ``ray.init`` takes it: ``auto``, ``HOST:PORT``, ``ray://HOST:PORT``; of Slurm, submitit's
+        name of an executor: ``slurm`` or
             ``local``. None: the Ray of ``RAY_ADDRESS``, else one on this machine; Slurm.
-        options: handed to the engine: Ray's options of a task, such as ``num_gpus``; submitit's parameters, such as ``slurm_partition``.
+        options: handed to the engine: Ray's options of a task, such as ``num_gpus``; submitit's parameters, such as
+        ``slurm_partition``.
     """
 
     name: Name = "inline"
@@ -92,7 +94,9 @@ def _check(settings: LauncherSettings) -> None:
     }.get(settings.name, ())
     for name in unused:
         if name in settings.given():
-            raise ConfigError(f"launcher.{name}: launcher={settings.name} has no use for it; expected it with launcher={_who_uses(name)}")
+            raise ConfigError(
+                f"launcher.{name}: launcher={settings.name} has no use for it; expected it with launcher={_who_uses(name)}"
+            )
 
 
 def _who_uses(name: str) -> str:

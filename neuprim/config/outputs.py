@@ -16,7 +16,8 @@ DEFAULT_TASK = "static"
 
 
 def run_name(task: str, scene: str) -> str:
-    """The name of a run's directory in the output root, where users chose none; ``PACKAGE:NAME`` becomes a part of it."""
+    """The name of a run's directory in the output root, where users chose none; ``PACKAGE:NAME`` becomes a part of
+    it."""
     return "-".join(part for word in (task, scene) for part in split(word) if part)
 
 
@@ -42,7 +43,9 @@ def output_directory(asked: str | None, name: str, resume: bool, check: bool = T
         if path.exists() and not path.is_dir():
             raise ConfigError(f"output_dir={path}: is a file; expected a directory")
         if not resume and path.is_dir() and any(path.iterdir()):
-            raise ConfigError(f"output_dir={path}: exists and is not empty; choose another, or continue its run with resume=true")
+            raise ConfigError(
+                f"output_dir={path}: exists and is not empty; choose another, or continue its run with resume=true"
+            )
         _check_place(path)
     except (OSError, ValueError) as error:
         raise ConfigError(f"output_dir={path}: {error}") from error

@@ -11,7 +11,18 @@ from typing import Any
 
 from neuprim.core.errors import ConfigError
 
-__all__ = ["Assignment", "Typed", "assigned", "expand_sweep", "key_of", "parse", "sweep_names", "swept_keys", "without_place", "word"]
+__all__ = [
+    "Assignment",
+    "Typed",
+    "assigned",
+    "expand_sweep",
+    "key_of",
+    "parse",
+    "sweep_names",
+    "swept_keys",
+    "without_place",
+    "word",
+]
 
 NOT_SWEPT = ("output_dir", "resume")
 MAX_RUNS = 10_000
@@ -19,7 +30,8 @@ MAX_RUNS = 10_000
 
 @dataclass(frozen=True)
 class Assignment:
-    """One ``key=value``; ``key`` is dotted, ``text`` is what was typed. ``whole``: a mapping takes the place of what was there, instead of entries of it."""
+    """One ``key=value``; ``key`` is dotted, ``text`` is what was typed. ``whole``: a mapping takes the place of what
+    was there, instead of entries of it."""
 
     key: str
     value: Any
@@ -30,7 +42,8 @@ class Assignment:
 def parse(overrides: Sequence[str]) -> list[Assignment]:
     """Assignments in the order given.
 
-    A leading ``+`` or ``++`` is accepted and means nothing here: whether a key exists is checked by name, not by prefix.
+    A leading ``+`` or ``++`` is accepted and means nothing here: whether a key exists is checked by name, not by
+    prefix.
 
     Raises:
         ConfigError: for anything that is not one assignment of one value.
@@ -39,7 +52,8 @@ def parse(overrides: Sequence[str]) -> list[Assignment]:
 
 
 def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
-    """Every combination of the values separated by commas, or given by ``range(...)`` or ``choice(...)``, one list per run.
+    """Every combination of the values separated by commas, or given by ``range(...)`` or ``choice(...)``, one list per
+    run.
 
     The last key varies fastest. ``["a=1,2", "b=3"]`` gives ``[["a=1", "b=3"], ["a=2", "b=3"]]``.
     """
@@ -80,7 +94,8 @@ def sweep_names(overrides: Sequence[str], combinations: Sequence[Sequence[str]])
 
 
 def assigned(key: str, value: str) -> str:
-    """``key=value`` as :func:`parse` reads it back, the value quoted where it would be taken for something else than text."""
+    """``key=value`` as :func:`parse` reads it back, the value quoted where it would be taken for something else than
+    text."""
     plain = f"{key}={value}"
     try:
         if value and parse([plain])[0].value == value:
@@ -111,7 +126,9 @@ class Typed:
         sweep = bool(swept_keys(self.words))
         words = without_place(self.words)
         if not words and self.file is None and not (directory / "config.yaml").is_file():
-            words = ["task=static"]  # nothing was said and nothing is written yet: the default, which a bare resume=true does not begin
+            words = [
+                "task=static"
+            ]  # nothing was said and nothing is written yet: the default, which a bare resume=true does not begin
         flags = [*(["-m"] if sweep else []), *([] if self.file is None else ["--config", str(self.file)])]
         return [*flags, *words, assigned("output_dir", str(directory.parent if sweep else directory)), "resume=true"]
 
@@ -146,7 +163,9 @@ def _read(overrides: Sequence[str]) -> list[Any]:
         try:
             result.append(parser.parse_override(text))
         except HydraException as error:
-            raise ConfigError(f"{text}: cannot be read; quote values that contain , = or brackets: {_quoted(text)}") from error
+            raise ConfigError(
+                f"{text}: cannot be read; quote values that contain , = or brackets: {_quoted(text)}"
+            ) from error
     return result
 
 

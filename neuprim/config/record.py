@@ -134,7 +134,15 @@ class RunConfig:
         Raises:
             ConfigError: a setting in it does not exist or has an impossible value.
         """
-        known = ["task", "scene", "preset", *(f.name for f in dataclasses.fields(RunSettings)), "overrides", "non_default", "made_by"]
+        known = [
+            "task",
+            "scene",
+            "preset",
+            *(f.name for f in dataclasses.fields(RunSettings)),
+            "overrides",
+            "non_default",
+            "made_by",
+        ]
         refuse_unknown(data, known, "")
         task, scene = _node(data, "task"), _node(data, "scene")
         common = checked(RunSettings, {f.name: data[f.name] for f in dataclasses.fields(RunSettings) if f.name in data})
@@ -143,7 +151,9 @@ class RunConfig:
         overrides, non_default = data.get("overrides", []), data.get("non_default", {})
         if not isinstance(overrides, list) or not all(isinstance(o, str) for o in overrides):
             raise ConfigError("overrides: expected a list of texts")
-        if not isinstance(non_default, dict) or not all(isinstance(p, list) and len(p) == 2 for p in non_default.values()):
+        if not isinstance(non_default, dict) or not all(
+            isinstance(p, list) and len(p) == 2 for p in non_default.values()
+        ):
             raise ConfigError("non_default: expected KEY: [default, value] pairs")
         options = task.get("options", {})
         if not isinstance(options, dict):
@@ -173,7 +183,11 @@ class RunConfig:
         """Raises ConfigError for a record of makers that is not this run's."""
         record = self.made_by
         loss = None if self.train.loss is None else split(self.train.loss)[1]
-        for kind, key, name in (("task", "task.name", self.task), ("scene", "scene.name", self.scene_name), ("loss", "train.loss", loss)):
+        for kind, key, name in (
+            ("task", "task.name", self.task),
+            ("scene", "scene.name", self.scene_name),
+            ("loss", "train.loss", loss),
+        ):
             maker = None if record is None else getattr(record, kind)
             if maker is not None and maker.name != name:
                 raise ConfigError(f"made_by.{kind}.name: found {maker.name!r}; expected {name!r}, as {key} says")

@@ -1,4 +1,5 @@
-"""What a run that goes on has from its directory: its own configuration, and who made it, where that is not installed."""
+"""What a run that goes on has from its directory: its own configuration, and who made it, where that is not
+installed."""
 
 from __future__ import annotations
 
@@ -22,11 +23,21 @@ from neuprim.plugins.names import qualified, split
 from neuprim.plugins.provenance import Maker, missing
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS
 
-__all__ = ["begun_as", "begun_run", "chosen_again", "new_words", "not_installed", "of_launch", "refuse_contradictions", "words_of_both"]
+__all__ = [
+    "begun_as",
+    "begun_run",
+    "chosen_again",
+    "new_words",
+    "not_installed",
+    "of_launch",
+    "refuse_contradictions",
+    "words_of_both",
+]
 
 
 def not_installed(assignments: Sequence[Assignment], task: str | None, scene: str | None) -> ConfigError | None:
-    """The error that names what made the run to resume, where that is missing; None where nothing is resumed or the fault is another.
+    """The error that names what made the run to resume, where that is missing; None where nothing is resumed or the
+    fault is another.
 
     Args:
         assignments: all that was typed.
@@ -35,7 +46,11 @@ def not_installed(assignments: Sequence[Assignment], task: str | None, scene: st
     given: dict[str, Any] = {a.key: a.value for a in assignments}
     if given.get("resume") is not True:
         return None
-    directory = _latest(task or DEFAULT_TASK) if given.get("output_dir") is None else Path(str(given["output_dir"])).expanduser()
+    directory = (
+        _latest(task or DEFAULT_TASK)
+        if given.get("output_dir") is None
+        else Path(str(given["output_dir"])).expanduser()
+    )
     try:
         made_by = None if directory is None else RunConfig.from_yaml(directory).made_by
     except NeuprimError:  # a damaged run says nothing
@@ -59,7 +74,8 @@ def not_installed(assignments: Sequence[Assignment], task: str | None, scene: st
 
 
 def begun_run(assignments: Sequence[Assignment], chosen: Mapping[str, str | None], file: bool) -> RunConfig | None:
-    """The configuration of the run that ``resume=true`` goes on with; None where nothing is resumed, or nothing was begun there yet.
+    """The configuration of the run that ``resume=true`` goes on with; None where nothing is resumed, or nothing was
+    begun there yet.
 
     Args:
         assignments: what was typed.
@@ -68,7 +84,8 @@ def begun_run(assignments: Sequence[Assignment], chosen: Mapping[str, str | None
 
     Raises:
         ConfigError: only the place is said, and no run is there.
-        CheckpointError, ConfigError: its ``config.yaml`` is damaged; of settings that do not exist it warns where others were typed.
+        CheckpointError, ConfigError: its ``config.yaml`` is damaged; of settings that do not exist it warns where
+        others were typed.
         UnknownPlugin: the place follows from a task, which is not installed.
     """
     given: dict[str, Any] = {a.key: a.value for a in assignments}
@@ -85,7 +102,9 @@ def begun_run(assignments: Sequence[Assignment], chosen: Mapping[str, str | None
             return None
     if bare:
         hint = ", or -m for the sweep there" if (directory / _SWEEP).is_file() else ""
-        raise ConfigError(f"output_dir={directory} resume=true: no run was begun there (no config.yaml); expected a run's directory{hint}")
+        raise ConfigError(
+            f"output_dir={directory} resume=true: no run was begun there (no config.yaml); expected a run's directory{hint}"
+        )
     return None
 
 
@@ -114,13 +133,19 @@ def chosen_again(begun: RunConfig, chosen: Mapping[str, str | None]) -> dict[str
 
 def new_words(begun: RunConfig, overrides: Sequence[str]) -> list[str]:
     """The words that say something else than those that the run was begun with, and those of its place."""
-    before, now = ({key_of(word): word for word in words} for words in (begun.overrides, overrides))  # of each key the last
-    return [word for word in overrides if key_of(word) in (*NOT_SWEPT, _SHARD, _VIEWS) or before.get(key_of(word)) != now[key_of(word)]]
+    before, now = (
+        {key_of(word): word for word in words} for words in (begun.overrides, overrides)
+    )  # of each key the last
+    return [
+        word
+        for word in overrides
+        if key_of(word) in (*NOT_SWEPT, _SHARD, _VIEWS) or before.get(key_of(word)) != now[key_of(word)]
+    ]
 
 
 def of_launch(overrides: Sequence[str]) -> set[str]:
-    """The settings that a run does not take over from how it was launched before: one process has all primitives, and where the words that
-    describe the run are given to several, each has the views that these say."""
+    """The settings that a run does not take over from how it was launched before: one process has all primitives, and
+    where the words that describe the run are given to several, each has the views that these say."""
     if place_of() is None:
         return {_SHARD}
     return {_VIEWS} if {key_of(word) for word in overrides} & {"task", "scene"} else set()
@@ -133,8 +158,8 @@ def words_of_both(begun: RunConfig, overrides: Sequence[str]) -> list[str]:
 
 
 def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]) -> None:
-    """Refuse settings that a run cannot change on its way. Rule: what a model is, and what it is trained on and for, stays; budgets, rates,
-    renderers, where data lie and how much memory they take may change.
+    """Refuse settings that a run cannot change on its way. Rule: what a model is, and what it is trained on and for,
+    stays; budgets, rates, renderers, where data lie and how much memory they take may change.
 
     Args:
         paths: the scene's settings that are paths.
@@ -153,7 +178,8 @@ _SHARD, _VIEWS = "train.shard", "train.views_per_step"
 """Settings of each process, which follow from how many are launched."""
 
 _FREE = ("memory", "chunks")
-"""Settings of scenes that may change: what is decoded at once, and the chunks, of which the record of what is done has its own word."""
+"""Settings of scenes that may change: what is decoded at once, and the chunks, of which the record of what is done has
+its own word."""
 
 _SEARCH, _SWEEP = "target.json", "sweep.json"
 """Records of the directories that hold more than a run, and go on with the words of a search or of a sweep."""

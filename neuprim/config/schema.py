@@ -1,4 +1,5 @@
-"""What the settings dataclasses say about names and defaults, for composing; their values are checked by ``neuprim.core.checked``."""
+"""What the settings dataclasses say about names and defaults, for composing; their values are checked by
+``neuprim.core.checked``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Task and scene of a run's configuration, from the packages that made the run and not from whatever has their names by now."""
+"""Task and scene of a run's configuration, from the packages that made the run and not from whatever has their names by
+now."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ def task_of(config: RunConfig, file: Path | None = None) -> TaskSpec:
 
 
 def scene_of(config: RunConfig, task: TaskSpec, file: Path | None = None) -> FoundScene:
-    """The scene of a run's configuration, the task's own or from the package that made the run; raises as :func:`task_of`."""
+    """The scene of a run's configuration, the task's own or from the package that made the run; raises as
+    :func:`task_of`."""
     if config.made_by is None:
         return find_scene(task, config.scene_name)
     if config.made_by.scene is None:

@@ -1,7 +1,7 @@
 """The words that ask for a result instead of a configuration: ``target.psnr=30 budget=10m``.
 
-They stand among the words after ``neuprim run`` and are taken out of them here; what is left composes to the configuration that the search
-starts from.
+They stand among the words after ``neuprim run`` and are taken out of them here; what is left composes to the
+configuration that the search starts from.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ __all__ = ["Target", "target_words"]
 
 @dataclass(frozen=True)
 class Target:
-    """What a model is to reach. With ``psnr`` or ``ssim``, or both, the smallest model that has them is wanted, and ``megabytes`` and ``fps`` are limits
-    beside them; without, the best model within the limits is.
+    """What a model is to reach. With ``psnr`` or ``ssim``, or both, the smallest model that has them is wanted, and
+    ``megabytes`` and ``fps`` are limits beside them; without, the best model within the limits is.
 
     Attributes:
         psnr: mean over views, dB.
@@ -75,7 +75,9 @@ def target_words(words: Sequence[str]) -> tuple[tuple[Target, float] | None, lis
     if not target.given():
         raise ConfigError(f"{next(iter(said.values())).text}: expected one of {_choices()}")
     if budget is None:
-        raise ConfigError(f"{target}: expected a budget beside it, the time for search and training together, such as budget=10m")
+        raise ConfigError(
+            f"{target}: expected a budget beside it, the time for search and training together, such as budget=10m"
+        )
     if not isinstance(budget.value, str):
         raise ConfigError(f"budget={shown(budget.value)}: expected a time such as 90s, 5m or 1h")
     return (target, seconds_of(budget.value, budget.text)), [word for word in words if not _is_own(word)]

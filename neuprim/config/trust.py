@@ -1,7 +1,8 @@
 """What opening a run that was read from a file may reach, and the user's word for more.
 
-Rule: a stored configuration is text of somebody else. What it names is read from this machine's own folders, as any user's run does. What is
-an address of another machine, and what would be written to outside of the run, is used only where the user typed it or said ``--trust``.
+Rule: a stored configuration is text of somebody else. What it names is read from this machine's own folders, as any
+user's run does. What is an address of another machine, and what would be written to outside of the run, is used only
+where the user typed it or said ``--trust``.
 """
 
 from __future__ import annotations
@@ -26,19 +27,31 @@ def check_stored(config: RunConfig, typed: Mapping[str, Any] | None = None) -> N
 
     Args:
         config: of a file, if its ``source`` says so; any other passes.
-        typed: dotted keys that the user gave values for beside the file; None: there is no way to give any, and the flag is it.
+        typed: dotted keys that the user gave values for beside the file; None: there is no way to give any, and the
+        flag is it.
 
     Raises:
         ConfigError: names file, key and value, and what to type.
     """
     if config.source is None or trusted():
         return
-    tree = {"scene": config.scene, "task.options": config.options, "model.init": config.model.init, "metrics.lpips": config.metrics.lpips}
+    tree = {
+        "scene": config.scene,
+        "task.options": config.options,
+        "model.init": config.model.init,
+        "metrics.lpips": config.metrics.lpips,
+    }
     for key, value in _texts("", tree):
         given = typed is not None and any(key == name or key.startswith(f"{name}.") for name in typed)
-        if given or not (_is_address(value) or (key == f"scene.{_WRITTEN}" and not _inside(value, config.source.parent))):
+        if given or not (
+            _is_address(value) or (key == f"scene.{_WRITTEN}" and not _inside(value, config.source.parent))
+        ):
             continue
-        what = "an address, which would be contacted" if _is_address(value) else "a folder outside of the run, which would be written to"
+        what = (
+            "an address, which would be contacted"
+            if _is_address(value)
+            else "a folder outside of the run, which would be written to"
+        )
         allow = f"type {key}=... to use it" if typed is not None else f"{FLAG} allows it"
         raise ConfigError(
             f"{config.source}: {key} is {cut(value)!r}, {what}; {allow}, {ENVIRONMENT}=1 in the environment does so for all runs"
@@ -46,7 +59,8 @@ def check_stored(config: RunConfig, typed: Mapping[str, Any] | None = None) -> N
 
 
 def refuse_links(run_dir: Path) -> None:
-    """Refuse a run directory with folders that are links out of it, unless the user trusts it: what is written into them would be elsewhere.
+    """Refuse a run directory with folders that are links out of it, unless the user trusts it: what is written into
+    them would be elsewhere.
 
     Raises:
         ConfigError: names the link.
@@ -56,7 +70,9 @@ def refuse_links(run_dir: Path) -> None:
     whole = run_dir.resolve()
     for entry in os.scandir(run_dir):
         if entry.is_symlink() and entry.is_dir() and whole not in (there := Path(entry.path).resolve()).parents:
-            raise ConfigError(f"{entry.path}: is a link to {there}, outside of the run; expected a folder, or {FLAG} to write there")
+            raise ConfigError(
+                f"{entry.path}: is a link to {there}, outside of the run; expected a folder, or {FLAG} to write there"
+            )
 
 
 def _is_address(value: str) -> bool:

@@ -1,6 +1,7 @@
 """The words that ask for a viewer beside a training: ``viewer=true viewer.port=8080``.
 
-They say nothing about the run itself, so they are taken out of the words after ``neuprim run`` here and no file keeps them.
+They say nothing about the run itself, so they are taken out of the words after ``neuprim run`` here and no file keeps
+them.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@
     def test_conforms(check):
         check()
 
-Each check builds tiny models on the reference backend from the task's default preset, on the task's own ``example`` or on a small
-synthetic data set with the conditions it declares. The docstring of a check says what it demands and why.
+Each check builds tiny models on the reference backend from the task's default preset, on the task's own ``example`` or
+on a small synthetic data set with the conditions it declares. The docstring of a check says what it demands and why.
 """
 
 from __future__ import annotations
@@ -104,7 +104,8 @@ _LIBRARIES = ("torch", "numpy", "scipy", "numba", "importlib", "omegaconf", "hyd
 
 
 def _origin(error: BaseException) -> str:
-    """``" in Waves.on_split (fields.py, line 12)"``: the innermost line of the task's own code; nothing where none was running."""
+    """``" in Waves.on_split (fields.py, line 12)"``: the innermost line of the task's own code; nothing where none was
+    running."""
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         module = str(frame.f_globals.get("__name__", ""))
         if not module.startswith(_FRAMEWORK) and module.split(".")[0] not in _LIBRARIES:
@@ -112,7 +113,9 @@ def _origin(error: BaseException) -> str:
     return ""
 
 
-def named_checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] | None = None) -> dict[str, Callable[[], None]]:
+def named_checks(
+    task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] | None = None
+) -> dict[str, Callable[[], None]]:
     """Check name -> function without arguments that raises :class:`ConformanceError`.
 
     Args:
@@ -140,7 +143,9 @@ def named_checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, 
                 raise ConformanceError(f"task {task.name!r}: {name}: {error}") from error
             except (Exception, SystemExit) as error:  # whatever a task's code does, the message must say whose it is
                 text = " ".join(str(error).split())
-                raise ConformanceError(f"task {task.name!r}: {name}: stopped by {type(error).__name__}: {text}{_origin(error)}") from error
+                raise ConformanceError(
+                    f"task {task.name!r}: {name}: stopped by {type(error).__name__}: {text}{_origin(error)}"
+                ) from error
 
         run.__doc__ = check.__doc__
         return run
@@ -165,7 +170,10 @@ def check_task(task: TaskSpec, preset: str | None = None, model: Mapping[str, An
 
 
 def checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] | None = None) -> Any:
-    """A pytest decorator that runs a test once per check, which it passes as ``check``; see :func:`named_checks` for the arguments."""
+    """A pytest decorator that runs a test once per check, which it passes as ``check``; see :func:`named_checks` for
+    the arguments."""
     import pytest
 
-    return pytest.mark.parametrize("check", [pytest.param(run, id=name) for name, run in named_checks(task, preset, model).items()])
+    return pytest.mark.parametrize(
+        "check", [pytest.param(run, id=name) for name, run in named_checks(task, preset, model).items()]
+    )

@@ -12,9 +12,11 @@ _COUNTS = (1, 5)
 
 
 def check_channels(t: Subject) -> None:
-    """A colour made for grey images has one channel and for five bands five, or ``build`` refuses them: data need not be RGB."""
+    """A colour made for grey images has one channel and for five bands five, or ``build`` refuses them: data need not
+    be RGB."""
     if t.task.example is not None or t.task.channels:
-        return  # the first alone knows what data of other channels would look like, the others are the only ones there are
+        # the first alone knows what data of other channels would look like, the others are the only ones there are
+        return
     subjects, declared = {}, {}
     for count in _COUNTS:
         other = t.with_channels(count)

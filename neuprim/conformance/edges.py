@@ -25,11 +25,14 @@ __all__ = ["check_clear_errors", "check_conditions", "check_extremes", "check_mi
 
 
 def check_conditions(t: Subject) -> None:
-    """Each declared condition parses from numbers, refuses nonsense in one line, and any value in its range renders: flags derive from it."""
+    """Each declared condition parses from numbers, refuses nonsense in one line, and any value in its range renders:
+    flags derive from it."""
     model = t.model(torch.float32)
     for spec in t.task.conditions:
         where = f"condition {spec.name!r}"
-        t.require(spec.name.isidentifier(), where, repr(spec.name), "a name of letters, digits and _ (it becomes a flag)")
+        t.require(
+            spec.name.isidentifier(), where, repr(spec.name), "a name of letters, digits and _ (it becomes a flag)"
+        )
         low, high = spec.range
         t.require(low < high, f"{where}: range", spec.range, "a lower and a higher end")
         _parses(t, spec, where)
@@ -46,7 +49,9 @@ def check_conditions(t: Subject) -> None:
         ends = [torch.full(spec.shape, float(end)) for end in (low, high)]
         for value in (*ends, sample(spec, generator)):
             view = t.views()[0]
-            t.image(f"{where} = {value.tolist()}", model, replace(view, conditions={**view.conditions, spec.name: value}))
+            t.image(
+                f"{where} = {value.tolist()}", model, replace(view, conditions={**view.conditions, spec.name: value})
+            )
 
 
 def _parses(t: Subject, spec: ConditionSpec, where: str) -> None:
@@ -57,7 +62,12 @@ def _parses(t: Subject, spec: ConditionSpec, where: str) -> None:
     values = spec.parse(text)
     t.require(len(values) >= 1, f"{where}: parse({text!r})", "no frame", "one tensor per frame")
     for value in values:
-        t.require(tuple(value.shape) == spec.shape, f"{where}: parse({text!r})", f"shape {tuple(value.shape)}", str(spec.shape))
+        t.require(
+            tuple(value.shape) == spec.shape,
+            f"{where}: parse({text!r})",
+            f"shape {tuple(value.shape)}",
+            str(spec.shape),
+        )
     expected = torch.full(spec.shape, middle)
     near = torch.allclose(values[0].float(), expected, rtol=1e-4, atol=1e-6)
     t.require(near, f"{where}: parse({text!r})", values[0].tolist(), str(expected.tolist()))
@@ -72,20 +82,32 @@ def check_missing_conditions(t: Subject) -> None:
         try:
             render(model, view.camera, others, t.settings.renderer)
         except (KeyError, NeuprimError) as error:
-            t.require(spec.name in str(error), f"message without condition {spec.name!r}", repr(str(error)), "one that names it")
+            t.require(
+                spec.name in str(error),
+                f"message without condition {spec.name!r}",
+                repr(str(error)),
+                "one that names it",
+            )
             continue
         generator = torch.Generator().manual_seed(10)
         images = [
-            render(model, v.camera, {**v.conditions, spec.name: sample(spec, generator)}, t.settings.renderer).rgb for v in (view, view)
+            render(model, v.camera, {**v.conditions, spec.name: sample(spec, generator)}, t.settings.renderer).rgb
+            for v in (view, view)
         ]
-        t.require(torch.equal(*images), f"a frame without condition {spec.name!r}", "it was drawn", "KeyError or ConfigError that names it")
+        t.require(
+            torch.equal(*images),
+            f"a frame without condition {spec.name!r}",
+            "it was drawn",
+            "KeyError or ConfigError that names it",
+        )
 
 
 # ---------------------------------------------------------------- extremes
 
 
 def check_extremes(t: Subject) -> None:
-    """Colours and gradients stay finite for huge, tiny and needle-like primitives, cameras far away or inside, and no density at all."""
+    """Colours and gradients stay finite for huge, tiny and needle-like primitives, cameras far away or inside, and no
+    density at all."""
     for name, change, place in _CASES:
         model = t.model(torch.float32)
         change(model)
@@ -96,7 +118,9 @@ def check_extremes(t: Subject) -> None:
             rgb.sum().backward()
         for parameter, value in params.items():
             bad = value.grad is not None and not bool(torch.isfinite(value.grad).all())
-            t.require(not bad, f"{t.lowering(parameter)}gradient of {parameter}, {name}", "NaN or infinity", "finite numbers")
+            t.require(
+                not bad, f"{t.lowering(parameter)}gradient of {parameter}, {name}", "NaN or infinity", "finite numbers"
+            )
 
 
 def _scaled(by: tuple[float, float, float]) -> Callable[[Primitives], None]:
@@ -148,7 +172,8 @@ _CASES: tuple[tuple[str, Callable[[Primitives], None], Callable[[View, Primitive
 
 
 def check_clear_errors(t: Subject) -> None:
-    """A setting that the task does not have is a ConfigError that names it, before any data are loaded: typos cost no run."""
+    """A setting that the task does not have is a ConfigError that names it, before any data are loaded: typos cost no
+    run."""
     model = t.settings.model
     t.task.check(build_settings(t.task, model, t.options))
     for group in ("density", "colour"):

@@ -1,4 +1,5 @@
-"""A tiny data set for tasks that bring none: ellipsoids of constant density, seen by a ring of cameras under random conditions."""
+"""A tiny data set for tasks that bring none: ellipsoids of constant density, seen by a ring of cameras under random
+conditions."""
 
 from __future__ import annotations
 
@@ -38,14 +39,23 @@ def ring_camera(angle: float, height: float, distance: float = DISTANCE) -> Came
     """A camera on a ring around the origin, which it looks at."""
     eye = distance * torch.tensor([math.cos(angle), math.sin(angle), height], dtype=torch.float64)
     focal = 0.5 * WIDTH / math.tan(0.35)
-    return Camera(look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+    return Camera(
+        look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT
+    )
 
 
 class _Views(ViewSet):
     def __init__(
-        self, split: str, cameras: list[Camera], conditions: tuple[ConditionSpec, ...], generator: torch.Generator, channels: int
+        self,
+        split: str,
+        cameras: list[Camera],
+        conditions: tuple[ConditionSpec, ...],
+        generator: torch.Generator,
+        channels: int,
     ) -> None:
-        self.views = [View(f"{split}{i}", c, {s.name: sample(s, generator) for s in conditions}) for i, c in enumerate(cameras)]
+        self.views = [
+            View(f"{split}{i}", c, {s.name: sample(s, generator) for s in conditions}) for i, c in enumerate(cameras)
+        ]
         settings = RenderSettings(backend=ORACLE)
         frames = [render_lowered(_truth(channels), c, settings) for c in cameras]
         self.images = [Pixels(f.rgb, f.alpha) for f in frames]
@@ -61,7 +71,8 @@ class _Views(ViewSet):
 
 
 def example(conditions: tuple[ConditionSpec, ...], channels: int = 3) -> Dataset:
-    """Six training and two test views of 10 x 9 pixels, background grey, sRGB; conditions and channels as the task declares them."""
+    """Six training and two test views of 10 x 9 pixels, background grey, sRGB; conditions and channels as the task
+    declares them."""
     generator = torch.Generator().manual_seed(7)
     ring = [ring_camera(1.1 * i, 0.6 * math.sin(2.0 * i)) for i in range(8)]
     train, test = (_Views(n, c, conditions, generator, channels) for n, c in (("train", ring[:6]), ("test", ring[6:])))

@@ -35,11 +35,16 @@ _STEPS = (1e-5, 1e-6)
 def double(view: View) -> View:
     """The view with camera and conditions in float64."""
     camera = replace(view.camera, viewmat=view.camera.viewmat.double())
-    return replace(view, camera=camera, conditions={k: v.double() if v.is_floating_point() else v for k, v in view.conditions.items()})
+    return replace(
+        view,
+        camera=camera,
+        conditions={k: v.double() if v.is_floating_point() else v for k, v in view.conditions.items()},
+    )
 
 
 def check_lowered_forms(t: Subject) -> None:
-    """Lowered tensors have one row per primitive, the shapes of their form, the data set's channels and the parameters' dtype."""
+    """Lowered tensors have one row per primitive, the shapes of their form, the data set's channels and the parameters'
+    dtype."""
     for dtype in (torch.float32, torch.float64):
         model = t.model(dtype)
         for view in t.views()[:3]:
@@ -77,7 +82,8 @@ def check_alive(t: Subject) -> None:
 
 
 def check_line_integral(t: Subject) -> None:
-    """Optical depths of the lowered form equal quadrature of ``density`` on whole chords and on pieces, and pieces add up to the whole."""
+    """Optical depths of the lowered form equal quadrature of ``density`` on whole chords and on pieces, and pieces add
+    up to the whole."""
     model = t.model()
     generator = torch.Generator().manual_seed(4)
     tested = 0
@@ -95,7 +101,10 @@ def check_line_integral(t: Subject) -> None:
                 f"shape {tuple(whole.shape)}",
                 str(tuple(prim.shape)),
             )
-            parts = [alive.form.optical_depth(Pairs.of(alive.moved, prim, o, d, a, b)) for a, b in ((t0, middle), (middle, t1))]
+            parts = [
+                alive.form.optical_depth(Pairs.of(alive.moved, prim, o, d, a, b))
+                for a, b in ((t0, middle), (middle, t1))
+            ]
             expected, peak = by_quadrature(model, alive, view.conditions, prim, o, d, t0, t1)
             piece, _ = by_quadrature(model, alive, view.conditions, prim, o, d, middle, t1)
             size = (t1 - t0) * peak + 1e-30
@@ -109,12 +118,15 @@ def check_line_integral(t: Subject) -> None:
                 ok = bool((error <= 1e-5).all())
                 if not ok:
                     place = f"{where}, primitive {int(alive.rows[prim[worst]])}, view {view.name}"
-                    t.require(False, place, f"{float(a[worst]):.6g}", f"{float(b[worst]):.6g}, the integral of density(...)")
+                    t.require(
+                        False, place, f"{float(a[worst]):.6g}", f"{float(b[worst]):.6g}, the integral of density(...)"
+                    )
     t.require(tested > 0, "density.alive", "no primitive in any view", "some")
 
 
 def check_opaque_twin(t: Subject) -> None:
-    """A frame looks the same when density and colour are handed over as plain code per ray: what lowers means what the field says."""
+    """A frame looks the same when density and colour are handed over as plain code per ray: what lowers means what the
+    field says."""
     model = t.model()
     seen = 0.0
     with torch.no_grad():
@@ -122,10 +134,14 @@ def check_opaque_twin(t: Subject) -> None:
             lowered = model.lower(view.camera, view.conditions)
             alive = Alive.of(model, view.conditions)
 
-            def twin(prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor, alive: Alive = alive, view: View = view) -> Tensor:
+            def twin(
+                prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor, alive: Alive = alive, view: View = view
+            ) -> Tensor:
                 return by_quadrature(model, alive, view.conditions, prim, o, d, t0, t1)[0]
 
-            plain = Lowered(lowered.geometry, Opaque(twin), opaque_colour(lowered.colour, lowered.geometry), lowered.rows)
+            plain = Lowered(
+                lowered.geometry, Opaque(twin), opaque_colour(lowered.colour, lowered.geometry), lowered.rows
+            )
             a, b = (render_lowered(x, view.camera, EXACT) for x in (lowered, plain))
             seen = max(seen, float(a.alpha.max()))
             for what, x, y in (("density.lower: alpha", a.alpha, b.alpha), ("colour.lower: colour", a.rgb, b.rgb)):
@@ -163,7 +179,8 @@ def check_gradients(t: Subject) -> None:
 
 
 def check_finite_differences(t: Subject) -> None:
-    """Autograd agrees with finite differences in float64 on a few entries of every parameter: a detached or wrong derivative shows here."""
+    """Autograd agrees with finite differences in float64 on a few entries of every parameter: a detached or wrong
+    derivative shows here."""
     model = t.model()
     for view in list(map(double, t.views()))[:2]:
         frozen = Primitives(model.density, Frozen.of(model, view.conditions), model.params)

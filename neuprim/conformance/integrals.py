@@ -1,4 +1,5 @@
-"""Optical depths of chords twice over: by the lowered form, and by quadrature of the density that it claims to integrate."""
+"""Optical depths of chords twice over: by the lowered form, and by quadrature of the density that it claims to
+integrate."""
 
 from __future__ import annotations
 
@@ -47,14 +48,17 @@ class Alive:
 
 def inside(geometry: Geometry, rows: Tensor, generator: torch.Generator, reach: float = 0.95) -> Tensor:
     """(M, 3) float64 scene points, one uniform in ``reach`` of the ellipsoid of each of ``rows`` (M,)."""
-    direction = torch.nn.functional.normalize(torch.randn(len(rows), 3, generator=generator, dtype=torch.float64), dim=-1)
+    direction = torch.nn.functional.normalize(
+        torch.randn(len(rows), 3, generator=generator, dtype=torch.float64), dim=-1
+    )
     radius = reach * torch.rand(len(rows), 1, generator=generator, dtype=torch.float64) ** (1 / 3)
     local = geometry.scales.double()[rows] * direction * radius
     return geometry.means.double()[rows] + (geometry.rotations.double()[rows] @ local[:, :, None])[..., 0]
 
 
 def chords(geometry: Geometry, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(origins, directions, t0, t1), float64: a random ray from outside through the ellipsoid of each of ``rows`` (M,)."""
+    """(origins, directions, t0, t1), float64: a random ray from outside through the ellipsoid of each of ``rows``
+    (M,)."""
     point = inside(geometry, rows, generator)
     d = torch.nn.functional.normalize(torch.randn(len(rows), 3, generator=generator, dtype=torch.float64), dim=-1)
     whiten = geometry.rotations.double()[rows].transpose(1, 2) / geometry.scales.double()[rows][:, :, None]
@@ -68,7 +72,8 @@ def chords(geometry: Geometry, rows: Tensor, generator: torch.Generator) -> tupl
 def by_quadrature(
     model: Primitives, alive: Alive, conditions: Conditions, prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """(integral, greatest |sigma|), both (M,), of the field's own ``density`` along chord pieces: Gauss-Legendre on eight panels."""
+    """(integral, greatest |sigma|), both (M,), of the field's own ``density`` along chord pieces: Gauss-Legendre on
+    eight panels."""
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(_NODES))
     nodes = ((x[None] + 1) / 2 + torch.arange(_PANELS)[:, None]).reshape(-1) / _PANELS
     weights = (w / (2 * _PANELS)).repeat(_PANELS)

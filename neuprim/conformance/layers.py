@@ -12,14 +12,19 @@ __all__ = ["check_layers"]
 
 
 def check_layers(t: Subject) -> None:
-    """Every layer that the task names is drawn of its example: finite floats of the declared channels, the same each time, the model left as it is."""
+    """Every layer that the task names is drawn of its example: finite floats of the declared channels, the same each
+    time, the model left as it is."""
     model, settings = t.model(torch.float32), t.settings.renderer
     before = {name: value.clone() for name, value in model.params.items()}
     for spec in t.task.layers:
         for view in t.views():
             try:
                 one, two = (
-                    layer_of(spec, LayerFrame(model, view.camera, view.conditions, settings, t.dataset.color_space), t.dataset.channels)
+                    layer_of(
+                        spec,
+                        LayerFrame(model, view.camera, view.conditions, settings, t.dataset.color_space),
+                        t.dataset.channels,
+                    )
                     for _ in range(2)
                 )
             except TaskFault as error:  # it says what was found and what was expected

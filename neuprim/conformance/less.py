@@ -17,7 +17,8 @@ __all__ = ["check_pieces", "check_reductions"]
 
 
 def check_reductions(t: Subject) -> None:
-    """A field that can do with less of something becomes a field of the task that has less, is rebuilt from its settings and draws, so that models can be pruned and tried smaller."""
+    """A field that can do with less of something becomes a field of the task that has less, is rebuilt from its
+    settings and draws, so that models can be pruned and tried smaller."""
     model = t.model(torch.float32)
     for kind, own in (("density", model.density), ("colour", model.colour)):
         for name, values in own.reductions().items():
@@ -34,20 +35,30 @@ def _smaller(t: Subject, model: Primitives, kind: str, own: Field, name: str, va
     try:
         less = with_less(model, kind, name, value)
     except (ValueError, AssertionError) as error:
-        t.require(False, where, f"tensors or a field that do not fit ({error})", "a field of the same kind and its tensors")
+        t.require(
+            False, where, f"tensors or a field that do not fit ({error})", "a field of the same kind and its tensors"
+        )
         raise
     field = less.density if kind == "density" else less.colour
-    t.require(type(field) in (t.task.fields or {}).values(), where, type(field).__name__, "a field that TaskSpec.fields lists")
+    t.require(
+        type(field) in (t.task.fields or {}).values(), where, type(field).__name__, "a field that TaskSpec.fields lists"
+    )
     again = type(field)(**field.settings())
     same = [(s.name, s.shape) for s in again.parameters()] == [(s.name, s.shape) for s in field.parameters()]
     t.require(same, f"{where}.settings()", "other parameters", "settings that rebuild it")
-    t.require(less.parameters_per_primitive < model.parameters_per_primitive, where, f"{less.parameters_per_primitive} numbers", "fewer")
+    t.require(
+        less.parameters_per_primitive < model.parameters_per_primitive,
+        where,
+        f"{less.parameters_per_primitive} numbers",
+        "fewer",
+    )
     for view in t.views()[:2]:
         t.image(f"{where}: image", less, view)
 
 
 def check_pieces(t: Subject) -> None:
-    """A piece names numbers that exist, no number is in two of them, and without it a primitive still draws, so that pruning may leave it out of files."""
+    """A piece names numbers that exist, no number is in two of them, and without it a primitive still draws, so that
+    pruning may leave it out of files."""
     model = t.model(torch.float32)
     for own in (model.density, model.colour):
         names = [piece.name for piece in own.pieces()]
@@ -59,8 +70,15 @@ def check_pieces(t: Subject) -> None:
         _place(t, model.params, taken, name, piece)
         gone = torch.arange(model.count) % 2 == 0
         less = Primitives(model.density, model.colour, without({name: (piece, gone)}, model.params))
-        t.require(bool((alive(piece, less.params) == ~gone).all()), f"piece {name!r}", "numbers that stay", "zeros where it is gone")
-        if piece.group not in drawn:  # of pieces that are told of together, such as the coefficients of a band, one is drawn
+        t.require(
+            bool((alive(piece, less.params) == ~gone).all()),
+            f"piece {name!r}",
+            "numbers that stay",
+            "zeros where it is gone",
+        )
+        if (
+            piece.group not in drawn
+        ):  # of pieces that are told of together, such as the coefficients of a band, one is drawn
             for view in t.views()[:2]:
                 t.image(f"image without {name!r}", less, view)
         drawn |= {piece.group} - {""}
@@ -74,7 +92,12 @@ def _place(t: Subject, params: Mapping[str, Any], taken: dict[str, Any], name: s
         try:
             before = taken[parameter][(slice(None), *place)]
         except (IndexError, TypeError) as error:
-            t.require(False, where, f"a place {place} that it does not have ({error})", f"one within {tuple(params[parameter].shape[1:])}")
+            t.require(
+                False,
+                where,
+                f"a place {place} that it does not have ({error})",
+                f"one within {tuple(params[parameter].shape[1:])}",
+            )
             raise
         t.require(before.numel() > 0, where, f"an empty place {place}", "numbers")
         t.require(not bool(before.any()), where, "numbers of another piece", "each number in one piece")

@@ -32,11 +32,17 @@ def check_members(t: Subject) -> None:
     t.require(wrong is None, "TaskSpec", wrong, "members as documented in neuprim.core.task.TaskSpec")
     t.require(t.task.api == API_VERSION, "TaskSpec.api", t.task.api, str(API_VERSION))
     t.require(t.task.name.isidentifier(), "TaskSpec.name", repr(t.task.name), "letters, digits and _")
-    t.require(bool(t.task.fields), "TaskSpec.fields", t.task.fields, "every field class by its name, or saved models cannot be read")
+    t.require(
+        bool(t.task.fields),
+        "TaskSpec.fields",
+        t.task.fields,
+        "every field class by its name, or saved models cannot be read",
+    )
 
 
 def check_files(t: Subject) -> None:
-    """Every scene, preset and level of effort has settings that compose, and rates and their units only for parameters that exist, so that no choice is a dead end."""
+    """Every scene, preset and level of effort has settings that compose, and rates and their units only for parameters
+    that exist, so that no choice is a dead end."""
     check_groups(t.task)
     choice = task_choices(t.task)
     known = t.task.parameter_names() | {s.name for s in GEOMETRY_SPECS}
@@ -47,7 +53,12 @@ def check_files(t: Subject) -> None:
         settings = preset_settings(t.task, preset, choice.scene, level)
         for group, given in (("rates", settings.train.rates), ("rate_units", settings.train.rate_units)):
             for name in given:
-                t.require(name in known, f"{where}: train.{group}.{name}", "no such parameter", f"one of {', '.join(sorted(known))}")
+                t.require(
+                    name in known,
+                    f"{where}: train.{group}.{name}",
+                    "no such parameter",
+                    f"one of {', '.join(sorted(known))}",
+                )
         try:
             t.task.check(build_settings(t.task, settings.model, choice.options))
         except ConfigError as error:
@@ -57,7 +68,8 @@ def check_files(t: Subject) -> None:
 
 
 def check_trade(t: Subject) -> None:
-    """What the task offers to trade are settings that exist, at values that its own check accepts, so that no training of a designed set is offered in vain."""
+    """What the task offers to trade are settings that exist, at values that its own check accepts, so that no training
+    of a designed set is offered in vain."""
     offered = traded(t.task, build_settings(t.task, t.settings.model, t.options))
     for name, values in offered.items():
         for value in values:
@@ -71,15 +83,24 @@ def check_trade(t: Subject) -> None:
                 options = complete_options(t.task.options, tree["task"]["options"], f"task {t.task.name!r}")
                 t.task.check(build_settings(t.task, checked(ModelSettings, tree["model"], "model"), options))
             except ConfigError as error:
-                t.require(False, f"trade: {name}={value}", f"a setting that is refused ({error})", "settings that the task takes")
+                t.require(
+                    False,
+                    f"trade: {name}={value}",
+                    f"a setting that is refused ({error})",
+                    "settings that the task takes",
+                )
 
 
 def check_fields(t: Subject) -> None:
-    """A field is rebuilt from its class name and JSON-able settings with the same parameters, so that a saved model can be read."""
+    """A field is rebuilt from its class name and JSON-able settings with the same parameters, so that a saved model can
+    be read."""
     for kind, field in zip(("density", "colour"), t.fields(), strict=True):
         name, listed = type(field).__name__, t.task.fields or {}
         t.require(
-            listed.get(name) is type(field), f"TaskSpec.fields[{name!r}]", listed.get(name), f"the class of the {kind} that build makes"
+            listed.get(name) is type(field),
+            f"TaskSpec.fields[{name!r}]",
+            listed.get(name),
+            f"the class of the {kind} that build makes",
         )
         settings = field.settings()
         try:
@@ -108,7 +129,9 @@ def check_parameter_specs(t: Subject) -> None:
     for kind, spec in t.specs():
         where = f"{kind}.parameters: {spec.name!r}"
         t.require(isinstance(spec, ParameterSpec), where, type(spec).__name__, "ParameterSpec")
-        t.require(str(spec.name).isidentifier(), where, repr(spec.name), "a name of letters, digits and _ (it becomes a key)")
+        t.require(
+            str(spec.name).isidentifier(), where, repr(spec.name), "a name of letters, digits and _ (it becomes a key)"
+        )
         t.require(spec.name not in taken, where, "a name used twice", "a unique one")
         taken.add(spec.name)
         fits = isinstance(spec.shape, tuple) and all(isinstance(n, int) and n >= 0 for n in spec.shape)
@@ -119,13 +142,16 @@ def check_parameter_specs(t: Subject) -> None:
 
 
 def check_initialisers(t: Subject) -> None:
-    """Start values have the spec's shape, are finite, and depend on nothing but the context and its generator, so that seeds mean something."""
+    """Start values have the spec's shape, are finite, and depend on nothing but the context and its generator, so that
+    seeds mean something."""
 
     def drawn(seed: int) -> InitContext:
         generator = torch.Generator().manual_seed(seed)
         cloud = t.dataset.initial_points(t.settings.model.primitives, generator)
         scales = torch.full((len(cloud.means),), 0.1)
-        return InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, t.settings.model.init, cloud.conditions)
+        return InitContext(
+            cloud.means.float(), scales, cloud.colors.float(), generator, t.settings.model.init, cloud.conditions
+        )
 
     for kind, spec in t.specs():
         where = f"{kind}.parameters: {spec.name!r}: init"
@@ -140,9 +166,14 @@ def check_initialisers(t: Subject) -> None:
         t.require(tuple(value.shape) == expected, f"{where}: start value", f"shape {tuple(value.shape)}", str(expected))
         t.require(bool(torch.isfinite(value).all()), f"{where}: start value", "NaN or infinity", "finite numbers")
         t.require(
-            torch.equal(value, again), f"{where}: two draws with one seed", "different values", "equal ones (use only context.generator)"
+            torch.equal(value, again),
+            f"{where}: two draws with one seed",
+            "different values",
+            "equal ones (use only context.generator)",
         )
-        same = all(torch.equal(a, b) for a, b in zip(kept, (context.means, context.scales, context.colors), strict=True))
+        same = all(
+            torch.equal(a, b) for a, b in zip(kept, (context.means, context.scales, context.colors), strict=True)
+        )
         t.require(same, where, "the context's means, scales or colors changed in place", "a context left alone")
     first, other = t.fresh(), t.fresh()
     equal = all(torch.equal(first.params[n], other.params[n]) for n in first.params)

@@ -18,7 +18,8 @@ __all__ = ["check_clone", "check_divide", "check_on_split", "check_scale_density
 
 
 def check_scale_density(t: Subject) -> None:
-    """``scale_density`` multiplies sigma everywhere by its factor and leaves the tensors it was given alone; clones rely on it."""
+    """``scale_density`` multiplies sigma everywhere by its factor and leaves the tensors it was given alone; clones
+    rely on it."""
     model = t.model()
     factor = torch.linspace(0.25, 2.0, model.count, dtype=torch.float64)
     own = model.of(model.density)
@@ -36,7 +37,10 @@ def check_scale_density(t: Subject) -> None:
 def check_clone(t: Subject) -> None:
     """Two copies at half the density look like one, clamps and cut-offs aside: a clone must not change the picture."""
     model = t.model()
-    half = {**model.params, **model.density.scale_density(model.of(model.density), torch.full((model.count,), 0.5, dtype=torch.float64))}
+    half = {
+        **model.params,
+        **model.density.scale_density(model.of(model.density), torch.full((model.count,), 0.5, dtype=torch.float64)),
+    }
     pair = {name: torch.cat([value, value]) for name, value in half.items()}
     twice = Primitives(model.density, model.colour, pair)
     with torch.no_grad():
@@ -53,7 +57,8 @@ def check_clone(t: Subject) -> None:
 
 
 def check_on_split(t: Subject) -> None:
-    """Children continue their parent's sigma inside themselves, or where ``exact_split`` is False hold its mass: splits must not flicker."""
+    """Children continue their parent's sigma inside themselves, or where ``exact_split`` is False hold its mass: splits
+    must not flicker."""
     model = t.model()
     old = model.geometry
     axis = torch.nn.functional.one_hot(old.log_scales.argmax(-1), 3).double()
@@ -92,8 +97,8 @@ _EACH, _MEAN = 0.25, 0.05
 def _mass(t: Subject, model: Primitives, children: list[tuple[dict[str, Tensor], Geometry]]) -> None:
     """Integrals of |sigma| over the ellipsoids, by the same points in every one of them.
 
-    A density that varies within a primitive goes on as it is in the children, whose supports see other parts of it. So a pair may be off;
-    all of them on average may not.
+    A density that varies within a primitive goes on as it is in the children, whose supports see other parts of it. So
+    a pair may be off; all of them on average may not.
     """
     view = double(t.views()[0])
     generator = torch.Generator().manual_seed(8)
@@ -110,16 +115,29 @@ def _mass(t: Subject, model: Primitives, children: list[tuple[dict[str, Tensor],
 
     parents = mass(model.of(model.density), model.geometry)
     both = mass(*children[0]) + mass(*children[1])
-    change = torch.where((parents > 0) | (both > 0), both / parents.clamp_min(1e-30) - 1, torch.zeros_like(both))  # some are not there now
+    change = torch.where(
+        (parents > 0) | (both > 0), both / parents.clamp_min(1e-30) - 1, torch.zeros_like(both)
+    )  # some are not there now
     worst = int(change.abs().argmax())
     where = "density.on_split: mass of both children of"
-    t.require(float(change.abs().max()) <= _EACH, f"{where} primitive {worst}", f"{float(both[worst]):.4g}", f"{float(parents[worst]):.4g}")
+    t.require(
+        float(change.abs().max()) <= _EACH,
+        f"{where} primitive {worst}",
+        f"{float(both[worst]):.4g}",
+        f"{float(parents[worst]):.4g}",
+    )
     mean = float(change.mean())
-    t.require(abs(mean) <= _MEAN, f"{where} a primitive, on average", f"{1 + mean:.3f} times its parent's", f"1, within {_MEAN}")
+    t.require(
+        abs(mean) <= _MEAN,
+        f"{where} a primitive, on average",
+        f"{1 + mean:.3f} times its parent's",
+        f"1, within {_MEAN}",
+    )
 
 
 def check_divide(t: Subject) -> None:
-    """``divide`` names parents in a mask and returns two rows for every one, all first halves first, in the parents' shapes."""
+    """``divide`` names parents in a mask and returns two rows for every one, all first halves first, in the parents'
+    shapes."""
     model = t.model(torch.float32)
     divided = model.density.divide(model.of(model.density), model.geometry)
     if divided is None:
@@ -160,5 +178,8 @@ def _close(t: Subject, where: str, found: Tensor, expected: Tensor, prim: Tensor
     error = (found - expected).abs() / expected.abs().max().clamp_min(1e-30)
     worst = int(error.argmax())
     t.require(
-        float(error.max()) <= 1e-6, f"{where}, primitive {int(prim[worst])}", f"{float(found[worst]):.6g}", f"{float(expected[worst]):.6g}"
+        float(error.max()) <= 1e-6,
+        f"{where}, primitive {int(prim[worst])}",
+        f"{float(found[worst]):.6g}",
+        f"{float(expected[worst]):.6g}",
     )

@@ -36,7 +36,8 @@ EXACT = RenderSettings(backend=ORACLE, alpha_max=0.9999, alpha_min=0.0, transmit
 
 
 class ConformanceError(AssertionError):
-    """A task does not do what the framework relies on; names task, check, place, what was found and what was expected."""
+    """A task does not do what the framework relies on; names task, check, place, what was found and what was
+    expected."""
 
 
 class Subject:
@@ -48,7 +49,9 @@ class Subject:
         model: changes to them by name, e.g. ``{"density": {"form": "gaussian"}}``.
     """
 
-    def __init__(self, task: TaskSpec, check: str = "", preset: str | None = None, model: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, task: TaskSpec, check: str = "", preset: str | None = None, model: Mapping[str, Any] | None = None
+    ) -> None:
         self.task, self.check, self.preset, self.changes = task, check, preset, dict(model or {})
 
     def named(self, check: str) -> Subject:
@@ -68,7 +71,9 @@ class Subject:
     def require(self, ok: bool, where: str, found: object, expected: str) -> None:
         """Raise :class:`ConformanceError` unless ``ok``."""
         if not ok:
-            raise ConformanceError(f"task {self.task.name!r}: {self.check}: {where}: found {found}; expected {expected}")
+            raise ConformanceError(
+                f"task {self.task.name!r}: {self.check}: {where}: found {found}; expected {expected}"
+            )
 
     def image(self, where: str, model: Primitives, view: View) -> Tensor:
         """(H, W, C) colours of a view, which must be finite."""
@@ -98,7 +103,11 @@ class Subject:
     @cached_property
     def dataset(self) -> Dataset:
         """The task's own example, or one with the conditions and channels it declares."""
-        return self.task.example() if self.task.example is not None else example(self.task.conditions, len(self.task.channels) or 3)
+        return (
+            self.task.example()
+            if self.task.example is not None
+            else example(self.task.conditions, len(self.task.channels) or 3)
+        )
 
     def fields(self) -> tuple[DensityField, ColourField]:
         """Freshly built fields."""
@@ -110,7 +119,8 @@ class Subject:
         return [*(("density", s) for s in density.parameters()), *(("colour", s) for s in colour.parameters())]
 
     def lowering(self, name: str) -> str:
-        """``"density.lower: "`` for a parameter of the density, and so on: the method that the image depends on it through."""
+        """``"density.lower: "`` for a parameter of the density, and so on: the method that the image depends on it
+        through."""
         kind = next((kind for kind, spec in self.specs() if spec.name == name), None)
         return "" if kind is None else f"{kind}.lower: "
 
@@ -120,11 +130,14 @@ class Subject:
         return initial_model(density, colour, self.dataset, self.settings.model, seed)
 
     def model(self, dtype: torch.dtype = torch.float64) -> Primitives:
-        """A model in the middle of training, as it were: initial values moved a little, so that nothing is zero or equal by chance."""
+        """A model in the middle of training, as it were: initial values moved a little, so that nothing is zero or
+        equal by chance."""
         model = self.fresh()
         generator = torch.Generator().manual_seed(11)
         for name, value in model.params.items():
-            strength = {"quats": 0.3, "log_scales": 0.2}.get(name, 0.05 * max(1.0, float(value.abs().mean()) if value.numel() else 1.0))
+            strength = {"quats": 0.3, "log_scales": 0.2}.get(
+                name, 0.05 * max(1.0, float(value.abs().mean()) if value.numel() else 1.0)
+            )
             model.params[name] = (value + strength * torch.randn(value.shape, generator=generator)).to(dtype)
         for field in (model.density, model.colour):
             field.set_progress(1.0)
@@ -136,7 +149,9 @@ class Subject:
         population = PopulationSettings(strategy=strategy, every=2, start=0.0, stop=1.0, fraction=0.2)
         rates = {name: rate for name, rate in train.rates.items() if name in model.params}
         units = {name: unit for name, unit in train.rate_units.items() if name in model.params}
-        short = TrainSettings(iterations=iterations, rates=rates, rate_units=units, ssim_weight=train.ssim_weight, population=population)
+        short = TrainSettings(
+            iterations=iterations, rates=rates, rate_units=units, ssim_weight=train.ssim_weight, population=population
+        )
         loss = self.task.loss(loss_settings(self.task, short, self.options))
         return Trainer(model, self.dataset, loss, short, self.settings.renderer, seed)
 
@@ -157,7 +172,9 @@ class Frozen(ColourField):
     def settings(self) -> dict[str, Any]:
         return self.colour.settings()
 
-    def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings) -> Shading | None:
+    def shade(
+        self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
+    ) -> Shading | None:
         return self.shading
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Any:

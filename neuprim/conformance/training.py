@@ -42,7 +42,8 @@ _FOLDED = 1e-4  # of a colour: what rounding may change
 
 
 def check_dataset(t: Subject) -> None:
-    """The task's example holds what training asks of any data set: conditions in every view, pixels that fit the cameras, start points."""
+    """The task's example holds what training asks of any data set: conditions in every view, pixels that fit the
+    cameras, start points."""
     data = t.dataset
     for split, views in (("train", data.train), ("test", data.test)):
         t.require(len(views) > 0, f"example: {split} split", "no views", "some")
@@ -52,7 +53,12 @@ def check_dataset(t: Subject) -> None:
             expected = (view.camera.height, view.camera.width, data.channels)
             t.require(tuple(pixels.rgb.shape) == expected, f"{where}: pixels", tuple(pixels.rgb.shape), str(expected))
             for spec in t.task.conditions:
-                t.require(spec.name in view.conditions, f"{where}: condition {spec.name!r}", "none", "one, as the task declares it")
+                t.require(
+                    spec.name in view.conditions,
+                    f"{where}: condition {spec.name!r}",
+                    "none",
+                    "one, as the task declares it",
+                )
                 shape = tuple(view.conditions[spec.name].shape)
                 t.require(shape == spec.shape, f"{where}: condition {spec.name!r}", f"shape {shape}", str(spec.shape))
     try:
@@ -66,7 +72,8 @@ def check_dataset(t: Subject) -> None:
 
 
 def check_display(t: Subject) -> None:
-    """The names of the channels fit the data, and the display makes sRGB of each pixel by itself: of primitives, parts and whole images."""
+    """The names of the channels fit the data, and the display makes sRGB of each pixel by itself: of primitives, parts
+    and whole images."""
     channels = channels_of(t.task, t.dataset)
     image = t.dataset.test.pixels(0).over(t.dataset.background)
     given = image.clone()
@@ -74,11 +81,17 @@ def check_display(t: Subject) -> None:
     t.require(torch.equal(image, given), "display", "its argument changed in place", "the image as it was")
     apart = torch.cat([channels.display(row[None]) for row in image])
     off = float((shown - apart).abs().max())
-    t.require(off < 1e-4, "display of an image", f"{off:.3g} off its rows one by one", "the same, as single primitives have colours too")
+    t.require(
+        off < 1e-4,
+        "display of an image",
+        f"{off:.3g} off its rows one by one",
+        "the same, as single primitives have colours too",
+    )
 
 
 def check_judging(t: Subject) -> None:
-    """What the task measures, films and keeps of its example is what a run can write down, and its orbit has every condition to draw."""
+    """What the task measures, films and keeps of its example is what a run can write down, and its orbit has every
+    condition to draw."""
     task, data = t.task, t.dataset
     try:
         clips_of(task, data)
@@ -94,12 +107,16 @@ def check_judging(t: Subject) -> None:
     for view in around:
         for spec in task.conditions:
             t.require(
-                spec.name in view.conditions, f"orbit: view {view.name}: condition {spec.name!r}", "none", "one, or it cannot be drawn"
+                spec.name in view.conditions,
+                f"orbit: view {view.name}: condition {spec.name!r}",
+                "none",
+                "one, or it cannot be drawn",
             )
 
 
 def check_loss(t: Subject) -> None:
-    """The loss is one finite number with a gradient, least where image and truth agree, and its parts are numbers for the log."""
+    """The loss is one finite number with a gradient, least where image and truth agree, and its parts are numbers for
+    the log."""
     loss = t.task.loss(loss_settings(t.task, t.settings.train, t.options))
     frame = _supervision(t.dataset, 0)
     truth = t.dataset.train.pixels(0).over(t.dataset.background)
@@ -112,14 +129,21 @@ def check_loss(t: Subject) -> None:
     fine = off.grad is not None and bool(torch.isfinite(off.grad).all()) and float(off.grad.abs().max()) > 0
     t.require(fine, "gradient of the loss", "none, zero, NaN or infinity", "a finite one")
     for name, number in parts.items():
-        t.require(isinstance(number, float) and math.isfinite(number), f"loss part {name!r}", repr(number), "a finite float")
+        t.require(
+            isinstance(number, float) and math.isfinite(number), f"loss part {name!r}", repr(number), "a finite float"
+        )
     mask = torch.zeros(truth.shape[:2], dtype=torch.bool)
     mask[: max(1, len(mask) // 2)] = True
     masked = torch.where(mask[..., None], off.detach(), truth).requires_grad_()
     part = loss(masked, truth, replace(frame, mask=mask))[0].item()
     t.require(math.isfinite(part), "loss of a frame with a mask", part, "a finite number")
     least = loss(truth.clone().requires_grad_(), truth, frame)[0].item()
-    t.require(least < value.item(), "loss of the truth itself", f"{least:g}", f"less than {value.item():g}, that of a wrong image")
+    t.require(
+        least < value.item(),
+        "loss of the truth itself",
+        f"{least:g}",
+        f"less than {value.item():g}, that of a wrong image",
+    )
 
 
 def _supervision(dataset: Dataset, index: int) -> Supervision:
@@ -137,7 +161,8 @@ def check_determinism(t: Subject) -> None:
 
 
 def check_resume(t: Subject) -> None:
-    """2N steps equal N steps, a checkpoint on disk, a kill and N more, bit for bit: fields keep no state that a checkpoint lacks."""
+    """2N steps equal N steps, a checkpoint on disk, a kill and N more, bit for bit: fields keep no state that a
+    checkpoint lacks."""
     whole, first, second = (t.trainer(2 * _STEPS) for _ in range(3))
     for _ in range(2 * _STEPS):
         whole.train_step()
@@ -156,7 +181,9 @@ def check_resume(t: Subject) -> None:
 
 def _equal(t: Subject, where: str, a: Trainer, b: Trainer) -> None:
     ours, theirs = a.state()[0], b.state()[0]
-    t.require(set(ours) == set(theirs), where, f"state {sorted(set(ours) ^ set(theirs))} in one of them", "the same tensors")
+    t.require(
+        set(ours) == set(theirs), where, f"state {sorted(set(ours) ^ set(theirs))} in one of them", "the same tensors"
+    )
     for name, value in ours.items():
         same = value.shape == theirs[name].shape and torch.equal(value, theirs[name])
         t.require(same, f"{where}: {name}", "different values", "equal bits")
@@ -169,7 +196,12 @@ def check_learning(t: Subject) -> None:
     for _ in trainer.run():
         pass
     after = _mean_loss(trainer)
-    t.require(after < before, "mean loss over the training views after five rounds", f"{after:.5g}", f"less than {before:.5g} at the start")
+    t.require(
+        after < before,
+        "mean loss over the training views after five rounds",
+        f"{after:.5g}",
+        f"less than {before:.5g} at the start",
+    )
 
 
 @torch.no_grad()
@@ -186,7 +218,8 @@ def _mean_loss(trainer: Trainer) -> float:
 
 
 def check_save_load(t: Subject) -> None:
-    """A model comes back from ``model.safetensors`` with the same bits and the same picture, and foreign files are refused."""
+    """A model comes back from ``model.safetensors`` with the same bits and the same picture, and foreign files are
+    refused."""
     model = t.model(torch.float32)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.safetensors"
@@ -198,7 +231,10 @@ def check_save_load(t: Subject) -> None:
             for view in t.views()[:3]:
                 a, b = (_frame(t, m, view.camera, view.conditions) for m in (model, loaded))
                 t.require(
-                    torch.equal(a, b), f"view {view.name} after loading", f"a change of {float((a - b).abs().max()):.3g}", "equal bits"
+                    torch.equal(a, b),
+                    f"view {view.name} after loading",
+                    f"a change of {float((a - b).abs().max()):.3g}",
+                    "equal bits",
                 )
         _refuses_foreign(t, path)
 
@@ -218,24 +254,48 @@ def _refuses_foreign(t: Subject, path: Path) -> None:
         except CheckpointError:
             continue
         where = f"{header[kind]['class']}(no_such_setting=1), as a model file has it"
-        t.require(False, where, "it was loaded", "CheckpointError, because the class refuses settings that it does not have")
+        t.require(
+            False, where, "it was loaded", "CheckpointError, because the class refuses settings that it does not have"
+        )
 
 
 def check_folded(t: Subject) -> None:
-    """What ``folded`` makes of tensors is the same field, and stays as it is, so that what is compressed again is not lost bit by bit."""
+    """What ``folded`` makes of tensors is the same field, and stays as it is, so that what is compressed again is not
+    lost bit by bit."""
     model = t.model(torch.float32)
     once = folded(model)
     for name, value in folded(once).params.items():
-        t.require(torch.equal(value, once.params[name]), f"{name} after folding twice", "other values than after once", "equal bits")
+        t.require(
+            torch.equal(value, once.params[name]),
+            f"{name} after folding twice",
+            "other values than after once",
+            "equal bits",
+        )
     with torch.no_grad():
         for view in t.views()[:3]:
-            change = float((_frame(t, once, view.camera, view.conditions) - _frame(t, model, view.camera, view.conditions)).abs().max())
-            t.require(change < _FOLDED, f"view {view.name} after folding", f"a change of {change:.3g}", f"less than {_FOLDED:g}")
+            change = float(
+                (_frame(t, once, view.camera, view.conditions) - _frame(t, model, view.camera, view.conditions))
+                .abs()
+                .max()
+            )
+            t.require(
+                change < _FOLDED,
+                f"view {view.name} after folding",
+                f"a change of {change:.3g}",
+                f"less than {_FOLDED:g}",
+            )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.neuprim"
         stored = [once.params]
         for _ in range(2):
-            checkpoint.save_compressed(path, Primitives(model.density, model.colour, stored[-1]), t.task.name, {}, LEVELS[1])
+            checkpoint.save_compressed(
+                path, Primitives(model.density, model.colour, stored[-1]), t.task.name, {}, LEVELS[1]
+            )
             stored.append(checkpoint.load_model(path, t.task)[0].params)
     for name, value in stored[2].items():
-        t.require(torch.equal(value, stored[1][name]), f"{name} compressed twice", "other values than after once", "equal bits")
+        t.require(
+            torch.equal(value, stored[1][name]),
+            f"{name} compressed twice",
+            "other values than after once",
+            "equal bits",
+        )

@@ -1,4 +1,5 @@
-"""What the channels of a task's images are, and how people see them: the one place that makes red, green and blue of them."""
+"""What the channels of a task's images are, and how people see them: the one place that makes red, green and blue of
+them."""
 
 from __future__ import annotations
 
@@ -30,8 +31,8 @@ class Channels:
     Attributes:
         names: one per channel, in the order of the tensors' last axis.
         color_space: "srgb" or "linear", the data set's.
-        own: the task's display, or None: three channels are red, green and blue, one is grey, and of others some are shown.
-        task: its name, for messages.
+        own: the task's display, or None: three channels are red, green and blue, one is grey, and of others some are
+        shown. task: its name, for messages.
     """
 
     names: tuple[str, ...] = ("R", "G", "B")
@@ -46,15 +47,16 @@ class Channels:
 
     @property
     def rgb(self) -> tuple[int, int, int] | None:
-        """Which channels are red, green and blue: those of that name, else all three there are, or the only one three times; None where
-        that is not said."""
+        """Which channels are red, green and blue: those of that name, else all three there are, or the only one three
+        times; None where that is not said."""
         if {"R", "G", "B"} <= set(self.names):
             return self.names.index("R"), self.names.index("G"), self.names.index("B")
         return {1: (0, 0, 0), 3: (0, 1, 2)}.get(self.count)
 
     @property
     def plain(self) -> bool:
-        """Whether an image is red, green and blue and nothing else, so that the sRGB curve has its meaning for all of it."""
+        """Whether an image is red, green and blue and nothing else, so that the sRGB curve has its meaning for all of
+        it."""
         return self.own is None and sorted(self.names) == ["B", "G", "R"]
 
     @property
@@ -105,17 +107,22 @@ class Channels:
         return linear_to_srgb(image.clamp_min(0.0)) if self.color_space == "linear" else image
 
     def display_rows(self, colours: Tensor) -> Tensor:
-        """(M, 3) display-referred sRGB values 0..1 of M colours (M, C), e.g. those of primitives: the same as of an image one pixel high."""
+        """(M, 3) display-referred sRGB values 0..1 of M colours (M, C), e.g. those of primitives: the same as of an
+        image one pixel high."""
         return self.display(colours[None])[0].clamp(0.0, 1.0)
 
     def _checked(self, found: Any, image: Tensor) -> Tensor:
         expected = (*image.shape[:2], 3)
         if not isinstance(found, Tensor) or tuple(found.shape) != expected or not found.is_floating_point():
             what = f"{found.dtype} of shape {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
-            raise ConfigError(f"task {self.task!r}: display gave {what} for {tuple(image.shape)}; expected floats of shape {expected}")
+            raise ConfigError(
+                f"task {self.task!r}: display gave {what} for {tuple(image.shape)}; expected floats of shape {expected}"
+            )
         bad = int((~torch.isfinite(found)).sum())
         if bad:
-            raise ConfigError(f"task {self.task!r}: display gave {bad} NaN or infinite values; expected numbers from 0 to 1")
+            raise ConfigError(
+                f"task {self.task!r}: display gave {bad} NaN or infinite values; expected numbers from 0 to 1"
+            )
         return found.clamp(0.0, 1.0)
 
 
@@ -134,7 +141,9 @@ def channels_of(task: TaskSpec, dataset: Dataset) -> Channels:
         raise DataError(
             f"{dataset.name}: the background has shape {tuple(dataset.background.shape)}; expected ({dataset.channels},), a number per channel"
         )
-    return Channels(tuple(task.channels) or default_names(dataset.channels), dataset.color_space, task.display, task.name)
+    return Channels(
+        tuple(task.channels) or default_names(dataset.channels), dataset.color_space, task.display, task.name
+    )
 
 
 def stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec, count: int) -> Channels:
@@ -151,5 +160,7 @@ def stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec, coun
     if names is None:  # written before models kept them
         names = task.channels if len(task.channels) == count else default_names(count)
     elif not isinstance(names, list) or len(names) != count or names_fault(names):
-        raise CheckpointError(f"{where}: the model's header names the channels {str(names)[:100]}; expected {count} different names")
+        raise CheckpointError(
+            f"{where}: the model's header names the channels {str(names)[:100]}; expected {count} different names"
+        )
     return Channels(tuple(names), str(header.get("color_space", "srgb")), task.display, task.name)

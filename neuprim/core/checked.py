@@ -1,15 +1,18 @@
-"""Settings, declared once: their types, bounds and choices stand on the fields of a dataclass, and one function refuses what does not fit.
+"""Settings, declared once: their types, bounds and choices stand on the fields of a dataclass, and one function refuses
+what does not fit.
 
     @dataclass(frozen=True)
     class Waves:
         count: Annotated[int, Range(1, 16)] = 3
         form: Literal["sine", "cosine"] = "sine"
 
-    checked(Waves, {"cuont": 4}, "model.density")  # model.density.cuont: no such setting; did you mean 'model.density.count'?
-    checked(Waves, {"count": 99}, "model.density")  # model.density.count=99: expected a whole number from 1 to 16
+    checked(Waves, {"cuont": 4}, "model.density")  # model.density.cuont: no such setting; did you mean
+    'model.density.count'? checked(Waves, {"count": 99}, "model.density")  # model.density.count=99: expected a whole
+    number from 1 to 16
 
-Types are ``bool``, ``int``, ``float``, ``str``, ``Path``, ``list``, ``Literal``, ``tuple``, ``dict``, other settings dataclasses, unions of
-these, and ``Any``. Conversions lose nothing: 1e5 is a whole number, true is not one, and no number is NaN or infinite.
+Types are ``bool``, ``int``, ``float``, ``str``, ``Path``, ``list``, ``Literal``, ``tuple``, ``dict``, other settings
+dataclasses, unions of these, and ``Any``. Conversions lose nothing: 1e5 is a whole number, true is not one, and no
+number is NaN or infinite.
 """
 
 from __future__ import annotations
@@ -45,10 +48,17 @@ __all__ = [
 T = TypeVar("T")
 
 Option = tuple[Any, str] | tuple[Any, str, Any]
-"""An option of a task or loss: its default, one line of help, and perhaps its type, as on a settings dataclass, where bounds or choices
-matter; without one, values get the type of the default."""
+"""An option of a task or loss: its default, one line of help, and perhaps its type, as on a settings dataclass, where
+bounds or choices matter; without one, values get the type of the default."""
 
-_KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "text", Path: "a path", list: "a list"}
+_KINDS = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a finite number",
+    str: "text",
+    Path: "a path",
+    list: "a list",
+}
 
 
 # ---------------------------------------------------------------- what a field says about its values
@@ -91,7 +101,11 @@ class Range:
         else:
             lower = low and (f"of at least {low}" if self.above is None else f"above {low}")
             upper = high and (f"at most {high}" if self.below is None else f"below {high}")
-            limits = f"{lower} and {upper}" if lower and upper else lower or (upper and f"of {upper}" if self.below is None else upper)
+            limits = (
+                f"{lower} and {upper}"
+                if lower and upper
+                else lower or (upper and f"of {upper}" if self.below is None else upper)
+            )
         return "".join(f"{_number(value)}, or " for value in self.also) + f"{kind} {limits}".rstrip()
 
 
@@ -141,7 +155,8 @@ def checked(cls: type[T], values: object, where: str = "") -> T:
         where: dotted key of this group, for messages; empty at the root.
 
     Raises:
-        ConfigError: one line for an unknown or missing key, or a value of the wrong type, beyond its bounds, or none of its choices.
+        ConfigError: one line for an unknown or missing key, or a value of the wrong type, beyond its bounds, or none of
+        its choices.
     """
     if isinstance(values, cls):
         return values
@@ -153,7 +168,9 @@ def checked(cls: type[T], values: object, where: str = "") -> T:
         if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
             name = joined(where, field.name)
             raise ConfigError(f"{name}: required and not given; expected {_words(hints[field.name], name)}")
-    return cls(**{name: converted(values[name], hint, joined(where, name)) for name, hint in hints.items() if name in values})
+    return cls(
+        **{name: converted(values[name], hint, joined(where, name)) for name, hint in hints.items() if name in values}
+    )
 
 
 def choose(found: Mapping[str, Any], where: str, offered: Mapping[str, Any]) -> None:
@@ -162,7 +179,8 @@ def choose(found: Mapping[str, Any], where: str, offered: Mapping[str, Any]) -> 
     Args:
         found: what the user and the preset set.
         where: dotted name of the group, for messages.
-        offered: name -> type, as on a settings dataclass: ``int``, ``Annotated[float, Range(above=0)]``, ``Literal["a", "b"]``; or a tuple
+        offered: name -> type, as on a settings dataclass: ``int``, ``Annotated[float, Range(above=0)]``, ``Literal["a",
+        "b"]``; or a tuple
             of the values to choose from.
 
     Raises:
@@ -173,12 +191,14 @@ def choose(found: Mapping[str, Any], where: str, offered: Mapping[str, Any]) -> 
         hint = _offered(offered[key])
         made = converted(value, hint, joined(where, key))
         if made != value or (isinstance(made, int) and isinstance(value, float)):
-            # "1e-3" for a number, 3 for text, 4.0 for a whole number: a field that gets the value itself would not read them so
+            # "1e-3" for a number, 3 for text, 4.0 for a whole number: a field that gets the value itself would not read
+            # them so
             raise _Unfit(joined(where, key), value, _words(hint, joined(where, key)))
 
 
 def verify(settings: Any, where: str) -> None:
-    """For ``__post_init__`` of a settings dataclass: what Python code passes is checked, and converted, as what users type.
+    """For ``__post_init__`` of a settings dataclass: what Python code passes is checked, and converted, as what users
+    type.
 
     Raises:
         ConfigError: as :func:`checked`.
@@ -252,14 +272,17 @@ def joined(where: str, name: str) -> str:
 
 
 def shown(value: object) -> str:
-    """A value as users type it, cut where it is long; text that reads as something else is quoted, and so is what would break the line."""
+    """A value as users type it, cut where it is long; text that reads as something else is quoted, and so is what would
+    break the line."""
     return cut(_whole(value))
 
 
 def _whole(value: object) -> str:
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, str) and (not value.isprintable() or value.lower() in ("", "null", "true", "false") or _reads_as_number(value)):
+    if isinstance(value, str) and (
+        not value.isprintable() or value.lower() in ("", "null", "true", "false") or _reads_as_number(value)
+    ):
         return repr(value)
     return " ".join(str(value).split()) if not isinstance(value, str) else value
 
@@ -284,7 +307,11 @@ def _words(hint: Any, where: str) -> str:
     if origin is Literal:
         return _either(args)
     if origin is tuple:
-        return f"a list, each {_words(args[0], where)}" if args[-1] is ... else f"a list of {', '.join(_words(a, where) for a in args)}"
+        return (
+            f"a list, each {_words(args[0], where)}"
+            if args[-1] is ...
+            else f"a list of {', '.join(_words(a, where) for a in args)}"
+        )
     if plain is str:
         return f"text (quote it: {where}='...')"
     kind = _KINDS.get(plain, getattr(plain, "__name__", str(plain)))
@@ -348,7 +375,9 @@ def _plain(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
             return _entries(value, args, where)
         raise ConfigError(f"{where}={shown(value)}: expected entries, each as {where}.KEY=VALUE")
     elif origin in (tuple, list):
-        items = args[:1] * len(value) if isinstance(value, list | tuple) and (origin is list or args[-1] is ...) else args
+        items = (
+            args[:1] * len(value) if isinstance(value, list | tuple) and (origin is list or args[-1] is ...) else args
+        )
         if isinstance(value, list | tuple) and len(items) == len(value):
             try:
                 return origin(converted(v, item, where) for v, item in zip(value, items, strict=True))
@@ -384,6 +413,8 @@ def _scalar(value: Any, kind: Any) -> Any:
         return number if math.isfinite(number) else None
     if kind is str and isinstance(value, str | int) and not truth:
         return str(value)  # a directory may be called 123
-    if kind is Path and isinstance(value, str | int | Path) and not truth and str(value):  # Path("") would be the working directory
+    if (
+        kind is Path and isinstance(value, str | int | Path) and not truth and str(value)
+    ):  # Path("") would be the working directory
         return Path(str(value))
     return value if kind is list and isinstance(value, list) else None

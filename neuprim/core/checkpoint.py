@@ -1,7 +1,8 @@
 """Models and checkpoints on disk: safetensors with one JSON header. Nothing in a file is ever executed.
 
-A *model* holds what rendering needs and nothing else; a *checkpoint* holds the exact training state. A model may also be a compressed file
-(:mod:`neuprim.core.compressed`), which its first bytes tell; whatever reads models here reads both.
+A *model* holds what rendering needs and nothing else; a *checkpoint* holds the exact training state. A model may also
+be a compressed file (:mod:`neuprim.core.compressed`), which its first bytes tell; whatever reads models here reads
+both.
 """
 
 from __future__ import annotations
@@ -59,7 +60,9 @@ def write(path: Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[
         with atomic_path(path) as temporary:
             save_file(compact, str(temporary), metadata={_KEY: text})
     except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path}: could not write the {kind}: {error}; the previous one, if any, is untouched") from error
+        raise CheckpointError(
+            f"{path}: could not write the {kind}: {error}; the previous one, if any, is untouched"
+        ) from error
 
 
 def read_header(path: Path, kind: str) -> dict[str, Any]:
@@ -76,7 +79,9 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such {kind}") from None
     except (OSError, SafetensorError, ValueError, RuntimeError) as error:  # RuntimeError: replaced while being opened
-        raise CheckpointError(f"{path}: not a readable {kind} (safetensors: {error}); the file is damaged or of another kind") from error
+        raise CheckpointError(
+            f"{path}: not a readable {kind} (safetensors: {error}); the file is damaged or of another kind"
+        ) from error
     if _KEY not in metadata:
         raise CheckpointError(f"{path}: no {_KEY!r} header found; expected a {kind} written by neuprim")
     try:
@@ -91,7 +96,9 @@ def _checked(path: Path, header: Any, kind: str) -> dict[str, Any]:
         found = header.get("kind") if isinstance(header, dict) else type(header).__name__
         raise CheckpointError(f"{path}: kind is {cut(repr(found))}; expected {kind!r}")
     if header.get("format") != FORMAT:
-        raise CheckpointError(f"{path}: format version is {cut(repr(header.get('format')))}; this neuprim reads {FORMAT}")
+        raise CheckpointError(
+            f"{path}: format version is {cut(repr(header.get('format')))}; this neuprim reads {FORMAT}"
+        )
     for name in _NUMBERS:  # in any header; null: not known
         number = 0.0 if header.get(name) is None else finite(header[name])
         if number is None or number < 0:
@@ -103,7 +110,11 @@ def _checked(path: Path, header: Any, kind: str) -> dict[str, Any]:
 
 
 def write_in_pieces(
-    path: Path, kind: str, kinds: Mapping[str, Kind], header: Mapping[str, Any], pieces: Callable[[str], Iterable[Tensor]]
+    path: Path,
+    kind: str,
+    kinds: Mapping[str, Kind],
+    header: Mapping[str, Any],
+    pieces: Callable[[str], Iterable[Tensor]],
 ) -> None:
     """As :func:`write`, of tensors that are nowhere whole, see :func:`~neuprim.core.io.pieces.write_pieces`."""
     text = json.dumps({"format": FORMAT, "kind": kind, **header}, allow_nan=False)
@@ -111,7 +122,9 @@ def write_in_pieces(
         with atomic_path(path) as temporary:
             write_pieces(temporary, kinds, {_KEY: text}, pieces)
     except OSError as error:
-        raise CheckpointError(f"{path}: could not write the {kind}: {error}; the previous one, if any, is untouched") from error
+        raise CheckpointError(
+            f"{path}: could not write the {kind}: {error}; the previous one, if any, is untouched"
+        ) from error
 
 
 def shapes(path: Path, kind: str) -> dict[str, tuple[int, ...]]:
@@ -145,7 +158,10 @@ def read(
             found = {name: file.get_slice(name) for name in file.keys()}
             parts = {name: rows(name, tuple(one.get_shape())) for name, one in found.items()}
             empty = {name for name, one in found.items() if 0 in one.get_shape()}  # of which the library takes no slice
-            tensors = {name: found[name][part] if part and name not in empty else file.get_tensor(name) for name, part in parts.items()}
+            tensors = {
+                name: found[name][part] if part and name not in empty else file.get_tensor(name)
+                for name, part in parts.items()
+            }
             tensors |= {name: tensors[name][part] for name, part in parts.items() if part and name in empty}
     except (OSError, SafetensorError, ValueError, RuntimeError) as error:
         raise CheckpointError(f"{path}: tensors of the {kind} are unreadable: {error}") from error
@@ -156,7 +172,8 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
     """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source.
 
     Args:
-        without_zeros: whether zeros of the fields are left out (:mod:`neuprim.core.model.zeros`), as in models that were pruned.
+        without_zeros: whether zeros of the fields are left out (:mod:`neuprim.core.model.zeros`), as in models that
+        were pruned.
     """
     specs = (*model.density.parameters(), *model.colour.parameters()) if without_zeros else ()
     tensors, sparse = split_off(model.params, specs)
@@ -213,14 +230,19 @@ def model_header(model: Primitives, task: str, extra: Mapping[str, Any]) -> dict
 
 def extra_of(header: Mapping[str, Any]) -> dict[str, Any]:
     """Of a model's header, what :func:`save_model` was given beside the model itself."""
-    return {key: value for key, value in header.items() if key not in ("format", "kind", "task", "primitives", "density", "colour")}
+    return {
+        key: value
+        for key, value in header.items()
+        if key not in ("format", "kind", "task", "primitives", "density", "colour")
+    }
 
 
 def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
     """The model in ``path`` and its header.
 
     Raises:
-        CheckpointError: damaged, written for another task, with fields this task does not have, or tensors that do not fit them.
+        CheckpointError: damaged, written for another task, with fields this task does not have, or tensors that do not
+        fit them.
     """
     header = read_header(path, "model")
     if header.get("task") != task.name:
@@ -250,15 +272,23 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
 
 def _field(path: Path, header: Mapping[str, Any], task: TaskSpec, kind: str) -> Any:
     entry = header.get(kind)
-    if not isinstance(entry, dict) or not isinstance(entry.get("class"), str) or not isinstance(entry.get("settings"), dict):
-        raise CheckpointError(f"{path}: header field {kind!r} is {cut(repr(entry))}; expected {{'class': ..., 'settings': {{...}}}}")
+    if (
+        not isinstance(entry, dict)
+        or not isinstance(entry.get("class"), str)
+        or not isinstance(entry.get("settings"), dict)
+    ):
+        raise CheckpointError(
+            f"{path}: header field {kind!r} is {cut(repr(entry))}; expected {{'class': ..., 'settings': {{...}}}}"
+        )
     known = task.fields or {}
     if entry["class"] not in known:
         raise CheckpointError(
             f"{path}: unknown {kind} field {cut(entry['class'])!r} for task {task.name!r}{nearest(entry['class'], known)}"
         )
     for name, value in entry["settings"].items():
-        if not isinstance(value, (int, float, str, bool, type(None), list)) or (isinstance(value, int) and abs(value) > 10_000):
+        if not isinstance(value, (int, float, str, bool, type(None), list)) or (
+            isinstance(value, int) and abs(value) > 10_000
+        ):
             raise CheckpointError(f"{path}: {kind} setting {cut(name)}={cut(repr(value))} is not plausible")
     try:
         return known[entry["class"]](**entry["settings"])

@@ -1,9 +1,9 @@
 """What a user may write for a condition of a task: one grammar for every command, and for exporters of anybody's.
 
-A condition is given as ``--NAME TEXT``, ``--NAME=TEXT`` or ``NAME=TEXT``, with ``-`` or ``_`` inside its name. For a condition that is
-one number the text may be a number, a list ``A,B,C`` of them, ``FIRST:LAST`` or ``FIRST:LAST:COUNT``, one frame each; what one number
-is, the task's own :attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>` says. The text of any other condition is the task's
-altogether, as ``x,y,z`` or ``orbit`` for a light.
+A condition is given as ``--NAME TEXT``, ``--NAME=TEXT`` or ``NAME=TEXT``, with ``-`` or ``_`` inside its name. For a
+condition that is one number the text may be a number, a list ``A,B,C`` of them, ``FIRST:LAST`` or ``FIRST:LAST:COUNT``,
+one frame each; what one number is, the task's own :attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>`
+says. The text of any other condition is the task's altogether, as ``x,y,z`` or ``orbit`` for a light.
 
 Values are held against the condition's range here, so that no command and no exporter can forget to.
 """
@@ -50,8 +50,11 @@ def named(word: str, specs: Sequence[ConditionSpec]) -> str | None:
     return next((spec.name for spec in specs if spec.name.replace("-", "_") == word.replace("-", "_")), None)
 
 
-def split_words(words: Sequence[str], specs: Sequence[ConditionSpec], bare: bool = True) -> tuple[dict[str, str], list[str]]:
-    """Condition name -> text out of the words of a command, and the words that are about something else, in their order.
+def split_words(
+    words: Sequence[str], specs: Sequence[ConditionSpec], bare: bool = True
+) -> tuple[dict[str, str], list[str]]:
+    """Condition name -> text out of the words of a command, and the words that are about something else, in their
+    order.
 
     Args:
         bare: whether ``NAME=TEXT`` counts too, beside ``--NAME TEXT`` and ``--NAME=TEXT``.
@@ -83,7 +86,9 @@ def split_words(words: Sequence[str], specs: Sequence[ConditionSpec], bare: bool
 # ---------------------------------------------------------------- values
 
 
-def read_conditions(specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = _silent) -> dict[str, list[Tensor]]:
+def read_conditions(
+    specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = _silent
+) -> dict[str, list[Tensor]]:
     """Name -> values, one per frame, of the conditions that were given, in the task's order.
 
     An animation that does not say how many frames it has, ``0:1`` or ``orbit``, takes the number of those that do.
@@ -92,7 +97,8 @@ def read_conditions(specs: Sequence[ConditionSpec], texts: Mapping[str, str], wa
         warn: called with one line for each condition that leaves its range; those of strict ones are refused.
 
     Raises:
-        ConfigError: a text that the condition does not take, values that are not finite, or beyond the range of a strict condition.
+        ConfigError: a text that the condition does not take, values that are not finite, or beyond the range of a
+        strict condition.
     """
     given = [spec for spec in specs if spec.name in texts]
     said = {}
@@ -101,7 +107,10 @@ def read_conditions(specs: Sequence[ConditionSpec], texts: Mapping[str, str], wa
         if len(found) > 1 and _in_frames(spec, texts[spec.name], len(found)) is None:
             said[spec.name] = len(found)
     count = max(said.values(), default=0)
-    lengths = {spec.name: None if spec.name in said or not count else _in_frames(spec, texts[spec.name], count) for spec in given}
+    lengths = {
+        spec.name: None if spec.name in said or not count else _in_frames(spec, texts[spec.name], count)
+        for spec in given
+    }
     return {spec.name: _read(spec, lengths[spec.name] or texts[spec.name], warn) for spec in given}
 
 
@@ -132,13 +141,16 @@ def _read(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
     for part in parts:
         values += _values(spec, part)
         if len(values) > _MOST:  # before the next part takes more memory
-            raise ConfigError(f"{flag(spec.name)} {text[:40]}...: {len(values)} values and more; expected at most {_MOST}")
+            raise ConfigError(
+                f"{flag(spec.name)} {text[:40]}...: {len(values)} values and more; expected at most {_MOST}"
+            )
     _check_range(spec, text, values, warn)
     return values
 
 
 def _values(spec: ConditionSpec, text: str) -> list[Tensor]:
-    """One number or one range, as the task reads it; a range that the task does not read is made of numbers that it does."""
+    """One number or one range, as the task reads it; a range that the task does not read is made of numbers that it
+    does."""
     try:
         return _parsed(spec, text)
     except NeuprimError:
@@ -154,7 +166,9 @@ def _values(spec: ConditionSpec, text: str) -> list[Tensor]:
         else:
             count = FRAMES if found[3] is None else int(found[3])
             if not 2 <= count <= _MOST:
-                raise ConfigError(f"{flag(spec.name)} {text}: expected FIRST:LAST or FIRST:LAST:COUNT, 2 to {_MOST} frames") from None
+                raise ConfigError(
+                    f"{flag(spec.name)} {text}: expected FIRST:LAST or FIRST:LAST:COUNT, 2 to {_MOST} frames"
+                ) from None
             numbers = (first + (last - first) * i / (count - 1) for i in range(count))
             return [value for x in numbers for value in _parsed(spec, _plain(x))]
         raise
@@ -200,7 +214,9 @@ def _first(value: Tensor, where: Tensor) -> float:
 # ---------------------------------------------------------------- frames of an export
 
 
-def export_frames(specs: Sequence[ConditionSpec], texts: Mapping[str, str], several: bool = False) -> list[dict[str, Tensor]]:
+def export_frames(
+    specs: Sequence[ConditionSpec], texts: Mapping[str, str], several: bool = False
+) -> list[dict[str, Tensor]]:
     """One mapping of every condition of the task per frame that was asked for; only one frame unless ``several``.
 
     Raises:

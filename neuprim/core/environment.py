@@ -1,14 +1,16 @@
 """Light from all around: an image of latitude and longitude, and a few directions that stand for it.
 
-The top row of the image is up, the bottom row down. The middle column looks along the first horizontal axis; to the right of it, as seen
-from inside, directions turn clockwise about up. With up = +z: the middle column is +x, a quarter to its right -y, both edges -x, a quarter
-to its left +y (the convention of Blender's environment textures). Where up is another axis, the first horizontal axis is the scene's x,
-or y if x is up, made perpendicular to it; the second, a quarter to the left, is up x first. A rotation turns the light anticlockwise
-about up as seen from above: by 90 degrees, what came from +x comes from +y.
+The top row of the image is up, the bottom row down. The middle column looks along the first horizontal axis; to the
+right of it, as seen from inside, directions turn clockwise about up. With up = +z: the middle column is +x, a quarter
+to its right -y, both edges -x, a quarter to its left +y (the convention of Blender's environment textures). Where up is
+another axis, the first horizontal axis is the scene's x, or y if x is up, made perpendicular to it; the second, a
+quarter to the left, is up x first. A rotation turns the light anticlockwise about up as seen from above: by 90 degrees,
+what came from +x comes from +y.
 
-Directions are chosen by cutting the image into rectangles, each cut the one that most lowers the sum over all rectangles of the variance of
-direction weighted by energy (Viriyothai and Debevec 2009, "Variance minimization light probe sampling", in place of the median cut). A
-rectangle's light carries all of its energy, so the total per colour is the image's for any number of lights.
+Directions are chosen by cutting the image into rectangles, each cut the one that most lowers the sum over all
+rectangles of the variance of direction weighted by energy (Viriyothai and Debevec 2009, "Variance minimization light
+probe sampling", in place of the median cut). A rectangle's light carries all of its energy, so the total per colour is
+the image's for any number of lights.
 """
 
 from __future__ import annotations
@@ -100,20 +102,33 @@ class Environment:
         DataError: another shape, or values that are negative or not finite.
     """
 
-    def __init__(self, radiance: Tensor, up: Tensor | None = None, rotation: float = 0.0, where: str = "environment") -> None:
-        if radiance.dim() != 3 or radiance.shape[2] != 3 or radiance.shape[1] != 2 * radiance.shape[0] or not radiance.numel():
-            found = "x".join(str(n) for n in (radiance.shape[1], radiance.shape[0])) if radiance.dim() == 3 else str(tuple(radiance.shape))
+    def __init__(
+        self, radiance: Tensor, up: Tensor | None = None, rotation: float = 0.0, where: str = "environment"
+    ) -> None:
+        if (
+            radiance.dim() != 3
+            or radiance.shape[2] != 3
+            or radiance.shape[1] != 2 * radiance.shape[0]
+            or not radiance.numel()
+        ):
+            found = (
+                "x".join(str(n) for n in (radiance.shape[1], radiance.shape[0]))
+                if radiance.dim() == 3
+                else str(tuple(radiance.shape))
+            )
             raise DataError(f"{where}: image is {found}; expected latitude and longitude, RGB, twice as wide as high")
         axes = _axes(torch.tensor([0.0, 0.0, 1.0]) if up is None else up)
         self._flux, self._moment = _cells(radiance, axes, math.radians(rotation), where)
 
     @property
     def irradiance(self) -> Tensor:
-        """(3,) float64 sum of radiance times solid angle over all directions; 4 pi for a uniform environment of radiance 1."""
+        """(3,) float64 sum of radiance times solid angle over all directions; 4 pi for a uniform environment of
+        radiance 1."""
         return torch.from_numpy(self._flux.sum((0, 1)))
 
     def beams(self, count: int) -> Beams:
-        """At most ``count`` directions that carry all of the energy; fewer where fewer cells of the image shine, none if it is black.
+        """At most ``count`` directions that carry all of the energy; fewer where fewer cells of the image shine, none
+        if it is black.
 
         Equal arguments give equal directions; nothing is random.
 
@@ -131,10 +146,13 @@ class Environment:
             directions.append(moment / length)
             irradiance.append(flux)
         shape = (len(directions), 3)
-        return Beams(*(torch.from_numpy(np.array(x, dtype=np.float64).reshape(shape)) for x in (directions, irradiance)))
+        return Beams(
+            *(torch.from_numpy(np.array(x, dtype=np.float64).reshape(shape)) for x in (directions, irradiance))
+        )
 
     def share_beyond(self, directions: Tensor, degrees: float) -> float:
-        """Share 0..1 of the energy (luminance) that comes from farther than ``degrees`` from each of (D, 3) unit ``directions``."""
+        """Share 0..1 of the energy (luminance) that comes from farther than ``degrees`` from each of (D, 3) unit
+        ``directions``."""
         weight = self._flux @ _LUMINANCE
         total = float(weight.sum())
         if total == 0.0:
@@ -183,7 +201,8 @@ def _axes(up: Tensor) -> Array:
 
 
 def _cells(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Array, Array]:
-    """(R, C, 3) radiance times solid angle, and (R, C, 3) its luminance times direction, summed over blocks of texels."""
+    """(R, C, 3) radiance times solid angle, and (R, C, 3) its luminance times direction, summed over blocks of
+    texels."""
     height, width = radiance.shape[:2]
     block = -(-height // _ROWS)
     starts = np.arange(0, width, block)
@@ -197,9 +216,13 @@ def _cells(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Arra
         wrong = ~(np.isfinite(band) & (band >= 0))
         if wrong.any():
             y, x, channel = (int(i[0]) for i in np.nonzero(wrong))
-            raise DataError(f"{where}: radiance {band[y, x, channel]} at row {top + y}, column {x}, channel {channel}; expected 0 or more")
+            raise DataError(
+                f"{where}: radiance {band[y, x, channel]} at row {top + y}, column {x}, channel {channel}; expected 0 or more"
+            )
         polar = (rows + 0.5) * (math.pi / height)
-        solid = (2 * math.pi / width) * 2 * np.sin(polar) * math.sin(0.5 * math.pi / height)  # cos of the upper edge - cos of the lower
+        solid = (
+            (2 * math.pi / width) * 2 * np.sin(polar) * math.sin(0.5 * math.pi / height)
+        )  # cos of the upper edge - cos of the lower
         energy = band * solid[:, None, None]
         luminance = (energy @ _LUMINANCE)[..., None]
         way = np.sin(polar)[:, None, None] * around + np.cos(polar)[:, None, None] * axes[2]

@@ -30,7 +30,8 @@ DISK = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
 )
-"""What a disk or a path may refuse wherever a command reads or writes; a missing file is left out, as it may well be a bug."""
+"""What a disk or a path may refuse wherever a command reads or writes; a missing file is left out, as it may well be a
+bug."""
 
 
 class NeuprimError(Exception):
@@ -74,11 +75,13 @@ class RankError(NeuprimError):
 
 
 class FormError(NeuprimError):
-    """A field handed over tensors that the renderer or the training cannot take; the message names field, method and tensor."""
+    """A field handed over tensors that the renderer or the training cannot take; the message names field, method and
+    tensor."""
 
 
 def cut(text: str, most: int = 80) -> str:
-    """A value's text as messages show it: at most so many characters. Rule: what files and users gave goes into a message through this."""
+    """A value's text as messages show it: at most so many characters. Rule: what files and users gave goes into a
+    message through this."""
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
@@ -95,7 +98,8 @@ def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "")
 
 
 _HEAD, _TAIL = 1200, 300
-"""Characters of a line's beginning, with file and key, and of its end, with what was expected; a damaged file's value between them is cut."""
+"""Characters of a line's beginning, with file and key, and of its end, with what was expected; a damaged file's value
+between them is cut."""
 
 _FULL_CARD = (
     "the card's memory is full; expected a smaller image or grid, fewer primitives, or CUDA_VISIBLE_DEVICES= in the environment, "

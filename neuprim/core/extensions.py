@@ -1,7 +1,8 @@
-"""What a plugin can add beside whole tasks: scenes and losses of a task, file formats to export to, ways of looking into a density.
+"""What a plugin can add beside whole tasks: scenes and losses of a task, file formats to export to, ways of looking
+into a density.
 
-Each is registered under an entry-point group of its own, found and loaded by :mod:`neuprim.plugins.registry`; the built-in ones come
-through the same groups as anybody's.
+Each is registered under an entry-point group of its own, found and loaded by :mod:`neuprim.plugins.registry`; the
+built-in ones come through the same groups as anybody's.
 """
 
 from __future__ import annotations
@@ -25,7 +26,16 @@ from neuprim.core.settings import RenderSettings
 from neuprim.core.task import Loss, SceneSpec, TaskSpec
 from neuprim.core.volumes.source import VolumeSource
 
-__all__ = ["Exporter", "ExportJob", "ExportReport", "Inspector", "LossExtension", "SceneExtension", "StoredModel", "TrainedModel"]
+__all__ = [
+    "Exporter",
+    "ExportJob",
+    "ExportReport",
+    "Inspector",
+    "LossExtension",
+    "SceneExtension",
+    "StoredModel",
+    "TrainedModel",
+]
 
 
 @dataclass(frozen=True)
@@ -38,7 +48,8 @@ class TrainedModel:
         scene: settings of the scene it was fitted to.
         settings: how the run renders.
         dataset: loads the scene again; raises :class:`~neuprim.core.errors.DataError` where its files are gone.
-        volume: the voxel files of the scene, without drawing anything; None for scenes that have none. Raises as ``dataset``.
+        volume: the voxel files of the scene, without drawing anything; None for scenes that have none. Raises as
+        ``dataset``.
     """
 
     directory: Path
@@ -74,12 +85,13 @@ class ExportJob:
     """One call of ``neuprim export``.
 
     Attributes:
-        out: the file to write, or the folder to make; files beside it count too. It has the name that the user will find but lies in a
-            private folder: what is written there is moved to its place when all is done and if nothing is in the way there, so an
-            exporter need not know about ``--force``, and one that fails leaves nothing behind.
+        out: the file to write, or the folder to make; files beside it count too. It has the name that the user will
+        find but lies in a
+            private folder: what is written there is moved to its place when all is done and if nothing is in the way
+            there, so an exporter need not know about ``--force``, and one that fails leaves nothing behind.
         options: every option of the exporter: what the user gave, numbers and booleans as such, or else its default.
-        conditions: condition name -> text, already read and held against its range once; empty unless the exporter takes conditions.
-        progress: called with (text, fraction 0..1).
+        conditions: condition name -> text, already read and held against its range once; empty unless the exporter
+        takes conditions. progress: called with (text, fraction 0..1).
     """
 
     run: TrainedModel
@@ -89,7 +101,8 @@ class ExportJob:
     progress: Callable[[str, float], None] = lambda text, fraction: None
 
     def frames(self, several: bool = False) -> list[dict[str, Tensor]]:
-        """Every condition of the task per frame that the user asked for; one frame unless ``several``, and for tasks without conditions.
+        """Every condition of the task per frame that the user asked for; one frame unless ``several``, and for tasks
+        without conditions.
 
         Raises:
             ConfigError: a condition is missing, or has several values where one is wanted.
@@ -157,13 +170,15 @@ class Exporter:
 
     Attributes:
         options: option name -> (default, one line of help); shown by ``neuprim export --format NAME --help``.
-        write: writes :attr:`ExportJob.out`; raises a :class:`~neuprim.core.errors.NeuprimError` for what the format cannot hold.
-        conditions: whether it takes values of the task's conditions (``time=0.5``).
+        write: writes :attr:`ExportJob.out`; raises a :class:`~neuprim.core.errors.NeuprimError` for what the format
+        cannot hold. conditions: whether it takes values of the task's conditions (``time=0.5``).
         read: for lossless formats, ``neuprim import``: what ``write`` wrote, from an untrusted file; raises
             :class:`~neuprim.core.errors.DataError`. Chosen by the file's suffix, which is then the exporter's name.
-        default: name of the file or folder in ``RUN_DIR/export`` where the user names none; "" for the exporter's name with the first
+        default: name of the file or folder in ``RUN_DIR/export`` where the user names none; "" for the exporter's name
+        with the first
             suffix. It ends in one of these, where there are any.
-        suffixes: what the name of its one file may end in, as ``(".glb", ".ply")``; other names, and folders, are refused before it is
+        suffixes: what the name of its one file may end in, as ``(".glb", ".ply")``; other names, and folders, are
+        refused before it is
             called. Empty: it takes any name, also that of a folder.
     """
 
@@ -183,10 +198,13 @@ class Inspector:
     """A way of showing a density in ``neuprim inspect --show NAME``; group ``neuprim.inspectors``.
 
     Attributes:
-        layers: a :class:`~neuprim.plugins.inspect.field.FieldFrame` -> a list of layers of :mod:`neuprim.plugins.inspect.layers`, which
+        layers: a :class:`~neuprim.plugins.inspect.field.FieldFrame` -> a list of layers of
+        :mod:`neuprim.plugins.inspect.layers`, which
             a window, a picture, a film and a page draw; called once per frame and panel.
-        shows: "sigma" for the extinction on the frame's grid, asked a second time with the ground truth where there is one; "model"
-            for the primitives themselves; "primitive" for a single one, with a camera of its own; "both" for what needs the truth.
+        shows: "sigma" for the extinction on the frame's grid, asked a second time with the ground truth where there is
+        one; "model"
+            for the primitives themselves; "primitive" for a single one, with a camera of its own; "both" for what needs
+            the truth.
     """
 
     api: int
@@ -217,7 +235,8 @@ class LossExtension:
 
     Attributes:
         make: the settings under ``train``, and this loss's options as "options" -> the loss.
-        options: name -> (default, one line of help), perhaps with a type, set as ``task.options.NAME`` while the loss is chosen; as
+        options: name -> (default, one line of help), perhaps with a type, set as ``task.options.NAME`` while the loss
+        is chosen; as
             :attr:`~neuprim.core.task.TaskSpec.options`.
         uses: the settings of :data:`neuprim.core.uses.OPTIONAL` under ``train`` that ``make`` reads.
     """

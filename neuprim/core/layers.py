@@ -1,6 +1,7 @@
 """Layers of an image: what ``neuprim render --format exr`` can write of a frame beside its beauty.
 
-Every task's frames have those of :data:`COMMON`; a task says which others its frames have (:attr:`neuprim.core.task.TaskSpec.layers`).
+Every task's frames have those of :data:`COMMON`; a task says which others its frames have
+(:attr:`neuprim.core.task.TaskSpec.layers`).
 """
 
 from __future__ import annotations
@@ -24,10 +25,13 @@ class LayerSpec:
     Attributes:
         name: what the user types after ``--layers``, and the prefix of its channels in the file: letters, digits and _.
         summary: one line that says what a value is and in which unit; it is written into the file, too.
-        draw: :class:`~neuprim.core.render.layers.LayerFrame` -> (H, W, C) finite values; (H, W) where there is one channel. None where the frame's
+        draw: :class:`~neuprim.core.render.layers.LayerFrame` -> (H, W, C) finite values; (H, W) where there is one
+        channel. None where the frame's
             model has no such thing.
-        channels: their names; empty: light, with the channels of the task's images, over black, that is premultiplied by alpha. Light is left
-            to models whose colours are linear light, as sums of it mean nothing else; and it adds up over the lights of an environment.
+        channels: their names; empty: light, with the channels of the task's images, over black, that is premultiplied
+        by alpha. Light is left
+            to models whose colours are linear light, as sums of it mean nothing else; and it adds up over the lights of
+            an environment.
     """
 
     name: str
@@ -55,7 +59,10 @@ COMMON: tuple[LayerSpec, ...] = (
         ("Z",),
     ),
     LayerSpec(
-        "density", "density integral: the optical depth of the whole ray behind the near plane, without unit", LayerFrame.integral, ("Y",)
+        "density",
+        "density integral: the optical depth of the whole ray behind the near plane, without unit",
+        LayerFrame.integral,
+        ("Y",),
     ),
 )
 """Those of every task."""
@@ -69,7 +76,12 @@ def layer_fault(layers: object) -> str | None:
     for i, spec in enumerate(layers):
         if not isinstance(spec, LayerSpec):
             return f"[{i}] is of type {type(spec).__name__}; expected a LayerSpec"
-        if not isinstance(spec.name, str) or not spec.name.isidentifier() or not spec.name.isascii() or len(spec.name) > 31:
+        if (
+            not isinstance(spec.name, str)
+            or not spec.name.isidentifier()
+            or not spec.name.isascii()
+            or len(spec.name) > 31
+        ):
             return f"[{i}].name is {spec.name!r}; expected at most 31 letters, digits and _"
         if spec.name in taken or spec.name.startswith("light_"):
             return f"[{i}].name is {spec.name!r}, which is taken; expected another name"
@@ -92,7 +104,8 @@ def chosen_layers(text: str | None, own: Sequence[LayerSpec], several: bool) -> 
     Args:
         text: names separated by commas, or None.
         own: the task's.
-        several: whether several lights are on. Then what is not light and depends on one of them, a task's own numbers, is not offered.
+        several: whether several lights are on. Then what is not light and depends on one of them, a task's own numbers,
+        is not offered.
 
     Raises:
         ConfigError: a name that is none of them, or nothing.

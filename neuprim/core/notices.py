@@ -1,6 +1,7 @@
 """Warnings to the user: things that do not stop a command and should be known. One line each, said once per process.
 
-They are Python warnings, so that notebooks and programs can filter them; the command line shows them as lines on standard error.
+They are Python warnings, so that notebooks and programs can filter them; the command line shows them as lines on
+standard error.
 """
 
 from __future__ import annotations

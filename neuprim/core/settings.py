@@ -20,22 +20,30 @@ class RenderSettings:
     """How a frame is drawn; part of a run's configuration as ``renderer``.
 
     Attributes:
-        backend: a name of the table :mod:`neuprim.core.render.backends`, which refuses any other: "reference" (float64 torch, the
+        backend: a name of the table :mod:`neuprim.core.render.backends`, which refuses any other: "reference" (float64
+        torch, the
             oracle), "cpu" (numba); or "auto" (the fastest that can run the model).
-        device: where a run keeps the model, the optimiser's state and the images it compares: "cpu", "cuda" (an NVIDIA card, refused
-            where there is none), or "auto": the card, where there is one and a backend that draws the model on it, else the processor.
+        device: where a run keeps the model, the optimiser's state and the images it compares: "cpu", "cuda" (an NVIDIA
+        card, refused
+            where there is none), or "auto": the card, where there is one and a backend that draws the model on it, else
+            the processor.
             Files are the same either way: a run begun on one goes on on the other.
-        sort: what is composited front to back. "center": whole primitives by camera-z of their centres, one order for all pixels.
-            "entry": the chords of each pixel by camera-z of where the ray enters them, those cut by the near plane first, and by
-            their centres where entries are equal; no popping when centres swap, but slower (``benchmarks/sorting.py``).
-        samples: rays per pixel side, on a regular grid inside the pixel, averaged: 1 draws through pixel centres, n costs n^2.
-        alpha_max: opacity clamp of one primitive; at most 0.9999, because the backward pass divides by 1 - alpha.
-        alpha_min: a ray-primitive pair fainter than this is skipped.
+        sort: what is composited front to back. "center": whole primitives by camera-z of their centres, one order for
+        all pixels.
+            "entry": the chords of each pixel by camera-z of where the ray enters them, those cut by the near plane
+            first, and by their centres where entries are equal; no popping when centres swap, but slower
+            (``benchmarks/sorting.py``).
+        samples: rays per pixel side, on a regular grid inside the pixel, averaged: 1 draws through pixel centres, n
+        costs n^2. alpha_max: opacity clamp of one primitive; at most 0.9999, because the backward pass divides by 1 -
+        alpha. alpha_min: a ray-primitive pair fainter than this is skipped.
         transmittance_min: a ray stops after the primitive that takes its transmittance below this.
-        near: camera-z of the near plane, scene units; chords are cut there. Ray distance for a ``RayCamera``, which has no z plane. "auto",
-            the default of a run: 1/400 of the median depth at which training cameras see the starting points, and at most a tenth of the
-            least; decided when training begins, and recorded. Without a training it follows from the primitives and each camera.
-        depth_floor: lower bound on D = 1 - |x_m|^2 in the backward pass only: gradients grow as D^-1/2 at a silhouette, where float32
+        near: camera-z of the near plane, scene units; chords are cut there. Ray distance for a ``RayCamera``, which has
+        no z plane. "auto",
+            the default of a run: 1/400 of the median depth at which training cameras see the starting points, and at
+            most a tenth of the least; decided when training begins, and recorded. Without a training it follows from
+            the primitives and each camera.
+        depth_floor: lower bound on D = 1 - |x_m|^2 in the backward pass only: gradients grow as D^-1/2 at a silhouette,
+        where float32
             knows D to about 3e-7. At 1e-4 they keep three digits, and one chord in ten thousand is affected.
         depth: whether to accumulate the depth image.
         threads: worker threads of the cpu backend, 0 for all cores; results are bit-identical for any count.
@@ -73,7 +81,8 @@ class MetricsSettings:
     """What a run measures beside its usual numbers; part of its configuration as ``metrics``.
 
     Attributes:
-        lpips: weights for LPIPS, a file or a folder that :meth:`neuprim.core.metrics.lpips.Lpips.load` reads; None does not measure it.
+        lpips: weights for LPIPS, a file or a folder that :meth:`neuprim.core.metrics.lpips.Lpips.load` reads; None does
+        not measure it.
             neuprim has no weights and downloads none.
     """
 

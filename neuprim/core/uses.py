@@ -1,8 +1,9 @@
 """Which settings a task or loss reads: its own options, and those of the shared settings that only some of them use.
 
-Most of ``model`` and ``train`` concerns every run, because the trainer reads it. The settings in :data:`OPTIONAL` are read by a task's
-``build`` or by a loss, if at all. Whoever reads one says so in ``uses``; setting one that nobody reads is refused, and a function that
-reads one which it did not declare does not get it.
+Most of ``model`` and ``train`` concerns every run, because the trainer reads it. The settings in :data:`OPTIONAL` are
+read by a task's
+``build`` or by a loss, if at all. Whoever reads one says so in ``uses``; setting one that nobody reads is refused, and
+a function that reads one which it did not declare does not get it.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, A
     return _group("model", vars(model), task.uses, task.options, options, f"task {task.name!r}")
 
 
-def loss_settings(owner: TaskSpec | LossExtension, train: TrainSettings, options: Mapping[str, Any]) -> Mapping[str, Any]:
+def loss_settings(
+    owner: TaskSpec | LossExtension, train: TrainSettings, options: Mapping[str, Any]
+) -> Mapping[str, Any]:
     """What makes a loss: the training settings that it uses, and its options as "options".
 
     Args:

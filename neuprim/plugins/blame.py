@@ -1,4 +1,5 @@
-"""Crashes in a plugin's code, told in one line that names its package; the traceback goes to a file that the line names.
+"""Crashes in a plugin's code, told in one line that names its package; the traceback goes to a file that the line
+names.
 
 A :class:`~neuprim.core.errors.NeuprimError` passes as it is, and a crash in neuprim's own code keeps its traceback.
 """
@@ -27,7 +28,8 @@ StackFrame = tuple[str, str, int, str]
 
 
 def origin_of(group: Group[Any], word: str, module: str = "") -> PluginInfo:
-    """What package metadata says about the plugin that ``NAME`` or ``PACKAGE:NAME`` chooses; imports and warns of nothing.
+    """What package metadata says about the plugin that ``NAME`` or ``PACKAGE:NAME`` chooses; imports and warns of
+    nothing.
 
     Of one that is not registered: that it comes from ``module``.
     """
@@ -64,16 +66,21 @@ class _Guard:
 
     folders: Sequence[Path] = ()
     line = "{who}: {error}{place}; traceback: {path}"
-    lost: str | None = "{who}: {error}{place}; its traceback could not be written anywhere"  # None: then the crash is not hidden
+    lost: str | None = (
+        "{who}: {error}{place}; its traceback could not be written anywhere"  # None: then the crash is not hidden
+    )
 
     def accused(self, error: BaseException, called: Sequence[StackFrame]) -> Party | None:
-        """The plugin whose fault it is, if it is one's; ``called`` is what the guarded lines called, outermost first."""
+        """The plugin whose fault it is, if it is one's; ``called`` is what the guarded lines called, outermost
+        first."""
         raise NotImplementedError
 
     def __enter__(self) -> Any:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if not isinstance(error, (Exception, SystemExit)) or isinstance(error, NeuprimError):
             return
         called = _frames(trace)[1:]  # the first one is the caller's
@@ -84,7 +91,9 @@ class _Guard:
         line = self.line if path is not None else self.lost
         if line is not None:
             said = ": ".join(part for part in (type(error).__name__, " ".join(str(error).split())) if part)
-            place = "".join(f" ({Path(file).name} line {number}, in {name})" for _, file, number, name in party.among(called)[-1:])
+            place = "".join(
+                f" ({Path(file).name} line {number}, in {name})" for _, file, number, name in party.among(called)[-1:]
+            )
             raise PluginError(line.format(who=party.who, error=said, place=place, path=path)) from error
 
 
@@ -97,7 +106,8 @@ class blamed(_Guard):
         folder: for the file with the traceback, usually ``RUN_DIR/logs``.
 
     Raises:
-        PluginError: the function raised something other than a :class:`~neuprim.core.errors.NeuprimError`, or does not take the
+        PluginError: the function raised something other than a :class:`~neuprim.core.errors.NeuprimError`, or does not
+        take the
             arguments that it gets. Functions of neuprim's own that a plugin lends (a loss, say) are not its fault.
     """
 
@@ -113,7 +123,8 @@ class reported(blamed):
     """Around the work of an exporter or inspector; raises as :class:`blamed`, but refusals of a disk pass.
 
     Args:
-        folders: for the file with the traceback; where none of them nor the temporary files' takes it, the traceback is not hidden.
+        folders: for the file with the traceback; where none of them nor the temporary files' takes it, the traceback is
+        not hidden.
     """
 
     line, lost = "{who} crashed: {error}; traceback in {path}", None
@@ -138,10 +149,18 @@ class Suspects:
     def __init__(self, task: str, scene: str, loss: str | None = None) -> None:
         home = origin_of(TASKS, task)
         (_, task), (package, scene) = split(task), split(scene)
-        added = [info for info in SCENES.listed() if info.name == f"{task}.{scene}" and package in (None, normalised(info.distribution))]
+        added = [
+            info
+            for info in SCENES.listed()
+            if info.name == f"{task}.{scene}" and package in (None, normalised(info.distribution))
+        ]
         self.task = Party(f"task {task!r}", home)
         self.scene = Party(f"scene {scene!r}", added[0] if added else home)
-        self.loss = Party(f"the loss of task {task!r}", home) if loss is None else Party(f"loss {loss!r}", origin_of(LOSSES, loss))
+        self.loss = (
+            Party(f"the loss of task {task!r}", home)
+            if loss is None
+            else Party(f"loss {loss!r}", origin_of(LOSSES, loss))
+        )
 
     def know(self, dataset: object) -> None:
         """Code that the scene's loader put into its data set is the scene's, whichever module it is in."""
@@ -151,7 +170,8 @@ class Suspects:
         self.scene.modules |= {_top(module) for module in modules} - {_OURS, "builtins"}
 
     def watch(self, folder: Path | None = None) -> _Watch:
-        """Around neuprim's own code that calls plugins here and there: whose code a crash is in is read off the traceback.
+        """Around neuprim's own code that calls plugins here and there: whose code a crash is in is read off the
+        traceback.
 
         A :class:`~neuprim.core.data.check.DatasetFault` becomes a DataError that names the scene's package, and a
         :class:`~neuprim.plugins.judging.TaskFault` a PluginError that names the task's.
@@ -163,7 +183,9 @@ class _Watch(_Guard):
     def __init__(self, suspects: Suspects, folder: Path | None) -> None:
         self.suspects, self.folders = suspects, _absolute(folder)
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if isinstance(error, DatasetFault):
             raise DataError(f"{self.suspects.scene.who}: {error}") from error
         if isinstance(error, TaskFault):
@@ -172,7 +194,9 @@ class _Watch(_Guard):
 
     def accused(self, error: BaseException, called: Sequence[StackFrame]) -> Party | None:
         parties = (self.suspects.task, self.suspects.scene, self.suspects.loss)  # of one package, the most general
-        return next((p for frame in reversed(called) for p in parties if not p.origin.built_in and p.among([frame])), None)
+        return next(
+            (p for frame in reversed(called) for p in parties if not p.origin.built_in and p.among([frame])), None
+        )
 
 
 def _absolute(folder: Path | None) -> list[Path]:
@@ -184,7 +208,9 @@ def _frames(trace: TracebackType | None) -> list[StackFrame]:
     found = []
     while trace is not None:
         code = trace.tb_frame.f_code
-        found.append((str(trace.tb_frame.f_globals.get("__name__", "")), code.co_filename, trace.tb_lineno, code.co_name))
+        found.append(
+            (str(trace.tb_frame.f_globals.get("__name__", "")), code.co_filename, trace.tb_lineno, code.co_name)
+        )
         trace = trace.tb_next
     return found
 

@@ -23,10 +23,14 @@ def check_fields(density: object, colour: object, dataset: Dataset, where: str) 
     """
     for name, made, kind in (("density", density, DensityField), ("colour", colour, ColourField)):
         if not isinstance(made, kind):
-            raise PluginError(f"{where}: the {name} is of type {type(made).__name__}; expected a neuprim.core.model.fields.{kind.__name__}")
+            raise PluginError(
+                f"{where}: the {name} is of type {type(made).__name__}; expected a neuprim.core.model.fields.{kind.__name__}"
+            )
     channels = getattr(colour, "channels", None)
     if channels != dataset.channels:
-        raise PluginError(f"{where}: the colour has channels={channels}; expected {dataset.channels}, as data set {dataset.name!r} has")
+        raise PluginError(
+            f"{where}: the colour has channels={channels}; expected {dataset.channels}, as data set {dataset.name!r} has"
+        )
 
 
 def checked_loss(loss: Loss, guard: blamed) -> Loss:

@@ -19,7 +19,8 @@ _LARGEST = 1_000_000  # bytes of a pyproject.toml
 
 
 def not_installed_yet(group: str, name: str, package: str | None = None) -> str:
-    """``"; FILE registers it, but ..."`` where the source of an editable installation has an entry point that its metadata lack, else "".
+    """``"; FILE registers it, but ..."`` where the source of an editable installation has an entry point that its
+    metadata lack, else "".
 
     Args:
         group: of entry points.

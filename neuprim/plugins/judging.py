@@ -24,7 +24,8 @@ _OURS = ("name", "psnr", "ssim", "ssim_3dgs", "lpips", "lpips_3dgs", "seconds") 
 
 
 class TaskFault(NeuprimError):
-    """A task broke a promise of :class:`~neuprim.core.task.TaskSpec`; whoever knows the task's package adds its name."""
+    """A task broke a promise of :class:`~neuprim.core.task.TaskSpec`; whoever knows the task's package adds its
+    name."""
 
 
 def mask_of(task: TaskSpec, dataset: Dataset, index: int) -> Tensor | None:
@@ -106,7 +107,8 @@ def orbit_of(task: TaskSpec, dataset: Dataset, frames: int) -> list[View]:
 
 
 def layer_of(spec: LayerSpec, frame: LayerFrame, channels: int) -> Tensor | None:
-    """(H, W, C) values of a layer, those of light with the image's ``channels``; None where the model has no such layer.
+    """(H, W, C) values of a layer, those of light with the image's ``channels``; None where the model has no such
+    layer.
 
     Raises:
         TaskFault: it is something else, or not finite.
@@ -119,19 +121,27 @@ def layer_of(spec: LayerSpec, frame: LayerFrame, channels: int) -> Tensor | None
     if isinstance(found, Tensor) and tuple(found.shape) == expected[:2] and count == 1:
         found = found[..., None]
     if not isinstance(found, Tensor) or tuple(found.shape) != expected or not found.is_floating_point():
-        what = f"{found.dtype} of shape {tuple(found.shape)}" if isinstance(found, Tensor) else f"a {type(found).__name__}"
+        what = (
+            f"{found.dtype} of shape {tuple(found.shape)}" if isinstance(found, Tensor) else f"a {type(found).__name__}"
+        )
         raise TaskFault(f"layers: {spec.name} is {what}; expected floats of shape {expected}")
     if not bool(found.isfinite().all()):
-        raise TaskFault(f"layers: {spec.name} has {int((~found.isfinite()).sum())} NaN or infinite values; expected finite numbers")
+        raise TaskFault(
+            f"layers: {spec.name} has {int((~found.isfinite()).sum())} NaN or infinite values; expected finite numbers"
+        )
     return found.detach()
 
 
 def _listed(found: Any, where: str, kind: type[Kind]) -> list[Kind]:
     if not isinstance(found, Sequence):
-        raise TaskFault(f"{where}: found a {type(found).__name__}; expected a list of neuprim.core.data.{kind.__name__}")
+        raise TaskFault(
+            f"{where}: found a {type(found).__name__}; expected a list of neuprim.core.data.{kind.__name__}"
+        )
     for entry in found:
         if not isinstance(entry, kind):
-            raise TaskFault(f"{where}: found a {type(entry).__name__} in the list; expected a neuprim.core.data.{kind.__name__}")
+            raise TaskFault(
+                f"{where}: found a {type(entry).__name__} in the list; expected a neuprim.core.data.{kind.__name__}"
+            )
     return list(found)
 
 

@@ -9,8 +9,16 @@ from neuprim.core.train.losses import compressed, l1, photometric, relative
 __all__ = ["COMPRESSED", "L1", "PHOTOMETRIC", "RELATIVE"]
 
 PHOTOMETRIC = LossExtension(
-    API_VERSION, "photometric", "(1 - w) L1 + w (1 - SSIM), w = train.ssim_weight", photometric, uses=("train.ssim_weight",)
+    API_VERSION,
+    "photometric",
+    "(1 - w) L1 + w (1 - SSIM), w = train.ssim_weight",
+    photometric,
+    uses=("train.ssim_weight",),
 )
 L1 = LossExtension(API_VERSION, "l1", "mean absolute difference", l1)
-COMPRESSED = LossExtension(API_VERSION, "compressed", "L1 of log(1 + 16 x), for linear light: shadows count more", compressed)
-RELATIVE = LossExtension(API_VERSION, "relative", "squared error over the squared rendered value, for linear light (RawNeRF)", relative)
+COMPRESSED = LossExtension(
+    API_VERSION, "compressed", "L1 of log(1 + 16 x), for linear light: shadows count more", compressed
+)
+RELATIVE = LossExtension(
+    API_VERSION, "relative", "squared error over the squared rendered value, for linear light (RawNeRF)", relative
+)

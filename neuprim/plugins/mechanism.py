@@ -1,6 +1,7 @@
 """How any kind of plugin is found and loaded; :mod:`neuprim.plugins.registry` says which kinds there are.
 
-Listing reads package metadata only. A plugin is imported when it is asked for by name, so a broken one stops nothing but itself.
+Listing reads package metadata only. A plugin is imported when it is asked for by name, so a broken one stops nothing
+but itself.
 
 A name means the built-in plugin where there is one, whoever else claims it. Everything else of that name is chosen as
 ``PACKAGE:NAME``; what was not chosen is not imported.
@@ -85,8 +86,8 @@ class Group(Generic[T]):
         entry_points: the entry-point group.
         kind: the word for one of them in messages.
         typed: how a user names one, e.g. ``"task={}"``.
-        described_by: ``module:class`` of the descriptions; imported with the first plugin, because the interfaces import torch.
-        name_of: the name that a description gives itself; it must be the entry point's.
+        described_by: ``module:class`` of the descriptions; imported with the first plugin, because the interfaces
+        import torch. name_of: the name that a description gives itself; it must be the entry point's.
         typed_name: what a user types for an entry point's name.
     """
 
@@ -102,7 +103,8 @@ class Group(Generic[T]):
         return [info for info, _ in self._registered()]
 
     def find(self, word: str) -> PluginInfo:
-        """Who registers the plugin that ``NAME`` or ``PACKAGE:NAME`` chooses; imports nothing. Raises as :meth:`load`."""
+        """Who registers the plugin that ``NAME`` or ``PACKAGE:NAME`` chooses; imports nothing. Raises as
+        :meth:`load`."""
         return self._find(word)[0]
 
     def load(self, word: str) -> T:
@@ -112,7 +114,8 @@ class Group(Generic[T]):
 
         Raises:
             UnknownPlugin: there is none.
-            PluginError: the bare name is claimed by several packages, or the plugin is broken or was written for another version.
+            PluginError: the bare name is claimed by several packages, or the plugin is broken or was written for
+            another version.
         """
         return self.loaded(word)[1]
 
@@ -157,7 +160,11 @@ class Group(Generic[T]):
     def word(self, info: PluginInfo) -> str:
         """The shortest word that chooses this one: its name where that is not another's, else ``PACKAGE:NAME``."""
         same = [other for other in self.listed() if other.name == info.name]
-        return self.typed_name(info.name) if self._note(info, same) is None else qualified(info.distribution, self.typed_name(info.name))
+        return (
+            self.typed_name(info.name)
+            if self._note(info, same) is None
+            else qualified(info.distribution, self.typed_name(info.name))
+        )
 
     def owner(self, spec: T) -> PluginInfo | None:
         """Who registers this very object, as far as the modules that are imported tell; the built-in before others."""
@@ -175,7 +182,9 @@ class Group(Generic[T]):
     def _find(self, word: str) -> tuple[PluginInfo, metadata.EntryPoint]:
         registered = self._registered()
         package, name = split(word)
-        found = [pair for pair in registered if pair[0].name == name and package in (None, normalised(pair[0].distribution))]
+        found = [
+            pair for pair in registered if pair[0].name == name and package in (None, normalised(pair[0].distribution))
+        ]
         if not found:
             raise UnknownPlugin(self._unknown(word, [info for info, _ in registered]))
         if package is None:
@@ -192,7 +201,9 @@ class Group(Generic[T]):
         package, name = split(word)
         names = {info.name for info in registered if package in (None, normalised(info.distribution))}
         of = f" of {package}" if package and names else ""
-        hint = nearest(name, names) or (f"; no {self.kind} is installed" if package is None else _nothing_of(package, self.kind))
+        hint = nearest(name, names) or (
+            f"; no {self.kind} is installed" if package is None else _nothing_of(package, self.kind)
+        )
         return f"{self.typed.format(word)}: no such {self.kind}{of}{hint}{not_installed_yet(self.entry_points, name, package)}"
 
     def _note(self, info: PluginInfo, same: Sequence[PluginInfo]) -> str | None:
@@ -201,7 +212,9 @@ class Group(Generic[T]):
             return None
         if any(other.built_in for other in others):
             return f"hidden by the built-in {self.kind}; {self.choice(info)} chooses it"
-        return f"also registered by {' and '.join(other.origin for other in others)}; {self.choice(info)} chooses this one"
+        return (
+            f"also registered by {' and '.join(other.origin for other in others)}; {self.choice(info)} chooses this one"
+        )
 
     def _registered(self) -> list[tuple[PluginInfo, metadata.EntryPoint]]:
         result = []
@@ -265,8 +278,8 @@ def _nothing_of(package: str, kind: str) -> str:
 def _forget_half_imported(target: str) -> None:
     """Drops modules whose package is not imported, of the top-level package of a ``module:attribute``.
 
-    They are left over where a package imported them and failed itself. Python would hand them out without importing the package
-    again, so that what is broken would look fine to everybody but the first who asks.
+    They are left over where a package imported them and failed itself. Python would hand them out without importing the
+    package again, so that what is broken would look fine to everybody but the first who asks.
     """
     top = target.partition(":")[0].partition(".")[0].strip()
     for name in [n for n in list(sys.modules) if n.startswith(f"{top}.")]:
@@ -276,9 +289,11 @@ def _forget_half_imported(target: str) -> None:
 
 
 def _distributions() -> list[metadata.Distribution]:
-    """Installed distributions that register anything with us, each once: of two copies on ``sys.path`` the first counts.
+    """Installed distributions that register anything with us, each once: of two copies on ``sys.path`` the first
+    counts.
 
-    Distributions whose entry points cannot be read are left out: one damaged folder in site-packages must not take the others along.
+    Distributions whose entry points cannot be read are left out: one damaged folder in site-packages must not take the
+    others along.
     """
     found, names = [], set()
     for dist in metadata.distributions():

@@ -39,7 +39,8 @@ _CALLS: dict[type, tuple[str, ...]] = {
 
 
 def fault(spec: Any) -> str | None:
-    """``"MEMBER is WHAT; expected WHAT"`` of the first member of a description that cannot be used; None if all is well."""
+    """``"MEMBER is WHAT; expected WHAT"`` of the first member of a description that cannot be used; None if all is
+    well."""
     kind = next(k for k in _TEXTS if isinstance(spec, k))
     for name in (*_TEXTS[kind], *_CALLS[kind]):
         if not hasattr(spec, name):
@@ -93,7 +94,9 @@ def _exporter(spec: Exporter) -> str | None:
     if not isinstance(spec.default, str) or PurePath(spec.default).name != spec.default or spec.default == "..":
         return f"default is {spec.default!r}; expected the name of a file or folder"
     suffixes = spec.suffixes
-    if not isinstance(suffixes, tuple | list) or not all(isinstance(s, str) and s.startswith(".") and s == s.lower() for s in suffixes):
+    if not isinstance(suffixes, tuple | list) or not all(
+        isinstance(s, str) and s.startswith(".") and s == s.lower() for s in suffixes
+    ):
         return f"suffixes is {suffixes!r}; expected a tuple of such as '.json', in lower case"
     if spec.default and suffixes and not spec.default.lower().endswith(tuple(suffixes)):
         return f"default is {spec.default!r}; expected a name that ends in {' or '.join(suffixes)}, its suffixes"
@@ -101,7 +104,10 @@ def _exporter(spec: Exporter) -> str | None:
 
 
 def _task(spec: TaskSpec) -> str | None:
-    groups: tuple[tuple[str, Any, type], ...] = (("scenes", spec.scenes, SceneSpec), ("conditions", spec.conditions, ConditionSpec))
+    groups: tuple[tuple[str, Any, type], ...] = (
+        ("scenes", spec.scenes, SceneSpec),
+        ("conditions", spec.conditions, ConditionSpec),
+    )
     for name, members, kind in groups:
         if not isinstance(members, tuple | list):
             return f"{name} is of type {type(members).__name__}; expected a tuple of {kind.__name__}"
@@ -150,7 +156,9 @@ def _declared(spec: TaskSpec | LossExtension, *groups: str) -> str | None:
         if not isinstance(entry, tuple | list) or len(entry) not in (2, 3) or not isinstance(entry[1], str):
             return f"options[{name!r}] is {entry!r}; expected (default, one line of help), and perhaps a type"
         if not isinstance(entry[0], bool | int | float | str | list | Mapping | None):
-            return f"options[{name!r}] has a default of type {type(entry[0]).__name__}; expected what a YAML file can hold"
+            return (
+                f"options[{name!r}] has a default of type {type(entry[0]).__name__}; expected what a YAML file can hold"
+            )
         try:
             converted(entry[0], option_type(tuple(entry)), f"options[{name!r}]")
         except ConfigError as error:

@@ -29,7 +29,9 @@ def new_task(name: str, out: Path | None = None) -> list[str]:
         ConfigError: the name cannot be a task's or is taken, or the folder exists; nothing was written.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", name) or keyword.iskeyword(name):
-        raise ConfigError(f"new-task {name!r}: expected a name of lower-case letters, digits and _ that starts with a letter")
+        raise ConfigError(
+            f"new-task {name!r}: expected a name of lower-case letters, digits and _ that starts with a letter"
+        )
     for info in list_tasks():
         if info.name == name:
             raise ConfigError(f"new-task {name}: {info.origin} already has a task of this name; choose another")

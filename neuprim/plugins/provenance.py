@@ -1,4 +1,5 @@
-"""Who made a run: the packages that its task, scene and loss come from, with their versions, as kept in its ``config.yaml``.
+"""Who made a run: the packages that its task, scene and loss come from, with their versions, as kept in its
+``config.yaml``.
 
 A stored run is read with the plugins of the packages that made it, whatever else has their names by now.
 """
@@ -43,7 +44,9 @@ class Maker:
     @classmethod
     def of(cls, info: PluginInfo, name: str | None = None) -> Maker:
         """From what is registered; ``name`` where the entry point is called otherwise, as a scene's is."""
-        version = "".join(c for c in info.version if c.isprintable())[:_LONGEST]  # what is written must be readable again
+        version = "".join(c for c in info.version if c.isprintable())[
+            :_LONGEST
+        ]  # what is written must be readable again
         return cls(info.name if name is None else name, info.distribution, version)
 
     @property
@@ -70,7 +73,10 @@ class MadeBy:
     def to_dict(self) -> dict[str, Any]:
         """Plain values; what is None is left out."""
         makers = {"task": self.task, "scene": self.scene, "loss": self.loss}
-        return {"neuprim": self.neuprim, **{kind: vars(maker).copy() for kind, maker in makers.items() if maker is not None}}
+        return {
+            "neuprim": self.neuprim,
+            **{kind: vars(maker).copy() for kind, maker in makers.items() if maker is not None},
+        }
 
     @classmethod
     def from_dict(cls, value: object) -> MadeBy:
@@ -80,7 +86,11 @@ class MadeBy:
             ConfigError: one line that names the key, what was found and what was expected.
         """
         record = _mapping(value, "made_by", [f.name for f in fields(cls)])
-        makers = {kind: _maker(record[kind], f"made_by.{kind}") for kind in ("task", "scene", "loss") if record.get(kind) is not None}
+        makers = {
+            kind: _maker(record[kind], f"made_by.{kind}")
+            for kind in ("task", "scene", "loss")
+            if record.get(kind) is not None
+        }
         if "task" not in makers:
             raise ConfigError("made_by.task: missing; expected name, package and version")
         return cls(_text(record.get("neuprim"), "made_by.neuprim"), **makers)
@@ -91,7 +101,9 @@ class MadeBy:
         return {"neuprim": self.neuprim, **{kind: maker.origin for kind, maker in makers.items() if maker is not None}}
 
 
-def load_recorded(group: Group[T], maker: Maker, file: Path | None = None, entry: str | None = None) -> tuple[PluginInfo, T]:
+def load_recorded(
+    group: Group[T], maker: Maker, file: Path | None = None, entry: str | None = None
+) -> tuple[PluginInfo, T]:
     """The plugin that a run was made by; another version of it is named in a warning.
 
     Args:
@@ -108,7 +120,9 @@ def load_recorded(group: Group[T], maker: Maker, file: Path | None = None, entry
     except UnknownPlugin as error:
         raise ConfigError(_told(file, missing(group, maker, entry))) from error
     if not info.built_in and info.version != maker.version:
-        warn_once(_told(file, f"this run was made by {maker.origin} ({group.kind} {maker.name}); installed is {info.origin}"))
+        warn_once(
+            _told(file, f"this run was made by {maker.origin} ({group.kind} {maker.name}); installed is {info.origin}")
+        )
     return info, spec
 
 
@@ -187,6 +201,8 @@ def _mapping(value: object, where: str, known: list[str]) -> Mapping[str, Any]:
 
 def _text(value: object, where: str, empty: bool = False) -> str:
     if not isinstance(value, str) or len(value) > _LONGEST or not value.isprintable() or not (empty or value.strip()):
-        found = repr(value) if len(repr(value)) <= _LONGEST else f"{type(value).__name__} of {len(repr(value))} characters"
+        found = (
+            repr(value) if len(repr(value)) <= _LONGEST else f"{type(value).__name__} of {len(repr(value))} characters"
+        )
         raise ConfigError(f"{where}: found {found}; expected text of at most {_LONGEST} characters")
     return value

@@ -1,8 +1,8 @@
 """Plugins by name, from entry points: tasks, and scenes, losses, exporters and inspectors for the tasks of others.
 
-The built-in ones come through the same groups as anybody's. Listing reads package metadata only; a plugin is imported when
-it is asked for, so a broken one stops nothing but itself. A name is ``NAME``, or ``PACKAGE:NAME`` for the plugin of one package;
-a bare name that a built-in has is the built-in's. See :mod:`neuprim.plugins.mechanism`.
+The built-in ones come through the same groups as anybody's. Listing reads package metadata only; a plugin is imported
+when it is asked for, so a broken one stops nothing but itself. A name is ``NAME``, or ``PACKAGE:NAME`` for the plugin
+of one package; a bare name that a built-in has is the built-in's. See :mod:`neuprim.plugins.mechanism`.
 """
 
 from __future__ import annotations
@@ -59,7 +59,9 @@ SCENES: Group[SceneExtension] = Group(
 """Entry points here are called ``TASK.SCENE``, so that metadata alone says what there is for a task."""
 LOSSES: Group[LossExtension] = Group("neuprim.losses", "loss", "train.loss={}", "neuprim.core.extensions:LossExtension")
 EXPORTERS: Group[Exporter] = Group("neuprim.exporters", "exporter", "--format {}", "neuprim.core.extensions:Exporter")
-INSPECTORS: Group[Inspector] = Group("neuprim.inspectors", "inspector", "--show {}", "neuprim.core.extensions:Inspector")
+INSPECTORS: Group[Inspector] = Group(
+    "neuprim.inspectors", "inspector", "--show {}", "neuprim.core.extensions:Inspector"
+)
 
 # ---------------------------------------------------------------- tasks
 
@@ -102,20 +104,28 @@ class FoundScene:
 
 
 def list_scenes(task: str | None = None) -> list[PluginInfo]:
-    """Scenes that packages add to tasks of others (to ``task`` only, if given), without importing any; named ``TASK.SCENE``."""
+    """Scenes that packages add to tasks of others (to ``task`` only, if given), without importing any; named
+    ``TASK.SCENE``."""
     return [info for info in SCENES.listed() if task is None or info.name.startswith(f"{task}.")]
 
 
 def scene_names(task: TaskSpec) -> list[str]:
     """Names of all scenes of a task: its own ones, then those that other packages add."""
     own = [scene.name for scene in task.scenes]
-    return [*own, *dict.fromkeys(n for n in (i.name.removeprefix(f"{task.name}.") for i in list_scenes(task.name)) if n not in own)]
+    return [
+        *own,
+        *dict.fromkeys(
+            n for n in (i.name.removeprefix(f"{task.name}.") for i in list_scenes(task.name)) if n not in own
+        ),
+    ]
 
 
 def find_scene(task: TaskSpec, word: str) -> FoundScene:
-    """The scene that ``NAME`` or ``PACKAGE:NAME`` chooses, the task's own or one that another package adds; imports no other.
+    """The scene that ``NAME`` or ``PACKAGE:NAME`` chooses, the task's own or one that another package adds; imports no
+    other.
 
-    A bare name is the task's own scene where it has one; a package that adds another of that name is named in a warning.
+    A bare name is the task's own scene where it has one; a package that adds another of that name is named in a
+    warning.
 
     Raises:
         UnknownPlugin: there is none.
@@ -136,7 +146,9 @@ def find_scene(task: TaskSpec, word: str) -> FoundScene:
         offered = scene_names(task)
         if package is not None:
             offered = [scene.name for scene in task.scenes] if package == _package_of(task) else []
-            offered += [SCENES.typed_name(i.name) for i in list_scenes(task.name) if normalised(i.distribution) == package]
+            offered += [
+                SCENES.typed_name(i.name) for i in list_scenes(task.name) if normalised(i.distribution) == package
+            ]
         whose = f"task {task.name!r} has no such scene" + (f" of {package}" if package else "")
         late = not_installed_yet(SCENES.entry_points, f"{task.name}.{name}", package)
         raise UnknownPlugin(f"scene={word}: {whose}{nearest(name, offered)}{late}") from None

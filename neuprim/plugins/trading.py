@@ -28,6 +28,10 @@ def traded(task: TaskSpec, settings: Mapping[str, Any]) -> dict[str, tuple[Any, 
     for name, values in found.items():
         if not isinstance(name, str) or not name.startswith(_GROUPS):
             raise TaskFault(f"trade: {name!r}; expected the name of a setting, beginning with {' or '.join(_GROUPS)}")
-        if not isinstance(values, Sequence) or isinstance(values, str) or not all(isinstance(v, bool | int | float | str) for v in values):
+        if (
+            not isinstance(values, Sequence)
+            or isinstance(values, str)
+            or not all(isinstance(v, bool | int | float | str) for v in values)
+        ):
             raise TaskFault(f"trade: {name} has {values!r}; expected a list of numbers, texts, true or false")
     return {name: tuple(values) for name, values in found.items()}

@@ -1,7 +1,7 @@
 """A run's report: one HTML page that stands alone, with pictures, curves, numbers and settings.
 
-:func:`write_report` reads a run directory, finished or interrupted, and writes ``report.html`` into it. :func:`error_map` colours
-the error of a rendered view on the fixed scale that the page's colour bar shows.
+:func:`write_report` reads a run directory, finished or interrupted, and writes ``report.html`` into it.
+:func:`error_map` colours the error of a rendered view on the fixed scale that the page's colour bar shows.
 """
 
 from neuprim.report.page import Viewer, write_report

@@ -1,4 +1,5 @@
-"""The report's curves: small SVG charts that take their colours from the page, so that they follow its light and dark mode."""
+"""The report's curves: small SVG charts that take their colours from the page, so that they follow its light and dark
+mode."""
 
 from __future__ import annotations
 
@@ -20,7 +21,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.ticker import Locator
 
-__all__ = ["GRID", "HELD_OUT", "INK", "TRAINING", "Series", "curve", "dots", "look", "series", "short_number", "svg", "together"]
+__all__ = [
+    "GRID",
+    "HELD_OUT",
+    "INK",
+    "TRAINING",
+    "Series",
+    "curve",
+    "dots",
+    "look",
+    "series",
+    "short_number",
+    "svg",
+    "together",
+]
 
 # Colours no chart uses otherwise: matplotlib draws with them, and the page's CSS variables take their place in the SVG.
 INK, GRID, TRAINING, HELD_OUT = "#010203", "#010204", "#010205", "#010206"
@@ -33,7 +47,8 @@ WIDTH_TOGETHER, HEIGHT_TOGETHER = 540, 300
 """The same of a chart with the curves of several runs."""
 
 BUCKETS = 120
-"""A series of more points than twice this is drawn as medians of so many groups, inside a band from the least to the greatest."""
+"""A series of more points than twice this is drawn as medians of so many groups, inside a band from the least to the
+greatest."""
 
 UNITS = {"step": "steps", "frame": "frame"}
 
@@ -70,7 +85,9 @@ def curve(training: Series, held_out: Series | None, x: str, label: str, log: bo
             _line(axes, training[0] / divisor, training[1])
         if held_out is not None and held_out[0].size:
             size = 4 if held_out[0].size <= 40 else 0
-            axes.plot(held_out[0] / divisor, held_out[1], color=HELD_OUT, linewidth=1.6, marker="o", markersize=size, zorder=4)
+            axes.plot(
+                held_out[0] / divisor, held_out[1], color=HELD_OUT, linewidth=1.6, marker="o", markersize=size, zorder=4
+            )
         values = np.concatenate([s[1] for s in drawn])
         if log and values.min() > 0 and values.max() / values.min() >= LOG_RATIO:
             _log_axis(axes, float(values.min()), float(values.max()))
@@ -81,7 +98,8 @@ def curve(training: Series, held_out: Series | None, x: str, label: str, log: bo
 
 
 def together(lines: Sequence[tuple[Series, str]], x: str, label: str) -> str | None:
-    """Curves of several runs in one chart over ``x`` ("seconds" or "step"), each with its own colour; None where there is nothing to draw."""
+    """Curves of several runs in one chart over ``x`` ("seconds" or "step"), each with its own colour; None where there
+    is nothing to draw."""
     drawn = [(one, colour) for one, colour in lines if one[0].size]
     if not drawn:
         return None
@@ -91,14 +109,24 @@ def together(lines: Sequence[tuple[Series, str]], x: str, label: str) -> str | N
         figure, axes = _axes(WIDTH_TOGETHER, HEIGHT_TOGETHER)
         for one, colour in drawn:
             size = 3 if one[0].size <= 40 else 0
-            axes.plot(one[0] / divisor, one[1], color=colour, linewidth=1.4, marker="o", markersize=size, markeredgewidth=0, zorder=3)
+            axes.plot(
+                one[0] / divisor,
+                one[1],
+                color=colour,
+                linewidth=1.4,
+                marker="o",
+                markersize=size,
+                markeredgewidth=0,
+                zorder=3,
+            )
         axes.set_xlabel(unit)
         axes.set_xlim(0, right / divisor * 1.02 if right > 0 else 1)
         return svg(figure, label)
 
 
 def dots(values: Sequence[float | None], mean: float | None, worst: str | None, label: str) -> str | None:
-    """One value per view, in the split's order, hung from their mean (the dashed line); infinite and missing values are left out.
+    """One value per view, in the split's order, hung from their mean (the dashed line); infinite and missing values are
+    left out.
 
     Args:
         worst: text for the lowest dot, e.g. the view's name.
@@ -112,7 +140,9 @@ def dots(values: Sequence[float | None], mean: float | None, worst: str | None, 
         if mean is not None and math.isfinite(mean):
             axes.axhline(mean, color=INK, linewidth=1, linestyle=(0, (4, 3)), zorder=2)
             axes.vlines(xs, mean, ys, color=HELD_OUT, linewidth=1, alpha=0.45, zorder=3)
-        axes.plot(xs, ys, linestyle="none", marker="o", markersize=4.5 if len(known) <= 60 else 2.5, color=HELD_OUT, zorder=4)
+        axes.plot(
+            xs, ys, linestyle="none", marker="o", markersize=4.5 if len(known) <= 60 else 2.5, color=HELD_OUT, zorder=4
+        )
         lowest = int(ys.argmin())
         side = "left" if lowest < len(ys) / 2 else "right"
         if worst and len(known) > 1:
@@ -216,11 +246,14 @@ def _ticks(most: int, integer: bool = False) -> Locator:
 
 
 def svg(figure: Figure, label: str) -> str:
-    """The chart as an element of the page: no outside addresses, no global styles, own ids, the page's font and colours."""
+    """The chart as an element of the page: no outside addresses, no global styles, own ids, the page's font and
+    colours."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True)
     body = buffer.getvalue()
-    body = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->|<style.*?</style>", "", body[body.index("<svg") :], flags=re.DOTALL)
+    body = re.sub(
+        r"<metadata>.*?</metadata>|<!--.*?-->|<style.*?</style>", "", body[body.index("<svg") :], flags=re.DOTALL
+    )
     width, height = 72 * figure.get_size_inches()
     opening = f'<svg class="chart" role="img" aria-label="{html.escape(label, quote=True)}" viewBox="0 0 {width:g} {height:g}">'
     body = opening + body[body.index(">") + 1 :]

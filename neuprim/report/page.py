@@ -33,11 +33,11 @@ class Viewer:
 def write_report(run_dir: Path, conditions: Sequence[ConditionSpec] = (), viewer: Viewer | None = None) -> Path:
     """Write ``report.html`` into a run directory, finished or not, and return its path.
 
-    ``conditions`` are those of the run's task; the commands that the page offers animate them. ``viewer`` becomes a part of the page, or
-    where both would have more than :data:`LIMIT` bytes, ``viewer.html`` beside it.
+    ``conditions`` are those of the run's task; the commands that the page offers animate them. ``viewer`` becomes a
+    part of the page, or where both would have more than :data:`LIMIT` bytes, ``viewer.html`` beside it.
 
-    The page needs nothing else: pictures and charts are part of the file, and its content policy forbids loading anything. An
-    earlier report is replaced only once the new one is complete.
+    The page needs nothing else: pictures and charts are part of the file, and its content policy forbids loading
+    anything. An earlier report is replaced only once the new one is complete.
 
     Raises:
         DataError: the directory is no run, or its ``config.yaml`` or ``metrics.json`` is damaged.
@@ -54,7 +54,9 @@ def write_report(run_dir: Path, conditions: Sequence[ConditionSpec] = (), viewer
     return target
 
 
-def render_page(run: RunRecord, conditions: Sequence[ConditionSpec] = (), viewer: Viewer | None = None, linked: str = "") -> str:
+def render_page(
+    run: RunRecord, conditions: Sequence[ConditionSpec] = (), viewer: Viewer | None = None, linked: str = ""
+) -> str:
     """The report as HTML text, with a viewer in it or a link to one."""
     template = Template(files("neuprim.report").joinpath("template.html").read_text(encoding="utf-8"))
     names = [name for name in (run.name_of("task"), run.name_of("scene")) if name]

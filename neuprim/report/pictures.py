@@ -29,8 +29,9 @@ COLOR_MAP = "inferno"
 def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> NDArray[np.uint8]:
     """The error of a view in colour, on a fixed scale so that maps of different views and runs compare.
 
-    The mean absolute difference over channels runs linearly from 0 (black) to ``scale`` (pale yellow) through matplotlib's perceptually
-    uniform "inferno"; larger errors are drawn as ``scale``. The report's colour bar assumes the default scale.
+    The mean absolute difference over channels runs linearly from 0 (black) to ``scale`` (pale yellow) through
+    matplotlib's perceptually uniform "inferno"; larger errors are drawn as ``scale``. The report's colour bar assumes
+    the default scale.
 
     Args:
         rendered, truth: (H, W, C) float images in the same colour space.
@@ -76,7 +77,11 @@ def inline(path: Path) -> Inlined | None:
             image.load()
             width, height = image.size
             kind = f"image/{(image.format or 'png').lower()}"
-            compressed = len(content) > INLINE_LIMIT and image.mode in ("L", "P", "RGB", "RGBA") and getattr(image, "n_frames", 1) == 1
+            compressed = (
+                len(content) > INLINE_LIMIT
+                and image.mode in ("L", "P", "RGB", "RGBA")
+                and getattr(image, "n_frames", 1) == 1
+            )
             if compressed:
                 buffer = io.BytesIO()
                 image.convert("RGBA" if image.mode == "RGBA" or "transparency" in image.info else "RGB").save(

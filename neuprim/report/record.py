@@ -1,8 +1,9 @@
 """What a run directory holds, read without assuming that the run ended.
 
-Expected files, each of which may be missing: ``config.yaml`` (resolved settings), ``metrics.json`` (final numbers), ``metrics.jsonl``
-(one JSON object per logged step) and ``renders/`` (held-out views as ``test_<index>_<name>.png`` with ``_truth`` and ``_error``
-beside them, ``worst.json`` and its pictures, ``clip_<name>.webp`` with ground truth and render side by side, and ``orbit.webp``).
+Expected files, each of which may be missing: ``config.yaml`` (resolved settings), ``metrics.json`` (final numbers),
+``metrics.jsonl`` (one JSON object per logged step) and ``renders/`` (held-out views as ``test_<index>_<name>.png`` with
+``_truth`` and ``_error`` beside them, ``worst.json`` and its pictures, ``clip_<name>.webp`` with ground truth and
+render side by side, and ``orbit.webp``).
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ __all__ = ["RunRecord", "ViewFiles", "number", "read_run"]
 
 @dataclass(frozen=True)
 class ViewFiles:
-    """The pictures of one held-out view; ``stem`` is its name as file names spell it, ``index`` its place in the split."""
+    """The pictures of one held-out view; ``stem`` is its name as file names spell it, ``index`` its place in the
+    split."""
 
     index: int
     stem: str
@@ -91,7 +93,8 @@ class RunRecord:
     def view_numbers(self, view: ViewFiles) -> Mapping[str, Any]:
         """The entry of ``per_view`` that belongs to a view's pictures; empty where none does.
 
-        File names may spell a view's name with other punctuation. Numbers are shown only where the names agree apart from that.
+        File names may spell a view's name with other punctuation. Numbers are shown only where the names agree apart
+        from that.
         """
         entries = per_view(self)
         named = [e for e in entries if str(e.get("name")) == view.stem]
@@ -133,7 +136,9 @@ def read_run(run_dir: Path) -> RunRecord:
     views, orbit = _pictures(run_dir / "renders")
     clips = sorted((run_dir / "renders").glob("clip_*.webp"))
     regions = read_regions(run_dir / "renders")
-    return RunRecord(run_dir, config_text, config, _metrics(metrics_file), log, unreadable, views, orbit, clips, regions)
+    return RunRecord(
+        run_dir, config_text, config, _metrics(metrics_file), log, unreadable, views, orbit, clips, regions
+    )
 
 
 def _text(path: Path) -> str | None:
@@ -202,7 +207,9 @@ def _pictures(folder: Path) -> tuple[list[ViewFiles], Path | None]:
     for index in sorted(groups, key=lambda digits: (int(digits), digits)):
         # The shortest name of an index is the render, so that a view called "x_truth" is not taken for another's truth.
         stem = min(groups[index], key=len)
-        truth, error = (folder / f"{stem}_{kind}.png" if f"{stem}_{kind}" in groups[index] else None for kind in ("truth", "error"))
+        truth, error = (
+            folder / f"{stem}_{kind}.png" if f"{stem}_{kind}" in groups[index] else None for kind in ("truth", "error")
+        )
         views.append(ViewFiles(int(index), stem[len(f"test_{index}_") :], folder / f"{stem}.png", truth, error))
     orbit = folder / "orbit.webp"
     return views, orbit if orbit.is_file() else None

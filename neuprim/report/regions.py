@@ -35,7 +35,8 @@ _STEPS = 8
 
 @dataclass(frozen=True)
 class Region:
-    """A square of an image, in pixels from its upper left corner, and its PSNR in dB (infinite where nothing differs)."""
+    """A square of an image, in pixels from its upper left corner, and its PSNR in dB (infinite where nothing
+    differs)."""
 
     x: int
     y: int
@@ -48,7 +49,8 @@ class Region:
 
 
 def worst_region(rendered: Tensor, truth: Tensor) -> Region:
-    """Where the mean squared error over a square of a quarter of the shorter side is largest; (H, W, C) images in the same colour space."""
+    """Where the mean squared error over a square of a quarter of the shorter side is largest; (H, W, C) images in the
+    same colour space."""
     height, width = truth.shape[:2]
     side = min(max(round(SHARE * min(height, width)), LEAST), height, width)
     error = (rendered.double() - truth.double()).square().mean(-1)[None, None]
@@ -86,7 +88,8 @@ class Regions:
         del self._found[MOST:]
 
     def write(self, folder: Path) -> None:
-        """``worst_000.png`` (truth, render and error side by side), the worst first, and ``worst.json`` that says what they are."""
+        """``worst_000.png`` (truth, render and error side by side), the worst first, and ``worst.json`` that says what
+        they are."""
         self._worst()
         entries = []
         for place, (region, name, picture) in enumerate(self._found):
@@ -106,7 +109,8 @@ class RegionFile:
 
 
 def read_regions(folder: Path) -> list[RegionFile]:
-    """What ``folder`` (``renders/``) has; empty without ``worst.json``, as older runs and those that have not ended are.
+    """What ``folder`` (``renders/``) has; empty without ``worst.json``, as older runs and those that have not ended
+    are.
 
     Raises:
         DataError: the file is damaged.

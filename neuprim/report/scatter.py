@@ -1,4 +1,5 @@
-"""Charts of what a point costs against how good it is, with the front marked: for a page, and as a picture of their own."""
+"""Charts of what a point costs against how good it is, with the front marked: for a page, and as a picture of their
+own."""
 
 from __future__ import annotations
 
@@ -48,8 +49,8 @@ class Dot:
 
 @dataclass(frozen=True)
 class Chart:
-    """Points with a title and what their axes mean. ``joined`` draws a line through those of the front; what costs more than ``most`` and is
-    not on it is off the chart."""
+    """Points with a title and what their axes mean. ``joined`` draws a line through those of the front; what costs more
+    than ``most`` and is not on it is off the chart."""
 
     title: str
     x: str
@@ -112,15 +113,33 @@ def _draw(axes: Axes, chart: Chart, colours: dict[str, str]) -> None:
     for group, colour, size, alpha in ((others, TRAINING, 4.5, 0.75), (marked, HELD_OUT, 6.0, 1.0)):
         if group:
             x, y, e = ([getattr(d, name) for d in group] for name in ("cost", "good", "spread"))
-            axes.errorbar(x, y, xerr=e, marker="o", markersize=size, color=colours[colour], alpha=alpha, markeredgewidth=0, **kind)
+            axes.errorbar(
+                x, y, xerr=e, marker="o", markersize=size, color=colours[colour], alpha=alpha, markeredgewidth=0, **kind
+            )
     if chart.joined and len(marked) > 1:
         line = sorted(marked, key=lambda d: d.cost)
-        axes.plot([d.cost for d in line], [d.good for d in line], color=colours[HELD_OUT], linewidth=1.2, alpha=0.6, zorder=2)
+        axes.plot(
+            [d.cost for d in line], [d.good for d in line], color=colours[HELD_OUT], linewidth=1.2, alpha=0.6, zorder=2
+        )
     for dot in (d for d in dots if d.reference):
-        axes.plot([dot.cost], [dot.good], marker="o", markersize=11, markerfacecolor="none", markeredgecolor=colours[INK], zorder=4)
+        axes.plot(
+            [dot.cost],
+            [dot.good],
+            marker="o",
+            markersize=11,
+            markerfacecolor="none",
+            markeredgecolor=colours[INK],
+            zorder=4,
+        )
     for dot in marked:
         axes.annotate(
-            dot.mark or "", (dot.cost, dot.good), (0, -13), textcoords="offset points", ha="center", fontsize=9, color=colours[INK]
+            dot.mark or "",
+            (dot.cost, dot.good),
+            (0, -13),
+            textcoords="offset points",
+            ha="center",
+            fontsize=9,
+            color=colours[INK],
         )
     axes.set_xlabel(chart.axis, color=colours[INK])
     axes.yaxis.label.set_color(colours[INK])
@@ -139,7 +158,13 @@ def _log_axis(axes: Axes, low: float, high: float) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     axes.set_xscale("log")
-    subs = (1.0,) if high / low > 300 else (1.0, 2.0, 5.0) if high / low > 8 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+    subs = (
+        (1.0,)
+        if high / low > 300
+        else (1.0, 2.0, 5.0)
+        if high / low > 8
+        else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+    )
     axes.xaxis.set_major_locator(LogLocator(subs=subs))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))

@@ -71,7 +71,9 @@ def banner(run: RunRecord) -> str:
     notes = []
     if not run.finished:
         last = run.last("step")
-        where = "No step was logged." if last is None else f"The last logged step is {count(last[1])}{_of_iterations(run)}."
+        where = (
+            "No step was logged." if last is None else f"The last logged step is {count(last[1])}{_of_iterations(run)}."
+        )
         notes.append(
             f"<strong>This run has not finished.</strong> There is no metrics.json yet: it is still going, or it was interrupted. {where}"
         )
@@ -83,12 +85,15 @@ def banner(run: RunRecord) -> str:
     bad = run.field("worse_than_black_image")
     if isinstance(bad, list) and bad:
         views = "1 view is" if len(bad) == 1 else f"{count(len(bad))} views are"
-        notes.append(f"<strong>{views} worse than a black image</strong>, which the mean hides: {escape(', '.join(map(str, bad)))}.")
+        notes.append(
+            f"<strong>{views} worse than a black image</strong>, which the mean hides: {escape(', '.join(map(str, bad)))}."
+        )
     return "".join(f'<p class="banner" role="status">{note}</p>' for note in notes)
 
 
 def headline(run: RunRecord) -> str:
-    """The numbers in large type (final, or the last logged ones of an unfinished run), beside the orbit if it was rendered."""
+    """The numbers in large type (final, or the last logged ones of an unfinished run), beside the orbit if it was
+    rendered."""
     tiles = _final_tiles(run) if run.finished else _interim_tiles(run)
     cells = (
         f'<div class="tile{" lead" if i == 0 else ""}"><dt>{label}</dt><dd>{value}{f"<small>{unit}</small>" if unit else ""}</dd>'
@@ -98,7 +103,11 @@ def headline(run: RunRecord) -> str:
     html = f'<dl class="tiles">{"".join(cells)}</dl>'
     if run.finished:
         kept = run.field("checkpoint")
-        rule = "Metrics of the last checkpoint, not the best." if kept in (None, "last") else f"Metrics of checkpoint “{escape(kept)}”."
+        rule = (
+            "Metrics of the last checkpoint, not the best."
+            if kept in (None, "last")
+            else f"Metrics of checkpoint “{escape(kept)}”."
+        )
         html += f'<p class="rule">{rule}</p>'
     if run.orbit is not None:
         caption = "camera orbit" + (f"; shown: {escape(run.shown)}" if run.shown else "")
@@ -114,9 +123,7 @@ def viewer(page: str, linked: str) -> str:
         return f"""<section><h2>The model</h2>
 <iframe title="the model, drawn by this browser" loading="lazy" srcdoc="{escape(page)}"></iframe><p class="rule">{what}</p></section>"""
     if linked:
-        return (
-            f'<section><h2>The model</h2><p><a href="{escape(linked)}">{escape(linked)}</a> draws it, to be turned by hand.</p></section>'
-        )
+        return f'<section><h2>The model</h2><p><a href="{escape(linked)}">{escape(linked)}</a> draws it, to be turned by hand.</p></section>'
     return ""
 
 
@@ -132,9 +139,18 @@ def _final_tiles(run: RunRecord) -> list[Tile]:
     split = escape(metrics.get("split") or "held-out")
     fps = number(metrics.get("render_fps"))
     return [
-        ("PSNR, mean", decimal(mean, 2), _unit("dB", mean), f"{count(views)} {split} view{'s' if views != 1 else ''}" if views else ""),
+        (
+            "PSNR, mean",
+            decimal(mean, 2),
+            _unit("dB", mean),
+            f"{count(views)} {split} view{'s' if views != 1 else ''}" if views else "",
+        ),
         ("PSNR, worst view", decimal(worst, 2), _unit("dB", worst), escape(name) if name else ""),
-        *([("Empty views", count(metrics["views_empty"]), "", "the model is not in them")] if metrics.get("views_empty") else []),
+        *(
+            [("Empty views", count(metrics["views_empty"]), "", "the model is not in them")]
+            if metrics.get("views_empty")
+            else []
+        ),
         ("SSIM", decimal(similarity, 4), "", "" if similarity is None else "mean over views" + _padded(metrics)),
         *_lpips_tile(metrics),
         *_masked_tile(metrics),
@@ -142,8 +158,18 @@ def _final_tiles(run: RunRecord) -> list[Tile]:
         ("Primitives", count(metrics.get("primitives")), "", ""),
         ("Parameters", count(metrics.get("parameters")), "", "" if each is None else f"{count(each)} per primitive"),
         ("Model size", size, size_unit, ""),
-        ("Training", duration(metrics.get("train_seconds")), "", "" if iterations is None else f"{count(iterations)} iterations"),
-        ("Rendering", decimal(fps, 1 if fps is None or fps < 100 else 0), _unit("fps", fps), escape(backend) if backend else ""),
+        (
+            "Training",
+            duration(metrics.get("train_seconds")),
+            "",
+            "" if iterations is None else f"{count(iterations)} iterations",
+        ),
+        (
+            "Rendering",
+            decimal(fps, 1 if fps is None or fps < 100 else 0),
+            _unit("fps", fps),
+            escape(backend) if backend else "",
+        ),
     ]
 
 
@@ -167,7 +193,9 @@ def _masked_tile(metrics: Mapping[str, object]) -> list[Tile]:
     inside, black = from_json(metrics, "psnr_mask"), from_json(metrics, "psnr_black_image_mask")
     if inside is None:
         return []
-    note = "where anything ever is" if black is None else f"where anything ever is; a black image: {decimal(black, 1)} dB"
+    note = (
+        "where anything ever is" if black is None else f"where anything ever is; a black image: {decimal(black, 1)} dB"
+    )
     return [("PSNR inside the mask", decimal(inside, 2), _unit("dB", inside), note)]
 
 
@@ -175,12 +203,19 @@ def _volume_tiles(metrics: Mapping[str, object]) -> list[Tile]:
     """The largest error of extinctions that are known, over the compared frames."""
     tiles: list[Tile] = []
     for key, frames in metrics.items():
-        known = isinstance(frames, list) and key.endswith("_frames") and all(isinstance(frame, Mapping) for frame in frames)
+        known = (
+            isinstance(frames, list) and key.endswith("_frames") and all(isinstance(frame, Mapping) for frame in frames)
+        )
         errors = [value for frame in frames if (value := from_json(frame, "max_error")) is not None] if known else []  # type: ignore[attr-defined]
         if errors:
             what = "extinction" if key == "sigma_frames" else escape(key.removesuffix("_frames"))
             tiles.append(
-                (f"Largest error of {what}", decimal(100 * max(errors), 0), "%", "of the frame’s largest value, on the files’ voxels")
+                (
+                    f"Largest error of {what}",
+                    decimal(100 * max(errors), 0),
+                    "%",
+                    "of the frame’s largest value, on the files’ voxels",
+                )
             )
     return tiles
 
@@ -224,7 +259,14 @@ def films(run: RunRecord) -> str:
     figures = []
     for path in run.clips:
         name = escape(path.stem.removeprefix("clip_"))
-        figures.append(_figure(inline(path), f"{name}: ground truth, render", f"film of {name}, ground truth beside render", exists=True))
+        figures.append(
+            _figure(
+                inline(path),
+                f"{name}: ground truth, render",
+                f"film of {name}, ground truth beside render",
+                exists=True,
+            )
+        )
     return _section("Held-out films", f'{_shown(run)}<div class="films">{"".join(figures)}</div>') if figures else ""
 
 
@@ -245,7 +287,9 @@ def held_out(run: RunRecord) -> str:
     if len(shown) < len(run.views):
         notes.append(f"{len(shown)} of {len(run.views)} views, evenly spaced.")
     if any(p is not None and p.compressed for _, row in pictures for p in row):
-        notes.append("Large pictures are compressed on this page (WebP, quality 90); the PNG files in renders/ are exact.")
+        notes.append(
+            "Large pictures are compressed on this page (WebP, quality 90); the PNG files in renders/ are exact."
+        )
     ticks = "".join(f"<span>{'≥ ' if i == 4 else ''}{ERROR_SCALE * i / 4:g}</span>" for i in range(5))
     bar = (
         f'<div class="scale"><p>Error: mean absolute difference over {"all " if run.shown else ""}channels</p><div class="bar" style="background: {color_bar()}"></div>'
@@ -262,17 +306,22 @@ def regions(run: RunRecord) -> str:
     for one in run.regions:
         caption = f"<b>{decimal(one.psnr, 1)}</b> dB in {escape(one.place)} of {escape(one.name)}"
         figures.append(
-            _figure(inline(one.path), caption, f"worst region of view {escape(one.name)}: ground truth, render, error", exists=True)
+            _figure(
+                inline(one.path),
+                caption,
+                f"worst region of view {escape(one.name)}: ground truth, render, error",
+                exists=True,
+            )
         )
     if not figures:
         return ""
-    note = (
-        '<p class="note">Of every view the square of a quarter of its shorter side with the largest error: ground truth, render, error.</p>'
-    )
+    note = '<p class="note">Of every view the square of a quarter of its shorter side with the largest error: ground truth, render, error.</p>'
     first, rest = figures[:WORST_SHOWN], figures[WORST_SHOWN:]
     body = f'{note}<div class="regions">{"".join(first)}</div>'
     if rest:
-        body += f'<details><summary>{count(len(rest))} more</summary><div class="regions">{"".join(rest)}</div></details>'
+        body += (
+            f'<details><summary>{count(len(rest))} more</summary><div class="regions">{"".join(rest)}</div></details>'
+        )
     return _section("Worst regions", body)
 
 
@@ -290,9 +339,7 @@ def _view_row(run: RunRecord, view: ViewFiles, row: list[Inlined | None]) -> str
         _figure(picture, caption, f"{caption} of view {name}", file is not None)
         for picture, caption, file in zip(row, captions, files, strict=True)
     )
-    numbers = (
-        f"<span><b>{decimal(from_json(entry, 'psnr'), 2)}</b> dB PSNR</span><span><b>{decimal(from_json(entry, 'ssim'), 4)}</b> SSIM</span>"
-    )
+    numbers = f"<span><b>{decimal(from_json(entry, 'psnr'), 2)}</b> dB PSNR</span><span><b>{decimal(from_json(entry, 'ssim'), 4)}</b> SSIM</span>"
     if number(entry.get("seconds")) is not None:
         numbers += f"<span><b>{decimal(number(entry['seconds']), 3)}</b> s to render</span>"
     return f'<article class="view"><header><h3>{name}</h3><p>{numbers}</p></header>{figures}</article>'
@@ -313,15 +360,23 @@ def charts(run: RunRecord) -> str:
     """PSNR and loss over time and steps, primitives over time, PSNR per view."""
     seconds, steps = "seconds", "step"
     table: Iterable[tuple[str, str | None]] = (
-        ("PSNR over time, dB", curve(series(run, seconds, "psnr"), series(run, seconds, "eval_psnr"), seconds, "PSNR over time")),
+        (
+            "PSNR over time, dB",
+            curve(series(run, seconds, "psnr"), series(run, seconds, "eval_psnr"), seconds, "PSNR over time"),
+        ),
         ("Loss over time", curve(series(run, seconds, "loss"), None, seconds, "Loss over time", log=True)),
         ("Primitives over time", curve(series(run, seconds, "primitives"), None, seconds, "Primitives over time")),
-        ("PSNR over steps, dB", curve(series(run, steps, "psnr"), series(run, steps, "eval_psnr"), steps, "PSNR over steps")),
+        (
+            "PSNR over steps, dB",
+            curve(series(run, steps, "psnr"), series(run, steps, "eval_psnr"), steps, "PSNR over steps"),
+        ),
         ("Loss over steps", curve(series(run, steps, "loss"), None, steps, "Loss over steps", log=True)),
         ("PSNR per view, dB <small>dashed: mean</small>", _view_dots(run)),
         ("PSNR over the frames of a film, dB", _frames(run)),
     )
-    panels = "".join(f'<figure class="panel"><figcaption>{title}</figcaption>{svg}</figure>' for title, svg in table if svg)
+    panels = "".join(
+        f'<figure class="panel"><figcaption>{title}</figcaption>{svg}</figure>' for title, svg in table if svg
+    )
     if not panels:
         return ""
     key = '<p class="key"><span class="training">training views</span><span class="held-out">held-out views</span></p>'
@@ -380,7 +435,18 @@ def _change(pair: object) -> str:
 
 def facts(run: RunRecord) -> str:
     """Where the numbers come from: split, data, machine, versions."""
-    keys = ("split", "data_source", "color_space", "downsampling", "background", "seed", "iterations", "checkpoint", "backend", "device")
+    keys = (
+        "split",
+        "data_source",
+        "color_space",
+        "downsampling",
+        "background",
+        "seed",
+        "iterations",
+        "checkpoint",
+        "backend",
+        "device",
+    )
     pairs = [(key.replace("_", " ").replace("color", "colour"), escape(run.field(key))) for key in keys]
     channels = run.field("channels")
     pairs.insert(3, ("channels", escape(", ".join(map(str, channels)) if isinstance(channels, list) else channels)))
@@ -391,18 +457,28 @@ def facts(run: RunRecord) -> str:
         pairs.append(("versions", MISSING))
     made_by = run.field("made_by")
     if isinstance(made_by, Mapping):
-        pairs += [(f"{escape(kind)} made by", escape(made_by[kind])) for kind in ("task", "scene", "loss") if kind in made_by]
-    return _section("Run", '<dl class="facts">' + "".join(f"<div><dt>{k}</dt><dd>{v}</dd></div>" for k, v in pairs) + "</dl>")
+        pairs += [
+            (f"{escape(kind)} made by", escape(made_by[kind])) for kind in ("task", "scene", "loss") if kind in made_by
+        ]
+    return _section(
+        "Run", '<dl class="facts">' + "".join(f"<div><dt>{k}</dt><dd>{v}</dd></div>" for k, v in pairs) + "</dl>"
+    )
 
 
 def commands(run: RunRecord, conditions: Sequence[ConditionSpec]) -> str:
-    """The commands that go on from here: what every run can do, and an animation of each of the task's conditions that has one."""
+    """The commands that go on from here: what every run can do, and an animation of each of the task's conditions that
+    has one."""
     folder = shlex.quote(str(run.run_dir))
-    lines = [(f"neuprim eval {folder}", "measure again"), (f"neuprim render {folder} --camera orbit", "fly around the scene")]
+    lines = [
+        (f"neuprim eval {folder}", "measure again"),
+        (f"neuprim render {folder} --camera orbit", "fly around the scene"),
+    ]
     for spec in conditions:
         if spec.sweep:
             changing = f"fly around it while the {escape(spec.name.replace('_', ' '))} changes"
-            lines.append((f"neuprim render {folder} --camera orbit {flag(spec.name)} {shlex.quote(spec.sweep)}", changing))
+            lines.append(
+                (f"neuprim render {folder} --camera orbit {flag(spec.name)} {shlex.quote(spec.sweep)}", changing)
+            )
     items = "".join(f"<li><code>{escape(line)}</code><span>{what}</span></li>" for line, what in lines)
     return _section("Go on", f'<ul class="commands">{items}</ul>')
 

@@ -26,12 +26,33 @@ LESS, MORE = "less", "more"
 BETTER: dict[str, str] = {
     **dict.fromkeys(("psnr", "ssim", "render_fps", "sigma_correlation", "sigma_psnr"), MORE),
     **dict.fromkeys(
-        ("lpips", "flip", "model_bytes", "primitives", "parameters", "train_seconds", "sigma_relative", "sigma_max_error"), LESS
+        (
+            "lpips",
+            "flip",
+            "model_bytes",
+            "primitives",
+            "parameters",
+            "train_seconds",
+            "sigma_relative",
+            "sigma_max_error",
+        ),
+        LESS,
     ),
 }
 """Beginning of a metric's name -> whether more of it is better, or less. Of any other the page does not say."""
 
-FIRST = ("psnr", "ssim", "psnr_worst", "psnr_mask", "lpips", "primitives", "model_bytes", "train_seconds", "render_fps", "iterations")
+FIRST = (
+    "psnr",
+    "ssim",
+    "psnr_worst",
+    "psnr_mask",
+    "lpips",
+    "primitives",
+    "model_bytes",
+    "train_seconds",
+    "render_fps",
+    "iterations",
+)
 """Metrics in the order of the table; the others follow."""
 
 NOT_COMPARED = ("psnr_black_image", "seed", "vdb_bytes")
@@ -91,7 +112,10 @@ def write_sweep(folder: Path, runs: Sequence[Compared], words: Sequence[str]) ->
     nonce = hashlib.sha256("".join([script, *parts.values()]).encode()).hexdigest()[:32]  # no text inside can know it
     template = Template(assets.joinpath("sweep.html").read_text(encoding="utf-8"))
     target = folder / "sweep.html"
-    write_text(target, template.substitute(title=escape(folder.resolve().name), style=style(), script=script, nonce=nonce, **parts))
+    write_text(
+        target,
+        template.substitute(title=escape(folder.resolve().name), style=style(), script=script, nonce=nonce, **parts),
+    )
     return target
 
 
@@ -157,11 +181,16 @@ class _Page:
         keys = list(dict.fromkeys(key for run in self.runs for key in run.swept))
         best = {name: self._best(name) for name in self.metrics}
         heads = "".join(f"<th>{escape(title)}</th>" for title in ("run", *keys, "state"))
-        heads += "".join(f'<th data-metric="{escape(m)}" data-better="{better(m) or ""}">{escape(_title(m))}</th>' for m in self.metrics)
+        heads += "".join(
+            f'<th data-metric="{escape(m)}" data-better="{better(m) or ""}">{escape(_title(m))}</th>'
+            for m in self.metrics
+        )
         body = "".join(self._row(run, keys, best) for run in self.runs)
         table = f'<div class="scroll"><table class="numbers runs"><thead><tr>{heads}<th>seconds in all</th></tr></thead><tbody>{body}</tbody></table></div>'
         options = "".join(
-            f'<option value="{escape(name)}">{escape(_title(name))}</option>' for name in self.metrics if better(name) is not None
+            f'<option value="{escape(name)}">{escape(_title(name))}</option>'
+            for name in self.metrics
+            if better(name) is not None
         )
         choice = (
             f'<p class="choose" hidden><label for="metric">Best by</label><select id="metric">{options}</select><b id="best"></b></p>'
@@ -177,10 +206,16 @@ class _Page:
         if run.run is not None and (run.run.run_dir / "report.html").is_file():
             name = f'<a href="{escape(_link(run.name))}">{name}</a>'
         cells = [f"<th scope=row>{chip}{name}</th>", *(f"<td>{escape(run.swept.get(key))}</td>" for key in keys)]
-        cells.append(f"<td>{escape(run.state)}</td>" if run.state == "done" else f'<td class="bad">{escape(run.state)}</td>')
+        cells.append(
+            f"<td>{escape(run.state)}</td>" if run.state == "done" else f'<td class="bad">{escape(run.state)}</td>'
+        )
         for metric in self.metrics:
             value, first = self.numbers[run.name].get(metric), best[metric]
-            kind = ' class="best"' if first is not None and value == self.numbers[first.name][metric] and len(self.runs) > 1 else ""
+            kind = (
+                ' class="best"'
+                if first is not None and value == self.numbers[first.name][metric] and len(self.runs) > 1
+                else ""
+            )
             cells.append(
                 f'<td{kind} data-value="{"" if value is None else _sortable(value)}">{" ".join(filter(None, _shown(metric, value)))}</td>'
             )
@@ -191,10 +226,13 @@ class _Page:
         known = [(run, run.run) for run in self.runs if run.run is not None]
         panels = ""
         for x, title in (("seconds", "Held-out PSNR over training time, dB"), ("step", "Held-out PSNR over steps, dB")):
-            drawn = together([(series(record, x, "eval_psnr"), self.colours[run.name]) for run, record in known], x, title)
+            drawn = together(
+                [(series(record, x, "eval_psnr"), self.colours[run.name]) for run, record in known], x, title
+            )
             panels += f'<figure class="panel"><figcaption>{title}</figcaption>{drawn}</figure>' if drawn else ""
         keys = "".join(
-            f'<li><span class="chip" style="background: {self.colours[run.name]}"></span>{escape(run.name)}</li>' for run, _ in known
+            f'<li><span class="chip" style="background: {self.colours[run.name]}"></span>{escape(run.name)}</li>'
+            for run, _ in known
         )
         return section("Curves", f'<div class="charts">{panels}</div><ul class="keys">{keys}</ul>') if panels else ""
 
@@ -210,7 +248,9 @@ class _Page:
     def _group(self, members: Sequence[tuple[Compared, RunRecord]], titled: bool) -> str:
         shown = members[:MOST_PICTURES]
         views = _spread(shown[0][1].views, MOST_VIEWS)
-        html = f"<h3>{escape(shown[0][1].name_of('task'))} / {escape(shown[0][1].name_of('scene'))}</h3>" if titled else ""
+        html = (
+            f"<h3>{escape(shown[0][1].name_of('task'))} / {escape(shown[0][1].name_of('scene'))}</h3>" if titled else ""
+        )
         if len(shown) < len(members):
             html += f'<p class="note">{len(shown)} of {len(members)} runs, those with the best PSNR.</p>'
         for view in views:
@@ -219,7 +259,9 @@ class _Page:
                 same = next((own for own in record.views if own.index == view.index and own.stem == view.stem), None)
                 if same is not None:
                     psnr = from_json(record.view_numbers(same), "psnr")
-                    figures += _figure(same.render, f"{escape(run.name)} <b>{decimal(psnr, 2)}</b> dB", view.stem, run.name)
+                    figures += _figure(
+                        same.render, f"{escape(run.name)} <b>{decimal(psnr, 2)}</b> dB", view.stem, run.name
+                    )
             html += f'<h3>{escape(view.stem or view.index)}</h3><div class="pictures">{figures}</div>'
         return html
 
@@ -234,13 +276,19 @@ class _Page:
     def _best(self, name: str) -> Compared | None:
         sign = {MORE: 1.0, LESS: -1.0, None: math.nan}[better(name)]
         having = [run for run in self.runs if name in self.numbers[run.name]]
-        return None if math.isnan(sign) else max(having, key=lambda run: sign * self.numbers[run.name][name], default=None)
+        return (
+            None if math.isnan(sign) else max(having, key=lambda run: sign * self.numbers[run.name][name], default=None)
+        )
 
 
 def _title(name: str) -> str:
-    return {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "model_bytes": "model file", "train_seconds": "training"}.get(
-        name, name.replace("_", " ")
-    )
+    return {
+        "psnr": "PSNR",
+        "ssim": "SSIM",
+        "lpips": "LPIPS",
+        "model_bytes": "model file",
+        "train_seconds": "training",
+    }.get(name, name.replace("_", " "))
 
 
 def _shown(name: str, value: float | None) -> tuple[str, str]:

@@ -1,4 +1,5 @@
-"""The page of ``neuprim tradeoff``: charts with the front marked, pictures of its points side by side, and every point's numbers."""
+"""The page of ``neuprim tradeoff``: charts with the front marked, pictures of its points side by side, and every
+point's numbers."""
 
 from __future__ import annotations
 
@@ -61,7 +62,10 @@ def write_page(folder: Path, page: Page) -> None:
     """Write ``tradeoff.html`` and ``front.png`` into ``folder``."""
     template = Template(files("neuprim.report").joinpath("tradeoff.html").read_text(encoding="utf-8"))
     title = f"{page.record['task']} / {page.record['scene']}"
-    sections = {name: getattr(page, name)() for name in ("heading", "headline", "charts", "speed", "size", "table", "left_out", "facts")}
+    sections = {
+        name: getattr(page, name)()
+        for name in ("heading", "headline", "charts", "speed", "size", "table", "left_out", "facts")
+    }
     write_charts(folder / "front.png", page.fronts())
     write_text(folder / "tradeoff.html", template.substitute(title=escape(title), style=style(), **sections))
 
@@ -69,7 +73,9 @@ def write_page(folder: Path, page: Page) -> None:
 class Page:
     """What both pages of `neuprim tradeoff` have; texts are those of a finished run's drawing."""
 
-    def __init__(self, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Callable[[Sequence[str]], str]) -> None:
+    def __init__(
+        self, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Callable[[Sequence[str]], str]
+    ) -> None:
         self.record, self.points, self.command = record, record["points"], command
         self.front_of: dict[str, list[int]] = {name: list(record["front"][name]) for name in ("speed", "size")}
         self.pictures = pictures
@@ -147,14 +153,22 @@ class Page:
         ]
 
     def _dots(
-        self, front: str, numbers: Sequence[int], cost: Callable[[int], float], spread: Callable[[int], float], good: str
+        self,
+        front: str,
+        numbers: Sequence[int],
+        cost: Callable[[int], float],
+        spread: Callable[[int], float],
+        good: str,
     ) -> list[Dot]:
         place = {number: str(k + 1) for k, number in enumerate(self.front_of[front])}
         return [Dot(cost(i), self.quality(i, good), spread(i), place.get(i), i == 0) for i in numbers]
 
     def charts(self) -> str:
         near = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr_exact")
-        more = [Chart("PSNR against the exact image", self.time_is, "dB", near, joined=False, most=SLOWEST), *self._marching()]
+        more = [
+            Chart("PSNR against the exact image", self.time_is, "dB", near, joined=False, most=SLOWEST),
+            *self._marching(),
+        ]
         panels = ""
         for chart in [*self.fronts(), *more]:
             drawn = chart_svg(chart)
@@ -171,8 +185,19 @@ class Page:
         if not rows:
             return []
         closed = rows[0]["seconds"]
-        dots = [Dot(row["seconds"] / closed, row["psnr"], 0.0, str(row["samples"])) for row in rows[1:] if row["psnr"] is not None]
-        return [Chart("Sampled chords against the closed form", "time of the integrals, as a multiple of the closed form's", "dB", dots)]
+        dots = [
+            Dot(row["seconds"] / closed, row["psnr"], 0.0, str(row["samples"]))
+            for row in rows[1:]
+            if row["psnr"] is not None
+        ]
+        return [
+            Chart(
+                "Sampled chords against the closed form",
+                "time of the integrals, as a multiple of the closed form's",
+                "dB",
+                dots,
+            )
+        ]
 
     def _march_note(self) -> str:
         marching = self.record["marching"]
@@ -191,7 +216,9 @@ class Page:
     def size(self) -> str:
         base = self.points[0]["bytes"]
         note = "Each is smaller than all that are as good; bytes are those of a model file that stores it so."
-        return self._cards("The front of size", note, "size", lambda i: f"{base / self.points[i]['bytes']:.2f}× smaller")
+        return self._cards(
+            "The front of size", note, "size", lambda i: f"{base / self.points[i]['bytes']:.2f}× smaller"
+        )
 
     def _cards(self, title: str, note: str, front: str, gain: Any) -> str:
         cards = [self._card(None, -1, "ground truth", "")] if -1 in self.pictures else []
@@ -222,7 +249,11 @@ class Page:
             images.append(torch.from_numpy(error_map(picture.image, picture.against, self.difference)).float() / 255)
         drawn = [_inlined(image) for image in images]
         captions = (escape(name), f"difference of {escape(name)}")
-        return '<div class="pair">' + "".join(_figure(one, text) for one, text in zip(drawn, captions, strict=False)) + "</div>"
+        return (
+            '<div class="pair">'
+            + "".join(_figure(one, text) for one, text in zip(drawn, captions, strict=False))
+            + "</div>"
+        )
 
     def table(self) -> str:
         head = "".join(
@@ -254,11 +285,20 @@ class Page:
         cells = (
             *(decimal(p.get("time_ratio"), 3), decimal(self.spread(i), 3) if len(p["ratios"]) > 2 else "–"),
             *(decimal(p.get("ms_per_frame"), 2), decimal(p.get("frames_per_second"), 1)),
-            *(decimal(self.quality(i), 3), self.lost(i), decimal(self.quality(i, "ssim"), 4), decimal(self.quality(i, "psnr_exact"), 1)),
+            *(
+                decimal(self.quality(i), 3),
+                self.lost(i),
+                decimal(self.quality(i, "ssim"), 4),
+                decimal(self.quality(i, "psnr_exact"), 1),
+            ),
             *(count(p["bytes"]), decimal(peak, 1), count(len(p["ms"]))),
         )
         kind = ' class="front"' if marked else ""
-        return f"<tr{kind}><th scope=row>{escape(self.name(i))}</th>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+        return (
+            f"<tr{kind}><th scope=row>{escape(self.name(i))}</th>"
+            + "".join(f"<td>{cell}</td>" for cell in cells)
+            + "</tr>"
+        )
 
     def left_out(self) -> str:
         rows = "".join(
@@ -268,7 +308,9 @@ class Page:
         if not rows:
             return ""
         head = "<tr><th>knob</th><th>point</th><th>why</th></tr>"
-        return section("Not measured", f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>')
+        return section(
+            "Not measured", f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
+        )
 
     def facts(self) -> str:
         r, same = self.record, self.record["same"]
@@ -277,7 +319,9 @@ class Page:
         checked = (
             ""
             if exact.get("float64", True)
-            else (f"; {decimal(exact['psnr_against_float64'], 0)} dB from float64 at {'×'.join(map(str, exact['checked_size']))}")
+            else (
+                f"; {decimal(exact['psnr_against_float64'], 0)} dB from float64 at {'×'.join(map(str, exact['checked_size']))}"
+            )
         )
         pairs = [
             ("views", ", ".join(same["views"])),

@@ -13,7 +13,9 @@ from neuprim.report.tradeoff import Page, Picture, section, write_page
 __all__ = ["write_models"]
 
 
-def write_models(folder: Path, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Callable[[Sequence[str]], str]) -> None:
+def write_models(
+    folder: Path, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Callable[[Sequence[str]], str]
+) -> None:
     """Write ``tradeoff.html`` and ``front.png`` into ``folder``.
 
     Args:
@@ -39,7 +41,12 @@ class _Models(Page):
         base = self.points[0]
         size, unit = byte_size(base["bytes"])
         tiles = [
-            ("The centre", decimal(base.get("ms_per_frame"), 2), "ms a frame", f"{count(base['primitives'])} primitives"),
+            (
+                "The centre",
+                decimal(base.get("ms_per_frame"), 2),
+                "ms a frame",
+                f"{count(base['primitives'])} primitives",
+            ),
             ("PSNR", decimal(self.quality(0), 2), "dB", f"{len(self.record['same']['views'])} test views"),
             ("Model file", size, unit, f"{base['parameters_per_primitive']} numbers per primitive"),
             *self._within("speed", "Fastest", lambda i: f"{1 / self.ratio(i):.2f}"),
@@ -49,7 +56,10 @@ class _Models(Page):
 
     def charts(self) -> str:
         near = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr_exact")
-        drawn = [*self.fronts(), Chart("PSNR against the model’s own exact image", self.time_is, "dB", near, joined=False)]
+        drawn = [
+            *self.fronts(),
+            Chart("PSNR against the model’s own exact image", self.time_is, "dB", near, joined=False),
+        ]
         panels = "".join(
             f'<figure class="panel"><figcaption>{escape(chart.title)}, dB</figcaption>{svg}</figure>'
             for chart in drawn
@@ -63,7 +73,9 @@ class _Models(Page):
 
     def fronts(self) -> list[Chart]:
         in_time = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr")
-        in_bytes = self._dots("size", range(len(self.points)), lambda i: float(self.points[i]["bytes"]), lambda i: 0.0, "psnr")
+        in_bytes = self._dots(
+            "size", range(len(self.points)), lambda i: float(self.points[i]["bytes"]), lambda i: 0.0, "psnr"
+        )
         return [
             Chart("PSNR against time", self.time_is, "PSNR, dB", in_time),
             Chart("PSNR against size", "bytes of the model file", "PSNR, dB", in_bytes),
@@ -71,16 +83,36 @@ class _Models(Page):
 
     def speed(self) -> str:
         note = "Each is faster than all that are as good. Beside the picture: its difference from the ground truth. Below: the words that train it."
-        return self._cards("The front of speed", note, "speed", lambda i: f"{1 / self.ratio(i):.2f}× as fast as the centre")
+        return self._cards(
+            "The front of speed", note, "speed", lambda i: f"{1 / self.ratio(i):.2f}× as fast as the centre"
+        )
 
     def size(self) -> str:
         base = self.points[0]["bytes"]
         note = "Each is smaller than all that are as good."
-        return self._cards("The front of size", note, "size", lambda i: f"{base / self.points[i]['bytes']:.2f}× smaller than the centre")
+        return self._cards(
+            "The front of size",
+            note,
+            "size",
+            lambda i: f"{base / self.points[i]['bytes']:.2f}× smaller than the centre",
+        )
 
     def table(self) -> str:
         titles = (
-            *("model", "primitives", "numbers each", "PSNR", "change", "SSIM", "against exact, dB", "bytes", "time", "±", "ms", "frames/s"),
+            *(
+                "model",
+                "primitives",
+                "numbers each",
+                "PSNR",
+                "change",
+                "SSIM",
+                "against exact, dB",
+                "bytes",
+                "time",
+                "±",
+                "ms",
+                "frames/s",
+            ),
             *("steps", "ms a step", "step", "seconds", "memory, MB", "rounds"),
         )
         head = "".join(f"<th>{title}</th>" for title in titles)
@@ -99,14 +131,27 @@ class _Models(Page):
         paces = p["steps_in_turns"]
         cells = (
             *(count(p["primitives"]), count(p["parameters_per_primitive"])),
-            *(decimal(self.quality(i), 3), self.lost(i), decimal(self.quality(i, "ssim"), 4), decimal(self.quality(i, "psnr_exact"), 1)),
-            *(count(p["bytes"]), decimal(p.get("time_ratio"), 3), decimal(self.spread(i), 3) if len(p["ratios"]) > 2 else "–"),
+            *(
+                decimal(self.quality(i), 3),
+                self.lost(i),
+                decimal(self.quality(i, "ssim"), 4),
+                decimal(self.quality(i, "psnr_exact"), 1),
+            ),
+            *(
+                count(p["bytes"]),
+                decimal(p.get("time_ratio"), 3),
+                decimal(self.spread(i), 3) if len(p["ratios"]) > 2 else "–",
+            ),
             *(decimal(p.get("ms_per_frame"), 2), decimal(p.get("frames_per_second"), 1)),
             *(count(p["steps"]), decimal(p["ms_per_step"], 2), decimal(sum(paces) / len(paces) if paces else None, 2)),
             *(decimal(p["seconds"], 1), decimal(peak, 1), count(len(p["ms"]))),
         )
         kind = ' class="front"' if marked else ""
-        return f"<tr{kind}><th scope=row>{escape(self.name(i))}</th>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+        return (
+            f"<tr{kind}><th scope=row>{escape(self.name(i))}</th>"
+            + "".join(f"<td>{cell}</td>" for cell in cells)
+            + "</tr>"
+        )
 
     def facts(self) -> str:
         r, same = self.record, self.record["same"]

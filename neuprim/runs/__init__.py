@@ -1,4 +1,5 @@
-"""What the commands do, for Python too: fit, measure, draw, export and inspect runs, and weigh speed against accuracy. Nothing here parses arguments or prints."""
+"""What the commands do, for Python too: fit, measure, draw, export and inspect runs, and weigh speed against accuracy.
+Nothing here parses arguments or prints."""
 
 from __future__ import annotations
 

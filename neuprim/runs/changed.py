@@ -15,7 +15,8 @@ _OPTIONS = "task.options"
 
 
 def value_of(config: RunConfig, key: str) -> Any:
-    """A setting by its dotted name below ``model``, ``train`` or ``task.options``; None where the configuration does not say it."""
+    """A setting by its dotted name below ``model``, ``train`` or ``task.options``; None where the configuration does
+    not say it."""
     node, path = _root(config, key)
     for part in path:
         node = node.get(part) if isinstance(node, Mapping) else getattr(node, part, None)
@@ -30,8 +31,8 @@ def _root(config: RunConfig, key: str) -> tuple[Any, list[str]]:
 
 
 def changed(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
-    """A configuration with other settings, by dotted names below ``model``, ``train`` and ``task.options``, and with its record of what is not
-    a default."""
+    """A configuration with other settings, by dotted names below ``model``, ``train`` and ``task.options``, and with
+    its record of what is not a default."""
     for key, value in values.items():
         config = _with(config, key, value)
     return config

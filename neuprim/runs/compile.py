@@ -1,7 +1,7 @@
 """Compile the renderer's kernels in a process of their own, while a run is still busy with its data.
 
-Compiling takes a minute of one core, once per installation, and its result is kept on disk, so that the run finds it there when it
-needs it. Nothing depends on it: a run that finds no kernels compiles them itself.
+Compiling takes a minute of one core, once per installation, and its result is kept on disk, so that the run finds it
+there when it needs it. Nothing depends on it: a run that finds no kernels compiles them itself.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ class Compiling:
 
 @contextmanager
 def compiling(backend: str | None, edge: int = 0) -> Iterator[Compiling]:
-    """Start compiling this backend for densities of an edge, None for none, unless that has been done; the process never outlives the block."""
+    """Start compiling this backend for densities of an edge, None for none, unless that has been done; the process
+    never outlives the block."""
     process = None
     if backend is not None and not compiled(backend, variant("Constant", edge)) and sys.executable:
         quiet, words = subprocess.DEVNULL, [sys.executable, "-m", "neuprim.runs.compile", backend, str(edge)]
@@ -104,15 +105,26 @@ def main(backend: str, edge: int = 0) -> None:
     context = InitContext(means, torch.full((8,), 0.3), torch.full((8, 3), 0.5), generator)
     density = CosineDensity(edge=edge)
     dc = ParameterSpec("dc", (3,), 1e-3, lambda c: torch.zeros(c.count, 3))
-    specs = [*GEOMETRY_SPECS, *density.parameters(), dc, ParameterSpec("rest", (15, 3), 1e-3, lambda c: torch.zeros(c.count, 15, 3))]
+    specs = [
+        *GEOMETRY_SPECS,
+        *density.parameters(),
+        dc,
+        ParameterSpec("rest", (15, 3), 1e-3, lambda c: torch.zeros(c.count, 15, 3)),
+    ]
     params = {spec.name: spec.init(context).float().contiguous().requires_grad_() for spec in specs}
     eye = torch.tensor([0.0, -3.0, 0.5], dtype=torch.float64)
-    camera = Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0])), 30.0, 30.0, 16.0, 16.0, 32, 32)
+    camera = Camera(
+        look_at(eye, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0])), 30.0, 30.0, 16.0, 16.0, 32, 32
+    )
     geometry = Geometry(params["means"], params["log_scales"], params["quats"])
     colour = Constant(fused_colors(params["means"], params["dc"], params["rest"], camera.position, 3) + 0.5)
-    output = render_lowered(Lowered(geometry, density.lower(params, geometry, {}), colour), camera, RenderSettings(backend=backend))
+    output = render_lowered(
+        Lowered(geometry, density.lower(params, geometry, {}), colour), camera, RenderSettings(backend=backend)
+    )
     output.watch(torch.ones(output.rgb.shape[:2]))
-    loss, _ = photometric({"ssim_weight": 0.2})(output.rgb, torch.zeros_like(output.rgb), Supervision(View("warm", camera)))
+    loss, _ = photometric({"ssim_weight": 0.2})(
+        output.rgb, torch.zeros_like(output.rgb), Supervision(View("warm", camera))
+    )
     loss.backward()
     RowAdam(specs, params).step(params, {spec.name: 1e-3 for spec in specs})
     mark_compiled(backend, variant("Constant", edge))

@@ -44,8 +44,8 @@ class Compression:
 
     Attributes:
         file: where it is; before: bytes of its numbers in float32; after: of the file.
-        measured: "psnr" and "ssim" -> means over the held-out views before and after; empty where the run's data are not there.
-        seconds: of training, taking apart and writing; steps: of training.
+        measured: "psnr" and "ssim" -> means over the held-out views before and after; empty where the run's data are
+        not there. seconds: of training, taking apart and writing; steps: of training.
     """
 
     file: Path
@@ -69,13 +69,15 @@ def compress_run(
     steps: int | None = None,
     tolerance: float | None = None,
 ) -> Compression:
-    """Write a run's model as a compressed file, whole or not at all, and measure what that costs where the run's data are there.
+    """Write a run's model as a compressed file, whole or not at all, and measure what that costs where the run's data
+    are there.
 
-    Unless a level or bits are given, training views decide how coarse every number may be: as coarse as ``tolerance`` allows. Where the run's data
-    are not there, it is :data:`~neuprim.core.compressed.USUAL_LEVEL`.
+    Unless a level or bits are given, training views decide how coarse every number may be: as coarse as ``tolerance``
+    allows. Where the run's data are not there, it is :data:`~neuprim.core.compressed.USUAL_LEVEL`.
 
-    With ``seconds`` or ``steps`` the numbers are trained for the few bits first: every image of a step is drawn of what will be read back, and
-    gradients go to the numbers themselves (straight through). What training views say is better, trained or not, is written.
+    With ``seconds`` or ``steps`` the numbers are trained for the few bits first: every image of a step is drawn of what
+    will be read back, and gradients go to the numbers themselves (straight through). What training views say is better,
+    trained or not, is written.
 
     Args:
         level: 1 (nearly everything) to 5 (very little), see :data:`neuprim.core.compressed.LEVELS`.
@@ -126,14 +128,25 @@ def compress_run(
         stored = save_compressed(final, whole, task.name, extra, coded, text)
     taken = time.perf_counter() - start
     parameters = tuple(
-        StoredParameter(s.name, stored[s.name].bits, 4 * model.count * s.size, stored[s.name].size) for s in model.specs if s.size
+        StoredParameter(s.name, stored[s.name].bits, 4 * model.count * s.size, stored[s.name].size)
+        for s in model.specs
+        if s.size
     )
     again, _ = load_model(final, task)
     measured: dict[str, tuple[float, float]] = {}
     if dataset is not None:
         measured = _costs(run_dir, config, task, dataset, model, again, progress)
     before = sum(p.before for p in parameters)
-    return Compression(final, parameters, before, final.stat().st_size, measured, taken, 0 if fewer is None else fewer.steps, tuple(notes))
+    return Compression(
+        final,
+        parameters,
+        before,
+        final.stat().st_size,
+        measured,
+        taken,
+        0 if fewer is None else fewer.steps,
+        tuple(notes),
+    )
 
 
 def _dataset(run_dir: Path, config: RunConfig, task: TaskSpec) -> Dataset:
@@ -144,7 +157,13 @@ def _dataset(run_dir: Path, config: RunConfig, task: TaskSpec) -> Dataset:
 
 
 def _costs(
-    run_dir: Path, config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primitives, again: Primitives, progress: Progress
+    run_dir: Path,
+    config: RunConfig,
+    task: TaskSpec,
+    dataset: Dataset,
+    model: Primitives,
+    again: Primitives,
+    progress: Progress,
 ) -> dict[str, tuple[float, float]]:
     """PSNR and SSIM before and after, as in ``metrics.json``."""
     suspects = suspects_of(config)

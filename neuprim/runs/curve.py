@@ -41,7 +41,9 @@ class Curve:
     def __enter__(self) -> Curve:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._file.close()
 
 
@@ -60,7 +62,8 @@ def open_curve(path: Path, step: int) -> Curve:
 
 
 def read_curve(path: Path, settings: TrainSettings) -> tuple[tuple[float, float], ...]:
-    """(used fraction of the budget, PSNR of the held-out views behind the curve, dB) of every evaluation in metrics.jsonl; none of a file that is not there."""
+    """(used fraction of the budget, PSNR of the held-out views behind the curve, dB) of every evaluation in
+    metrics.jsonl; none of a file that is not there."""
     found = []
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else ():
         try:
@@ -69,7 +72,9 @@ def read_curve(path: Path, settings: TrainSettings) -> tuple[tuple[float, float]
         except (ValueError, AttributeError, RecursionError):
             continue  # a line that a kill cut short
         if value is not None and step is not None and seconds is not None:
-            used = [part / whole for part, whole in ((step, settings.iterations), (seconds, settings.max_seconds)) if whole]
+            used = [
+                part / whole for part, whole in ((step, settings.iterations), (seconds, settings.max_seconds)) if whole
+            ]
             found.append((min(max(used, default=1.0), 1.0), value))
     return tuple(found)
 
@@ -81,8 +86,8 @@ def next_evaluation(trainer: Trainer) -> float:
 
 
 def curve_psnr(trainer: Trainer) -> float:
-    """Mean PSNR of a few held-out views as :func:`~neuprim.runs.measure.measure` has it, but at most 200 dB, so that a line of JSON can hold
-    it; does not touch the training state."""
+    """Mean PSNR of a few held-out views as :func:`~neuprim.runs.measure.measure` has it, but at most 200 dB, so that a
+    line of JSON can hold it; does not touch the training state."""
     views = trainer.dataset.test
     picks = sorted({i * len(views) // _VIEWS for i in range(_VIEWS)})
 

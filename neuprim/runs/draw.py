@@ -44,7 +44,8 @@ _TIME = "time"
 ANIMATIONS = ("webp", "gif", "mp4")
 _RAW = ("exr", "npy")
 FORMATS = ("png", "exr", "npy", *ANIMATIONS)
-"""What ``neuprim render`` writes: pictures of what the task's channels look like, but all channels as they are in EXR and npy."""
+"""What ``neuprim render`` writes: pictures of what the task's channels look like, but all channels as they are in EXR
+and npy."""
 
 
 def render_run(
@@ -67,24 +68,28 @@ def render_run(
 ) -> list[Path]:
     """Draw a run's model: ``camera`` is "orbit", "test" or a file of cameras (see :mod:`neuprim.core.cameras.file`).
 
-    Writes one file per view, or one animation for the formats of :data:`ANIMATIONS` with more than one view; returns the files.
-    Without a format, the suffix of ``out`` decides, else views that differ in a condition become a WebP animation and others PNGs.
+    Writes one file per view, or one animation for the formats of :data:`ANIMATIONS` with more than one view; returns
+    the files.
+    Without a format, the suffix of ``out`` decides, else views that differ in a condition become a WebP animation and
+    others PNGs.
 
     Args:
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
-        fps: of an animation; None for what the file of cameras says, or lets it last four seconds, at 5 to 30 frames per second.
-        environment: light from all around instead of the task's light.
+        fps: of an animation; None for what the file of cameras says, or lets it last four seconds, at 5 to 30 frames
+        per second. environment: light from all around instead of the task's light.
         tell: called with lines for the user, e.g. what the model never saw.
         progress: called with (text, fraction 0..1) while images are drawn.
         words: of an operating point (:mod:`neuprim.runs.operating`), over how the run draws.
-        layers: of an OpenEXR file, names separated by commas (:mod:`neuprim.core.layers`); None for all but a layer per light.
-        space: "world": a file's cameras, lights, and what is written of cameras and depths are in the coordinates of the data's files; "scene":
+        layers: of an OpenEXR file, names separated by commas (:mod:`neuprim.core.layers`); None for all but a layer per
+        light. space: "world": a file's cameras, lights, and what is written of cameras and depths are in the
+        coordinates of the data's files; "scene":
             in those of the model, for volumes their unit box.
         datatype: of light and alpha in an OpenEXR file, "half" or "float" (16 or 32 bits, the default).
         overwrite: replace pictures of the run's report.
 
     Raises:
-        DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory; no image shows anything of the model.
+        DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory; no image shows anything of
+        the model.
         BackendUnavailable: a format whose package is missing.
     """
     config, task, model, header = load_run(run_dir)
@@ -101,7 +106,9 @@ def render_run(
             around = _illumination(environment, config, task, header, conditions)
         lights = around.frames(environment.guesses)
         if not lights:
-            raise ConfigError(f"--environment-unseen drop: all light of {environment.path} comes from where the model never saw any")
+            raise ConfigError(
+                f"--environment-unseen drop: all light of {environment.path} comes from where the model never saw any"
+            )
         hint = " (--environment-unseen drop leaves it out)" if environment.guesses and any(around.guessed) else ""
         for note in around.notes:
             tell(f"{environment.path}: {note}{hint}")
@@ -115,7 +122,11 @@ def render_run(
         dataset = load_dataset(config, task, run_dir=run_dir)
         suspects.know(dataset)
         with watch:
-            views = orbit_of(task, dataset, frames) if camera == "orbit" else [dataset.test.view(i) for i in range(len(dataset.test))]
+            views = (
+                orbit_of(task, dataset, frames)
+                if camera == "orbit"
+                else [dataset.test.view(i) for i in range(len(dataset.test))]
+            )
     if size is not None:
         views = [replace(v, camera=v.camera.resized(*size)) for v in views]
     if lights:  # these replace the views' own; the first stands for all where only their presence counts
@@ -128,13 +139,19 @@ def render_run(
     for flag_given, value in (("--layers", layers), ("--datatype", datatype)):
         if value is not None and format != "exr":
             raise ConfigError(f"{flag_given} {value}: of OpenEXR files; expected --format exr, found {format}")
-    layered = Layers(run_dir, task, channels, point, background, layers, datatype == "half", lights, world) if format == "exr" else None
+    layered = (
+        Layers(run_dir, task, channels, point, background, layers, datatype == "half", lights, world)
+        if format == "exr"
+        else None
+    )
     if channels.partial and format not in _RAW:
         tell(f"shown: {channels.shown}; --format exr and npy hold all channels")
 
     single = out is not None and out.suffix.lower() == f".{format}"
     name = _file_name(Path(camera.partition("#")[0]).resolve().stem)
-    folder = out if out is not None and not single else run_dir / "frames" / name  # "renders" holds the report's pictures
+    folder = (
+        out if out is not None and not single else run_dir / "frames" / name
+    )  # "renders" holds the report's pictures
     animate = format in ANIMATIONS and len(views) > 1
     if single and len(views) > 1 and not animate:
         raise ConfigError(
@@ -162,7 +179,9 @@ def render_run(
     def image(view: View) -> torch.Tensor:
         with watch:
             if lights:
-                return point.enlarged(draw_sum(model, point.seen(view), lights, point.settings, background, drawn), view.camera)
+                return point.enlarged(
+                    draw_sum(model, point.seen(view), lights, point.settings, background, drawn), view.camera
+                )
             return point.draw(model, view, background, drawn)
 
     def refuse_empty() -> None:
@@ -231,8 +250,13 @@ def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fp
 
 
 def _views_of(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
-    """A view per camera; each at its own time where the file has times, the task has one, and the user gave no other."""
-    timed = file.times is not None and _TIME not in conditions and any(spec.name == _TIME and not spec.shape for spec in task.conditions)
+    """A view per camera; each at its own time where the file has times, the task has one, and the user gave no
+    other."""
+    timed = (
+        file.times is not None
+        and _TIME not in conditions
+        and any(spec.name == _TIME and not spec.shape for spec in task.conditions)
+    )
     times = [{_TIME: torch.tensor(time)} for time in file.times or ()] if timed else [{} for _ in file.named]
     return [View(name, camera, time) for (name, camera), time in zip(file.named, times, strict=True)]
 
@@ -264,31 +288,44 @@ def _format_of(out: Path | None, animated: bool) -> str:
 def with_conditions(
     views: list[View], task: TaskSpec, texts: Mapping[str, str], warn: Callable[[str], None] = lambda text: None
 ) -> tuple[list[View], bool]:
-    """Views with the conditions the user gave, and whether one of these is animated. Animated conditions go along together, frame by frame;
-    where there are more frames than cameras, or the other way round, the fewer are spread evenly over the more.
+    """Views with the conditions the user gave, and whether one of these is animated. Animated conditions go along
+    together, frame by frame; where there are more frames than cameras, or the other way round, the fewer are spread
+    evenly over the more.
 
     Raises:
-        ConfigError: a view lacks a condition that the task needs, or as :func:`neuprim.core.conditions.read_conditions`.
+        ConfigError: a view lacks a condition that the task needs, or as
+        :func:`neuprim.core.conditions.read_conditions`.
     """
     given = read_conditions(task.conditions, texts, warn)
     frames = in_step(texts, given)
     if frames > 1:
         count = max(frames, len(views))
         names = f"{{}}_{{:0{max(3, len(str(count - 1)))}d}}"
-        views = [replace(views[i * len(views) // count], name=names.format(views[i * len(views) // count].name, i)) for i in range(count)]
-    moments = [{name: values[i * len(values) // len(views)] for name, values in given.items()} for i in range(len(views))]
+        views = [
+            replace(views[i * len(views) // count], name=names.format(views[i * len(views) // count].name, i))
+            for i in range(count)
+        ]
+    moments = [
+        {name: values[i * len(values) // len(views)] for name, values in given.items()} for i in range(len(views))
+    ]
     views = [replace(v, conditions={**v.conditions, **moment}) for v, moment in zip(views, moments, strict=True)]
     for spec in task.conditions:
         for v in views:
             if spec.name not in v.conditions:
-                raise ConfigError(f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give {flag(spec.name)}")
+                raise ConfigError(
+                    f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give {flag(spec.name)}"
+                )
     return views, frames > 1
 
 
 def _file_names(views: Sequence[View]) -> list[str]:
     """Of each view, with its number where two would share a file."""
     names = [_file_name(v.name) for v in views]
-    return names if len({name.lower() for name in names}) == len(names) else [f"{i:03d}_{name}" for i, name in enumerate(names)]
+    return (
+        names
+        if len({name.lower() for name in names}) == len(names)
+        else [f"{i:03d}_{name}" for i, name in enumerate(names)]
+    )
 
 
 def _file_name(name: str) -> str:

@@ -1,4 +1,5 @@
-"""What happens in a run while it works, as one stream: the console, a test or a viewer listens, and nothing here prints.
+"""What happens in a run while it works, as one stream: the console, a test or a viewer listens, and nothing here
+prints.
 
 A listener is a function of one event. It is called from the thread that trains, so what it takes is added to the step.
 """

@@ -39,14 +39,16 @@ def export_run(
     overwrite: bool = False,
     progress: Progress = lambda text, fraction: None,
 ) -> ExportReport:
-    """Write a run's model in a format: whole, or not at all, and over files that exist only with ``overwrite``, whoever's format it is.
+    """Write a run's model in a format: whole, or not at all, and over files that exist only with ``overwrite``,
+    whoever's format it is.
 
     Args:
         words: ``KEY=VALUE`` options of the exporter, and conditions of the task, also as ``--NAME TEXT``.
         progress: called with (text, fraction 0..1).
 
     Raises:
-        NeuprimError: no such run, format or option, something that the format cannot hold, files in its way, or an exporter that crashed.
+        NeuprimError: no such run, format or option, something that the format cannot hold, files in its way, or an
+        exporter that crashed.
     """
     try:
         exporter = load_exporter(name)
@@ -88,15 +90,20 @@ def _files(report: Any, draft: Draft, name: str) -> tuple[Path, ...]:
     for path in map(Path, report.files):
         place = draft.place(path)
         if place is None:
-            raise PluginError(f"{who}: wrote {path} instead of {draft.out}, past everything that keeps files from being replaced")
+            raise PluginError(
+                f"{who}: wrote {path} instead of {draft.out}, past everything that keeps files from being replaced"
+            )
         if not path.exists():
             raise PluginError(f"{who}: reports {path}, which it did not write")
         files.append(place)
     return tuple(files)
 
 
-def _options(words: Sequence[str], exporter: Exporter, specs: Sequence[ConditionSpec]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Every option of the exporter, and the texts of the conditions; where both have one name, ``NAME=`` means the option."""
+def _options(
+    words: Sequence[str], exporter: Exporter, specs: Sequence[ConditionSpec]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Every option of the exporter, and the texts of the conditions; where both have one name, ``NAME=`` means the
+    option."""
     options = {name: default for name, (default, _) in exporter.options.items()}
     conditions, rest = split_words(words, specs, bare=False)
     if conditions and not exporter.conditions:
@@ -116,7 +123,9 @@ def _options(words: Sequence[str], exporter: Exporter, specs: Sequence[Condition
             options[key] = _scalar(text)
         else:
             known = [*exporter.options, *((spec.name for spec in specs) if exporter.conditions else ())]
-            raise ConfigError(f"{key}: no such option of --format {exporter.name}{nearest(key, known) or '; it has none'}")
+            raise ConfigError(
+                f"{key}: no such option of --format {exporter.name}{nearest(key, known) or '; it has none'}"
+            )
     return options, conditions
 
 
@@ -139,7 +148,8 @@ def _scalar(text: str) -> Any:
 def import_run(path: Path, out: Path, name: str | None = None) -> Path:
     """Make a run directory of a file that a lossless exporter or ``neuprim compress`` wrote; returns ``out``.
 
-    It has ``config.yaml`` and ``model.safetensors``, or the compressed file as ``model.neuprim``, so that it renders, is measured and exports like the run that it came from.
+    It has ``config.yaml`` and ``model.safetensors``, or the compressed file as ``model.neuprim``, so that it renders,
+    is measured and exports like the run that it came from.
 
     Raises:
         ConfigError: ``out`` exists and is not empty, or no format reads such files.
@@ -163,7 +173,9 @@ def _reader(path: Path, name: str | None) -> Exporter:
     try:
         exporter = load_exporter(name)
     except UnknownPlugin:
-        raise ConfigError(f"{path}: no format reads .{name} files; expected one of `neuprim compress`, or of --format ply or npz") from None
+        raise ConfigError(
+            f"{path}: no format reads .{name} files; expected one of `neuprim compress`, or of --format ply or npz"
+        ) from None
     if exporter.read is None:
         raise ConfigError(f"{path}: --format {name} is lossy and cannot be imported; ply and npz can")
     return exporter
@@ -173,7 +185,9 @@ def import_model(stored: StoredModel, path: Path, out: Path) -> Path:
     """Write a stored model as a run directory and load it once, so that nothing unsound gets the name ``out``."""
     header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
     tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}
-    return _run_of(path, out, stored.config, lambda draft: checkpoint.write(draft / "model.safetensors", "model", tensors, header))
+    return _run_of(
+        path, out, stored.config, lambda draft: checkpoint.write(draft / "model.safetensors", "model", tensors, header)
+    )
 
 
 def _import_compressed(path: Path, out: Path) -> Path:

@@ -38,7 +38,10 @@ def record_export(word: str, job: ExportJob, report: ExportReport) -> ExportRepo
     try:
         write_json(path, [*_read(path), _entry(word, job, report)][-_ENTRIES:])
     except OSError as error:
-        return replace(report, notes=(*report.notes, f"{path}: not written ({error.strerror or error}); this export is not recorded"))
+        return replace(
+            report,
+            notes=(*report.notes, f"{path}: not written ({error.strerror or error}); this export is not recorded"),
+        )
     except ValueError as error:
         return replace(report, notes=(*report.notes, f"{path}: {error}; left as it is, this export is not recorded"))
     return report

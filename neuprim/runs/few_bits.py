@@ -1,4 +1,5 @@
-"""Training that knows in how few bits its numbers will be stored (quantisation-aware fine-tuning), and how few of them images allow."""
+"""Training that knows in how few bits its numbers will be stored (quantisation-aware fine-tuning), and how few of them
+images allow."""
 
 from __future__ import annotations
 
@@ -31,11 +32,13 @@ _AHEAD = 2.0
 """Times the tolerance that may be lost at once where training follows, to begin with."""
 
 _ROUND, _ROUNDS = 500, 3
-"""Steps of a round of training, at least, and rounds, at most: after one it is known how much training brings back. What was trained for some steps
-between numbers is best stored in these: of a fire finer ones are worse, since only what is read back was trained."""
+"""Steps of a round of training, at least, and rounds, at most: after one it is known how much training brings back.
+What was trained for some steps between numbers is best stored in these: of a fire finer ones are worse, since only what
+is read back was trained."""
 
 _SLOPE, _AIM = 0.7, 0.95
-"""dB that a trained model loses more, for one more at once; and the share of the tolerance that the next round aims at."""
+"""dB that a trained model loses more, for one more at once; and the share of the tolerance that the next round aims
+at."""
 
 _LOOKS = 16
 """At how coarse numbers may be, at most."""
@@ -55,7 +58,8 @@ class Fewer:
 
 
 class Rounding:
-    """How coarsely a model's numbers can be stored, by one number: the squared error that rounding all of them may add, as a share of what there is.
+    """How coarsely a model's numbers can be stored, by one number: the squared error that rounding all of them may add,
+    as a share of what there is.
 
     Attributes:
         model: folded.
@@ -65,7 +69,9 @@ class Rounding:
         self.model = folded(model)
         views = sensitivity(self.model, dataset, judge.others[:_LOOKED_AT], judge.settings)
         if judge.draws:
-            views = views.beside(inner_sensitivity(self.model, judge.draws, threads=judge.settings.threads), judge.apart(self.model))
+            views = views.beside(
+                inner_sensitivity(self.model, judge.draws, threads=judge.settings.threads), judge.apart(self.model)
+            )
         columns = sum(spec.size for spec in self.model.specs)
         self._effects, self._error = views.columns, 10 ** (-judge.images(self.model) / 10) / max(columns, 1)
 
@@ -98,7 +104,8 @@ class Rounding:
         return read_back(self.model, made)
 
     def _between(self, fine_enough: Callable[[Schemes], bool], start: float) -> tuple[float, float]:
-        """Two shares that lie close together, of which the first is fine enough and the second is not; or both an end of what is tried."""
+        """Two shares that lie close together, of which the first is fine enough and the second is not; or both an end
+        of what is tried."""
         fine, coarse, share = 0.0, 0.0, start
         for _ in range(_LOOKS):
             if fine_enough(self.schemes(share)):
@@ -107,7 +114,13 @@ class Rounding:
                 coarse = share
             if coarse == _LEAST or fine == _MOST or (fine and coarse and coarse < 1.08 * fine):
                 break
-            share = math.sqrt(fine * coarse) if fine and coarse else min(2.0 * fine, _MOST) if fine else max(share / 2.0, _LEAST)
+            share = (
+                math.sqrt(fine * coarse)
+                if fine and coarse
+                else min(2.0 * fine, _MOST)
+                if fine
+                else max(share / 2.0, _LEAST)
+            )
         return fine or _LEAST, coarse or _MOST
 
 
@@ -132,7 +145,9 @@ def train_for(
         whole = folded(model)
         made, judge = schemes(whole, table), judge_of(config, dataset)
         before = judge(read_back(whole, made))
-        trained = _trained(config, task, dataset, whole, made, steps, lambda share: progress("training for few bits", share))
+        trained = _trained(
+            config, task, dataset, whole, made, steps, lambda share: progress("training for few bits", share)
+        )
         after = judge(read_back(trained, made))
     if after <= before:
         note = f"{steps:,} steps for few bits brought nothing ({after - before:+.3f} dB on training views); stored as it was"
@@ -150,7 +165,8 @@ def train_within(
     steps: int | None,
     progress: Progress,
 ) -> Fewer:
-    """The model in the fewest bits with which judged training views are at most ``tolerance`` dB worse, trained for them.
+    """The model in the fewest bits with which judged training views are at most ``tolerance`` dB worse, trained for
+    them.
 
     Args:
         seconds: about, where there are no ``steps``; 0 for no training.
@@ -177,16 +193,25 @@ def train_within(
             if lost <= tolerance and (best is None or share > best[2]):
                 best = rounding.model, made, share
             at_once = max(at_once + (_AIM * tolerance - lost) / _SLOPE, 0.25 * at_once)
-        if best is None:  # of what was trained between coarser numbers, and of what was not trained, what can be stored more coarsely
+        if (
+            best is None
+        ):  # of what was trained between coarser numbers, and of what was not trained, what can be stored more coarsely
             progress("looking for the coarsest numbers", 1.0)
             tried = [plain, rounding] if rounds else [plain]
 
             def found(one: Rounding) -> tuple[Primitives, Schemes, float]:
-                return one.model, *one.coarsest(lambda made: base - judge(one.read_back(made)) <= tolerance, _share(tolerance))
+                return one.model, *one.coarsest(
+                    lambda made: base - judge(one.read_back(made)) <= tolerance, _share(tolerance)
+                )
 
             best = max(map(found, tried), key=lambda each: each[2])
     whole, made, share = best
-    return Fewer(whole, made, steps, (f"rounding may add {share:.1%} to the squared error; every number's last bit is worth as much",))
+    return Fewer(
+        whole,
+        made,
+        steps,
+        (f"rounding may add {share:.1%} to the squared error; every number's last bit is worth as much",),
+    )
 
 
 def _share(decibels: float) -> float:
@@ -195,7 +220,13 @@ def _share(decibels: float) -> float:
 
 
 def _trained(
-    config: RunConfig, task: TaskSpec, dataset: Dataset, whole: Primitives, made: Schemes, steps: int, progress: Callable[[float], None]
+    config: RunConfig,
+    task: TaskSpec,
+    dataset: Dataset,
+    whole: Primitives,
+    made: Schemes,
+    steps: int,
+    progress: Callable[[float], None],
 ) -> Primitives:
     """A folded model after so many steps in which every image is drawn of what will be read back."""
     trainer = fine_tuner(config, task, dataset, whole, steps)
@@ -210,9 +241,13 @@ def _trained(
         trainer.train_step()
         if done % 20 == 0:
             progress(done / steps)
-    return Primitives(whole.density, whole.colour, {name: value.detach().cpu() for name, value in trainer.model.params.items()})
+    return Primitives(
+        whole.density, whole.colour, {name: value.detach().cpu() for name, value in trainer.model.params.items()}
+    )
 
 
 def read_back(model: Primitives, made: Schemes) -> Primitives:
     """A folded model as it would come back."""
-    return Primitives(model.density, model.colour, {name: value.detach() for name, value in rounded(model.params, made).items()})
+    return Primitives(
+        model.density, model.colour, {name: value.detach() for name, value in rounded(model.params, made).items()}
+    )

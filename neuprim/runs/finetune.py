@@ -1,4 +1,5 @@
-"""Training that goes on with a model that was changed: the end of a run once more, at the rates of its end, with the primitives that there are."""
+"""Training that goes on with a model that was changed: the end of a run once more, at the rates of its end, with the
+primitives that there are."""
 
 from __future__ import annotations
 
@@ -18,16 +19,19 @@ BEGIN = 0.8
 """Progress of the run that the fine-tuning stands for at its first step."""
 
 START, COOL = 3.0, 0.02
-"""The rates at the first step over those at the end of the run, and those at the last step over these at the first: with next to none at the end, numbers
-settle, which is worth something by itself (row "trained as long" of docs/tradeoffs.md) and decides where numbers are rounded."""
+"""The rates at the first step over those at the end of the run, and those at the last step over these at the first:
+with next to none at the end, numbers settle, which is worth something by itself (row "trained as long" of
+docs/tradeoffs.md) and decides where numbers are rounded."""
 
 LONG, LEAST_START = 2000, 1.0
-"""Steps from which on rates begin so high; of fewer they begin lower, in proportion, but not below :data:`LEAST_START`. A few hundred steps at high
-rates leave a well trained volume worse than they found it: they unsettle more than there is time to settle."""
+"""Steps from which on rates begin so high; of fewer they begin lower, in proportion, but not below :data:`LEAST_START`.
+A few hundred steps at high rates leave a well trained volume worse than they found it: they unsettle more than there is
+time to settle."""
 
 VOXELS_EVERY = 8
-"""Steps between two looks at voxels, at most, where a run learned from them: in a few hundred steps with looks as rare as in a whole run some frames are
-hardly met, and their extinction drifts for the sake of the images; at every fourth step images are lost for the sake of voxels."""
+"""Steps between two looks at voxels, at most, where a run learned from them: in a few hundred steps with looks as rare
+as in a whole run some frames are hardly met, and their extinction drifts for the sake of the images; at every fourth
+step images are lost for the sake of voxels."""
 
 _WARM, _PACED = 5, 20
 """Steps before the pace is taken, and those that it is taken of."""
@@ -44,10 +48,13 @@ def fine_tuner(
 ) -> Trainer:
     """A trainer of a copy of a finished run's model that is ``steps`` steps before the end of its budget.
 
-    Schedules are those of a run from the progress ``begin`` on, but for the rates (:data:`START`, :data:`COOL`); nothing is born, moves or is removed, and
-    views are as they are. Gains of photographs' exposures go on from the run's checkpoint, where there is one.
+    Schedules are those of a run from the progress ``begin`` on, but for the rates (:data:`START`, :data:`COOL`);
+    nothing is born, moves or is removed, and views are as they are. Gains of photographs' exposures go on from the
+    run's checkpoint, where there is one.
     """
-    copy = Primitives(model.density, model.colour, {name: value.detach().clone() for name, value in model.params.items()})
+    copy = Primitives(
+        model.density, model.colour, {name: value.detach().clone() for name, value in model.params.items()}
+    )
     whole = round(steps / (1 - begin))
     usual = settings_for(config.train, task, copy)
     final = COOL ** (1 / (1 - begin))  # a rate's factor is final ** progress
@@ -69,7 +76,9 @@ def fine_tuner(
     saved = config.output_dir / "checkpoint.safetensors"
     if trainer.exposures is not None and saved.exists():
         _, tensors = checkpoint.read(saved, "checkpoint")
-        trainer.exposures.load_state({name.removeprefix("exposure."): t for name, t in tensors.items() if name.startswith("exposure.")})
+        trainer.exposures.load_state(
+            {name.removeprefix("exposure."): t for name, t in tensors.items() if name.startswith("exposure.")}
+        )
     return trainer
 
 

@@ -29,7 +29,8 @@ _ORBIT_FRAMES = 36
 
 
 def finish(fitted: Fitted, directory: Path) -> dict[str, Any]:
-    """Writes ``metrics.json``, ``renders/`` and the report of a run whose model is on disk in ``directory``; returns the metrics."""
+    """Writes ``metrics.json``, ``renders/`` and the report of a run whose model is on disk in ``directory``; returns
+    the metrics."""
     config, task, dataset, channels, model = fitted.config, fitted.task, fitted.dataset, fitted.channels, fitted.model
     fitted.unlock()
     count = len(dataset.test)
@@ -81,7 +82,12 @@ def finish(fitted: Fitted, directory: Path) -> dict[str, Any]:
 def _viewer(fitted: Fitted, directory: Path) -> Viewer | None:
     """The page that draws the model; None of a model that no page can show."""
     config, task, dataset, channels = fitted.config, fitted.task, fitted.dataset, fitted.channels
-    if channels.own is not None or channels.rgb is None or fitted.model.density.script() is None or fitted.model.colour.script() is None:
+    if (
+        channels.own is not None
+        or channels.rgb is None
+        or fitted.model.density.script() is None
+        or fitted.model.colour.script() is None
+    ):
         return None
 
     def look(model: Primitives, camera: Camera, conditions: Conditions) -> torch.Tensor:

@@ -1,4 +1,5 @@
-"""Fit in memory: data, model and training of a configuration, without a directory. ``neuprim run``, benchmarks and sweeps all start here."""
+"""Fit in memory: data, model and training of a configuration, without a directory. ``neuprim run``, benchmarks and
+sweeps all start here."""
 
 from __future__ import annotations
 
@@ -35,7 +36,18 @@ from neuprim.runs.events import Evaluated, Events, Note, Preparing, Step, silent
 from neuprim.runs.measure import measure, summary
 from neuprim.runs.open import LOGS, load_dataset
 
-__all__ = ["Fitted", "Make", "complete", "fit", "make_loss", "make_trainer", "one_torch_thread", "start", "steps", "compile_kernels"]
+__all__ = [
+    "Fitted",
+    "Make",
+    "complete",
+    "fit",
+    "make_loss",
+    "make_trainer",
+    "one_torch_thread",
+    "start",
+    "steps",
+    "compile_kernels",
+]
 
 
 Make = Callable[[RunConfig, TaskSpec, Dataset, Loss], Trainer]
@@ -70,11 +82,23 @@ class Fitted:
             field.set_progress(1.0)
 
     def metrics(self) -> dict[str, Any]:
-        """The content of ``metrics.json``, measured on the views that judge; the model's size is that of its tensors."""
+        """The content of ``metrics.json``, measured on the views that judge; the model's size is that of its
+        tensors."""
         self.unlock()
         views = measure(self.model, self.task, self.dataset, self.config.renderer, self.channels, lpips=self.lpips)
         size = 4 * sum(value.numel() for value in self.model.params.values())
-        return summary(self.config, self.model, self.task, self.dataset, self.channels, views, size, self.training, self.lpips, self.split)
+        return summary(
+            self.config,
+            self.model,
+            self.task,
+            self.dataset,
+            self.channels,
+            views,
+            size,
+            self.training,
+            self.lpips,
+            self.split,
+        )
 
 
 def fit(config: RunConfig, events: Events = silent, dataset: Dataset | None = None) -> Fitted:
@@ -115,7 +139,8 @@ def start(
 
     Args:
         suspects: who is watched for crashes around this call; told whose code the data set is.
-        hold_out: n > 1: every n-th training view takes the place of the test views; 0: the data are taken as they are. What a task knows of
+        hold_out: n > 1: every n-th training view takes the place of the test views; 0: the data are taken as they are.
+        What a task knows of
             its test views, and checks here, is of those that the data set came with.
         make: what makes the trainer; None: :func:`make_trainer`, of a fresh model.
     """
@@ -192,7 +217,9 @@ def make_loss(config: RunConfig, task: TaskSpec) -> Loss:
     chosen = None if config.train.loss is None else load_loss(config.train.loss)
     party = suspects_of(config).loss
     with blamed(party.origin, party.what, config.output_dir / LOGS) as guard:
-        made = (task.loss if chosen is None else chosen.make)(loss_settings(chosen or task, config.train, config.options))
+        made = (task.loss if chosen is None else chosen.make)(
+            loss_settings(chosen or task, config.train, config.options)
+        )
     if not callable(made):
         raise PluginError(f"{party.who}: made a {type(made).__name__}; expected a function")
     return checked_loss(made, guard)
@@ -225,8 +252,8 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
 
 
 def settings_for(train: TrainSettings, task: TaskSpec, model: Primitives) -> TrainSettings:
-    """Training settings as a model's trainer takes them: a preset has rates for every density and colour of its task, and the trainer
-    refuses names that the model does not have."""
+    """Training settings as a model's trainer takes them: a preset has rates for every density and colour of its task,
+    and the trainer refuses names that the model does not have."""
     others = task.parameter_names() - model.params.keys()
     rates = {k: v for k, v in train.rates.items() if k not in others}
     units = {k: v for k, v in train.rate_units.items() if k not in others}

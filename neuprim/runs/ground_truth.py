@@ -33,7 +33,9 @@ _kept: dict[str, GroundTruth] = {}
 
 
 def truth_of(
-    config: RunConfig, progress: Callable[[str, float], None] = lambda text, fraction: None, known: Mapping[str, Any] | None = None
+    config: RunConfig,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
+    known: Mapping[str, Any] | None = None,
 ) -> GroundTruth | None:
     """The ground truth of a configuration's scene; None of a scene whose images are not rendered frame by frame.
 
@@ -51,7 +53,8 @@ def truth_of(
 def make_truth(config: RunConfig, settings: LauncherSettings, events: Events = silent) -> GroundTruth | None:
     """Have what is missing of the ground truth made where the launcher says; None of a scene that renders none.
 
-    Frames that are there are not made again, and each is kept as it is done. The launcher's files lie beside the run's directory while it works.
+    Frames that are there are not made again, and each is kept as it is done. The launcher's files lie beside the run's
+    directory while it works.
 
     The first frame that cannot be made ends the rest, as no run can do without it; what was made is kept.
 
@@ -75,7 +78,8 @@ def make_truth(config: RunConfig, settings: LauncherSettings, events: Events = s
 
 
 def before_runs(configs: Sequence[RunConfig], settings: LauncherSettings, hear: Hear) -> None:
-    """The ground truth of runs that are to be launched, once for all that share it; ``launcher=inline`` leaves that to the runs.
+    """The ground truth of runs that are to be launched, once for all that share it; ``launcher=inline`` leaves that to
+    the runs.
 
     What cannot be made is left to the run that needs it, which says why, and holds up no other.
 
@@ -112,8 +116,8 @@ def before_training(config: RunConfig, settings: LauncherSettings, progress: Cal
 
 
 def shares(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
-    """Frames for one job after the other: several at first, and one by one in the end, so that nobody waits long for a slow worker
-    (guided self-scheduling; Polychronopoulos and Kuck, 1987)."""
+    """Frames for one job after the other: several at first, and one by one in the end, so that nobody waits long for a
+    slow worker (guided self-scheduling; Polychronopoulos and Kuck, 1987)."""
     left = list(missing)
     while left:
         count = min(max(len(left) // (4 * workers), 1), _MOST)
@@ -122,7 +126,8 @@ def shares(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
 
 
 def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
-    """The function of a job; the number of its frames that are there then. Those that are, as of a worker that died, are not made again."""
+    """The function of a job; the number of its frames that are there then. Those that are, as of a worker that died,
+    are not made again."""
     config = RunConfig.from_dict(data["config"])
     truth = _truth(config, data["known"])
     if truth.key != data["key"]:
@@ -137,14 +142,18 @@ def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
     return len(data["frames"])
 
 
-def _launched(config: RunConfig, truth: GroundTruth, missing: Sequence[int], settings: LauncherSettings, events: Events) -> None:
+def _launched(
+    config: RunConfig, truth: GroundTruth, missing: Sequence[int], settings: LauncherSettings, events: Events
+) -> None:
     workers, _ = at_once(settings, len(missing))
     parts = list(shares(missing, workers))
     outputs = config.output_dir.parent.absolute()  # which every machine sees
     new, folder = not outputs.exists(), outputs / f"truth-{uuid.uuid4().hex[:8]}"
     stop = folder / "failed"
     common = {"config": config.to_dict(), "known": dict(truth.known), "key": truth.key, "stop": str(stop)}
-    jobs = [Job(truth.frames[part[0]], f"{__name__}:{make_frames.__name__}", {**common, "frames": part}) for part in parts]
+    jobs = [
+        Job(truth.frames[part[0]], f"{__name__}:{make_frames.__name__}", {**common, "frames": part}) for part in parts
+    ]
     told = _Told(truth, parts, len(missing), events, stop)
     _kept.clear()
     _kept[_scene(config)] = truth
@@ -172,7 +181,9 @@ def _launched(config: RunConfig, truth: GroundTruth, missing: Sequence[int], set
 class _Told:
     """How far a launch is, as events."""
 
-    def __init__(self, truth: GroundTruth, parts: Sequence[Sequence[int]], count: int, events: Events, stop: Path) -> None:
+    def __init__(
+        self, truth: GroundTruth, parts: Sequence[Sequence[int]], count: int, events: Events, stop: Path
+    ) -> None:
         self._truth, self._parts, self._events, self._done = truth, parts, events, len(truth.frames) - count
         self._stop = stop
         self._said: set[str] = set()

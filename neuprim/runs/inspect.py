@@ -75,7 +75,8 @@ class Request:
 def inspect_run(request: Request, events: Events = silent) -> list[Path]:
     """Does it, and returns the files that were written; none where a window was shown.
 
-    Several frames become numbered files for .png and .vdb, an animation for .webp, .gif and .mp4, and a slider in a page or a window.
+    Several frames become numbered files for .png and .vdb, an animation for .webp, .gif and .mp4, and a slider in a
+    page or a window.
 
     Args:
         events: told, as notes, what is shown: the truth and each frame's agreement with it, the grid, warnings.
@@ -194,7 +195,11 @@ class _Film:
         low, high = ([round(x, 4) for x in corner] for corner in self.world.world_box(np.asarray(box)).tolist())
         units = "scene units" if self.world.identity else "in the coordinates of the run's data"
         on = f"{' x '.join(map(str, self.shape))} points from {low} to {high} {units}"
-        events(Note(f"extinction of {self.model.count} primitives on {on}, in 1/scene unit, each primitive clamped at 0 from below"))
+        events(
+            Note(
+                f"extinction of {self.model.count} primitives on {on}, in 1/scene unit, each primitive clamped at 0 from below"
+            )
+        )
         if (request.run_dir / PRUNED).exists():
             for line in kept_words(kept_pieces(self.model)):
                 events(Note(line))
@@ -218,7 +223,8 @@ class _Film:
         return numbers
 
     def _scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
-        """Largest extinction shown, by how much volumes are shown more or less opaque than they are, and the middle of the matter."""
+        """Largest extinction shown, by how much volumes are shown more or less opaque than they are, and the middle of
+        the matter."""
         matrix, shape = lattice(box, _COARSE)
         most, depth, total = 0.0, 0.0, np.zeros(shape)
         for conditions, number in self.pairs:
@@ -231,18 +237,31 @@ class _Film:
                 most = max(most, float(np.quantile(filled, 0.995))) if filled.size else most
                 depth = max(depth, *(float(grid.sum(axis).max()) * float(matrix[0, 0]) for axis in range(3)))
         weights = total + 1e-12 * (total.max() or 1.0)
-        index = [float(np.average(np.arange(n), weights=weights.sum(tuple({0, 1, 2} - {a})))) for a, n in enumerate(shape)]
+        index = [
+            float(np.average(np.arange(n), weights=weights.sum(tuple({0, 1, 2} - {a})))) for a, n in enumerate(shape)
+        ]
         focus = matrix[:3, :3].numpy() @ np.array(index) + matrix[:3, 3].numpy()
         return round_up(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
 
     def frame(self, index: int) -> FieldFrame:
         """A fresh frame; its grids live as long as it does."""
         conditions, number = self.pairs[index]
-        made = FieldFrame(self.model, conditions, in_words(conditions), self.matrix, self.shape, self.top, self.gain, self.focus)
+        made = FieldFrame(
+            self.model, conditions, in_words(conditions), self.matrix, self.shape, self.top, self.gain, self.focus
+        )
         made = replace(
-            made, channels=self.channels, needed=self.needed, options=self.options, numbers=self.numbers[index], device=self.device
+            made,
+            channels=self.channels,
+            needed=self.needed,
+            options=self.options,
+            numbers=self.numbers[index],
+            device=self.device,
         )
         truth = self.truth
         if truth is None:
             return made
-        return replace(made, truth=lambda: truth.grid(number, self.matrix, self.shape).numpy(), truth_name=truth.frames[number].name)
+        return replace(
+            made,
+            truth=lambda: truth.grid(number, self.matrix, self.shape).numpy(),
+            truth_name=truth.frames[number].name,
+        )

@@ -16,7 +16,8 @@ def interruptible(terminated: bool = False) -> Iterator[threading.Event]:
     """An event that the first Ctrl-C sets; the second interrupts at once. Outside the main thread Ctrl-C is not ours.
 
     Args:
-        terminated: whether SIGTERM counts as Ctrl-C does: torchrun sends it when it is stopped, or another process of it ended.
+        terminated: whether SIGTERM counts as Ctrl-C does: torchrun sends it when it is stopped, or another process of
+        it ended.
     """
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():

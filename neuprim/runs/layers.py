@@ -1,4 +1,5 @@
-"""One view of a run as layers of one OpenEXR file: linear light, numbers beside it, and the camera and conditions in its header."""
+"""One view of a run as layers of one OpenEXR file: linear light, numbers beside it, and the camera and conditions in
+its header."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ def linear_light(image: Tensor, color_space: str, alpha: Tensor | None = None) -
     """(H, W, C) linear light of an image in a data set's colour space; sRGB values lose what is below 0.
 
     Args:
-        alpha: (H, W) that the image is premultiplied by. The curve is that of the colour without it: what is linear is the light of the
+        alpha: (H, W) that the image is premultiplied by. The curve is that of the colour without it: what is linear is
+        the light of the
             matter that is seen, times how much of the pixel it covers.
     """
     if color_space == "linear":
@@ -107,7 +109,9 @@ class Layers:
                 )
         return tuple(spec for spec in found if not spec.light or spec.name == "beauty")
 
-    def write(self, path: Path, model: Primitives, view: View, drawn: Callable[[Tensor], None] = lambda alpha: None) -> None:
+    def write(
+        self, path: Path, model: Primitives, view: View, drawn: Callable[[Tensor], None] = lambda alpha: None
+    ) -> None:
         """Draw and write one view; ``drawn`` is called after each of its lights, with the image's alpha.
 
         Raises:
@@ -165,8 +169,13 @@ class Layers:
             light = spec is None or spec.light
             names = self.channels.names if spec is None or not spec.channels else spec.channels
             prefix = "" if name in ("beauty", "alpha") else f"{name}."
-            planes |= {f"{prefix}{c}": Plane(image[..., i], self.half and (light or name == "alpha")) for i, c in enumerate(names)}
-            said[f"neuprim:layer:{name}"] = "light of this light alone, premultiplied by alpha" if spec is None else spec.summary
+            planes |= {
+                f"{prefix}{c}": Plane(image[..., i], self.half and (light or name == "alpha"))
+                for i, c in enumerate(names)
+            }
+            said[f"neuprim:layer:{name}"] = (
+                "light of this light alone, premultiplied by alpha" if spec is None else spec.summary
+            )
         if "beauty" in found and "alpha" not in found:
             said["neuprim:layer:beauty"] = "the image over the background, linear light"
         return planes, said
@@ -187,7 +196,9 @@ class Layers:
             "neuprim:run": self.run_dir.resolve().name,
             "neuprim:task": self.task.name,
             "neuprim:view": view.name,
-            "neuprim:colorSpace": "linear light" if linear else "linear light, of a model whose colours are sRGB values",
+            "neuprim:colorSpace": "linear light"
+            if linear
+            else "linear light, of a model whose colours are sRGB values",
             "neuprim:background": linear_light(self.background[None, None], self.channels.color_space)[0, 0].tolist(),
         }
         if self.channels.plain:
@@ -213,4 +224,8 @@ def _attribute(value: Tensor) -> Any:
     numbers = value.detach().cpu().double().flatten().tolist()
     if len(numbers) == 1:
         return float(numbers[0])
-    return np.array(numbers, np.float64 if value.dtype == torch.float64 else np.float32) if len(numbers) in (2, 3) else numbers
+    return (
+        np.array(numbers, np.float64 if value.dtype == torch.float64 else np.float32)
+        if len(numbers) in (2, 3)
+        else numbers
+    )

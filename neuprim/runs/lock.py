@@ -1,8 +1,9 @@
 """One process at a time in a run's directory.
 
-An advisory lock of the system on a file in it (``flock``; on Windows ``msvcrt``), by the package filelock. The system lets go of it when the process
-ends, however it ends, so that nothing is left to be cleared up after a kill. On shared folders it holds between machines where their file system
-has such locks: NFS from version 4 on, CephFS, GPFS, Lustre mounted with ``flock``.
+An advisory lock of the system on a file in it (``flock``; on Windows ``msvcrt``), by the package filelock. The system
+lets go of it when the process ends, however it ends, so that nothing is left to be cleared up after a kill. On shared
+folders it holds between machines where their file system has such locks: NFS from version 4 on, CephFS, GPFS, Lustre
+mounted with ``flock``.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ def held(directory: Path, what: str = "run") -> Iterator[None]:
     try:
         with suppress(OSError):  # a note to others; on Windows a locked file takes none
             file.write_text(
-                json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "since": time.strftime("%F %T")}), encoding="utf-8"
+                json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "since": time.strftime("%F %T")}),
+                encoding="utf-8",
             )
         remove_left(directory)
         yield

@@ -1,11 +1,12 @@
 """The numbers of a fitted model: every held-out view, their means, and what the task adds.
 
-PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set also gets
-both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``), if its channels are red, green and blue; a task with a display
-of its own gets both of what that shows instead (``psnr_display``, ``ssim_display``). Where it marks a part of a view (the union of all that a
-camera ever sees of a volume), the error there counts on its own: a black background flatters. For comparing with other people's tables
-``ssim_3dgs`` is the SSIM of what is displayed as the tools of 3D Gaussian splatting count it, and ``lpips`` and ``lpips_3dgs``, where the user has
-weights, are LPIPS as published and as these tools take it.
+PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set also
+gets both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``), if its channels are red, green and blue; a task
+with a display of its own gets both of what that shows instead (``psnr_display``, ``ssim_display``). Where it marks a
+part of a view (the union of all that a camera ever sees of a volume), the error there counts on its own: a black
+background flatters. For comparing with other people's tables
+``ssim_3dgs`` is the SSIM of what is displayed as the tools of 3D Gaussian splatting count it, and ``lpips`` and
+``lpips_3dgs``, where the user has weights, are LPIPS as published and as these tools take it.
 """
 
 from __future__ import annotations
@@ -57,8 +58,10 @@ class ViewMetrics:
         seconds: of the forward pass alone.
         black: PSNR of an image of the background alone.
         empty: the model is not in the view; the image is the background alone.
-        more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``, ``ssim_display`` of what the
-            task's own display shows; ``psnr_gain`` of opaque photographs; ``ssim_3dgs``, ``lpips``; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without
+        more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``,
+        ``ssim_display`` of what the
+            task's own display shows; ``psnr_gain`` of opaque photographs; ``ssim_3dgs``, ``lpips``; ``psnr_mask`` and
+            ``mse_mask`` inside the task's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without
             anything on it; what the task's :attr:`~neuprim.core.task.TaskSpec.judge` adds.
     """
 
@@ -85,7 +88,8 @@ def draw_sum(
     background: Tensor,
     drawn: Callable[[Tensor], None] = lambda alpha: None,
 ) -> Tensor:
-    """(H, W, C) sum of one view's images under conditions that change light alone, over the background once; as :func:`draw`.
+    """(H, W, C) sum of one view's images under conditions that change light alone, over the background once; as
+    :func:`draw`.
 
     Exact for what is linear in light, as opacity does not depend on it. Sums are float64.
 
@@ -132,7 +136,9 @@ def measure(
         if pixels.mask is not None:
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
         counted = mask_of(task, dataset, i)
-        more = _more(rendered, truth, dataset, channels, counted, pixels.mask) | _as_others(rendered, truth, channels, lpips)
+        more = _more(rendered, truth, dataset, channels, counted, pixels.mask) | _as_others(
+            rendered, truth, channels, lpips
+        )
         if pixels.alpha is None:
             more["psnr_gain"] = psnr_gain(rendered, truth, pixels.mask)
         more |= judged(task, dataset, i, rendered, truth)
@@ -187,7 +193,8 @@ def evaluate_run(run_dir: Path, lpips: str | Path | None = None, words: Sequence
 
     Args:
         lpips: weights for LPIPS; without, those that the run names.
-        words: of an operating point (:mod:`neuprim.runs.operating`), over how the run draws; ``model_bytes`` is the size of the run's file
+        words: of an operating point (:mod:`neuprim.runs.operating`), over how the run draws; ``model_bytes`` is the
+        size of the run's file
             but for what these change.
     """
     config, task, model, header = load_run(run_dir)
@@ -292,9 +299,16 @@ def _means(views: Sequence[ViewMetrics]) -> dict[str, Any]:
 def _lpips(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dict[str, Any]:
     """Which network measured LPIPS, or why none did: a missing number is not a zero."""
     if lpips is None:
-        return {"lpips": None, "not_measured": {"lpips": "no weights were given (metrics.lpips=FILE, or neuprim eval --lpips FILE)"}}
+        return {
+            "lpips": None,
+            "not_measured": {"lpips": "no weights were given (metrics.lpips=FILE, or neuprim eval --lpips FILE)"},
+        }
     if any("lpips" not in v.more for v in views):
-        return {"lpips": None, "lpips_3dgs": None, "not_measured": {"lpips": f"some view is lower or narrower than {lpips.least} pixels"}}
+        return {
+            "lpips": None,
+            "lpips_3dgs": None,
+            "not_measured": {"lpips": f"some view is lower or narrower than {lpips.least} pixels"},
+        }
     return {"lpips_network": lpips.network}
 
 
@@ -305,7 +319,9 @@ def _per_frame(made: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[str, 
         return {}
     frames = []
     for same in zip(*clips, strict=True):
-        entry = to_json("psnr", float(np.mean([v.psnr for v in same]))) | {"ssim": float(np.mean([v.ssim for v in same]))}
+        entry = to_json("psnr", float(np.mean([v.psnr for v in same]))) | {
+            "ssim": float(np.mean([v.ssim for v in same]))
+        }
         for name in ("psnr_mask", "psnr_black_image"):
             values = [v.more[name] for v in same if name in v.more]
             entry |= to_json(name, float(np.mean(values))) if values else {}

@@ -26,7 +26,17 @@ from neuprim.plugins.blame import blamed
 from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.provenance import warn_of_neuprim
 
-__all__ = ["COMPRESSED", "LOGS", "context_of", "load_dataset", "load_run", "model_file", "open_run", "placed", "read_metrics"]
+__all__ = [
+    "COMPRESSED",
+    "LOGS",
+    "context_of",
+    "load_dataset",
+    "load_run",
+    "model_file",
+    "open_run",
+    "placed",
+    "read_metrics",
+]
 
 LOGS = "logs"
 """Folder of a run directory for tracebacks of plugins."""
@@ -52,7 +62,8 @@ def load_dataset(
     """The data set of a run's configuration.
 
     Args:
-        run_dir: the finished run that the configuration was read from: messages name its file, and the traceback of a loader of
+        run_dir: the finished run that the configuration was read from: messages name its file, and the traceback of a
+        loader of
             another package is kept there, should it crash. None: a run that is only about to be made.
 
     Raises:
@@ -74,7 +85,8 @@ def load_dataset(
 
 
 def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:
-    """Configuration, task, model and model header of a run directory; the task reads positions in the world of the run's files.
+    """Configuration, task, model and model header of a run directory; the task reads positions in the world of the
+    run's files.
 
     Warns where another version of neuprim or of the task's package made the run.
 
@@ -106,7 +118,8 @@ def context_of(config: RunConfig, progress: Progress) -> SceneContext:
     """What a run's scene is loaded with.
 
     Raises:
-        ConfigError: a stored configuration has the scene contact an address, or write outside of the run (:mod:`neuprim.config.trust`).
+        ConfigError: a stored configuration has the scene contact an address, or write outside of the run
+        (:mod:`neuprim.config.trust`).
     """
     check_stored(config)
     return SceneContext(config.seed, cache_directory() / "scenes", progress, computing_device(config.renderer))
@@ -146,6 +159,8 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
         data = load_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: {error}") from error
-    if not isinstance(data, dict) or any(finite(data[name]) is None for name in ("ssim", "train_seconds") if data.get(name) is not None):
+    if not isinstance(data, dict) or any(
+        finite(data[name]) is None for name in ("ssim", "train_seconds") if data.get(name) is not None
+    ):
         raise DataError(f"{path}: expected an object with metrics")
     return data

@@ -4,7 +4,8 @@
     resolution=0.5           drawn at half the width and height, and enlarged by bilinear interpolation
     density.NAME=N           a density that does with less of something, such as neurons (Field.reductions)
     colour.NAME=N            the same of a colour: bands of spherical harmonics, terms in time
-    store.GROUP=FORMAT       means, shape, density or colour, or all, as a format of neuprim.runs.storage brings them back
+    store.GROUP=FORMAT       means, shape, density or colour, or all, as a format of neuprim.runs.storage brings them
+    back
 
 ``neuprim render``, ``neuprim eval`` and ``neuprim tradeoff`` take them after the run directory.
 """
@@ -89,9 +90,15 @@ class OperatingPoint:
         if image.shape[:2] == (camera.height, camera.width):
             return image
         size = (camera.height, camera.width)
-        return interpolate(image.permute(2, 0, 1)[None], size, mode="bilinear", align_corners=False)[0].permute(1, 2, 0).contiguous()
+        return (
+            interpolate(image.permute(2, 0, 1)[None], size, mode="bilinear", align_corners=False)[0]
+            .permute(1, 2, 0)
+            .contiguous()
+        )
 
-    def draw(self, model: Primitives, view: View, background: Tensor, drawn: Callable[[Tensor], None] = lambda alpha: None) -> Tensor:
+    def draw(
+        self, model: Primitives, view: View, background: Tensor, drawn: Callable[[Tensor], None] = lambda alpha: None
+    ) -> Tensor:
         """(H, W, C) image of a view of an :meth:`applied` model, without gradients; on the processor.
 
         Args:
@@ -108,7 +115,8 @@ def read_point(words: Sequence[str], usual: RenderSettings, model: Primitives) -
     """The operating point that words name, over ``usual`` settings, for a model.
 
     Raises:
-        ConfigError: a word that is none of :data:`HEADS`, a setting or format that does not exist, something that the model's fields cannot
+        ConfigError: a word that is none of :data:`HEADS`, a setting or format that does not exist, something that the
+        model's fields cannot
             do with less of, or a value that does not fit; one line with key, found and expected.
     """
     values: dict[str, Any] = dataclasses.asdict(usual)
@@ -129,7 +137,9 @@ def read_point(words: Sequence[str], usual: RenderSettings, model: Primitives) -
                 *(f"store.{name}" for name in (*GROUPS, ALL)),
                 *less_of(model.density, model.colour),
             ]
-            raise ConfigError(f"{assignment.key}: nothing that a finished run is drawn by{nearest(assignment.key, known)}")
+            raise ConfigError(
+                f"{assignment.key}: nothing that a finished run is drawn by{nearest(assignment.key, known)}"
+            )
     settings = checked(RenderSettings, values, "renderer")
     if settings.near == "auto":
         settings = dataclasses.replace(settings, near=usual.near)  # what the run's training decided

@@ -1,7 +1,8 @@
 """The paper's tables, and the runs that stand for their rows: ``neuprim bench paper``.
 
-What a run is compared by are its ``psnr``, and its ``ssim_3dgs`` and ``lpips_3dgs``, the rules by which tables like these are made. It is the
-last checkpoint of one seed; the paper's are the best of a run on the test views, whose number of seeds it does not say.
+What a run is compared by are its ``psnr``, and its ``ssim_3dgs`` and ``lpips_3dgs``, the rules by which tables like
+these are made. It is the last checkpoint of one seed; the paper's are the best of a run on the test views, whose number
+of seeds it does not say.
 """
 
 from __future__ import annotations
@@ -100,7 +101,9 @@ def _table(entry: Mapping[str, Any]) -> Table:
     rows = []
     for row in entry["rows"]:
         beside = row.get("beside")
-        rows.append(Row(row["name"], row["preset"], figures(row), (beside["name"], figures(beside)) if beside else ("", {})))
+        rows.append(
+            Row(row["name"], row["preset"], figures(row), (beside["name"], figures(beside)) if beside else ("", {}))
+        )
     images = dict(zip(scenes, entry.get("images", ()), strict="images" in entry))
     return Table(entry["title"], tuple(entry["tables"]), entry["loader"], scenes, images, tuple(rows))
 
@@ -167,9 +170,13 @@ def plan(
                     ]
                     if scene in table.images and (folder / table.images[scene]).is_dir():
                         own.append(f"scene.images={table.images[scene]}")
-                    found.append(Planned(table, row, scene, compose(["task=static", *own, *budget_words(budget), *words])))
+                    found.append(
+                        Planned(table, row, scene, compose(["task=static", *own, *budget_words(budget), *words]))
+                    )
     if not found:
-        raise ConfigError(f"--data {data}: no folder named like a scene; expected one of {', '.join(s for t in chosen for s in t.scenes)}")
+        raise ConfigError(
+            f"--data {data}: no folder named like a scene; expected one of {', '.join(s for t in chosen for s in t.scenes)}"
+        )
     return found
 
 
@@ -180,7 +187,8 @@ def _known(flag: str, given: Sequence[str] | Mapping[str, str], names: Sequence[
 
 
 def pace(planned: Planned, steps: int = 8) -> float:
-    """Seconds that a step takes at the start of a run, on this machine; a population that grows makes later ones slower."""
+    """Seconds that a step takes at the start of a run, on this machine; a population that grows makes later ones
+    slower."""
     fitted = start(planned.config)
     compile_kernels(fitted.trainer)
     with one_torch_thread():
@@ -191,7 +199,9 @@ def pace(planned: Planned, steps: int = 8) -> float:
         return (time.perf_counter() - begin) / steps
 
 
-def compared(planned: Planned, metrics: Mapping[str, Any]) -> Iterator[tuple[str, float | None, float | None, float | None]]:
+def compared(
+    planned: Planned, metrics: Mapping[str, Any]
+) -> Iterator[tuple[str, float | None, float | None, float | None]]:
     """(what, ours, the paper's, that of what the paper puts beside it) of a finished run; None for what is not there.
 
     LPIPS of another network than the paper's tools', VGG, is left out.

@@ -1,6 +1,8 @@
-"""Files of a model whose primitives are in parts: each rank brings its rows, the first one writes them as they come, and each reads its own again.
+"""Files of a model whose primitives are in parts: each rank brings its rows, the first one writes them as they come,
+and each reads its own again.
 
-No rank has the whole training state in memory at any time. The files are those of any run, which go on with any number of ranks, in parts or not.
+No rank has the whole training state in memory at any time. The files are those of any run, which go on with any number
+of ranks, in parts or not.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ def write_parts(
     header: Mapping[str, Any],
     rows: Callable[[str, Tensor], bool] = by_row,
 ) -> None:
-    """As :func:`~neuprim.core.checkpoint.write`, of tensors of which this rank has its rows; called on all ranks, written by the first.
+    """As :func:`~neuprim.core.checkpoint.write`, of tensors of which this rank has its rows; called on all ranks,
+    written by the first.
 
     Args:
         rows: which tensors are those; of the others every rank has all.
@@ -82,7 +85,8 @@ def read_part(path: Path, kind: str, ranks: Alone) -> tuple[dict[str, Any], dict
 
 
 def assemble(fitted: Fitted, directory: Path) -> None:
-    """At the end, on the first rank: the whole model's parameters, as its file has them, take the place of this rank's part and its moments."""
+    """At the end, on the first rank: the whole model's parameters, as its file has them, take the place of this rank's
+    part and its moments."""
     if fitted.trainer.ranks.parts:
         model, _ = checkpoint.load_model(directory / "model.safetensors", fitted.task)
         fitted.trainer.leave(model.params)

@@ -22,7 +22,8 @@ def result_files(run_dir: Path) -> list[Path]:
 
 
 def discard_results(run_dir: Path) -> None:
-    """Remove them. Rule: a run that goes on does so before its model changes, so that a kill never leaves numbers of another model beside it."""
+    """Remove them. Rule: a run that goes on does so before its model changes, so that a kill never leaves numbers of
+    another model beside it."""
     for path in result_files(run_dir):
         path.unlink(missing_ok=True)
 
@@ -32,4 +33,6 @@ def refuse_results(run_dir: Path, targets: Iterable[Path]) -> None:
     own = {path.resolve() for path in result_files(run_dir)}
     for target in targets:
         if target.resolve() in own:
-            raise ConfigError(f"{target}: is a picture of the run's report; --force replaces it, --out PATH writes elsewhere")
+            raise ConfigError(
+                f"{target}: is a picture of the run's report; --force replaces it, --out PATH writes elsewhere"
+            )

@@ -30,16 +30,18 @@ def run(
 ) -> Path:
     """Fit, measure and report; returns the run directory.
 
-    Ctrl-C finishes the step, writes a checkpoint and a report, and raises KeyboardInterrupt; a second one stops at once.
+    Ctrl-C finishes the step, writes a checkpoint and a report, and raises KeyboardInterrupt; a second one stops at
+    once.
 
     Args:
         events: told what happens.
         between: called between training steps, see :data:`~neuprim.runs.training.Between`.
-        ranks: the processes that train this model, each of which calls this with the same configuration; the first one alone writes files.
-        launcher: where the chunks of a scene are fitted, if it is fitted in chunks.
+        ranks: the processes that train this model, each of which calls this with the same configuration; the first one
+        alone writes files. launcher: where the chunks of a scene are fitted, if it is fitted in chunks.
 
     Raises:
-        NeuprimError: the input's fault, another process that is at work there, or numbers that left the finite; whatever was on disk before
+        NeuprimError: the input's fault, another process that is at work there, or numbers that left the finite;
+        whatever was on disk before
             is intact.
         RankError: another rank is gone; what was trained is in the checkpoint.
     """

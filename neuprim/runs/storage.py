@@ -1,7 +1,7 @@
 """How a model's numbers may be stored, and what comes back of them: the one table of formats. A new one is a row here.
 
-A model file of neuprim holds float32, unless it was compressed (:mod:`neuprim.core.compressed`). What it would be otherwise is tried in memory:
-values are rounded to what the format brings back, and its bytes are counted.
+A model file of neuprim holds float32, unless it was compressed (:mod:`neuprim.core.compressed`). What it would be
+otherwise is tried in memory: values are rounded to what the format brings back, and its bytes are counted.
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ FULL = "float32"
 
 FORMATS: Mapping[str, Format] = {
     FULL: Format("32-bit floats, as model files hold them", lambda value: value, lambda value: 4 * value.numel()),
-    "float16": Format("16-bit floats, 11 bits of precision", lambda value: value.half().float(), lambda value: 2 * value.numel()),
+    "float16": Format(
+        "16-bit floats, 11 bits of precision", lambda value: value.half().float(), lambda value: 2 * value.numel()
+    ),
     "uint8": Format("8-bit codes, even steps between the ends of each column", _codes, _code_bytes),
 }
 
@@ -98,14 +100,18 @@ def rounded(model: Primitives, stored: Mapping[str, str]) -> Primitives:
 
 def stored_bytes(model: Primitives, stored: Mapping[str, str]) -> int:
     """Bytes of the model's tensors, each group in its format."""
-    return sum(FORMATS[stored.get(group, FULL)].bytes(model.params[name]) for group in GROUPS for name in parameters_of(model, group))
+    return sum(
+        FORMATS[stored.get(group, FULL)].bytes(model.params[name])
+        for group in GROUPS
+        for name in parameters_of(model, group)
+    )
 
 
 def file_bytes(path: Path, whole: Primitives, part: Primitives, stored: Mapping[str, str]) -> int:
     """Bytes of a run's model file if it held ``part`` of the ``whole`` model that is in it, in formats.
 
-    A compressed file, and one that leaves zeros out, has its own size as it is; less of it, or other formats, are counted as the tensors of a
-    file that is not compressed and leaves nothing out.
+    A compressed file, and one that leaves zeros out, has its own size as it is; less of it, or other formats, are
+    counted as the tensors of a file that is not compressed and leaves nothing out.
     """
     size, after = path.stat().st_size, stored_bytes(part, stored)
     if not is_compressed(path) and "apart" not in read_header(path, "model"):

@@ -38,7 +38,8 @@ from neuprim.runs.results import discard_results
 __all__ = ["COMPILING", "Between", "alone", "make_ready", "save", "train"]
 
 Between = Callable[[Fitted, threading.Event], None]
-"""Called on the training's thread before its first step and after every one, with what is trained and the event that ends the training as
+"""Called on the training's thread before its first step and after every one, with what is trained and the event that
+ends the training as
 Ctrl-C does. It may look at the state, save it and wait, and must not change it."""
 
 COMPILING = "compiling kernels, once per installation (about a minute)"
@@ -58,14 +59,14 @@ def train(
     ranks: Alone = ALONE,
     make: Make | None = None,
 ) -> tuple[Fitted, bool]:
-    """Train until the budget is used or Ctrl-C, which finishes the step; leaves configuration, curve, checkpoint and model in the run's
-    directory either way. Of several ranks the first one writes them.
+    """Train until the budget is used or Ctrl-C, which finishes the step; leaves configuration, curve, checkpoint and
+    model in the run's directory either way. Of several ranks the first one writes them.
 
     Args:
         suspects: of the configuration, who is watched for crashes around this call.
         dataset: the scene of the configuration, if it is loaded already.
-        hold_out: n > 1: every n-th training view is a test view, and no other is; see :func:`~neuprim.core.data.held_out.held_out`.
-        between: called between steps, see :data:`Between`.
+        hold_out: n > 1: every n-th training view is a test view, and no other is; see
+        :func:`~neuprim.core.data.held_out.held_out`. between: called between steps, see :data:`Between`.
         make: what makes the trainer of a model that is there already; None: a fresh model is trained.
 
     Returns:
@@ -76,7 +77,9 @@ def train(
         RankError: another rank is gone; the first one, if it is there, has written a checkpoint of the last whole step.
     """
     ranks = in_parts(config, ranks)
-    ahead = compiled_ahead(config.renderer) if dataset is None else None  # beside loading; of data that are there nothing is waited for
+    ahead = (
+        compiled_ahead(config.renderer) if dataset is None else None
+    )  # beside loading; of data that are there nothing is waited for
     edge = config.model.density.get("edge", 0)  # of a density of ours; of another's, whatever the word means there
     with ranks.in_turn(), compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
         fitted = start(config, events, dataset, suspects, hold_out, make)
@@ -93,7 +96,11 @@ def train(
             kernels.wait()
         make_ready(fitted.trainer, events)
     if ranks.size > 1:
-        facts = {**begun, "steps done": fitted.trainer.step, "primitives": fitted.trainer.count} if begun else _begun(fitted.trainer)
+        facts = (
+            {**begun, "steps done": fitted.trainer.step, "primitives": fitted.trainer.count}
+            if begun
+            else _begun(fitted.trainer)
+        )
         ranks.agree("expected the same words, data and output directory on all ranks", facts)
     return fitted, _train(fitted, events, between) if ranks.first else _follow(fitted)
 
@@ -128,7 +135,9 @@ def _resume(fitted: Fitted, events: Events) -> None:
     check_resumed(header.get("made_by"), config.made_by, saved)
     fitted.trainer.load_state(tensors, header, str(saved))
     was, now = World.of(header, str(saved)), fitted.dataset.world
-    if ("world" in header or fitted.dataset.placement is None) and not torch.equal(was.scene_from_world, now.scene_from_world):
+    if ("world" in header or fitted.dataset.placement is None) and not torch.equal(
+        was.scene_from_world, now.scene_from_world
+    ):
         origins = [w.world_points(torch.zeros(3, dtype=torch.float64)).tolist() for w in (was, now)]
         raise CheckpointError(
             f"{saved}: the scene's origin is {origins[0]} of the data's files, and now {origins[1]}; expected the same data"
@@ -170,19 +179,25 @@ def _train(fitted: Fitted, events: Events, between: Between) -> bool:
 
 @contextmanager
 def _full(fitted: Fitted, file: Path) -> Iterator[None]:
-    """A file of the way that cannot be written, as on a full disk, is one warning: training goes on to the next checkpoint, and only the last
-    one is an error. Where several ranks write one file together, it is an error at once."""
+    """A file of the way that cannot be written, as on a full disk, is one warning: training goes on to the next
+    checkpoint, and only the last one is an error. Where several ranks write one file together, it is an error at
+    once."""
     try:
         yield
     except (CheckpointError, OSError) as error:
         if fitted.trainer.ranks.parts:
             raise
-        said = str(error) if isinstance(error, CheckpointError) else f"{file}: cannot be written ({error.strerror or error})"
+        said = (
+            str(error)
+            if isinstance(error, CheckpointError)
+            else f"{file}: cannot be written ({error.strerror or error})"
+        )
         warn_once(f"{said}; training goes on from step {fitted.trainer.step} to the next checkpoint")
 
 
 def _follow(fitted: Fitted) -> bool:
-    """The same on a rank that writes nothing; one that has a part of the primitives hands it to the first, which writes."""
+    """The same on a rank that writes nothing; one that has a part of the primitives hands it to the first, which
+    writes."""
     ranks = fitted.trainer.ranks
     with interruptible(terminated=True) as stop, one_torch_thread():
         last, due = ranks.last(stop.is_set), ranks.saves(lambda: False)
@@ -200,7 +215,8 @@ def _follow(fitted: Fitted) -> bool:
 
 @contextmanager
 def _kept(fitted: Fitted) -> Iterator[None]:
-    """A rank that is gone costs no step: what the others have is saved. Where it had primitives of its own they are gone, and the last checkpoint counts."""
+    """A rank that is gone costs no step: what the others have is saved. Where it had primitives of its own they are
+    gone, and the last checkpoint counts."""
     try:
         yield
     except RankError:
@@ -214,7 +230,11 @@ def save(fitted: Fitted) -> None:
     trainer, config, dataset = fitted.trainer, fitted.config, fitted.dataset
     tensors, header = trainer.state()
     made_by = {} if config.made_by is None else {"made_by": config.made_by.to_dict()}
-    world = dataset.world.to_json() if dataset.placement is None else {**dataset.placement.to_json(), **dataset.world.to_json()}
+    world = (
+        dataset.world.to_json()
+        if dataset.placement is None
+        else {**dataset.placement.to_json(), **dataset.world.to_json()}
+    )
     place = {} if dataset.world.identity and dataset.placement is None else {"world": world}
     header = {"task": config.task, **made_by, **place, **header}
     files = [config.output_dir / f"{name}.safetensors" for name in ("checkpoint", "model")]

@@ -1,7 +1,8 @@
 """Short trainings that a search compares, each in a folder that is a run directory without report and pictures.
 
-``trial.json`` beside the run's files says what was asked for and, once it is known, what came out. A trial that is done is read back; one
-that was interrupted goes on from its checkpoint; one whose folder was made with other settings is trained anew there.
+``trial.json`` beside the run's files says what was asked for and, once it is known, what came out. A trial that is done
+is read back; one that was interrupted goes on from its checkpoint; one whose folder was made with other settings is
+trained anew there.
 """
 
 from __future__ import annotations
@@ -46,9 +47,9 @@ class Trial:
     """What a search asks for.
 
     Attributes:
-        config: composed; its ``output_dir`` is the trial's folder, its budget in ``train.iterations`` or ``train.max_seconds``.
-        hold_out: n > 1: judged by every n-th training view, which it does not learn from; 0: by the test views.
-        views: at most so many of the views that judge are measured, evenly spread.
+        config: composed; its ``output_dir`` is the trial's folder, its budget in ``train.iterations`` or
+        ``train.max_seconds``. hold_out: n > 1: judged by every n-th training view, which it does not learn from; 0: by
+        the test views. views: at most so many of the views that judge are measured, evenly spread.
     """
 
     config: RunConfig
@@ -106,7 +107,8 @@ class Outcome:
 def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = silent) -> Outcome:
     """Train and judge, or read back what is there already.
 
-    Ctrl-C while it trains finishes the step, writes a checkpoint and raises KeyboardInterrupt; the same call goes on from there.
+    Ctrl-C while it trains finishes the step, writes a checkpoint and raises KeyboardInterrupt; the same call goes on
+    from there.
 
     Args:
         dataset: the scene of the configuration, whole, if it is loaded already.
@@ -131,7 +133,13 @@ def _run_trial(trial: Trial, dataset: Dataset | None, events: Events) -> Outcome
         changed = sorted(_names(before["asked"], asked))
         events(Note(f"{folder}: tried with another {', '.join(changed)}; trained anew"))
         (folder / "checkpoint.safetensors").unlink(missing_ok=True)
-    if same and before is not None and before["outcome"] is not None and before["views"] == trial.views and _whole(folder):
+    if (
+        same
+        and before is not None
+        and before["outcome"] is not None
+        and before["views"] == trial.views
+        and _whole(folder)
+    ):
         return _outcome(folder / FILE, before["outcome"])
     record = {"format": FORMAT, "asked": asked, "views": trial.views, "outcome": None}
     write_json(folder / FILE, record)
@@ -161,7 +169,9 @@ def _judged(fitted: Fitted, views: int) -> Outcome:
     model, dataset, config = fitted.model, fitted.dataset, fitted.config
     truths = truths_of(dataset, views)
     rows, seconds = [], []
-    draw(model, truths[0].view, config.renderer, dataset.background)  # whatever a first frame loads is no part of its time
+    draw(
+        model, truths[0].view, config.renderer, dataset.background
+    )  # whatever a first frame loads is no part of its time
     for truth in truths:
         start = time.perf_counter()
         drawn = draw(model, truth.view, config.renderer, dataset.background)
@@ -213,10 +223,17 @@ def _read(file: Path) -> dict[str, Any] | None:
     data = read_json(file, "the record of a trial", "delete its folder to train anew")
     if data is None:
         return None
-    if not isinstance(data, dict) or not isinstance(data.get("asked"), dict) or "outcome" not in data or "views" not in data:
+    if (
+        not isinstance(data, dict)
+        or not isinstance(data.get("asked"), dict)
+        or "outcome" not in data
+        or "views" not in data
+    ):
         raise DataError(f"{file}: not the record of a trial; delete its folder to train anew")
     if data.get("format") != FORMAT:
-        raise DataError(f"{file}: format {data.get('format')!r}; this neuprim reads {FORMAT}; delete its folder to train anew")
+        raise DataError(
+            f"{file}: format {data.get('format')!r}; this neuprim reads {FORMAT}; delete its folder to train anew"
+        )
     return data
 
 

@@ -15,7 +15,8 @@ __all__ = ["Truth", "masked", "truths_of"]
 
 @dataclass(frozen=True)
 class Truth:
-    """A held-out view: its name, camera and conditions, its true image over the background, (H, W, C), and which pixels count."""
+    """A held-out view: its name, camera and conditions, its true image over the background, (H, W, C), and which pixels
+    count."""
 
     view: View
     image: Tensor

@@ -1,7 +1,7 @@
 """Rays against triangles compiled with numba: a bounding volume hierarchy for machines embree has no package for.
 
-Median splits along the longest axis, nearest child first, Möller and Trumbore's intersection in double precision ("Fast, minimum storage
-ray-triangle intersection", 1997), both sides of a triangle counting.
+Median splits along the longest axis, nearest child first, Möller and Trumbore's intersection in double precision
+("Fast, minimum storage ray-triangle intersection", 1997), both sides of a triangle counting.
 """
 
 from __future__ import annotations
@@ -25,18 +25,22 @@ class Hierarchy:
         self._corners = corners[self._order]  # leaves read neighbouring memory
 
     def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """(N,) each: triangle or -1, the weights u and v of its second and third corner, distance in lengths of ``d`` (N, 3)."""
+        """(N,) each: triangle or -1, the weights u and v of its second and third corner, distance in lengths of ``d``
+        (N, 3)."""
         limit = np.full(len(o), np.inf)
         index, u, v, distance = _trace(self._corners, self._low, self._high, self._links, o, d, limit, False)
         return np.where(index >= 0, self._order[index], -1), u, v, distance
 
     def any(self, o: NDArray, d: NDArray, distance: NDArray) -> NDArray[np.bool_]:
         """(N,) whether a triangle is nearer than ``distance`` (N,)."""
-        return _trace(self._corners, self._low, self._high, self._links, o, d, distance.astype(np.float64), True)[0] >= 0
+        return (
+            _trace(self._corners, self._low, self._high, self._links, o, d, distance.astype(np.float64), True)[0] >= 0
+        )
 
 
 def _build(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Order of the triangles, node boxes, and per node (first child, 0) or (first triangle, count); children are neighbours.
+    """Order of the triangles, node boxes, and per node (first child, 0) or (first triangle, count); children are
+    neighbours.
 
     Plain numpy: compiling a sort takes longer than this takes.
     """

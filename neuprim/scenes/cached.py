@@ -14,7 +14,8 @@ __all__ = ["cached_folder"]
 def cached_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
     """Have ``write`` fill the folder ``final`` unless all files are there; returns it.
 
-    The folder appears under its name only when complete, so an interrupted run leaves nothing that could be taken for a data set.
+    The folder appears under its name only when complete, so an interrupted run leaves nothing that could be taken for a
+    data set.
 
     Args:
         files: every file that belongs there, relative to the folder.

@@ -59,9 +59,13 @@ class ImageSet(Generic[V]):
             DataError: the cache directory cannot be written.
         """
         files = [f"transforms_{split}.json" for split in self.splits]
-        files += [f"{split}/{file}" for split, views in self.splits.items() for view in views for file in self.files(view)]
+        files += [
+            f"{split}/{file}" for split, views in self.splits.items() for view in views for file in self.files(view)
+        ]
         what = f"scene {self.name}: cannot write the generated images"
-        return cached_folder(Path(cache_dir) / f"{self.name}-{self.key}", files, lambda folder: self._write(folder, progress), what)
+        return cached_folder(
+            Path(cache_dir) / f"{self.name}-{self.key}", files, lambda folder: self._write(folder, progress), what
+        )
 
     def _write(self, folder: Path, progress: Progress) -> None:
         progress(f"{self.name}: building the scene", 0.0)

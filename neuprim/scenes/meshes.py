@@ -16,14 +16,16 @@ from scipy import sparse
 __all__ = ["arc_tube", "ball", "chamfered_box", "corner_normals", "lathe", "merged", "pyramid", "ring", "rod"]
 
 CREASE_DEGREES = 24.0
-"""Faces that meet at more than this angle keep their own normals: chamfers and caps stay hard, facets of round parts blend."""
+"""Faces that meet at more than this angle keep their own normals: chamfers and caps stay hard, facets of round parts
+blend."""
 
 CORNERS_AT_ONCE = 1 << 18
 """Bounds the memory for pairs of corners."""
 
 
 def chamfered_box(size: ArrayLike, centre: ArrayLike, chamfer: float) -> trimesh.Trimesh:
-    """An axis-aligned box of edge lengths ``size`` (3,) about ``centre`` (3,), every edge cut at 45 degrees by ``chamfer``."""
+    """An axis-aligned box of edge lengths ``size`` (3,) about ``centre`` (3,), every edge cut at 45 degrees by
+    ``chamfer``."""
     half = np.asarray(size, dtype=np.float64) / 2
     # Each corner becomes a triangle: one axis at full extent, the other two drawn in. Their hull is the chamfered box.
     pulls = sorted(set(permutations((0.0, chamfer, chamfer))))
@@ -34,7 +36,8 @@ def chamfered_box(size: ArrayLike, centre: ArrayLike, chamfer: float) -> trimesh
 
 
 def pyramid(base: float, height: float, centre: ArrayLike, turn: float) -> trimesh.Trimesh:
-    """A four-sided pyramid: square of edge ``base`` about ``centre`` (3,) turned by ``turn`` radians about z, apex ``height`` above."""
+    """A four-sided pyramid: square of edge ``base`` about ``centre`` (3,) turned by ``turn`` radians about z, apex
+    ``height`` above."""
     angles = turn + np.pi / 4 + np.pi / 2 * np.arange(4)
     square = np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1) * base / np.sqrt(2)
     vertices = np.concatenate([square, [[0.0, 0.0, height]]]) + np.asarray(centre, dtype=np.float64)
@@ -50,7 +53,8 @@ def ball(centre: ArrayLike, radius: float, fine: bool = True) -> trimesh.Trimesh
 
 
 def ring(centre: ArrayLike, axis: ArrayLike, major: float, minor: float) -> trimesh.Trimesh:
-    """A torus about ``centre`` (3,): circle of radius ``major`` in the plane normal to ``axis`` (3,), tube radius ``minor``."""
+    """A torus about ``centre`` (3,): circle of radius ``major`` in the plane normal to ``axis`` (3,), tube radius
+    ``minor``."""
     mesh = trimesh.creation.torus(major, minor, major_sections=128, minor_sections=48)
     mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis))
     mesh.apply_translation(centre)
@@ -63,27 +67,39 @@ def rod(start: ArrayLike, end: ArrayLike, radius: float) -> trimesh.Trimesh:
     return lathe(start, np.subtract(end, start), [(0.0, radius), (length, radius)], sections=24)
 
 
-def lathe(start: ArrayLike, axis: ArrayLike, profile: Sequence[tuple[float, float]], sections: int = 96) -> trimesh.Trimesh:
-    """A solid of revolution: ``profile`` lists (distance along ``axis`` from ``start``, radius); equal distances make a shoulder."""
+def lathe(
+    start: ArrayLike, axis: ArrayLike, profile: Sequence[tuple[float, float]], sections: int = 96
+) -> trimesh.Trimesh:
+    """A solid of revolution: ``profile`` lists (distance along ``axis`` from ``start``, radius); equal distances make a
+    shoulder."""
     direction = np.asarray(axis, dtype=np.float64)
     direction = direction / np.linalg.norm(direction)
     side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
     side /= np.linalg.norm(side)
     heights, radii = np.array(profile, dtype=np.float64).T
     path = np.asarray(start, dtype=np.float64) + heights[:, None] * direction
-    return _tube(path, np.broadcast_to(side, path.shape), np.cross(direction, side), np.stack([radii, radii], axis=1), sections)
+    return _tube(
+        path, np.broadcast_to(side, path.shape), np.cross(direction, side), np.stack([radii, radii], axis=1), sections
+    )
 
 
 def arc_tube(
-    centre: ArrayLike, first: ArrayLike, second: ArrayLike, radius: float, angles: NDArray[np.float64], radii: ArrayLike, sections: int = 64
+    centre: ArrayLike,
+    first: ArrayLike,
+    second: ArrayLike,
+    radius: float,
+    angles: NDArray[np.float64],
+    radii: ArrayLike,
+    sections: int = 64,
 ) -> trimesh.Trimesh:
     """A tube swept along a circular arc, with a radius that may change on the way.
 
     Args:
-        centre, first, second: (3,) circle centre and orthonormal axes of its plane; angle 0 lies on ``first``, 90 degrees on ``second``.
-        radius: of the arc.
+        centre, first, second: (3,) circle centre and orthonormal axes of its plane; angle 0 lies on ``first``, 90
+        degrees on ``second``. radius: of the arc.
         angles: (n,) ascending, in radians.
-        radii: (n, 2) half axes of the elliptic cross-section, in the arc's plane and across it; (n,) or a number for a round one.
+        radii: (n, 2) half axes of the elliptic cross-section, in the arc's plane and across it; (n,) or a number for a
+        round one.
     """
     one, two = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     outward = np.cos(angles)[:, None] * one + np.sin(angles)[:, None] * two
@@ -95,15 +111,20 @@ def arc_tube(
 
 
 def _tube(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sections: int) -> trimesh.Trimesh:
-    """Rings of ``sections`` points about ``path`` (n, 3) in the planes of ``side`` (n, 3) and ``across`` (3,), joined and capped."""
+    """Rings of ``sections`` points about ``path`` (n, 3) in the planes of ``side`` (n, 3) and ``across`` (3,), joined
+    and capped."""
     turn = 2 * np.pi * np.arange(sections) / sections
     rings = (
-        path[:, None] + (half[:, :1] * np.cos(turn))[..., None] * side[:, None] + (half[:, 1:] * np.sin(turn))[..., None] * across
+        path[:, None]
+        + (half[:, :1] * np.cos(turn))[..., None] * side[:, None]
+        + (half[:, 1:] * np.sin(turn))[..., None] * across
     )  # (n, sections, 3)
     n = len(path)
     here = (np.arange(n - 1)[:, None] * sections + np.arange(sections)).ravel()
     right = (np.arange(n - 1)[:, None] * sections + (np.arange(sections) + 1) % sections).ravel()
-    walls = np.concatenate([np.stack([here, right, right + sections], 1), np.stack([here, right + sections, here + sections], 1)])
+    walls = np.concatenate(
+        [np.stack([here, right, right + sections], 1), np.stack([here, right + sections, here + sections], 1)]
+    )
     rim, following = np.arange(sections), (np.arange(sections) + 1) % sections
     first, last = n * sections, n * sections + 1
     bottom = np.stack([np.full(sections, first), following, rim], 1)
@@ -121,13 +142,17 @@ def merged(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def corner_normals(mesh: trimesh.Trimesh, crease: float = CREASE_DEGREES) -> NDArray[np.float64]:
-    """(F, 3, 3) unit normals at each face's corners: the mean over faces around the vertex that turn by less than ``crease`` degrees.
+    """(F, 3, 3) unit normals at each face's corners: the mean over faces around the vertex that turn by less than
+    ``crease`` degrees.
 
-    Faces are weighted by their angle at the vertex, so the result does not depend on how a flat part was cut into triangles.
+    Faces are weighted by their angle at the vertex, so the result does not depend on how a flat part was cut into
+    triangles.
     """
     faces, flat = mesh.faces.view(np.ndarray), mesh.face_normals.view(np.ndarray)
     corners, angles = faces.size, mesh.face_angles.view(np.ndarray).ravel()
-    around = sparse.csr_matrix((np.ones(corners), (np.arange(corners), faces.ravel())), shape=(corners, len(mesh.vertices)))
+    around = sparse.csr_matrix(
+        (np.ones(corners), (np.arange(corners), faces.ravel())), shape=(corners, len(mesh.vertices))
+    )
     touching = around.T.tocsr()
     normals = np.empty((corners, 3))
     for begin in range(0, corners, CORNERS_AT_ONCE):

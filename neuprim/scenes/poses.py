@@ -1,4 +1,5 @@
-"""Where generated cameras and lights stand, z up: directions on the sphere, and the pose of a camera that looks at the origin."""
+"""Where generated cameras and lights stand, z up: directions on the sphere, and the pose of a camera that looks at the
+origin."""
 
 from __future__ import annotations
 

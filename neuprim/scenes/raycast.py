@@ -1,7 +1,7 @@
 """Rays against the solids: what a ray meets first, and whether anything lies between two points.
 
-Embree does the work where its package ``embreex`` has a wheel; elsewhere (Linux and Windows on ARM) the compiled search of :mod:`.bvh`
-gives the same answers, about ten times slower. :attr:`Scene.engine` says which one runs.
+Embree does the work where its package ``embreex`` has a wheel; elsewhere (Linux and Windows on ARM) the compiled search
+of :mod:`.bvh` gives the same answers, about ten times slower. :attr:`Scene.engine` says which one runs.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ __all__ = ["Engine", "Hits", "Scene"]
 Engine = Literal["auto", "embree", "numba"]
 
 LIFT = 2e-4
-"""How far a shadow ray starts above the surface, in scene units: a hundred times the rounding of single precision in the unit box."""
+"""How far a shadow ray starts above the surface, in scene units: a hundred times the rounding of single precision in
+the unit box."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +80,13 @@ class Scene:
         meshes = [solid.mesh for solid in self.solids]
         start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
         self._vertices = np.concatenate([mesh.vertices.view(np.ndarray) for mesh in meshes]).astype(np.float32)
-        self._faces = np.concatenate([mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start, strict=False)]).astype(
-            np.int32
-        )
+        self._faces = np.concatenate(
+            [mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start, strict=False)]
+        ).astype(np.int32)
         self._face_normals = np.concatenate([mesh.face_normals.view(np.ndarray) for mesh in meshes]).astype(np.float32)
-        self._corner_normals = np.concatenate([corner_normals(s.mesh) if s.normals is None else s.normals for s in self.solids]).astype(
-            np.float32
-        )
+        self._corner_normals = np.concatenate(
+            [corner_normals(s.mesh) if s.normals is None else s.normals for s in self.solids]
+        ).astype(np.float32)
         self._owner = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         self._gloss = np.array([solid.gloss for solid in self.solids], dtype=np.float32)
         self._specular = np.array([solid.specular for solid in self.solids], dtype=np.float32)
@@ -115,11 +116,13 @@ class Scene:
         return Hits(hit, position, distance, normal, face, albedo, gloss, specular, owner, triangle, weight)
 
     def _first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """(N,) each: triangle or -1, the weights u and v of its second and third corner, distance in lengths of ``d`` (N, 3)."""
+        """(N,) each: triangle or -1, the weights u and v of its second and third corner, distance in lengths of ``d``
+        (N, 3)."""
         return self._search.first(o, d)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
-        """(N,) whether a surface lies within ``distance`` (in lengths of the direction) of the points (N, 3) along directions (N, 3).
+        """(N,) whether a surface lies within ``distance`` (in lengths of the direction) of the points (N, 3) along
+        directions (N, 3).
 
         Start from :meth:`Hits.lifted`, not from the bare position: a point on a triangle may meet that triangle.
         """
@@ -142,7 +145,8 @@ class _Search(Protocol):
     """Float32 rays (N, 3) against one triangle soup."""
 
     def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """(N,) each: triangle or -1, the weights u and v of its second and third corner, distance in lengths of ``d``."""
+        """(N,) each: triangle or -1, the weights u and v of its second and third corner, distance in lengths of
+        ``d``."""
 
     def any(self, o: NDArray, d: NDArray, distance: NDArray) -> NDArray[np.bool_]:
         """(N,) whether a triangle is nearer than ``distance`` (N,)."""
@@ -173,7 +177,9 @@ def _open(vertices: NDArray, faces: NDArray, engine: Engine) -> tuple[Literal["e
             return "embree", _Embree(vertices, faces)
         except ImportError as error:
             if engine == "embree":
-                raise BackendUnavailable(f"ray casting with embree needs the package 'embreex' (pip install embreex): {error}") from error
+                raise BackendUnavailable(
+                    f"ray casting with embree needs the package 'embreex' (pip install embreex): {error}"
+                ) from error
     from neuprim.scenes.bvh import Hierarchy
 
     return "numba", Hierarchy(vertices, faces)

@@ -16,7 +16,8 @@ Array = NDArray[np.float32]
 
 
 def lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Array]:
-    """The cosine to the light, zero where the surface faces away, and pi times the highlight's reflectance; (M,) float32 each.
+    """The cosine to the light, zero where the surface faces away, and pi times the highlight's reflectance; (M,)
+    float32 each.
 
     Args:
         to_eye, to_light: (M, 3) or (3,) unit vectors away from the surface.
@@ -31,7 +32,8 @@ def lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Ar
 
 
 def reflected(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
-    """(M, 3) linear RGB radiance towards the eye per unit irradiance of a surface facing the light: reflectance times cosine.
+    """(M, 3) linear RGB radiance towards the eye per unit irradiance of a surface facing the light: reflectance times
+    cosine.
 
     Args:
         to_eye, to_light: (M, 3) or (3,) unit vectors away from the surface.
@@ -42,4 +44,6 @@ def reflected(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
 
 def dot(a: Array, b: Array) -> Array:
     """(M,) products of (M, 3) rows with (M, 3) rows or one (3,) vector."""
-    return np.einsum("nc,nc->n", a, np.broadcast_to(b, a.shape))  # several times faster than a sum over an axis of three
+    return np.einsum(
+        "nc,nc->n", a, np.broadcast_to(b, a.shape)
+    )  # several times faster than a sum over an axis of three

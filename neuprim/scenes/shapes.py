@@ -1,7 +1,8 @@
 """The solids of the built-in scenes: a power drill over a chequered plate, and small things that are hard to fit.
 
-Sharp edges (chamfered boxes, a pyramid, a plate), thin parts (drill bit, pins, a wire cube, a trigger guard) and smooth curves (grip, ring,
-banana) in saturated colours, all inside the box [-1, 1]^3 with z up. Nothing here knows about lights or cameras, and nothing is random.
+Sharp edges (chamfered boxes, a pyramid, a plate), thin parts (drill bit, pins, a wire cube, a trigger guard) and smooth
+curves (grip, ring, banana) in saturated colours, all inside the box [-1, 1]^3 with z up. Nothing here knows about
+lights or cameras, and nothing is random.
 """
 
 from __future__ import annotations
@@ -120,7 +121,12 @@ def _drill() -> list[Solid]:
             two_tone("#f2600c", "#fff4e0", lambda p: np.abs(p[:, 2] - 0.37) < 0.022),
             0.5,
         ),
-        Solid("gearbox", lathe([0.12, 0, axis_z], [1, 0, 0], [(0, 0.125), (0.05, 0.15), (0.13, 0.15), (0.19, 0.1)]), plain("#2b2d42"), 0.6),
+        Solid(
+            "gearbox",
+            lathe([0.12, 0, axis_z], [1, 0, 0], [(0, 0.125), (0.05, 0.15), (0.13, 0.15), (0.19, 0.1)]),
+            plain("#2b2d42"),
+            0.6,
+        ),
         Solid(
             "chuck",
             lathe([0.29, 0, axis_z], [1, 0, 0], [(0, 0.07), (0.02, 0.09), (0.15, 0.09), (0.22, 0.05), (0.24, 0.032)]),
@@ -139,7 +145,12 @@ def _drill() -> list[Solid]:
             two_tone("#2a3bb8", "#19c3e6", grip_ribs),
             0.3,
         ),
-        Solid("guard", arc_tube([-0.27, 0, 0.22], [1, 0, 0], [0, 0, 1], 0.3, guard, 0.014, sections=32), plain("#d7263d"), 0.6),
+        Solid(
+            "guard",
+            arc_tube([-0.27, 0, 0.22], [1, 0, 0], [0, 0, 1], 0.3, guard, 0.014, sections=32),
+            plain("#d7263d"),
+            0.6,
+        ),
         Solid("trigger", chamfered_box([0.06, 0.07, 0.14], [-0.19, 0, 0.19], 0.012), plain("#d7263d"), 0.6),
         Solid(
             "battery",
@@ -160,7 +171,10 @@ def _wire_cube() -> list[Solid]:
     turn = trimesh.transformations.rotation_matrix(np.radians(20.0), [0, 0, 1])[:3, :3]
     corner = {sign: centre + turn @ (np.array(sign) * side / 2) for sign in product((-1, 1), repeat=3)}
     rods = [
-        rod(corner[a], corner[b], thick) for a in corner for b in corner if a < b and sum(x != y for x, y in zip(a, b, strict=True)) == 1
+        rod(corner[a], corner[b], thick)
+        for a in corner
+        for b in corner
+        if a < b and sum(x != y for x, y in zip(a, b, strict=True)) == 1
     ]
     knots = [ball(point, 2 * thick, fine=False) for point in corner.values()]
     return [
@@ -194,7 +208,14 @@ def _small_things() -> list[Solid]:
         return (angle < 25) | (angle > 133)
 
     return [
-        Solid("ring", ring([0.46, -0.42, FLOOR + major + minor], [0.8, -0.6, 0.0], major, minor), plain("#8f35e8"), 0.8),
-        Solid("banana", arc_tube(bend, [1, 0, 0], [0, 1, 0], 0.34, span, thickness), two_tone("#ffd60a", "#5b3a12", tips), 0.3),
+        Solid(
+            "ring", ring([0.46, -0.42, FLOOR + major + minor], [0.8, -0.6, 0.0], major, minor), plain("#8f35e8"), 0.8
+        ),
+        Solid(
+            "banana",
+            arc_tube(bend, [1, 0, 0], [0, 1, 0], 0.34, span, thickness),
+            two_tone("#ffd60a", "#5b3a12", tips),
+            0.3,
+        ),
         Solid("pyramid", pyramid(0.24, 0.32, [0.66, 0.03, FLOOR], np.radians(15.0)), plain("#12b5e5"), 0.4),
     ]

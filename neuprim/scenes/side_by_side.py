@@ -1,4 +1,5 @@
-"""Pieces of work that do not depend on each other, in threads; NumPy and embree let go of the interpreter while they compute."""
+"""Pieces of work that do not depend on each other, in threads; NumPy and embree let go of the interpreter while they
+compute."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""What the shaders take from the mathematics: polynomials for cos, sinc and the soft edges' profiles, and a quadrature rule."""
+"""What the shaders take from the mathematics: polynomials for cos, sinc and the soft edges' profiles, and a quadrature
+rule."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ _POINTS = 16
 
 
 def shader_constants(edge: int) -> dict[str, list[float]]:
-    """Coefficients in z = v^2, highest power first, for v in turns, |v| <= 1/2, and the positive half of Gauss's and Legendre's rule.
+    """Coefficients in z = v^2, highest power first, for v in turns, |v| <= 1/2, and the positive half of Gauss's and
+    Legendre's rule.
 
     ``cos`` is cos(2 pi v), ``sinc`` sin(2 pi v)/(2 pi v), ``edge`` B_p(2 pi v) of :mod:`neuprim.core.model.edge`.
     """

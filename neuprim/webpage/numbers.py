@@ -1,4 +1,5 @@
-"""A model's parameters in a page: codes of a few bits or whole floats, as byte planes, gzipped; ``assets/codec.js`` reads them."""
+"""A model's parameters in a page: codes of a few bits or whole floats, as byte planes, gzipped; ``assets/codec.js``
+reads them."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ class PackedModel:
 
 
 def pack_model(model: Primitives, level: int) -> PackedModel:
-    """All parameters: every bit of them at level 0, else in as few bits as ``neuprim compress --level`` 1 to 5 gives them.
+    """All parameters: every bit of them at level 0, else in as few bits as ``neuprim compress --level`` 1 to 5 gives
+    them.
 
     Raises:
         ConfigError: no such level.
@@ -43,7 +45,9 @@ def pack_model(model: Primitives, level: int) -> PackedModel:
     parts, planes, params = zip(*made, strict=True) if made else ((), (), ())
     data = gzip.compress(b"".join(planes), 9, mtime=0)
     return PackedModel(
-        tuple(parts), data, Primitives(model.density, model.colour, {part["name"]: x for part, x in zip(parts, params, strict=True)})
+        tuple(parts),
+        data,
+        Primitives(model.density, model.colour, {part["name"]: x for part, x in zip(parts, params, strict=True)}),
     )
 
 
@@ -72,7 +76,14 @@ def _coded(model: Primitives, level: int) -> _Made:
         if isinstance(scheme, Rotations):
             about |= {"coding": "rotations", "bits": scheme.bits}
         else:
-            about |= {"coding": "columns", "bits": scheme.bits.tolist(), "low": scheme.low.tolist(), "high": scheme.high.tolist()}
-        section = pack(spec.name, spec.shape, scheme, codes.numpy(), ROTATIONS if isinstance(scheme, Rotations) else COLUMNS)
+            about |= {
+                "coding": "columns",
+                "bits": scheme.bits.tolist(),
+                "low": scheme.low.tolist(),
+                "high": scheme.high.tolist(),
+            }
+        section = pack(
+            spec.name, spec.shape, scheme, codes.numpy(), ROTATIONS if isinstance(scheme, Rotations) else COLUMNS
+        )
         made.append((about, b"".join(section.planes), scheme.values(codes).reshape(own.count, *spec.shape)))
     return made

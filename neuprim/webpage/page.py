@@ -101,8 +101,8 @@ def web_page(
 
     Args:
         rgb: which of the model's channels are red, green and blue.
-        settings: cuts and near plane are taken from here; one ray a pixel, whole primitives in the order of their centres.
-        level: of :func:`~neuprim.webpage.numbers.pack_model`.
+        settings: cuts and near plane are taken from here; one ray a pixel, whole primitives in the order of their
+        centres. level: of :func:`~neuprim.webpage.numbers.pack_model`.
         background: (C,) in the model's colour space.
         linear: whether colours are linear light, and need the sRGB curve to be seen.
         views: the page begins with the first one.
@@ -139,8 +139,15 @@ def web_page(
         "home": camera_numbers(home),
     }
     assets = resources.files(__package__).joinpath("assets")
-    texts = {path: assets.joinpath(path).read_text(encoding="utf-8") for path in ("page.html", "page.css", *_SHARED, *_MAIN, *_SHADERS)}
-    fields = "const fieldScripts = {\n" + "".join(f"{kind}: {script.rstrip().rstrip(';')},\n" for kind, script in scripts.items()) + "};"
+    texts = {
+        path: assets.joinpath(path).read_text(encoding="utf-8")
+        for path in ("page.html", "page.css", *_SHARED, *_MAIN, *_SHADERS)
+    }
+    fields = (
+        "const fieldScripts = {\n"
+        + "".join(f"{kind}: {script.rstrip().rstrip(';')},\n" for kind, script in scripts.items())
+        + "};"
+    )
     shaders = f"const shaders = {json.dumps({path: texts[path] for path in _SHADERS})};"
     parts = {
         "title": html.escape(name),
@@ -163,7 +170,9 @@ def _script(kind: str, field: Field) -> str:
     if text is None:
         raise ConfigError(f"{kind} field {type(field).__name__} has no script for browsers; a page cannot show it")
     if not isinstance(text, str) or "</script" in text.lower() or "<!--" in text:
-        raise ConfigError(f"{kind} field {type(field).__name__}: script() must be a text of JavaScript without an end of its element")
+        raise ConfigError(
+            f"{kind} field {type(field).__name__}: script() must be a text of JavaScript without an end of its element"
+        )
     return re.sub(r"^(//[^\n]*\n)+", "", text)
 
 
@@ -171,12 +180,17 @@ def _script(kind: str, field: Field) -> str:
 
 
 def fullest(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Tensor]:
-    """The conditions where a viewer begins; if no primitive is active there, those among them along one range where most are."""
+    """The conditions where a viewer begins; if no primitive is active there, those among them along one range where
+    most are."""
     start = {one.spec.name: one.value for one in conditions}
     if model.places(start)[1].count:
         return start
     ranges = [one.spec for one in conditions if one.spec.shape == () and one.spec.range[1] - one.spec.range[0] <= _WIDE]
-    others = [start | {spec.name: start[spec.name].new_tensor(x)} for spec in ranges for x in torch.linspace(*spec.range, FRAMES).tolist()]
+    others = [
+        start | {spec.name: start[spec.name].new_tensor(x)}
+        for spec in ranges
+        for x in torch.linspace(*spec.range, FRAMES).tolist()
+    ]
     return max(others, key=lambda found: model.places(found)[1].count, default=start)
 
 
@@ -184,7 +198,10 @@ def fullest(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Ten
 def _extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tuple[list[float], float, float]:
     """Middle and radius of what is drawn, and a density that few centres are above."""
     living = model.living(conditions)
-    means, scales = living.geometry.means.double(), living.geometry.scales.double().amax(1) if living.geometry.count else torch.zeros(0)
+    means, scales = (
+        living.geometry.means.double(),
+        living.geometry.scales.double().amax(1) if living.geometry.count else torch.zeros(0),
+    )
     if not len(means):
         return [0.0, 0.0, 0.0], 1.0, 1.0
     low, high = (torch.quantile(means[:100_000], q, dim=0) for q in (0.01, 0.99))
@@ -203,9 +220,12 @@ def _home(middle: Sequence[float], radius: float, up: Sequence[float]) -> Camera
 
 
 def camera_numbers(camera: Camera) -> dict[str, Any]:
-    """A camera as the scripts take it: R and t of the world-to-camera matrix row by row, OpenCV axes, intrinsics and size in pixels."""
+    """A camera as the scripts take it: R and t of the world-to-camera matrix row by row, OpenCV axes, intrinsics and
+    size in pixels."""
     view = camera.viewmat.detach().double().cpu()
-    numbers = {key.name: float(getattr(camera, key.name)) for key in dataclasses.fields(camera) if key.name != "viewmat"}
+    numbers = {
+        key.name: float(getattr(camera, key.name)) for key in dataclasses.fields(camera) if key.name != "viewmat"
+    }
     return {"R": view[:3, :3].flatten().tolist(), "t": view[:3, 3].tolist(), **numbers}
 
 
@@ -220,6 +240,10 @@ def _condition(one: Condition, views: Sequence[PageView]) -> dict[str, Any]:
     value = one.value.double().tolist()
     if one.spec.shape == () and high - low > _WIDE:
         seen = [float(view.conditions[one.spec.name]) for view in views if one.spec.name in view.conditions]
-        low, high = (min(seen), max(seen)) if seen and min(seen) < max(seen) else (float(one.value) - 1.0, float(one.value) + 1.0)
+        low, high = (
+            (min(seen), max(seen))
+            if seen and min(seen) < max(seen)
+            else (float(one.value) - 1.0, float(one.value) + 1.0)
+        )
     place = one.spec.shape == (3,) and one.spec.unit.startswith("position")
     return {"name": one.spec.name, "value": value, "range": [low, high], "place": place, "period": _PERIOD}

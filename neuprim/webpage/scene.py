@@ -29,7 +29,8 @@ _WIDEST, _STILL = 320, 640
 
 
 def held_out(dataset: Dataset, channels: Channels, most: int) -> list[PageView]:
-    """At most so many of the held-out views, evenly spread, those of pinholes; first the one in which most is to be seen."""
+    """At most so many of the held-out views, evenly spread, those of pinholes; first the one in which most is to be
+    seen."""
     count, found, contrasts = min(most, len(dataset.test)), [], []
     for index in (k * len(dataset.test) // count for k in range(count)):
         view = dataset.test.view(index)
@@ -42,8 +43,11 @@ def held_out(dataset: Dataset, channels: Channels, most: int) -> list[PageView]:
     return found
 
 
-def start_of(specs: Sequence[ConditionSpec], views: Sequence[PageView], given: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The conditions that a page begins with: those given, else the first view's, else the middle of their ranges, or 1 where that says nothing."""
+def start_of(
+    specs: Sequence[ConditionSpec], views: Sequence[PageView], given: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """The conditions that a page begins with: those given, else the first view's, else the middle of their ranges, or 1
+    where that says nothing."""
     found: dict[str, Tensor] = {}
     for spec in specs:
         low, high = spec.range

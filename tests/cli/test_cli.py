@@ -36,7 +36,9 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         made.append((run_dir, *words) if words else run_dir)
         return {"psnr": 31.23456, "views": 20, "worst": {"name": "r_3", "psnr": 27.0}}
 
-    def render_run(*args: Any, environment: Any = None, tell: Any = None, progress: Any = None, words: Any = ()) -> list[Path]:
+    def render_run(
+        *args: Any, environment: Any = None, tell: Any = None, progress: Any = None, words: Any = ()
+    ) -> list[Path]:
         made.append((*args, *words) if environment is None else (*args, environment))
         return [Path("a.png"), Path("b.png")]
 
@@ -131,13 +133,17 @@ def test_a_failing_combination_does_not_lose_the_others(
         (["tasks", "more"], "more: no such argument of `neuprim tasks`"),
     ],
 )
-def test_one_line_and_status_2(calls: list[Any], capsys: pytest.CaptureFixture[str], argv: list[str], text: str) -> None:
+def test_one_line_and_status_2(
+    calls: list[Any], capsys: pytest.CaptureFixture[str], argv: list[str], text: str
+) -> None:
     assert main(argv) == 2
     assert text in error_line(capsys)
     assert calls == []
 
 
-def test_errors_of_many_lines_become_one(calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_of_many_lines_become_one(
+    calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def run(config: RunConfig, events: Events, launcher: Any = None) -> Path:
         raise DataError("missing images:\n  a.png\n  b.png")
 
@@ -198,10 +204,17 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
         assert capsys.readouterr().err.splitlines()[1] == second, "the same words again"
         before, after = started[-2:]
         assert after.resume and not before.resume and after.output_dir == before.output_dir == Path(where)
-        assert (after.seed, after.train, after.model, after.options) == (before.seed, before.train, before.model, before.options)
+        assert (after.seed, after.train, after.model, after.options) == (
+            before.seed,
+            before.train,
+            before.model,
+            before.options,
+        )
 
 
-def test_a_disk_that_refuses_is_no_bug(calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_refuses_is_no_bug(
+    calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(config: RunConfig, events: Events, launcher: Any = None) -> Path:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -226,7 +239,12 @@ def test_eval_prints_metrics(calls: list[Any], capsys: pytest.CaptureFixture[str
     Path("r").mkdir()
     assert main(["eval", "r"]) == 0
     assert calls == [Path("r")]
-    assert capsys.readouterr().out.splitlines() == ["psnr        31.2346", "views       20", "worst.name  r_3", "worst.psnr  27.0000"]
+    assert capsys.readouterr().out.splitlines() == [
+        "psnr        31.2346",
+        "views       20",
+        "worst.name  r_3",
+        "worst.psnr  27.0000",
+    ]
 
 
 def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
@@ -236,13 +254,43 @@ def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     assert calls[-1] == (Path("r"), "test", None, None, None, 60, {}, None)
     assert capsys.readouterr().out == "a.png\nb.png\n"
     Path("cams.json").touch()
-    flags = ["--camera", "cams.json", "--size", "640x480", "--format", "exr", "--out", "o", "--frames", "3", "--fps", "12"]
+    flags = [
+        "--camera",
+        "cams.json",
+        "--size",
+        "640x480",
+        "--format",
+        "exr",
+        "--out",
+        "o",
+        "--frames",
+        "3",
+        "--fps",
+        "12",
+    ]
     assert main(["render", "r", *flags, "--time", "0:1", "--light-pos=-1,0,2"]) == 0
-    assert calls[-1] == (Path("r"), "cams.json", (640, 480), "exr", Path("o"), 3, {"time": "0:1", "light_pos": "-1,0,2"}, 12.0)
+    assert calls[-1] == (
+        Path("r"),
+        "cams.json",
+        (640, 480),
+        "exr",
+        Path("o"),
+        3,
+        {"time": "0:1", "light_pos": "-1,0,2"},
+        12.0,
+    )
     for words in (["--light_pos", "-1,0,2"], ["--light-pos", "-1,0,2"], ["light-pos=-1,0,2"], ["--light_pos=-1,0,2"]):
         assert main(["render", "r", "--camera", "orbit", *words]) == 0
         assert calls[-1][6] == {"light_pos": "-1,0,2"}
-    flags = ["--camera", "orbit", "--environment", "sky.exr", "--environment-samples", "9", "--environment-rotation=-45"]
+    flags = [
+        "--camera",
+        "orbit",
+        "--environment",
+        "sky.exr",
+        "--environment-samples",
+        "9",
+        "--environment-rotation=-45",
+    ]
     assert main(["render", "r", *flags]) == 0
     assert calls[-1][-1] == EnvironmentFile(Path("sky.exr"), 9, -45.0, 1.0)
 
@@ -260,7 +308,9 @@ def test_render_knows_the_conditions_of_the_runs_task(calls: list[Any], capsys: 
 
 
 def test_tasks_lists_all_and_the_broken_ones(toy: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    install(site, "neuprim-bad", {"bad": "fake_bad:TASK"}, {"fake_bad.py": "raise ImportError('no such luck')"}, version="2")
+    install(
+        site, "neuprim-bad", {"bad": "fake_bad:TASK"}, {"fake_bad.py": "raise ImportError('no such luck')"}, version="2"
+    )
     assert main(["tasks"]) == 0
     out = capsys.readouterr().out
     assert "toy  (neuprim-toy 0.3)  a toy" in out

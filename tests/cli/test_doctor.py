@@ -23,7 +23,18 @@ def test_report(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_probe", lambda name: None if name == "reference" else "no such luck")
     status, text = report()
     assert status == 0
-    for word in ("python", "simd", "memory", "hydra-core", metadata.version("torch"), "pycolmap", "triton", "CUDA", "numba", "works"):
+    for word in (
+        "python",
+        "simd",
+        "memory",
+        "hydra-core",
+        metadata.version("torch"),
+        "pycolmap",
+        "triton",
+        "CUDA",
+        "numba",
+        "works",
+    ):
         assert word in text
     assert "does not work: no such luck" in text
     assert "pytest" not in text and "mkdocs" not in text, "extras for developers are not shown"
@@ -37,7 +48,13 @@ def test_status_1_when_nothing_works(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_is_missing_or_too_old_says_how_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    needs = ["numpy>=999", "not-there>=1", "also-not>=2; extra == 'colmap'", "skipped; extra == 'dev'", "skipped; sys_platform == 'none'"]
+    needs = [
+        "numpy>=999",
+        "not-there>=1",
+        "also-not>=2; extra == 'colmap'",
+        "skipped; extra == 'dev'",
+        "skipped; sys_platform == 'none'",
+    ]
     monkeypatch.setattr(metadata, "requires", lambda name: needs)
     rows = dict(doctor._packages())
     assert "needs >=999: pip install 'numpy>=999'" in rows["numpy"]
@@ -49,7 +66,12 @@ def test_what_is_missing_or_too_old_says_how_to_install(monkeypatch: pytest.Monk
 def test_a_package_of_two_extras_is_one_row(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [name for name, _ in doctor._packages()]
     assert len(rows) == len(set(rows)) and "pyvista" in rows
-    needs = ["not-there>=1; extra == 'viewer'", "not-there>=2; extra == 'mesh'", "rich>=1; extra == 'viewer'", "rich>=999; extra == 'mesh'"]
+    needs = [
+        "not-there>=1; extra == 'viewer'",
+        "not-there>=2; extra == 'mesh'",
+        "rich>=1; extra == 'viewer'",
+        "rich>=999; extra == 'mesh'",
+    ]
     monkeypatch.setattr(metadata, "requires", lambda name: needs)
     rows = dict(doctor._packages())
     assert rows["not-there"] == "not installed: pip install 'neuprim[viewer]' or 'neuprim[mesh]'"
@@ -97,7 +119,9 @@ def test_it_says_whether_runs_use_a_card_and_why_not(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
     assert dict(doctor._cuda())["used by runs"] == "no: torch finds no CUDA device" and "used by runs" in report()[1]
     monkeypatch.setattr(device, "card_missing", lambda: None)
-    row = Backend("card", lambda: pytest.fail("loaded"), missing=lambda: "pip install 'neuprim[cuda]'", devices=("cuda",))
+    row = Backend(
+        "card", lambda: pytest.fail("loaded"), missing=lambda: "pip install 'neuprim[cuda]'", devices=("cuda",)
+    )
     monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE[-1:]))
     assert dict(doctor._cuda())["used by runs"] == "no: pip install 'neuprim[cuda]'"
     monkeypatch.setattr(backends, "TABLE", (replace(row, missing=lambda: None), *backends.TABLE[-1:]))

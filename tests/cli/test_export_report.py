@@ -25,10 +25,20 @@ def test_frames_have_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
         ["frame_0001", "0.2500", "23.5000"],
         ["frame_0012", "0.1250"],
     ]
-    assert len({line.index(word) + len(word) for line, word in zip(lines[2:5], ("relative_l2", "0.2500", "0.1250"), strict=True)}) == 1
+    assert (
+        len(
+            {
+                line.index(word) + len(word)
+                for line, word in zip(lines[2:5], ("relative_l2", "0.2500", "0.1250"), strict=True)
+            }
+        )
+        == 1
+    )
 
 
-@pytest.mark.parametrize("errors", [{}, {"psnr": 31.25}, {"iou": 0.5, "front.iou": 0.75}, {"frame_0001.relative_l2": 0.25}])
+@pytest.mark.parametrize(
+    "errors", [{}, {"psnr": 31.25}, {"iou": 0.5, "front.iou": 0.75}, {"frame_0001.relative_l2": 0.25}]
+)
 def test_other_numbers_have_a_line_each(capsys: pytest.CaptureFixture[str], errors: dict[str, float]) -> None:
     lines = printed(capsys, errors).splitlines()
     assert [line.split() for line in lines[2:-1]] == [[name, f"{value:.4f}"] for name, value in errors.items()]
@@ -36,4 +46,7 @@ def test_other_numbers_have_a_line_each(capsys: pytest.CaptureFixture[str], erro
 
 def test_programs_get_every_number_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     errors = {"frame_0001.relative_l2": 0.25, "frame_0002.relative_l2": float("inf")}
-    assert json.loads(printed(capsys, errors, True))["errors"] == {"frame_0001.relative_l2": 0.25, "frame_0002.relative_l2": None}
+    assert json.loads(printed(capsys, errors, True))["errors"] == {
+        "frame_0001.relative_l2": 0.25,
+        "frame_0002.relative_l2": None,
+    }

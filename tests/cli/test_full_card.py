@@ -15,7 +15,10 @@ def test_it_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     monkeypatch.setattr(cli, "_dispatch", full)
     assert cli.main(["render", "run"]) == 2
     line = capsys.readouterr().err
-    assert line.startswith("neuprim: error: the card's memory is full; expected a smaller image or grid") and line.count("\n") == 1
+    assert (
+        line.startswith("neuprim: error: the card's memory is full; expected a smaller image or grid")
+        and line.count("\n") == 1
+    )
 
 
 def test_another_fault_is_not(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,14 @@ from neuprim.core.train.ranks.place import Place
 from tests.ranks import Threads, done, together
 
 WORDS = ["task=static", "scene=solids"]
-ALL = {"RANK": "0", "WORLD_SIZE": "2", "LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "here", "MASTER_PORT": "1"}
+ALL = {
+    "RANK": "0",
+    "WORLD_SIZE": "2",
+    "LOCAL_RANK": "0",
+    "LOCAL_WORLD_SIZE": "2",
+    "MASTER_ADDR": "here",
+    "MASTER_PORT": "1",
+}
 
 
 def test_all_ranks_write_where_the_first_one_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,9 +48,16 @@ def test_all_ranks_write_where_the_first_one_does(tmp_path: Path, monkeypatch: p
 
 @pytest.mark.parametrize(
     "words",
-    [[*WORDS, "target.psnr=30", "budget=10m"], [*WORDS, "launcher=processes"], [*WORDS, "viewer=true"], [*WORDS, "output_dir=taken"]],
+    [
+        [*WORDS, "target.psnr=30", "budget=10m"],
+        [*WORDS, "launcher=processes"],
+        [*WORDS, "viewer=true"],
+        [*WORDS, "output_dir=taken"],
+    ],
 )
-def test_what_the_first_rank_refuses_the_others_do_not_repeat(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_first_rank_refuses_the_others_do_not_repeat(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "file").touch()
@@ -61,7 +75,8 @@ def test_one_run_alone_is_shared(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("cards", "device", "wrong"), [(0, "auto", False), (1, "cpu", False), (2, "auto", False), (1, "auto", True), (1, "cuda", True)]
+    ("cards", "device", "wrong"),
+    [(0, "auto", False), (1, "cpu", False), (2, "auto", False), (1, "auto", True), (1, "cuda", True)],
 )
 def test_a_card_for_each_rank(cards: int, device: str, wrong: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen: list[int] = []
@@ -72,7 +87,8 @@ def test_a_card_for_each_rank(cards: int, device: str, wrong: bool, monkeypatch:
     config = replace(config, renderer=replace(config.renderer, device=device))
     if wrong:
         with pytest.raises(
-            BackendUnavailable, match=rf"renderer\.device={device}: 1 cards? for 2 ranks of this machine; expected a card for each"
+            BackendUnavailable,
+            match=rf"renderer\.device={device}: 1 cards? for 2 ranks of this machine; expected a card for each",
         ):
             _choose_card(config, Place(1, 2, 1, 2, ""))
     else:
@@ -96,7 +112,9 @@ class _Lonely:
 
 
 @pytest.mark.parametrize(("machine", "ranks", "own"), [(8, 2, 4), (5, 2, 2), (1, 2, 1)])
-def test_cores_are_shared_out(machine: int, ranks: int, own: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_cores_are_shared_out(
+    machine: int, ranks: int, own: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     from neuprim.cli import ranks as module
 
     found: list[int] = []

@@ -20,7 +20,10 @@ TINY = (
     [
         (["target.psnr=30"], "target.psnr=30: expected a budget beside it"),
         (["budget=5m"], "budget=5m: no target"),
-        (["target.psnr=30", "budget=5m", "-m", "model.sh_degree=0,1"], "target.psnr=30: a target is for one run; expected no -m beside it"),
+        (
+            ["target.psnr=30", "budget=5m", "-m", "model.sh_degree=0,1"],
+            "target.psnr=30: a target is for one run; expected no -m beside it",
+        ),
         (["target.psnr=30", "budget=5m", "model.primitive=3"], "model.primitive: no such setting"),
     ],
 )
@@ -62,7 +65,9 @@ def test_a_search_prints_what_it_tried_and_what_came_of_it(
         assert text in printed.err, text
 
 
-def test_an_interruption_says_what_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_says_what_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def interrupted(*args: Any, **where: object) -> None:
         raise KeyboardInterrupt
 
@@ -70,4 +75,7 @@ def test_an_interruption_says_what_goes_on(tmp_path: Path, capsys: pytest.Captur
     out = tmp_path / "run"
     assert main(["run", *TINY, "target.psnr=20", "budget=5m", f"output_dir={out}"]) == 130
     error = capsys.readouterr().err
-    assert f"{out} has the trials up to here" in error and f"target.psnr=20 budget=5m output_dir={out} resume=true" in error
+    assert (
+        f"{out} has the trials up to here" in error
+        and f"target.psnr=20 budget=5m output_dir={out} resume=true" in error
+    )

@@ -29,7 +29,17 @@ STEPS = 200
 
 def torchrun(overrides: list[str], ranks: int = 2, **more: Any) -> subprocess.Popen[str]:
     """``neuprim run`` in that many processes."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(ranks), "-m", "neuprim", "run", *overrides]
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--nproc-per-node",
+        str(ranks),
+        "-m",
+        "neuprim",
+        "run",
+        *overrides,
+    ]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(neuprim.__file__).parents[1])}
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, **more)
 
@@ -37,9 +47,9 @@ def torchrun(overrides: list[str], ranks: int = 2, **more: Any) -> subprocess.Po
 def rank(launched: subprocess.Popen[str], number: int) -> int:
     """Process id of a rank."""
     for child in Path(f"/proc/{launched.pid}/task/{launched.pid}/children").read_text().split():
-        if f"RANK={number}\0".encode() in b"\0" + Path(f"/proc/{child}/environ").read_bytes().replace(b"LOCAL_RANK", b"").replace(
-            b"GROUP_RANK", b""
-        ):
+        if f"RANK={number}\0".encode() in b"\0" + Path(f"/proc/{child}/environ").read_bytes().replace(
+            b"LOCAL_RANK", b""
+        ).replace(b"GROUP_RANK", b""):
             return int(child)
     raise AssertionError(f"no rank {number}")
 
@@ -60,11 +70,16 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of one process with two views a step that nothing happens to."""
-    return fit(words(scene, tmp_path_factory.mktemp("runs") / "whole", STEPS, "train.log_every=1", "train.views_per_step=2"))
+    return fit(
+        words(scene, tmp_path_factory.mktemp("runs") / "whole", STEPS, "train.log_every=1", "train.views_per_step=2")
+    )
 
 
-def test_two_ranks_of_which_one_is_killed_then_one_process_then_two_ranks_are_one_process(scene: Path, whole: Path, tmp_path: Path) -> None:
-    """With as many views a step in all, every bit of the checkpoint is that of a run that nothing happened to, and so is its curve."""
+def test_two_ranks_of_which_one_is_killed_then_one_process_then_two_ranks_are_one_process(
+    scene: Path, whole: Path, tmp_path: Path
+) -> None:
+    """With as many views a step in all, every bit of the checkpoint is that of a run that nothing happened to, and so
+    is its curve."""
     out = tmp_path / "out"
     of_two = words(scene, out, STEPS, "train.log_every=1")
     of_one = words(scene, out, STEPS, "train.log_every=1", "train.views_per_step=2")
@@ -80,7 +95,8 @@ def test_two_ranks_of_which_one_is_killed_then_one_process_then_two_ranks_are_on
     assert launched.returncode != 0 and time.monotonic() - killed < 20
     (line,) = errors(said)
     found = re.match(
-        r"neuprim: error: rank 1 died, in step (\d+); to go on: torchrun --nproc-per-node 2 -m neuprim run .*resume=true$", line
+        r"neuprim: error: rank 1 died, in step (\d+); to go on: torchrun --nproc-per-node 2 -m neuprim run .*resume=true$",
+        line,
     )
     assert found is not None, line
     step = int(found[1])
@@ -92,31 +108,46 @@ def test_two_ranks_of_which_one_is_killed_then_one_process_then_two_ranks_are_on
 
     with pytest.raises(KeyboardInterrupt):
         run(compose([*of_one, "resume=true"]), interrupt)
-    assert [line["step"] for line in lines(out / "metrics.jsonl")] == list(range(1, step + 21)), "no step is lost, none is there twice"
+    assert [line["step"] for line in lines(out / "metrics.jsonl")] == list(range(1, step + 21)), (
+        "no step is lost, none is there twice"
+    )
 
     launched = torchrun([*of_two, "resume=true"])
     printed, said = launched.communicate(timeout=200)
     assert launched.returncode == 0, said
-    assert printed.split() == [str(out)] and said.count(f"resumed at step {step + 20}") == 1 and said.count("measuring held-out views") == 1
+    assert (
+        printed.split() == [str(out)]
+        and said.count(f"resumed at step {step + 20}") == 1
+        and said.count("measuring held-out views") == 1
+    )
 
     first, second = (load_file(place / "checkpoint.safetensors") for place in (whole, out))
     assert first.keys() == second.keys()
     assert [name for name, value in first.items() if not torch.equal(value, second[name])] == []
-    curves = [[{k: v for k, v in line.items() if k != "seconds"} for line in lines(place / "metrics.jsonl")] for place in (whole, out)]
+    curves = [
+        [{k: v for k, v in line.items() if k != "seconds"} for line in lines(place / "metrics.jsonl")]
+        for place in (whole, out)
+    ]
     assert curves[0] == curves[1] and len(curves[0]) == STEPS and any("change" in line for line in curves[0])
     metrics = [json.loads((place / "metrics.json").read_text()) for place in (whole, out)]
     assert metrics[0]["psnr"] == metrics[1]["psnr"] and (out / "report.html").exists()
 
 
 def test_what_is_wrong_is_said_once(tmp_path: Path) -> None:
-    launched = torchrun(["task=static", "scene=blender", f"scene.path={tmp_path / 'gone'}", f"output_dir={tmp_path / 'out'}"])
+    launched = torchrun(
+        ["task=static", "scene=blender", f"scene.path={tmp_path / 'gone'}", f"output_dir={tmp_path / 'out'}"]
+    )
     _, said = launched.communicate(timeout=120)
     assert launched.returncode != 0
-    assert errors(said) == [f"neuprim: error: {tmp_path / 'gone'}: does not exist; expected the data set's folder (scene.path)"]
+    assert errors(said) == [
+        f"neuprim: error: {tmp_path / 'gone'}: does not exist; expected the data set's folder (scene.path)"
+    ]
     assert not (tmp_path / "out").exists()
 
 
-def test_two_ranks_with_a_part_each_that_are_interrupted_then_one_process_are_one_process(scene: Path, whole: Path, tmp_path: Path) -> None:
+def test_two_ranks_with_a_part_each_that_are_interrupted_then_one_process_are_one_process(
+    scene: Path, whole: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     more = ("train.log_every=1", "train.checkpoint_every_seconds=0.2")
     launched = torchrun(words(scene, out, STEPS, *more, "train.shard=true"))
@@ -133,5 +164,8 @@ def test_two_ranks_with_a_part_each_that_are_interrupted_then_one_process_are_on
         first, second = (load_file(place / f"{name}.safetensors") for place in (whole, out))
         assert first.keys() == second.keys()
         assert [key for key, value in first.items() if not torch.equal(value, second[key])] == []
-    curves = [[{k: v for k, v in line.items() if k != "seconds"} for line in lines(place / "metrics.jsonl")] for place in (whole, out)]
+    curves = [
+        [{k: v for k, v in line.items() if k != "seconds"} for line in lines(place / "metrics.jsonl")]
+        for place in (whole, out)
+    ]
     assert curves[0] == curves[1] and len(curves[0]) == STEPS and any("change" in line for line in curves[0][:20])

@@ -31,11 +31,16 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["view", "{run}", "--prot", "1"], "--prot: no such argument of `neuprim view`; did you mean '--port'"),
         (["view", "{run}", "--host", "host.invalid"], "viewer at host.invalid, port 8080"),
         (["run", "-m", "viewer=true", "seed=1,2"], "viewer=true: shows one run; expected no -m beside it"),
-        (["run", "viewer=true", "target.psnr=20", "budget=1m"], "viewer=true: shows one run; expected no target beside it"),
+        (
+            ["run", "viewer=true", "target.psnr=20", "budget=1m"],
+            "viewer=true: shows one run; expected no target beside it",
+        ),
         (["run", "viewer.prot=1"], "viewer.prot: no such setting"),
     ],
 )
-def test_what_cannot_be_is_one_line(run_dir: Path, argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_is_one_line(
+    run_dir: Path, argv: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([word.format(run=run_dir) for word in argv]) == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("neuprim: error: ") and message in error
@@ -46,9 +51,14 @@ def test_help_names_the_flags(capsys: pytest.CaptureFixture[str]) -> None:
     assert {"--port N", "--host ADDRESS"} <= set(re.findall(r"--\w+ \w+", capsys.readouterr().out))
 
 
-def test_without_viser_it_says_how_to_get_it(run_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_viser_it_says_how_to_get_it(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
-    for argv in (["view", str(run_dir)], ["run", "task=static", "scene=solids", "viewer=true", f"output_dir={run_dir}-new"]):
+    for argv in (
+        ["view", str(run_dir)],
+        ["run", "task=static", "scene=solids", "viewer=true", f"output_dir={run_dir}-new"],
+    ):
         assert main(argv) == 2
         assert "pip install 'neuprim[viewer]'" in capsys.readouterr().err
     assert not Path(f"{run_dir}-new").exists()
@@ -74,5 +84,9 @@ def test_ctrl_c_ends_it(run_dir: Path) -> None:
     assert process.stdout.readline() == "open it in a browser; Ctrl-C ends the viewer\n"
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=30)
-    assert process.returncode == 0 and error.splitlines()[-1] == "neuprim: the viewer is closed" and "Traceback" not in error + out
+    assert (
+        process.returncode == 0
+        and error.splitlines()[-1] == "neuprim: the viewer is closed"
+        and "Traceback" not in error + out
+    )
     assert out == "", "nothing of viser's own"

@@ -46,7 +46,11 @@ def test_another_strategy_starts_with_all_primitives_unless_growth_is_typed() ->
         return compose(["task=static", *words]).train.population.grow_from
 
     assert grow_from() == 0.5
-    for word in ("train.population.strategy=fixed", "train.population={strategy: fixed}", "train.population.strategy=gradient"):
+    for word in (
+        "train.population.strategy=fixed",
+        "train.population={strategy: fixed}",
+        "train.population.strategy=gradient",
+    ):
         assert grow_from(word) == 1.0
     assert grow_from("train.population.strategy=relocate") == 0.5
     with pytest.raises(ConfigError, match=r"grow_from=0\.5: fixed does not grow that way"):
@@ -54,17 +58,32 @@ def test_another_strategy_starts_with_all_primitives_unless_growth_is_typed() ->
 
 
 def test_free_dictionaries_need_no_plus(toy: Path) -> None:
-    c = toys("train.rates.w2=1e-3", "+train.rates.b2=2", "model.init.mode=paper", "model.init.deep={a:[1,2]}", "task.options.gain=3")
+    c = toys(
+        "train.rates.w2=1e-3",
+        "+train.rates.b2=2",
+        "model.init.mode=paper",
+        "model.init.deep={a:[1,2]}",
+        "task.options.gain=3",
+    )
     assert c.train.rates == {"means": 1e-3, "w2": 1e-3, "b2": 2.0}
     assert c.model.init == {"mode": "paper", "deep": {"a": [1, 2]}}
     assert c.options == {"gain": 3}
     assert c.non_default["train.rates.w2"] == (None, 1e-3)
     units = toys("train.rate_units.glow=extent")  # a parameter that only another package knows
-    assert units.train.rate_units == {"glow": "extent"} and units.non_default == {"train.rate_units.glow": (None, "extent")}
+    assert units.train.rate_units == {"glow": "extent"} and units.non_default == {
+        "train.rate_units.glow": (None, "extent")
+    }
 
 
 def test_values_in_other_spellings(toy: Path) -> None:
-    c = toys("train.iterations=1e3", "train.max_seconds=5", "train.population.strategy=fixed", "scene.steps=[3]", "scene.ratio=1", "seed=5")
+    c = toys(
+        "train.iterations=1e3",
+        "train.max_seconds=5",
+        "train.population.strategy=fixed",
+        "scene.steps=[3]",
+        "scene.ratio=1",
+        "seed=5",
+    )
     assert c.train.iterations == 1000
     assert isinstance(c.train.max_seconds, float)
     assert c.train.population.strategy == "fixed"
@@ -310,7 +329,12 @@ def test_a_wrong_combination_stops_the_sweep_before_it_starts(toy: Path) -> None
 
 def test_yaml_round_trip(toy: Path) -> None:
     c = toys(
-        "scene=files", "scene.path='a: b, #c'", "train.rates.w2=1e-5", "train.max_seconds=3", "scene.downsample=2", "model.init={l:[1]}"
+        "scene=files",
+        "scene.path='a: b, #c'",
+        "train.rates.w2=1e-5",
+        "train.max_seconds=3",
+        "scene.downsample=2",
+        "model.init={l:[1]}",
     )
     Path("run").mkdir()
     Path("run/config.yaml").write_text(c.to_yaml())
@@ -404,7 +428,8 @@ def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pr
 
 @pytest.mark.parametrize("task", ["static", "dynamic", "relight"])
 def test_papers_rates_are_absolute(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Appendix A: means 1.6e-4, which the authors multiply by nothing; the most primitives are those of Stump (table 6)."""
+    """Appendix A: means 1.6e-4, which the authors multiply by nothing; the most primitives are those of Stump (table
+    6)."""
     monkeypatch.chdir(tmp_path)
     train = compose([f"task={task}", "preset=paper"]).train
     assert (train.rates["means"], train.rate_units) == (1.6e-4, {"means": "absolute"})
@@ -412,14 +437,21 @@ def test_papers_rates_are_absolute(task: str, tmp_path: Path, monkeypatch: pytes
     assert compose([f"task={task}"]).train.rate_units == {}
 
 
-def test_papers_presets_of_static_scenes_differ_in_what_they_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Appendix A and B.1: another schedule on photographs; 200 and 5,000 primitives as budgets of the Blender scenes."""
+def test_papers_presets_of_static_scenes_differ_in_what_they_say(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Appendix A and B.1: another schedule on photographs; 200 and 5,000 primitives as budgets of the Blender
+    scenes."""
     monkeypatch.chdir(tmp_path)
-    plain, real, least, middle = (compose([f"preset={name}"]) for name in ("paper", "paper_real", "paper_200", "paper_5k"))
+    plain, real, least, middle = (
+        compose([f"preset={name}"]) for name in ("paper", "paper_real", "paper_200", "paper_5k")
+    )
     steps = plain.train.iterations
     for c, schedule in ((plain, (200, 1_000, 20_000, 1e-5, 1e-6)), (real, (500, 1_000, 15_000, 1e-4, 2e-6))):
         p = c.train.population
-        assert (p.every, p.start * steps, p.stop * steps, p.grow_threshold, p.prune_threshold) == pytest.approx(schedule)
+        assert (p.every, p.start * steps, p.stop * steps, p.grow_threshold, p.prune_threshold) == pytest.approx(
+            schedule
+        )
         assert (p.clone_scale, p.prune_scale) == (1e-2, 0.5)
     assert (least.model.primitives, middle.model.primitives) == (200, 5000)
     for c in (real, least, middle):
@@ -428,7 +460,9 @@ def test_papers_presets_of_static_scenes_differ_in_what_they_say(tmp_path: Path,
         assert (model, train, c.renderer) == (plain.model, plain.train, plain.renderer)
 
 
-def test_a_run_older_than_units_of_rates_goes_on_in_those_it_began_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_older_than_units_of_rates_goes_on_in_those_it_began_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     words = ["task=static", "preset=paper", "output_dir=run"]
     begun = compose(words).to_yaml()

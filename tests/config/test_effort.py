@@ -42,8 +42,17 @@ def run(*words: str) -> RunConfig:
 
 def test_a_level_lies_over_the_preset_that_it_was_measured_with(levels: Path) -> None:
     config = run("effort=3")
-    assert (config.preset, config.model.primitives, config.train.iterations, config.renderer.near) == ("long", 300, 30, 0.5)
-    assert config.non_default == {"preset": ("quick", "long"), "model.primitives": (9, 300), "train.iterations": (700, 30)}
+    assert (config.preset, config.model.primitives, config.train.iterations, config.renderer.near) == (
+        "long",
+        300,
+        30,
+        0.5,
+    )
+    assert config.non_default == {
+        "preset": ("quick", "long"),
+        "model.primitives": (9, 300),
+        "train.iterations": (700, 30),
+    }
     assert config.overrides == ["task=toy", "effort=3"]
     assert run().preset == "quick", "without a level nothing changes"
 
@@ -56,7 +65,11 @@ def test_what_is_typed_lies_over_the_level(levels: Path) -> None:
 
 
 def test_levels_are_swept(levels: Path) -> None:
-    assert [c.model.primitives for c in compose_all(["task=toy", "effort=1,5,9"], check_output=False)] == [100, 500, 900]
+    assert [c.model.primitives for c in compose_all(["task=toy", "effort=1,5,9"], check_output=False)] == [
+        100,
+        500,
+        900,
+    ]
 
 
 def test_the_list_of_tasks_says_that_there_are_levels(levels: Path) -> None:
@@ -65,7 +78,12 @@ def test_the_list_of_tasks_says_that_there_are_levels(levels: Path) -> None:
 
 def test_a_run_is_the_same_as_if_its_settings_were_typed(levels: Path) -> None:
     level, typed = run("effort=2"), run("preset=long", "model.primitives=200", "train.iterations=20")
-    assert (level.model, level.train, level.renderer, level.non_default) == (typed.model, typed.train, typed.renderer, typed.non_default)
+    assert (level.model, level.train, level.renderer, level.non_default) == (
+        typed.model,
+        typed.train,
+        typed.renderer,
+        typed.non_default,
+    )
     assert RunConfig.from_yaml(_written(level)).train == typed.train
 
 
@@ -83,13 +101,17 @@ def test_no_such_level(levels: Path, word: str) -> None:
 
 def test_levels_of_another_preset(levels: Path) -> None:
     with pytest.raises(
-        ConfigError, match=r"^effort=2: levels of task 'toy' are of preset=long, found preset=quick; expected one of the two$"
+        ConfigError,
+        match=r"^effort=2: levels of task 'toy' are of preset=long, found preset=quick; expected one of the two$",
     ):
         run("effort=2", "preset=quick")
 
 
 def test_a_task_without_levels(toy: Path) -> None:
-    with pytest.raises(ConfigError, match=r"^effort=2: task 'toy' has no levels; set model\.primitives=N and train\.iterations=N instead$"):
+    with pytest.raises(
+        ConfigError,
+        match=r"^effort=2: task 'toy' has no levels; set model\.primitives=N and train\.iterations=N instead$",
+    ):
         run("effort=2")
 
 
@@ -127,7 +149,9 @@ def test_a_damaged_level_is_named(toy: Path, one: str, expected: str) -> None:
 
 def test_conformance_holds_packages_to_their_levels(levels: Path) -> None:
     """A task that is static but for its files; the check of files names the level that cannot be composed."""
-    task = replace(load_task("static"), name="toy", config_package="toytask.conf", scenes=load_task("toy").scenes, options={})
+    task = replace(
+        load_task("static"), name="toy", config_package="toytask.conf", scenes=load_task("toy").scenes, options={}
+    )
     (levels / "conf" / "task" / "toy.yaml").write_text("scene: ball\n")
     check = named_checks(task)["files"]
     check()
@@ -154,7 +178,9 @@ def test_levels_are_points_that_were_measured(name: str) -> None:
     for number, level in levels.items():
         config = compose([f"task={name}", f"effort={number}"], check_output=False)
         assert config.preset == level.preset == "quick"
-        there = [r for r in trials if (r["asked"], r["iterations"]) == (config.model.primitives, config.train.iterations)]
+        there = [
+            r for r in trials if (r["asked"], r["iterations"]) == (config.model.primitives, config.train.iterations)
+        ]
         assert len(there) == 1 and there[0]["level"] <= number, f"level {number}"
         seen.append(there[0])
     judged = {"static": "psnr", "relight": "psnr_linear_clamped", "dynamic": "psnr_mask"}[name]

@@ -12,7 +12,15 @@ from neuprim.config import RunConfig, compose, compose_all, stored_config
 from neuprim.core.errors import ConfigError
 
 WORDS = [
-    *("task=static", "scene=solids", "scene.size=48", "preset=paper", "seed=7", "model.primitives=123", "train.rates={means: 1e-3}"),
+    *(
+        "task=static",
+        "scene=solids",
+        "scene.size=48",
+        "preset=paper",
+        "seed=7",
+        "model.primitives=123",
+        "train.rates={means: 1e-3}",
+    ),
     *("model.density.edge=2", "train.iterations=50", "output_dir=first"),
 ]
 
@@ -35,7 +43,9 @@ def settings(config: RunConfig) -> dict[str, object]:
 def test_the_same_settings_in_a_directory_of_its_own(stored: RunConfig) -> None:
     again = compose([], stored=stored)
     assert settings(again) == settings(stored) and again.train.rates == {"means": 0.5} and again.train.log_every == 17
-    assert again.output_dir == Path("outputs/static-solids") and again.overrides == [w for w in WORDS if not w.startswith("output_dir=")]
+    assert again.output_dir == Path("outputs/static-solids") and again.overrides == [
+        w for w in WORDS if not w.startswith("output_dir=")
+    ]
     assert again.non_default["train.log_every"][1] == 17
 
 
@@ -51,7 +61,9 @@ def test_what_is_typed_comes_first(stored: RunConfig) -> None:
 
 @pytest.mark.parametrize("word", ["task=dynamic", "preset=quick", "effort=3"])
 def test_what_the_file_has_said_already_is_refused(stored: RunConfig, word: str) -> None:
-    with pytest.raises(ConfigError, match=rf"{word}: the file of --config says .*; expected no {word.partition('=')[0]}= beside it"):
+    with pytest.raises(
+        ConfigError, match=rf"{word}: the file of --config says .*; expected no {word.partition('=')[0]}= beside it"
+    ):
         compose([word], stored=stored)
 
 
@@ -61,7 +73,8 @@ def test_on_the_command_line(stored: RunConfig, capsys: pytest.CaptureFixture[st
     assert RunConfig.from_yaml("shown.yaml").model.primitives == 9
     assert main(["run", "--config", "nowhere.yaml"]) == 2
     assert (
-        capsys.readouterr().err == "neuprim: error: --config nowhere.yaml: no such file; expected RUN_DIR/config.yaml of an earlier run\n"
+        capsys.readouterr().err
+        == "neuprim: error: --config nowhere.yaml: no such file; expected RUN_DIR/config.yaml of an earlier run\n"
     )
     Path("first/config.yaml").write_text("- 1")
     assert main(["run", "--config", "first"]) == 2

@@ -10,7 +10,15 @@ from neuprim.cli import main
 from neuprim.config import RunConfig, compose, compose_all
 from neuprim.core.errors import ConfigError
 
-BEGUN = ["task=dynamic", "scene=vdb", "scene.vdb=/data/fire", "scene.size=24", "model.primitives=40", "train.iterations=30", "seed=5"]
+BEGUN = [
+    "task=dynamic",
+    "scene=vdb",
+    "scene.vdb=/data/fire",
+    "scene.size=24",
+    "model.primitives=40",
+    "train.iterations=30",
+    "seed=5",
+]
 
 
 @pytest.fixture
@@ -51,7 +59,9 @@ def test_its_own_configuration_with_and_without_its_words(run: Path) -> None:
         (["seed=6"], "seed=6"),
     ],
 )
-def test_contradictions_are_refused_by_name(run: Path, words: list[str], key: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_contradictions_are_refused_by_name(
+    run: Path, words: list[str], key: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = (run / "config.yaml").read_bytes()
     assert main(["run", *words, "output_dir=run", "resume=true"]) == 2
     error = capsys.readouterr().err
@@ -69,7 +79,12 @@ def test_what_may_change_does(run: Path) -> None:
     ]
     config = resumed(*words, "scene.vdb=/moved/fire", "scene.cache=/cache", "train.rates={means: 1e-4}")
     assert (config.train.iterations, config.renderer.threads, config.renderer.backend) == (90, 1, "reference")
-    assert (config.scene["vdb"], config.scene["size"], config.model.primitives, config.seed) == ("/moved/fire", 24, 40, 5)
+    assert (config.scene["vdb"], config.scene["size"], config.model.primitives, config.seed) == (
+        "/moved/fire",
+        24,
+        40,
+        5,
+    )
     assert [w for w in config.overrides if w.startswith("train.iterations")] == ["train.iterations=90"]
     assert resumed("train.max_seconds=9").train.iterations is None
 
@@ -91,5 +106,7 @@ def test_runs_of_a_sweep_go_on_as_they_were_begun(run: Path) -> None:
         (1, 7, True, "sweep/seed-1"),
         (2, 7, True, "sweep/seed-2"),
     ]
-    with pytest.raises(ConfigError, match=r"^model\.primitives=8: the run to resume was begun with model\.primitives=9"):
+    with pytest.raises(
+        ConfigError, match=r"^model\.primitives=8: the run to resume was begun with model\.primitives=9"
+    ):
         compose_all([*words[:2], "model.primitives=8", "output_dir=sweep", "resume=true"])

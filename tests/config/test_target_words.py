@@ -10,14 +10,19 @@ from neuprim.core.errors import ConfigError
 
 
 def test_words_are_taken_out_of_the_others() -> None:
-    found, rest = target_words(["task=static", "target.psnr=30", "model.primitives=100", "+target.megabytes=1.5", "budget=10m"])
+    found, rest = target_words(
+        ["task=static", "target.psnr=30", "model.primitives=100", "+target.megabytes=1.5", "budget=10m"]
+    )
     assert found == (Target(psnr=30, megabytes=1.5), 600.0)
     assert rest == ["task=static", "model.primitives=100"]
     assert str(found[0]) == "target.psnr=30 target.megabytes=1.5" and found[0].quality == {"psnr": 30}
 
 
 def test_other_words_are_left_alone() -> None:
-    assert target_words(["model.primitives=1,2", "scene.path='a,b'"]) == (None, ["model.primitives=1,2", "scene.path='a,b'"])
+    assert target_words(["model.primitives=1,2", "scene.path='a,b'"]) == (
+        None,
+        ["model.primitives=1,2", "scene.path='a,b'"],
+    )
 
 
 def test_the_last_of_equal_words_counts() -> None:

@@ -25,12 +25,15 @@ def stored(folder: Path, *words: str) -> RunConfig:
 
 
 @pytest.mark.parametrize(
-    "address", ["ftp://user:pw@127.0.0.1:1/x", "s3://bucket/x", "simplecache::s3://b/x", r"\\\\host\\share", "/tmp/other/cache"]
+    "address",
+    ["ftp://user:pw@127.0.0.1:1/x", "s3://bucket/x", "simplecache::s3://b/x", r"\\\\host\\share", "/tmp/other/cache"],
 )
 def test_caches_elsewhere_need_the_users_word(tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = stored(tmp_path / "run", *VOLUMES)
     config.scene["cache"] = address
-    with pytest.raises(ConfigError, match=r"config\.yaml: scene\.cache is .*; --trust allows it, NEUPRIM_TRUST=1 in the environment"):
+    with pytest.raises(
+        ConfigError, match=r"config\.yaml: scene\.cache is .*; --trust allows it, NEUPRIM_TRUST=1 in the environment"
+    ):
         context_of(config, lambda text, fraction: None)
     with trusting(True):
         check_stored(config)
@@ -43,7 +46,9 @@ def test_caches_elsewhere_need_the_users_word(tmp_path: Path, address: str, monk
 
 
 def test_a_users_own_run_is_opened_again_without_a_word(tmp_path: Path) -> None:
-    config = stored(tmp_path / "run", *VOLUMES, f"scene.cache={tmp_path / 'run' / 'cache'}", f"metrics.lpips={tmp_path / 'weights'}")
+    config = stored(
+        tmp_path / "run", *VOLUMES, f"scene.cache={tmp_path / 'run' / 'cache'}", f"metrics.lpips={tmp_path / 'weights'}"
+    )
     check_stored(config)
     assert config.scene["vdb"] == "/data/fire"
 
@@ -51,7 +56,9 @@ def test_a_users_own_run_is_opened_again_without_a_word(tmp_path: Path) -> None:
 def test_any_setting_that_is_an_address_is_named(tmp_path: Path) -> None:
     config = stored(tmp_path / "run", *VOLUMES)
     config.model.init["points"] = "https://host/points.ply" + "x" * 10**5
-    with pytest.raises(ConfigError, match=r"model\.init\.points is 'https://host/points\.plyx+\.\.\.', an address") as refused:
+    with pytest.raises(
+        ConfigError, match=r"model\.init\.points is 'https://host/points\.plyx+\.\.\.', an address"
+    ) as refused:
         check_stored(config)
     assert len(str(refused.value)) < 400
 
@@ -63,7 +70,10 @@ def test_stored_text_is_data_and_typed_text_may_refer(tmp_path: Path, monkeypatc
         config.metrics = type(config.metrics)(f"/{text}")
         again = compose([f"output_dir={tmp_path / 'new'}"], stored=config)
         assert again.metrics.lpips == f"/{text}"
-    assert compose(["metrics.lpips=/${oc.env:SECRET}", f"output_dir={tmp_path / 'new'}"], stored=config).metrics.lpips == "/leaked"
+    assert (
+        compose(["metrics.lpips=/${oc.env:SECRET}", f"output_dir={tmp_path / 'new'}"], stored=config).metrics.lpips
+        == "/leaked"
+    )
 
 
 def test_a_bomb_of_aliases_is_one_line_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -73,7 +83,9 @@ def test_a_bomb_of_aliases_is_one_line_at_once(tmp_path: Path, capsys: pytest.Ca
     for n in range(1, 40):
         bomb = f"&A{n} [{bomb},*A{n - 1}]"
     file.write_text(file.read_text().replace("seed: 0", f"seed: {bomb}"))
-    with pytest.raises(CheckpointError, match=r"config\.yaml line \d+: damaged configuration \(anchors and aliases are not read\)"):
+    with pytest.raises(
+        CheckpointError, match=r"config\.yaml line \d+: damaged configuration \(anchors and aliases are not read\)"
+    ):
         RunConfig.from_yaml(file)
     assert main(["eval", str(tmp_path / "run")]) == 2 and capsys.readouterr().err.count("\n") == 1
 

@@ -101,7 +101,9 @@ def test_a_data_set_must_have_the_channels_that_its_task_names() -> None:
     assert channels_of(replace(TASK, channels=("a", "b", "c")), dataset).names == ("a", "b", "c")
     with pytest.raises(DataError, match=r"^two: 3 channels; expected 5, which task 'static' names: 450nm, 550 nm"):
         channels_of(replace(TASK, channels=BANDS), dataset)
-    with pytest.raises(DataError, match=r"^two: the background has shape \(3,\); expected \(5,\), a number per channel"):
+    with pytest.raises(
+        DataError, match=r"^two: the background has shape \(3,\); expected \(5,\), a number per channel"
+    ):
         channels_of(TASK, replace(dataset, channels=5))
 
 
@@ -137,7 +139,9 @@ def test_names_that_no_file_holds(names: list[Any], text: str) -> None:
 
 
 @pytest.mark.parametrize("half", [True, False])
-@pytest.mark.parametrize("names", [BANDS, ("R", "G", "B"), ("Y",), ("NIR", "B", "G", "R"), ("z" * 31, "ü" * 15), default_names(31)])
+@pytest.mark.parametrize(
+    "names", [BANDS, ("R", "G", "B"), ("Y",), ("NIR", "B", "G", "R"), ("z" * 31, "ü" * 15), default_names(31)]
+)
 def test_exr_gives_back_every_channel_by_its_name(tmp_path: Path, names: tuple[str, ...], half: bool) -> None:
     path, values = tmp_path / "a.exr", image(len(names))
     images.write_exr(path, values, half=half, names=names)
@@ -166,11 +170,17 @@ def test_exr_refusals_name_the_channels(tmp_path: Path) -> None:
         assert all(w in str(caught.value) for w in (str(path), *words)), caught.value
 
     refuses(lambda: images.write_exr(path, image(5)), "(4, 6, 5); expected (H, W, 3) or (H, W, 4)")
-    refuses(lambda: images.write_exr(path, image(4), names=BANDS), "(4, 6, 4); expected (H, W, 5), for the channels 450nm, 550 nm")
+    refuses(
+        lambda: images.write_exr(path, image(4), names=BANDS),
+        "(4, 6, 4); expected (H, W, 5), for the channels 450nm, 550 nm",
+    )
     refuses(lambda: images.write_exr(path, image(2), names=("a", "a")), "names[1] is 'a' once more")
     assert not path.exists()
     images.write_exr(path, image(5), names=BANDS)
-    refuses(lambda: images.read_image(path), "channels are 450nm, 550 nm, NIR, layer.R, Ünïcode; expected R, G, B and optionally A")
+    refuses(
+        lambda: images.read_image(path),
+        "channels are 450nm, 550 nm, NIR, layer.R, Ünïcode; expected R, G, B and optionally A",
+    )
     refuses(lambda: images.read_image(path, channels=("NIR", "red")), "channels are 450nm", "expected NIR, red")
     refuses(lambda: images.read_image(path, channels=()), "expected some to be asked for")
     images.write_png(path, torch.zeros(2, 2, 3))

@@ -37,10 +37,22 @@ class Outer:
 
 
 def test_what_loses_nothing_is_converted() -> None:
-    values = {"path": 123, "inner": {"size": 32.0}, "exposure": "1e-3", "rates": {"a": 1}, "range": [0, 1], "free": object}
+    values = {
+        "path": 123,
+        "inner": {"size": 32.0},
+        "exposure": "1e-3",
+        "rates": {"a": 1},
+        "range": [0, 1],
+        "free": object,
+    }
     made = checked(Outer, values, "scene")
     assert made.path == Path("123") and made.inner == Inner(size=32) and isinstance(made.inner.size, int)
-    assert made.exposure == 1e-3 and isinstance(made.rates["a"], float) and made.range == (0.0, 1.0) and made.free is object
+    assert (
+        made.exposure == 1e-3
+        and isinstance(made.rates["a"], float)
+        and made.range == (0.0, 1.0)
+        and made.free is object
+    )
     assert checked(Outer, {"path": "x", "exposure": "auto", "inner": Inner(9)}).inner.size == 9
     assert checked(Outer, made) is made
 
@@ -61,10 +73,16 @@ def test_what_loses_nothing_is_converted() -> None:
         ({"path": "x", "form": "soft\n"}, "scene.form='soft\\n': expected sharp or soft"),
         ({"path": "x", "exposure": 0}, "scene.exposure=0: expected a number above 0, or auto"),
         ({"path": "x", "exposure": math.nan}, "scene.exposure=nan: expected a finite number above 0, or auto"),
-        ({"path": "x", "exposure": 10**400}, f"scene.exposure=1{76 * '0'}...: expected a finite number above 0, or auto"),
+        (
+            {"path": "x", "exposure": 10**400},
+            f"scene.exposure=1{76 * '0'}...: expected a finite number above 0, or auto",
+        ),
         ({"path": "x", "rates": {"a": -1}}, "scene.rates.a=-1: expected a number of at least 0"),
         ({"path": "x", "rates": 1}, "scene.rates=1: expected entries, each as scene.rates.KEY=VALUE"),
-        ({"path": "x", "grids": {"smoke": "s"}}, "scene.grids.smoke: no such setting; valid: scene.grids.density, scene.grids.flames"),
+        (
+            {"path": "x", "grids": {"smoke": "s"}},
+            "scene.grids.smoke: no such setting; valid: scene.grids.density, scene.grids.flames",
+        ),
         ({"path": "x", "range": [0]}, "scene.range=[0]: expected a list of a finite number, a finite number, or null"),
     ],
 )
@@ -101,7 +119,15 @@ def test_bounds_include_what_they_say() -> None:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(None, "null"), (True, "true"), ("8", "'8'"), ("null", "'null'"), ("a b", "a b"), ([1, "x"], "[1, 'x']"), ("", "''")],
+    [
+        (None, "null"),
+        (True, "true"),
+        ("8", "'8'"),
+        ("null", "'null'"),
+        ("a b", "a b"),
+        ([1, "x"], "[1, 'x']"),
+        ("", "''"),
+    ],
 )
 def test_values_are_shown_as_they_are_typed(value: object, text: str) -> None:
     assert shown(value) == text

@@ -44,7 +44,8 @@ def saved(tmp_path: Path) -> Path:
 
 
 def refused(path: Path, task: TaskSpec = TASK) -> str:
-    """The message with which a model is refused, which names the file; within a second of computing, whatever else the machine does."""
+    """The message with which a model is refused, which names the file; within a second of computing, whatever else the
+    machine does."""
     start = time.thread_time()
     with pytest.raises(CheckpointError) as caught:
         checkpoint.load_model(path, task)
@@ -53,7 +54,9 @@ def refused(path: Path, task: TaskSpec = TASK) -> str:
     return str(caught.value)
 
 
-def rewrite(path: Path, header: dict[str, Any] | str | None = None, tensors: dict[str, Tensor] | None = None, **changes: Any) -> None:
+def rewrite(
+    path: Path, header: dict[str, Any] | str | None = None, tensors: dict[str, Tensor] | None = None, **changes: Any
+) -> None:
     """The saved model with another header or other tensors."""
     old, values = checkpoint.read(path, "model")
     text = header if isinstance(header, str) else json.dumps({**old, **(header or {}), **changes})
@@ -121,7 +124,10 @@ def test_a_header_that_claims_terabytes(saved: Path) -> None:
         saved.write_bytes(struct.pack("<Q", length) + whole[8:])
         refused(saved)
     huge = json.dumps(
-        {"means": {"dtype": "F32", "shape": [2**38, 3], "data_offsets": [0, 3 * 2**40]}, "__metadata__": {"neuprim": "{}"}}
+        {
+            "means": {"dtype": "F32", "shape": [2**38, 3], "data_offsets": [0, 3 * 2**40]},
+            "__metadata__": {"neuprim": "{}"},
+        }
     ).encode()
     saved.write_bytes(struct.pack("<Q", len(huge)) + huge + b"\0" * 64)
     refused(saved)
@@ -231,7 +237,9 @@ def test_absurd_colour_settings(saved: Path, settings: dict[str, Any]) -> None:
 
 def test_a_degree_that_does_not_exist_is_refused_when_its_tensors_fit(saved: Path) -> None:
     rewrite(
-        saved, tensors={"sh_rest": torch.zeros(5, 24, 3)}, colour={"class": "SphericalHarmonics", "settings": {"degree": 4, "channels": 3}}
+        saved,
+        tensors={"sh_rest": torch.zeros(5, 24, 3)},
+        colour={"class": "SphericalHarmonics", "settings": {"degree": 4, "channels": 3}},
     )
     refused(saved)
 
@@ -240,7 +248,9 @@ def test_a_degree_that_does_not_exist_is_refused_when_its_tensors_fit(saved: Pat
 
 
 @pytest.mark.parametrize(
-    "value", [torch.zeros(5, 4), torch.zeros(4, 3), torch.zeros(()), torch.zeros(0), torch.zeros(15)], ids=lambda v: str(tuple(v.shape))
+    "value",
+    [torch.zeros(5, 4), torch.zeros(4, 3), torch.zeros(()), torch.zeros(0), torch.zeros(15)],
+    ids=lambda v: str(tuple(v.shape)),
 )
 def test_wrong_shapes(saved: Path, value: Tensor) -> None:
     rewrite(saved, tensors={"means": value})
@@ -289,7 +299,9 @@ def test_a_full_disk_leaves_the_old_file(saved: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
-def test_an_interruption_leaves_the_old_file(saved: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]) -> None:
+def test_an_interruption_leaves_the_old_file(
+    saved: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
+) -> None:
     before = saved.read_bytes()
 
     def stop(tensors: dict[str, Tensor], name: str, metadata: dict[str, str]) -> None:

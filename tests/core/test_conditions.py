@@ -156,7 +156,9 @@ def test_the_ends_are_within_in_the_precision_of_the_values() -> None:
 
 def test_a_strict_task_has_it_refused() -> None:
     strict = replace(SHIFT, strict=True)
-    with pytest.raises(ConfigError, match=r"^--wavelength-shift 7: 7 is outside its range, 0 to 1 \(of the spectrum\); expected values"):
+    with pytest.raises(
+        ConfigError, match=r"^--wavelength-shift 7: 7 is outside its range, 0 to 1 \(of the spectrum\); expected values"
+    ):
         shifts("7", strict)
     with pytest.raises(ConfigError, match="--wavelength-shift 0:2:3: 2 is outside"):
         shifts("0:2:3", strict)
@@ -185,7 +187,11 @@ def test_an_export_has_every_condition_in_each_frame() -> None:
             True,
             "3 frames and --sun 1,2,0;0,0,0 has 2 frames; expected as many of each",
         ),
-        ({"wavelength_shift": "0"}, True, r"--sun: required, as the model depends on it \(m\); for example --sun 1,1,1"),
+        (
+            {"wavelength_shift": "0"},
+            True,
+            r"--sun: required, as the model depends on it \(m\); for example --sun 1,1,1",
+        ),
     ):
         with pytest.raises(ConfigError, match=expected):
             export_frames(SPECS, texts, several)
@@ -236,13 +242,22 @@ def test_one_value_holds_in_every_frame() -> None:
 
 def test_lengths_that_differ_are_refused_with_both() -> None:
     texts = {"time": "0:1:48", "light": "orbit:4:40:60"}
-    with pytest.raises(ConfigError, match=r"--time 0:1:48 has 48 frames and --light orbit:4:40:60 has 60 frames; expected as many of each"):
+    with pytest.raises(
+        ConfigError,
+        match=r"--time 0:1:48 has 48 frames and --light orbit:4:40:60 has 60 frames; expected as many of each",
+    ):
         in_step(texts, read_conditions([TIME, LIGHT], texts))
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
-    [("orbit", "orbit:4.5:40:9"), ("orbit:3", "orbit:3:40:9"), ("orbit:3:20", "orbit:3:20:9"), ("orbit:3:20:60", None), ("1,2,3", None)],
+    [
+        ("orbit", "orbit:4.5:40:9"),
+        ("orbit:3", "orbit:3:40:9"),
+        ("orbit:3:20", "orbit:3:20:9"),
+        ("orbit:3:20:60", None),
+        ("1,2,3", None),
+    ],
 )
 def test_an_orbit_in_so_many_frames(text: str, expected: str | None) -> None:
     assert orbit_in_frames(text, 9) == expected

@@ -38,7 +38,14 @@ def direction(row: int, column: int, height: int) -> list[float]:
 
 @pytest.mark.parametrize(
     ("row", "column", "expected"),
-    [(64, 128, (1, 0, 0)), (64, 192, (0, -1, 0)), (64, 64, (0, 1, 0)), (64, 0, (-1, 0, 0)), (0, 17, (0, 0, 1)), (127, 200, (0, 0, -1))],
+    [
+        (64, 128, (1, 0, 0)),
+        (64, 192, (0, -1, 0)),
+        (64, 64, (0, 1, 0)),
+        (64, 0, (-1, 0, 0)),
+        (0, 17, (0, 0, 1)),
+        (127, 200, (0, 0, -1)),
+    ],
 )
 def test_which_texel_is_which_direction(row: int, column: int, expected: tuple[int, int, int]) -> None:
     image = dark(128)
@@ -51,11 +58,17 @@ def test_which_texel_is_which_direction(row: int, column: int, expected: tuple[i
 def test_other_upward_axes() -> None:
     image = dark(64)
     image[0] = 1.0
-    assert Environment(image, torch.tensor([0.0, 2.0, 0.0])).beams(1).directions[0].tolist() == pytest.approx([0, 1, 0], abs=1e-9)
+    assert Environment(image, torch.tensor([0.0, 2.0, 0.0])).beams(1).directions[0].tolist() == pytest.approx(
+        [0, 1, 0], abs=1e-9
+    )
     image = dark(64)
     image[32, 32] = 1.0  # the horizon, a quarter to the left of the middle: up x first axis
-    assert Environment(image, torch.tensor([0.0, 1.0, 0.0])).beams(1).directions[0].tolist() == pytest.approx([0, 0, -1], abs=0.04)
-    assert Environment(image, torch.tensor([1.0, 0.0, 0.0])).beams(1).directions[0].tolist() == pytest.approx([0, 0, 1], abs=0.04)
+    assert Environment(image, torch.tensor([0.0, 1.0, 0.0])).beams(1).directions[0].tolist() == pytest.approx(
+        [0, 0, -1], abs=0.04
+    )
+    assert Environment(image, torch.tensor([1.0, 0.0, 0.0])).beams(1).directions[0].tolist() == pytest.approx(
+        [0, 0, 1], abs=0.04
+    )
 
 
 def test_a_rotation_turns_every_light() -> None:
@@ -109,7 +122,9 @@ def test_many_lights_light_a_surface_like_the_whole() -> None:
     """Irradiance under a half-dark random environment, of surfaces facing every way."""
     image = wild(32, seed=4).clamp_max(30.0)
     every, few = Environment(image).beams(4096), Environment(image).beams(256)
-    normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64), dim=1)
+    normals = torch.nn.functional.normalize(
+        torch.randn(50, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64), dim=1
+    )
     exact, found = ((normals @ b.directions.T).clamp_min(0) @ b.irradiance for b in (every, few))
     assert len(every.directions) > 1000
     assert float((found / exact - 1).abs().max()) < 0.03
@@ -194,7 +209,8 @@ def test_impossible_radiance(tmp_path: Path, value: float, message: str) -> None
 def test_other_shapes(tmp_path: Path) -> None:
     write_exr(tmp_path / "square.exr", torch.ones(8, 8, 3), half=False)
     with pytest.raises(
-        DataError, match=r"square\.exr: image is 8x8; expected an environment in latitude and longitude, twice as wide as high"
+        DataError,
+        match=r"square\.exr: image is 8x8; expected an environment in latitude and longitude, twice as wide as high",
     ):
         read_environment(tmp_path / "square.exr")
     with pytest.raises(DataError, match="image is 4x4; expected"):

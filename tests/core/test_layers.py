@@ -30,7 +30,8 @@ def test_all_without_a_word_and_in_one_order_with() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "several"), [("depht", False), ("lights", False), ("heat", True), ("", False), (",", False), ("beauty depth", False)]
+    ("text", "several"),
+    [("depht", False), ("lights", False), ("heat", True), ("", False), (",", False), ("beauty depth", False)],
 )
 def test_other_names_are_refused_with_those_that_there_are(text: str, several: bool) -> None:
     with pytest.raises(ConfigError, match=r"--layers .*; expected some of beauty, alpha, depth, density, .*glow"):
@@ -64,4 +65,8 @@ def test_what_a_task_declares_is_checked(layers: Any, words: str | None) -> None
 
 
 def test_the_built_in_ones_are_sound() -> None:
-    assert fault(DYNAMIC) is None and [spec.name for spec in DYNAMIC.layers] == ["emission", "absorption"] and STATIC.layers == ()
+    assert (
+        fault(DYNAMIC) is None
+        and [spec.name for spec in DYNAMIC.layers] == ["emission", "absorption"]
+        and STATIC.layers == ()
+    )

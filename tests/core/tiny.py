@@ -64,7 +64,9 @@ class Views(ViewSet):
         return self.images[index]
 
 
-def two_primitives(random_background: bool = False, views: Callable[[int, float], Views] = Views, **changes: Any) -> Dataset:
+def two_primitives(
+    random_background: bool = False, views: Callable[[int, float], Views] = Views, **changes: Any
+) -> Dataset:
     """The two known primitives; ``views(count, start)`` makes the sets, ``changes`` are members of the data set."""
     train, test = views(6, 0.0), views(2, 0.4)
     members: dict[str, Any] = {
@@ -88,7 +90,9 @@ def near_the_truth(views: ViewSet, count: int, generator: torch.Generator) -> Po
 
 def trainer(dataset: Dataset, iterations: int = 40, seed: int = 0, **changes: Any) -> Trainer:
     """A fresh trainer of 12 primitives; ``changes`` go to the train settings, ``population`` as a dictionary."""
-    population = PopulationSettings(**{"strategy": "fixed", "every": 7, "start": 0.0, "stop": 1.0, **changes.pop("population", {})})
+    population = PopulationSettings(
+        **{"strategy": "fixed", "every": 7, "start": 0.0, "stop": 1.0, **changes.pop("population", {})}
+    )
     settings = TrainSettings(iterations=iterations, **changes, population=population)
     model = initial_model(CosineDensity(4), SphericalHarmonics(1, 3, 0.25), dataset, ModelSettings(primitives=12), seed)
     return Trainer(model, dataset, photometric({"ssim_weight": settings.ssim_weight}), settings, RenderSettings(), seed)

@@ -11,7 +11,9 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
-_FENCE = re.compile(r"^(?P<mark>`{3,}|~{3,})[ \t]*(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=mark)[ \t]*$", re.DOTALL | re.MULTILINE)
+_FENCE = re.compile(
+    r"^(?P<mark>`{3,}|~{3,})[ \t]*(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=mark)[ \t]*$", re.DOTALL | re.MULTILINE
+)
 _NOT_RUN = re.compile(r"<!--\s*not run:\s*(\S.*?)\s*-->\s*$")
 _HEADING = re.compile(r"^#{1,6} +(.+?) *#*$", re.MULTILINE)
 
@@ -22,7 +24,8 @@ def name_of(page: Path) -> str:
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block; ``line`` is that of its first line of code, ``skipped`` the reason in a comment ``<!-- not run: … -->`` before it."""
+    """A fenced block; ``line`` is that of its first line of code, ``skipped`` the reason in a comment ``<!-- not run: …
+    -->`` before it."""
 
     page: Path
     line: int
@@ -42,7 +45,8 @@ def blocks(page: Path) -> list[Block]:
 
 
 def commands(block: Block, program: str) -> Iterator[list[str]]:
-    """The words after ``program`` in every command of a shell block; comments, ellipses and the brackets of ``[--optional X]`` are left out."""
+    """The words after ``program`` in every command of a shell block; comments, ellipses and the brackets of
+    ``[--optional X]`` are left out."""
     for line in block.text.replace("\\\n", " ").splitlines():
         part: list[str] = []
         optional = False
@@ -70,7 +74,9 @@ def prose(page: Path) -> str:
 def links(page: Path) -> list[str]:
     """Targets of links and pictures that are not addresses of the network."""
     text = prose(page)
-    found = re.findall(r"\]\(([^)\s]+)(?: +\"[^\"]*\")?\)", text) + re.findall(r"<(?:img|a)[^>]*(?:src|href)=\"([^\"]+)\"", text)
+    found = re.findall(r"\]\(([^)\s]+)(?: +\"[^\"]*\")?\)", text) + re.findall(
+        r"<(?:img|a)[^>]*(?:src|href)=\"([^\"]+)\"", text
+    )
     return [target for target in found if not re.match(r"[a-z]+:", target)]
 
 

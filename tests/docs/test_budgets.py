@@ -21,7 +21,14 @@ def budget(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def row(steps: int, seed: int, psnr: float, worst: float = 20.0) -> dict[str, Any]:
-    return {"scene": "chair", "iterations": steps, "seed": seed, "psnr": psnr, "psnr_worst": worst, "cpu_seconds": steps / 100}
+    return {
+        "scene": "chair",
+        "iterations": steps,
+        "seed": seed,
+        "psnr": psnr,
+        "psnr_worst": worst,
+        "cpu_seconds": steps / 100,
+    }
 
 
 def test_the_page_shows_what_was_recorded(budget: ModuleType) -> None:
@@ -56,7 +63,9 @@ def test_doublings_compare_the_seeds_that_both_budgets_have(budget: ModuleType) 
 
 
 def test_budgets_double_short_ones_first_with_the_population_of_the_preset(budget: ModuleType) -> None:
-    args = budget.argparse.Namespace(scenes=["lit_solids", "smoke_fire"], doublings=5, seeds=3, set=["train.rates.net_x=1e-2"])
+    args = budget.argparse.Namespace(
+        scenes=["lit_solids", "smoke_fire"], doublings=5, seeds=3, set=["train.rates.net_x=1e-2"]
+    )
     made = budget.trials(args)
     assert [t.iterations for t in made if t.seed == 0 and t.name.startswith("lit")] == [360 << i for i in range(6)]
     assert sorted({t.iterations for t in made if t.seed == 2 and t.name.startswith("lit")}) == [360, 720, 1440, 2880]

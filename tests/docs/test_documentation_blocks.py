@@ -45,7 +45,8 @@ OF_THE_READER = {
         *("task=neuprim-spectral:static", "scene=neuprim-spectral:ball", "train.loss=my-losses:photometric"),
     }
 }
-"""Page -> words of its commands that name what its reader writes; they are left out, the rest of the command is checked."""
+"""Page -> words of its commands that name what its reader writes; they are left out, the rest of the command is
+checked."""
 
 STAND_INS = {"DEG": "30", "N": "3", "F": "12", "WxH": "64x48"}
 """Placeholders whose values the command line reads as numbers."""
@@ -65,7 +66,14 @@ def static_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny run of the built-in static scene."""
     out = tmp_path_factory.mktemp("documented") / "static-solids"
     small = ["scene.size=48", "scene.train_views=6", "scene.test_views=2", "model.primitives=50", "model.neurons=2"]
-    words = ["task=static", "scene=solids", f"output_dir='{out}'", *small, "train.iterations=5", "train.max_seconds=null"]
+    words = [
+        "task=static",
+        "scene=solids",
+        f"output_dir='{out}'",
+        *small,
+        "train.iterations=5",
+        "train.max_seconds=null",
+    ]
     return run(compose(words))
 
 
@@ -189,7 +197,9 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         (compose_all if args.multirun else compose)(settings, False)
     if args.command == "truth":
         rest += args.overrides
-        (compose_all if args.multirun else compose)(launcher_words([word for word in rest if not word.startswith("-")])[1], False)
+        (compose_all if args.multirun else compose)(
+            launcher_words([word for word in rest if not word.startswith("-")])[1], False
+        )
         rest = [word for word in rest if word.startswith("-")]
     if args.command == "bench":
         rest += args.overrides
@@ -204,7 +214,9 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
     if args.command in ("render", "inspect", "export"):
         given, rest = split_words(rest, conditions)
         assert (
-            read_conditions(conditions, {name: text for name, text in given.items() if not PLACEHOLDER.search(text)}, pytest.fail)
+            read_conditions(
+                conditions, {name: text for name, text in given.items() if not PLACEHOLDER.search(text)}, pytest.fail
+            )
             is not None
         )
     if args.command == "export":
@@ -215,7 +227,9 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
 
 
 @pytest.mark.parametrize("block", [b for b in SHELL if any(commands(b, "neuprim"))], ids=place)
-def test_commands(block: Block, conditions: list[ConditionSpec], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands(
+    block: Block, conditions: list[ConditionSpec], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     unknown = OF_THE_READER.get(name_of(block.page), set())
     for words in commands(block, "neuprim"):
@@ -250,7 +264,9 @@ def test_a_wrong_command_is_noticed(line: str, conditions: list[ConditionSpec]) 
 def test_scripts_that_commands_name_exist() -> None:
     text = {name_of(page): page.read_text(encoding="utf-8") for page in PAGES}
     named = {
-        (page, path) for page, words in text.items() for path in re.findall(r"python3? ((?:benchmarks|docs|examples)/[\w/]+\.py)", words)
+        (page, path)
+        for page, words in text.items()
+        for path in re.findall(r"python3? ((?:benchmarks|docs|examples)/[\w/]+\.py)", words)
     }
     assert len(named) > 5
     assert [(page, path) for page, path in named if not (ROOT / path).is_file()] == []

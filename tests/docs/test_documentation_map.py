@@ -44,18 +44,27 @@ def missing(lines: list[str], root: Path) -> list[str]:
     for path, others, _ in entries(lines, root):
         if not path.exists():
             wrong.append(path.relative_to(root).as_posix())
-        wrong += [f"{path.relative_to(root)}: {name}" for name in others if not any((d / name).is_file() for d in (path, path.parent))]
+        wrong += [
+            f"{path.relative_to(root)}: {name}"
+            for name in others
+            if not any((d / name).is_file() for d in (path, path.parent))
+        ]
     return wrong
 
 
 def left_out(lines: list[str], root: Path) -> list[str]:
-    """Packages, and modules directly in the first one or in its core, that no line names; tasks' conf folders are all alike."""
+    """Packages, and modules directly in the first one or in its core, that no line names; tasks' conf folders are all
+    alike."""
     named = {path for path, _, _ in entries(lines, root)}
-    named |= {folder / name for path, others, _ in entries(lines, root) for name in others for folder in (path, path.parent)}
+    named |= {
+        folder / name for path, others, _ in entries(lines, root) for name in others for folder in (path, path.parent)
+    }
     package = root / lines[0].strip().rstrip("/")
     rooms = {f.parent for f in package.rglob("__init__.py")}
     rooms = {
-        room for room in rooms if "template" not in room.relative_to(package).parts and not (room.name == "conf" and "tasks" in room.parts)
+        room
+        for room in rooms
+        if "template" not in room.relative_to(package).parts and not (room.name == "conf" and "tasks" in room.parts)
     }
     modules = {f for folder in (package, package / "core") for f in folder.glob("[!_]*.py")}
     return sorted(p.relative_to(root).as_posix() for p in (rooms | modules) - named)

@@ -59,7 +59,11 @@ def roles() -> Iterator[tuple[str, str]]:
 def test_names_on_pages_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     unknown = [name for name in sorted(set(DOTTED.findall(text)) - GROUPS) if not exists(name)]
-    gone = [path for path in sorted(set(PLACE.findall(text)) - OF_THE_READER.get(name_of(page), set())) if not (ROOT / path).exists()]
+    gone = [
+        path
+        for path in sorted(set(PLACE.findall(text)) - OF_THE_READER.get(name_of(page), set()))
+        if not (ROOT / path).exists()
+    ]
     assert (unknown, gone) == ([], [])
 
 
@@ -70,12 +74,15 @@ def test_names_in_docstrings_exist() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["neuprim.core.fields", "neuprim.core.model.fields.RayNets", "neuprim.cores", "neuprim.core.geometry.Geometry"]
+    "name",
+    ["neuprim.core.fields", "neuprim.core.model.fields.RayNets", "neuprim.cores", "neuprim.core.geometry.Geometry"],
 )
 def test_a_wrong_name_is_noticed(name: str) -> None:
     assert not exists(name)
 
 
-@pytest.mark.parametrize("name", ["neuprim.rasterize", "neuprim.core.settings.RenderSettings.near", "neuprim.core.io.vdb"])
+@pytest.mark.parametrize(
+    "name", ["neuprim.rasterize", "neuprim.core.settings.RenderSettings.near", "neuprim.core.io.vdb"]
+)
 def test_a_right_name_is_not(name: str) -> None:
     assert exists(name)

@@ -1,4 +1,5 @@
-"""What the site's hooks do to links, docstrings and pages that load from the network. Needs mkdocs (``neuprim[docs]``)."""
+"""What the site's hooks do to links, docstrings and pages that load from the network. Needs mkdocs
+(``neuprim[docs]``)."""
 
 from __future__ import annotations
 
@@ -50,9 +51,16 @@ def test_roles_become_links(hooks: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "tag", ['<script src="https://a.b/c.js">', "<link rel=stylesheet href=//fonts.x/y>", '<img alt="x" src="http://a.b/c.png">']
+    "tag",
+    [
+        '<script src="https://a.b/c.js">',
+        "<link rel=stylesheet href=//fonts.x/y>",
+        '<img alt="x" src="http://a.b/c.png">',
+    ],
 )
-def test_a_page_that_loads_from_the_network_is_a_warning(hooks: Any, caplog: pytest.LogCaptureFixture, tag: str) -> None:
+def test_a_page_that_loads_from_the_network_is_a_warning(
+    hooks: Any, caplog: pytest.LogCaptureFixture, tag: str
+) -> None:
     with caplog.at_level(logging.WARNING):
         hooks.on_post_page('<a href="https://arxiv.org/x">x</a> <img src="pictures/a.png">', page("a.md"))
         assert caplog.messages == []

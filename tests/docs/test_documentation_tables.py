@@ -36,7 +36,9 @@ def benchmark(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
 
 def between(page: str, name: str) -> str:
     """What stands between a page's markers of this name, of which it has one pair."""
-    found = re.findall(rf"<!-- {name} -->\n(.*?)\n?<!-- /{name} -->", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
+    found = re.findall(
+        rf"<!-- {name} -->\n(.*?)\n?<!-- /{name} -->", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL
+    )
     assert len(found) == 1, f"{page}: {len(found)} pairs of markers {name}"
     return str(found[0])
 
@@ -49,7 +51,9 @@ def between(page: str, name: str) -> str:
         ("relight", "docs/relighting.md", "quality_table"),
     ],
 )
-def test_tables_are_those_of_the_recorded_results(task: str, page: str, full: str, benchmark: Callable[[str], ModuleType]) -> None:
+def test_tables_are_those_of_the_recorded_results(
+    task: str, page: str, full: str, benchmark: Callable[[str], ModuleType]
+) -> None:
     script = benchmark(f"{task}_quality")
     recorded: dict[str, Any] = json.loads((RESULTS / f"{task}_quality.json").read_text(encoding="utf-8"))
     short = script.short_table(recorded)
@@ -66,7 +70,9 @@ def test_the_dynamic_tables_say_which_preset_is_which(benchmark: Callable[[str],
     count = script.as_many_bytes(13500, *script.PRESETS["equations"])
     short = script.short_table(recorded).splitlines()
     assert len(short) == 6 and "K = 0 with a soft edge, voxels and images | 13,500 |" in short[3]
-    assert f"equations 10 to 13 | {count:,} |" in short[4] and "K = 8 with a hard edge, images alone | 5,008 |" in short[5]
+    assert (
+        f"equations 10 to 13 | {count:,} |" in short[4] and "K = 8 with a hard edge, images alone | 5,008 |" in short[5]
+    )
     full = script.main_table(recorded).splitlines()
     assert "`quick`, 13,500 primitives" in full[0] and f"`equations`, {count:,} primitives" in full[0]
     assert len({line.count("|") for line in full}) == 1
@@ -88,7 +94,9 @@ def test_a_benchmark_rewrites_its_tables_without_measuring(
         assert len(emptied) < len(text)
     monkeypatch.setattr(script, "README", tmp_path / "README.md")
     monkeypatch.setattr(script, "ROOT", tmp_path)
-    monkeypatch.setattr(sys, "argv", ["benchmark", "--readme", "--docs", *(["--parts", "none"] if task == "relight" else [])])
+    monkeypatch.setattr(
+        sys, "argv", ["benchmark", "--readme", "--docs", *(["--parts", "none"] if task == "relight" else [])]
+    )
     script.main()
     for name, text in before.items():
         wanted = re.findall(rf"<!-- {task}-\w+ -->\n.*?<!-- /{task}-\w+ -->", text, re.DOTALL)
@@ -129,17 +137,25 @@ def test_the_table_of_factors_is_that_of_the_recorded_results(benchmark: Callabl
 def test_the_fronts_are_those_that_were_measured_and_reach_far(benchmark: Callable[[str], ModuleType]) -> None:
     script, found = benchmark("fronts"), json.loads((RESULTS / "fronts.json").read_text(encoding="utf-8"))
     assert found.keys() == script.SCENES.keys(), "one of each task"
-    assert between("docs/tradeoffs.md", "fronts") == "\n\n".join(script.report(name, found[name]) for name in script.SCENES)
+    assert between("docs/tradeoffs.md", "fronts") == "\n\n".join(
+        script.report(name, found[name]) for name in script.SCENES
+    )
     assert all(script.reach(result, "size", "bytes") >= 10 for result in found.values())
     assert all(script.reach(result, "speed", "time_ratio") >= 8 for result in found.values())
 
 
 def test_targets_are_met_by_models_that_are_hardly_larger_than_a_grids(benchmark: Callable[[str], ModuleType]) -> None:
     script, found = benchmark("target"), json.loads((RESULTS / "target.json").read_text(encoding="utf-8"))
-    assert between("docs/tradeoffs.md", "target") == "\n\n".join(script.report(name, found[name]) for name in script.SCENES)
+    assert between("docs/tradeoffs.md", "target") == "\n\n".join(
+        script.report(name, found[name]) for name in script.SCENES
+    )
     for result in (found[name] for name in script.SCENES):
         for run in result["runs"]:
-            assert 0 <= run["held_out_stored"] - run["target"] <= 0.3 and run["seconds"] <= run["budget"] and run["warning"] is None
+            assert (
+                0 <= run["held_out_stored"] - run["target"] <= 0.3
+                and run["seconds"] <= run["budget"]
+                and run["warning"] is None
+            )
         larger = [run["bytes_usual"] / script.smallest(result["grid"], run["target"]) for run in result["runs"]]
         assert statistics.median(larger) <= 1.15 and max(larger) <= 1.25, (
             "where a tenth of a decibel is a tenth of the bytes, seeds differ by that"
@@ -154,9 +170,9 @@ def test_the_levels_of_effort_are_those_that_were_measured(benchmark: Callable[[
     assert len(tables) == 3 and between("docs/tradeoffs.md", "effort") == "\n\n".join(tables)
     for scene, rows in found.items():
         task = script.SCENES[scene].task
-        assert (ROOT / "neuprim" / "tasks" / task / "conf" / "effort" / f"{task}.yaml").read_text(encoding="utf-8") == script.frozen(
-            rows, scene
-        )
+        assert (ROOT / "neuprim" / "tasks" / task / "conf" / "effort" / f"{task}.yaml").read_text(
+            encoding="utf-8"
+        ) == script.frozen(rows, scene)
 
 
 def test_eight_bits_are_half_a_step_off_and_a_quarter_of_the_bytes(benchmark: Callable[[str], ModuleType]) -> None:
@@ -193,7 +209,8 @@ def test_the_tables_of_the_forms_are_those_of_the_recorded_results(benchmark: Ca
 
 
 class Busy:
-    """Stands for a trainer: each step computes a millisecond, every ``every``-th as many more, and waits for ``waits`` seconds."""
+    """Stands for a trainer: each step computes a millisecond, every ``every``-th as many more, and waits for ``waits``
+    seconds."""
 
     def __init__(self, every: int = 0, waits: float = 0.0) -> None:
         self.renderer, self.dataset = SimpleNamespace(threads=1), SimpleNamespace(points=None)
@@ -221,11 +238,18 @@ def test_paces_are_what_a_thread_computes_with_its_share_of_rare_steps(
 
 def test_forms_of_equal_bytes_are_counted_by_their_parameters(benchmark: Callable[[str], ModuleType]) -> None:
     forms = benchmark("expressivity").Form
-    assert [forms.named(text).equal_bytes(2000, "static") for text in ("8:0", "2:2", "0:2", "gaussian")] == [2000, 2829, 3300, 3356]
+    assert [forms.named(text).equal_bytes(2000, "static") for text in ("8:0", "2:2", "0:2", "gaussian")] == [
+        2000,
+        2829,
+        3300,
+        3356,
+    ]
     assert forms.named("0:2@images").equal_bytes(2000, "dynamic") == 5391
     with_source = forms.named("0:2@images")
     assert (
-        "train.supervision=images" in with_source.words and str(with_source) == "0:2@images" and with_source.label.endswith("images alone")
+        "train.supervision=images" in with_source.words
+        and str(with_source) == "0:2@images"
+        and with_source.label.endswith("images alone")
     )
 
 
@@ -245,10 +269,15 @@ def test_tables_of_a_card_show_every_number(benchmark: Callable[[str], ModuleTyp
         "forward_ms": 0.5, "both_ms": 1.25, "step_ms": 2.5, "peak_mb": 123.4,
     }  # fmt: skip
     train = {"scene": "lit_solids", "primitives": 900, "steps": 2000, "step_ms": 3.14159, "psnr": 31.2345, "of": "psnr"}
-    records = [{"device": "A card", "torch": "2.11", "times": [times], "train": [train]}, {"device": "None", "torch": "1"}]
+    records = [
+        {"device": "A card", "torch": "2.11", "times": [times], "train": [train]},
+        {"device": "None", "torch": "1"},
+    ]
     found = script.times_table(records)
     assert found.startswith("A card, torch 2.11:\n\n| form |") and "None" not in found
-    assert found.splitlines()[-1] == "| K=8 p=0 | 5,000 | 800×600 | 12,345 | 678,901 | 0.50 | 1.25 | 2.50 | 2000 | 123 |"
+    assert (
+        found.splitlines()[-1] == "| K=8 p=0 | 5,000 | 800×600 | 12,345 | 678,901 | 0.50 | 1.25 | 2.50 | 2000 | 123 |"
+    )
     assert script.training_table(records).splitlines()[-1] == "| lit solids | 900 | 2,000 | 3.14 | 31.23 (psnr) |"
     assert script.parity_table(records) == ""
 
@@ -259,9 +288,13 @@ def test_the_table_of_photographs_is_that_of_the_recorded_results(benchmark: Cal
     assert between("docs/static.md", "photographs") == f"{script.table(rows)}\n\n{script.caption(rows)}"
 
 
-def test_the_tables_of_parts_and_of_the_cost_model_are_those_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
+def test_the_tables_of_parts_and_of_the_cost_model_are_those_of_the_recorded_results(
+    benchmark: Callable[[str], ModuleType],
+) -> None:
     shards, costs = benchmark("shards"), benchmark("cost_model")
-    parts, record = (json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for name in ("shards", "cost_model"))
+    parts, record = (
+        json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for name in ("shards", "cost_model")
+    )
     assert between("docs/scaling.md", "shards") == shards.table(parts)
     for kind, terms in costs.model_of(record).items():
         assert record["model"][kind] == pytest.approx(terms, rel=1e-6)
@@ -285,7 +318,8 @@ def test_a_cost_model_finds_the_terms_that_times_are_made_of(benchmark: Callable
 
 
 def test_amounts_on_paper_are_those_of_a_step(benchmark: Callable[[str], ModuleType]) -> None:
-    """Of a scene of which a view shows all, parts hold the state divided by the ranks, and send what their formula says."""
+    """Of a scene of which a view shows all, parts hold the state divided by the ranks, and send what their formula
+    says."""
     paper = benchmark("shared.paper_scenes")
     scene = paper.Paper("", 1000, 70, 1.0, 10.0, 64 * 64, 5, 2)
     found = paper.amounts(scene)

@@ -52,10 +52,14 @@ def _shown(dataset: Dataset) -> None:
 
 
 def _loaded(load: Callable[..., Dataset], **settings: Any) -> Callable[[Path], None]:
-    return lambda folder: _shown(load({"path": str(folder), **settings}, SceneContext(seed=0, cache_dir=folder / "cache")))
+    return lambda folder: _shown(
+        load({"path": str(folder), **settings}, SceneContext(seed=0, cache_dir=folder / "cache"))
+    )
 
 
-def _posed(folder: Path, split: str, count: int, suffix: str = ".png", head: Mapping[str, Any] = {}, **more: Any) -> None:
+def _posed(
+    folder: Path, split: str, count: int, suffix: str = ".png", head: Mapping[str, Any] = {}, **more: Any
+) -> None:
     """A transforms file of so many views of a square, with their images; ``more`` goes into every frame."""
     from tests.tasks.conftest import Scenes
 
@@ -138,7 +142,9 @@ _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 def _ply(path: Path, names: str, rows: np.ndarray, text: bool = False) -> None:
     head = f"ply\nformat {'ascii' if text else 'binary_little_endian'} 1.0\nelement vertex {len(rows)}\n"
     head += "".join(f"property float {name}\n" for name in names.split()) + "end_header\n"
-    body = "\n".join(" ".join(map(str, row)) for row in rows.tolist()).encode() if text else rows.astype("<f4").tobytes()
+    body = (
+        "\n".join(" ".join(map(str, row)) for row in rows.tolist()).encode() if text else rows.astype("<f4").tobytes()
+    )
     path.write_bytes(head.encode() + body)
 
 
@@ -175,7 +181,9 @@ def _mesh(name: str) -> tuple[Callable[[Path], Any], Callable[[Path], None]]:
         if name == "a.ply":
             models.write_ply(path, vertices, faces, np.full((24, 3), 99, np.uint8))
         elif path.suffix in (".ply", ".stl"):
-            data = trimesh.Trimesh(vertices, faces, process=False).export(file_type=_EXPORTED[name], **_OPTIONS.get(name, {}))
+            data = trimesh.Trimesh(vertices, faces, process=False).export(
+                file_type=_EXPORTED[name], **_OPTIONS.get(name, {})
+            )
             path.write_bytes(data.encode() if isinstance(data, str) else data)
         else:
             {".glb": models.write_glb, ".gltf": models.write_gltf, ".obj": models.write_obj}[path.suffix](path)
@@ -183,7 +191,9 @@ def _mesh(name: str) -> tuple[Callable[[Path], Any], Callable[[Path], None]]:
     def read(folder: Path) -> None:
         from neuprim.tasks.static.mesh.generate import MeshSettings, generate
 
-        generate(MeshSettings(path=folder / name, size=8, train_views=1, test_views=1, supersampling=1), folder / "cache")
+        generate(
+            MeshSettings(path=folder / name, size=8, train_views=1, test_views=1, supersampling=1), folder / "cache"
+        )
 
     return make, read
 
@@ -264,7 +274,9 @@ def _cameras(folder: Path) -> None:
         {"transform_matrix": pose},
         {"transform_matrix": pose, "fl_x": 10, "fl_y": 11.5, "cx": 3, "cy": 7, "w": 20, "h": 30, "time": 0.5},
     ]
-    (folder / "c.json").write_text(json.dumps({"w": 64, "h": 48, "camera_angle_x": math.pi / 2, "fps": 24, "frames": frames}))
+    (folder / "c.json").write_text(
+        json.dumps({"w": 64, "h": 48, "camera_angle_x": math.pi / 2, "fps": 24, "frames": frames})
+    )
 
 
 _STAGE = """#usda 1.0
@@ -323,7 +335,9 @@ def _compressed(folder: Path) -> None:
     from tests.compressing import example, without_pieces
 
     for name, model in (("whole", example("static", 20)[1]), ("pruned", without_pieces(example("static", 20)[1]))):
-        checkpoint.save_compressed(folder / f"{name}.neuprim", model, "static", {"note": "naïve"}, LEVELS[3], "task: static\n")
+        checkpoint.save_compressed(
+            folder / f"{name}.neuprim", model, "static", {"note": "naïve"}, LEVELS[3], "task: static\n"
+        )
 
 
 def _read_compressed(folder: Path) -> None:
@@ -367,16 +381,22 @@ def _records(folder: Path) -> None:
     (folder / "run/renders/worst_0.png").touch()
     region = [{"file": "worst_0.png", "name": "a", "psnr": 10.0, "x": 1, "y": 2, "side": 3}]
     (folder / "run/renders/worst.json").write_text(json.dumps(region))
-    SweepRecord(("a=1,2",), (Row("0", ("a=1",), {"a": "1"}), Row("1", ("a=2",), {"a": "2"}, "failed", "why", 2.5, 1))).write(folder)
+    SweepRecord(
+        ("a=1,2",), (Row("0", ("a=1",), {"a": "1"}), Row("1", ("a=2",), {"a": "2"}, "failed", "why", 2.5, 1))
+    ).write(folder)
     ChunkRecord((Chunk("chunk_0", 20, 30, None), Chunk("chunk_1", 20, 30, 1.5)), 100).write(folder)
     turned = [Turn("model.neurons", 4, 2, {"psnr": 0.1}, 0.8, True)]
-    TargetRecord({"psnr": 30.0}, {}, length=200, attempts=[attempt(100, 50, 30.0)], turns=turned).write(folder / "target")
+    TargetRecord({"psnr": 30.0}, {}, length=200, attempts=[attempt(100, 50, 30.0)], turns=turned).write(
+        folder / "target"
+    )
     points = [
         Measured("reference", (), {"psnr": 30.0}, 100, None, [1.0, 1.1, 1.2], [1.0] * 3),
         Measured("sort", ("renderer.sort=entry",), {"psnr": 29.0}, 100, 5, [0.5], [0.5]),
     ]
     (folder / "run/tradeoff").mkdir()
-    Record({"views": 1}, {}, points, [LeftOut("a", ("b=1",), "why")], [0, 1], [0]).write(folder / "run/tradeoff/tradeoff.json")
+    Record({"views": 1}, {}, points, [LeftOut("a", ("b=1",), "why")], [0, 1], [0]).write(
+        folder / "run/tradeoff/tradeoff.json"
+    )
     outcome = Outcome(30.0, 0.9, 40, 12, 1000, 50, 1.5, 10.0, ((0.5, 20.0),))
     (folder / "trial.json").write_text(json.dumps({"format": 1, "asked": {}, "views": 3, "outcome": outcome.to_dict()}))
     write_status(folder / "status.json", Status())
@@ -402,7 +422,12 @@ def _read_records(folder: Path) -> None:
     if (chunks := read_chunks(folder)) is not None:
         chunks.write(folder / "again")
     if (target := read_target(folder / "target")) is not None:
-        target.write(folder / "again"), target.words, target.done("size"), [one.count for one in target.attempts if one.outcome]
+        (
+            target.write(folder / "again"),
+            target.words,
+            target.done("size"),
+            [one.count for one in target.attempts if one.outcome],
+        )
     read_front(folder / "run")
     if (points := read_record(folder / "run/tradeoff/tradeoff.json")) is not None:
         write_points(folder / "out.csv", points, lambda i: 40)
@@ -466,7 +491,9 @@ def _lazy(module: str, **settings: Any) -> Callable[[Path], None]:
 
 
 _RECORDS: Files = {
-    **dict.fromkeys(("run/metrics.json", "run/renders/worst.json", "sweep.json", "chunks.json", "target/target.json"), m.json_of),
+    **dict.fromkeys(
+        ("run/metrics.json", "run/renders/worst.json", "sweep.json", "chunks.json", "target/target.json"), m.json_of
+    ),
     **dict.fromkeys(("run/tradeoff/tradeoff.json", "trial.json", "status.json"), m.json_of),
     "run/metrics.jsonl": m.jsonl_of,
 }
@@ -475,12 +502,18 @@ _SPLITS: Files = {"transforms_train.json": m.json_of, "transforms_test.json": m.
 FORMATS: dict[str, Format] = {
     "blender": Format(_blender, _lazy(f"{_DATASETS}.blender"), _SPLITS),
     "nerfstudio": Format(
-        _nerfstudio, _lazy(f"{_DATASETS}.nerfstudio"), {"transforms.json": m.json_of, "points.ply": m.text_of, "mask.png": m.png}
+        _nerfstudio,
+        _lazy(f"{_DATASETS}.nerfstudio"),
+        {"transforms.json": m.json_of, "points.ply": m.text_of, "mask.png": m.png},
     ),
     "multiview": Format(_multiview, _lazy("neuprim.tasks.dynamic.multiview"), _SPLITS, slow=True),
     "olat": Format(_olat, _lazy("neuprim.tasks.relight.olat"), _SPLITS),
-    "colmap": Format(_colmap(False), _lazy(f"{_DATASETS}.colmap"), {f"sparse/0/{part}.bin": m.lies(0, 400) for part in _PARTS}),
-    "colmap-text": Format(_colmap(True), _lazy(f"{_DATASETS}.colmap"), {f"sparse/0/{part}.txt": m.text_of for part in _PARTS}),
+    "colmap": Format(
+        _colmap(False), _lazy(f"{_DATASETS}.colmap"), {f"sparse/0/{part}.bin": m.lies(0, 400) for part in _PARTS}
+    ),
+    "colmap-text": Format(
+        _colmap(True), _lazy(f"{_DATASETS}.colmap"), {f"sparse/0/{part}.txt": m.text_of for part in _PARTS}
+    ),
     "points": Format(_points, _read_points, {"points.ply": m.text_of, "text.ply": m.text_of}),
     "gaussians": Format(_gaussians, _read_points, {"points.ply": m.text_of}),
     "mesh-ply": Format(*_mesh("a.ply"), {"a.ply": m.text_of}),
@@ -506,5 +539,7 @@ FORMATS: dict[str, Format] = {
     "checkpoint": Format(_checkpoint, _read_checkpoint, {"out/checkpoint.safetensors": m.safetensors}),
     "lpips": Format(_lpips, _read_lpips, {"weights.pth": m.npz, "weights.safetensors": m.safetensors}),
     "records": Format(_records, _read_records, _RECORDS),
-    "compressed": Format(_compressed, _read_compressed, {"whole.neuprim": m.compressed, "pruned.neuprim": m.compressed}),
+    "compressed": Format(
+        _compressed, _read_compressed, {"whole.neuprim": m.compressed, "pruned.neuprim": m.compressed}
+    ),
 }

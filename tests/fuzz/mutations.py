@@ -16,19 +16,119 @@ from typing import Any
 import numpy as np
 import yaml
 
-__all__ = ["bytes_of", "compressed", "container", "glb", "json_of", "jsonl_of", "lies", "npz", "png", "safetensors", "text_of", "yaml_of"]
+__all__ = [
+    "bytes_of",
+    "compressed",
+    "container",
+    "glb",
+    "json_of",
+    "jsonl_of",
+    "lies",
+    "npz",
+    "png",
+    "safetensors",
+    "text_of",
+    "yaml_of",
+]
 
 Mutation = Callable[[bytes, Random], bytes]
 
-_NUMBERS = (0, 1, -1, 2, 255, 256, 65535, 2**31 - 1, 2**31, -(2**31), 2**32 - 1, 2**40, 2**53 + 1, 2**63 - 1, 2**64 - 1, 10**30)
+_NUMBERS = (
+    0,
+    1,
+    -1,
+    2,
+    255,
+    256,
+    65535,
+    2**31 - 1,
+    2**31,
+    -(2**31),
+    2**32 - 1,
+    2**40,
+    2**53 + 1,
+    2**63 - 1,
+    2**64 - 1,
+    10**30,
+)
 _WORDS = (
-    *("nan", "inf", "-inf", "1e400", "-1", "0", "4294967295", "99999999999999999999999", "1e38", "-1e300", "0x10", "", " ", "\t"),
-    *("a" * 3000, "../../../../etc/passwd", "/etc/passwd", "http://127.0.0.1:9/x", "${oc.env:HOME}", "\x00", "\u202e", "ÿ", "%s%n", "--"),
+    *(
+        "nan",
+        "inf",
+        "-inf",
+        "1e400",
+        "-1",
+        "0",
+        "4294967295",
+        "99999999999999999999999",
+        "1e38",
+        "-1e300",
+        "0x10",
+        "",
+        " ",
+        "\t",
+    ),
+    *(
+        "a" * 3000,
+        "../../../../etc/passwd",
+        "/etc/passwd",
+        "http://127.0.0.1:9/x",
+        "${oc.env:HOME}",
+        "\x00",
+        "\u202e",
+        "ÿ",
+        "%s%n",
+        "--",
+    ),
 )
 _VALUES: tuple[Any, ...] = (
-    *(None, True, False, [], {}, [[]], [{}], "", "text", 0, 1, -1, 1.5, float("nan"), float("inf"), -float("inf"), 1e300, -1e300, 1e-300),
-    *(2**31, -(2**31), 2**63, 10**30, 10**400, -(10**400), "nan", "1e400", "1", [0] * 1000, [[1, 2], [3]], ["a", None], {"a": {"b": []}}),
-    *("../../outside", "/etc/passwd", "http://127.0.0.1:9/x", "${oc.env:HOME}", "${.}", "a" * 5000, "\x00", "é\ud800", [[[[[[[[1]]]]]]]]),
+    *(
+        None,
+        True,
+        False,
+        [],
+        {},
+        [[]],
+        [{}],
+        "",
+        "text",
+        0,
+        1,
+        -1,
+        1.5,
+        float("nan"),
+        float("inf"),
+        -float("inf"),
+        1e300,
+        -1e300,
+        1e-300,
+    ),
+    *(
+        2**31,
+        -(2**31),
+        2**63,
+        10**30,
+        10**400,
+        -(10**400),
+        "nan",
+        "1e400",
+        "1",
+        [0] * 1000,
+        [[1, 2], [3]],
+        ["a", None],
+        {"a": {"b": []}},
+    ),
+    *(
+        "../../outside",
+        "/etc/passwd",
+        "http://127.0.0.1:9/x",
+        "${oc.env:HOME}",
+        "${.}",
+        "a" * 5000,
+        "\x00",
+        "é\ud800",
+        [[[[[[[[1]]]]]]]],
+    ),
 )
 
 
@@ -62,7 +162,8 @@ def bytes_of(raw: bytes, rng: Random) -> bytes:
 
 
 def lies(*reach: int) -> Mutation:
-    """Absurd numbers in a binary header: at a place of ``range(*reach)``, 1 to 8 bytes in either order, or a float that is none."""
+    """Absurd numbers in a binary header: at a place of ``range(*reach)``, 1 to 8 bytes in either order, or a float that
+    is none."""
 
     def mutate(raw: bytes, rng: Random) -> bytes:
         data, places = bytearray(raw), range(*reach)
@@ -80,9 +181,12 @@ def lies(*reach: int) -> Mutation:
 
 
 def text_of(raw: bytes, rng: Random) -> bytes:
-    """Replace, repeat, drop or exchange words and lines of a text; what follows a header that ends in ``end_header`` is left."""
+    """Replace, repeat, drop or exchange words and lines of a text; what follows a header that ends in ``end_header`` is
+    left."""
     head, mark, body = raw.partition(b"end_header\n")
-    lines = [[""]] + [re.split(r"(\s+|[=,()\"]+)", line) for line in head.decode("utf-8", "surrogateescape").split("\n")]
+    lines = [[""]] + [
+        re.split(r"(\s+|[=,()\"]+)", line) for line in head.decode("utf-8", "surrogateescape").split("\n")
+    ]
     for _ in range(rng.randint(1, 3)):
         line = rng.choice(lines[1:] or lines)
         at, how = rng.randrange(max(len(line), 1)), rng.randrange(6)
@@ -136,10 +240,16 @@ def _nodes(root: list[Any] | dict[Any, Any], depth: int = 0) -> Any:
 
 
 def _dumped(value: Any, rng: Random) -> bytes:
-    """JSON of Python's kind (NaN and Infinity), now and then with a number beyond float64, a key twice or what is no JSON at all."""
+    """JSON of Python's kind (NaN and Infinity), now and then with a number beyond float64, a key twice or what is no
+    JSON at all."""
     text = json.dumps(value)
     if rng.random() < 0.15:
-        text = re.sub(r"\d+\.?\d*", lambda m: rng.choice((m[0], m[0], "1e400", "-1e400", "9" * 5000)), text, count=rng.randint(1, 6))
+        text = re.sub(
+            r"\d+\.?\d*",
+            lambda m: rng.choice((m[0], m[0], "1e400", "-1e400", "9" * 5000)),
+            text,
+            count=rng.randint(1, 6),
+        )
     if rng.random() < 0.05:
         text = re.sub(r'("\w+"): ', r"\1: 7, \1: ", text, count=1)
     if rng.random() < 0.03:
@@ -247,12 +357,16 @@ def png(raw: bytes, rng: Random) -> bytes:
         if how == 0 and len(chunks) > 1:
             del chunks[index]
         elif how == 1:
-            chunks.insert(rng.randrange(len(chunks)), (rng.choice((kind, b"PLTE", b"tRNS", b"iCCP", b"zTXt", b"eXIf")), content))
+            chunks.insert(
+                rng.randrange(len(chunks)), (rng.choice((kind, b"PLTE", b"tRNS", b"iCCP", b"zTXt", b"eXIf")), content)
+            )
         elif how == 2:
             chunks[index] = (kind, zlib.compress(bytes(rng.choice((1, 10**6, 10**8))), 9))
         else:
             chunks[index] = (kind, lies(0, max(len(content), 1))(content, rng))
-    parts = (len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big") for kind, body in chunks)
+    parts = (
+        len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big") for kind, body in chunks
+    )
     return raw[:8] + b"".join(parts)
 
 
@@ -266,7 +380,8 @@ def npz(raw: bytes, rng: Random) -> bytes:
         del members[name]
     elif how == 1:
         np.lib.format.write_array(
-            made, rng.choice((np.zeros(0), np.array(["a"]), np.zeros((2, 2, 2)), np.full(5, np.nan), np.zeros(3, ">f8")))
+            made,
+            rng.choice((np.zeros(0), np.array(["a"]), np.zeros((2, 2, 2)), np.full(5, np.nan), np.zeros(3, ">f8"))),
         )
         members[name] = made.getvalue()
     elif how == 2:

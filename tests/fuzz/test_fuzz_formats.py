@@ -1,5 +1,6 @@
-"""Every format that is read, spoiled in bytes and in structure: what comes is valid, or one line; within 4 GB and seconds; nothing is written or
-contacted. ``python -m tests.fuzz.worker`` does the same from a console, and repeats a failure by its number.
+"""Every format that is read, spoiled in bytes and in structure: what comes is valid, or one line; within 4 GB and
+seconds; nothing is written or contacted. ``python -m tests.fuzz.worker`` does the same from a console, and repeats a
+failure by its number.
 """
 
 from __future__ import annotations
@@ -31,11 +32,17 @@ class Reader:
         self.folder, self.process = folder, None
 
     def faults(self, name: str, kind: str, count: int, seed: int) -> list[Any]:
-        """What is wrong with the reading of so many spoiled files; all numbers of one that ends the worker are named."""
+        """What is wrong with the reading of so many spoiled files; all numbers of one that ends the worker are
+        named."""
         if self.process is None or self.process.poll() is not None:
             root = Path(__file__).parents[2]
             paths = os.pathsep.join([str(root), *filter(None, sys.path)])
-            env = os.environ | {"PYTHONPATH": paths, "TMPDIR": str(self.folder), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+            env = os.environ | {
+                "PYTHONPATH": paths,
+                "TMPDIR": str(self.folder),
+                "OMP_NUM_THREADS": "1",
+                "OPENBLAS_NUM_THREADS": "1",
+            }
             command = [sys.executable, "-m", "tests.fuzz.worker"]
             self.process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=env, text=True

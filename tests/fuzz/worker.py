@@ -1,9 +1,11 @@
 """Reads spoiled files in a process that may take 4 GB, write into one folder and reach nobody.
 
     python -m tests.fuzz.worker FORMAT|all bytes|structure COUNT [SEED]   # every failure as a line
-    python -m tests.fuzz.worker FORMAT bytes|structure =NUMBER [SEED]     # one of them again, with its traceback; the file is left in the folder
+    python -m tests.fuzz.worker FORMAT bytes|structure =NUMBER [SEED]     # one of them again, with its traceback; the
+    file is left in the folder
 
-Without words it serves the tests: a JSON list of FORMAT, KIND, FIRST, LAST and SEED a line, answered by a JSON list of failures.
+Without words it serves the tests: a JSON list of FORMAT, KIND, FIRST, LAST and SEED a line, answered by a JSON list of
+failures.
 """
 
 from __future__ import annotations
@@ -54,7 +56,16 @@ class Sandbox:
             self.offences.append(f"{event} {args[1:]}")
         elif event == "open" and isinstance(args[0], str) and (args[2] or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
             self._written(args[0])
-        elif event in ("os.remove", "os.rmdir", "os.mkdir", "os.rename", "os.symlink", "os.link", "os.truncate", "os.chmod"):
+        elif event in (
+            "os.remove",
+            "os.rmdir",
+            "os.mkdir",
+            "os.rename",
+            "os.symlink",
+            "os.link",
+            "os.truncate",
+            "os.chmod",
+        ):
             self._written(args[1] if event in ("os.rename", "os.symlink", "os.link") else args[0])
         elif event in ("os.system", "os.exec", "pty.spawn"):
             self.offences.append(event)
@@ -101,7 +112,9 @@ class Example:
         self.folder = sandbox.folder / name
         self.folder.mkdir()
         self.format.make(self.folder)
-        self.pristine = {file: (self.folder / file).read_bytes() for file in self.format.files if (self.folder / file).exists()}
+        self.pristine = {
+            file: (self.folder / file).read_bytes() for file in self.format.files if (self.folder / file).exists()
+        }
         assert self.pristine, f"{name}: none of {list(self.format.files)} was made"
         self.format.read(self.folder)  # a valid file is read
 
@@ -141,7 +154,9 @@ class Example:
                 self.format.read(self.folder)
         except NeuprimError as error:
             text = one_line(error) or ""
-            if str(self.folder) not in text and "/etc/passwd" not in text:  # a picture that a spoiled file names is named by its own path
+            if (
+                str(self.folder) not in text and "/etc/passwd" not in text
+            ):  # a picture that a spoiled file names is named by its own path
                 return f"names no file: {text[:200]!r}"
             text = text.replace(str(self.folder), "")
             if len(text) > LONGEST:
@@ -149,7 +164,9 @@ class Example:
         except _TooLong:
             return f"took more than {SECONDS} s"
         except BaseException as error:
-            places = [f"{Path(place.filename).name}:{place.lineno}" for place in traceback.extract_tb(error.__traceback__)]
+            places = [
+                f"{Path(place.filename).name}:{place.lineno}" for place in traceback.extract_tb(error.__traceback__)
+            ]
             return f"{type(error).__name__}: {' '.join(str(error).split())[:150]} at {' '.join(places[-4:])}"
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)

@@ -1,4 +1,5 @@
-"""Models, cameras and settings that several tests draw: one case for each thing a kernel may do wrong, and arrangements of spheres."""
+"""Models, cameras and settings that several tests draw: one case for each thing a kernel may do wrong, and arrangements
+of spheres."""
 
 from __future__ import annotations
 
@@ -47,7 +48,10 @@ def case(name: str) -> tuple[dict[str, Tensor], Camera, RenderSettings]:
     if name == "opaque":
         t["b2"] += 0.2
     if name == "K=16 C=1":
-        t["w2"] *= 0.5  # optical depths like the other cases': denser ones graze with D ~ 1e-6, where float32 has few digits left
+        t["w2"] *= (
+            # optical depths like the other cases': denser ones graze with D ~ 1e-6, where float32 has few digits left
+            0.5
+        )
     return t, scenes.camera(**{"width": 48, "height": 35, **view}), replace(DEFAULT, **knobs)
 
 
@@ -55,7 +59,8 @@ def case(name: str) -> tuple[dict[str, Tensor], Camera, RenderSettings]:
 
 
 def spheres(means: list[list[float]], radii: list[float], density: list[float]) -> dict[str, Tensor]:
-    """Homogeneous spheres of the colours red, green, blue; ``density`` times the diameter is a central chord's optical depth."""
+    """Homogeneous spheres of the colours red, green, blue; ``density`` times the diameter is a central chord's optical
+    depth."""
     count = len(radii)
     t = scenes.tensors(count, 0, dtype=torch.float64)
     t["means"] = torch.tensor(means, dtype=torch.float64)
@@ -75,7 +80,8 @@ def along_z(size: int = 21, fov: float = 40.0, turn: float = 0.0, distance: floa
 
 
 def needle_and_sphere() -> dict[str, Tensor]:
-    """A long red needle that reaches far towards the camera passes in front of a green sphere whose centre is nearer than its own."""
+    """A long red needle that reaches far towards the camera passes in front of a green sphere whose centre is nearer
+    than its own."""
     t = spheres([[0.0, 0.0, 0.0], [-0.3, 0.0, -0.05]], [1.0, 0.15], [8.0, 40.0])
     angle = math.radians(20)  # the needle lies in the x-z plane, its near end at x = -sin(angle), z = -cos(angle)
     t["log_scales"][0] = torch.tensor([0.1, 0.1, 1.0]).log()

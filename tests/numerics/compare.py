@@ -34,8 +34,9 @@ def weights(shape: tuple[int, ...], seed: int) -> Tensor:
 def undecided(t: dict[str, Tensor], camera: Camera, settings: RenderSettings) -> Tensor:
     """(H, W) pixels on which float32 and float64 may rightly fall on different sides of a cut.
 
-    Those whose reference image jumps when alpha_min or transmittance_min moves by 1e-5 (of itself, for the latter 1e-3). Where the
-    order is that of entries, also those with :func:`near_ties`; where colours are networks, those with :func:`near_black`.
+    Those whose reference image jumps when alpha_min or transmittance_min moves by 1e-5 (of itself, for the latter
+    1e-3). Where the order is that of entries, also those with :func:`near_ties`; where colours are networks, those with
+    :func:`near_black`.
     """
     wide = scenes.lowered({k: v.detach().double() for k, v in t.items()})
     images = []
@@ -57,7 +58,8 @@ def undecided(t: dict[str, Tensor], camera: Camera, settings: RenderSettings) ->
 
 
 def near_black(t: dict[str, Tensor], camera: Camera, settings: RenderSettings, gap: float = 4e-6) -> Tensor:
-    """(H, W) pixels with a colour within ``gap`` of where max(0, .) clamps it: float32 may pass its gradient where float64 does not."""
+    """(H, W) pixels with a colour within ``gap`` of where max(0, .) clamps it: float32 may pass its gradient where
+    float64 does not."""
     w = {k: v.detach().double() for k, v in t.items()}
     low = scenes.lowered(w)
     m = low.geometry.length_scale
@@ -70,12 +72,15 @@ def near_black(t: dict[str, Tensor], camera: Camera, settings: RenderSettings, g
         return ((value.abs() < gap * size) & (size > 0)).any(1, keepdim=True).double()
 
     with torch.no_grad():
-        found = render_lowered(replace(low, colour=OpaqueColour(close, 1)), camera, replace(settings, backend="reference", depth=False))
+        found = render_lowered(
+            replace(low, colour=OpaqueColour(close, 1)), camera, replace(settings, backend="reference", depth=False)
+        )
     return found.rgb[..., 0] > 0
 
 
 def entries(t: dict[str, Tensor], camera: Camera, near: float) -> Tensor:
-    """(N, H, W) camera-z at which each pixel's ray enters each ellipsoid, float64: ``near`` where that plane cuts it, inf if missed."""
+    """(N, H, W) camera-z at which each pixel's ray enters each ellipsoid, float64: ``near`` where that plane cuts it,
+    inf if missed."""
     g = scenes.lowered({k: v.detach().double() for k, v in t.items()}).geometry
     d = pixel_directions(camera)
     world = d @ camera.viewmat.detach().double()[:3, :3]
@@ -94,7 +99,8 @@ def entries(t: dict[str, Tensor], camera: Camera, near: float) -> Tensor:
 def near_ties(t: dict[str, Tensor], camera: Camera, near: float, gap: float = 2e-6) -> Tensor:
     """(H, W) pixels with two entries closer than ``gap`` of their camera-z: float32 may order them the other way.
 
-    That changes a pixel by the opacities' product times the colours' difference. Entries on the near plane are ties, not near ties.
+    That changes a pixel by the opacities' product times the colours' difference. Entries on the near plane are ties,
+    not near ties.
     """
     z = entries(t, camera, near).sort(0).values
     front, back = z[:-1], z[1:]
@@ -102,14 +108,21 @@ def near_ties(t: dict[str, Tensor], camera: Camera, near: float, gap: float = 2e
 
 
 def draw(
-    backend: str, t: dict[str, Tensor], camera: Camera, settings: RenderSettings, skip: Tensor | None = None, with_view: bool = True
+    backend: str,
+    t: dict[str, Tensor],
+    camera: Camera,
+    settings: RenderSettings,
+    skip: Tensor | None = None,
+    with_view: bool = True,
 ) -> Frame:
     """Images and gradients; the reference gets the same numbers in float64. ``skip`` pixels carry no gradient."""
     dtype = torch.float64 if backend == "reference" else torch.float32
     leaves = {k: v.detach().to(dtype).requires_grad_() for k, v in t.items()}
     view = camera.viewmat.detach().clone().requires_grad_(with_view)
     background = torch.linspace(0.2, 0.9, scenes.channels(t)).to(dtype).requires_grad_()
-    output = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, **by(backend)), background)
+    output = render_lowered(
+        scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, **by(backend)), background
+    )
     h, w, C = output.rgb.shape
     keep = torch.ones(h, w, dtype=torch.float64) if skip is None else (~skip).double()
     tally = output.watch((weights((h, w), 3).abs() * keep).float())
@@ -146,9 +159,12 @@ def assert_same_frame(
     grad_bound: float = 1e-3,
     backend: str = "cpu",
 ) -> tuple[Frame, Frame]:
-    """``backend`` within ``image_bound`` of the reference, gradients within ``grad_bound`` of each row's norm; returns both."""
+    """``backend`` within ``image_bound`` of the reference, gradients within ``grad_bound`` of each row's norm; returns
+    both."""
     skip = undecided(t, camera, settings)
-    assert skip.float().mean() < 0.05, f"{int(skip.sum())} pixels are undecided: too many for the comparison to mean much"
+    assert skip.float().mean() < 0.05, (
+        f"{int(skip.sum())} pixels are undecided: too many for the comparison to mean much"
+    )
     fast, slow = (draw(b, t, camera, settings, skip) for b in (backend, ORACLE))
     keep = ~skip
     report: dict[str, Any] = {}
@@ -157,7 +173,9 @@ def assert_same_frame(
     if settings.depth:
         assert fast.output.depth is not None and slow.output.depth is not None
         distance = slow.output.depth.abs().max().clamp_min(1e-30)
-        error = (fast.output.depth.double() - slow.output.depth).abs() * slow.output.alpha / distance  # the sum of w z is what is drawn
+        error = (
+            (fast.output.depth.double() - slow.output.depth).abs() * slow.output.alpha / distance
+        )  # the sum of w z is what is drawn
         report["depth"] = error[keep].max().item()
     assert all(v <= image_bound for v in report.values()), report
     found = {k: row_errors(fast.grads[k], slow.grads[k]).max().item() for k in t}

@@ -1,8 +1,10 @@
-"""Forms with one thing wrong, drawn by some backends: each must be refused by name. Run by ``test_forms.py`` in a process of its own.
+"""Forms with one thing wrong, drawn by some backends: each must be refused by name. Run by ``test_forms.py`` in a
+process of its own.
 
     python -m tests.numerics.forms_fuzz [COUNT] [SEED] [BACKEND ...]
 
-Between them are forms that only look odd (strides, views, mixed dtypes), which must be drawn, forward and backward, as plain ones are.
+Between them are forms that only look odd (strides, views, mixed dtypes), which must be drawn, forward and backward, as
+plain ones are.
 Prints one line of counts; what goes wrong is an exception, or the end of the process.
 """
 
@@ -43,7 +45,13 @@ def with_tensor(lowered: Lowered, name: str, value: Any) -> Lowered:
 
 def random_form(r: random.Random) -> Lowered:
     hidden = r.choice([None, None, 0, 3, 4])
-    t = scenes.tensors(r.choice([1, 2, 3, 7, 20]), r.choice([0, 1, 4, 8]), r.choice([1, 3, 3, 5]), seed=r.randrange(1000), hidden=hidden)
+    t = scenes.tensors(
+        r.choice([1, 2, 3, 7, 20]),
+        r.choice([0, 1, 4, 8]),
+        r.choice([1, 3, 3, 5]),
+        seed=r.randrange(1000),
+        hidden=hidden,
+    )
     if r.random() < 0.3:
         t = {k: v.double() for k, v in t.items()}
     if r.random() < 0.3:
@@ -57,7 +65,11 @@ def random_form(r: random.Random) -> Lowered:
 def _other_size(r: random.Random, v: Tensor) -> Tensor:
     """One axis shorter, longer or gone."""
     axis = r.randrange(v.dim())
-    return v.narrow(axis, 0, r.randrange(v.shape[axis])) if v.shape[axis] and r.random() < 0.5 else torch.cat([v, v[: r.choice([1, 1, 5])]])
+    return (
+        v.narrow(axis, 0, r.randrange(v.shape[axis]))
+        if v.shape[axis] and r.random() < 0.5
+        else torch.cat([v, v[: r.choice([1, 1, 5])]])
+    )
 
 
 def _numbers(r: random.Random, v: Tensor) -> Tensor:
@@ -87,7 +99,9 @@ def _expanded(r: random.Random, v: Tensor) -> Tensor:
 
 
 def _dtype(r: random.Random, v: Tensor) -> Tensor:
-    return v.to(r.choice([torch.int32, torch.int64, torch.float16, torch.bfloat16, torch.complex64, torch.bool, torch.uint8]))
+    return v.to(
+        r.choice([torch.int32, torch.int64, torch.float16, torch.bfloat16, torch.complex64, torch.bool, torch.uint8])
+    )
 
 
 def _elsewhere(r: random.Random, v: Tensor) -> Tensor:
@@ -116,7 +130,9 @@ def legal(lowered: Lowered, name: str, value: Any) -> bool:
         return False
     n = lowered.geometry.count
     either = {(n,), (n, 1)} if name == "b2" else {tuple(old.shape)}
-    alone = name == "rgb" and value.dim() == 2 and len(value) == n and value.shape[1] > 0  # nothing else fixes the channels
+    alone = (
+        name == "rgb" and value.dim() == 2 and len(value) == n and value.shape[1] > 0
+    )  # nothing else fixes the channels
     return tuple(value.shape) in either or alone
 
 
@@ -141,7 +157,9 @@ def refuse(lowered: Lowered, backend: str, name: str, background: Any = None) ->
         return
     if image.requires_grad:
         image.sum().backward()
-    raise AssertionError(f"{backend}: a wrong {name} was drawn: {[(k, tuple(v.shape)) for k, (_, v) in tensors_of(lowered).items()]}")
+    raise AssertionError(
+        f"{backend}: a wrong {name} was drawn: {[(k, tuple(v.shape)) for k, (_, v) in tensors_of(lowered).items()]}"
+    )
 
 
 def _strided(r: random.Random, v: Tensor) -> Tensor:
@@ -166,7 +184,9 @@ def same(r: random.Random, lowered: Lowered, backend: str) -> None:
     assert torch.equal(a[0], b[0]), f"{backend}: strides change the picture"
     for name, grad in a[1].items():
         other = b[1][name]
-        assert (grad is None) == (other is None) and (grad is None or other is None or torch.equal(grad, other)), f"{backend}: {name}"
+        assert (grad is None) == (other is None) and (grad is None or other is None or torch.equal(grad, other)), (
+            f"{backend}: {name}"
+        )
 
 
 def main(count: int, seed: int, backends: list[str]) -> None:
@@ -179,24 +199,43 @@ def main(count: int, seed: int, backends: list[str]) -> None:
         if name == "background":
             channels = getattr(lowered.colour, "rgb", getattr(lowered.colour, "base", None)).shape[1]  # type: ignore[union-attr]
             value: Any = r.choice(
-                [torch.ones(channels + 1), torch.ones(channels - 1), torch.ones(1, channels), torch.ones(channels).long(), 1]
+                [
+                    torch.ones(channels + 1),
+                    torch.ones(channels - 1),
+                    torch.ones(1, channels),
+                    torch.ones(channels).long(),
+                    1,
+                ]
             )
             refuse(lowered, backend, name, value)
         elif name == "rows":
             n = lowered.geometry.count
-            rows = [torch.arange(n + 1), torch.arange(n).float(), torch.arange(n)[:, None], torch.arange(n) - 1, [*range(n)]]
+            rows = [
+                torch.arange(n + 1),
+                torch.arange(n).float(),
+                torch.arange(n)[:, None],
+                torch.arange(n) - 1,
+                [*range(n)],
+            ]
             refuse(replace(lowered, rows=r.choice(rows)), backend, name)
         elif name == "omega0":
-            refuse(with_tensor(lowered, name, r.choice([float("nan"), float("inf"), torch.tensor(3.0), "30", None, True])), backend, name)
+            refuse(
+                with_tensor(lowered, name, r.choice([float("nan"), float("inf"), torch.tensor(3.0), "30", None, True])),
+                backend,
+                name,
+            )
         else:
             value = r.choice(FAULTS)(r, tensors_of(lowered)[name][1])
             if legal(lowered, name, value):
                 skipped += 1
                 continue
             changed = with_tensor(lowered, name, value)
-            blamed = {"W1": ("W1", "b1"), "Wx": ("Wx", "bias"), "base": ("base", "Wout"), "means": ("means", "log_scales")}.get(
-                name, (name,)
-            )
+            blamed = {
+                "W1": ("W1", "b1"),
+                "Wx": ("Wx", "bias"),
+                "base": ("base", "Wout"),
+                "means": ("means", "log_scales"),
+            }.get(name, (name,))
             error: AssertionError | None = None
             for word in blamed:  # the first tensor of a form says how large the others are
                 try:
@@ -211,7 +250,9 @@ def main(count: int, seed: int, backends: list[str]) -> None:
         if refused % 20 == 0:
             same(r, lowered, backend)
             drawn += 1
-    print(f"{refused} wrong forms refused, {skipped} skipped that were right by chance, {drawn} odd but right ones drawn alike")
+    print(
+        f"{refused} wrong forms refused, {skipped} skipped that were right by chance, {drawn} odd but right ones drawn alike"
+    )
 
 
 if __name__ == "__main__":

@@ -25,7 +25,16 @@ class Draw:
 
 FOUND: dict[str, Draw] = {
     "the camera inside a needle, nearly two thin radii off its centre": Draw(
-        seed=0, distance=0.01, ratio=10.0**2.25, kind="needle", neurons=0, rate=0.0, pixels=1.0, off=1.0, depth=1.0, offset=1.0
+        seed=0,
+        distance=0.01,
+        ratio=10.0**2.25,
+        kind="needle",
+        neurons=0,
+        rate=0.0,
+        pixels=1.0,
+        off=1.0,
+        depth=1.0,
+        offset=1.0,
     ),
 }
 """What hypothesis found."""

@@ -37,11 +37,19 @@ def test_cases_mean_what_they_say() -> None:
     """The camera really is inside primitives, the near plane really cuts chords, opacity really saturates."""
     t, camera, settings = case("inside")
     rotation = scenes.lowered(t).geometry.rotations.double()
-    inside = (((camera.position - t["means"].double())[:, None] @ rotation)[:, 0] / t["log_scales"].double().exp()).norm(dim=1) < 1
+    inside = (
+        ((camera.position - t["means"].double())[:, None] @ rotation)[:, 0] / t["log_scales"].double().exp()
+    ).norm(dim=1) < 1
     assert inside.sum() >= 2
-    for name, other in (("near plane", {"near": 0.01}), ("low ceiling", {"alpha_max": 0.99}), ("opaque", {"transmittance_min": 0.0})):
+    for name, other in (
+        ("near plane", {"near": 0.01}),
+        ("low ceiling", {"alpha_max": 0.99}),
+        ("opaque", {"transmittance_min": 0.0}),
+    ):
         t, camera, settings = case(name)
-        first, second = (render_lowered(scenes.lowered(t), camera, s).alpha for s in (settings, replace(settings, **other)))
+        first, second = (
+            render_lowered(scenes.lowered(t), camera, s).alpha for s in (settings, replace(settings, **other))
+        )
         assert (first - second).abs().max() > (1e-6 if name == "opaque" else 0.05), name
 
 
@@ -60,7 +68,9 @@ def test_a_view_that_shows_nothing() -> None:
     for backend in BACKENDS:
         leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
         background.grad = None
-        out = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(DEFAULT, **by(backend)), background)
+        out = render_lowered(
+            scenes.lowered(leaves), replace(camera, viewmat=view), replace(DEFAULT, **by(backend)), background
+        )
         assert torch.equal(out.rgb, background.detach().expand(20, 33, 3)) and out.depth is not None
         assert out.alpha.abs().max() == 0 and out.depth.abs().max() == 0
         (out.rgb.sum() + out.alpha.sum() + out.depth.sum()).backward()
@@ -71,7 +81,9 @@ def test_a_view_that_shows_nothing() -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_no_primitives_at_all(backend: str) -> None:
     leaves = {k: v[:0].clone().requires_grad_() for k, v in scenes.tensors(2).items()}
-    out = render_lowered(scenes.lowered(leaves), scenes.camera(20, 17), RenderSettings(**by(backend)), torch.tensor([0.5, 0.25, 1.0]))
+    out = render_lowered(
+        scenes.lowered(leaves), scenes.camera(20, 17), RenderSettings(**by(backend)), torch.tensor([0.5, 0.25, 1.0])
+    )
     assert torch.equal(out.rgb, torch.tensor([0.5, 0.25, 1.0]).expand(17, 20, 3))
     assert out.alpha.abs().max() == 0
     if out.rgb.requires_grad:
@@ -114,14 +126,19 @@ def test_order_of_primitives_does_not_matter(backend: str) -> None:
 # ---------------------------------------------------------------- gradients of the oracle itself
 
 
-@pytest.mark.parametrize(("neurons", "distance", "near"), [(2, 3.0, 0.01), (0, 3.0, 0.01), (2, 0.4, 0.05), (3, 3.0, 2.9)])
+@pytest.mark.parametrize(
+    ("neurons", "distance", "near"), [(2, 3.0, 0.01), (0, 3.0, 0.01), (2, 0.4, 0.05), (3, 3.0, 2.9)]
+)
 def test_reference_gradients_are_finite_differences(neurons: int, distance: float, near: float) -> None:
     t = scenes.tensors(5, neurons, seed=11, radius=0.4, dtype=torch.float64)
     camera = scenes.camera(7, 5, distance=distance, fov=50 if distance > 1 else 80, shift=(0.37, -0.21))
     settings = RenderSettings(backend="reference", near=near, alpha_min=1e-9, depth_floor=1e-14, depth=True)
     g = torch.Generator().manual_seed(0)
     names = [k for k in t if t[k].numel()]
-    w_rgb, w_z = torch.randn(5, 7, 3, generator=g, dtype=torch.float64), torch.randn(5, 7, generator=g, dtype=torch.float64)
+    w_rgb, w_z = (
+        torch.randn(5, 7, 3, generator=g, dtype=torch.float64),
+        torch.randn(5, 7, generator=g, dtype=torch.float64),
+    )
 
     def functional(view: Tensor, background: Tensor, *values: Tensor) -> Tensor:
         low = scenes.lowered({**t, **dict(zip(names, values, strict=True))})
@@ -129,7 +146,11 @@ def test_reference_gradients_are_finite_differences(neurons: int, distance: floa
         assert out.depth is not None
         return (out.rgb * w_rgb).sum() + (out.alpha * w_z).sum() + (out.depth * w_z.flip(0)).sum()
 
-    inputs = [camera.viewmat.clone(), torch.tensor([0.3, 0.5, 0.1], dtype=torch.float64), *(t[k].clone() for k in names)]
+    inputs = [
+        camera.viewmat.clone(),
+        torch.tensor([0.3, 0.5, 0.1], dtype=torch.float64),
+        *(t[k].clone() for k in names),
+    ]
     assert render_lowered(scenes.lowered(t), camera, settings).alpha.max() > 0.3
     assert torch.autograd.gradcheck(functional, [x.requires_grad_() for x in inputs], eps=1e-7, atol=2e-6, rtol=1e-5)
 
@@ -212,5 +233,9 @@ def test_opaque_forms_draw_what_the_closed_forms_draw() -> None:
     assert isinstance(low.colour, Constant)
     first = render_lowered(low, camera, settings).rgb
     assert first.max() > 0.2
-    for other in (replace(low, density=opaque), replace(low, colour=colour), replace(low, density=opaque, colour=colour)):
+    for other in (
+        replace(low, density=opaque),
+        replace(low, colour=colour),
+        replace(low, density=opaque, colour=colour),
+    ):
         assert (render_lowered(other, camera, settings).rgb - first).abs().max() < 1e-12

@@ -106,16 +106,21 @@ def test_against_the_loop(name: str) -> None:
         bound = 1e-11 if backend == ORACLE else 1e-5
         dtype = torch.float64 if backend == "reference" else torch.float32
         model = {k: v.to(dtype) for k, v in t.items()}
-        out = render_lowered(scenes.lowered(model), camera, replace(settings, **by(backend)), torch.tensor(BACKGROUND, dtype=dtype))
+        out = render_lowered(
+            scenes.lowered(model), camera, replace(settings, **by(backend)), torch.tensor(BACKGROUND, dtype=dtype)
+        )
         assert out.depth is not None
         for image, found in zip(expected, (out.rgb, out.alpha, out.depth), strict=True):
             scale = max(np.abs(image).max(), 1.0)
-            assert np.abs(found.double().numpy() - image).max() <= bound * scale * (10 if image is expected[2] else 1), backend
+            assert np.abs(found.double().numpy() - image).max() <= bound * scale * (
+                10 if image is expected[2] else 1
+            ), backend
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_the_primitive_that_crosses_the_limit_still_counts(backend: str) -> None:
-    """Three opaque spheres in a row, T_min = 0.05: the second takes T from 0.1 to 0.01 and is drawn, the third is not."""
+    """Three opaque spheres in a row, T_min = 0.05: the second takes T from 0.1 to 0.01 and is drawn, the third is
+    not."""
     t = scenes.tensors(3, 0)
     t["quats"][:] = torch.tensor([1.0, 0, 0, 0])
     t["log_scales"][:] = math.log(0.2)

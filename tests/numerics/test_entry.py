@@ -88,12 +88,21 @@ def test_nothing_to_draw(backend: str) -> None:
 
 
 def by_hand(t: dict[str, Tensor], camera: Camera, s: RenderSettings) -> tuple[Tensor, Tensor]:
-    """(rgb, alpha) composited pixel by pixel from frames of one primitive each, sorted by :func:`entries`, ties by depth of the centre."""
+    """(rgb, alpha) composited pixel by pixel from frames of one primitive each, sorted by :func:`entries`, ties by
+    depth of the centre."""
     depth = t["means"].double() @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
     by_centre = {k: v[depth.argsort(stable=True)] for k, v in t.items()}
-    alone = torch.stack([render({k: v[n : n + 1] for k, v in by_centre.items()}, camera, s, "reference").alpha for n in range(len(depth))])
+    alone = torch.stack(
+        [
+            render({k: v[n : n + 1] for k, v in by_centre.items()}, camera, s, "reference").alpha
+            for n in range(len(depth))
+        ]
+    )
     z = entries(by_centre, camera, s.near)
-    rgb, alpha = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64), torch.zeros(camera.height, camera.width).double()
+    rgb, alpha = (
+        torch.zeros(camera.height, camera.width, 3, dtype=torch.float64),
+        torch.zeros(camera.height, camera.width).double(),
+    )
     for y in range(camera.height):
         for x in range(camera.width):
             T = 1.0
@@ -127,7 +136,9 @@ def test_against_the_order_by_hand(distance: float, extra: float, knobs: dict[st
     for backend in BACKENDS:
         bound = 1e-11 if backend == ORACLE else 1e-5
         out = render(t, camera, settings, backend)
-        assert (out.rgb.double() - rgb).abs().max() < bound and (out.alpha.double() - alpha).abs().max() < bound, backend
+        assert (out.rgb.double() - rgb).abs().max() < bound and (out.alpha.double() - alpha).abs().max() < bound, (
+            backend
+        )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -149,7 +160,8 @@ def test_entry_is_right_where_the_order_of_centres_is_wrong(backend: str) -> Non
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_no_popping(backend: str) -> None:
-    """A small sphere beside the middle of a large one: turning the camera by 2e-8 radians swaps their centres' depths."""
+    """A small sphere beside the middle of a large one: turning the camera by 2e-8 radians swaps their centres'
+    depths."""
     t = spheres([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], [0.8, 0.2], [1.0, 4.0])
     settings = replace(ENTRY, alpha_min=0.0)
     jump = {}
@@ -174,8 +186,14 @@ def test_chords_that_the_near_plane_cuts_keep_the_order_of_centres(backend: str)
         model = {k: v[order] for k, v in t.items()}
         first, second = (render(model, camera, ENTRY, backend, sort=s) for s in ("center", "entry"))
         assert (first.rgb - second.rgb).abs().max() < 1e-6 and first.rgb.amin(0).amin(0).min() > 0.02
-    fourth = {k: torch.cat([v, v[:1]]) for k, v in t.items()}  # a small sphere in front of all their centres, not cut, comes last
-    fourth["means"][3], fourth["log_scales"][3], fourth["colors"][3] = torch.tensor([0.0, 0.0, -2.5]), math.log(0.2), torch.ones(3)
+    fourth = {
+        k: torch.cat([v, v[:1]]) for k, v in t.items()
+    }  # a small sphere in front of all their centres, not cut, comes last
+    fourth["means"][3], fourth["log_scales"][3], fourth["colors"][3] = (
+        torch.tensor([0.0, 0.0, -2.5]),
+        math.log(0.2),
+        torch.ones(3),
+    )
     fourth["b2"][3] = 50.0
     out = render(fourth, camera, ENTRY, backend).rgb[10, 10]
     alone = render(t, camera, ENTRY, backend)

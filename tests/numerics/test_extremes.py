@@ -33,7 +33,8 @@ def test_bounds_hold(region: Region, edge: int) -> None:
 @pytest.mark.parametrize("edge", EDGES)
 @pytest.mark.parametrize("region", SINGLE, ids=lambda r: r.name)
 def test_the_oracle_agrees_with_fifty_digits(region: Region, edge: int) -> None:
-    """Another form of the integral, on the three most different pixels of a case: the largest and smallest D and the largest I."""
+    """Another form of the integral, on the three most different pixels of a case: the largest and smallest D and the
+    largest I."""
     case = region.case(0, edge)
     exact = integrals(case)
     hit = exact.hit & (exact.D > 1e-12)

@@ -1,4 +1,5 @@
-"""What does not fit is refused at every entrance, by field, tensor, found and expected; what fits in an odd way is drawn."""
+"""What does not fit is refused at every entrance, by field, tensor, found and expected; what fits in an odd way is
+drawn."""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ def settings(backend: str, **more: Any) -> RenderSettings:
     return RenderSettings(**by(backend), **more)
 
 
-def model(density: type[CosineDensity] = CosineDensity, colour: type[SphericalHarmonics] = SphericalHarmonics) -> Primitives:
+def model(
+    density: type[CosineDensity] = CosineDensity, colour: type[SphericalHarmonics] = SphericalHarmonics
+) -> Primitives:
     t = scenes.tensors(N, K)
     params = {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"], "sh_rest": torch.zeros(N, 15, 3)}
     return Primitives(density(K), colour(3), params)
@@ -89,15 +92,33 @@ def test_the_checks_take_less_than_a_hundredth_of_a_step() -> None:
 
 NAN = float("nan")
 WRONG: dict[str, tuple[type[CosineDensity], str]] = {
-    "w2 too short": (lowers("w2", lambda v: v[:5]), r"Cosine: w2 has shape \(5, 8\); expected \(20, 8\), as means has N=20 and W1 has K=8"),
+    "w2 too short": (
+        lowers("w2", lambda v: v[:5]),
+        r"Cosine: w2 has shape \(5, 8\); expected \(20, 8\), as means has N=20 and W1 has K=8",
+    ),
     "w2 flat": (lowers("w2", lambda v: v[:, 0]), r"Cosine: w2 has shape \(20,\); expected \(20, 8\)"),
     "b1 too short": (lowers("b1", lambda v: v[:7]), r"Cosine: b1 has shape \(7, 8\); expected \(20, 8\)"),
-    "b2 wide": (lowers("b2", lambda v: v.expand(-1, 2)), r"Cosine: b2 has shape \(20, 2\); expected \(20, 1\) or \(20,\)"),
-    "no [:, None]": (lowers("W1", lambda v: v[:, 0]), r"Cosine: W1 has shape \(20, 3\); expected \(N, K, 3\) with N=20 as in means"),
-    "too many neurons": (lowers("W1", lambda v: v.repeat(1, 33, 1)), r"Cosine: W1 has shape \(20, 264, 3\); .* K at most 256"),
-    "whole numbers": (lowers("W1", lambda v: v.int()), r"Cosine: W1 has dtype torch\.int32; expected torch\.float32 or torch\.float64"),
+    "b2 wide": (
+        lowers("b2", lambda v: v.expand(-1, 2)),
+        r"Cosine: b2 has shape \(20, 2\); expected \(20, 1\) or \(20,\)",
+    ),
+    "no [:, None]": (
+        lowers("W1", lambda v: v[:, 0]),
+        r"Cosine: W1 has shape \(20, 3\); expected \(N, K, 3\) with N=20 as in means",
+    ),
+    "too many neurons": (
+        lowers("W1", lambda v: v.repeat(1, 33, 1)),
+        r"Cosine: W1 has shape \(20, 264, 3\); .* K at most 256",
+    ),
+    "whole numbers": (
+        lowers("W1", lambda v: v.int()),
+        r"Cosine: W1 has dtype torch\.int32; expected torch\.float32 or torch\.float64",
+    ),
     "another device": (lowers("b1", lambda v: v.to("meta")), r"Cosine: b1 has device meta; expected cpu"),
-    "sparse": (lowers("w2", lambda v: v.to_sparse()), r"Cosine: w2 has layout torch\.sparse_coo; expected a dense tensor"),
+    "sparse": (
+        lowers("w2", lambda v: v.to_sparse()),
+        r"Cosine: w2 has layout torch\.sparse_coo; expected a dense tensor",
+    ),
     "nested": (
         lowers("w2", lambda v: torch.nested.nested_tensor(list(v), layout=torch.jagged)),
         r"Cosine: w2 has layout nested; expected a dense tensor",
@@ -128,13 +149,25 @@ def test_a_wrong_density_does_not_reach_the_grid(name: str) -> None:
 @pytest.mark.parametrize(
     ("colour", "message"),
     [
-        (Constant(torch.ones(N)), r"Constant: rgb has shape \(20,\); expected \(N, C\) with N=20 as in means, C at least 1"),
+        (
+            Constant(torch.ones(N)),
+            r"Constant: rgb has shape \(20,\); expected \(N, C\) with N=20 as in means, C at least 1",
+        ),
         (Constant(torch.ones(N - 1, 3)), r"Constant: rgb has shape \(19, 3\)"),
         (Constant(torch.ones(N, 0)), r"Constant: rgb has shape \(20, 0\)"),
         (torch.ones(N, 3), r"Tensor; expected Constant, RayNet or OpaqueColour"),
-        (scenes.colour({**scenes.tensors(N, hidden=4), "bias": torch.ones(N, 5)}), r"RayNet: bias has shape \(20, 5\); .* Wx has H=4"),
-        (scenes.colour({**scenes.tensors(N, hidden=4), "Wout": torch.ones(N, 4, 3)}), r"RayNet: Wout has .*; expected \(20, 3, 4\)"),
-        (OpaqueColour(lambda prim, x, d: x[:, :2], 3), r"OpaqueColour: radiance returned shape \(\d+, 2\); expected \(\d+, 3\)"),
+        (
+            scenes.colour({**scenes.tensors(N, hidden=4), "bias": torch.ones(N, 5)}),
+            r"RayNet: bias has shape \(20, 5\); .* Wx has H=4",
+        ),
+        (
+            scenes.colour({**scenes.tensors(N, hidden=4), "Wout": torch.ones(N, 4, 3)}),
+            r"RayNet: Wout has .*; expected \(20, 3, 4\)",
+        ),
+        (
+            OpaqueColour(lambda prim, x, d: x[:, :2], 3),
+            r"OpaqueColour: radiance returned shape \(\d+, 2\); expected \(\d+, 3\)",
+        ),
         (OpaqueColour(lambda prim, x, d: x.long(), 3), r"OpaqueColour: radiance returned torch\.int64"),
         (OpaqueColour(lambda prim, x, d: x, 0), r"OpaqueColour: channels has value 0"),
         (OpaqueColour(None, 3), r"OpaqueColour: radiance has type NoneType; expected a function"),  # type: ignore[arg-type]
@@ -160,7 +193,9 @@ def test_a_wrong_opaque_density_is_named_wherever_it_is_asked() -> None:
         lambda: density_grid(both, {}, torch.eye(4, dtype=torch.float64) * 0.1, (4, 4, 4)),
         lambda: density_at(both, {}, torch.zeros(3, 3) + both.params["means"][0]),
     ):
-        with pytest.raises(FormError, match=r"^density field Waves: density returned shape \(\d+, 3\); expected \(\d+,\)"):
+        with pytest.raises(
+            FormError, match=r"^density field Waves: density returned shape \(\d+, 3\); expected \(\d+,\)"
+        ):
             ask()
 
 
@@ -172,7 +207,10 @@ def test_a_wrong_opaque_density_is_named_wherever_it_is_asked() -> None:
             r"alive returned rows 3 to 99; expected ascending int64 rows \(M,\) from 0 to 19",
         ),
         ({"alive": lambda self, p, c: torch.tensor([-1, 3])}, r"alive returned rows -1 to 3"),
-        ({"alive": lambda self, p, c: torch.tensor([4, 2, 3, 5])}, r"alive returned rows that do not ascend, \[4, 2, 3, 5\]"),
+        (
+            {"alive": lambda self, p, c: torch.tensor([4, 2, 3, 5])},
+            r"alive returned rows that do not ascend, \[4, 2, 3, 5\]",
+        ),
         (
             {"alive": lambda self, p, c: torch.ones(N, dtype=torch.bool)},
             r"alive returned torch\.bool \(20,\) on cpu; expected ascending int64",
@@ -180,14 +218,21 @@ def test_a_wrong_opaque_density_is_named_wherever_it_is_asked() -> None:
         ({"alive": lambda self, p, c: torch.tensor([1.0])}, r"alive returned torch\.float32 \(1,\)"),
         ({"alive": lambda self, p, c: [1, 2]}, r"alive returned type list"),
         ({"move": lambda self, p, g, c: g[:3]}, r"move: means has shape \(3, 3\); expected \(20, 3\)"),
-        ({"move": lambda self, p, g, c: replace(g, quats=g.quats.T)}, r"move: quats has shape \(4, 20\); expected \(20, 4\)"),
+        (
+            {"move": lambda self, p, g, c: replace(g, quats=g.quats.T)},
+            r"move: quats has shape \(4, 20\); expected \(20, 4\)",
+        ),
         ({"move": lambda self, p, g, c: replace(g, means=g.means.half())}, r"move: means has dtype torch\.float16"),
         ({"move": lambda self, p, g, c: g.means}, r"move has type Tensor; expected Geometry"),
     ],
 )
 def test_rows_and_places_name_their_method(methods: dict[str, Any], message: str) -> None:
     wrong = model(waves(**methods))
-    for ask in (lambda: render(wrong, CAMERA), lambda: wrong.lower_density({}), lambda: density_at(wrong, {}, torch.zeros(1, 3))):
+    for ask in (
+        lambda: render(wrong, CAMERA),
+        lambda: wrong.lower_density({}),
+        lambda: density_at(wrong, {}, torch.zeros(1, 3)),
+    ):
         with pytest.raises(FormError, match=rf"^density field Waves: {message}"):
             ask()
 
@@ -201,7 +246,9 @@ def test_a_wrong_shade_names_its_field(backend: str) -> None:
         render(model(colour=paint(shade=lambda *a: Shading(pixels=0.5))), CAMERA, settings=settings(backend))
     with pytest.raises(FormError, match=r"^colour field Paint: shade returned type float; expected Shading or None"):
         render(model(colour=paint(shade=lambda *a: 0.5)), CAMERA, settings=settings(backend))
-    with pytest.raises(FormError, match=r"^colour field Paint: shade: primitives returned shape \(1,\); expected \(\d+,\)"):
+    with pytest.raises(
+        FormError, match=r"^colour field Paint: shade: primitives returned shape \(1,\); expected \(\d+,\)"
+    ):
         render(model(colour=paint(shade=lambda *a: Shading(torch.ones(1)))), CAMERA, settings=settings(backend))
 
 
@@ -222,7 +269,9 @@ def test_the_colour_never_sees_a_wrong_density() -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_backgrounds_rows_and_cameras(backend: str, samples: int) -> None:
     lowered, s = scenes.lowered(scenes.tensors(N)), settings(backend, samples=samples)
-    with pytest.raises(FormError, match=r"^background has shape \(1,\); expected \(3,\), as colour lowered to Constant has C=3"):
+    with pytest.raises(
+        FormError, match=r"^background has shape \(1,\); expected \(3,\), as colour lowered to Constant has C=3"
+    ):
         render_lowered(lowered, CAMERA, s, torch.ones(1))
     with pytest.raises(FormError, match=r"^viewmat has shape \(2, 2\); expected \(4, 4\)"):
         render_lowered(lowered, replace(CAMERA, viewmat=torch.eye(2)), s)
@@ -264,7 +313,13 @@ def test_an_error_map_of_another_size(backend: str, samples: int) -> None:
     ],
 )
 def test_harmonics_do_not_read_beyond_their_tensors(change: dict[str, Any], message: str) -> None:
-    whole = {"means": torch.ones(N, 3), "dc": torch.zeros(N, 3), "rest": torch.zeros(N, 15, 3), "origin": torch.zeros(3), "degree": 3}
+    whole = {
+        "means": torch.ones(N, 3),
+        "dc": torch.zeros(N, 3),
+        "rest": torch.zeros(N, 15, 3),
+        "origin": torch.zeros(3),
+        "degree": 3,
+    }
     assert sh.colors(**whole).shape == (N, 3)
     with pytest.raises(FormError, match=f"^sh.colors: {message}"):
         sh.colors(**{**whole, **change})
@@ -275,7 +330,9 @@ def test_harmonics_do_not_read_beyond_their_tensors(change: dict[str, Any], mess
 
 def drawn(t: dict[str, Tensor], backend: str, **more: Any) -> tuple[Tensor, dict[str, Tensor]]:
     t = {k: v.detach().clone().requires_grad_() for k, v in t.items()}
-    image = render_lowered(scenes.lowered(t), CAMERA, settings(backend, alpha_min=0.0, transmittance_min=0.0, **more)).rgb
+    image = render_lowered(
+        scenes.lowered(t), CAMERA, settings(backend, alpha_min=0.0, transmittance_min=0.0, **more)
+    ).rgb
     image.sum().backward()
     return image.detach(), {k: v.grad for k, v in t.items() if v.grad is not None}
 
@@ -300,7 +357,10 @@ def test_dtypes_may_be_mixed(names: list[str], hidden: int | None, backend: str)
 def test_as_many_units_as_the_kernels_know(backend: str, neurons: int, hidden: int | None, sort: str) -> None:
     t = scenes.tensors(N, neurons, hidden=hidden)
     t["w2"] = t["w2"] / neurons**0.5
-    (image, grads), (truth, expected) = drawn(t, backend, sort=sort), drawn({k: v.double() for k, v in t.items()}, "reference", sort=sort)
+    (image, grads), (truth, expected) = (
+        drawn(t, backend, sort=sort),
+        drawn({k: v.double() for k, v in t.items()}, "reference", sort=sort),
+    )
     assert (image - truth).abs().max() < 2e-6
     for name, grad in expected.items():
         assert (grads[name] - grad).norm() <= 1e-4 * grad.norm(), name

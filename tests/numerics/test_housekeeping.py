@@ -38,7 +38,12 @@ def test_the_key_of_compiled_kernels_covers_all_that_is_in_them(tmp_path: Path) 
     frozen = {file.relative_to(PACKAGE) for file in frozen_into_kernels()}
     assert {
         Path(p)
-        for p in ("core/render/cpu/layout.py", "core/model/colours/sh_constants.py", "core/model/colours/sh_cpu.py", "core/volumes/grid.py")
+        for p in (
+            "core/render/cpu/layout.py",
+            "core/model/colours/sh_constants.py",
+            "core/model/colours/sh_cpu.py",
+            "core/volumes/grid.py",
+        )
     } <= frozen
     copy = tmp_path / "neuprim"
     for source in PACKAGE.rglob("*.py"):

@@ -104,4 +104,6 @@ def test_swept_cases_stay_mended(name: str, backend: str) -> None:
     region = next(r for r in REGIONS if r.name == region_name)
     errors = compare(region.case(number), backend, "float32", region.whole, gradients=True)
     assert errors.hits > 0
-    assert errors.forward <= region.forward and errors.thin <= region.thin and errors.gradient <= region.gradient, errors
+    assert errors.forward <= region.forward and errors.thin <= region.thin and errors.gradient <= region.gradient, (
+        errors
+    )

@@ -22,7 +22,8 @@ SKY = torch.tensor([0.2, 0.4, 0.7], dtype=torch.float64)
 
 
 def chord_depths(t: dict[str, Tensor], row: int) -> tuple[Tensor, Tensor, Tensor]:
-    """(optical depth, camera-z of entry, optical depth per camera-z) of a homogeneous sphere, per pixel of :func:`along_z`."""
+    """(optical depth, camera-z of entry, optical depth per camera-z) of a homogeneous sphere, per pixel of
+    :func:`along_z`."""
     camera = along_z()
     one = {k: v[row : row + 1] for k, v in t.items()}
     depth = -torch.log1p(-render_lowered(scenes.lowered(one), camera, EXACT).alpha)
@@ -48,7 +49,8 @@ def test_without_overlap_all_three_agree(neurons: int) -> None:
 
 
 def test_coincident_spheres() -> None:
-    """Equal colours: all three agree. Different colours: the volume shows their mean, either order the first one too much."""
+    """Equal colours: all three agree. Different colours: the volume shows their mean, either order the first one too
+    much."""
     t = spheres([[0.0, 0.0, 0.0]] * 2, [0.6, 0.6], [1.0, 1.0])
     camera = along_z()
     one = 1 - chord_depths(t, 0)[0].neg().exp()
@@ -86,12 +88,15 @@ def test_two_overlapping_spheres() -> None:
     for steps in (1, 7):
         joint = joint_volume(scenes.lowered(t), camera, EXACT, steps=steps)
         found = joint.rgb[layered]
-        assert torch.allclose(found[:, 0], red[layered], atol=1e-10) and torch.allclose(found[:, 1], green[layered], atol=1e-10)
+        assert torch.allclose(found[:, 0], red[layered], atol=1e-10) and torch.allclose(
+            found[:, 1], green[layered], atol=1e-10
+        )
         assert torch.allclose(joint.alpha[layered], (1 - (-d0 - d1).exp())[layered], atol=1e-10)
 
 
 def test_against_a_plain_march_of_the_density() -> None:
-    """Sum of clamped point densities at 4,000 points per ray, three overlapping cosine primitives; and convergence in ``steps``."""
+    """Sum of clamped point densities at 4,000 points per ray, three overlapping cosine primitives; and convergence in
+    ``steps``."""
     t = scenes.tensors(3, 3, seed=8, radius=0.5, dtype=torch.float64)
     t["means"] *= 0.3
     low, camera = scenes.lowered(t), scenes.camera(5, 4)
@@ -103,7 +108,9 @@ def test_against_a_plain_march_of_the_density() -> None:
     expected = torch.zeros(4, 5, 3, dtype=torch.float64)
     for y in range(4):
         for x in range(5):
-            ray = torch.tensor([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0], dtype=torch.float64)
+            ray = torch.tensor(
+                [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0], dtype=torch.float64
+            )
             X = camera.position + z[:, None] * (camera.viewmat[:3, :3].T @ ray)
             sigma = []
             for n in range(3):
@@ -115,7 +122,10 @@ def test_against_a_plain_march_of_the_density() -> None:
             weight = -torch.expm1(-total) * (total - total.cumsum(0)).exp()
             mixed = (t["colors"].T @ tau) / total.clamp_min(1e-30)
             expected[y, x] = (mixed * weight).sum(1)
-    errors = [(joint_volume(low, camera, EXACT, steps=s, keep="density").rgb - expected).abs().max().item() for s in (4, 16, 256)]
+    errors = [
+        (joint_volume(low, camera, EXACT, steps=s, keep="density").rgb - expected).abs().max().item()
+        for s in (4, 16, 256)
+    ]
     assert expected.max() > 0.3
     assert errors[2] < 5e-4, errors  # the march misplaces a chord's ends by half a step
     assert errors[0] > errors[2]
@@ -148,7 +158,8 @@ def test_inside_the_near_plane_and_several_samples() -> None:
 
 
 def test_entry_is_the_volume_where_nothing_overlaps() -> None:
-    """And the order of centres is not. Where primitives overlap, neither order is, and neither is always the nearer one."""
+    """And the order of centres is not. Where primitives overlap, neither order is, and neither is always the nearer
+    one."""
     errors = sorting_errors(scenes.lowered(needle_and_sphere()), along_z(41, 30.0), EXACT, SKY)
     assert errors["entry"].max_abs < 1e-12 and errors["center"].max_abs > 0.3
     assert errors["entry"].psnr > 100 + errors["center"].psnr

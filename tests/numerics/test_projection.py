@@ -39,7 +39,9 @@ def extent(mask: Tensor, pixel: float) -> tuple[float, float, float, float]:
     return tuple((float(v) + 0.5) / pixel for v in (xs.min(), ys.min(), xs.max(), ys.max()))  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize(("distance", "fov", "shift"), [(3.0, 40.0, (0.0, 0.0)), (1.6, 100.0, (9.0, -6.0)), (30.0, 4.0, (-25.0, 3.0))])
+@pytest.mark.parametrize(
+    ("distance", "fov", "shift"), [(3.0, 40.0, (0.0, 0.0)), (1.6, 100.0, (9.0, -6.0)), (30.0, 4.0, (-25.0, 3.0))]
+)
 def test_boxes_hold_every_hit_and_are_tight(distance: float, fov: float, shift: tuple[float, float]) -> None:
     fine = 5
     t = scenes.tensors(12, 0, seed=31, radius=0.2, dtype=torch.float64)
@@ -81,7 +83,8 @@ def test_boxes_across_the_near_plane_are_the_whole_screen() -> None:
 
 
 def shapes(count: int, log_scales: Tensor, seed: int, depth: float) -> dict[str, Tensor]:
-    """Constant-density ellipsoids of the given shape at random places and angles; ``depth``: optical depth through the middle, at most."""
+    """Constant-density ellipsoids of the given shape at random places and angles; ``depth``: optical depth through the
+    middle, at most."""
     t = scenes.tensors(count, 0, seed=seed)
     t["log_scales"] = log_scales.expand(count, 3).clone()
     t["b2"][:] = depth / 2
@@ -95,9 +98,12 @@ BALL = torch.tensor([math.log(6.0), math.log(5.0), math.log(4.0)])
 
 
 def compare(t: dict[str, Tensor], camera: Camera, tau_error: float) -> float:
-    """Largest difference in alpha with all cuts off, allowing optical depths to differ by ``tau_error``; returns the coverage."""
+    """Largest difference in alpha with all cuts off, allowing optical depths to differ by ``tau_error``; returns the
+    coverage."""
     settings = RenderSettings(alpha_min=0.0, transmittance_min=0.0)
-    slow = render_lowered(scenes.lowered({k: v.double() for k, v in t.items()}), camera, replace(settings, backend="reference")).alpha
+    slow = render_lowered(
+        scenes.lowered({k: v.double() for k, v in t.items()}), camera, replace(settings, backend="reference")
+    ).alpha
     for backend in FAST:
         fast = render_lowered(scenes.lowered(t), camera, replace(settings, **by(backend))).alpha.double()
         assert (fast - slow).abs().max() <= tau_error, backend
@@ -145,7 +151,12 @@ def test_one_primitive_in_every_corner_and_edge() -> None:
     view = camera.viewmat
     for pixel in (-0.6, -0.4, 0.0, 0.5, 15.5, 16.0, 16.5, 31.9, 32.5, 33.4):
         for line in (-0.4, 0.5, 15.9, 17.5, 18.3):
-            place = torch.tensor([(pixel - camera.cx) / camera.fx, (line - camera.cy) / camera.fy, 1.0], dtype=torch.float64) * 3
+            place = (
+                torch.tensor(
+                    [(pixel - camera.cx) / camera.fx, (line - camera.cy) / camera.fy, 1.0], dtype=torch.float64
+                )
+                * 3
+            )
             t = shapes(1, torch.full((3,), math.log(0.05)), 0, 1.0)
             t["means"] = (view[:3, :3].T @ (place - view[:3, 3])).float()[None]
             compare(t, camera, 2e-4)

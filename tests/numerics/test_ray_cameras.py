@@ -51,7 +51,9 @@ def test_a_pinhole_s_own_rays_draw_the_pinhole_s_image() -> None:
     for view in (camera, same_rays(camera)):
         leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
         matrix = camera.viewmat.clone().requires_grad_()
-        out = render_lowered(scenes.lowered(leaves), replace(view, viewmat=matrix), replace(SETTINGS, backend="reference"))
+        out = render_lowered(
+            scenes.lowered(leaves), replace(view, viewmat=matrix), replace(SETTINGS, backend="reference")
+        )
         (out.rgb.square().sum() + out.alpha.sum()).backward()
         outs.append(out)
         grads.append([matrix.grad, *(v.grad for v in leaves.values())])
@@ -61,9 +63,12 @@ def test_a_pinhole_s_own_rays_draw_the_pinhole_s_image() -> None:
     for a, b in zip(*grads, strict=True):
         assert a is not None and b is not None and torch.equal(a, b)
     assert first.depth is not None and second.depth is not None
-    one = {k: v[5:6] for k, v in t.items()}  # of one primitive, depths along the ray and along z differ by the ray's slope
+    one = {
+        k: v[5:6] for k, v in t.items()
+    }  # of one primitive, depths along the ray and along z differ by the ray's slope
     z, distance = (
-        render_lowered(scenes.lowered(one), v, replace(SETTINGS, backend="reference")).depth for v in (camera, same_rays(camera))
+        render_lowered(scenes.lowered(one), v, replace(SETTINGS, backend="reference")).depth
+        for v in (camera, same_rays(camera))
     )
     assert z is not None and distance is not None and z.max() > 1
     assert torch.allclose(distance * pixel_directions(camera)[..., 2], z, rtol=1e-12)
@@ -73,7 +78,9 @@ def test_a_pinhole_s_own_rays_draw_the_pinhole_s_image() -> None:
 def test_every_direction_of_a_ball_round_the_camera(kind: str) -> None:
     """Off the centre of a ball of radius 2 the chord ahead has a closed form; near cuts its first tenth."""
     t = ball((0.3, -0.5, 0.4), 2.0, 0.7)
-    camera = RayCamera.equirectangular(64, 40, EYE) if kind == "equirectangular" else RayCamera.fisheye(40, 40, EYE, 360)
+    camera = (
+        RayCamera.equirectangular(64, 40, EYE) if kind == "equirectangular" else RayCamera.fisheye(40, 40, EYE, 360)
+    )
     out = render_lowered(scenes.lowered(t), camera, replace(SETTINGS, near=0.1))
     assert out.stats.backend == "reference" and out.depth is not None
     ray = camera.directions.norm(dim=-1) > 0
@@ -94,12 +101,15 @@ def test_where_directions_point() -> None:
     f = RayCamera.fisheye(61, 41, EYE, 200).directions
     assert torch.equal(f[20, 30], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     angle = f[..., 2].clamp(-1, 1).acos()
-    assert torch.allclose(angle[20, 30:], torch.arange(31, dtype=torch.float64) * math.radians(200) / 41, atol=1e-7), "equidistant"
+    assert torch.allclose(angle[20, 30:], torch.arange(31, dtype=torch.float64) * math.radians(200) / 41, atol=1e-7), (
+        "equidistant"
+    )
     assert f[20, 40, 0] > 0 and f[30, 30, 1] > 0 and abs(f[20, 40, 1]) < 1e-15
 
 
 def test_a_fisheye_sees_what_is_behind() -> None:
-    """A small ball behind and to the right, at 150 degrees from the axis, shows at 150/180 of the image circle's radius."""
+    """A small ball behind and to the right, at 150 degrees from the axis, shows at 150/180 of the image circle's
+    radius."""
     angle = math.radians(150)
     t = ball((2 * math.sin(angle), 0.0, 2 * math.cos(angle)), 0.15, 20.0)
     out = render_lowered(scenes.lowered(t), RayCamera.fisheye(101, 101, EYE, 360), SETTINGS)
@@ -128,7 +138,9 @@ def test_blocks_leave_out_nothing_that_is_hit(kind: str) -> None:
     t = scenes.tensors(60, 0, seed=4, radius=0.2, dtype=torch.float64)
     t["means"] *= 3
     view = look_at(torch.tensor([0.3, 0.2, 0.1]), torch.tensor([1.0, 0.4, 0.2]), torch.tensor([0.0, 0.0, 1.0]))
-    camera = RayCamera.equirectangular(70, 40, view) if kind == "equirectangular" else RayCamera.fisheye(70, 50, view, 300)
+    camera = (
+        RayCamera.equirectangular(70, 40, view) if kind == "equirectangular" else RayCamera.fisheye(70, 50, view, 300)
+    )
     low = scenes.lowered(t)
     whole = render_lowered(low, camera, SETTINGS)
     assert (whole.alpha > 0.05).double().mean() > 0.1
@@ -138,13 +150,19 @@ def test_blocks_leave_out_nothing_that_is_hit(kind: str) -> None:
     assert everything.directions.shape == (camera.height, camera.width, 3) and len(corner[1]) < 40
     for y, x in [(y, x) for y in range(0, camera.height, 3) for x in range(0, camera.width, 5)]:
         pixel = replace(camera, directions=camera.directions[y : y + 1, x : x + 1])
-        assert torch.allclose(render_lowered(low, pixel, SETTINGS).rgb[0, 0], whole.rgb[y, x], rtol=0, atol=1e-13), (y, x)
+        assert torch.allclose(render_lowered(low, pixel, SETTINGS).rgb[0, 0], whole.rgb[y, x], rtol=0, atol=1e-13), (
+            y,
+            x,
+        )
 
 
 def test_gradients_are_finite_differences() -> None:
-    """To the primitives, the pose and the rays themselves (a lens to calibrate), on a panorama from inside the primitives."""
+    """To the primitives, the pose and the rays themselves (a lens to calibrate), on a panorama from inside the
+    primitives."""
     t = scenes.tensors(4, 2, seed=11, radius=0.5, dtype=torch.float64)
-    camera = RayCamera.equirectangular(8, 4, look_at(torch.tensor([0.2, 0.1, 0.0]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])))
+    camera = RayCamera.equirectangular(
+        8, 4, look_at(torch.tensor([0.2, 0.1, 0.0]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    )
     settings = RenderSettings(backend="reference", near=0.05, alpha_min=1e-9, depth_floor=1e-14, depth=True)
     g = torch.Generator().manual_seed(0)
     w = torch.randn(4, 8, 5, generator=g, dtype=torch.float64)
@@ -182,7 +200,10 @@ def test_a_task_s_model_through_a_fisheye() -> None:
     colour["sh_rest"][0, 1] = 0.5  # the band of z
     model = Primitives(CosineDensity(neurons=0), SphericalHarmonics(1), {**params, **colour})
     seen = [
-        render(model, RayCamera.fisheye(21, 21, look_at(torch.tensor([0, 0, z]), torch.zeros(3), torch.tensor([1.0, 0, 0])), 360))
+        render(
+            model,
+            RayCamera.fisheye(21, 21, look_at(torch.tensor([0, 0, z]), torch.zeros(3), torch.tensor([1.0, 0, 0])), 360),
+        )
         for z in (1.0, -5.0)
     ]
     first, second = ((o.rgb.sum((0, 1)) / o.alpha.sum())[0].item() for o in seen)
@@ -215,13 +236,16 @@ def test_more_samples_are_refused_by_name() -> None:
 
 
 def test_entry_order_is_by_distance() -> None:
-    """Two overlapping spheres whose centres and entries disagree: behind the camera, where z would turn the order round."""
+    """Two overlapping spheres whose centres and entries disagree: behind the camera, where z would turn the order
+    round."""
     t = {k: v.double() for k, v in scenes.tensors(2, 0).items()}
     t["means"] = torch.tensor([[0.0, 0.0, -3.0], [0.0, 0.0, -3.5]], dtype=torch.float64)
     t["log_scales"] = torch.tensor([[0.5] * 3, [1.5] * 3], dtype=torch.float64).log()
     t["quats"], t["b2"] = torch.tensor([[1.0, 0, 0, 0]] * 2).double(), torch.full((2, 1), 3.0, dtype=torch.float64)
     t["colors"] = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]], dtype=torch.float64)
     camera = RayCamera(torch.eye(4, dtype=torch.float64), torch.tensor([[[0.0, 0.0, -1.0]]], dtype=torch.float64))
-    images = {s: render_lowered(scenes.lowered(t), camera, RenderSettings(sort=s)).rgb[0, 0] for s in ("center", "entry")}  # type: ignore[arg-type]
+    images = {
+        s: render_lowered(scenes.lowered(t), camera, RenderSettings(sort=s)).rgb[0, 0] for s in ("center", "entry")
+    }  # type: ignore[arg-type]
     assert images["center"][0] > 0.9 > 0.1 > images["center"][1]  # the red centre is nearer,
     assert images["entry"][1] > 0.9 > 0.1 > images["entry"][0]  # the green sphere is entered at 2.0, the red one at 2.5

@@ -1,4 +1,5 @@
-"""Colours that vary per pixel, :class:`RayNet`: the cpu backend against the float64 reference, the reference against finite differences."""
+"""Colours that vary per pixel, :class:`RayNet`: the cpu backend against the float64 reference, the reference against
+finite differences."""
 
 from __future__ import annotations
 
@@ -68,10 +69,18 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "1000 rad, inside": ({"colour_frequency": 500.0, "count": 90}, {"distance": 0.15, "fov": 70.0}, {}),
     "far 1e3": ({"radius": 0.01, "spread": 0.05}, {"distance": 10.0, "fov": 0.6}, {}),
     "far 1e5": ({"radius": 0.01, "spread": 0.05}, {"distance": 1000.0, "fov": 0.006}, {}),
-    "far 1e5, 100 rad": ({"radius": 0.01, "spread": 0.05, "colour_frequency": 50.0}, {"distance": 1000.0, "fov": 0.006}, {}),
+    "far 1e5, 100 rad": (
+        {"radius": 0.01, "spread": 0.05, "colour_frequency": 50.0},
+        {"distance": 1000.0, "fov": 0.006},
+        {},
+    ),
     "needles": ({"axes": (1.0, 0.02, 0.03), "radius": 0.5}, {}, {}),
     "discs": ({"axes": (1.0, 0.9, 0.01)}, {}, {}),
-    "needles, inside": ({"axes": (1.0, 0.02, 0.03), "radius": 0.5}, {"distance": 0.5, "fov": 60.0}, {"depth_floor": 1e-3}),
+    "needles, inside": (
+        {"axes": (1.0, 0.02, 0.03), "radius": 0.5},
+        {"distance": 0.5, "fov": 60.0},
+        {"depth_floor": 1e-3},
+    ),
     "thin discs, far": (
         {"seed": 10, "axes": (1.0, 0.8, 1e-3), "radius": 0.01, "spread": 0.05, "denser": 50.0},
         {"distance": 100.0, "fov": 0.06},
@@ -169,7 +178,12 @@ def test_a_network_that_starts_at_zero_can_learn(backend: str) -> None:
     out = render_lowered(scenes.lowered(leaves), scenes.camera(33, 25), RenderSettings(**by(backend)))
     out.rgb.sum().backward()
     seen = leaves["base"].grad
-    assert seen is not None and (seen > 0.1).any() and leaves["Wout"].grad is not None and leaves["Wout"].grad.abs().max() > 0.1
+    assert (
+        seen is not None
+        and (seen > 0.1).any()
+        and leaves["Wout"].grad is not None
+        and leaves["Wout"].grad.abs().max() > 0.1
+    )
 
 
 # ---------------------------------------------------------------- the reference
@@ -184,7 +198,9 @@ def test_reference_gradients_are_finite_differences(hidden: int, distance: float
     settings = RenderSettings(backend="reference", near=near, alpha_min=1e-9, depth_floor=1e-14, sort=sort)  # type: ignore[arg-type]
 
     def image(view: Tensor, *values: Tensor) -> Tensor:
-        return render_lowered(scenes.lowered(dict(zip(t, values, strict=True))), replace(camera, viewmat=view), settings).rgb
+        return render_lowered(
+            scenes.lowered(dict(zip(t, values, strict=True))), replace(camera, viewmat=view), settings
+        ).rgb
 
     inputs = [camera.viewmat.clone(), *(v.clone() for v in t.values())]
     assert image(*inputs).max() > 0.1

@@ -38,7 +38,12 @@ def test_means_of_a_finer_image(backend: str, sort: str, n: int) -> None:
     settings = replace(SETTINGS, **by(backend), sort=sort)  # type: ignore[arg-type]
     first, second = leaves(), leaves()
     out, fine = frame(first, replace(settings, samples=n)), frame(second, settings, n)
-    assert out.rgb.shape == (15, 20, 3) and out.alpha.shape == (15, 20) and out.depth is not None and fine.depth is not None
+    assert (
+        out.rgb.shape == (15, 20, 3)
+        and out.alpha.shape == (15, 20)
+        and out.depth is not None
+        and fine.depth is not None
+    )
     rgb, alpha = torch.stack([blocks(fine.rgb[..., c], n).mean(-1) for c in range(3)], -1), blocks(fine.alpha, n)
     depth = (blocks(fine.depth, n) * alpha).sum(-1) / alpha.sum(-1).clamp_min(1e-30)
     assert (out.rgb - rgb).abs().max() < 1e-6 and (out.alpha - alpha.mean(-1)).abs().max() < 1e-6
@@ -92,5 +97,9 @@ def test_one_sample_is_the_backend_itself(backend: str) -> None:
     t = scenes.tensors(40, 4, seed=6)
     settings = replace(SETTINGS, **by(backend), samples=1)
     out, direct = frame(t, settings), draw(scenes.lowered(t), CAMERA, SKY, settings)
-    assert torch.equal(out.rgb, direct.rgb) and torch.equal(out.alpha, direct.alpha) and torch.equal(out.depth, direct.depth)
+    assert (
+        torch.equal(out.rgb, direct.rgb)
+        and torch.equal(out.alpha, direct.alpha)
+        and torch.equal(out.depth, direct.depth)
+    )
     assert out.stats.samples == direct.stats.samples == 1 and out.stats.pairs == direct.stats.pairs

@@ -1,4 +1,5 @@
-"""Densities with a soft edge on the fast backends, in every case that hard ones are tested in, and the reference's own gradients."""
+"""Densities with a soft edge on the fast backends, in every case that hard ones are tested in, and the reference's own
+gradients."""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ def test_equals_reference_under_colour_networks(backend: str, sort: str, edge: i
 
 
 @pytest.mark.parametrize(
-    ("edge", "neurons", "distance", "near"), [(1, 2, 3.0, 0.01), (2, 2, 3.0, 0.01), (2, 0, 0.4, 0.05), (1, 2, 0.4, 0.05), (2, 3, 3.0, 2.9)]
+    ("edge", "neurons", "distance", "near"),
+    [(1, 2, 3.0, 0.01), (2, 2, 3.0, 0.01), (2, 0, 0.4, 0.05), (1, 2, 0.4, 0.05), (2, 3, 3.0, 2.9)],
 )
 def test_reference_gradients_are_finite_differences(edge: int, neurons: int, distance: float, near: float) -> None:
     """Without a floor on grazing rays: a soft edge needs none."""
@@ -62,7 +64,10 @@ def test_reference_gradients_are_finite_differences(edge: int, neurons: int, dis
     )  # the depth of a thin chord that is cut has no bounds
     g = torch.Generator().manual_seed(0)
     names = [k for k in t if t[k].numel()]
-    w_rgb, w_z = torch.randn(5, 7, 3, generator=g, dtype=torch.float64), torch.randn(5, 7, generator=g, dtype=torch.float64)
+    w_rgb, w_z = (
+        torch.randn(5, 7, 3, generator=g, dtype=torch.float64),
+        torch.randn(5, 7, generator=g, dtype=torch.float64),
+    )
 
     def functional(view: Tensor, *values: Tensor) -> Tensor:
         with scenes.soft(edge):
@@ -84,7 +89,9 @@ def test_silhouettes_have_finite_gradients_without_a_floor() -> None:
             for floor in (1e-12, 1e-2):
                 leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
                 with scenes.soft(edge):
-                    out = render_lowered(scenes.lowered(leaves), camera, replace(settings, **by(backend), depth=False, depth_floor=floor))
+                    out = render_lowered(
+                        scenes.lowered(leaves), camera, replace(settings, **by(backend), depth=False, depth_floor=floor)
+                    )
                 out.rgb.sum().backward()
                 assert leaves["means"].grad is not None and bool(torch.isfinite(leaves["means"].grad).all())
                 grads.append(leaves["means"].grad)

@@ -13,7 +13,8 @@ BLOCK = 2000
 
 
 def wild(seed: int, count: int = BLOCK) -> dict[str, Tensor]:
-    """Every parameter over many decades, signs at random; a third of the blocks has everyday densities, so that light gets through."""
+    """Every parameter over many decades, signs at random; a third of the blocks has everyday densities, so that light
+    gets through."""
     g = torch.Generator().manual_seed(seed)
 
     def u(low: float, high: float, *shape: int) -> Tensor:
@@ -55,5 +56,7 @@ def render_block(seed: int, backend: str = "cpu") -> float:
         if value.numel():
             assert value.grad is not None
             bad = (~torch.isfinite(value.grad.reshape(len(value), -1)).all(dim=1)).nonzero().flatten()
-            assert not len(bad), f"gradient of {name} of primitive {int(bad[0])} of block {seed} ({len(bad)} of {len(value)})"
+            assert not len(bad), (
+                f"gradient of {name} of primitive {int(bad[0])} of block {seed} ({len(bad)} of {len(value)})"
+            )
     return float(out.alpha.detach().max())

@@ -55,13 +55,20 @@ def install(
 
 
 def install_groups(
-    root: Path, distribution: str, groups: Mapping[str, Mapping[str, str]], files: Mapping[str, str], version: str = "0.3"
+    root: Path,
+    distribution: str,
+    groups: Mapping[str, Mapping[str, str]],
+    files: Mapping[str, str],
+    version: str = "0.3",
 ) -> Path:
     """The same with entry points of several groups; returns the distribution's folder of metadata."""
     info = root / f"{distribution.replace('-', '_')}-{version}.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
-    sections = [f"[{group}]\n" + "".join(f"{name} = {target}\n" for name, target in entries.items()) for group, entries in groups.items()]
+    sections = [
+        f"[{group}]\n" + "".join(f"{name} = {target}\n" for name, target in entries.items())
+        for group, entries in groups.items()
+    ]
     (info / "entry_points.txt").write_text("\n".join(sections))
     for name, text in files.items():
         path = root / name
@@ -85,7 +92,8 @@ def uninstall(root: Path, distribution: str) -> None:
 
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """An empty directory on ``sys.path``; what was imported from it is forgotten afterwards, and no warning was given before."""
+    """An empty directory on ``sys.path``; what was imported from it is forgotten afterwards, and no warning was given
+    before."""
     monkeypatch.setattr(notices, "_said", set())
     root = tmp_path / "site"
     root.mkdir()
@@ -98,7 +106,8 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture
 def toy(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The task ``toy`` of the distribution ``neuprim-toy``, with an empty working directory; returns its package's folder."""
+    """The task ``toy`` of the distribution ``neuprim-toy``, with an empty working directory; returns its package's
+    folder."""
     install(site, "neuprim-toy", {"toy": "toytask:TASK"}, TOY_FILES)
     work = tmp_path / "work"
     work.mkdir()

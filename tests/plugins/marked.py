@@ -1,4 +1,5 @@
-"""Run directories of tiny models whose axes cannot be mistaken: a large red ball in the origin, small ones out on +x, +y and +z."""
+"""Run directories of tiny models whose axes cannot be mistaken: a large red ball in the origin, small ones out on +x,
++y and +z."""
 
 from __future__ import annotations
 
@@ -49,7 +50,13 @@ def write_run(folder: Path, model: Primitives, words: list[str], **header: Any) 
     config = compose([*words, f"output_dir='{folder}'", "renderer.backend=reference"])
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text(config.to_yaml())
-    extra = {"background": [1.0, 1.0, 1.0], "color_space": "srgb", "data_source": "generated", "iterations": 7, "train_seconds": 0.1 + 0.2}
+    extra = {
+        "background": [1.0, 1.0, 1.0],
+        "color_space": "srgb",
+        "data_source": "generated",
+        "iterations": 7,
+        "train_seconds": 0.1 + 0.2,
+    }
     checkpoint.save_model(folder / "model.safetensors", model, config.task, {**extra, **header})
     return folder
 
@@ -72,7 +79,9 @@ def write_sequence(folder: Path, frames: tuple[int, ...] = (3, 4, 5)) -> Path:
         matrix = np.diag([WORLD_VOXEL] * 3 + [1.0])
         matrix[:3, 3] = WORLD_SHIFT
         write_vdb(
-            folder / f"block_{number}.vdb", [Grid.from_dense("density", values, lower=(-3, 4, 5), transform=matrix)], compression="zip"
+            folder / f"block_{number}.vdb",
+            [Grid.from_dense("density", values, lower=(-3, 4, 5), transform=matrix)],
+            compression="zip",
         )
     return folder
 
@@ -81,7 +90,10 @@ def dynamic_run(folder: Path, vdb: Path, **header: Any) -> Path:
     """A model of two primitives in the scene that the sequence makes; it is no fit, only something to compare."""
     task = load_task("dynamic")
     assert task.fields is not None
-    density, colour = task.fields["TimeDensity"](neurons=2, time="window"), task.fields["TimeHarmonics"](degree=0, powers=1, waves=0)
+    density, colour = (
+        task.fields["TimeDensity"](neurons=2, time="window"),
+        task.fields["TimeHarmonics"](degree=0, powers=1, waves=0),
+    )
     n = 2
     params = {
         "means": torch.tensor([[-0.2, 0.0, 0.0], [0.1, 0.2, 0.2]]),

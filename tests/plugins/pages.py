@@ -16,7 +16,9 @@ __all__ = ["array", "layers_of"]
 
 def layers_of(page: Path) -> dict[str, Any]:
     """The data of a page: frames with their layers and arrays."""
-    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', page.read_text(encoding="utf-8"), re.DOTALL)
+    found = re.search(
+        r'<script id="data" type="application/json">(.*?)</script>', page.read_text(encoding="utf-8"), re.DOTALL
+    )
     assert found
     data: dict[str, Any] = json.loads(found[1])
     return data

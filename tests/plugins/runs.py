@@ -47,7 +47,15 @@ def volumes(folder: Path) -> Path:
 def run_directory(folder: Path) -> Path:
     """A run of ``scene=vdb`` whose files are in ``folder``/files."""
     files, run = volumes(folder / "files"), folder / "run"
-    words = ["task=dynamic", "scene=vdb", f"scene.vdb={files}", "scene.size=8", "scene.cameras=4", "scene.samples=1", f"output_dir={run}"]
+    words = [
+        "task=dynamic",
+        "scene=vdb",
+        f"scene.vdb={files}",
+        "scene.size=8",
+        "scene.cameras=4",
+        "scene.samples=1",
+        f"output_dir={run}",
+    ]
     run.mkdir()
     (run / "config.yaml").write_text(compose(words).to_yaml())
     save_model(run / "model.safetensors", model(), "dynamic", {"color_space": "linear", "background": [0.0, 0.0, 0.0]})

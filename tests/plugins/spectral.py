@@ -1,4 +1,5 @@
-"""The package ``neuprim-spectral`` beside this file: somebody else's task of five bands, installed without pip, whole or with other lines."""
+"""The package ``neuprim-spectral`` beside this file: somebody else's task of five bands, installed without pip, whole
+or with other lines."""
 
 from __future__ import annotations
 
@@ -42,7 +43,9 @@ def install_spectral(site: Path, edits: Mapping[str, tuple[str, str]] | None = N
         changes: replace lines of the TaskSpec, e.g. ``display="None"``.
     """
     forget()
-    source = {str(p.relative_to(PACKAGE)): p.read_text() for p in sorted((PACKAGE / "neuprim_spectral").rglob("*.[py][ya]*"))}
+    source = {
+        str(p.relative_to(PACKAGE)): p.read_text() for p in sorted((PACKAGE / "neuprim_spectral").rglob("*.[py][ya]*"))
+    }
     for module, (old, new) in (edits or {}).items():
         text = source[f"neuprim_spectral/{module}.py"]
         assert old in text, f"{module}.py has no {old!r}"

@@ -43,16 +43,24 @@ PLUGIN = Inspector(api=1, name="crumbs", summary="points", layers=lambda frame: 
 
 
 def add(site: Path, kind: str, source: str) -> None:
-    """The exporter ``centres`` of the distribution strange-exporter 0.3, or the inspector ``crumbs`` of strange-inspector."""
+    """The exporter ``centres`` of the distribution strange-exporter 0.3, or the inspector ``crumbs`` of
+    strange-inspector."""
     groups: dict[str, tuple[Group, str]] = {"exporter": (EXPORTERS, "centres"), "inspector": (INSPECTORS, "crumbs")}  # type: ignore[type-arg]
     group, name = groups[kind]
-    install(site, f"strange-{kind}", {name: f"strange_{kind}:PLUGIN"}, {f"strange_{kind}.py": source}, group=group.entry_points)
+    install(
+        site,
+        f"strange-{kind}",
+        {name: f"strange_{kind}:PLUGIN"},
+        {f"strange_{kind}.py": source},
+        group=group.entry_points,
+    )
     importlib.invalidate_caches()
     sys.modules.pop(f"strange_{kind}", None)
 
 
 def spectral(site: Path, strict: bool = False) -> Path:
-    """The task ``spectral``, which depends on a ``wavelength_shift``, and a run of it; ``strict`` as its condition is."""
+    """The task ``spectral``, which depends on a ``wavelength_shift``, and a run of it; ``strict`` as its condition
+    is."""
     install_spectral(site, {"bands": ("strict=True", f"strict={strict}")})
     fields = TASKS.load("spectral").fields
     assert fields is not None

@@ -1,4 +1,5 @@
-"""Third-party loaders, tasks and losses that crash or hand over nonsense: one line names the package, the traceback is in a file."""
+"""Third-party loaders, tasks and losses that crash or hand over nonsense: one line names the package, the traceback is
+in a file."""
 
 from __future__ import annotations
 
@@ -153,7 +154,13 @@ TASK = TaskSpec(
 """
 TASK_PLACES = ("start", "lower", "build", "check", "mask", "judge", "diagnose", "clips", "facts", "orbit")
 
-SMALL = ["renderer.backend=reference", "model.primitives=8", "train.iterations=4", "train.max_seconds=null", "output_dir=r"]
+SMALL = [
+    "renderer.backend=reference",
+    "model.primitives=8",
+    "train.iterations=4",
+    "train.max_seconds=null",
+    "output_dir=r",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -171,14 +178,25 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def scene(site: Path, **code: str) -> list[str]:
     """Installs a scene with code in some of its functions; the words of a run of it."""
     text = SCENE.format(**{place: code.get(place, "pass") for place in PLACES})
-    files = {"fake_scene/__init__.py": text, "fake_scene/conf/__init__.py": "", "fake_scene/conf/scene/static/mine.yaml": "{}"}
+    files = {
+        "fake_scene/__init__.py": text,
+        "fake_scene/conf/__init__.py": "",
+        "fake_scene/conf/scene/static/mine.yaml": "{}",
+    }
     install(site, "fake-scene", {"static.mine": "fake_scene:PLUGIN"}, files, version="0.7", group="neuprim.scenes")
     return ["task=static", "scene=mine", "model.neurons=1", "model.sh_degree=0", *SMALL]
 
 
 def loss(site: Path, **code: str) -> list[str]:
     text = LOSS.format(**{place: code.get(place, "pass") for place in ("make", "loss")})
-    install(site, "fake-loss", {"mine": "fake_loss:PLUGIN"}, {"fake_loss/__init__.py": text}, version="1.2", group="neuprim.losses")
+    install(
+        site,
+        "fake-loss",
+        {"mine": "fake_loss:PLUGIN"},
+        {"fake_loss/__init__.py": text},
+        version="1.2",
+        group="neuprim.losses",
+    )
     return [*scene(site), "train.loss=mine"]
 
 
@@ -217,19 +235,38 @@ CRASHES = {
     "build": (task, "build", "build of task 'mine' of fake-task 2.0", "build"),
     "initialiser": (task, "start", "task 'mine' of fake-task 2.0", "start"),
     "field": (task, "lower", "task 'mine' of fake-task 2.0", "lower"),
-    **{place: (task, place, "task 'mine' of fake-task 2.0", place) for place in ("mask", "judge", "diagnose", "clips", "facts", "orbit")},
+    **{
+        place: (task, place, "task 'mine' of fake-task 2.0", place)
+        for place in ("mask", "judge", "diagnose", "clips", "facts", "orbit")
+    },
 }
 
 
 @pytest.mark.parametrize(("kind", "place", "who", "function"), CRASHES.values(), ids=CRASHES)
-def test_a_crash_is_one_line_and_a_file(kind, place, who, function, site: Path, capsys: pytest.CaptureFixture[str]) -> None:  # type: ignore[no-untyped-def]
+def test_a_crash_is_one_line_and_a_file(
+    kind, place, who, function, site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:  # type: ignore[no-untyped-def]
     message = refusal(kind(site, **{place: BOOM}), capsys)
     package = "fake_" + who.split(" of fake-")[1].split()[0]
-    assert re.match(rf"{re.escape(who)}: ValueError: boom twice \(__init__\.py line \d+, in {function}\); traceback: ", message)
+    assert re.match(
+        rf"{re.escape(who)}: ValueError: boom twice \(__init__\.py line \d+, in {function}\); traceback: ", message
+    )
     file = traceback_of(message)
     text = file.read_text()
-    assert text.startswith(f"{who} ({package}:") and "Traceback" in text and f", in {function}\n" in text and "ValueError: boom" in text
-    begun = place in ("mask", "judge", "diagnose", "orbit", "loss", "lower")  # after a step or two; clips and facts are looked at before
+    assert (
+        text.startswith(f"{who} ({package}:")
+        and "Traceback" in text
+        and f", in {function}\n" in text
+        and "ValueError: boom" in text
+    )
+    begun = place in (
+        "mask",
+        "judge",
+        "diagnose",
+        "orbit",
+        "loss",
+        "lower",
+    )  # after a step or two; clips and facts are looked at before
     assert (file.parent == Path("r/logs").resolve()) == begun == Path("r").exists()
 
 
@@ -240,7 +277,9 @@ def test_every_place_is_quiet_when_nothing_is_wrong(site: Path, capsys: pytest.C
 
 
 def test_a_loader_may_still_refuse_in_its_own_words(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert refusal(scene(site, load="raise DataError('file.xyz: expected light')"), capsys) == "file.xyz: expected light"
+    assert (
+        refusal(scene(site, load="raise DataError('file.xyz: expected light')"), capsys) == "file.xyz: expected light"
+    )
 
 
 @pytest.mark.parametrize(
@@ -258,7 +297,9 @@ def test_a_loader_may_still_refuse_in_its_own_words(site: Path, capsys: pytest.C
         ({"load": "class Mine(Dataset): pass"}, "TypeError: class Mine(Dataset): a data set is made by calling neuprim.core.data.Dataset(name="),
     ],
 )  # fmt: skip
-def test_broken_promises_name_the_scenes_package(code: dict[str, str], text: str, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_broken_promises_name_the_scenes_package(
+    code: dict[str, str], text: str, site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     message = refusal([*scene(site, **code), "train.iterations=6"], capsys)
     assert message.startswith("scene 'mine' of fake-scene 0.7: ") and text in message
 
@@ -266,13 +307,22 @@ def test_broken_promises_name_the_scenes_package(code: dict[str, str], text: str
 @pytest.mark.parametrize(
     ("code", "text"),
     [
-        ({"mask": "import torch; return torch.zeros(2, 2, dtype=torch.bool)"}, "test view v0: mask is bool (2, 2); expected bool (24, 24)"),
+        (
+            {"mask": "import torch; return torch.zeros(2, 2, dtype=torch.bool)"},
+            "test view v0: mask is bool (2, 2); expected bool (24, 24)",
+        ),
         ({"judge": "return [1]"}, "judge of test view v0: found a list; expected a dictionary with texts as keys"),
         ({"judge": "return {'error': rendered.mean()}"}, "judge of test view v0: error is tensor("),
         ({"judge": "return {'error': float('nan')}"}, "judge of test view v0: error is nan; expected a number"),
         ({"judge": "return {'psnr': 3.0}"}, "judge of test view v0: psnr is a name that all views' numbers have"),
-        ({"diagnose": "return {'shape': {1, 2}}"}, "diagnose: shape cannot be written as JSON (Object of type set is not"),
-        ({"diagnose": "return {'error': float('inf')}"}, "diagnose: error cannot be written as JSON (Out of range float values"),
+        (
+            {"diagnose": "return {'shape': {1, 2}}"},
+            "diagnose: shape cannot be written as JSON (Object of type set is not",
+        ),
+        (
+            {"diagnose": "return {'error': float('inf')}"},
+            "diagnose: error cannot be written as JSON (Out of range float values",
+        ),
         ({"clips": "return [3]"}, "clips: found a int in the list; expected a neuprim.core.data.Clip"),
         ({"clips": "return None"}, "clips: found a NoneType; expected a list of neuprim.core.data.Clip"),
         ({"clips": "return [Clip('round', ['v0'])]"}, "clips: 'round' has view 'v0'; expected indices below 2"),
@@ -294,17 +344,31 @@ def test_broken_promises_of_judging_name_the_tasks_package(
 @pytest.mark.parametrize(
     ("code", "text"),
     [
-        ({"loss": "return 3.0, {}"}, "loss 'mine' of fake-loss 1.2: returned a float as its value; expected one number as a tensor"),
-        ({"loss": "return (rendered - truth).abs(), {}"}, "returned a tensor of shape (24, 24, 3) as its value; expected one number"),
+        (
+            {"loss": "return 3.0, {}"},
+            "loss 'mine' of fake-loss 1.2: returned a float as its value; expected one number as a tensor",
+        ),
+        (
+            {"loss": "return (rendered - truth).abs(), {}"},
+            "returned a tensor of shape (24, 24, 3) as its value; expected one number",
+        ),
         ({"loss": "return rendered.detach().mean(), {}"}, "returned a value without gradient"),
         ({"loss": "return rendered.mean(), 3"}, "returned parts of type int; expected a dictionary"),
-        ({"loss": "return rendered.mean(), {'l1': rendered.mean()}"}, "returned part 'l1' of type Tensor; expected a number"),
+        (
+            {"loss": "return rendered.mean(), {'l1': rendered.mean()}"},
+            "returned part 'l1' of type Tensor; expected a number",
+        ),
         ({"loss": "return rendered.mean()"}, "loss 'mine' of fake-loss 1.2: TypeError: "),
         ({"make": "return 3"}, "loss 'mine' of fake-loss 1.2: made a int; expected a function"),
-        ({"make": "return lambda rendered, truth: (rendered.mean(), {})"}, "takes 2 positional arguments but 3 were given"),
+        (
+            {"make": "return lambda rendered, truth: (rendered.mean(), {})"},
+            "takes 2 positional arguments but 3 were given",
+        ),
     ],
 )
-def test_losses_that_return_something_else(code: dict[str, str], text: str, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_losses_that_return_something_else(
+    code: dict[str, str], text: str, site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert text in refusal(loss(site, **code), capsys)
 
 
@@ -340,7 +404,14 @@ def test_eval_and_render_name_the_package_too(site: Path, capsys: pytest.Capture
 
 def _broken(source: Path):  # type: ignore[no-untyped-def]
     names: dict[str, object] = {"__name__": "fake_task"}
-    exec(compile("def lower(self, params, geometry, camera, conditions):\n    raise RuntimeError('gone')", str(source), "exec"), names)
+    exec(
+        compile(
+            "def lower(self, params, geometry, camera, conditions):\n    raise RuntimeError('gone')",
+            str(source),
+            "exec",
+        ),
+        names,
+    )
     return names["lower"]
 
 
@@ -393,13 +464,17 @@ def test_where_the_traceback_goes(here: Path, tmp_path: Path) -> None:
     assert traceback_of(crash(None)).parent == tmp_path / "tmp"
     assert traceback_of(crash(run / "logs")).parent == tmp_path / "tmp" and not run.exists()
     run.mkdir()
-    assert traceback_of(crash(run / "logs")).parent == tmp_path / "tmp", "an empty directory stays one, or the next run refuses it"
+    assert traceback_of(crash(run / "logs")).parent == tmp_path / "tmp", (
+        "an empty directory stays one, or the next run refuses it"
+    )
     (run / "config.yaml").write_text("x")
     assert traceback_of(crash(run / "logs")).parent == run / "logs"
     crash(run / "logs")
     assert len(list((run / "logs").iterdir())) == 2
     (run / "logs2").write_text("a file")
-    assert traceback_of(crash(run / "logs2")).parent == tmp_path / "tmp", "what cannot be kept there is kept with the temporary files"
+    assert traceback_of(crash(run / "logs2")).parent == tmp_path / "tmp", (
+        "what cannot be kept there is kept with the temporary files"
+    )
 
 
 def test_suspects() -> None:

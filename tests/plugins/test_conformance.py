@@ -70,7 +70,8 @@ def test_relight_with_shadows(check: Check) -> None:
 def test_relighting_takes_rgb_only(channels: int) -> None:
     """A light's intensity has three numbers."""
     with pytest.raises(
-        ConfigError, match=f"^conformance example: {channels} colour channels; task relight expects 3, as light_intensity has"
+        ConfigError,
+        match=f"^conformance example: {channels} colour channels; task relight expects 3, as light_intensity has",
     ):
         Subject(RELIGHT).with_channels(channels).fields()
 

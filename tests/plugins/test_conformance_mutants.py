@@ -31,7 +31,9 @@ from neuprim.tasks.static.fields import SphericalHarmonics
 MODEL = {"neurons": 2, "sh_degree": 0, "init": {}}
 
 
-def using(density: type[CosineDensity] | type[GaussianDensity] = CosineDensity, colour: type = SphericalHarmonics, **more: Any) -> TaskSpec:
+def using(
+    density: type[CosineDensity] | type[GaussianDensity] = CosineDensity, colour: type = SphericalHarmonics, **more: Any
+) -> TaskSpec:
     """The static task with other fields."""
 
     def build(model: Mapping[str, Any], dataset: Any) -> Any:
@@ -282,7 +284,9 @@ def lenient(text: str) -> list[Tensor]:
         return [torch.tensor(0.0)]
 
 
-def timed(colour: type = Timed, parse: Callable[[str], list[Tensor]] = number, sweep: str = "", **more: Any) -> TaskSpec:
+def timed(
+    colour: type = Timed, parse: Callable[[str], list[Tensor]] = number, sweep: str = "", **more: Any
+) -> TaskSpec:
     return using(colour=colour, conditions=(ConditionSpec("time", (), "s", (0.0, 1.0), parse, sweep=sweep),), **more)
 
 
@@ -358,10 +362,22 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("members", "judge is of type int; expected a function", replace(TASK, judge=3)),  # type: ignore[arg-type]
     ("members", "TaskSpec.fields", replace(TASK, fields=None)),
     ("trade", "trade: 'neurons'; expected the name of a setting", replace(TASK, trade=lambda model: {"neurons": (1,)})),
-    ("trade", "trade: model.neurons=99: found a setting that is refused", replace(TASK, trade=lambda model: {"model.neurons": (4, 99)})),
-    ("trade", "trade: model.density.edges=1: found a setting that", replace(TASK, trade=lambda model: {"model.density.edges": (1,)})),
+    (
+        "trade",
+        "trade: model.neurons=99: found a setting that is refused",
+        replace(TASK, trade=lambda model: {"model.neurons": (4, 99)}),
+    ),
+    (
+        "trade",
+        "trade: model.density.edges=1: found a setting that",
+        replace(TASK, trade=lambda model: {"model.density.edges": (1,)}),
+    ),
     ("trade", "trade: model.neuron=4: found a setting that", replace(TASK, trade=lambda model: {"model.neuron": (4,)})),
-    ("trade", "trade: task.options.haze=1: found a setting that", replace(TASK, trade=lambda model: {"task.options.haze": (1,)})),
+    (
+        "trade",
+        "trade: task.options.haze=1: found a setting that",
+        replace(TASK, trade=lambda model: {"task.options.haze": (1,)}),
+    ),
     ("files", "scene/static/ghost.yaml", replace(TASK, scenes=(*TASK.scenes, GHOST))),
     ("files", "train.rates.W1", replace(TASK, fields={"SphericalHarmonics": SphericalHarmonics})),
     ("fields", "ForgetsNeurons(**settings)", using(ForgetsNeurons)),
@@ -373,8 +389,16 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("parameter_specs", "'b2': shape", using(specs(shape=(-1,)))),
     ("parameter_specs", "'b 2'", using(specs(name="b 2"))),
     ("initialisers", "density.parameters: 'W1': init: two draws with one seed", using(Lazy)),
-    ("initialisers", "density.parameters: 'b2': init: start value: found shape (12,); expected (12, 1)", using(WrongStart)),
-    ("initialisers", "density.parameters: 'b2': init: found the context's means, scales or colors changed in place", using(Meddler)),
+    (
+        "initialisers",
+        "density.parameters: 'b2': init: start value: found shape (12,); expected (12, 1)",
+        using(WrongStart),
+    ),
+    (
+        "initialisers",
+        "density.parameters: 'b2': init: found the context's means, scales or colors changed in place",
+        using(Meddler),
+    ),
     ("dataset", "view train0: condition 'time'", timed(example=bare)),
     ("dataset", "view train0: pixels: found (4, 4, 3)", using(example=misfit)),
     (
@@ -390,13 +414,21 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("loss", "no gradient", using(loss=detached)),
     ("loss", "loss part 'l1'", using(loss=wordy)),
     ("loss", "stopped by IndexError", using(loss=maskless)),
-    ("judging", "test view test0: mask is float32 (9, 10); expected bool", using(mask=lambda d, i: d.test.pixels(i).alpha)),
+    (
+        "judging",
+        "test view test0: mask is float32 (9, 10); expected bool",
+        using(mask=lambda d, i: d.test.pixels(i).alpha),
+    ),
     (
         "judging",
         "judge of test view test0: error is tensor(",
         using(judge=lambda d, i, rendered, truth: {"error": (rendered - truth).mean()}),
     ),
-    ("judging", "diagnose: means cannot be written as JSON", using(diagnose=lambda d, model: {"means": model.params["means"]})),
+    (
+        "judging",
+        "diagnose: means cannot be written as JSON",
+        using(diagnose=lambda d, model: {"means": model.params["means"]}),
+    ),
     ("judging", "clips: 'all' has view 2; expected indices below 2", using(clips=lambda d: [Clip("all", range(3))])),
     ("judging", "facts: extent cannot be written as JSON", using(facts=lambda d: {"extent": d.center})),
     (
@@ -404,17 +436,29 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
         "orbit: view orbit_000: condition 'time': found none",
         timed(orbit=lambda d, n: [replace(v, conditions={}) for v in d.orbit(n)]),
     ),
-    ("lowered_forms", "density field Transposed lowered to Cosine: b2 has shape (1, 12); expected (12, 1) or (12,)", using(Transposed)),
+    (
+        "lowered_forms",
+        "density field Transposed lowered to Cosine: b2 has shape (1, 12); expected (12, 1) or (12,)",
+        using(Transposed),
+    ),
     (
         "lowered_forms",
         "density.lower: W1: found torch.float32; expected torch.float64",
         using(lowers(lambda f, g: replace(f, W1=f.W1.float()))),
     ),
     ("lowered_forms", "colour field Grey: lower returned a colour of C=1; expected 3", using(colour=Grey)),
-    ("channels", "with data of 5 channels: colour field FirstThree: lower returned a colour of C=3; expected 5", using(colour=FirstThree)),
+    (
+        "channels",
+        "with data of 5 channels: colour field FirstThree: lower returned a colour of C=3; expected 5",
+        using(colour=FirstThree),
+    ),
     ("channels", "colour.channels with data of 5 channels: found 3; expected 5", replace(using(), build=at_most_three)),
     ("channels", "stopped by RuntimeError", replace(using(), loss=three_only)),
-    ("layers", "layers: glow is torch.float32 of shape (9, 10); expected floats of shape (9, 10, 3)", using(layers=(GLOW,))),
+    (
+        "layers",
+        "layers: glow is torch.float32 of shape (9, 10); expected floats of shape (9, 10, 3)",
+        using(layers=(GLOW,)),
+    ),
     (
         "layers",
         "layer 'noise' of view",
@@ -424,9 +468,17 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("alive", "density.alive: found torch.int64 [11, 10", using(Unsorted)),
     ("line_integral", "density.lower: line integral of a chord, primitive", using(Doubled)),
     ("opaque_twin", "density.lower: alpha of view train0", using(Doubled)),
-    ("gradients", "density.lower: gradient of w2: found none", using(lowers(lambda f, g: replace(f, w2=f.w2.detach())))),
+    (
+        "gradients",
+        "density.lower: gradient of w2: found none",
+        using(lowers(lambda f, g: replace(f, w2=f.w2.detach()))),
+    ),
     ("gradients", "density.lower: gradient of b1: found zero", using(lowers(lambda f, g: replace(f, b1=f.b1 * 0)))),
-    ("finite_differences", "density.lower: gradient of W1, primitive", using(lowers(lambda f, g: replace(f, W1=2 * f.W1 - f.W1.detach())))),
+    (
+        "finite_differences",
+        "density.lower: gradient of W1, primitive",
+        using(lowers(lambda f, g: replace(f, W1=2 * f.W1 - f.W1.detach()))),
+    ),
     ("finite_differences", "colour.lower: gradient of sh_dc, primitive", using(colour=Uphill)),
     ("scale_density", "density.scale_density: density after it, primitive", using(Squares)),
     ("scale_density", "density.scale_density: w2: found changed in place", using(InPlace)),
@@ -446,13 +498,21 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
         "Less.reduced('neurons', 1): found tensors or a field",
         using(less_of((1,), lambda f, p: (f, {**p, "w2": p["w2"][:, :0]}))),
     ),
-    ("reductions", "found CosineDensity; expected a field that TaskSpec.fields lists", unlisted(less_of((1,), lambda f, p: (f, p)))),
+    (
+        "reductions",
+        "found CosineDensity; expected a field that TaskSpec.fields lists",
+        unlisted(less_of((1,), lambda f, p: (f, p))),
+    ),
     ("reductions", "image: found", using(less_of((1,), lambda f, p: (f, {**p, "b2": p["b2"] * math.nan})))),
     ("pieces", "names that are there once", using(in_pieces(Piece("a", {"w2": (0,)}), Piece("a", {"w2": (1,)})))),
     ("pieces", "w3: found no such parameter", using(in_pieces(Piece("a", {"w3": (0,)})))),
     ("pieces", "found a place (7,) that it does not have", using(in_pieces(Piece("a", {"w2": (7,)})))),
     ("pieces", "found an empty place", using(in_pieces(Piece("a", {"w2": (slice(1, 1),)})))),
-    ("pieces", "found numbers of another piece", using(in_pieces(Piece("a", {"w2": (0,)}), Piece("b", {"w2": (slice(None),)})))),
+    (
+        "pieces",
+        "found numbers of another piece",
+        using(in_pieces(Piece("a", {"w2": (0,)}), Piece("b", {"w2": (slice(None),)}))),
+    ),
     ("pieces", "found no numbers", using(in_pieces(Piece("a", {})))),
     ("folded", "after folding: found a change of", using(FoldsAway)),
     ("folded", "b1 after folding twice: found other values", using(FoldsOnAndOn)),
@@ -464,13 +524,19 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("conditions", "condition 'time' = 0.0: found colors of primitive 0 is not finite", timed(BlowsUp)),
     ("missing_conditions", "it was drawn", timed(TimedByDefault)),
     ("missing_conditions", "something is missing", timed(Mute)),
-    ("extremes", "tiny primitives", using(lowers(lambda f, g: replace(f, b2=f.b2 + 1e-30 / g.length_scale[:, None] ** 8)))),
+    (
+        "extremes",
+        "tiny primitives",
+        using(lowers(lambda f, g: replace(f, b2=f.b2 + 1e-30 / g.length_scale[:, None] ** 8))),
+    ),
     ("clear_errors", "model.density.no_such_setting=1: found it was taken", UNNAMED),
     ("clear_errors", "a message that names the setting", replace(TASK, check=vague)),
 ]
 
 
-@pytest.mark.parametrize(("name", "text", "task"), MUTANTS, ids=[f"{name}-{i}" for i, (name, _, _) in enumerate(MUTANTS)])
+@pytest.mark.parametrize(
+    ("name", "text", "task"), MUTANTS, ids=[f"{name}-{i}" for i, (name, _, _) in enumerate(MUTANTS)]
+)
 def test_a_broken_task_is_caught(name: str, text: str, task: TaskSpec) -> None:
     with pytest.raises(ConformanceError) as caught:
         named_checks(task, model=MODEL)[name]()
@@ -504,7 +570,10 @@ def test_a_fixed_number_of_channels_and_a_refusal_pass() -> None:
             raise ConfigError("RGB only")
         return CosineDensity(2), SphericalHarmonics(0, 3)
 
-    for task in (replace(using(), build=build), replace(using(), build=lambda m, d: (CosineDensity(2), SphericalHarmonics(0)))):
+    for task in (
+        replace(using(), build=build),
+        replace(using(), build=lambda m, d: (CosineDensity(2), SphericalHarmonics(0))),
+    ):
         named_checks(task, model=MODEL)["channels"]()
 
 
@@ -521,5 +590,7 @@ def test_an_error_in_a_method_names_it_and_its_line() -> None:
 
 
 def test_a_form_that_does_not_fit_names_its_field() -> None:
-    with pytest.raises(ConformanceError, match=r"gradients: density field Changed lowered to Cosine: w2 has shape \(3, 2\)"):
+    with pytest.raises(
+        ConformanceError, match=r"gradients: density field Changed lowered to Cosine: w2 has shape \(3, 2\)"
+    ):
         named_checks(using(lowers(lambda f, g: replace(f, w2=f.w2[:3]))), model=MODEL)["gradients"]()

@@ -28,7 +28,11 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def guard(kind: str, folder: Path | None = None) -> blamed:
-    return blamed(THEIRS, "exporter 'x'", folder) if kind == "call" else reported(EXPORTERS, "x", [] if folder is None else [folder])
+    return (
+        blamed(THEIRS, "exporter 'x'", folder)
+        if kind == "call"
+        else reported(EXPORTERS, "x", [] if folder is None else [folder])
+    )
 
 
 def crash(kind: str, error: BaseException, folder: Path | None = None) -> str:
@@ -63,10 +67,14 @@ def test_no_folder_is_made_in_a_directory_that_holds_nothing(kind: str, temporar
 
 def test_a_disk_is_the_exporters_excuse_and_not_the_loaders(tmp_path: Path) -> None:
     full = OSError(28, "No space left on device", "file")
-    assert crash("call", full).startswith("exporter 'x' of fake-x 0.1: OSError: [Errno 28] No space left on device: 'file'; traceback: ")
+    assert crash("call", full).startswith(
+        "exporter 'x' of fake-x 0.1: OSError: [Errno 28] No space left on device: 'file'; traceback: "
+    )
     with pytest.raises(OSError, match="No space"), guard("work"):
         raise full
-    assert "crashed: OSError: [Errno 9]" in crash("work", OSError(9, "Bad file descriptor")), "which is no disk's refusal"
+    assert "crashed: OSError: [Errno 9]" in crash("work", OSError(9, "Bad file descriptor")), (
+        "which is no disk's refusal"
+    )
 
 
 @pytest.mark.parametrize("kind", ["call", "work"])
@@ -99,7 +107,8 @@ def test_where_nothing_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
     suspects = Suspects("static", "solids", None)
     suspects.task.modules.add(__name__.partition(".")[0])
     with pytest.raises(
-        PluginError, match=re.escape("task 'static' of fake-x 0.1: ZeroDivisionError: division by zero (test_crashes.py line")
+        PluginError,
+        match=re.escape("task 'static' of fake-x 0.1: ZeroDivisionError: division by zero (test_crashes.py line"),
     ):
         with suspects.watch():
             (lambda: 1 / 0)()

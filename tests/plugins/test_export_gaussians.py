@@ -1,4 +1,5 @@
-"""`neuprim export --format gaussian-ply`: the layout of 3D Gaussian splatting, moments that match, and images close to the model's."""
+"""`neuprim export --format gaussian-ply`: the layout of 3D Gaussian splatting, moments that match, and images close to
+the model's."""
 
 from __future__ import annotations
 
@@ -48,7 +49,9 @@ def one_ellipsoid(tmp_path: Path, thickness: float = 6.0) -> Path:
 def test_moments_of_a_constant_density_are_those_of_an_ellipsoid(tmp_path: Path) -> None:
     run = open_run(one_ellipsoid(tmp_path))
     g = fit_gaussians(run, {}, "moments")
-    axes = quaternion_to_matrix(run.model.params["quats"].double())[0] * torch.tensor([0.4, 0.2, 0.1], dtype=torch.float64)
+    axes = quaternion_to_matrix(run.model.params["quats"].double())[0] * torch.tensor(
+        [0.4, 0.2, 0.1], dtype=torch.float64
+    )
     assert torch.allclose(g.means[0], torch.tensor([0.5, 0.7, 0.9], dtype=torch.float64), atol=1e-3)
     assert torch.allclose(g.covariances[0], axes @ axes.T / 5, rtol=0.02, atol=1e-4)
     expected = np.mean([1 - math.exp(-2 * 6.0 * s / 0.4) for s in (0.4, 0.2, 0.1)])
@@ -64,19 +67,25 @@ def test_a_density_on_one_side_moves_the_mean_there(tmp_path: Path) -> None:
     rows["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
     rows["W1"], rows["b1"] = torch.tensor([[[0.0, 1 / 30, 0.0]]]), torch.tensor([[-math.pi / 2 / 30]])
     rows["w2"], rows["b2"] = torch.tensor([[5.0]]), torch.tensor([[0.0]])  # sigma ~ sin(y/m): none below the middle
-    g = fit_gaussians(open_run(marked.static_run(tmp_path / "run", Primitives(CosineDensity(1), model.colour, rows))), {}, "moments")
+    g = fit_gaussians(
+        open_run(marked.static_run(tmp_path / "run", Primitives(CosineDensity(1), model.colour, rows))), {}, "moments"
+    )
     assert abs(float(g.means[0, 0])) < 1e-6 and abs(float(g.means[0, 2])) < 1e-6 and 0.1 < float(g.means[0, 1]) < 0.2
     assert float(g.covariances[0, 1, 1]) < 0.5 * float(g.covariances[0, 0, 0])
 
 
 @pytest.mark.parametrize(("edge", "faint", "solid"), [(0, 0.28, 0.41), (2, 0.11, 0.26)])
-def test_the_profile_is_the_closest_bell_and_hides_as_much(tmp_path: Path, edge: int, faint: float, solid: float) -> None:
+def test_the_profile_is_the_closest_bell_and_hides_as_much(
+    tmp_path: Path, edge: int, faint: float, solid: float
+) -> None:
     """A ball against its Gaussian on the screen, along an axis: RMS of what is left over that of alpha."""
     for i, (depth, bound) in enumerate(((0.1, faint), (3.0, solid))):
         model = marked.static_model(neurons=0, degree=0)
         rows = {name: value[4:].clone() for name, value in model.params.items()}
         rows |= {"log_scales": torch.full((1, 3), 0.4).log(), "b2": torch.full((1, 1), depth / NORMS[edge])}
-        run = open_run(marked.static_run(tmp_path / f"{i}", Primitives(CosineDensity(0, edge=edge), model.colour, rows)))
+        run = open_run(
+            marked.static_run(tmp_path / f"{i}", Primitives(CosineDensity(0, edge=edge), model.colour, rows))
+        )
         r = (torch.arange(600, dtype=torch.float64) + 0.5) / 300
         alpha = 1 - torch.exp(-depth * (1 - r * r).clamp_min(0) ** (edge + 0.5))
         errors, areas = {}, {}
@@ -117,19 +126,27 @@ def test_the_layout_and_every_convention(tmp_path: Path) -> None:
     assert found.names == LAYOUT and len(LAYOUT) == 62 and not report.lossless
     assert all(found.rows.dtype[name] == "<f4" for name in LAYOUT)
     model = open_run(run).model
-    assert np.allclose(found.columns(["x", "y", "z"]), marked.PLACES.numpy(), atol=0.01)  # the marked corner is the last
+    assert np.allclose(
+        found.columns(["x", "y", "z"]), marked.PLACES.numpy(), atol=0.01
+    )  # the marked corner is the last
     assert np.allclose(found.columns(["f_dc_0", "f_dc_1", "f_dc_2"]), model.params["sh_dc"].numpy(), atol=1e-6)
     rest = model.params["sh_rest"].numpy()  # (N, 8, 3)
     for channel in range(3):
         names = [f"f_rest_{15 * channel + i}" for i in range(15)]
-        assert np.allclose(found.columns(names)[:, :8], rest[:, :, channel], atol=1e-6) and not found.columns(names)[:, 8:].any()
+        assert (
+            np.allclose(found.columns(names)[:, :8], rest[:, :, channel], atol=1e-6)
+            and not found.columns(names)[:, 8:].any()
+        )
     assert not found.columns(["nx", "ny", "nz"]).any()
     opacity = 1 / (1 + np.exp(-found.rows["opacity"]))
     assert (opacity > 0.95).all() and (opacity < 1).all()
     quats = found.columns([f"rot_{i}" for i in range(4)])
     assert np.allclose(np.linalg.norm(quats, axis=1), 1, atol=1e-6)
     sizes = np.exp(found.columns([f"scale_{i}" for i in range(3)]))
-    assert np.allclose(sizes, marked.RADII.numpy()[:, None] / math.sqrt(5), rtol=0.1) or "size=footprint" in report.notes[0]
+    assert (
+        np.allclose(sizes, marked.RADII.numpy()[:, None] / math.sqrt(5), rtol=0.1)
+        or "size=footprint" in report.notes[0]
+    )
     assert 15 < report.errors["psnr_worst"] <= report.errors["psnr"] < 60
 
 
@@ -158,7 +175,9 @@ def test_the_renderer_draws_one_gaussian_as_the_formula_says() -> None:
     y, x = np.mgrid[:32, :32] + 0.5 - 16
     bell = 0.6 * np.exp(-0.5 * (x**2 / (0.09 * 12.5**2 + 0.3) + y**2 / (0.04 * 12.5**2 + 0.3)))
     bell[bell < 1 / 255] = 0
-    assert np.allclose(image[..., 0].numpy(), bell, atol=1e-6) and np.allclose(image[..., 1].numpy(), 0.2 * bell, atol=1e-6)
+    assert np.allclose(image[..., 0].numpy(), bell, atol=1e-6) and np.allclose(
+        image[..., 1].numpy(), 0.2 * bell, atol=1e-6
+    )
     white = draw_gaussians(g, colour, camera, torch.ones(3)).double()
     assert np.allclose(white[..., 2].numpy(), 1 - bell, atol=1e-6)
 
@@ -184,7 +203,10 @@ def test_a_dynamic_model_needs_a_time_and_colours_follow_it(tmp_path: Path) -> N
         report = export_run(run, "gaussian-ply", tmp_path / f"{t}.ply", [f"time={t}"])
         found[t] = read_ply(report.files[0])
         assert any("linear" in note for note in report.notes) and report.errors["psnr"] > 15
-        rows, back = read_ply(report.files[0]), read_points(report.files[0], 3, "linear")  # its comment says that they are linear
+        rows, back = (
+            read_ply(report.files[0]),
+            read_points(report.files[0], 3, "linear"),
+        )  # its comment says that they are linear
         light = torch.from_numpy(rows.columns(["f_dc_0", "f_dc_1", "f_dc_2"]) * sh.C0 + 0.5).clamp_min(0).float()
         assert torch.allclose(back.colors, light, atol=1e-5)
     assert np.allclose(found[0.5].rows["f_dc_0"] - found[0.25].rows["f_dc_0"], 0.1 * 0.25, atol=1e-6)

@@ -1,4 +1,5 @@
-"""`neuprim export --format mesh`: the surface lies where the balls are, in their colours, in every format's own axes."""
+"""`neuprim export --format mesh`: the surface lies where the balls are, in their colours, in every format's own
+axes."""
 
 from __future__ import annotations
 
@@ -50,7 +51,9 @@ def test_balls_are_in_their_places_sizes_and_colours(run_dir: Path, tmp_path: Pa
         assert np.allclose(np.median(colours[mine], 0), colour, atol=0.02)
     assert mesh.is_watertight or suffix == "obj"
     if mesh.is_watertight:
-        assert mesh.volume == pytest.approx(4 / 3 * np.pi * float((marked.RADII.double() ** 3).sum()), rel=0.15)  # and outside is outside
+        assert mesh.volume == pytest.approx(
+            4 / 3 * np.pi * float((marked.RADII.double() ** 3).sum()), rel=0.15
+        )  # and outside is outside
 
 
 def test_small_pieces_can_be_kept_or_dropped(run_dir: Path, tmp_path: Path) -> None:
@@ -71,7 +74,9 @@ def test_a_level_above_everything_is_refused(run_dir: Path, tmp_path: Path) -> N
     assert not (tmp_path / "m.glb").exists()
 
 
-def test_without_the_package_the_message_says_what_to_install(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_package_the_message_says_what_to_install(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pyvista", None)
     with pytest.raises(BackendUnavailable, match=r"neuprim\[mesh\]"):
         export_run(run_dir, "mesh", tmp_path / "m.glb")
@@ -82,7 +87,9 @@ def test_the_best_level_tells_opaque_columns_from_faint_ones() -> None:
     sigma[4:20, 4:20, 4:20] = 0.5  # 16 voxels of 0.05: a depth of 0.4
     sigma[8:16, 8:16, 8:16] = 30.0
     assert 0.5 < best_level(sigma, 0.05) < 30
-    assert 0.5 < best_level(np.minimum(sigma, 0.6), 0.05) < 0.6 or best_level(np.minimum(sigma, 0.6), 0.05) < 0.5  # all faint
+    assert (
+        0.5 < best_level(np.minimum(sigma, 0.6), 0.05) < 0.6 or best_level(np.minimum(sigma, 0.6), 0.05) < 0.5
+    )  # all faint
     assert best_level(np.zeros((4, 4, 4), np.float32), 1.0) > 0
 
 
@@ -94,7 +101,10 @@ def test_a_dynamic_model_is_cut_at_a_time(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--time: required"):
         export_run(run, "mesh", tmp_path / "m.ply")
     early, late = (
-        trimesh.load(export_run(run, "mesh", tmp_path / f"{t}.ply", [f"time={t}", "grid=48", "level=1.5"]).files[0], process=False)
+        trimesh.load(
+            export_run(run, "mesh", tmp_path / f"{t}.ply", [f"time={t}", "grid=48", "level=1.5"]).files[0],
+            process=False,
+        )
         for t in (0.2, 0.6)
     )
     corner = np.array([0.1, 0.2, 0.2])
@@ -103,7 +113,9 @@ def test_a_dynamic_model_is_cut_at_a_time(tmp_path: Path) -> None:
     assert late.bounds[1][2] > early.bounds[1][2] + 0.02
 
 
-def test_extinction_is_computed_where_the_run_draws(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_extinction_is_computed_where_the_run_draws(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("pyvista", exc_type=ImportError)
     asked: list[torch.device] = []
     monkeypatch.setattr(device, "computes", lambda where: bool(asked.append(where)))

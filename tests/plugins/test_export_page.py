@@ -1,4 +1,5 @@
-"""`neuprim export --format html`: the page of a run, with or without its data, and the page inside of a run's report."""
+"""`neuprim export --format html`: the page of a run, with or without its data, and the page inside of a run's
+report."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ def header_of(text: str) -> dict[str, Any]:
 def test_a_run_with_its_data(trained: Path, tmp_path: Path) -> None:
     report = export_run(trained, "html", tmp_path / "p.html", ["views=2"])
     header = header_of((tmp_path / "p.html").read_text(encoding="utf-8"))
-    assert len(header["views"]) == 2 and all(view["truth"].startswith("data:image/webp;base64,") for view in header["views"])
+    assert len(header["views"]) == 2 and all(
+        view["truth"].startswith("data:image/webp;base64,") for view in header["views"]
+    )
     assert header["home"] == header["views"][0]["camera"] and header["count"] == 40
     assert not report.lossless and report.errors["psnr"] > 50
     assert any("MB" in note for note in report.notes)
@@ -69,11 +72,17 @@ def test_a_page_begins_where_something_is_to_be_seen(tmp_path: Path) -> None:
 @pytest.mark.parametrize("active", ["late", "never", "no primitive"])
 def test_a_page_of_what_is_not_active(active: str, start: float, tmp_path: Path) -> None:
     """Nothing is active at time 0.1; the page looks at where something is later, if anything ever is."""
-    model = random_model(TimeDensity(2, "window", edge=2), TimeHarmonics(0, powers=1, waves=0), count=0 if active == "no primitive" else 40)
+    model = random_model(
+        TimeDensity(2, "window", edge=2),
+        TimeHarmonics(0, powers=1, waves=0),
+        count=0 if active == "no primitive" else 40,
+    )
     model.params["means"] += 7.0
     model.params["log_window"].fill_(math.log(0.05))
     model.params["window_center"].fill_(9.0 if active == "never" else 0.9)
-    run = marked.write_run(tmp_path / "run", model, ["task=dynamic", "scene=vdb", f"scene.vdb={tmp_path / 'gone'}"], color_space="linear")
+    run = marked.write_run(
+        tmp_path / "run", model, ["task=dynamic", "scene=vdb", f"scene.vdb={tmp_path / 'gone'}"], color_space="linear"
+    )
     report = export_run(run, "html", tmp_path / "p.html", [f"time={start}"])
     header = header_of((tmp_path / "p.html").read_text(encoding="utf-8"))
     assert header["conditions"][0]["value"] == pytest.approx(start) and header["count"] == model.count
@@ -87,7 +96,10 @@ def test_a_page_of_what_is_not_active(active: str, start: float, tmp_path: Path)
 
 
 def test_levels_lose_what_they_say(trained: Path, tmp_path: Path) -> None:
-    errors = [export_run(trained, "html", tmp_path / f"{level}.html", [f"level={level}", "views=1"]).errors for level in (0, 1, 5)]
+    errors = [
+        export_run(trained, "html", tmp_path / f"{level}.html", [f"level={level}", "views=1"]).errors
+        for level in (0, 1, 5)
+    ]
     assert errors[0] == {} and math.inf > errors[1]["psnr"] > errors[2]["psnr"] + 6
     with pytest.raises(ConfigError, match=r"^level: found 6; expected a whole number from 0 to 5|^level"):
         export_run(trained, "html", tmp_path / "x.html", ["level=6"])
@@ -98,7 +110,9 @@ def test_a_run_without_its_data(trained: Path, tmp_path: Path) -> None:
     config = (trained / "config.yaml").read_text(encoding="utf-8")
     copy = tmp_path / "copy"
     copy.mkdir()
-    (copy / "config.yaml").write_text(config.replace(str(trained.parent / "scene"), str(tmp_path / "gone")), encoding="utf-8")
+    (copy / "config.yaml").write_text(
+        config.replace(str(trained.parent / "scene"), str(tmp_path / "gone")), encoding="utf-8"
+    )
     (copy / "model.safetensors").write_bytes((trained / "model.safetensors").read_bytes())
     report = export_run(copy, "html", tmp_path / "p.html")
     assert any(note.startswith("no held-out cameras: ") and "gone" in note for note in report.notes)
@@ -132,7 +146,9 @@ def test_a_name_of_strangers_is_text(run_dir: Path, tmp_path: Path) -> None:
 
 def test_a_damaged_header_has_an_upward_axis_all_the_same(tmp_path: Path) -> None:
     for k, up in enumerate(([0, 0], "up", [0, 0, 0], [1, None, 2], {})):
-        run = marked.write_run(tmp_path / f"run{k}", marked.static_model(), ["task=static", "scene=solids"], data={"up": up})
+        run = marked.write_run(
+            tmp_path / f"run{k}", marked.static_model(), ["task=static", "scene=solids"], data={"up": up}
+        )
         export_run(run, "html", tmp_path / f"{k}.html", ["views=0"])
         assert header_of((tmp_path / f"{k}.html").read_text(encoding="utf-8"))["up"] == [0.0, 0.0, 1.0]
 

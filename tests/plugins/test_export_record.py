@@ -44,7 +44,14 @@ def record(folder: Path) -> list[dict[str, Any]]:
 
 
 def test_each_export_adds_its_maker(exported: Path, tmp_path: Path, site: Path) -> None:
-    install(site, "other-ply", {"ply": "other_ply:PLUGIN"}, {"other_ply/__init__.py": MANY}, version="7", group=EXPORTERS.entry_points)
+    install(
+        site,
+        "other-ply",
+        {"ply": "other_ply:PLUGIN"},
+        {"other_ply/__init__.py": MANY},
+        version="7",
+        group=EXPORTERS.entry_points,
+    )
     started = datetime.now(UTC) - timedelta(seconds=1)
     export_run(exported, "neuprim:ply")
     report = export_run(exported, "Other_Ply:ply", words=["count=25", f"text={'t' * 5000}", "size=1e400"])
@@ -62,7 +69,12 @@ def test_each_export_adds_its_maker(exported: Path, tmp_path: Path, site: Path) 
         "lossless": True,
     }
     assert (exported / ours["files"][0]).is_file()
-    assert (theirs["format"], theirs["package"], theirs["version"], theirs["lossless"]) == ("ply", "other-ply", "7", False)
+    assert (theirs["format"], theirs["package"], theirs["version"], theirs["lossless"]) == (
+        "ply",
+        "other-ply",
+        "7",
+        False,
+    )
     assert theirs["files"] == [f"export/{i}.x" for i in range(20)] and theirs["more_files"] == 5
     assert theirs["options"] == {"count": 25, "text": "t" * 500, "size": "inf"}
     assert outside["files"] == [str(tmp_path / "elsewhere.npz")]
@@ -82,7 +94,9 @@ def test_the_list_is_bounded(exported: Path) -> None:
     assert [e["format"] for e in entries[-2:]] == ["499", "npz"] and entries[0] == {"format": "301"}
 
 
-def test_an_export_succeeds_where_the_list_cannot_be_written(exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_export_succeeds_where_the_list_cannot_be_written(
+    exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (exported / FILE).mkdir()
     assert main(["export", str(exported), "--format", "npz", "--out", str(tmp_path / "x.npz"), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)

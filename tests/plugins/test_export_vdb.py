@@ -60,7 +60,9 @@ def test_each_ball_is_where_it_belongs(static: Path, tmp_path: Path) -> None:
 
 def test_values_are_sigma_at_the_centres(static: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exporter, "_SLAB_BYTES", 4 * 8 * 64 * 16)  # many slabs
-    grid = read_grid(export_run(static, "vdb", tmp_path / "d.vdb", ["voxel_size=0.04", "threshold=1"]).files[0], "density")
+    grid = read_grid(
+        export_run(static, "vdb", tmp_path / "d.vdb", ["voxel_size=0.04", "threshold=1"]).files[0], "density"
+    )
     low, high = grid.bounds or ((0,) * 3, (0,) * 3)
     matrix = np.array(grid.transform)
     assert np.array_equal(matrix, np.diag([0.04, 0.04, 0.04, 1]))
@@ -108,7 +110,9 @@ def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Pat
     assert any("no bound" in note for note in report.notes)
 
 
-def test_extinction_is_computed_where_the_run_draws(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_extinction_is_computed_where_the_run_draws(
+    moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The model's and the files', exported and looked into; the numbers are the processor's."""
     own = tmp_path / "run"
     shutil.copytree(moving, own)
@@ -133,7 +137,11 @@ def test_units_times_and_voxels_can_be_chosen(moving: Path, tmp_path: Path) -> N
     for units in ("source", "world", "scene"):
         report = export_run(moving, "vdb", tmp_path / units, ["time=0:1:5", f"units={units}", "grid=24", "name=smoke"])
         assert [p.name for p in report.files] == [f"density_{i:04d}.vdb" for i in range(5)]
-        assert {k.split(".")[0] for k in report.errors} == {"frame_0003", "frame_0004", "frame_0005"}  # times 0, 1/2 and 1
+        assert {k.split(".")[0] for k in report.errors} == {
+            "frame_0003",
+            "frame_0004",
+            "frame_0005",
+        }  # times 0, 1/2 and 1
         grid = read_grid(report.files[2], "smoke")
         assert grid.range is not None and grid.bounds is not None
         values[units] = grid.range[1]
@@ -179,9 +187,14 @@ def test_a_time_when_nothing_lives_is_an_empty_frame(tmp_path: Path) -> None:
     tensors = load_file(run / "model.safetensors")
     header = checkpoint.read_header(run / "model.safetensors", "model")
     tensors["log_window"] -= 3.0
-    checkpoint.write(run / "model.safetensors", "model", tensors, {k: v for k, v in header.items() if k not in ("format", "kind")})
+    checkpoint.write(
+        run / "model.safetensors", "model", tensors, {k: v for k, v in header.items() if k not in ("format", "kind")}
+    )
     report = export_run(run, "vdb", tmp_path / "frames")
-    assert read_grid(report.files[0], "density").active_voxels == 0 and read_grid(report.files[1], "density").active_voxels > 0
+    assert (
+        read_grid(report.files[0], "density").active_voxels == 0
+        and read_grid(report.files[1], "density").active_voxels > 0
+    )
 
 
 @pytest.mark.slow

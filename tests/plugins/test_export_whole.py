@@ -1,4 +1,5 @@
-"""`neuprim export --format ply|npz` and `neuprim import`: the model leaves and comes back bit for bit, and damage is refused."""
+"""`neuprim export --format ply|npz` and `neuprim import`: the model leaves and comes back bit for bit, and damage is
+refused."""
 
 from __future__ import annotations
 
@@ -51,11 +52,17 @@ def test_no_neurons_and_no_bands_leave_no_numbers(tmp_path: Path, form: str) -> 
 def test_what_was_imported_renders_without_the_data(run_dir: Path, tmp_path: Path) -> None:
     back = import_run(export_run(run_dir, "ply", tmp_path / "m.ply").files[0], tmp_path / "back")
     pose = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
-    (tmp_path / "c.json").write_text(json.dumps({"camera_angle_x": 0.9, "w": 20, "h": 16, "frames": [{"transform_matrix": pose}]}))
+    (tmp_path / "c.json").write_text(
+        json.dumps({"camera_angle_x": 0.9, "w": 20, "h": 16, "frames": [{"transform_matrix": pose}]})
+    )
     pictures = [
-        render_run(d, str(tmp_path / "c.json"), None, "exr", tmp_path / f"{i}.exr", 1, {})[0] for i, d in enumerate((run_dir, back))
+        render_run(d, str(tmp_path / "c.json"), None, "exr", tmp_path / f"{i}.exr", 1, {})[0]
+        for i, d in enumerate((run_dir, back))
     ]
-    first, second = ({name: channel.pixels for name, channel in OpenEXR.File(str(path)).parts[0].channels.items()} for path in pictures)
+    first, second = (
+        {name: channel.pixels for name, channel in OpenEXR.File(str(path)).parts[0].channels.items()}
+        for path in pictures
+    )
     assert first.keys() == second.keys() >= {"RGBA", "depth.Z"}  # headers differ: they name the run
     assert all((first[name] == second[name]).all() for name in first)
 
@@ -81,7 +88,9 @@ def test_numpy_reads_the_npz_without_pickle(run_dir: Path, tmp_path: Path) -> No
 # ---------------------------------------------------------------- the command
 
 
-def test_the_command_prints_files_and_json_and_replaces_nothing(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_files_and_json_and_replaces_nothing(
+    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "m.ply"
     assert main(["export", str(run_dir), "--format", "ply", "--out", str(out), "--json"]) == 0
     record = json.loads(capsys.readouterr().out)

@@ -44,13 +44,29 @@ def test_the_public_functions(site: Path) -> None:
         assert "extra" in [info.name for info in found]
 
 
-def test_a_scene_and_a_loss_of_other_packages_make_a_run(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_and_a_loss_of_other_packages_make_a_run(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     add(site, "scene")
     add(site, "loss", package="fake_loss")
     monkeypatch.chdir(tmp_path)
-    words = ["task=static", "scene=extra", "train.loss=extra", "+task.options.weight=5.0", "output_dir=r", "renderer.backend=reference"]
+    words = [
+        "task=static",
+        "scene=extra",
+        "train.loss=extra",
+        "+task.options.weight=5.0",
+        "output_dir=r",
+        "renderer.backend=reference",
+    ]
     config = compose(
-        [*words, "model.primitives=12", "model.neurons=2", "train.iterations=3", "train.log_every=1", "train.max_seconds=null"]
+        [
+            *words,
+            "model.primitives=12",
+            "model.neurons=2",
+            "train.iterations=3",
+            "train.log_every=1",
+            "train.max_seconds=null",
+        ]
     )
     assert (config.scene_name, config.scene, config.train.loss) == ("extra", {"wobble": 2.0}, "extra")
     assert config.non_default["train.loss"] == (None, "extra")
@@ -78,7 +94,9 @@ def test_a_scene_cannot_replace_a_tasks_preset(site: Path) -> None:
 
 def test_wrong_settings_of_an_added_scene(site: Path) -> None:
     add(site, "scene")
-    with pytest.raises(ConfigError, match=r"scene.wobbel: no such setting of scene 'extra'; did you mean 'scene.wobble'"):
+    with pytest.raises(
+        ConfigError, match=r"scene.wobbel: no such setting of scene 'extra'; did you mean 'scene.wobble'"
+    ):
         compose(["task=static", "scene=extra", "scene.wobbel=1"], False)
     with pytest.raises(ConfigError, match=r"did you mean 'extra'"):
         compose(["task=static", "scene=extar"], False)
@@ -103,7 +121,12 @@ def test_unknown_names_suggest(site: Path) -> None:
 # ---------------------------------------------------------------- what is broken
 
 FAULTS: list[tuple[str, str, str, str]] = [
-    ("import error", "", "import a_module_that_is_not_there", "ModuleNotFoundError: No module named 'a_module_that_is_not_there'"),
+    (
+        "import error",
+        "",
+        "import a_module_that_is_not_there",
+        "ModuleNotFoundError: No module named 'a_module_that_is_not_there'",
+    ),
     ("exit", "", "import sys; sys.exit(3)", "cannot import fake_extra:PLUGIN: SystemExit: 3"),
     ("syntax", "", "def f(:", "SyntaxError"),
     ("nothing there", "", "x = 1", "AttributeError"),
@@ -134,21 +157,61 @@ def test_broken_plugins_say_why_and_stop_nothing_else(kind: str, old: str, new: 
 MEMBERS = [
     ("task", "build=lambda m, d: None", "build=3", "TaskSpec.build is of type int; expected a function"),
     ("task", 'summary="a toy"', 'summary=""', "TaskSpec.summary is ''; expected text"),
-    ("task", 'SceneSpec("ball", "one ball", lambda s, c: None)', '"ball"', "TaskSpec.scenes[0] is of type str; expected a SceneSpec"),
-    ("task", 'SceneSpec("files", "from files", lambda s, c: None)', 'SceneSpec("ball", "x", print)', "scenes has two of one name"),
+    (
+        "task",
+        'SceneSpec("ball", "one ball", lambda s, c: None)',
+        '"ball"',
+        "TaskSpec.scenes[0] is of type str; expected a SceneSpec",
+    ),
+    (
+        "task",
+        'SceneSpec("files", "from files", lambda s, c: None)',
+        'SceneSpec("ball", "x", print)',
+        "scenes has two of one name",
+    ),
     (
         "task",
         "lambda t: []), ConditionSpec",
         "None), ConditionSpec",
         "TaskSpec.conditions[0].parse is of type NoneType; expected a function",
     ),
-    ("task", '"1", (0.0, 1.0)', '"1", None', "TaskSpec.conditions[0].range is None; expected a lower and a higher number"),
-    ("task", '"m", (0.0, 1.0)', '"m", (1.0, 1.0)', "TaskSpec.conditions[1].range is (1.0, 1.0); expected a lower and a higher number"),
-    ("task", "loss=lambda s: None,", "loss=print, fields={'X': int},", "fields['X'] is <class 'int'>; expected a subclass"),
-    ("task", "loss=lambda s: None,", "loss=print, fields={'X': DensityField},", "fields['X'] lacks the methods density, lower"),
+    (
+        "task",
+        '"1", (0.0, 1.0)',
+        '"1", None',
+        "TaskSpec.conditions[0].range is None; expected a lower and a higher number",
+    ),
+    (
+        "task",
+        '"m", (0.0, 1.0)',
+        '"m", (1.0, 1.0)',
+        "TaskSpec.conditions[1].range is (1.0, 1.0); expected a lower and a higher number",
+    ),
+    (
+        "task",
+        "loss=lambda s: None,",
+        "loss=print, fields={'X': int},",
+        "fields['X'] is <class 'int'>; expected a subclass",
+    ),
+    (
+        "task",
+        "loss=lambda s: None,",
+        "loss=print, fields={'X': DensityField},",
+        "fields['X'] lacks the methods density, lower",
+    ),
     ("task", "loss=lambda s: None,", "loss=print, example=3,", "TaskSpec.example is of type int"),
-    ("scene", '"two ellipsoids", load', '"two ellipsoids", None', "SceneExtension.scene.load is of type NoneType; expected a function"),
-    ("scene", 'scene=SceneSpec("extra", "two ellipsoids", load)', "scene=None", "SceneExtension.scene is of type NoneType"),
+    (
+        "scene",
+        '"two ellipsoids", load',
+        '"two ellipsoids", None',
+        "SceneExtension.scene.load is of type NoneType; expected a function",
+    ),
+    (
+        "scene",
+        'scene=SceneSpec("extra", "two ellipsoids", load)',
+        "scene=None",
+        "SceneExtension.scene is of type NoneType",
+    ),
     (
         "scene",
         'task="static"',
@@ -158,14 +221,44 @@ MEMBERS = [
     ("loss", "make=make", "make=None", "LossExtension.make is of type NoneType; expected a function"),
     ("loss", 'name="extra"', 'name="other"', "its LossExtension is named 'other'"),
     ("loss", ", make=make", "", "TypeError"),
-    ("exporter", "write=lambda job: ExportReport((), False)", "write=0", "Exporter.write is of type int; expected a function"),
+    (
+        "exporter",
+        "write=lambda job: ExportReport((), False)",
+        "write=0",
+        "Exporter.write is of type int; expected a function",
+    ),
     ("exporter", 'options={"size": (1, "of it")}', "options=3", "Exporter.options is of type int; expected a mapping"),
-    ("exporter", 'options={"size": (1, "of it")}', "options={'size': 1}", "options['size'] is 1; expected (default, one line of help)"),
-    ("exporter", 'options={"size": (1, "of it")}', "default='../x'", "Exporter.default is '../x'; expected the name of a file or folder"),
-    ("exporter", 'options={"size": (1, "of it")}', "suffixes='.json'", "Exporter.suffixes is '.json'; expected a tuple"),
-    ("exporter", 'options={"size": (1, "of it")}', "suffixes=('.JSON',)", "expected a tuple of such as '.json', in lower case"),
+    (
+        "exporter",
+        'options={"size": (1, "of it")}',
+        "options={'size': 1}",
+        "options['size'] is 1; expected (default, one line of help)",
+    ),
+    (
+        "exporter",
+        'options={"size": (1, "of it")}',
+        "default='../x'",
+        "Exporter.default is '../x'; expected the name of a file or folder",
+    ),
+    (
+        "exporter",
+        'options={"size": (1, "of it")}',
+        "suffixes='.json'",
+        "Exporter.suffixes is '.json'; expected a tuple",
+    ),
+    (
+        "exporter",
+        'options={"size": (1, "of it")}',
+        "suffixes=('.JSON',)",
+        "expected a tuple of such as '.json', in lower case",
+    ),
     ("inspector", "layers=lambda frame: []", "layers='x'", "Inspector.layers is of type str; expected a function"),
-    ("inspector", "layers=lambda frame: []", "add=print", "Inspector.__init__() got an unexpected keyword argument 'add'"),
+    (
+        "inspector",
+        "layers=lambda frame: []",
+        "add=print",
+        "Inspector.__init__() got an unexpected keyword argument 'add'",
+    ),
     (
         "inspector",
         "layers=lambda frame: []",
@@ -233,7 +326,9 @@ def test_a_scene_without_its_yaml(site: Path, capsys: pytest.CaptureFixture[str]
 
 def test_a_scene_without_a_config_package(site: Path) -> None:
     add(site, "scene", SCENE.replace("fake_extra.conf", "fake_extra.nowhere"))
-    with pytest.raises(ConfigError, match=r"scene 'extra' of task 'static': cannot open its config_package 'fake_extra.nowhere'"):
+    with pytest.raises(
+        ConfigError, match=r"scene 'extra' of task 'static': cannot open its config_package 'fake_extra.nowhere'"
+    ):
         compose(["task=static", "scene=extra"], False)
 
 
@@ -247,7 +342,9 @@ def test_tasks_lists_everything_with_origin(toy: Path, site: Path, capsys: pytes
     out = capsys.readouterr().out
     assert "extra       (fake-extra 0.3)  two ellipsoids" in out
     assert "scenes of tasks that are not installed\n  elsewhere.extra  (fake-far 0.3)" in out
-    assert "extra        (fake-loss 0.3)  mean squared error" in out or "extra  (fake-loss 0.3)  mean squared error" in out
+    assert (
+        "extra        (fake-loss 0.3)  mean squared error" in out or "extra  (fake-loss 0.3)  mean squared error" in out
+    )
     assert "BROKEN  (fake-exporter 0.3)  exporter 'extra' of fake-exporter 0.3: cannot import" in out
     assert "(fake-inspector 0.3)  nothing at all" in out
     assert "toy  (neuprim-toy 0.3)  a toy" in out
@@ -278,11 +375,20 @@ def test_a_distribution_without_metadata_still_counts(site: Path) -> None:
     assert registry.load_loss("extra").name == "extra"
 
 
-def test_of_two_copies_of_a_distribution_the_first_counts(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_two_copies_of_a_distribution_the_first_counts(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As an editable installation and an older one: no clash with itself."""
     add(site, "loss", "raise SystemExit")
     first = tmp_path / "first"
-    install(first, "fake-extra", {"extra": "fake_newer:PLUGIN"}, {"fake_newer.py": LOSS}, version="0.4", group=LOSSES.entry_points)
+    install(
+        first,
+        "fake-extra",
+        {"extra": "fake_newer:PLUGIN"},
+        {"fake_newer.py": LOSS},
+        version="0.4",
+        group=LOSSES.entry_points,
+    )
     monkeypatch.syspath_prepend(str(first))
     assert [i.origin for i in registry.list_losses() if i.name == "extra"] == ["fake-extra 0.4"]
     assert registry.load_loss("extra").summary == "mean squared error"

@@ -1,4 +1,5 @@
-"""Looking inside a density without a window: frames, boxes, ground truth, OpenVDB files, the page, and what is refused."""
+"""Looking inside a density without a window: frames, boxes, ground truth, OpenVDB files, the page, and what is
+refused."""
 
 from __future__ import annotations
 
@@ -32,7 +33,10 @@ from tests.plugins import runs
 from tests.plugins.pages import array, layers_of
 from tests.systems import posix
 
-BUILT_IN = {i.name: i for i in (views.VOLUME, views.ISOSURFACE, views.SLICES, views.PRIMITIVES, views.PRIMITIVE, views.DIFFERENCE)}
+BUILT_IN = {
+    i.name: i
+    for i in (views.VOLUME, views.ISOSURFACE, views.SLICES, views.PRIMITIVES, views.PRIMITIVE, views.DIFFERENCE)
+}
 
 
 @pytest.fixture(autouse=True)
@@ -62,7 +66,12 @@ def test_a_condition_is_one_frame_a_range_a_list_or_the_middle() -> None:
     def times(text: str | None) -> list[float]:
         return [round(float(c["time"]), 3) for c in condition_frames(specs, {} if text is None else {"time": text})]
 
-    assert times("0.25") == [0.25] and times("0:1:3") == [0.0, 0.5, 1.0] and times("0.1,0.9") == [0.1, 0.9] and times(None) == [0.5]
+    assert (
+        times("0.25") == [0.25]
+        and times("0:1:3") == [0.0, 0.5, 1.0]
+        and times("0.1,0.9") == [0.1, 0.9]
+        and times(None) == [0.5]
+    )
     lights = condition_frames(load_task("relight").conditions, {})
     assert lights == [{}], "a light has no middle"
     with pytest.raises(ConfigError, match="give --light"):
@@ -93,7 +102,9 @@ def test_scales_end_at_a_number_of_two_digits() -> None:
 
 def frame_of(time: float = 1.0, **options: Any) -> FieldFrame:
     matrix, shape = lattice(np.array([[-0.5, -0.5, -0.4], [0.6, 0.5, 0.7]]), 24)
-    return FieldFrame(runs.model(), {"time": torch.tensor(time)}, "", matrix, shape, 8.0, 1.0, options=ViewOptions(**options))
+    return FieldFrame(
+        runs.model(), {"time": torch.tensor(time)}, "", matrix, shape, 8.0, 1.0, options=ViewOptions(**options)
+    )
 
 
 def test_one_primitive_is_asked_where_it_has_moved_to() -> None:
@@ -111,7 +122,10 @@ def test_one_primitive_is_asked_where_it_has_moved_to() -> None:
 
 def test_masses_are_the_integrals_of_the_density() -> None:
     frame = frame_of(0.5)
-    total = float(density_grid(frame.model, frame.conditions, frame.scene_from_index, frame.shape).double().sum()) * frame.step**3
+    total = (
+        float(density_grid(frame.model, frame.conditions, frame.scene_from_index, frame.shape).double().sum())
+        * frame.step**3
+    )
     assert frame.masses.sum() == pytest.approx(total, rel=0.1)
     assert frame.masses.argmax() == 0 and frame.row() == 0
     assert frame_of(0.5, primitive=1).row() == 1
@@ -146,15 +160,21 @@ def test_a_volume_file_is_the_density_in_scene_units(run_dir: Path, tmp_path: Pa
     dense = grid.to_dense()
     index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
     points = index @ grid.transform[:3, :3].T + grid.transform[:3, 3]
-    expected = density_at(runs.model(), {"time": torch.tensor(1.0)}, torch.from_numpy(points.reshape(-1, 3))).reshape(dense.shape)
+    expected = density_at(runs.model(), {"time": torch.tensor(1.0)}, torch.from_numpy(points.reshape(-1, 3))).reshape(
+        dense.shape
+    )
     assert float(expected.max()) > 3 and np.allclose(dense, expected, atol=1e-4)
 
 
 def test_its_own_volume_agrees_with_the_model(run_dir: Path, tmp_path: Path) -> None:
     look(run_dir, conditions={"time": "0:1:3"}, grid=128, out=tmp_path / "out" / "v.vdb")
-    paths, said = look(run_dir, conditions={"time": "0.9"}, grid=16, against=str(tmp_path / "out"), out=tmp_path / "again.vdb")
+    paths, said = look(
+        run_dir, conditions={"time": "0.9"}, grid=16, against=str(tmp_path / "out"), out=tmp_path / "again.vdb"
+    )
     assert len(paths) == 1 and "scene units" in said[0]
-    found = re.fullmatch(r"v_0002\.vdb  time 1  correlation (\S+)  relative_l2 (\S+)  psnr_active (\S+)  max_error (\S+)", said[1])
+    found = re.fullmatch(
+        r"v_0002\.vdb  time 1  correlation (\S+)  relative_l2 (\S+)  psnr_active (\S+)  max_error (\S+)", said[1]
+    )
     assert found and float(found[1]) > 0.99 and float(found[2]) < 0.12
 
 
@@ -162,7 +182,9 @@ def test_the_numbers_are_those_of_the_data_set(run_dir: Path, tmp_path: Path) ->
     config, task, model, _ = load_run(run_dir)
     expected = {f["frame"]: f for f in task.diagnose(load_dataset(config, task), model)["sigma_frames"]}
     for against in (str(run_dir.parent / "files"), "scene"):
-        _, said = look(run_dir, conditions={"time": "0:1:20"}, grid=8, against=against, out=tmp_path / "x.vdb", overwrite=True)
+        _, said = look(
+            run_dir, conditions={"time": "0:1:20"}, grid=8, against=against, out=tmp_path / "x.vdb", overwrite=True
+        )
         assert len(expected) == 3 and len(said) == 5
         for number, line in zip(runs.NUMBERS, said[1:], strict=False):
             wanted = "  ".join(f"{key} {expected[number][key]:.4f}" for key in NUMBERS)
@@ -183,7 +205,13 @@ def test_a_page_holds_the_grids(run_dir: Path, tmp_path: Path) -> None:
     (path,), _ = look(run_dir, out=tmp_path / "p.html", **words)
     assert not re.search(r"https?://|src=|@import", path.read_text()), "a page needs no network"
     data = layers_of(path)
-    assert data["first"] == "slices" and list(data["views"]) == ["volume", "isosurface", "slices", "difference", "primitives"]
+    assert data["first"] == "slices" and list(data["views"]) == [
+        "volume",
+        "isosurface",
+        "slices",
+        "difference",
+        "primitives",
+    ]
     assert [f["title"] for f in data["frames"]] == ["time 0", "time 1"]
     frame = data["frames"][1]
     (model,), (truth,) = (frame["layers"]["slices"][side] for side in ("model", "truth"))
@@ -194,11 +222,19 @@ def test_a_page_holds_the_grids(run_dir: Path, tmp_path: Path) -> None:
     expected = density_grid(runs.model(), {"time": torch.tensor(1.0)}, matrix, shape).numpy()
     top = model["scale"]["high"]
     stored = (array(frame, model["grid"], "u1").reshape(shape, order="F") / 255.0) ** 2 * top
-    assert model["code"] == "root" and expected.max() > 1 and np.abs(stored - np.minimum(expected, top)).max() < 0.01 * top
+    assert (
+        model["code"] == "root" and expected.max() > 1 and np.abs(stored - np.minimum(expected, top)).max() < 0.01 * top
+    )
     assert array(frame, truth["grid"], "u1").max() > 0
     (shown,) = (layer for layer in frame["layers"]["primitives"]["model"] if layer["kind"] == "ellipsoids")
     assert array(frame, shown["rows"], "<f4").shape == (2 * 15,)
-    grids = {layer["grid"] for view in frame["layers"].values() for side in view.values() for layer in side if "grid" in layer}
+    grids = {
+        layer["grid"]
+        for view in frame["layers"].values()
+        for side in view.values()
+        for layer in side
+        if "grid" in layer
+    }
     assert len(grids) == 3, "the model's, the truth's and their difference, each once, however many views show it"
 
 
@@ -234,7 +270,12 @@ def test_eight_bits_keep_thin_matter_and_zero() -> None:
     ],
 )
 def test_wrong_words_are_one_line(
-    run_dir: Path, words: list[str], text: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    run_dir: Path,
+    words: list[str],
+    text: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["inspect", str(run_dir), *words]) == 2
@@ -266,7 +307,11 @@ def test_a_vtk_that_dies_is_named_with_its_cure(
     monkeypatch.setattr(headless, "_PROBE", probe)
     with pytest.raises(BackendUnavailable, match="apt install libegl1 libgl1-mesa-dri") as caught:
         look(run_dir, out=tmp_path / "x.png")
-    assert text in str(caught.value) and "vtkEGLRenderWindow" in str(caught.value) and "vtkOSOpenGLRenderWindow" in str(caught.value)
+    assert (
+        text in str(caught.value)
+        and "vtkEGLRenderWindow" in str(caught.value)
+        and "vtkOSOpenGLRenderWindow" in str(caught.value)
+    )
 
 
 def test_the_built_in_inspectors_are_registered() -> None:

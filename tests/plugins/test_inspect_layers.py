@@ -80,7 +80,13 @@ def off_screen() -> None:
 
 def stranger(site: Path, found: str) -> None:
     source = SOURCE.replace("{found}", found)
-    install(site, "strange-marks", {"marks": "strange_marks:PLUGIN"}, {"strange_marks.py": source}, group="neuprim.inspectors")
+    install(
+        site,
+        "strange-marks",
+        {"marks": "strange_marks:PLUGIN"},
+        {"strange_marks.py": source},
+        group="neuprim.inspectors",
+    )
 
 
 def look(run_dir: Path, out: Path | None, **words: Any) -> list[Path]:
@@ -122,7 +128,9 @@ def test_it_reaches_the_window(site: Path, run_dir: Path, monkeypatch: pytest.Mo
     plain = window.Window.__init__
     monkeypatch.setattr(window.Window, "interact", interact)
     monkeypatch.setattr("neuprim.runs.inspect.has_display", lambda: True)
-    monkeypatch.setattr(window.Window, "__init__", lambda self, panels, up, off, size=None: plain(self, panels, up, True, (240, 200)))
+    monkeypatch.setattr(
+        window.Window, "__init__", lambda self, panels, up, off, size=None: plain(self, panels, up, True, (240, 200))
+    )
     assert look(run_dir, None, conditions={"time": "0,1"}) == []
     assert len(found) == 2 and 500 < found[0] < 0.8 * found[1]
 
@@ -131,7 +139,11 @@ def test_it_reaches_the_page_beside_the_truth(site: Path, run_dir: Path, tmp_pat
     stranger(site, EVERYTHING)
     (page,) = look(run_dir, tmp_path / "x.html", conditions={"time": "0,1"}, against=str(run_dir.parent / "files"))
     data = layers_of(page)
-    assert data["first"] == "marks" and "hello <there>" not in page.read_text() and {"viridis", "inferno"} <= set(data["maps"])
+    assert (
+        data["first"] == "marks"
+        and "hello <there>" not in page.read_text()
+        and {"viridis", "inferno"} <= set(data["maps"])
+    )
     sides = data["frames"][1]["layers"]["marks"]
     kinds = ["mesh", "volume", "slices", "isosurfaces", "ellipsoids", "points", "lines", "text"]
     assert [[layer["kind"] for layer in sides[side]] for side in ("model", "truth")] == [kinds] * 2
@@ -142,10 +154,17 @@ def test_it_reaches_the_page_beside_the_truth(site: Path, run_dir: Path, tmp_pat
     assert np.allclose(corners[[0, -1]], [low, low + 0.7 * (high - low)], atol=1e-6)
     assert array(frame, mesh["rgb"], "u1").reshape(-1, 3).tolist() == [[0, 255, 0]] * 8
     assert array(frame, mesh["rows"], "<u4").reshape(-1, 3).tolist()[1] == [0, 3, 2]
-    assert volume["grid"] == isosurfaces["grid"] and isosurfaces["level"] == pytest.approx(0.5 * volume["scale"]["high"])
+    assert volume["grid"] == isosurfaces["grid"] and isosurfaces["level"] == pytest.approx(
+        0.5 * volume["scale"]["high"]
+    )
     row = array(frame, ellipsoids["rows"], "<f4")
     assert np.allclose(row[3:12], 0.1 * np.eye(3).ravel()) and ellipsoids["scale"]["words"] == "size [m]"
-    assert (points["size"], points["opacity"], text["text"], text["corner"]) == (12.0, 0.5, "hello <there>", "upper_right")
+    assert (points["size"], points["opacity"], text["text"], text["corner"]) == (
+        12.0,
+        0.5,
+        "hello <there>",
+        "upper_right",
+    )
 
 
 @pytest.mark.slow
@@ -160,7 +179,9 @@ def test_a_browser_draws_it(site: Path, run_dir: Path, tmp_path: Path) -> None:
         shot, flags = tmp_path / "shot.png", ["--headless", "--no-sandbox", f"--user-data-dir={tmp_path / 'profile'}"]
         flags += ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=800,500"]
         flags += ["--proxy-server=127.0.0.1:9", "--virtual-time-budget=10000", f"--screenshot={shot}"]
-        subprocess.run([browser, *flags, f"{page.as_uri()}#view=marks&az=-58"], check=True, capture_output=True, timeout=180)
+        subprocess.run(
+            [browser, *flags, f"{page.as_uri()}#view=marks&az=-58"], check=True, capture_output=True, timeout=180
+        )
         with Image.open(shot) as picture:
             counts.append(green(picture.crop((0, 100, 800, 500))))
         forget(site)
@@ -196,9 +217,15 @@ WRONG: list[tuple[Any, str]] = [
     ([Volume(GRID, ORIGIN, (1.0, 2.0), SCALE)], "spacing is (1.0, 2.0); expected a positive"),  # type: ignore[arg-type]
     ([Volume(GRID, ORIGIN, 1.0, SCALE, depth=-1.0)], "depth is -1.0; expected a number from 0"),
     ([Volume(GRID, ORIGIN, 1.0, None)], "scale is None; expected a Scale"),  # type: ignore[arg-type]
-    ([Volume(GRID, ORIGIN, 1.0, Scale(1.0, 1.0))], "scale reaches from 1.0 to 1.0; expected a lower and a higher number"),
+    (
+        [Volume(GRID, ORIGIN, 1.0, Scale(1.0, 1.0))],
+        "scale reaches from 1.0 to 1.0; expected a lower and a higher number",
+    ),
     ([Volume(GRID, ORIGIN, 1.0, Scale(0.0, float("inf")))], "scale reaches from 0.0 to inf"),
-    ([Volume(GRID, ORIGIN, 1.0, Scale(0.0, 1.0, "infrno"))], "the colours 'infrno'; expected a colour map of matplotlib"),
+    (
+        [Volume(GRID, ORIGIN, 1.0, Scale(0.0, 1.0, "infrno"))],
+        "the colours 'infrno'; expected a colour map of matplotlib",
+    ),
     ([Slices(GRID, ORIGIN, 1.0, SCALE, through=np.zeros((1, 3)))], "through has shape (1, 3); expected (3,)"),
     ([Isosurfaces(GRID, ORIGIN, 1.0, SCALE)], "levels is (); expected a tuple of at least one number"),
     ([Mesh(POINTS[:, :2], FACES)], "layer 0, a Mesh, whose vertices has shape (4, 2); expected (N, 3)"),
@@ -212,7 +239,10 @@ WRONG: list[tuple[Any, str]] = [
     ([Mesh(POINTS, FACES, colours=np.full(3, 255))], "colours reach from 255 to 255; expected 0 to 1"),
     ([Mesh(POINTS, FACES, colours=np.ones(3), values=np.zeros(4), scale=SCALE)], "values and colours are both given"),
     ([Mesh(POINTS, FACES, opacity=2.0)], "opacity is 2.0; expected a number from 0 to 1"),
-    ([Ellipsoids(POINTS, np.zeros((3, 3, 3)))], "layer 0, an Ellipsoids, whose axes has shape (3, 3, 3); expected (4, 3, 3)"),
+    (
+        [Ellipsoids(POINTS, np.zeros((3, 3, 3)))],
+        "layer 0, an Ellipsoids, whose axes has shape (3, 3, 3); expected (4, 3, 3)",
+    ),
     ([Ellipsoids(POINTS + np.inf, np.zeros((4, 3, 3)))], "centres has a number that is not finite"),
     ([Points([[0.0, 0.0, 0.0]])], "centres is a list; expected a numpy array"),  # type: ignore[arg-type]
     ([Points(POINTS, size=0.0)], "size is 0.0; expected a positive number of pixels"),
@@ -230,7 +260,10 @@ def test_what_cannot_be_drawn_is_named(found: Any, text: str) -> None:
     ("found", "text"),
     [
         ("None", "returned None; expected a list of layers of neuprim.plugins.inspect.layers"),
-        ("[Mesh(frame.box, np.array([[0, 1, 7]]))]", "returned layer 0, a Mesh, whose faces has rows 0 to 7 of vertices; there are 2"),
+        (
+            "[Mesh(frame.box, np.array([[0, 1, 7]]))]",
+            "returned layer 0, a Mesh, whose faces has rows 0 to 7 of vertices; there are 2",
+        ),
     ],
 )
 def test_the_line_names_the_package(
@@ -271,7 +304,9 @@ def test_layers_of_nothing_are_drawn(site: Path, run_dir: Path, tmp_path: Path) 
 def test_a_page_says_how_many_ellipsoids_it_left_out() -> None:
     count = ELLIPSOIDS_LIMIT + 5
     packed = Packed()
-    (found,) = packed.layers([Ellipsoids(np.arange(3.0 * count).reshape(-1, 3), np.broadcast_to(np.eye(3), (count, 3, 3)))])
+    (found,) = packed.layers(
+        [Ellipsoids(np.arange(3.0 * count).reshape(-1, 3), np.broadcast_to(np.eye(3), (count, 3, 3)))]
+    )
     rows = array({"arrays": packed.arrays}, found["rows"], "<f4").reshape(-1, 15)
     assert (found["count"], found["of"], len(rows)) == (ELLIPSOIDS_LIMIT, count, ELLIPSOIDS_LIMIT)
     assert rows[-1].tolist() == [*(3.0 * (ELLIPSOIDS_LIMIT - 1) + np.arange(3)), *np.eye(3).ravel(), 1.0, 1.0, 1.0]
@@ -298,14 +333,21 @@ def test_level_lines_are_where_a_linear_function_is_zero() -> None:
 
 @pytest.mark.parametrize("edge", [0, 1, 2])
 def test_the_zero_line_of_a_soft_primitive_is_that_of_its_field(edge: int) -> None:
-    """f = sin(2 (x + y)/m + 0.4) is zero on one plane through the ball and nowhere else: not on the surface, where the weight is."""
+    """f = sin(2 (x + y)/m + 0.4) is zero on one plane through the ball and nowhere else: not on the surface, where the
+    weight is."""
     any_model = marked.static_model(neurons=1, degree=0)
     rows = {name: value[:1].clone() for name, value in any_model.params.items()}
-    rows |= {"means": torch.tensor([[0.3, -0.2, 0.1]]), "log_scales": torch.tensor([[0.5, 0.4, 0.3]]).log(), "quats": torch.eye(4)[:1]}
+    rows |= {
+        "means": torch.tensor([[0.3, -0.2, 0.1]]),
+        "log_scales": torch.tensor([[0.5, 0.4, 0.3]]).log(),
+        "quats": torch.eye(4)[:1],
+    }
     rows |= {"W1": torch.tensor([[[2 / 30, 2 / 30, 0.0]]]), "b1": torch.tensor([[(0.4 - math.pi / 2) / 30]])}
     rows |= {"w2": torch.tensor([[3.0]]), "b2": torch.zeros(1, 1)}
     model = Primitives(CosineDensity(1, edge=edge), any_model.colour, rows)
-    frame = FieldFrame(model, {}, "", torch.eye(4, dtype=torch.float64), (2, 2, 2), 8.0, 1.0, options=ViewOptions(primitive=0))
+    frame = FieldFrame(
+        model, {}, "", torch.eye(4, dtype=torch.float64), (2, 2, 2), 8.0, 1.0, options=ViewOptions(primitive=0)
+    )
     (lines,) = (layer for layer in PRIMITIVE.layers(frame) if isinstance(layer, Lines))
     local = (lines.vertices - np.array([0.3, -0.2, 0.1])) / 0.5
     assert len(lines.pairs) > 60 and np.abs(local[:, 0] + local[:, 1] + 0.2).max() < 0.02
@@ -314,5 +356,10 @@ def test_the_zero_line_of_a_soft_primitive_is_that_of_its_field(edge: int) -> No
 
 
 def test_the_frame_has_the_scale_of_all_frames() -> None:
-    frame = FieldFrame(runs.model(), {"time": torch.tensor(0.5)}, "", torch.eye(4, dtype=torch.float64), (2, 2, 2), 8.0, 1.0)
-    assert frame.scale == Scale(0.0, 8.0, "inferno", "extinction", "1/scene unit") and frame.scale.words == "extinction [1/scene unit]"
+    frame = FieldFrame(
+        runs.model(), {"time": torch.tensor(0.5)}, "", torch.eye(4, dtype=torch.float64), (2, 2, 2), 8.0, 1.0
+    )
+    assert (
+        frame.scale == Scale(0.0, 8.0, "inferno", "extinction", "1/scene unit")
+        and frame.scale.words == "extinction [1/scene unit]"
+    )

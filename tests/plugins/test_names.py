@@ -1,4 +1,5 @@
-"""Names that several packages claim, ``PACKAGE:NAME``, packages that are imported half-way, and editable installations."""
+"""Names that several packages claim, ``PACKAGE:NAME``, packages that are imported half-way, and editable
+installations."""
 
 from __future__ import annotations
 
@@ -46,7 +47,12 @@ TAKEN: dict[str, tuple[Group[Any], str, str]] = {
 def everything_taken(site: Path, source: str = "raise SystemExit('imported')") -> None:
     """A package that claims a name of every kind."""
     groups = {group.entry_points: {name: "greedy:PLUGIN"} for group, name, _ in TAKEN.values()}
-    install_groups(site, "Greedy_Pkg", {**groups, SCENES.entry_points: {"static.solids": "greedy:PLUGIN"}}, {"greedy/__init__.py": source})
+    install_groups(
+        site,
+        "Greedy_Pkg",
+        {**groups, SCENES.entry_points: {"static.solids": "greedy:PLUGIN"}},
+        {"greedy/__init__.py": source},
+    )
 
 
 # ---------------------------------------------------------------- the built-in wins
@@ -77,12 +83,20 @@ def test_each_is_chosen_by_its_package(kind: str, site: Path) -> None:
             assert group.load(f"{package}:{name}") is sys.modules["greedy"].PLUGIN
 
 
-def test_neither_a_similar_name_nor_a_second_copy_is_the_built_in(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_neither_a_similar_name_nor_a_second_copy_is_the_built_in(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     own = load_task("static")
     for i, name in enumerate(("neuprim-", "neuprim-static", "aneuprim")):
         install(site, name, {"static": f"like{i}:TASK"}, {})
     late = tmp_path / "late"
-    install(late, "NEUPRIM", {"static": "late:TASK", "extra": "late:TASK"}, {"late/__init__.py": "raise SystemExit"}, version="99")
+    install(
+        late,
+        "NEUPRIM",
+        {"static": "late:TASK", "extra": "late:TASK"},
+        {"late/__init__.py": "raise SystemExit"},
+        version="99",
+    )
     monkeypatch.setattr(sys, "path", [*sys.path, str(late)])
     with pytest.warns(NeuprimWarning) as warned:
         assert load_task("static") is own
@@ -108,7 +122,14 @@ def test_an_old_run_stays_readable_beside_a_package_that_claims_everything(
     site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A run from before makers were recorded: its task is a bare name."""
-    words = ["task=static", "scene=solids", "scene.size=16", "scene.train_views=4", "scene.test_views=1", "scene.supersampling=1"]
+    words = [
+        "task=static",
+        "scene=solids",
+        "scene.size=16",
+        "scene.train_views=4",
+        "scene.test_views=1",
+        "scene.supersampling=1",
+    ]
     run = write_run(tmp_path / "run", static_model(), words)
     config = run / "config.yaml"
     text = config.read_text()
@@ -125,7 +146,10 @@ def test_an_old_run_stays_readable_beside_a_package_that_claims_everything(
     assert record["lossless"] is True and Path(record["files"][0]).is_file()
     assert [line for line in err.splitlines() if "warning" in line] == [
         f"neuprim: warning: {kind} '{name}' of Greedy_Pkg 0.3 (greedy:PLUGIN) has the name of neuprim's own, which is used; {word} chooses the other"
-        for kind, name, word in (("task", "static", "task=greedy-pkg:static"), ("exporter", "ply", "--format greedy-pkg:ply"))
+        for kind, name, word in (
+            ("task", "static", "task=greedy-pkg:static"),
+            ("exporter", "ply", "--format greedy-pkg:ply"),
+        )
     ]
     assert main(["inspect", str(run), "--show", "slices", "--grid", "8", "--out", str(tmp_path / "x.html")]) == 0
     assert main(["eval", str(run)]) == 0
@@ -135,8 +159,16 @@ def test_an_old_run_stays_readable_beside_a_package_that_claims_everything(
 
 def test_what_is_listed_says_how_to_choose_it(site: Path, toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for kind, (group, name, source) in TAKEN.items():
-        install(site, f"greedy-{kind}", {name: f"greedy_{kind}:PLUGIN"}, {f"greedy_{kind}/__init__.py": source}, group=group.entry_points)
-    files = {path.replace("toytask/", "greedy_task/").replace("toy", "static"): text for path, text in TOY_FILES.items()}
+        install(
+            site,
+            f"greedy-{kind}",
+            {name: f"greedy_{kind}:PLUGIN"},
+            {f"greedy_{kind}/__init__.py": source},
+            group=group.entry_points,
+        )
+    files = {
+        path.replace("toytask/", "greedy_task/").replace("toy", "static"): text for path, text in TOY_FILES.items()
+    }
     for path, text in files.items():
         if path.endswith(".yaml") or "conf" in path:
             (site / path).parent.mkdir(parents=True, exist_ok=True)
@@ -149,18 +181,26 @@ def test_what_is_listed_says_how_to_choose_it(site: Path, toy: Path, capsys: pyt
     lines = [" ".join(line.split()) for line in out.splitlines()]
     assert any(line.startswith(f"static (neuprim {__version__})") and "[" not in line for line in lines)
     assert "static (greedy-task 0.3) a toy [hidden by the built-in task; task=greedy-task:static chooses it]" in lines
-    assert "ply (greedy-exporter 0.3) nothing at all [hidden by the built-in exporter; --format greedy-exporter:ply chooses it]" in lines
+    assert (
+        "ply (greedy-exporter 0.3) nothing at all [hidden by the built-in exporter; --format greedy-exporter:ply chooses it]"
+        in lines
+    )
     assert (
         "slices (greedy-inspector 0.3) nothing at all [hidden by the built-in inspector; --show greedy-inspector:slices chooses it]"
         in lines
     )
-    assert "extra (fake-one 0.3) mean squared error [also registered by fake-two 0.3; train.loss=fake-one:extra chooses this one]" in lines
+    assert (
+        "extra (fake-one 0.3) mean squared error [also registered by fake-two 0.3; train.loss=fake-one:extra chooses this one]"
+        in lines
+    )
     assert "BROKEN" not in out and err == ""
     assert main(["run", "--help"]) == 0
     assert "  greedy-task:static  (greedy-task 0.3)" in capsys.readouterr().out
 
 
-def test_a_page_keeps_anothers_view_apart_from_its_own(site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_page_keeps_anothers_view_apart_from_its_own(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _, name, source = TAKEN["inspector"]
     other = source.replace("lambda frame: []", "lambda frame: [Text('of another')]")
     files = {"my_views/__init__.py": f"from neuprim.plugins.inspect.layers import Text\n{other}"}
@@ -169,7 +209,9 @@ def test_a_page_keeps_anothers_view_apart_from_its_own(site: Path, tmp_path: Pat
     assert main(["inspect", run, "--show", "volume,my-views:slices", "--grid", "8", "--out", str(page)]) == 0
     (frame,) = layers_of(page)["frames"]
     assert [layer["kind"] for layer in frame["layers"]["slices"]["model"]] == ["slices"]
-    assert frame["layers"]["my-views:slices"]["model"] == [{"kind": "text", "text": "of another", "corner": "lower_right"}]
+    assert frame["layers"]["my-views:slices"]["model"] == [
+        {"kind": "text", "text": "of another", "corner": "lower_right"}
+    ]
     assert main(["inspect", run, "--show", "volume,slices", "--grid", "8", "--out", str(page), "--force"]) == 0
     assert "my-views:slices" not in page.read_text()
     assert "--show my-views:slices chooses the other" in capsys.readouterr().err
@@ -185,7 +227,9 @@ def other_static(site: Path) -> None:
         "other-static",
         {"static": "other:TASK"},
         {
-            "other/__init__.py": TOY.replace('"toy"', '"static"').replace("toytask", "other").replace('"ball"', '"solids"'),
+            "other/__init__.py": TOY.replace('"toy"', '"static"')
+            .replace("toytask", "other")
+            .replace('"ball"', '"solids"'),
             "other/conf/__init__.py": "",
             "other/conf/task/static.yaml": "scene: solids\npreset: quick\noptions: {gain: 2.0}\n",
             "other/conf/scene/static/solids.yaml": "wobble: 1.0\n",
@@ -205,7 +249,12 @@ def test_a_task_of_a_taken_name_has_its_own_files(site: Path, tmp_path: Path, mo
     assert (bare.scene, bare.train, bare.options) == (built_in.scene, built_in.train, {})
     for word in ("task=other-static:static", "task='Other_Static:static'"):
         theirs = compose([word])
-        assert (theirs.task, theirs.scene_name, theirs.scene, theirs.options) == ("static", "solids", {"wobble": 1.0}, {"gain": 2.0})
+        assert (theirs.task, theirs.scene_name, theirs.scene, theirs.options) == (
+            "static",
+            "solids",
+            {"wobble": 1.0},
+            {"gain": 2.0},
+        )
         assert theirs.train.iterations == 7
         assert compose([word, "preset=paper"]).train.iterations == 11
         assert compose([word, "scene=other-static:solids"]).scene == {"wobble": 1.0}
@@ -213,7 +262,10 @@ def test_a_task_of_a_taken_name_has_its_own_files(site: Path, tmp_path: Path, mo
             compose([word, "scene=blender"])
         with pytest.raises(ConfigError, match="scene=neuprim:solids: task 'static' has no such scene"):
             compose([word, "scene=neuprim:solids"])
-    assert (str(built_in.output_dir), str(bare.output_dir)) == ("outputs/neuprim-static-solids", "outputs/static-solids")
+    assert (str(built_in.output_dir), str(bare.output_dir)) == (
+        "outputs/neuprim-static-solids",
+        "outputs/static-solids",
+    )
     assert str(theirs.output_dir) == "outputs/other-static-static-solids"
 
 
@@ -229,13 +281,20 @@ def test_a_configuration_keeps_its_package_on_disk(site: Path, tmp_path: Path, m
     assert (again.made_by.task.origin, again.made_by.loss.origin) == ("other-static 0.3", "fake-extra 0.3")
 
 
-def test_sweeps_name_their_folders_after_package_and_name(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sweeps_name_their_folders_after_package_and_name(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     other_static(site)
     configs = compose_all(["task=neuprim:static,other-static:static", "seed=1"])
-    assert [str(c.output_dir) for c in configs] == ["outputs/sweep/task-neuprim_static", "outputs/sweep/task-other-static_static"]
+    assert [str(c.output_dir) for c in configs] == [
+        "outputs/sweep/task-neuprim_static",
+        "outputs/sweep/task-other-static_static",
+    ]
     assert [c.made_by.task.package for c in configs if c.made_by] == ["neuprim", "other-static"]
-    assert [compose(c.overrides).scene == c.scene for c in configs] == [True, True], "the words of one run of a sweep can be typed again"
+    assert [compose(c.overrides).scene == c.scene for c in configs] == [True, True], (
+        "the words of one run of a sweep can be typed again"
+    )
     seeds = compose_all(["task=other-static:static", "seed=1,2"])
     assert str(seeds[0].output_dir) == "outputs/other-static-static-solids-sweep/seed-1"
 
@@ -248,10 +307,17 @@ def test_a_scene_of_a_taken_name_has_its_own_file_and_the_tasks_presets(site: Pa
     preset.write_text("model: {primitives: 7}\n")
     config = compose(["task=static", "scene=fake-extra:solids"], False)
     assert (config.scene_name, config.scene, config.model.primitives) == ("solids", {"wobble": 3.0}, 2800)
-    assert config.made_by is not None and config.made_by.scene is not None and config.made_by.scene.origin == "fake-extra 0.3"
+    assert (
+        config.made_by is not None
+        and config.made_by.scene is not None
+        and config.made_by.scene.origin == "fake-extra 0.3"
+    )
     own = compose(["task=static", "scene=neuprim:solids"], False)
     assert "wobble" not in own.scene and own.made_by is not None and own.made_by.scene is None
-    with pytest.raises(ConfigError, match=r"scene=fake-extra:solid: task 'static' has no such scene of fake-extra; did you mean 'solids'"):
+    with pytest.raises(
+        ConfigError,
+        match=r"scene=fake-extra:solid: task 'static' has no such scene of fake-extra; did you mean 'solids'",
+    ):
         find_scene(load_task("static"), "fake-extra:solid")
     with pytest.raises(ConfigError, match=r"scene=nobody:solids: task 'static' has no such scene of nobody$"):
         find_scene(load_task("static"), "nobody:solids")
@@ -287,7 +353,13 @@ def test_words_that_choose_nothing(word: str, text: str) -> None:
 
 
 def test_names_that_cannot_be(site: Path) -> None:
-    install(site, "colon", {"a:b": "colon:PLUGIN"}, {"colon/__init__.py": LOSS.replace('"extra"', '"a:b"')}, group=LOSSES.entry_points)
+    install(
+        site,
+        "colon",
+        {"a:b": "colon:PLUGIN"},
+        {"colon/__init__.py": LOSS.replace('"extra"', '"a:b"')},
+        group=LOSSES.entry_points,
+    )
     with pytest.raises(PluginError, match=r"loss 'a:b' of colon 0\.3: a name cannot hold ':'"):
         LOSSES.load("colon:a:b")
     info = install_groups(site, "stutter", {LOSSES.entry_points: {"same": "stutter:ONE"}}, {})
@@ -303,8 +375,15 @@ def test_names_that_cannot_be(site: Path) -> None:
 
 
 def test_everything_of_a_package_that_fails_half_way_is_broken(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its modules are imported by then: the first plugin that is asked for fails, and Python would hand out the others."""
-    sources = {"losses": LOSS, "exporters": EXPORTER, "inspectors": INSPECTOR, "scenes": SCENE, "tasks": TOY.replace("toy", "extra")}
+    """Its modules are imported by then: the first plugin that is asked for fails, and Python would hand out the
+    others."""
+    sources = {
+        "losses": LOSS,
+        "exporters": EXPORTER,
+        "inspectors": INSPECTOR,
+        "scenes": SCENE,
+        "tasks": TOY.replace("toy", "extra"),
+    }
     names = {"losses": "extra", "exporters": "extra", "inspectors": "extra", "scenes": "static.extra", "tasks": "extra"}
     parts = {f"half/{name}/__init__.py": source.replace("TASK =", "PLUGIN =") for name, source in sources.items()}
     init = "\n".join(f"from half import {name}" for name in sources) + "\nraise RuntimeError('no licence found')\n"
@@ -327,7 +406,11 @@ def test_a_part_of_a_package_may_fail_alone(site: Path) -> None:
         "half/bad/good.py": LOSS,
     }
     install(
-        site, "half", {"extra": "half.fine:PLUGIN", "bad": "half.bad:x", "good": "half.bad.good:PLUGIN"}, files, group=LOSSES.entry_points
+        site,
+        "half",
+        {"extra": "half.fine:PLUGIN", "bad": "half.bad:x", "good": "half.bad.good:PLUGIN"},
+        files,
+        group=LOSSES.entry_points,
     )
     fine = LOSSES.load("extra")
     for _ in range(2):
@@ -377,9 +460,13 @@ def test_an_entry_point_that_an_editable_installation_lacks(site: Path, tmp_path
         assert "again" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["not toml = = =", "project = 3", '[project.entry-points]\n"neuprim.losses" = 3', "\x00"])
+@pytest.mark.parametrize(
+    "text", ["not toml = = =", "project = 3", '[project.entry-points]\n"neuprim.losses" = 3', "\x00"]
+)
 def test_a_damaged_source_is_no_hint(text: str, site: Path, tmp_path: Path) -> None:
     editable(site, tmp_path / "source", text)
     (install_groups(site, "odd", {}, {}) / "direct_url.json").write_text("[]")
-    with pytest.raises(ConfigError, match=r"train.loss=glow: no such loss; valid: compressed, l1, photometric, relative$"):
+    with pytest.raises(
+        ConfigError, match=r"train.loss=glow: no such loss; valid: compressed, l1, photometric, relative$"
+    ):
         LOSSES.load("glow")

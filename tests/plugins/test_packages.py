@@ -1,4 +1,5 @@
-"""Whole third-party packages, installed with pip into a folder of their own and used from the command line; nothing is downloaded."""
+"""Whole third-party packages, installed with pip into a folder of their own and used from the command line; nothing is
+downloaded."""
 
 from __future__ import annotations
 
@@ -24,15 +25,28 @@ EXAMPLE = ROOT / "examples" / "neuprim-gaussian"
 
 
 def shell(words: list[str], cwd: Path, site: Path) -> str:
-    """Standard output and error of a command that must succeed, with the packages in ``site`` and this neuprim importable."""
+    """Standard output and error of a command that must succeed, with the packages in ``site`` and this neuprim
+    importable."""
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)]), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(words, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=600)
+    done = subprocess.run(
+        words, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=600
+    )
     assert done.returncode == 0, done.stdout[-4000:]
     return done.stdout
 
 
 def pip_install(source: Path, site: Path) -> None:
-    pip = [sys.executable, "-m", "pip", "install", "-q", "--disable-pip-version-check", "--no-index", "--no-build-isolation", "--no-deps"]
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "--disable-pip-version-check",
+        "--no-index",
+        "--no-build-isolation",
+        "--no-deps",
+    ]
     shell([*pip, "--target", str(site), str(source)], source.parent, site)
 
 
@@ -53,14 +67,23 @@ def test_the_example_installs_and_trains(tmp_path: Path) -> None:
     listed = neuprim_command(["tasks"], tmp_path, site)
     assert "gaussian  (neuprim-gaussian 0.1.0)  A static scene of true Gaussian densities" in listed
     assert "BROKEN" not in listed
-    small = ["scene.size=16", "scene.train_views=4", "scene.test_views=1", "scene.supersampling=1", "model.primitives=40"]
+    small = [
+        "scene.size=16",
+        "scene.train_views=4",
+        "scene.test_views=1",
+        "scene.supersampling=1",
+        "model.primitives=40",
+    ]
     neuprim_command(["run", "task=gaussian", *small, "train.iterations=5", "output_dir=r"], tmp_path, site)
     header = (tmp_path / "r" / "model.safetensors").read_bytes()[:4000]
     assert b"BellDensity" in header
     assert json.loads((tmp_path / "r" / "metrics.json").read_text())["psnr"] > 5
     assert "psnr" in neuprim_command(["eval", "r"], tmp_path, site)
     assert re.search(r"log_kappa +[0-9]+ +160 ", neuprim_command(["compress", "r", "--steps", "5"], tmp_path, site))
-    assert re.search(r"log_kappa +7 +160 ", neuprim_command(["compress", "r", "--level", "3", "--steps", "5", "--force"], tmp_path, site))
+    assert re.search(
+        r"log_kappa +7 +160 ",
+        neuprim_command(["compress", "r", "--level", "3", "--steps", "5", "--force"], tmp_path, site),
+    )
     (tmp_path / "r" / "model.safetensors").unlink()
     assert "psnr" in neuprim_command(["eval", "r"], tmp_path, site)
 
@@ -86,10 +109,18 @@ def test_a_new_task_installs_trains_and_passes_its_tests(tmp_path: Path) -> None
     pip_install(folder, site)
     shutil.rmtree(folder / "neuprim_wave")
     assert "wave  (neuprim-wave 0.1.0)" in neuprim_command(["tasks"], tmp_path, site)
-    small = ["scene.size=16", "scene.train_views=4", "scene.test_views=1", "model.primitives=30", "renderer.backend=reference"]
+    small = [
+        "scene.size=16",
+        "scene.train_views=4",
+        "scene.test_views=1",
+        "model.primitives=30",
+        "renderer.backend=reference",
+    ]
     neuprim_command(["run", "task=wave", *small, "train.iterations=5", "output_dir=r"], tmp_path, site)
     assert (tmp_path / "r" / "report.html").is_file()
-    assert passed(shell([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], folder, site)) == len(CHECKS) + 1
+    assert (
+        passed(shell([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], folder, site)) == len(CHECKS) + 1
+    )
 
 
 @pytest.mark.parametrize("name", ["", "Wave", "3d", "a-b", "a b", "../x", "class", "wäve", "a" * 41])
@@ -100,7 +131,9 @@ def test_bad_names_write_nothing(name: str, tmp_path: Path, monkeypatch: pytest.
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_taken_name_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_taken_name_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["new-task", "static"]) == 2
     assert f"new-task static: neuprim {neuprim.__version__} already has a task of this name" in capsys.readouterr().err
@@ -126,5 +159,11 @@ def test_nothing_that_exists_is_touched(kind: str, tmp_path: Path) -> None:
 def test_the_default_folder_is_named_after_the_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     new_task("two_words")
-    assert (tmp_path / "neuprim-two-words" / "neuprim_two_words" / "conf" / "preset" / "two_words" / "quick.yaml").is_file()
-    assert not [p for p in (tmp_path / "neuprim-two-words").rglob("*") if "NAME" in p.name or "PACKAGE" in p.name or p.suffix == ".in"]
+    assert (
+        tmp_path / "neuprim-two-words" / "neuprim_two_words" / "conf" / "preset" / "two_words" / "quick.yaml"
+    ).is_file()
+    assert not [
+        p
+        for p in (tmp_path / "neuprim-two-words").rglob("*")
+        if "NAME" in p.name or "PACKAGE" in p.name or p.suffix == ".in"
+    ]

@@ -128,7 +128,9 @@ def test_without_the_package_every_command_names_it(made: Path, site: Path, caps
     assert error(["import", "r.npz", "--out", "again"], capsys) == f"neuprim: error: r.npz: {text}"
     assert not Path("again").exists()
     assert "task=glow: no such task" in error(["run", "task=glow"], capsys), "nothing is resumed"
-    assert "task=glwo: no such task" in error(["run", "task=glwo", "output_dir=r", "resume=true"], capsys), "a typing error"
+    assert "task=glwo: no such task" in error(["run", "task=glwo", "output_dir=r", "resume=true"], capsys), (
+        "a typing error"
+    )
 
 
 def test_a_run_that_was_not_told_where_is_found_to_resume(
@@ -168,12 +170,16 @@ def test_without_the_package_of_the_scene_or_the_loss(
     assert main(["export", "r", "--format", "npz"]) == 0, "the model alone needs no scene"
 
 
-def test_another_package_of_the_same_name_is_not_taken(made: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_package_of_the_same_name_is_not_taken(
+    made: Path, site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     glow(site, "glow-too", package="glow_too")
     assert main(["eval", "r"]) == 0, "two packages of that name: the run knows which one made it"
     assert "glow_too" not in sys.modules
     uninstall(site, "neuprim-glow")
-    assert "r/config.yaml: this run was made by neuprim-glow 0.1 (task glow), which is not installed" in error(["eval", "r"], capsys)
+    assert "r/config.yaml: this run was made by neuprim-glow 0.1 (task glow), which is not installed" in error(
+        ["eval", "r"], capsys
+    )
     edited(made, {"task.package": "Glow_Too"})
     assert main(["eval", "r"]) == 0
     assert "r/config.yaml: this run" not in capsys.readouterr().err
@@ -205,13 +211,18 @@ def test_another_version_is_one_warning(made: Path, site: Path, capsys: pytest.C
     assert [line for line in err.splitlines() if "warning" in line] == [
         "neuprim: warning: r/config.yaml: this run was made by neuprim-glow 0.1 (task glow); installed is neuprim-glow 0.2"
     ]
-    with pytest.warns(NeuprimWarning, match=r"r/checkpoint.safetensors: .* neuprim-glow 0.1 \(task glow\); installed is neuprim-glow 0.2"):
+    with pytest.warns(
+        NeuprimWarning,
+        match=r"r/checkpoint.safetensors: .* neuprim-glow 0.1 \(task glow\); installed is neuprim-glow 0.2",
+    ):
         run(compose(["task=glow", *SMALL, *QUICK, "train.iterations=3", "output_dir=r", "resume=true"]))
     made_by = RunConfig.from_yaml(made).made_by
     assert made_by is not None and made_by.task.version == "0.2", "what went on was made by what is installed"
 
 
-@pytest.mark.parametrize(("version", "warns"), [("0.1.7", False), ("0.2.0", True), ("0.2.0.dev1", True), ("not a version", True)])
+@pytest.mark.parametrize(
+    ("version", "warns"), [("0.1.7", False), ("0.2.0", True), ("0.2.0.dev1", True), ("not a version", True)]
+)
 def test_another_neuprim_is_a_warning_where_its_minor_version_differs(
     version: str, warns: bool, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -253,7 +264,14 @@ def test_a_run_of_a_chosen_package_goes_through_every_command(
         {"my_losses.py": LOSS.replace('"extra"', '"photometric"')},
         group="neuprim.losses",
     )
-    words = ["task=glow-too:glow", "scene=glow-too:ball", "train.loss=my-losses:photometric", *SMALL, *QUICK, "train.log_every=1"]
+    words = [
+        "task=glow-too:glow",
+        "scene=glow-too:ball",
+        "train.loss=my-losses:photometric",
+        *SMALL,
+        *QUICK,
+        "train.log_every=1",
+    ]
     assert "choose task=glow-too:glow or task=neuprim-glow:glow" in error(["run", "task=glow"], capsys)
     assert main(["run", *words]) == 0
     folder = capsys.readouterr().out.strip()
@@ -274,7 +292,9 @@ def test_a_run_of_a_chosen_package_goes_through_every_command(
     assert "neuprim_glow" not in sys.modules
 
 
-def test_a_run_does_not_go_on_with_another_packages_task(made: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_does_not_go_on_with_another_packages_task(
+    made: Path, site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     glow(site, "glow-too", "7", package="glow_too")
     before = (made / "checkpoint.safetensors").read_bytes()
     text = "written for task 'glow' of neuprim-glow 0.1; this run's task is that of glow-too 7"
@@ -308,19 +328,34 @@ def test_a_run_without_a_record_is_read_by_names(made: Path, site: Path) -> None
         ({}, "made_by.task: missing; expected name, package and version"),
         ({"neuprim": "0.1", "task": []}, "made_by.task: found list; expected a mapping of name, package, version"),
         ({"neuprim": "0.1", "tsak": {}}, "made_by.tsak: no such setting; did you mean 'task'?"),
-        ({"neuprim": "0.1", "task": {"name": "static", "package": "neuprim"}}, "made_by.task.version: found None; expected text"),
+        (
+            {"neuprim": "0.1", "task": {"name": "static", "package": "neuprim"}},
+            "made_by.task.version: found None; expected text",
+        ),
         (
             {"neuprim": "0.1", "task": {"name": "static", "package": "a:b", "version": ""}},
             "made_by.task.package: found 'a:b'; expected the name",
         ),
-        ({"neuprim": "0.1", "task": {"name": "static", "package": " ", "version": ""}}, "made_by.task.package: found ' '; expected text"),
+        (
+            {"neuprim": "0.1", "task": {"name": "static", "package": " ", "version": ""}},
+            "made_by.task.package: found ' '; expected text",
+        ),
         (
             {"neuprim": "0.1", "task": {"name": "static", "package": "a\nb", "version": ""}},
             "made_by.task.package: found 'a\\nb'; expected text",
         ),
-        ({"neuprim": "0.1", "task": {"name": "static", "package": "\x1b[31m", "version": ""}}, "made_by.task.package: found '\\x1b[31m'"),
-        ({"neuprim": "0.1", "task": {"name": "static", "package": "x" * 9999, "version": ""}}, "package: found str of 10001 characters"),
-        ({"neuprim": 1, "task": {"name": "static", "package": "neuprim", "version": ""}}, "made_by.neuprim: found 1; expected text"),
+        (
+            {"neuprim": "0.1", "task": {"name": "static", "package": "\x1b[31m", "version": ""}},
+            "made_by.task.package: found '\\x1b[31m'",
+        ),
+        (
+            {"neuprim": "0.1", "task": {"name": "static", "package": "x" * 9999, "version": ""}},
+            "package: found str of 10001 characters",
+        ),
+        (
+            {"neuprim": 1, "task": {"name": "static", "package": "neuprim", "version": ""}},
+            "made_by.neuprim: found 1; expected text",
+        ),
         (
             {"neuprim": "0.1", "task": {"name": "x", "package": "neuprim", "version": "1"}},
             "task.name: found 'x'; expected 'static', as task.name says",
@@ -351,7 +386,9 @@ def test_a_damaged_record_in_a_checkpoint(made: Path) -> None:
     rest = {key: value for key, value in header.items() if key not in ("format", "kind")}
     checkpoint.write(made / "checkpoint.safetensors", "checkpoint", tensors, {**rest, "made_by": {"task": 3}})
     config = compose(["task=glow", *SMALL, *QUICK, "output_dir=r", "resume=true"])
-    with pytest.raises(CheckpointError, match=r"^r/checkpoint.safetensors: made_by.task: found int; expected a mapping"):
+    with pytest.raises(
+        CheckpointError, match=r"^r/checkpoint.safetensors: made_by.task: found int; expected a mapping"
+    ):
         run(config)
 
 

@@ -87,6 +87,9 @@ def test_survey_reports_the_broken_ones(toy: Path, site: Path) -> None:
     assert reports["toy", "neuprim-toy"].spec is not None
     assert "RuntimeError: first line second" in (reports["boom", "neuprim-boom"].error or "")
     assert reports["same", "neuprim-one"].spec is not None, "a clash breaks nobody"
-    assert reports["same", "neuprim-one"].note == "also registered by neuprim-two 0.3; task=neuprim-one:same chooses this one"
+    assert (
+        reports["same", "neuprim-one"].note
+        == "also registered by neuprim-two 0.3; task=neuprim-one:same chooses this one"
+    )
     assert "its TaskSpec is named 'toy'" in (reports["same", "neuprim-two"].error or "")
     assert reports["toy", "neuprim-toy"].note is None

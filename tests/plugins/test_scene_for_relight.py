@@ -1,4 +1,5 @@
-"""A scene of another package for a task that judges more than images: it knows a Dataset, and may know one class more."""
+"""A scene of another package for a task that judges more than images: it knows a Dataset, and may know one class
+more."""
 
 from __future__ import annotations
 
@@ -78,7 +79,9 @@ def run(site: Path, extra: str) -> int:
 
 def written() -> tuple[dict[str, Any], dict[str, Any]]:
     """Metrics, and what the model's header says of the data."""
-    return json.loads(Path("r/metrics.json").read_text()), checkpoint.read(Path("r/model.safetensors"), "model")[0]["data"]
+    return json.loads(Path("r/metrics.json").read_text()), checkpoint.read(Path("r/model.safetensors"), "model")[0][
+        "data"
+    ]
 
 
 def test_images_cameras_and_lights_are_enough(site: Path) -> None:
@@ -86,7 +89,11 @@ def test_images_cameras_and_lights_are_enough(site: Path) -> None:
     metrics, data = written()
     assert (metrics["exposure"], metrics["falloff"], list(metrics["baselines"])) == (2.0, "none", ["black"])
     assert all({"psnr_linear_clamped", "psnr_display", "psnr_mask"} <= view.keys() for view in metrics["per_view"])
-    assert (data["lights"]["falloff"], data["lights"]["exposure"], len(data["lights"]["directions"])) == ("none", 2.0, 6)
+    assert (data["lights"]["falloff"], data["lights"]["exposure"], len(data["lights"]["directions"])) == (
+        "none",
+        2.0,
+        6,
+    )
     with Image.open("r/renders/orbit.webp") as film:
         assert getattr(film, "n_frames", 1) == 2
     write_exr(Path("sky.exr"), torch.ones(8, 16, 3))
@@ -113,7 +120,9 @@ def test_what_else_it_knows_of_its_pixels_counts(site: Path) -> None:
     metrics, data = written()
     assert metrics["falloff"] == data["lights"]["falloff"] == "inverse_square"
     assert list(metrics["baselines"]) == ["black", "grey"]
-    assert metrics["pixels_lit"] == metrics["pixels_cast_shadow"] == 2 * 24 * 12 and "psnr_pooled_cast_shadow" in metrics
+    assert (
+        metrics["pixels_lit"] == metrics["pixels_cast_shadow"] == 2 * 24 * 12 and "psnr_pooled_cast_shadow" in metrics
+    )
     assert ["psnr_linear_clamped_v0" in view for view in metrics["per_view"]] == [True, False]
     assert metrics["class_percent"] == {"lit": 50.0, "cast_shadow": 50.0, "attached_shadow": 0.0, "highlight": 0.0}
     with Image.open("r/renders/clip_all.webp") as film:
@@ -122,5 +131,7 @@ def test_what_else_it_knows_of_its_pixels_counts(site: Path) -> None:
 
 def test_another_class_is_refused_before_training(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(site, "3") == 2
-    expected = "scene 'mine' of lit-scene 0.3: two: extra is a int; expected a neuprim.tasks.relight.data.Lighting, or None"
+    expected = (
+        "scene 'mine' of lit-scene 0.3: two: extra is a int; expected a neuprim.tasks.relight.data.Lighting, or None"
+    )
     assert expected in capsys.readouterr().err and not Path("r").exists()

@@ -46,7 +46,10 @@ def toys(*words: str) -> RunConfig:
         (["task.options.gian=3"], "task.options.gian: task 'toy' has no such option; did you mean 'gain'?"),
         (["+task.options.gian=3"], "task.options.gian: task 'toy' has no such option; did you mean 'gain'?"),
         (["task.options={gian: 3}"], "task.options.gian: task 'toy' has no such option; did you mean 'gain'?"),
-        (["task.options.neurons=3"], "task.options.neurons: task 'toy' has no such option; did you mean 'model.neurons'?"),
+        (
+            ["task.options.neurons=3"],
+            "task.options.neurons: task 'toy' has no such option; did you mean 'model.neurons'?",
+        ),
         (["task.options.gain=high"], "task.options.gain=high: expected a finite number"),
         (["task.options.gain=null"], "task.options.gain=null: expected a finite number"),
         (["task.options.gain.of=3"], "task.options.gain={'of': 3}: expected a finite number"),
@@ -85,7 +88,8 @@ def test_options_are_complete_typed_and_shown(toy: Path, capsys: pytest.CaptureF
 def test_options_that_only_the_yaml_file_has(toy: Path) -> None:
     (toy / "conf/task/toy.yaml").write_text("scene: ball\noptions: {gian: 2}\n")
     with pytest.raises(
-        ConfigError, match=r"task 'toy': task/toy.yaml: options.gian: its TaskSpec has no such option; did you mean 'gain'\?"
+        ConfigError,
+        match=r"task 'toy': task/toy.yaml: options.gian: its TaskSpec has no such option; did you mean 'gain'\?",
     ):
         toys()
     (toy / "conf/task/toy.yaml").write_text("scene: ball\noptions: {gain: loud}\n")
@@ -110,9 +114,7 @@ def check(model):
 def test_an_option_may_say_its_bounds_and_choices(toy: Path) -> None:
     source = (toy / "__init__.py").read_text()
     imports = "from typing import Annotated\nfrom neuprim.core.checked import Range\n"
-    more = (
-        '"gain": (1.0, "of the amplifier", Annotated[float, Range(above=0, at_most=5)]), "form": ("soft", "of the knee", ("soft", "hard"))'
-    )
+    more = '"gain": (1.0, "of the amplifier", Annotated[float, Range(above=0, at_most=5)]), "form": ("soft", "of the knee", ("soft", "hard"))'
     (toy / "__init__.py").write_text(imports + source.replace('"gain": (1.0, "of the amplifier")', more))
     assert toys("task.options.gain=5", "task.options.form=hard").options == {"gain": 5.0, "form": "hard"}
     with pytest.raises(ConfigError, match=r"^task\.options\.gain=6: expected a number above 0 and at most 5$"):
@@ -125,7 +127,9 @@ def test_an_option_may_say_its_bounds_and_choices(toy: Path) -> None:
 # ---------------------------------------------------------------- options of losses
 
 
-def test_a_losss_options_belong_to_task_options_while_it_is_chosen(toy: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_losss_options_belong_to_task_options_while_it_is_chosen(
+    toy: Path, site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     add(site, "loss", package="fake_loss")
     assert toys("train.loss=extra").options == {"gain": 1.0, "weight": 3.0}
     assert toys("train.loss=extra").non_default == {"train.loss": (None, "extra")}
@@ -133,7 +137,10 @@ def test_a_losss_options_belong_to_task_options_while_it_is_chosen(toy: Path, si
     assert config.non_default == {"train.loss": (None, "extra"), "task.options.weight": (3.0, 5.0)}
     with pytest.raises(ConfigError, match=r"task.options.weight: task 'toy' has no such option"):
         toys("task.options.weight=5")
-    with pytest.raises(ConfigError, match=r"task.options.wieght: task 'toy' with loss 'extra' has no such option; did you mean 'weight'"):
+    with pytest.raises(
+        ConfigError,
+        match=r"task.options.wieght: task 'toy' with loss 'extra' has no such option; did you mean 'weight'",
+    ):
         toys("train.loss=extra", "task.options.wieght=5")
     settings = loss_settings(load_loss("extra"), config.train, config.options)
     assert settings["options"] == {"weight": 5.0}, "its own only"
@@ -172,11 +179,23 @@ def test_options_that_a_loss_refuses_cost_no_loading_of_data(site: Path, tmp_pat
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["task=toy", "model.sh_degree=2"], "model.sh_degree: task 'toy' does not use this setting; it uses model.neurons"),
-        (["task=toy", "model={sh_every: 0}"], "model.sh_every: task 'toy' does not use this setting; it uses model.neurons"),
-        (["task=relight", "train.ssim_weight=0.5"], "train.ssim_weight: task 'relight' does not use this setting; it uses model.neurons"),
+        (
+            ["task=toy", "model.sh_degree=2"],
+            "model.sh_degree: task 'toy' does not use this setting; it uses model.neurons",
+        ),
+        (
+            ["task=toy", "model={sh_every: 0}"],
+            "model.sh_every: task 'toy' does not use this setting; it uses model.neurons",
+        ),
+        (
+            ["task=relight", "train.ssim_weight=0.5"],
+            "train.ssim_weight: task 'relight' does not use this setting; it uses model.neurons",
+        ),
         (["task=relight", "model.sh_degree=1"], "model.sh_degree: task 'relight' does not use this setting"),
-        (["task=static", "train.loss=l1", "train.ssim_weight=0.5"], "train.ssim_weight: loss 'l1' does not use this setting"),
+        (
+            ["task=static", "train.loss=l1", "train.ssim_weight=0.5"],
+            "train.ssim_weight: loss 'l1' does not use this setting",
+        ),
     ],
 )
 def test_unused_settings_are_refused_when_typed(toy: Path, words: list[str], text: str) -> None:
@@ -188,7 +207,8 @@ def test_unused_settings_are_refused_when_typed(toy: Path, words: list[str], tex
 def test_unused_settings_are_refused_in_a_preset(toy: Path) -> None:
     (toy / "conf/preset/toy/quick.yaml").write_text("model: {sh_degree: 2}\n")
     with pytest.raises(
-        ConfigError, match=r"preset/toy/quick.yaml: model.sh_degree: task 'toy' does not use this setting; it uses model.neurons"
+        ConfigError,
+        match=r"preset/toy/quick.yaml: model.sh_degree: task 'toy' does not use this setting; it uses model.neurons",
     ):
         toys()
     (toy / "conf/preset/toy/quick.yaml").write_text("train: {ssim_weight: 0.1}\n")
@@ -201,7 +221,9 @@ def test_unused_settings_are_refused_in_a_preset(toy: Path) -> None:
 def test_used_settings_are_taken(toy: Path) -> None:
     assert toys("model.neurons=3").model.neurons == 3
     assert compose(["task=relight", "train.loss=photometric", "train.ssim_weight=0.5"], False).train.ssim_weight == 0.5
-    assert compose(["task=static", "train.loss=l1"], False).train.loss == "l1", "though its preset has a weight for its own loss"
+    assert compose(["task=static", "train.loss=l1"], False).train.loss == "l1", (
+        "though its preset has a weight for its own loss"
+    )
 
 
 def test_what_is_not_used_is_not_shown(toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -250,12 +272,16 @@ def test_functions_get_what_they_declare_and_no_more() -> None:
     assert "sh_degree" not in model and model.get("sh_degree", 7) == 7
     with pytest.raises(ConfigError, match=r"task 'static' reads model.sh_degree, which its 'uses' does not declare"):
         model["sh_degree"]
-    with pytest.raises(ConfigError, match=r"task 'static' reads task.options.width, which its 'options' does not declare"):
+    with pytest.raises(
+        ConfigError, match=r"task 'static' reads task.options.width, which its 'options' does not declare"
+    ):
         model["options"]["width"]
     with pytest.raises(KeyError):
         model["no_such_setting"]
     train = loss_settings(shy, TrainSettings(), {})
-    with pytest.raises(ConfigError, match=r"the loss of task 'static' reads train.ssim_weight, which its 'uses' does not declare"):
+    with pytest.raises(
+        ConfigError, match=r"the loss of task 'static' reads train.ssim_weight, which its 'uses' does not declare"
+    ):
         train["ssim_weight"]
 
 
@@ -265,12 +291,18 @@ def test_conformance_notices_settings_that_are_read_and_not_declared() -> None:
 
     relight = load_task("relight")
     with pytest.raises(
-        ConformanceError, match=r"fields: stopped by ConfigError: task 'relight' reads model.sh_degree, which its 'uses' does"
+        ConformanceError,
+        match=r"fields: stopped by ConfigError: task 'relight' reads model.sh_degree, which its 'uses' does",
     ):
         named_checks(replace(relight, build=build))["fields"]()
-    with pytest.raises(ConformanceError, match=r"loss: stopped by ConfigError: the loss of task 'relight' reads train.ssim_weight, which"):
+    with pytest.raises(
+        ConformanceError,
+        match=r"loss: stopped by ConfigError: the loss of task 'relight' reads train.ssim_weight, which",
+    ):
         named_checks(replace(relight, loss=photometric))["loss"]()
-    with pytest.raises(ConformanceError, match=r"files: stopped by ConfigError: preset.*model.neurons: task 'static' does not use this"):
+    with pytest.raises(
+        ConformanceError, match=r"files: stopped by ConfigError: preset.*model.neurons: task 'static' does not use this"
+    ):
         named_checks(replace(TASK, uses=()))["files"]()
 
 
@@ -281,12 +313,18 @@ def test_conformance_notices_settings_that_are_read_and_not_declared() -> None:
         ({"options": {"gain": 1.0}}, "options['gain'] is 1.0; expected (default, one line of help)"),
         ({"options": {"gain": (1.0, None)}}, "options['gain'] is (1.0, None); expected (default, one line of help)"),
         ({"options": {"a b": (1.0, "x")}}, "options has 'a b'; expected a name"),
-        ({"options": {"gain": (object, "x")}}, "options['gain'] has a default of type type; expected what a YAML file can hold"),
+        (
+            {"options": {"gain": (object, "x")}},
+            "options['gain'] has a default of type type; expected what a YAML file can hold",
+        ),
         (
             {"options": {"gain": (2.0, "x", Annotated[float, Range(0, 1)])}},
             "the default of options['gain']=2.0: expected a number from 0 to 1",
         ),
-        ({"options": {"gain": ("soft", "x", ("hard", "even"))}}, "the default of options['gain']=soft: expected hard or even"),
+        (
+            {"options": {"gain": ("soft", "x", ("hard", "even"))}},
+            "the default of options['gain']=soft: expected hard or even",
+        ),
         ({"uses": 3}, "uses is of type int; expected a tuple"),
         ({"uses": ("model.primitives",)}, "uses has 'model.primitives'; expected some of model.neurons"),
         ({"uses": ("neurons",)}, "uses has 'neurons'; expected some of"),
@@ -294,9 +332,12 @@ def test_conformance_notices_settings_that_are_read_and_not_declared() -> None:
 )
 def test_declarations_are_checked_when_a_plugin_is_loaded(changes: dict[str, Any], text: str) -> None:
     for spec in (TASK, load_loss("photometric")):
-        assert text in (fault(replace(spec, **changes)) or "").replace("some of train.ssim_weight", "some of model.neurons")
+        assert text in (fault(replace(spec, **changes)) or "").replace(
+            "some of train.ssim_weight", "some of model.neurons"
+        )
     assert (
-        fault(replace(load_loss("photometric"), uses=("model.neurons",))) == "uses has 'model.neurons'; expected some of train.ssim_weight"
+        fault(replace(load_loss("photometric"), uses=("model.neurons",)))
+        == "uses has 'model.neurons'; expected some of train.ssim_weight"
     )
     assert fault(replace(TASK, uses=OPTIONAL)) is None
 

@@ -1,4 +1,5 @@
-"""A task of five channels, from the data to the report: what is shown is said, what is written is everything, what cannot be is refused."""
+"""A task of five channels, from the data to the report: what is shown is said, what is written is everything, what
+cannot be is refused."""
 
 from __future__ import annotations
 
@@ -108,7 +109,9 @@ def test_metrics_and_report_name_the_channels(trained: Path) -> None:
     assert not {"psnr_srgb", "ssim_srgb"} & found.keys()
     channels, drawn, truth = first_view(trained)
     shown, wanted = channels.display(drawn).double(), channels.display(truth).double()
-    assert found["per_view"][0]["psnr_display"] == pytest.approx(-10 * torch.log10((shown - wanted).square().mean()).item(), abs=1e-4)
+    assert found["per_view"][0]["psnr_display"] == pytest.approx(
+        -10 * torch.log10((shown - wanted).square().mean()).item(), abs=1e-4
+    )
     assert found["ssim_display"] > 0.3
     page = (trained / "report.html").read_text()
     assert page.count(f"hown: {THROUGH.replace(chr(39), '&#x27;')}") == 2, "at the orbit and at the held-out views"
@@ -137,8 +140,12 @@ def test_rendering_needs_no_data_for_the_names(trained: Path, tmp_path: Path, mo
 
     monkeypatch.setattr("neuprim.runs.draw.load_dataset", gone)
     pose = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0.5], [0, 0, 0, 1]]
-    (tmp_path / "cameras.json").write_text(json.dumps({"w": 20, "h": 16, "camera_angle_x": 0.7, "frames": [{"transform_matrix": pose}]}))
-    (exr,) = render_run(trained, str(tmp_path / "cameras.json"), None, "exr", tmp_path / "exr", 1, SHIFT, layers="beauty")
+    (tmp_path / "cameras.json").write_text(
+        json.dumps({"w": 20, "h": 16, "camera_angle_x": 0.7, "frames": [{"transform_matrix": pose}]})
+    )
+    (exr,) = render_run(
+        trained, str(tmp_path / "cameras.json"), None, "exr", tmp_path / "exr", 1, SHIFT, layers="beauty"
+    )
     (png,) = render_run(trained, str(tmp_path / "cameras.json"), None, "png", tmp_path / "png", 1, SHIFT)
     display = load_task("spectral").display
     assert display is not None
@@ -157,7 +164,9 @@ def test_webp_is_a_picture_of_the_display(trained: Path, tmp_path: Path) -> None
 
 def test_the_inspectors_page_has_the_displays_colours(trained: Path, tmp_path: Path) -> None:
     said: list[str] = []
-    inspect_run(Request(trained, ("primitives",), grid=8, out=tmp_path / "page.html"), lambda event: said.append(event.text))
+    inspect_run(
+        Request(trained, ("primitives",), grid=8, out=tmp_path / "page.html"), lambda event: said.append(event.text)
+    )
     (frame,) = layers_of(tmp_path / "page.html")["frames"]
     (shown,) = (layer for layer in frame["layers"]["primitives"]["model"] if layer["kind"] == "ellipsoids")
     found = array(frame, shown["rows"], "<f4").reshape(-1, 15)[:, 12:]
@@ -178,7 +187,10 @@ def test_a_meshs_colours_go_through_the_display(trained: Path, tmp_path: Path, s
     colour = torch.tensor([0.1, 0.2, 0.3, 0.6, 0.8])
     header, tensors = checkpoint.read(trained / "model.safetensors", "model")
     (tmp_path / "config.yaml").write_text((trained / "config.yaml").read_text())
-    painted = {**tensors, "logit": torch.cat([colour, colour[:1]]).logit().expand(len(tensors["logit"]), 6).contiguous()}
+    painted = {
+        **tensors,
+        "logit": torch.cat([colour, colour[:1]]).logit().expand(len(tensors["logit"]), 6).contiguous(),
+    }
     rest = {k: v for k, v in header.items() if k not in ("format", "kind")}
     checkpoint.write(tmp_path / "model.safetensors", "model", painted, rest)
     report = export_run(tmp_path, "mesh", tmp_path / f"m.{suffix}", ["grid=32", "wavelength_shift=0"])
@@ -202,9 +214,13 @@ def test_whole_models_keep_every_channel(trained: Path, tmp_path: Path) -> None:
         assert torch.equal(images.read_image(exr, channels=every), images.read_image(own, channels=every))
 
 
-def test_gaussians_of_five_channels_are_refused_before_any_is_fitted(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gaussians_of_five_channels_are_refused_before_any_is_fitted(
+    trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("neuprim.plugins.export.gaussian_ply.harmonics_of", lambda *a: pytest.fail("too late"))
-    with pytest.raises(ConfigError, match=r"5 channels, 450nm, .*; this format has red, green and blue; --format ply and npz hold all"):
+    with pytest.raises(
+        ConfigError, match=r"5 channels, 450nm, .*; this format has red, green and blue; --format ply and npz hold all"
+    ):
         export_run(trained, "gaussian-ply", words=["wavelength_shift=0"])
 
 
@@ -220,7 +236,9 @@ def test_a_damaged_header_is_the_files_fault(trained: Path, tmp_path: Path) -> N
 # ---------------------------------------------------------------- without one
 
 
-def test_without_a_display_it_is_said_what_is_shown(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_display_it_is_said_what_is_shown(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, said = changed(site, tmp_path, display="None")
     assert f"shown: {SHOWN}; task 'spectral' has no display that shows them all" in said
     assert f"Shown: {SHOWN}." in (out / "report.html").read_text()
@@ -233,7 +251,9 @@ def test_without_a_display_it_is_said_what_is_shown(site: Path, tmp_path: Path, 
     assert lines == [f"shown: {SHOWN}; --format exr and npy hold all channels"]
     render_run(out, "orbit", None, "exr", tmp_path / "exr", 1, {}, tell=lines.append)
     assert len(lines) == 1
-    inspect_run(Request(out, ("primitives",), grid=8, out=tmp_path / "page.html"), lambda event: lines.append(event.text))
+    inspect_run(
+        Request(out, ("primitives",), grid=8, out=tmp_path / "page.html"), lambda event: lines.append(event.text)
+    )
     assert f"shown: {SHOWN}" in lines
     monkeypatch.setattr(mesh, "_sample", lambda *a: pytest.fail("too late"))
     with pytest.raises(ConfigError, match=r"5 channels, .* and task 'spectral' has no display that makes these"):
@@ -252,7 +272,9 @@ def test_any_number_of_channels_runs_and_is_written(site: Path, tmp_path: Path, 
     (npy,) = render_run(out, "orbit", None, "npy", tmp_path / "npy", 1, {})
     (exr,) = render_run(out, "orbit", None, "exr", tmp_path / "exr", 1, {}, layers="beauty")
     values, read = torch.from_numpy(np.load(npy)), images.read_image(exr, channels=names)
-    assert torch.allclose(read, values if space == "linear" else images.srgb_to_linear(values.clamp_min(0.0)), atol=1e-6, rtol=1e-6)
+    assert torch.allclose(
+        read, values if space == "linear" else images.srgb_to_linear(values.clamp_min(0.0)), atol=1e-6, rtol=1e-6
+    )
     assert torch.isfinite(read).all() and read.std() > 0
 
 
@@ -266,7 +288,9 @@ def test_a_grey_model_is_exported_as_grey(site: Path, tmp_path: Path) -> None:
     rows = trimesh.load(tmp_path / "g.ply").metadata["_ply_raw"]["vertex"]["data"]
     assert np.array_equal(rows["f_dc_0"], rows["f_dc_2"]) and np.array_equal(rows["f_rest_0"], rows["f_rest_15"])
     assert rows["f_dc_0"].std() > 0
-    ball = trimesh.load(export_run(out, "mesh", tmp_path / "m.ply", ["grid=32", "wavelength_shift=0"]).files[0], process=False)
+    ball = trimesh.load(
+        export_run(out, "mesh", tmp_path / "m.ply", ["grid=32", "wavelength_shift=0"]).files[0], process=False
+    )
     colours = np.asarray(ball.visual.vertex_colors)[:, :3]
     assert (colours == colours[:, :1]).all() and colours.std() > 0
 
@@ -296,7 +320,9 @@ def test_red_green_and_blue_among_others_are_exported_by_name(site: Path, tmp_pa
         ),
     ],
 )
-def test_contradictions_end_before_training(site: Path, tmp_path: Path, words: tuple[str, ...], changes: dict[str, str], text: str) -> None:
+def test_contradictions_end_before_training(
+    site: Path, tmp_path: Path, words: tuple[str, ...], changes: dict[str, str], text: str
+) -> None:
     with pytest.raises(NeuprimError, match=re.escape(text)):
         changed(site, tmp_path, *words, **changes)
     assert not (tmp_path / "run").exists()
@@ -318,7 +344,9 @@ def test_a_task_that_says_nonsense_is_refused(site: Path, changes: dict[str, str
         load_task("spectral")
 
 
-def test_the_command_line_offers_every_format(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_offers_every_format(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ["render", str(trained), "--camera", "orbit", "--frames", "1", "--size", "8x8"]
     for name in FORMATS:
         if name != "mp4":

@@ -1,4 +1,5 @@
-"""What somebody else's task, exporter and inspector may count on: conditions in every command, nothing overwritten, crashes in one line."""
+"""What somebody else's task, exporter and inspector may count on: conditions in every command, nothing overwritten,
+crashes in one line."""
 
 from __future__ import annotations
 
@@ -62,15 +63,26 @@ def test_one_spelling_of_a_condition_serves_every_command(spelling: list[str], r
     assert [p.read_bytes() for p in sorted((tmp_path / "r2").iterdir())] == alone
     assert call("inspect", run_dir, "--grid", "8", "--out", tmp_path / "i.vdb", *words("0:1:3")) == 0
     assert call("export", run_dir, "--format", "vdb", *words("0:1:3"), "grid=8", "--out", tmp_path / "e") == 0
-    inspected = [read_grid(tmp_path / f"i_{n:04d}.vdb", "extinction").metadata["neuprim_condition_wavelength_shift"] for n in range(3)]
-    exported = [read_grid(tmp_path / "e" / f"density_{n:04d}.vdb", "density").metadata["neuprim_wavelength_shift"] for n in range(3)]
+    inspected = [
+        read_grid(tmp_path / f"i_{n:04d}.vdb", "extinction").metadata["neuprim_condition_wavelength_shift"]
+        for n in range(3)
+    ]
+    exported = [
+        read_grid(tmp_path / "e" / f"density_{n:04d}.vdb", "density").metadata["neuprim_wavelength_shift"]
+        for n in range(3)
+    ]
     assert inspected == exported == [0.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize("command", ["render", "inspect", "export"])
-def test_advice_can_be_followed(command: str, run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_advice_can_be_followed(
+    command: str, run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The spelling that a message tells works in the command that printed it."""
-    camera = {"camera_angle_x": 0.7, "frames": [{"transform_matrix": [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0.5], [0, 0, 0, 1]]}]}
+    camera = {
+        "camera_angle_x": 0.7,
+        "frames": [{"transform_matrix": [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0.5], [0, 0, 0, 1]]}],
+    }
     (tmp_path / "camera.json").write_text(json.dumps(camera))
     words = {
         "render": ["--camera", tmp_path / "camera.json", "--size", "16x16", "--out", tmp_path / "a"],
@@ -83,7 +95,9 @@ def test_advice_can_be_followed(command: str, run_dir: Path, tmp_path: Path, cap
     else:
         assert call(command, run_dir, *words) == 2
         said = one_line(capsys)
-        advice = said.rsplit("give ", 1)[1].strip() if command == "render" else said.rsplit("for example ", 1)[1].strip()
+        advice = (
+            said.rsplit("give ", 1)[1].strip() if command == "render" else said.rsplit("for example ", 1)[1].strip()
+        )
     assert call(command, run_dir, *words, *(advice.split() if " " in advice else [advice, "0.5"])) == 0
 
 
@@ -104,7 +118,11 @@ def test_numbers_beyond_the_range_are_said_or_refused_by_all(
         assert "nan; expected finite numbers" in one_line(capsys)
         assert call(command, run, *words, "--wavelength-shift", "5") == (2 if strict else 0)
         out, error = capsys.readouterr()
-        assert (line + "; expected values within it" in error) if strict else f"warning: {line}" in " ".join((out + error).split())
+        assert (
+            (line + "; expected values within it" in error)
+            if strict
+            else f"warning: {line}" in " ".join((out + error).split())
+        )
     assert (tmp_path / "a.vdb").exists() != strict and (run / "export" / "centres").exists() != strict
 
 
@@ -115,7 +133,10 @@ def test_words_that_mean_nothing_are_refused(run_dir: Path, capsys: pytest.Captu
             "--wavelngth-shift: no such argument of `neuprim export` for task 'spectral'; did you",
         ),
         (["--format", "vdb", "--forc"], "did you mean '--force'"),
-        (["--format", "vdb", "wavelngth_shift=1"], "wavelngth_shift: no such option of --format vdb; did you mean 'wavelength_shift'"),
+        (
+            ["--format", "vdb", "wavelngth_shift=1"],
+            "wavelngth_shift: no such option of --format vdb; did you mean 'wavelength_shift'",
+        ),
         (["--format", "npz", "--wavelength-shift", "1"], "--wavelength-shift: --format npz takes no conditions"),
         (["--format", "vdb", "wavelength-shift=1", "--wavelength-shift", "1"], "wavelength-shift: given twice"),
         (["--format", "vdb", "--wavelength-shift"], "--wavelength-shift: expected a value after it"),
@@ -128,7 +149,11 @@ def test_words_that_mean_nothing_are_refused(run_dir: Path, capsys: pytest.Captu
 
 def test_an_option_and_a_condition_of_one_name(site: Path, run_dir: Path, tmp_path: Path) -> None:
     source = EXPORTER.replace("return", "path.write_text(repr((job.options, job.conditions)))\n    return", 1)
-    add(site, "exporter", source.replace("write=write", "write=write, conditions=True, options={'wavelength_shift': (3, 'x')}"))
+    add(
+        site,
+        "exporter",
+        source.replace("write=write", "write=write, conditions=True, options={'wavelength_shift': (3, 'x')}"),
+    )
     export_run(run_dir, "centres", tmp_path / "a", ["wavelength_shift=7", "--wavelength-shift", "0.5"])
     assert (tmp_path / "a").read_text() == "({'wavelength_shift': 7}, {'wavelength_shift': '0.5'})"
 
@@ -161,7 +186,11 @@ def test_an_exporter_that_fails_half_way_leaves_what_was_there(site: Path, run_d
         ("KeyboardInterrupt", KeyboardInterrupt),
         ("ZeroDivisionError", PluginError),
     ):
-        add(site, "exporter", f"from neuprim.core.errors import ConfigError\n{EXPORTER.replace('return ', f'raise {failure}; return ')}")
+        add(
+            site,
+            "exporter",
+            f"from neuprim.core.errors import ConfigError\n{EXPORTER.replace('return ', f'raise {failure}; return ')}",
+        )
         before = entries(tmp_path)
         with pytest.raises(raised) as caught:
             export_run(run_dir, "centres", path, overwrite=True)
@@ -185,12 +214,16 @@ def test_an_exporter_that_fails_half_way_leaves_what_was_there(site: Path, run_d
         ("path.write_text", "len", "reports {out}, which it did not write"),
     ],
 )
-def test_an_exporter_that_does_something_else_is_named(old: str, new: str, text: str, site: Path, run_dir: Path, tmp_path: Path) -> None:
+def test_an_exporter_that_does_something_else_is_named(
+    old: str, new: str, text: str, site: Path, run_dir: Path, tmp_path: Path
+) -> None:
     add(site, "exporter", EXPORTER.replace(old, new))
     out = tmp_path / "a.json"
     with pytest.raises(PluginError) as caught:
         export_run(run_dir, "centres", out)
-    assert str(caught.value).startswith("exporter 'centres' of strange-exporter 0.3: " + text.format(run=run_dir, out=out))
+    assert str(caught.value).startswith(
+        "exporter 'centres' of strange-exporter 0.3: " + text.format(run=run_dir, out=out)
+    )
     assert not out.exists()
 
 
@@ -210,9 +243,15 @@ def test_suffixes_are_checked_before_anything_is_done(site: Path, run_dir: Path,
         export_run(run_dir, "centres")
 
 
-def test_pictures_of_inspect_are_not_replaced(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pictures_of_inspect_are_not_replaced(
+    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words: list[str | Path] = ["inspect", run_dir, "--grid", "8", "--out"]
-    for name, taken, more in (("a.vdb", "a.vdb", []), ("b.vdb", "b_0001.vdb", ["--wavelength-shift", "0:1:2"]), ("p.html", "p.html", [])):
+    for name, taken, more in (
+        ("a.vdb", "a.vdb", []),
+        ("b.vdb", "b_0001.vdb", ["--wavelength-shift", "0:1:2"]),
+        ("p.html", "p.html", []),
+    ):
         (tmp_path / taken).write_text("precious")
         assert call(*words, tmp_path / name, *more) == 2
         assert f"{taken}: exists; --force replaces it" in one_line(capsys)
@@ -231,7 +270,9 @@ def test_help_shows_the_options_of_any_format(site: Path, run_dir: Path, capsys:
     add(
         site,
         "exporter",
-        EXPORTER.replace("write=write", "write=write, options={'digits': (6, 'decimal places'), 'pretty': (False, 'lines')}"),
+        EXPORTER.replace(
+            "write=write", "write=write, options={'digits': (6, 'decimal places'), 'pretty': (False, 'lines')}"
+        ),
     )
     assert call("export", "--help") == 0
     assert "  centres  (strange-exporter 0.3)\n" in capsys.readouterr().out
@@ -242,7 +283,11 @@ def test_help_shows_the_options_of_any_format(site: Path, run_dir: Path, capsys:
         assert "\n  digits=6      decimal places\n  pretty=false  lines\n" in out and "conditions" not in out
     assert call("export", "--format", "vdb", "--help") == 0
     out = capsys.readouterr().out
-    assert "\n  units=auto    source, world or scene" in out and "\n  voxel_size=   edge of a voxel" in out and "--time 0.5" in out
+    assert (
+        "\n  units=auto    source, world or scene" in out
+        and "\n  voxel_size=   edge of a voxel" in out
+        and "--time 0.5" in out
+    )
     assert call("export", "--format", "npz", "--help") == 0
     assert "--format npz has no options" in capsys.readouterr().out
     assert call("export", "--format", "centers", "--help") == 2
@@ -258,7 +303,10 @@ def test_options_have_their_defaults_and_limits(site: Path, run_dir: Path, tmp_p
     for i, (words, expected) in enumerate(
         [
             ([], "(6, None, False, 'z', [{'wavelength_shift': tensor(0.2500)}])"),
-            (["digits=2", "scale=0.5", "pretty=true", "up=y"], "(2, 0.5, True, 'y', [{'wavelength_shift': tensor(0.2500)}])"),
+            (
+                ["digits=2", "scale=0.5", "pretty=true", "up=y"],
+                "(2, 0.5, True, 'y', [{'wavelength_shift': tensor(0.2500)}])",
+            ),
         ]
     ):
         (path,) = export_run(run_dir, "centres", tmp_path / f"{i}", [shift, *words]).files
@@ -281,35 +329,53 @@ def test_options_have_their_defaults_and_limits(site: Path, run_dir: Path, tmp_p
 # ---------------------------------------------------------------- crashes
 
 
-def test_a_crash_of_an_exporter_is_one_line_and_a_file(site: Path, run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_crash_of_an_exporter_is_one_line_and_a_file(
+    site: Path, run_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     add(site, "exporter", EXPORTER.replace("return", "return job.run.model.no_such_thing\n    return", 1))
     for number in (1, 2):
         assert call("export", run_dir, "--format", "centres") == 2
         error = one_line(capsys)
-        assert "exporter 'centres' of strange-exporter 0.3 crashed: AttributeError: " in error and "no_such_thing" in error
+        assert (
+            "exporter 'centres' of strange-exporter 0.3 crashed: AttributeError: " in error and "no_such_thing" in error
+        )
         path = Path(error.strip().rpartition("traceback in ")[2])
-        assert path.parent == run_dir / "logs" and path.name.startswith("exporter-centres-") and len(os.listdir(path.parent)) == number
+        assert (
+            path.parent == run_dir / "logs"
+            and path.name.startswith("exporter-centres-")
+            and len(os.listdir(path.parent)) == number
+        )
         text = path.read_text()
         assert "strange_exporter.py" in text and "Traceback" in text and "strange-exporter 0.3" in text
     assert not (run_dir / "export").exists()
 
 
-def test_where_the_run_cannot_be_written_the_traceback_lies_elsewhere(site: Path, run_dir: Path, tmp_path: Path) -> None:
+def test_where_the_run_cannot_be_written_the_traceback_lies_elsewhere(
+    site: Path, run_dir: Path, tmp_path: Path
+) -> None:
     add(site, "exporter", EXPORTER.replace("return", "raise SystemExit(3)\n    return", 1))
     (run_dir / "logs").write_text("a file in the way")
     with pytest.raises(PluginError, match=rf"crashed: SystemExit: 3; traceback in {tmp_path}/new/exporter-centres-"):
         export_run(run_dir, "centres", tmp_path / "new" / "a.json")
 
 
-def test_a_traceback_that_can_be_kept_nowhere_is_not_hidden(site: Path, run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_traceback_that_can_be_kept_nowhere_is_not_hidden(
+    site: Path, run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     add(site, "exporter", EXPORTER.replace("return", "raise ZeroDivisionError\n    return", 1))
     monkeypatch.setattr(crashes, "written", lambda *_: None)
     with pytest.raises(ZeroDivisionError):
         export_run(run_dir, "centres")
 
 
-def test_a_full_disk_is_not_the_plugins_fault(site: Path, run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    add(site, "exporter", EXPORTER.replace("return", "raise OSError(28, 'No space left on device', str(path))\n    return", 1))
+def test_a_full_disk_is_not_the_plugins_fault(
+    site: Path, run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add(
+        site,
+        "exporter",
+        EXPORTER.replace("return", "raise OSError(28, 'No space left on device', str(path))\n    return", 1),
+    )
     assert call("export", run_dir, "--format", "centres", "--out", tmp_path / "a.json") == 2
     assert one_line(capsys) == f"neuprim: error: {tmp_path}/a.json: No space left on device\n"
     assert not (run_dir / "logs").exists()
@@ -327,7 +393,8 @@ def test_a_crash_of_a_reader(site: Path, run_dir: Path, tmp_path: Path) -> None:
     add(site, "exporter", EXPORTER.replace("write=write", "write=write, read=lambda path: {}[path]"))
     (tmp_path / "a.centres").touch()
     with pytest.raises(
-        PluginError, match=rf"exporter 'centres' of strange-exporter 0\.3 crashed: KeyError: .* traceback in {tmp_path}/exporter-"
+        PluginError,
+        match=rf"exporter 'centres' of strange-exporter 0\.3 crashed: KeyError: .* traceback in {tmp_path}/exporter-",
     ):
         import_run(tmp_path / "a.centres", tmp_path / "back")
 
@@ -338,9 +405,16 @@ def test_a_crash_of_an_inspector(
     add(site, "inspector", INSPECTOR.replace("frame.box", "frame.nowhere"))
     assert call("inspect", run_dir, "--show", "crumbs", "--grid", "8", "--out", tmp_path / "a.html") == 2
     error = one_line(capsys)
-    assert "inspector 'crumbs' of strange-inspector 0.3 crashed: AttributeError: 'FieldFrame' object has no attribute 'nowhere'" in error
+    assert (
+        "inspector 'crumbs' of strange-inspector 0.3 crashed: AttributeError: 'FieldFrame' object has no attribute 'nowhere'"
+        in error
+    )
     path = Path(error.strip().rpartition("traceback in ")[2])
-    assert path.parent == run_dir / "logs" and "strange_inspector.py" in path.read_text() and not (tmp_path / "a.html").exists()
+    assert (
+        path.parent == run_dir / "logs"
+        and "strange_inspector.py" in path.read_text()
+        and not (tmp_path / "a.html").exists()
+    )
     monkeypatch.setattr("neuprim.plugins.inspect.views.Slices", None)
     with pytest.raises(TypeError, match="not callable"):  # neuprim's own
         inspect_run(Request(run_dir, ["slices"], grid=8, out=tmp_path / "a.html"))

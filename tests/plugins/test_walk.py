@@ -1,4 +1,5 @@
-"""The walk of a stranger: a package written from the documentation alone, from its installation to its removal, and what it may do wrong."""
+"""The walk of a stranger: a package written from the documentation alone, from its installation to its removal, and
+what it may do wrong."""
 
 from __future__ import annotations
 
@@ -73,7 +74,10 @@ def test_a_name_that_one_package_has_is_listed_bare(package: Path, capsys: pytes
 
 
 def test_it_learns(package: Path, tmp_path: Path) -> None:
-    first, last = (read_metrics(fit(tmp_path / steps, f"train.iterations={steps}", "train.eval_every=1"))["psnr"] for steps in ("1", "150"))
+    first, last = (
+        read_metrics(fit(tmp_path / steps, f"train.iterations={steps}", "train.eval_every=1"))["psnr"]
+        for steps in ("1", "150")
+    )
     assert last > first + 3
 
 
@@ -98,15 +102,27 @@ def folder_of_images(folder: Path) -> Path:
         name = f"v{i}.exr" if i % 2 else f"v{i}.npy"
         write_exr(folder / name, image, names=NAMES) if i % 2 else np.save(folder / name, image.numpy())
         write_png(folder / f"m{i}.png", (torch.arange(16)[:, None, None] >= 4).expand(16, 16, 3).float())
-        pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
-        frames.append({"file_path": name, "mask_path": f"m{i}.png", "wavelength_shift": i / 4, "transform_matrix": pose.tolist()})
+        pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(
+            torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)
+        )
+        frames.append(
+            {"file_path": name, "mask_path": f"m{i}.png", "wavelength_shift": i / 4, "transform_matrix": pose.tolist()}
+        )
     (folder / "cameras.json").write_text(json.dumps({"w": 16, "h": 16, "fl_x": 20, "frames": frames}))
     return folder
 
 
 def test_its_files_are_read(package: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = folder_of_images(tmp_path / "data")
-    words = ["run", "task=spectral", "scene=files", f"scene.path={data}", "scene.test_every=4", "model.primitives=20", "train.iterations=5"]
+    words = [
+        "run",
+        "task=spectral",
+        "scene=files",
+        f"scene.path={data}",
+        "scene.test_every=4",
+        "model.primitives=20",
+        "train.iterations=5",
+    ]
     assert call(*words, f"output_dir={tmp_path / 'run'}") == 0
     assert read_metrics(tmp_path / "run")["channels"] == list(NAMES)
     assert refusal(capsys, *words, "scene.path=null", f"output_dir={tmp_path / 'x'}").startswith("scene.path: required")
@@ -140,7 +156,9 @@ def test_its_exporter_and_inspector(package: Path, tmp_path: Path, capsys: pytes
     ):
         spoken = [] if word.startswith("wave") else advice
         assert refusal(capsys, *table, *spoken, word, "--force") == text
-    assert refusal(capsys, *table, *advice, "--out", tmp_path / "a.txt").endswith("expected a file name that ends in .csv or .json")
+    assert refusal(capsys, *table, *advice, "--out", tmp_path / "a.txt").endswith(
+        "expected a file name that ends in .csv or .json"
+    )
 
     view = ["inspect", out, "--show", "bands", "--grid", "8"]
     assert call(*view, "--out", tmp_path / "page.html") == 0
@@ -157,7 +175,8 @@ def test_a_name_that_the_exporter_itself_would_refuse() -> None:
     assert fault(made) == "default is 'spectra.xml'; expected a name that ends in .csv or .json, its suffixes"
 
 
-# ---------------------------------------------------------------- mistakes: (module, text, another in its place), and the line
+# ---------------------------------------------------------------- mistakes: (module, text, another in its place), and
+# the line
 
 CONSTANT = 'return Constant(spectrum(params["logit"], conditions["wavelength_shift"]))'
 SUM = "density field TwoScales: lower: sum of two Cosine forms: the first: "
@@ -166,8 +185,18 @@ SUM = "density field TwoScales: lower: sum of two Cosine forms: the first: "
 @pytest.mark.parametrize(
     ("module", "old", "new", "text"),
     [
-        ("fields", 'params[f"{part}_w2"], offset', 'params[f"{part}_w2"][:, :1], offset', SUM + "w2 has shape (20, 1); expected (20, 2)"),
-        ("fields", 'params[f"{part}_b1"], params', 'params[f"{part}_b1"][:-1], params', SUM + "b1 has shape (19, 2); expected (20, 2)"),
+        (
+            "fields",
+            'params[f"{part}_w2"], offset',
+            'params[f"{part}_w2"][:, :1], offset',
+            SUM + "w2 has shape (20, 1); expected (20, 2)",
+        ),
+        (
+            "fields",
+            'params[f"{part}_b1"], params',
+            'params[f"{part}_b1"][:-1], params',
+            SUM + "b1 has shape (19, 2); expected (20, 2)",
+        ),
         (
             "fields",
             '(params["offset"], torch',
@@ -213,7 +242,9 @@ def test_conformance_finds_it(module: str, old: str, new: str, check: str, text:
 
 
 def test_a_package_that_raises_on_import_breaks_itself_alone(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    install_spectral(site, {"__init__": ("from neuprim.core.checked", 'raise RuntimeError("no licence")\nfrom neuprim.core.checked')})
+    install_spectral(
+        site, {"__init__": ("from neuprim.core.checked", 'raise RuntimeError("no licence")\nfrom neuprim.core.checked')}
+    )
     assert call("tasks") == 0
     said = capsys.readouterr().out
     assert said.count("BROKEN") == said.count("RuntimeError: no licence") == 4, "task, loss, exporter and inspector"
@@ -236,12 +267,15 @@ def test_a_format_of_the_package_that_is_gone_names_the_package(package: Path, s
 
 @pytest.mark.slow
 def test_pip_installs_it_and_its_own_tests_pass(tmp_path: Path) -> None:
-    """An editable installation into an environment of its own, an entry point that came later, and the end of it all."""
+    """An editable installation into an environment of its own, an entry point that came later, and the end of it
+    all."""
     home = tmp_path / "env"
     venv.create(home, with_pip=False)
     packages = next((home / "lib").glob("python*/site-packages"))
     root = Path(running.__file__).parents[1]
-    (packages / "base.pth").write_text("\n".join(p for p in (*sys.path, str(root)) if p.endswith("-packages") or p == str(root)))
+    (packages / "base.pth").write_text(
+        "\n".join(p for p in (*sys.path, str(root)) if p.endswith("-packages") or p == str(root))
+    )
     source = tmp_path / "neuprim-spectral"
     for path in PACKAGE.rglob("*"):
         if path.is_file() and "__pycache__" not in path.parts:
@@ -249,7 +283,9 @@ def test_pip_installs_it_and_its_own_tests_pass(tmp_path: Path) -> None:
             (source / path.relative_to(PACKAGE)).write_bytes(path.read_bytes())
 
     def python(*words: str | Path, ok: bool = True) -> str:
-        found = subprocess.run([home / "bin" / "python", *words], cwd=tmp_path, capture_output=True, text=True, env={**os.environ})
+        found = subprocess.run(
+            [home / "bin" / "python", *words], cwd=tmp_path, capture_output=True, text=True, env={**os.environ}
+        )
         assert (found.returncode == 0) == ok, found.stdout + found.stderr
         return found.stdout + found.stderr
 
@@ -261,12 +297,23 @@ def test_pip_installs_it_and_its_own_tests_pass(tmp_path: Path) -> None:
     pip = ("-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "-e", source)
     python(*pip)
     neuprim = ("-m", "neuprim")
-    words = ["scene.size=16", "scene.train_views=4", "scene.test_views=1", "model.primitives=20", "train.iterations=5", "output_dir=out"]
+    words = [
+        "scene.size=16",
+        "scene.train_views=4",
+        "scene.test_views=1",
+        "model.primitives=20",
+        "train.iterations=5",
+        "output_dir=out",
+    ]
     python(*neuprim, "run", "task=spectral", *words)
     project.write_text(whole)
-    assert f"run pip install -e {source} again" in python(*neuprim, "inspect", "out", "--show", "bands", "--out", "a.png", ok=False)
+    assert f"run pip install -e {source} again" in python(
+        *neuprim, "inspect", "out", "--show", "bands", "--out", "a.png", ok=False
+    )
     python(*pip)
     assert "\n  bands       (neuprim-spectral 0.1)" in python(*neuprim, "tasks")
     assert "passed" in python("-m", "pytest", "-q", "-p", "no:cacheprovider", source)
     python("-m", "pip", "uninstall", "-q", "-y", "neuprim-spectral")
-    assert "made by neuprim-spectral 0.1 (task spectral), which is not installed" in python(*neuprim, "eval", "out", ok=False)
+    assert "made by neuprim-spectral 0.1 (task spectral), which is not installed" in python(
+        *neuprim, "eval", "out", ok=False
+    )

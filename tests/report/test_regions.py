@@ -1,4 +1,5 @@
-"""The worst region of every held-out view: found where the error is, written worst first, shown, and never a way into other files."""
+"""The worst region of every held-out view: found where the error is, written worst first, shown, and never a way into
+other files."""
 
 from __future__ import annotations
 

@@ -31,11 +31,15 @@ def scene(height: int, width: int, turn: float) -> torch.Tensor:
     y, x = np.mgrid[:height, :width]
     u, v = (x + 0.5) / width * 2 - 1, (y + 0.5) / height * 2 - 1
     v = v * height / width
-    floor = ((np.floor(6 * u / (v + 1.3) + turn) + np.floor(6 / (v + 1.3))) % 2)[..., None] * np.array([0.25, 0.27, 0.3]) + 0.5
+    floor = ((np.floor(6 * u / (v + 1.3) + turn) + np.floor(6 / (v + 1.3))) % 2)[..., None] * np.array(
+        [0.25, 0.27, 0.3]
+    ) + 0.5
     sky = np.stack([0.62 + 0.2 * v, 0.74 + 0.12 * v, 0.9 + 0 * v], -1)
     image = np.where((v > 0.05)[..., None], floor, sky)
     radius = (u - 0.25 * math.sin(turn)) ** 2 + (v + 0.05) ** 2
-    normal = np.stack([u - 0.25 * math.sin(turn), v + 0.05, np.sqrt(np.clip(0.2 - radius, 0, None))], -1) / math.sqrt(0.2)
+    normal = np.stack([u - 0.25 * math.sin(turn), v + 0.05, np.sqrt(np.clip(0.2 - radius, 0, None))], -1) / math.sqrt(
+        0.2
+    )
     light = np.clip(normal @ np.array([-0.5, -0.6, 0.62]), 0, 1)[..., None]
     ball = np.array([0.75, 0.22, 0.12]) * (0.2 + 0.8 * light) + 0.6 * light**24
     return torch.from_numpy(np.clip(np.where((radius < 0.2)[..., None], ball, image), 0, 1))
@@ -44,7 +48,9 @@ def scene(height: int, width: int, turn: float) -> torch.Tensor:
 def blurred(image: torch.Tensor, seed: int) -> torch.Tensor:
     """What an imperfect model might render: soft edges, a little noise."""
     rows = image.permute(2, 0, 1)[None]
-    soft = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(rows, (2, 2, 2, 2), "replicate"), 5, 1)[0].permute(1, 2, 0)
+    soft = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(rows, (2, 2, 2, 2), "replicate"), 5, 1)[0].permute(
+        1, 2, 0
+    )
     noise = np.random.default_rng(seed).standard_normal(image.shape) * (0.006 + 0.008 * seed)
     return (soft + torch.from_numpy(noise)).clamp(0, 1)
 
@@ -85,10 +91,17 @@ def make_run(folder: Path, size: tuple[int, int] = (48, 64), lines: int = 400, n
         save(Path(f"{base}_truth.png"), truth)
         save(Path(f"{base}_error.png"), error_map(rendered, truth))
         entries.append(
-            {"name": name, **to_json("psnr", psnr(rendered, truth)), "ssim": ssim(rendered, truth), "seconds": 0.021 + 0.001 * i}
+            {
+                "name": name,
+                **to_json("psnr", psnr(rendered, truth)),
+                "ssim": ssim(rendered, truth),
+                "seconds": 0.021 + 0.001 * i,
+            }
         )
     frames = [Image.fromarray((scene(*size, 0.5 * k).numpy() * 255).astype(np.uint8)) for k in range(6)]
-    frames[0].save(folder / "renders" / "orbit.webp", save_all=True, append_images=frames[1:], duration=120, loop=0, quality=70)
+    frames[0].save(
+        folder / "renders" / "orbit.webp", save_all=True, append_images=frames[1:], duration=120, loop=0, quality=70
+    )
     metrics: dict[str, Any] = {
         "task": "static", "scene": "chequered-ball", "split": "test", "data_source": "generated",
         "psnr": float(np.mean([e["psnr"] for e in entries])), "ssim": float(np.mean([e["ssim"] for e in entries])),
@@ -100,7 +113,9 @@ def make_run(folder: Path, size: tuple[int, int] = (48, 64), lines: int = 400, n
         "non_default": {"train.iterations": [30000, 4000], "scene.downsample": [1, 4], "model.growth": [None, {"until": 3000}], "train.ssim": [True, False]},
     }  # fmt: skip
     (folder / "metrics.json").write_text(json.dumps(metrics), encoding="utf-8")
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in make_log(lines, 25)), encoding="utf-8")
+    (folder / "metrics.jsonl").write_text(
+        "".join(json.dumps(line) + "\n" for line in make_log(lines, 25)), encoding="utf-8"
+    )
     (folder / "config.yaml").write_text(
         "task: static\nscene:\n  name: chequered-ball\n  downsample: 4\npreset: fast\nmodel:\n  neurons: 8\n"
         "train:\n  iterations: 4000\n  ssim: false\nrenderer:\n  backend: cpu\nseed: 0\n",
@@ -202,10 +217,19 @@ def test_pictures_and_charts_are_all_there(finished: Path) -> None:
     elements = Structure((finished / "report.html").read_text(encoding="utf-8")).elements
     images = [attributes for tag, attributes in elements if tag == "img"]
     assert len(images) == 3 * len(NAMES) + 1
-    assert all(i["alt"] and i["width"] == "64" and i["height"] == "48" and i.get("class") == "pixelated" for i in images)
+    assert all(
+        i["alt"] and i["width"] == "64" and i["height"] == "48" and i.get("class") == "pixelated" for i in images
+    )
     assert sum(str(i["src"]).startswith("data:image/webp;base64,") for i in images) == 1
     labels = [attributes["aria-label"] for tag, attributes in elements if tag == "svg"]
-    assert labels == ["PSNR over time", "Loss over time", "Primitives over time", "PSNR over steps", "Loss over steps", "PSNR per view"]
+    assert labels == [
+        "PSNR over time",
+        "Loss over time",
+        "Primitives over time",
+        "PSNR over steps",
+        "Loss over steps",
+        "PSNR per view",
+    ]
 
 
 def test_the_page_stands_alone(finished: Path) -> None:
@@ -235,7 +259,8 @@ def test_the_same_run_gives_the_same_page(finished: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "badge"), [("real", None), ("generated", "generated data"), ("simulated", "simulated data"), ("dreamt", "dreamt")]
+    ("source", "badge"),
+    [("real", None), ("generated", "generated data"), ("simulated", "simulated data"), ("dreamt", "dreamt")],
 )
 def test_badge(quick: Path, source: str, badge: str | None) -> None:
     change(quick, data_source=source)
@@ -252,7 +277,14 @@ def test_everything_from_outside_is_escaped(tmp_path: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     strings = {key: evil for key, value in metrics.items() if isinstance(value, str)}
     views = [{"name": evil, "psnr": 20.0, "ssim": 0.5}, {"name": "z", "psnr": 30.0, "ssim": 0.5}]
-    change(run, **strings, per_view=views, versions={evil: evil}, non_default={evil: [evil, [evil]], "plain": evil}, background=[evil])
+    change(
+        run,
+        **strings,
+        per_view=views,
+        versions={evil: evil},
+        non_default={evil: [evil, [evil]], "plain": evil},
+        background=[evil],
+    )
     (run / "config.yaml").write_text("x: '</code></pre><script>bad</script>'\n", encoding="utf-8")
     page = page_of(run)
     structure = Structure(page)
@@ -270,9 +302,20 @@ def test_any_missing_or_wrong_field_is_a_dash(quick: Path) -> None:
     metrics = json.loads((quick / "metrics.json").read_text(encoding="utf-8"))
     for key in metrics:
         for value in (..., None, "text", [], {}, [1], {"a": 1}, True, float("nan")):
-            (quick / "metrics.json").write_text(json.dumps({k: v for k, v in (metrics | {key: value}).items() if v is not ...}))
+            (quick / "metrics.json").write_text(
+                json.dumps({k: v for k, v in (metrics | {key: value}).items() if v is not ...})
+            )
             structure = Structure(page_of(quick))
-            if value is ... and key in ("psnr", "ssim", "primitives", "model_bytes", "render_fps", "seed", "versions", "device"):
+            if value is ... and key in (
+                "psnr",
+                "ssim",
+                "primitives",
+                "model_bytes",
+                "render_fps",
+                "seed",
+                "versions",
+                "device",
+            ):
                 assert structure.text.count("–") > dashes, key
 
 
@@ -291,7 +334,11 @@ def test_infinite_psnr(quick: Path) -> None:
 
 def test_views_worse_than_a_black_image_are_named_at_the_head(quick: Path) -> None:
     assert "black image" not in page_of(quick)
-    change(quick, worse_than_black_image=["cam_01_frame_0000", "<b>"], density_frames=[{"max_error": 0.25}, {"max_error": 0.5}])
+    change(
+        quick,
+        worse_than_black_image=["cam_01_frame_0000", "<b>"],
+        density_frames=[{"max_error": 0.25}, {"max_error": 0.5}],
+    )
     page = page_of(quick)
     head = page[: page.index("Curves")] if "Curves" in page else page
     assert "2 views are worse than a black image" in head and "cam_01_frame_0000, &lt;b&gt;" in head
@@ -319,11 +366,21 @@ def test_views_are_told_apart_by_index(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text("")
     folder = tmp_path / "renders"
     folder.mkdir()
-    for stem in ("test_010_a", "test_002_x_truth", "test_002_x_truth_truth", "test_002_x_truth_error", "test_1000_b", "test_note"):
+    for stem in (
+        "test_010_a",
+        "test_002_x_truth",
+        "test_002_x_truth_truth",
+        "test_002_x_truth_error",
+        "test_1000_b",
+        "test_note",
+    ):
         save(folder / f"{stem}.png", scene(4, 4, 0.0))
     views = read_run(tmp_path).views
     assert [(v.index, v.stem) for v in views] == [(2, "x_truth"), (10, "a"), (1000, "b")]
-    assert views[0].truth == folder / "test_002_x_truth_truth.png" and views[0].error == folder / "test_002_x_truth_error.png"
+    assert (
+        views[0].truth == folder / "test_002_x_truth_truth.png"
+        and views[0].error == folder / "test_002_x_truth_error.png"
+    )
     assert views[1].truth is None and views[1].error is None
     assert Structure(page_of(tmp_path)).text.count("no picture") == 4
 

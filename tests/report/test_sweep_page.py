@@ -16,7 +16,16 @@ from tests.browsers import browser
 
 def run(folder: Path, psnr: float, size: int, **more: object) -> None:
     (folder / "renders").mkdir(parents=True)
-    metrics = {"task": "static", "scene": "solids", "psnr": psnr, "ssim": 0.9, "model_bytes": size, "iterations": 10, "seed": 1, **more}
+    metrics = {
+        "task": "static",
+        "scene": "solids",
+        "psnr": psnr,
+        "ssim": 0.9,
+        "model_bytes": size,
+        "iterations": 10,
+        "seed": 1,
+        **more,
+    }
     (folder / "metrics.json").write_text(json.dumps(metrics))
     lines = [{"step": s, "seconds": s / 10, "eval_psnr": psnr - 10 + s} for s in (5, 10)]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -30,7 +39,17 @@ def sweep(folder: Path) -> Path:
     runs = []
     for name, (psnr, size) in numbers.items():
         run(folder / name, psnr, size, lpips=None if name == "small" else 0.1 + psnr / 100)
-        runs.append(Compared(name, {"model.primitives": str(size)}, "done", "", 2.0, 2 if name == "small" else 1, read_run(folder / name)))
+        runs.append(
+            Compared(
+                name,
+                {"model.primitives": str(size)},
+                "done",
+                "",
+                2.0,
+                2 if name == "small" else 1,
+                read_run(folder / name),
+            )
+        )
     runs.append(Compared("gone", {"model.primitives": "7"}, "failed", "no <images>", 0.1, 1, None))
     return write_sweep(folder, runs, ["task=static", "model.primitives=1,2"])
 
@@ -40,8 +59,14 @@ def test_it_stands_without_scripts_in_the_order_of_psnr(tmp_path: Path) -> None:
     names = ["&lt;best&gt;", "a&amp;b", "small", "gone"]
     places = [text.index(f'data-run="{name}"') for name in names]
     assert places == sorted(places)
-    assert '<td class="best" data-value="30.0">30.00 dB</td>' in text and '<td class="best" data-value="1000.0">1 kB</td>' in text
-    assert "neuprim run -m task=static model.primitives=1,2" in text and "<strong>gone failed:</strong> no &lt;images&gt;" in text
+    assert (
+        '<td class="best" data-value="30.0">30.00 dB</td>' in text
+        and '<td class="best" data-value="1000.0">1 kB</td>' in text
+    )
+    assert (
+        "neuprim run -m task=static model.primitives=1,2" in text
+        and "<strong>gone failed:</strong> no &lt;images&gt;" in text
+    )
     assert 'href="%3Cbest%3E/report.html"' in text and "started 2 times" in text
     assert text.count("<figure data-run=") == 3 and text.count("ground truth</figcaption>") == 1
     assert all(text.count(colour) >= 3 for colour in COLOURS[:3]), "in the table, the key and both charts"
@@ -51,7 +76,13 @@ def test_it_stands_without_scripts_in_the_order_of_psnr(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        *(("psnr", "more"), ("psnr_mask", "more"), ("lpips_3dgs", "less"), ("model_bytes", "less"), ("render_fps", "more")),
+        *(
+            ("psnr", "more"),
+            ("psnr_mask", "more"),
+            ("lpips_3dgs", "less"),
+            ("model_bytes", "less"),
+            ("render_fps", "more"),
+        ),
         *(("parameters_per_primitive", None), ("iterations", None), ("glow", None), ("psnrx", None)),
     ],
 )
@@ -84,7 +115,10 @@ def test_a_browser_sorts_and_ranks(tmp_path: Path) -> None:
         assert order("table.runs tbody tr") == ["<best>", "a&b", "small", "gone"]
         assert page.inner_text("#best") == "<best>: 30.00 dB"
         page.select_option("#metric", "model_bytes")
-        assert order("table.runs tbody tr") == ["small", "a&b", "<best>", "gone"] and page.inner_text("#best") == "small: 1 kB"
+        assert (
+            order("table.runs tbody tr") == ["small", "a&b", "<best>", "gone"]
+            and page.inner_text("#best") == "small: 1 kB"
+        )
         assert order(".pictures figure[data-run]") == ["small", "a&b", "<best>"]
         page.select_option("#metric", "lpips")
         assert order("table.runs tbody tr")[:2] == ["a&b", "<best>"], "less is better; those without come last"

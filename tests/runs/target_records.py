@@ -10,9 +10,21 @@ from neuprim.runs.target.record import Attempt, Purpose, Record, Turn
 
 
 def attempt(
-    count: int, steps: int, psnr: float, purpose: Purpose = "size", words: dict[str, int] | None = None, ms: float = 10.0
+    count: int,
+    steps: int,
+    psnr: float,
+    purpose: Purpose = "size",
+    words: dict[str, int] | None = None,
+    ms: float = 10.0,
 ) -> Attempt:
-    outcome: dict[str, Any] = {"psnr": psnr, "ssim": 0.9, "primitives": count, "steps": steps, "bytes": 1, "ms_per_frame": ms}
+    outcome: dict[str, Any] = {
+        "psnr": psnr,
+        "ssim": 0.9,
+        "primitives": count,
+        "steps": steps,
+        "bytes": 1,
+        "ms_per_frame": ms,
+    }
     return Attempt(purpose, words or {}, count, steps, outcome=outcome, packed=1000 + 20 * count)
 
 

@@ -14,19 +14,27 @@ from tests import kernels
 
 
 def test_what_is_compiled_is_what_training_needs() -> None:
-    """A run that waited for it finds on disk every kernel that training calls, for the types that training calls it with."""
+    """A run that waited for it finds on disk every kernel that training calls, for the types that training calls it
+    with."""
     ahead = kernels.compiled_by("from neuprim.runs import compile; compile.main('cpu')")
     training = "t = tiny.trainer(tiny.two_primitives(True), 4, population={'strategy': 'relocate', 'every': 2})"
     needed = kernels.compiled_by(f"from tests.core import tiny; {training}; assert len(list(t.run())) == 4")
     assert len(needed) > 8
-    missing = [f"{name}{types}" for name, signatures in needed.items() for types in signatures if types not in ahead.get(name, [])]
+    missing = [
+        f"{name}{types}"
+        for name, signatures in needed.items()
+        for types in signatures
+        if types not in ahead.get(name, [])
+    ]
     assert missing == []
 
 
 @pytest.mark.parametrize(("edge", "key"), [(0, "Tuple(())"), (2, "UniTuple(int64, 2)")])
 def test_only_the_edge_that_a_run_draws_is_compiled(edge: int, key: str) -> None:
     found = kernels.compiled_by(f"from neuprim.runs import compile; compile.main('cpu', {edge})")
-    tiles = [types for name, types in found.items() if name.endswith(("forward.composite_tiles", "backward.backward_tiles"))]
+    tiles = [
+        types for name, types in found.items() if name.endswith(("forward.composite_tiles", "backward.backward_tiles"))
+    ]
     assert len(tiles) == 2 and all(len(types) == 1 and types[0].endswith(f"{key})") for types in tiles)
 
 
@@ -64,7 +72,9 @@ def test_nothing_is_started_where_there_is_nothing_to_do(monkeypatch: pytest.Mon
 def test_the_process_ends_with_the_block(monkeypatch: pytest.MonkeyPatch) -> None:
     genuine = ahead.subprocess.Popen
     monkeypatch.setattr(ahead, "compiled", lambda *a: False)
-    monkeypatch.setattr(ahead.subprocess, "Popen", lambda *a, **k: genuine([sys.executable, "-c", "import time; time.sleep(60)"]))
+    monkeypatch.setattr(
+        ahead.subprocess, "Popen", lambda *a, **k: genuine([sys.executable, "-c", "import time; time.sleep(60)"])
+    )
     before = time.monotonic()
     with ahead.compiling("cpu") as started:
         assert started.running

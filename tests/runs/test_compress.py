@@ -52,10 +52,27 @@ def error_line(capsys: pytest.CaptureFixture[str]) -> str:
 # ---------------------------------------------------------------- what it writes and says
 
 
-def test_the_command_says_what_became_of_every_parameter(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_what_became_of_every_parameter(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "m.neuprim"
     assert (
-        main(["compress", str(whole), "--seconds", "0", "--level", "2", "--bits", "W1=12", "means=20", "sh_rest=9,7", "--out", str(out)])
+        main(
+            [
+                "compress",
+                str(whole),
+                "--seconds",
+                "0",
+                "--level",
+                "2",
+                "--bits",
+                "W1=12",
+                "means=20",
+                "sh_rest=9,7",
+                "--out",
+                str(out),
+            ]
+        )
         == 0
     )
     lines = capsys.readouterr().out.splitlines()
@@ -89,7 +106,9 @@ def test_levels_trade_bytes(whole: Path, tmp_path: Path) -> None:
 
 def test_a_run_without_its_data_is_compressed_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = tiny.write_blender(tmp_path / "two")
-    run = marked.write_run(tmp_path / "run", marked.static_model(), ["task=static", "scene=blender", f"scene.path='{scene}'"])
+    run = marked.write_run(
+        tmp_path / "run", marked.static_model(), ["task=static", "scene=blender", f"scene.path='{scene}'"]
+    )
     shutil.rmtree(scene)
     assert main(["compress", str(run), "--seconds", "0"]) == 0
     out = capsys.readouterr().out
@@ -114,7 +133,10 @@ def test_a_file_in_the_way_stays(whole: Path, tmp_path: Path, capsys: pytest.Cap
         (["--level", "9"], "--level 9: expected one of 1, 2, 3, 4, 5"),
         (["--level", "x"], "expected a positive count"),
         (["--tolerance", "0dB"], "expected decibels above 0, for example 0.1dB"),
-        (["--tolerance", "0.2", "--level", "3"], "--tolerance 0.2: decides the bits of every number; expected no --level beside it"),
+        (
+            ["--tolerance", "0.2", "--level", "3"],
+            "--tolerance 0.2: decides the bits of every number; expected no --level beside it",
+        ),
         (["--tolerance", "0.2dB", "--bits", "W1=3"], "expected no --bits beside it"),
         (["--bits", "sh=3"], "no parameter 'sh'; did you mean"),
         (["--bit", "W1=3"], "--bit: no such argument of `neuprim compress`; did you mean '--bits'"),
@@ -126,7 +148,8 @@ def test_wrong_words(whole: Path, capsys: pytest.CaptureFixture[str], more: list
 
 
 def test_the_best_of_both_is_read(whole: Path, tmp_path: Path) -> None:
-    """A run keeps its model; the compressed one stands in where it is gone, and the message names the usual one where both are."""
+    """A run keeps its model; the compressed one stands in where it is gone, and the message names the usual one where
+    both are."""
     run = tmp_path / "run"
     shutil.copytree(whole, run)
     compress_run(run, 5)
@@ -164,12 +187,16 @@ def test_training_views_decide_how_coarse_numbers_are(whole: Path, tmp_path: Pat
     assert all(found <= allowed + 1e-4 for allowed, found in zip(tolerances, lost, strict=True))
     sizes = [sum(parameter.after for parameter in m.parameters) for m in made]
     assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 0.9 * sizes[0]
-    assert all(m.steps == steps and any("every number's last bit is worth as much" in note for note in m.notes) for m in made)
+    assert all(
+        m.steps == steps and any("every number's last bit is worth as much" in note for note in m.notes) for m in made
+    )
     again = compress_run(whole, tolerance=tolerances[1], steps=steps, out=tmp_path / "again")
     assert again.file.read_bytes() == made[1].file.read_bytes()
 
 
-def test_a_tenth_of_a_decibel_unless_said_otherwise(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_tenth_of_a_decibel_unless_said_otherwise(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = [tmp_path / name for name in ("usual", "said")]
     assert main(["compress", str(whole), "--seconds", "0", "--out", str(out[0])]) == 0
     assert main(["compress", str(whole), "--seconds", "0", "--tolerance", "0.1dB", "--out", str(out[1])]) == 0
@@ -209,12 +236,19 @@ def test_export_of_a_volume_and_inspect(tmp_path: Path, capsys: pytest.CaptureFi
     compress_run(run, 1)
     (run / "model.safetensors").unlink()
     assert main(["export", str(run), "--format", "vdb", "grid=16", "--time", "0.5"]) == 0
-    assert main(["inspect", str(run), "--time", "0.5", "--grid", "8", "--show", "slices", "--out", str(tmp_path / "a.png")]) == 0
+    assert (
+        main(
+            ["inspect", str(run), "--time", "0.5", "--grid", "8", "--show", "slices", "--out", str(tmp_path / "a.png")]
+        )
+        == 0
+    )
     assert (tmp_path / "a.png").stat().st_size > 1000
     capsys.readouterr()
 
 
-def test_import_makes_a_run_directory_of_the_file_alone(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_import_makes_a_run_directory_of_the_file_alone(
+    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "sent by somebody"
     shutil.copyfile(small / "model.neuprim", file)
     assert main(["import", str(file), "--out", str(tmp_path / "run")]) == 0
@@ -235,7 +269,8 @@ def test_files_that_import_refuses(small: Path, tmp_path: Path) -> None:
         import_run(tmp_path / "bare.neuprim", tmp_path / "out")
     (tmp_path / "wrong.neuprim").write_bytes(b"something else")
     with pytest.raises(
-        ConfigError, match=r"no format reads \.neuprim files; expected one of `neuprim compress`, or of --format ply or npz"
+        ConfigError,
+        match=r"no format reads \.neuprim files; expected one of `neuprim compress`, or of --format ply or npz",
     ):
         import_run(tmp_path / "wrong.neuprim", tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -244,11 +279,15 @@ def test_files_that_import_refuses(small: Path, tmp_path: Path) -> None:
 def test_a_file_in_place_of_a_run_directory_says_what_to_do(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = small / "model.neuprim"
     assert main(["eval", str(file)]) == 2
-    assert f"{file}: no such run directory; `neuprim import {file} --out RUN_DIR` makes one of this file" in error_line(capsys)
+    assert f"{file}: no such run directory; `neuprim import {file} --out RUN_DIR` makes one of this file" in error_line(
+        capsys
+    )
 
 
 def test_the_header_is_the_run_s(small: Path, whole: Path) -> None:
-    assert checkpoint.read_header(small / "model.neuprim", "model") == checkpoint.read_header(whole / "model.safetensors", "model")
+    assert checkpoint.read_header(small / "model.neuprim", "model") == checkpoint.read_header(
+        whole / "model.safetensors", "model"
+    )
     assert json.loads(json.dumps(load_run(small)[3])) == load_run(whole)[3]
 
 
@@ -262,7 +301,9 @@ def test_the_command_trains_for_few_bits(whole: Path, tmp_path: Path, capsys: py
     assert main(["compress", str(whole), "--level", "5", "--steps", "60", "--out", str(out[1])]) == 0
     text = capsys.readouterr().out
     assert "with 60 steps of training" in text
-    measured = [compress_run(whole, level=5, steps=steps, out=tmp_path / f"m{steps}").measured["psnr"][1] for steps in (0, 60)]
+    measured = [
+        compress_run(whole, level=5, steps=steps, out=tmp_path / f"m{steps}").measured["psnr"][1] for steps in (0, 60)
+    ]
     assert measured[1] > measured[0]
     assert (tmp_path / "m60").read_bytes() == out[1].read_bytes()  # steps, not seconds: the same file
 

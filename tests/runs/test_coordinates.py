@@ -38,7 +38,13 @@ MESH = World(torch.tensor([[0.5, 0, 0, -5], [0, 0, -0.5, 2], [0, 0.5, 0, -1000],
 """As of a mesh with y up, twice as large as its scene."""
 WORLDS = pytest.mark.parametrize("world", [UTM, MESH], ids=["utm", "mesh"])
 LOOK = Camera(
-    look_at(torch.tensor([2.0, -3, 1.5]), torch.tensor([0.1, 0.1, 0.1]), torch.tensor([0.0, 0, 1])), 60.0, 60.0, 24.0, 18.0, 48, 36
+    look_at(torch.tensor([2.0, -3, 1.5]), torch.tensor([0.1, 0.1, 0.1]), torch.tensor([0.0, 0, 1])),
+    60.0,
+    60.0,
+    24.0,
+    18.0,
+    48,
+    36,
 )
 
 
@@ -50,7 +56,9 @@ def write_cameras(path: Path, *cameras: Camera) -> str:
     frames = []
     for camera in cameras:
         pose = torch.linalg.inv(camera.viewmat) @ torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
-        frames.append({"transform_matrix": pose.tolist(), "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy})
+        frames.append(
+            {"transform_matrix": pose.tolist(), "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        )
     path.write_text(json.dumps({"w": LOOK.width, "h": LOOK.height, "frames": frames}))
     return str(path)
 
@@ -75,11 +83,17 @@ def test_a_files_cameras_are_in_the_world_and_so_is_what_is_written_of_them(tmp_
 def test_empty_images_are_told_and_a_shot_of_them_fails(tmp_path: Path) -> None:
     run, said = run_in(tmp_path / "run", UTM), list[str]()
     up = torch.tensor([0.0, 0.0, 1.0])
-    away = UTM.world_camera(replace(LOOK, viewmat=look_at(torch.tensor([2.0, -3, 1.5]), torch.tensor([9.0, -9, 9]), up)))
+    away = UTM.world_camera(
+        replace(LOOK, viewmat=look_at(torch.tensor([2.0, -3, 1.5]), torch.tensor([9.0, -9, 9]), up))
+    )
     cameras = write_cameras(tmp_path / "c.json", UTM.world_camera(LOOK), away)
     files = render_run(run, cameras, None, "png", tmp_path / "out", 1, {}, tell=said.append)
-    assert len(files) == 2 and any("1 of 2 images are empty, first camera_001: the model is within (44824" in line for line in said)
-    with pytest.raises(DataError, match=r"all 1 images are empty: the model is within .* looks towards .*--space scene"):
+    assert len(files) == 2 and any(
+        "1 of 2 images are empty, first camera_001: the model is within (44824" in line for line in said
+    )
+    with pytest.raises(
+        DataError, match=r"all 1 images are empty: the model is within .* looks towards .*--space scene"
+    ):
         render_run(run, write_cameras(tmp_path / "scene.json", LOOK), None, "png", tmp_path / "none", 1, {})
     assert not list((tmp_path / "none").iterdir())
 
@@ -126,7 +140,10 @@ def test_boxes_and_volumes_of_inspect_are_in_the_world(tmp_path: Path) -> None:
     grid = read_grid(tmp_path / "v.vdb", "extinction")
     assert np.abs(np.stack(grid.world_bounds()).mean(0) - box.mean(0)).max() < 0.1  # type: ignore[arg-type]
     said = list[str]()
-    inspect_run(Request(run, grid=16, against=str(tmp_path / "v.vdb"), out=tmp_path / "w.vdb"), lambda event: said.append(str(event)))
+    inspect_run(
+        Request(run, grid=16, against=str(tmp_path / "v.vdb"), out=tmp_path / "w.vdb"),
+        lambda event: said.append(str(event)),
+    )
     assert any("correlation 1.0000" in line for line in said)
 
 
@@ -140,7 +157,9 @@ def test_a_light_and_a_path_are_written_and_read_in_the_world(tmp_path: Path) ->
     CameraPath([Key(Pose.of(LOOK), {})]).write(tmp_path / "path.json", (48, 36), UTM)
     run = run_in(tmp_path / "run", UTM)
     (file,) = render_run(run, str(tmp_path / "path.json"), None, "npy", tmp_path / "a.npy", 1, {})
-    (same,) = render_run(run, write_cameras(tmp_path / "c.json", UTM.world_camera(LOOK)), None, "npy", tmp_path / "b.npy", 1, {})
+    (same,) = render_run(
+        run, write_cameras(tmp_path / "c.json", UTM.world_camera(LOOK)), None, "npy", tmp_path / "b.npy", 1, {}
+    )
     assert np.abs(np.load(file) - np.load(same)).max() < 1e-4
 
 
@@ -150,9 +169,16 @@ def test_a_page_and_a_compressed_model_say_where_they_are(tmp_path: Path) -> Non
     assert json.dumps(UTM.to_json())[1:-1] in page.read_text()
     model, header = open_run(run).model, open_run(run).header
     checkpoint.save_compressed(
-        tmp_path / "m.neuprim", model, "static", checkpoint.extra_of(header), LEVELS[1], (run / "config.yaml").read_text()
+        tmp_path / "m.neuprim",
+        model,
+        "static",
+        checkpoint.extra_of(header),
+        LEVELS[1],
+        (run / "config.yaml").read_text(),
     )
-    assert torch.equal(open_run(import_run(tmp_path / "m.neuprim", tmp_path / "back")).world.scene_from_world, UTM.scene_from_world)
+    assert torch.equal(
+        open_run(import_run(tmp_path / "m.neuprim", tmp_path / "back")).world.scene_from_world, UTM.scene_from_world
+    )
 
 
 def test_colours_turn_with_the_axes() -> None:
@@ -160,7 +186,9 @@ def test_colours_turn_with_the_axes() -> None:
     colours = Harmonics(torch.randn(2, 3, generator=generator), torch.randn(2, 15, 3, generator=generator), 0.0)
     turn, directions, rows = MESH.rotation, sphere(20), torch.zeros(20, dtype=torch.int64)
     assert turn is not None
-    assert torch.allclose(colours.turned(turn).towards(rows, directions @ turn.T), colours.towards(rows, directions), atol=1e-9)
+    assert torch.allclose(
+        colours.turned(turn).towards(rows, directions @ turn.T), colours.towards(rows, directions), atol=1e-9
+    )
 
 
 def moved(folder: Path, to: Path, offset: tuple[float, ...]) -> Path:
@@ -186,6 +214,7 @@ def test_a_scene_in_utm_trains_as_at_the_origin_and_stays_where_it_was(tmp_path:
     assert checkpoint.read_header(runs[1] / "checkpoint.safetensors", "checkpoint")["world"] == world.to_json()
     moved(near, far, (448250.0, 5400000.0, 210.0))
     with pytest.raises(
-        CheckpointError, match=r"the scene's origin is \[448250.0, 5411930.0, 210.0\] of the data's files, and now \[448250.0, 54"
+        CheckpointError,
+        match=r"the scene's origin is \[448250.0, 5411930.0, 210.0\] of the data's files, and now \[448250.0, 54",
     ):
         fit([*words(far, runs[1], 80), "resume=true"])

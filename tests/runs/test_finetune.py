@@ -44,14 +44,20 @@ def test_rates_begin_above_those_of_the_run_s_end_and_fall_to_next_to_nothing(ru
     for _ in range(40):
         trainer.train_step()
     assert trainer.finished and trainer.rates()["b2"] == pytest.approx(COOL * LEAST_START * usual, rel=1e-6)
-    for steps, start in ((LONG, START), (3 * LONG, START), (2 * LONG // 3, 2 * START / 3)):  # of many steps they begin higher
+    for steps, start in (
+        (LONG, START),
+        (3 * LONG, START),
+        (2 * LONG // 3, 2 * START / 3),
+    ):  # of many steps they begin higher
         assert fine_tuner(config, task, dataset, model, steps).rates()["b2"] == pytest.approx(start * usual, rel=1e-3)
 
 
 def test_the_model_itself_stays_as_it_is_and_no_primitive_is_born_or_moved(run_dir: Path, dataset: Dataset) -> None:
     config, task, model, _ = load_run(run_dir)
     before = {name: value.clone() for name, value in model.params.items()}
-    eager = replace(config, train=replace(config.train, population=replace(config.train.population, every=1, start=0.0, stop=1.0)))
+    eager = replace(
+        config, train=replace(config.train, population=replace(config.train.population, every=1, start=0.0, stop=1.0))
+    )
     trainer = fine_tuner(eager, task, dataset, model, 30)
     changes = [trainer.train_step().change for _ in range(30)]
     assert set(changes) == {None} and trainer.model.count == model.count
@@ -63,7 +69,9 @@ def test_what_is_to_stay_zero_does_and_nothing_else(run_dir: Path, dataset: Data
     config, task, model, _ = load_run(run_dir)
     zero = torch.zeros_like(model.params["sh_rest"], dtype=torch.bool)
     zero[::2, 3:] = True
-    pruned = Primitives(model.density, model.colour, {**model.params, "sh_rest": model.params["sh_rest"].masked_fill(zero, 0.0)})
+    pruned = Primitives(
+        model.density, model.colour, {**model.params, "sh_rest": model.params["sh_rest"].masked_fill(zero, 0.0)}
+    )
     trainer = fine_tuner(config, task, dataset, pruned, 20)
     trainer.zeros = {"sh_rest": zero}
     for _ in range(20):
@@ -115,7 +123,9 @@ def test_a_tolerance_is_kept(run_dir: Path, dataset: Dataset, steps: int) -> Non
         assert torch.equal(fewer.model.params["W1"], folded(model).params["W1"]) == (steps == 0)
 
 
-def test_training_that_spoils_the_model_is_not_stored(run_dir: Path, dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_that_spoils_the_model_is_not_stored(
+    run_dir: Path, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config, task, model, _ = load_run(run_dir)
     plain = train_within(config, task, dataset, model, 0.2, 0.0, 0, lambda text, fraction: None)
     monkeypatch.setattr("neuprim.runs.finetune.LEAST_START", 300.0)

@@ -43,7 +43,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def words(files: Path, place: Path, *more: str) -> list[str]:
     scene = [f"scene.vdb='{files}'", "scene.look=smoke_fire", "scene.size=16", "scene.cameras=4", "scene.samples=1"]
-    return ["task=dynamic", "scene=vdb", *scene, f"scene.cache='{place / 'cache'}'", f"output_dir='{place / 'outputs' / 'run'}'", *more]
+    return [
+        "task=dynamic",
+        "scene=vdb",
+        *scene,
+        f"scene.cache='{place / 'cache'}'",
+        f"output_dir='{place / 'outputs' / 'run'}'",
+        *more,
+    ]
 
 
 def config(files: Path, place: Path, *more: str) -> RunConfig:
@@ -83,16 +90,22 @@ def test_a_killed_worker_loses_the_frame_it_was_at_and_a_slow_one_holds_up_nobod
     made(config(files, tmp_path), LauncherSettings("processes", 2), heard)
     begun = [line.split() for line in (tmp_path / "cache" / "begun.txt").read_text().splitlines()]
     times = Counter(int(number) for number, _ in begun)
-    assert times == Counter([*range(1, FRAMES + 1), truth_jobs.FATAL]), "what its job had finished before was not made again"
+    assert times == Counter([*range(1, FRAMES + 1), truth_jobs.FATAL]), (
+        "what its job had finished before was not made again"
+    )
     slow = next(pid for number, pid in begun if int(number) == truth_jobs.SLOW)
-    assert next(number for number, pid in begun if pid == slow) == str(truth_jobs.SLOW), "the others did all that was left meanwhile"
+    assert next(number for number, pid in begun if pid == slow) == str(truth_jobs.SLOW), (
+        "the others did all that was left meanwhile"
+    )
     assert contents(tmp_path) == alone, "the same bytes, and nothing half made"
     assert ["its worker died" in e.text for e in heard if isinstance(e, Note)] == [True]
     assert [e.fraction for e in heard if isinstance(e, Preparing)][-1] == 1.0
     assert [f.name for f in tmp_path.iterdir()] == ["cache"]
 
 
-def test_what_is_there_is_not_made_again(files: Path, tmp_path: Path, alone: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_there_is_not_made_again(
+    files: Path, tmp_path: Path, alone: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     import shutil
 
     truth = made(config(files, tmp_path))
@@ -100,7 +113,9 @@ def test_what_is_there_is_not_made_again(files: Path, tmp_path: Path, alone: dic
     shutil.rmtree(Path(truth.place) / "frame_00003")
     calls: list[int] = []
     genuine = capture.Capture.render
-    monkeypatch.setattr(capture.Capture, "render", lambda self, frame, to: calls.append(frame.number) or genuine(self, frame, to))
+    monkeypatch.setattr(
+        capture.Capture, "render", lambda self, frame, to: calls.append(frame.number) or genuine(self, frame, to)
+    )
     made(config(files, tmp_path))
     assert calls == [3] and contents(tmp_path) == alone
     assert all(f.stat().st_ino == inode for f, inode in before.items() if f.parent.name != "frame_00003")
@@ -134,7 +149,9 @@ def test_two_makers_at_once_and_a_job_that_is_done_twice(files: Path, tmp_path: 
     assert contents(tmp_path) == alone
 
 
-def test_a_full_disk_is_one_line_and_leaves_nothing_half_made(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_made(
+    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     genuine = capture.images.write_exr
 
     def write(path: Path, *args: Any, **more: Any) -> None:
@@ -155,7 +172,12 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_made(files: Path, tmp_p
 @posix
 @pytest.mark.parametrize("back", [True, False])
 def test_a_shared_folder_that_vanishes(
-    files: Path, tmp_path: Path, alone: dict[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], back: bool
+    files: Path,
+    tmp_path: Path,
+    alone: dict[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    back: bool,
 ) -> None:
     """Renamed away in the middle of a frame, and back or not."""
     monkeypatch.setattr(stores, "EVERY", 0.05)
@@ -180,7 +202,9 @@ def test_a_shared_folder_that_vanishes(
         assert main(["truth", *words(files, tmp_path)]) == 2
         place = cache / "volumes" / next((away / "volumes").iterdir()).name
         line = capsys.readouterr().err.splitlines()[-1]
-        assert line.startswith(f"neuprim: error: {place}: gone for 0 s while it was in use; expected the folder there again")
+        assert line.startswith(
+            f"neuprim: error: {place}: gone for 0 s while it was in use; expected the folder there again"
+        )
         assert not cache.exists(), "nothing is written in its place"
         assert sorted(f.name for f in (away / "volumes" / place.name).glob("frame*")) == ["frame_00001", "frame_00002"]
         return
@@ -201,7 +225,9 @@ def test_other_files_where_a_worker_is_are_refused(files: Path, tmp_path: Path) 
     truth = truth_of(there)
     assert truth is not None
     with pytest.raises(DataError, match=r"a worker sees another scene; expected the launcher's files there"):
-        ground_truth.make_frames({"config": there.to_dict(), "known": truth.known, "key": "0" * 16, "frames": [0]}, 0, lambda event: None)
+        ground_truth.make_frames(
+            {"config": there.to_dict(), "known": truth.known, "key": "0" * 16, "frames": [0]}, 0, lambda event: None
+        )
     ground_truth._kept.clear()
 
 
@@ -217,7 +243,9 @@ def test_runs_that_share_a_scene_wait_for_it_together_and_a_broken_one_holds_up_
             raise DataError("broken")
 
     monkeypatch.setattr(ground_truth, "make_truth", make)
-    configs = [config(files, tmp_path, f"scene.size={size}", f"model.primitives={n}") for size in (24, 16) for n in (10, 20)]
+    configs = [
+        config(files, tmp_path, f"scene.size={size}", f"model.primitives={n}") for size in (24, 16) for n in (10, 20)
+    ]
     heard: list[tuple[int, Status]] = []
     before_runs(configs, LauncherSettings("processes"), lambda number, status: heard.append((number, status)))
     assert [c.scene["size"] for c in asked] == [24, 16] and [n for n, _ in heard] == [0, 1, 2, 3]
@@ -225,7 +253,9 @@ def test_runs_that_share_a_scene_wait_for_it_together_and_a_broken_one_holds_up_
     before_runs(configs, INLINE, lambda number, status: pytest.fail("left to the runs"))
 
 
-def test_the_command_says_where_it_is_or_why_not(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_where_it_is_or_why_not(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["truth", *words(files, tmp_path, "scene.frames='1:2'")]) == 0
     out = capsys.readouterr().out.strip()
     assert sorted(f.name for f in Path(out).iterdir()) == ["frame_00001", "frame_00002", "scene.json"]

@@ -25,7 +25,9 @@ def test_a_second_one_is_refused_by_name_and_the_first_is_left_alone(tmp_path: P
             with pytest.raises(ConfigError) as error, held(tmp_path / "run", "sweep"):
                 pytest.fail("two at once")
             found = f"{tmp_path / 'run'}: process {os.getpid()} on {socket.gethostname()} (since "
-            assert str(error.value).startswith(found) and "is at work on this sweep; expected that to end first" in str(error.value)
+            assert str(error.value).startswith(found) and "is at work on this sweep; expected that to end first" in str(
+                error.value
+            )
         refused: list[str] = []
 
         def other() -> None:
@@ -74,7 +76,8 @@ def test_what_killed_writers_left_is_gone_and_what_others_write_stays(tmp_path: 
     run = tmp_path / "run"
     (run / "renders").mkdir(parents=True)
     writers = [
-        subprocess.Popen([sys.executable, "-c", script, str(run / name)]) for name in ("model.safetensors", "renders/a.png", "b.npz")
+        subprocess.Popen([sys.executable, "-c", script, str(run / name)])
+        for name in ("model.safetensors", "renders/a.png", "b.npz")
     ]
     draft = run / f".neuprim.{writers[0].pid}.abcd1234"
     draft.mkdir()

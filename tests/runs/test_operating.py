@@ -52,7 +52,9 @@ POINTS = st.builds(
     ),
     st.floats(1e-3, 1.0),
     st.dictionaries(st.just(("colour", "degree")), st.integers(0, 2)).flatmap(
-        lambda found: st.dictionaries(st.just(("density", "neurons")), st.sampled_from((3, 2, 1, 0))).map(lambda more: {**found, **more})
+        lambda found: st.dictionaries(st.just(("density", "neurons")), st.sampled_from((3, 2, 1, 0))).map(
+            lambda more: {**found, **more}
+        )
     ),
     st.dictionaries(st.sampled_from(storage.GROUPS), st.sampled_from(["float16", "uint8"])),
 )
@@ -77,13 +79,19 @@ def test_no_words_are_the_run(model: Primitives) -> None:
 @pytest.mark.parametrize(
     ("word", "text"),
     [
-        ("rendere.alpha_min=0", "rendere.alpha_min: nothing that a finished run is drawn by; did you mean 'renderer.alpha_min'"),
+        (
+            "rendere.alpha_min=0",
+            "rendere.alpha_min: nothing that a finished run is drawn by; did you mean 'renderer.alpha_min'",
+        ),
         ("renderer.alpha_mi=0", "renderer.alpha_mi: no such setting; did you mean 'renderer.alpha_min'"),
         ("renderer.alpha_min=2", "renderer.alpha_min=2: expected a number"),
         ("renderer.backend=cup", "renderer.backend=cup: expected auto"),
         ("resolution=0", "resolution=0: expected a factor above 0, at most 1"),
         ("resolution=1.5", "resolution=1.5: expected a factor above 0, at most 1"),
-        ("colour.degre=1", "colour.degre: nothing that SphericalHarmonics can do with less of; did you mean 'colour.degree'"),
+        (
+            "colour.degre=1",
+            "colour.degre: nothing that SphericalHarmonics can do with less of; did you mean 'colour.degree'",
+        ),
         ("colour.degree=3", "colour.degree=3: expected 2 or 1 or 0, less than the model has"),
         ("colour.degree=true", "colour.degree=True: expected 2 or 1 or 0"),
         ("density.neurons=5", "density.neurons=5: expected 3 or 2 or 1 or 0"),
@@ -91,7 +99,9 @@ def test_no_words_are_the_run(model: Primitives) -> None:
         ("store.means=float61", "store.means=float61: no such format; did you mean 'float16'"),
     ],
 )
-def test_wrong_words_are_one_line(word: str, text: str, model: Primitives, run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_words_are_one_line(
+    word: str, text: str, model: Primitives, run_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(ConfigError) as refused:
         read_point([word], RenderSettings(), model)
     assert str(refused.value).startswith(text) and "\n" not in str(refused.value)
@@ -120,7 +130,8 @@ def test_a_format_changes_its_group_alone(model: Primitives) -> None:
 
 
 def test_bytes_are_those_of_a_file_that_holds_it_so(model: Primitives, run_dir: Path, tmp_path: Path) -> None:
-    """Of 32-bit floats to the byte but for the header, whose text is shorter; a row of another format counts by its own rule."""
+    """Of 32-bit floats to the byte but for the header, whose text is shorter; a row of another format counts by its own
+    rule."""
     smaller = read_point(["colour.degree=1", "density.neurons=2"], RenderSettings(), model)
     reduced = smaller.applied(model)
     save_model(tmp_path / "m.safetensors", reduced, "static", {})
@@ -168,10 +179,13 @@ def test_resolution_is_drawn_small_and_enlarged(model: Primitives, run_dir: Path
     small = draw(model, replace(view, camera=view.camera.resized(12, 12)), config.renderer, dataset.background)
     image = half.draw(model, view, dataset.background)
     assert image.shape == (24, 24, 3)
-    expected = torch.nn.functional.interpolate(small.permute(2, 0, 1)[None], (24, 24), mode="bilinear")[0].permute(1, 2, 0)
+    expected = torch.nn.functional.interpolate(small.permute(2, 0, 1)[None], (24, 24), mode="bilinear")[0].permute(
+        1, 2, 0
+    )
     assert torch.equal(image, expected)
     assert torch.equal(
-        OperatingPoint(config.renderer).draw(model, view, dataset.background), draw(model, view, config.renderer, dataset.background)
+        OperatingPoint(config.renderer).draw(model, view, dataset.background),
+        draw(model, view, config.renderer, dataset.background),
     )
 
 

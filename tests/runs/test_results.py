@@ -65,7 +65,9 @@ def test_a_picture_of_the_report_is_replaced_only_where_that_is_said(
     assert main(["render", str(out), "--camera", "orbit", "--frames", "1", "--out", str(picture)]) == 2
 
 
-def test_a_full_disk_costs_a_checkpoint_and_not_the_training(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_costs_a_checkpoint_and_not_the_training(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(notices, "_said", set())
     failing, save_file = {3, 4}, checkpoint.save_file
     calls = 0
@@ -80,14 +82,18 @@ def test_a_full_disk_costs_a_checkpoint_and_not_the_training(scene: Path, tmp_pa
     monkeypatch.setattr(checkpoint, "save_file", full)
     said = ["train.checkpoint_every_seconds=0"]
     with pytest.warns(
-        NeuprimWarning, match=r"checkpoint\.safetensors: could not write .*No space left.*; training goes on from step 2 to the next"
+        NeuprimWarning,
+        match=r"checkpoint\.safetensors: could not write .*No space left.*; training goes on from step 2 to the next",
     ):
         out = fit(words(scene, tmp_path / "run", 6, *said))
     assert read_metrics(out)["iterations"] == 6
     failing = set(range(10**3))
     monkeypatch.setattr(notices, "_said", set())
     calls = 0
-    with pytest.warns(NeuprimWarning), pytest.raises(CheckpointError, match=r"last/checkpoint\.safetensors: could not write"):
+    with (
+        pytest.warns(NeuprimWarning),
+        pytest.raises(CheckpointError, match=r"last/checkpoint\.safetensors: could not write"),
+    ):
         fit(words(scene, tmp_path / "last", 3, *said))
 
 

@@ -72,9 +72,15 @@ def assert_same_run(a: Path, b: Path) -> None:
 
 
 def test_contents(whole: Path) -> None:
-    assert {"config.yaml", "model.safetensors", "checkpoint.safetensors", "metrics.jsonl", "metrics.json", "renders", "report.html"} <= {
-        p.name for p in whole.iterdir()
-    }
+    assert {
+        "config.yaml",
+        "model.safetensors",
+        "checkpoint.safetensors",
+        "metrics.jsonl",
+        "metrics.json",
+        "renders",
+        "report.html",
+    } <= {p.name for p in whole.iterdir()}
     assert not list(whole.rglob("*.tmp"))
     pictures = sorted(p.name for p in (whole / "renders").iterdir())
     assert "orbit.webp" in pictures
@@ -91,7 +97,12 @@ def test_metrics(whole: Path, scene: Path) -> None:
         "backend device checkpoint downsampling background data_source seed versions"
     )
     assert set(asked.split()) <= metrics.keys()
-    assert (metrics["task"], metrics["scene"], metrics["split"], metrics["checkpoint"]) == ("static", "blender", "test", "last")
+    assert (metrics["task"], metrics["scene"], metrics["split"], metrics["checkpoint"]) == (
+        "static",
+        "blender",
+        "test",
+        "last",
+    )
     assert metrics["primitives"] == 40 and metrics["parameters_per_primitive"] == 10 + 22 + 48
     assert metrics["parameters"] == 40 * 80
     assert metrics["model_bytes"] == (whole / "model.safetensors").stat().st_size > 40 * 79 * 4
@@ -106,13 +117,22 @@ def test_metrics(whole: Path, scene: Path) -> None:
 
 
 def test_what_nobody_gave_weights_for_is_not_measured(whole: Path, scene: Path, tmp_path: Path) -> None:
-    """A missing LPIPS says so, in metrics.json and in the report; with weights it is measured from disk, or where a run names them."""
+    """A missing LPIPS says so, in metrics.json and in the report; with weights it is measured from disk, or where a run
+    names them."""
     metrics = read_metrics(whole)
-    assert metrics["lpips"] is None and metrics["not_measured"]["lpips"].startswith("no weights were given (metrics.lpips=FILE")
+    assert metrics["lpips"] is None and metrics["not_measured"]["lpips"].startswith(
+        "no weights were given (metrics.lpips=FILE"
+    )
     assert all("lpips" not in view for view in metrics["per_view"])
     assert "not measured: no weights were given" in (whole / "report.html").read_text()
-    assert metrics["ssim_3dgs"] == pytest.approx(sum(v["ssim_3dgs"] for v in metrics["per_view"]) / 2) and 0.1 < metrics["ssim_3dgs"] < 1
-    assert metrics["ssim_3dgs"] != metrics["ssim"] and f"{metrics['ssim_3dgs']:,.4f}" in (whole / "report.html").read_text()
+    assert (
+        metrics["ssim_3dgs"] == pytest.approx(sum(v["ssim_3dgs"] for v in metrics["per_view"]) / 2)
+        and 0.1 < metrics["ssim_3dgs"] < 1
+    )
+    assert (
+        metrics["ssim_3dgs"] != metrics["ssim"]
+        and f"{metrics['ssim_3dgs']:,.4f}" in (whole / "report.html").read_text()
+    )
 
     vgg = written(tmp_path, weights("vgg"))
     found = evaluate_run(whole, vgg)
@@ -122,14 +142,19 @@ def test_what_nobody_gave_weights_for_is_not_measured(whole: Path, scene: Path, 
 
     alex = written(tmp_path, weights("alex"))
     found = evaluate_run(whole, alex)
-    assert found["lpips"] is None and found["not_measured"] == {"lpips": "some view is lower or narrower than 31 pixels"}
+    assert found["lpips"] is None and found["not_measured"] == {
+        "lpips": "some view is lower or narrower than 31 pixels"
+    }
     with pytest.raises(DataError, match=r"absent[.]pth: cannot be read"):
         fit(words(scene, tmp_path / "early", 10**6, f"metrics.lpips={tmp_path / 'absent.pth'}"))  # before any training
     assert not (tmp_path / "early").exists()
 
     vgg = written(tmp_path, weights("vgg"))
     out = fit(words(scene, tmp_path / "with", 10, f"metrics.lpips={vgg}"))
-    assert read_metrics(out)["lpips"] == evaluate_run(out)["lpips"] > 0 and "vgg, mean over views" in (out / "report.html").read_text()
+    assert (
+        read_metrics(out)["lpips"] == evaluate_run(out)["lpips"] > 0
+        and "vgg, mean over views" in (out / "report.html").read_text()
+    )
 
 
 def test_curve(whole: Path) -> None:
@@ -173,12 +198,16 @@ def test_the_near_plane_of_a_run_is_recorded_once(scene: Path, tmp_path: Path) -
 
 def test_a_perfect_view_leaves_the_curve_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = tiny.two_primitives()
-    monkeypatch.setattr("neuprim.runs.curve.draw", lambda model, view, settings, background: dataset.test.pixels(0).over(background))
+    monkeypatch.setattr(
+        "neuprim.runs.curve.draw", lambda model, view, settings, background: dataset.test.pixels(0).over(background)
+    )
     dataset.test.images = [dataset.test.images[0]] * 2  # type: ignore[attr-defined]
     assert curve_psnr(tiny.trainer(dataset, 3)) == 200.0
 
 
-def test_a_task_may_judge_views_and_make_films_and_tell_facts(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_task_may_judge_views_and_make_films_and_tell_facts(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def judge(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
         return {"index": float(index), "mse_part": 0.1 if index else 0.2, "pixels_part": 3.0 if index == 0 else 1.0}
 
@@ -197,7 +226,10 @@ def test_a_task_may_judge_views_and_make_films_and_tell_facts(scene: Path, tmp_p
     count = len(metrics["per_view"])
     assert metrics["index"] == (count - 1) / 2 and [v["index"] for v in metrics["per_view"]] == list(range(count))
     pooled = (3 * 0.2 + (count - 1) * 0.1) / (3 + count - 1)
-    assert metrics["psnr_pooled_part"] == pytest.approx(-10 * math.log10(pooled)) and metrics["pixels_part"] == 3 + count - 1
+    assert (
+        metrics["psnr_pooled_part"] == pytest.approx(-10 * math.log10(pooled))
+        and metrics["pixels_part"] == 3 + count - 1
+    )
     assert "per_frame" not in metrics
     assert metrics["counted"] == [metrics["primitives"], 3]
     assert all(math.isfinite(view["psnr_mask"] + view["mse_mask"]) for view in metrics["per_view"])
@@ -243,7 +275,13 @@ def test_render_orbit_test_and_file(whole: Path, tmp_path: Path) -> None:
 
     cameras = tmp_path / "cameras.json"
     cameras.write_text(
-        json.dumps({**json.loads((Path(RunConfig.from_yaml(whole).scene["path"]) / "transforms_test.json").read_text()), "w": 18, "h": 14})
+        json.dumps(
+            {
+                **json.loads((Path(RunConfig.from_yaml(whole).scene["path"]) / "transforms_test.json").read_text()),
+                "w": 18,
+                "h": 14,
+            }
+        )
     )
     paths = render_run(whole, str(cameras), None, "png", None, 60, {})
     assert [Image.open(p).size for p in paths] == [(18, 14)] * 2
@@ -257,11 +295,14 @@ def test_render_orbit_test_and_file(whole: Path, tmp_path: Path) -> None:
 
 
 def start(overrides: list[str]) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-m", "neuprim", "run", *overrides], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(
+        [sys.executable, "-m", "neuprim", "run", *overrides], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
 
 
 def wait_for_step(process: subprocess.Popen[bytes], run_dir: Path, step: int) -> None:
-    """Until the checkpoint on disk has reached ``step``. Every state of the file that can be seen meanwhile is whole."""
+    """Until the checkpoint on disk has reached ``step``. Every state of the file that can be seen meanwhile is
+    whole."""
     seen, snapshot = run_dir / "checkpoint.safetensors", run_dir.with_name("snapshot.safetensors")
     end = time.monotonic() + 120
     while time.monotonic() < end:
@@ -280,7 +321,11 @@ def test_killed_and_resumed_is_the_uninterrupted_run(scene: Path, whole: Path, t
     more = (
         []
         if strategy == "relocate"
-        else ["train.population.strategy=gradient", "train.population.prune_threshold=0", "train.population.max_primitives=60"]
+        else [
+            "train.population.strategy=gradient",
+            "train.population.prune_threshold=0",
+            "train.population.max_primitives=60",
+        ]
     )
     expected = whole if not more else fit(words(scene, tmp_path / "expected", STEPS, *more))
     out = tmp_path / "killed"
@@ -294,7 +339,9 @@ def test_killed_and_resumed_is_the_uninterrupted_run(scene: Path, whole: Path, t
     stopped = checkpoint.read_header(out / "checkpoint.safetensors", "checkpoint")["step"]
     assert 75 <= stopped < STEPS and not (out / "metrics.json").exists()
 
-    done = subprocess.run([sys.executable, "-m", "neuprim", "run", *overrides, "resume=true"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "neuprim", "run", *overrides, "resume=true"], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert f"resumed at step {stopped}" in done.stderr
     assert_same_run(expected, out)

@@ -1,4 +1,5 @@
-"""Views as layers of one file: linear light that adds up, numbers that are as they were drawn, and a header that says what is what."""
+"""Views as layers of one file: linear light that adds up, numbers that are as they were drawn, and a header that says
+what is what."""
 
 from __future__ import annotations
 
@@ -68,7 +69,12 @@ def drawn(model: Primitives, view: View, background: Tensor | None = None) -> An
 def test_every_layer_of_a_volume_is_the_references(tmp_path: Path) -> None:
     found, _ = written(tmp_path / "a.exr", layers(), volume(), VIEW)
     expected = drawn(volume(), VIEW)
-    assert set(found) == {*"RGBA", "depth.Z", "density.Y", *(f"{n}.{c}" for n in ("emission", "absorption") for c in "RGB")}
+    assert set(found) == {
+        *"RGBA",
+        "depth.Z",
+        "density.Y",
+        *(f"{n}.{c}" for n in ("emission", "absorption") for c in "RGB"),
+    }
     assert all(plane.dtype == torch.float32 for plane in found.values())
     assert (rgb(found) - expected.rgb).abs().max() < 1e-5 and (found["A"] - expected.alpha).abs().max() < 1e-5
     assert (found["depth.Z"] - expected.depth).abs().max() < 1e-3
@@ -108,7 +114,9 @@ def test_the_header_says_camera_conditions_and_meaning(tmp_path: Path) -> None:
     points = torch.tensor([[0.2, -0.1, 0.3]], dtype=torch.float64)
     row = np.append(points[0].numpy(), 1.0) @ header["worldToNDC"]
     assert np.abs(row[:2] / row[3] * (20, 16) - CAMERA.project(points)[0][0].numpy()).max() < 1e-4
-    assert header["neuprim:condition:time"] == pytest.approx(0.4) and header["neuprim:near"] == pytest.approx(REFERENCE.near)
+    assert header["neuprim:condition:time"] == pytest.approx(0.4) and header["neuprim:near"] == pytest.approx(
+        REFERENCE.near
+    )
     assert (header["neuprim:run"], header["neuprim:task"], header["neuprim:view"]) == ("fire", "dynamic", "a view")
     assert header["software"].startswith("neuprim ") and "camera z" in header["neuprim:layer:depth"]
     assert np.allclose(header["chromaticities"], (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329))
@@ -123,7 +131,10 @@ def test_lights_apart_add_up_to_the_beauty(tmp_path: Path) -> None:
     assert (sum(apart) - rgb(found)).abs().max() < 1e-5 and min(image.max() for image in apart) > 0.05  # type: ignore[arg-type]
     for image, one in zip(apart, lights, strict=True):
         assert (image - drawn(model, replace(VIEW, conditions=one)).rgb).abs().max() < 1e-5
-    assert np.array_equal(header["neuprim:light_001:light"], np.float32([-2, 0, 1])) and "neuprim:condition:light" not in header
+    assert (
+        np.array_equal(header["neuprim:light_001:light"], np.float32([-2, 0, 1]))
+        and "neuprim:condition:light" not in header
+    )
     whole = draw_sum(model, replace(VIEW, conditions={}), lights, RenderSettings(), BLUE)
     over, _ = written(tmp_path / "b.exr", replace(how, names="beauty"), model, replace(VIEW, conditions={}))
     assert (rgb(over) - whole).abs().max() < 1e-5
@@ -152,13 +163,29 @@ def test_layers_of_others_in_any_channels(tmp_path: Path) -> None:
     def twice(frame: Any) -> Tensor:
         return frame.seen(Constant(2 * frame.lowered.colour.flat))
 
-    own = (LayerSpec("twice", "twice the light", twice), LayerSpec("where", "mean position", lambda f: f.drawn.rgb[..., :2], ("X", "Y")))
+    own = (
+        LayerSpec("twice", "twice the light", twice),
+        LayerSpec("where", "mean position", lambda f: f.drawn.rgb[..., :2], ("X", "Y")),
+    )
     bands = Channels(("450nm", "550nm", "NIR"), "linear")
-    found, header = written(tmp_path / "a.exr", layers(channels=bands, task=replace(DYNAMIC, layers=own)), volume(), VIEW)
-    assert set(found) == {*bands.names, "A", "depth.Z", "density.Y", *(f"twice.{c}" for c in bands.names), "where.X", "where.Y"}
+    found, header = written(
+        tmp_path / "a.exr", layers(channels=bands, task=replace(DYNAMIC, layers=own)), volume(), VIEW
+    )
+    assert set(found) == {
+        *bands.names,
+        "A",
+        "depth.Z",
+        "density.Y",
+        *(f"twice.{c}" for c in bands.names),
+        "where.X",
+        "where.Y",
+    }
     assert (found["twice.NIR"] - 2 * found["NIR"]).abs().max() < 1e-6 and "chromaticities" not in header
     for draw, words in (
-        (lambda f: f.drawn.alpha, r"twice is torch.float32 of shape \(16, 20\); expected floats of shape \(16, 20, 3\)"),
+        (
+            lambda f: f.drawn.alpha,
+            r"twice is torch.float32 of shape \(16, 20\); expected floats of shape \(16, 20, 3\)",
+        ),
         (lambda f: f.drawn.rgb / 0, "twice has .* NaN or infinite values"),
         (lambda f: 3, "twice is a int; expected floats"),
     ):

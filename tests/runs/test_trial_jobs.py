@@ -30,7 +30,11 @@ def test_the_same_outcomes_as_here(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     told: list[float] = []
     first, second = launched_trials([[there], [gone]], processes(), tmp_path, told.append)
     expected = run_trial(here)
-    assert isinstance(first, list) and (first[0].psnr, first[0].ssim, first[0].bytes) == (expected.psnr, expected.ssim, expected.bytes)
+    assert isinstance(first, list) and (first[0].psnr, first[0].ssim, first[0].bytes) == (
+        expected.psnr,
+        expected.ssim,
+        expected.bytes,
+    )
     assert isinstance(second, TrialFailed) and "nowhere" in str(second)
     assert told == sorted(told) and told[-1] == 1.0
     assert isinstance(first[0], Outcome) and not (tmp_path / "launch").exists()
@@ -48,6 +52,8 @@ def test_the_same_outcomes_as_here(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         (LauncherSettings("slurm"), (8, 1)),
     ],
 )
-def test_how_many_a_search_counts_on(settings: LauncherSettings, expected: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_how_many_a_search_counts_on(
+    settings: LauncherSettings, expected: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("neuprim.runs.launch.share.machine_cores", lambda: 8)
     assert at_once(settings, 100) == expected

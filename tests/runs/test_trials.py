@@ -62,23 +62,30 @@ def test_a_trial_is_a_run_without_report_and_pictures(done: tuple[Path, Outcome]
 def test_an_outcome_is_what_evaluating_the_folder_measures(done: tuple[Path, Outcome]) -> None:
     folder, outcome = done
     metrics = evaluate_run(folder)
-    assert outcome.psnr == pytest.approx(metrics["psnr"], abs=1e-9) and outcome.ssim == pytest.approx(metrics["ssim"], abs=1e-9)
+    assert outcome.psnr == pytest.approx(metrics["psnr"], abs=1e-9) and outcome.ssim == pytest.approx(
+        metrics["ssim"], abs=1e-9
+    )
     assert outcome.primitives == 40 and outcome.parameters_per_primitive == metrics["parameters_per_primitive"]
     assert outcome.bytes == (folder / "model.safetensors").stat().st_size and outcome.steps == STEPS
     assert outcome.seconds > 0 and outcome.ms_per_frame > 0
-    assert [progress for progress, _ in outcome.curve] == [0.25, 0.5, 0.75, 1.0] and outcome.curve[-1][1] == pytest.approx(
-        outcome.psnr, abs=1e-3
-    )
+    assert [progress for progress, _ in outcome.curve] == [0.25, 0.5, 0.75, 1.0] and outcome.curve[-1][
+        1
+    ] == pytest.approx(outcome.psnr, abs=1e-3)
     assert Outcome.from_dict(json.loads(json.dumps(outcome.to_dict()))) == outcome == read_outcome(folder)
     perfect = replace(outcome, psnr=float("inf"))
     assert Outcome.from_dict(json.loads(json.dumps(perfect.to_dict(), allow_nan=False))) == perfect
 
 
-def test_what_is_done_is_read_back_and_nothing_is_loaded(done: tuple[Path, Outcome], scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_done_is_read_back_and_nothing_is_loaded(
+    done: tuple[Path, Outcome], scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder, outcome = done
     monkeypatch.setattr("neuprim.runs.fit.load_dataset", lambda *args: pytest.fail("loaded"))
     before = (folder / "checkpoint.safetensors").stat().st_mtime_ns
-    assert run_trial(Trial(config_of(scene, folder))) == outcome and (folder / "checkpoint.safetensors").stat().st_mtime_ns == before
+    assert (
+        run_trial(Trial(config_of(scene, folder))) == outcome
+        and (folder / "checkpoint.safetensors").stat().st_mtime_ns == before
+    )
 
 
 def test_other_settings_are_trained_anew_and_said(scene: Path, tmp_path: Path) -> None:
@@ -90,7 +97,9 @@ def test_other_settings_are_trained_anew_and_said(scene: Path, tmp_path: Path) -
     assert second.parameters_per_primitive < first.parameters_per_primitive
     heard.clear()
     run_trial(Trial(config_of(scene, folder, "model.neurons=0"), hold_out=3), events=heard.append)
-    assert any("another hold_out" in event.text for event in heard if isinstance(event, Note)) and steps_of(heard) == STEPS
+    assert (
+        any("another hold_out" in event.text for event in heard if isinstance(event, Note)) and steps_of(heard) == STEPS
+    )
 
 
 def test_other_views_are_measured_and_not_trained_for(scene: Path, tmp_path: Path) -> None:
@@ -99,7 +108,10 @@ def test_other_views_are_measured_and_not_trained_for(scene: Path, tmp_path: Pat
     one = run_trial(Trial(config_of(scene, folder), views=1), events=heard.append)
     metrics = evaluate_run(folder)
     assert (
-        steps_of(heard) == 0 and one.psnr == pytest.approx(metrics["per_view"][0]["psnr"]) and one.psnr != both.psnr and one.steps == STEPS
+        steps_of(heard) == 0
+        and one.psnr == pytest.approx(metrics["per_view"][0]["psnr"])
+        and one.psnr != both.psnr
+        and one.steps == STEPS
     )
 
 
@@ -119,13 +131,21 @@ def test_views_that_judge_are_not_learned_from(scene: Path, tmp_path: Path) -> N
     assert outcome.psnr != pytest.approx(fitted.metrics()["psnr"], abs=1e-6), "the test views do not judge"
 
 
-def test_a_task_that_knows_its_test_views_is_not_asked_about_others(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_task_that_knows_its_test_views_is_not_asked_about_others(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Films and facts are those of the data as they came; indices of the test split would mean other views."""
     from neuprim.core.data import Clip
 
-    mine = replace(TASK, clips=lambda dataset: [Clip("all", [0, 1])], judge=lambda dataset, index, rendered, truth: pytest.fail("asked"))
+    mine = replace(
+        TASK,
+        clips=lambda dataset: [Clip("all", [0, 1])],
+        judge=lambda dataset, index, rendered, truth: pytest.fail("asked"),
+    )
     monkeypatch.setattr("neuprim.tasks.static.TASK", mine)
-    assert run_trial(Trial(config_of(scene, tmp_path / "t"), hold_out=6)).psnr > 5, "one view is held out, and the film has two"
+    assert run_trial(Trial(config_of(scene, tmp_path / "t"), hold_out=6)).psnr > 5, (
+        "one view is held out, and the film has two"
+    )
 
 
 class Halting(Trainer):
@@ -146,7 +166,10 @@ def test_interrupted_it_goes_on_to_the_same_end(
     with pytest.raises(KeyboardInterrupt):
         run_trial(Trial(config_of(scene, folder)))
     monkeypatch.undo()
-    assert checkpoint.read_header(folder / "checkpoint.safetensors", "checkpoint")["step"] == 16 and read_outcome(folder) is None
+    assert (
+        checkpoint.read_header(folder / "checkpoint.safetensors", "checkpoint")["step"] == 16
+        and read_outcome(folder) is None
+    )
     outcome = run_trial(Trial(config_of(scene, folder)), events=heard.append)
     assert steps_of(heard) == STEPS - 16 and outcome.psnr == done[1].psnr and len(outcome.curve) == 4
     assert (folder / "model.safetensors").read_bytes() != b"" and outcome.steps == STEPS
@@ -161,7 +184,9 @@ def test_a_run_that_is_no_trial_is_left_alone(scene: Path, tmp_path: Path) -> No
     assert (folder / "config.yaml").read_text() == "mine" and len(list(folder.iterdir())) == 1
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"format": 1}', '{"format": 9, "asked": {}, "views": 8, "outcome": null}'])
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"format": 1}', '{"format": 9, "asked": {}, "views": 8, "outcome": null}']
+)
 def test_a_damaged_record_is_refused(scene: Path, tmp_path: Path, text: str) -> None:
     (tmp_path / FILE).write_text(text)
     with pytest.raises(DataError, match=r"trial\.json: .*delete its folder to train anew"):

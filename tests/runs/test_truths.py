@@ -12,7 +12,8 @@ from tests.core import tiny
 
 
 @pytest.mark.parametrize(
-    ("asked", "found"), [(2, ["v0", "v3"]), (3, ["v0", "v2", "v4"]), (6, [f"v{i}" for i in range(6)]), (9, [f"v{i}" for i in range(6)])]
+    ("asked", "found"),
+    [(2, ["v0", "v3"]), (3, ["v0", "v2", "v4"]), (6, [f"v{i}" for i in range(6)]), (9, [f"v{i}" for i in range(6)])],
 )
 def test_evenly_spread_and_all_where_more_are_asked_for(asked: int, found: list[str]) -> None:
     dataset = tiny.two_primitives()

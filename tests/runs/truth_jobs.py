@@ -32,7 +32,8 @@ def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
         if frame.number == SLOW:
             late = time.monotonic() + 60
             while (
-                len({line.split()[0] for line in log.read_text(encoding="utf-8").splitlines()}) < data["wait"] and time.monotonic() < late
+                len({line.split()[0] for line in log.read_text(encoding="utf-8").splitlines()}) < data["wait"]
+                and time.monotonic() < late
             ):
                 time.sleep(0.05)  # until somebody has begun all of the others
         if frame.number == FATAL and attempt == 0:

@@ -1,4 +1,5 @@
-"""What every generated scene gets: files in the cache that are there whole or not at all, drawn in threads, described in transforms."""
+"""What every generated scene gets: files in the cache that are there whole or not at all, drawn in threads, described
+in transforms."""
 
 from __future__ import annotations
 

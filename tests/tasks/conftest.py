@@ -26,7 +26,9 @@ class Scenes:
     mark = np.array([0.21, -0.13, 0.34])
 
     @staticmethod
-    def opengl_pose(eye: tuple[float, float, float], target: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    def opengl_pose(
+        eye: tuple[float, float, float], target: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> np.ndarray:
         """(4, 4) camera-to-world: columns right, up, backward, position."""
         position = np.array(eye, float)
         back = position - np.array(target, float)
@@ -40,7 +42,9 @@ class Scenes:
     @staticmethod
     def ring(count: int, radius: float = 3.0) -> list[np.ndarray]:
         angles = 2 * np.pi * np.arange(count) / count + 0.3
-        return [Scenes.opengl_pose((radius * np.cos(a), radius * np.sin(a), 0.4 * radius * np.sin(3 * a))) for a in angles]
+        return [
+            Scenes.opengl_pose((radius * np.cos(a), radius * np.sin(a), 0.4 * radius * np.sin(3 * a))) for a in angles
+        ]
 
     @staticmethod
     def direction(pose: np.ndarray, point: np.ndarray) -> tuple[float, float]:
@@ -94,7 +98,14 @@ class Scenes:
     @staticmethod
     def fitted(scene: str, path: Path, out: Path) -> dict[str, Any]:
         """Metrics of a short run, from data to report, that has learned something: its loss has fallen by half."""
-        words = ["task=static", f"scene={scene}", f"scene.path={path}", f"output_dir={out}", "model.primitives=60", "model.neurons=4"]
+        words = [
+            "task=static",
+            f"scene={scene}",
+            f"scene.path={path}",
+            f"output_dir={out}",
+            "model.primitives=60",
+            "model.neurons=4",
+        ]
         run(compose([*words, "train.iterations=150", "train.max_seconds=null", "train.population.every=20"]))
         assert (out / "report.html").exists()
         losses = [json.loads(line)["loss"] for line in (out / "metrics.jsonl").read_text().splitlines()]

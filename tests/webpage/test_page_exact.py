@@ -1,4 +1,5 @@
-"""Pages draw what the float64 reference draws: every field, near and far, cut and inside. Read back from headless Chromium as numbers."""
+"""Pages draw what the float64 reference draws: every field, near and far, cut and inside. Read back from headless
+Chromium as numbers."""
 
 from __future__ import annotations
 
@@ -31,13 +32,22 @@ EYES = ((0.3, -3.0, 1.0), (2.0, 2.0, -1.5), (-0.4, 0.2, 0.1))
 """Two from outside, one among the primitives."""
 
 
-def error(tab: Tab, model: Primitives, camera: Camera, conditions: dict[str, torch.Tensor], settings: RenderSettings = SETTINGS) -> float:
+def error(
+    tab: Tab,
+    model: Primitives,
+    camera: Camera,
+    conditions: dict[str, torch.Tensor],
+    settings: RenderSettings = SETTINGS,
+) -> float:
     """Largest difference of colours and transmittances from the reference backend."""
     with torch.no_grad():
         truth = render(model, camera, conditions, replace(settings, backend="reference"))
     found = tab.numbers(camera, conditions)
     assert float(truth.alpha.max()) > 0.3
-    wrong = max(np.abs(found[..., :3] - truth.rgb.double().numpy()).max(), np.abs(1 - found[..., 3] - truth.alpha.double().numpy()).max())
+    wrong = max(
+        np.abs(found[..., :3] - truth.rgb.double().numpy()).max(),
+        np.abs(1 - found[..., 3] - truth.alpha.double().numpy()).max(),
+    )
     return float(wrong)
 
 
@@ -92,7 +102,9 @@ def test_dynamic_models(time: str, colour: TimeHarmonics, chromium: Any, tmp_pat
 @pytest.mark.parametrize("count", [0, 60])
 def test_a_start_at_which_nothing_is_active(count: int, chromium: Any, tmp_path: Path) -> None:
     """The page is empty there, and right at other times; empty throughout without primitives."""
-    model = random_model(TimeDensity(3, "window+motion", edge=2, gain=True), TimeHarmonics(1, powers=2, waves=0), count=count)
+    model = random_model(
+        TimeDensity(3, "window+motion", edge=2, gain=True), TimeHarmonics(1, powers=2, waves=0), count=count
+    )
     model.params["log_window"].fill_(math.log(0.05))
     model.params["window_center"].fill_(0.8)
     for level, views in ((0, []), (1, [PageView("first", camera_at(EYES[0]), {"time": torch.tensor(0.1)})])):
@@ -102,7 +114,10 @@ def test_a_start_at_which_nothing_is_active(count: int, chromium: Any, tmp_path:
             for moment in (0.1, 0.8, 0.0):
                 found = tab.numbers(camera_at(EYES[0]), {"time": torch.tensor(moment, dtype=torch.float64)})
                 if moment == 0.8 and count:
-                    assert error(tab, held, camera_at(EYES[0]), {"time": torch.tensor(moment, dtype=torch.float64)}) < ERROR
+                    assert (
+                        error(tab, held, camera_at(EYES[0]), {"time": torch.tensor(moment, dtype=torch.float64)})
+                        < ERROR
+                    )
                 else:
                     assert (found[..., :3] == 0).all() and (found[..., 3] == 1).all()
             assert tab.faults == [] and tab.page.inner_text("#fault") == ""
@@ -112,7 +127,9 @@ def test_a_start_at_which_nothing_is_active(count: int, chromium: Any, tmp_path:
 def test_models_joined_from_chunks(time: str, chromium: Any, tmp_path: Path) -> None:
     """Before, in and after the seams."""
     seams = ((0.25, 0.375), (0.625, 0.75))
-    model = random_model(TimeDensity(3, time, edge=2, gain=True, seams=seams), TimeHarmonics(0, powers=0, waves=0), count=90)
+    model = random_model(
+        TimeDensity(3, time, edge=2, gain=True, seams=seams), TimeHarmonics(0, powers=0, waves=0), count=90
+    )
     model.params["chunk"] = torch.arange(90.0)[:, None] % 3
     page_of(model, tmp_path / "p.html", {"time": torch.tensor(0.3)})
     with open_tab(chromium, tmp_path / "p.html") as tab:
@@ -124,8 +141,11 @@ def test_models_joined_from_chunks(time: str, chromium: Any, tmp_path: Path) -> 
 @pytest.mark.parametrize("visibility", ["none", "primitive", "pixel"])
 @pytest.mark.parametrize(("form", "falloff"), [("additive", False), ("multiplicative", True)])
 def test_relit_models(visibility: str, form: str, falloff: bool, chromium: Any, tmp_path: Path) -> None:
-    """The depth images out of the light are drawn by the page too. What lies near their shadows' edges amplifies their rounding."""
-    model = random_model(CosineDensity(2, edge=2), LightNetwork(5, form=form, visibility=visibility, falloff=falloff), seed=3)
+    """The depth images out of the light are drawn by the page too. What lies near their shadows' edges amplifies their
+    rounding."""
+    model = random_model(
+        CosineDensity(2, edge=2), LightNetwork(5, form=form, visibility=visibility, falloff=falloff), seed=3
+    )
     page_of(model, tmp_path / "p.html", LIGHT)
     with open_tab(chromium, tmp_path / "p.html") as tab:
         for light in (LIGHT["light"], torch.tensor([-1.0, 0.5, 3.0]), torch.tensor([0.0, 0.0, -0.3])):
@@ -171,21 +191,33 @@ def test_depth_and_density_slices(chromium: Any, tmp_path: Path) -> None:
     camera, plane = camera_at(EYES[0]), 3.0
     with torch.no_grad():
         truth = render(model, camera, {}, replace(SETTINGS, backend="reference", depth=True))
-        rows, columns = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-        local = torch.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, torch.ones_like(rows)], -1).double() * plane
+        rows, columns = torch.meshgrid(
+            torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij"
+        )
+        local = (
+            torch.stack(
+                [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, torch.ones_like(rows)], -1
+            ).double()
+            * plane
+        )
         view = camera.viewmat.double()
         points = ((local - view[:3, 3]) @ view[:3, :3]).reshape(-1, 3)
         sigma = torch.zeros(len(points), dtype=torch.float64)
         geometry = model.geometry
         for i in range(model.count):
-            whitened = (points - geometry.means[i].double()) @ geometry.rotations[i].double() / geometry.scales[i].double()
+            whitened = (
+                (points - geometry.means[i].double()) @ geometry.rotations[i].double() / geometry.scales[i].double()
+            )
             inside = ((whitened**2).sum(-1) < 1).nonzero()[:, 0]
             sigma[inside] += model.living({}, torch.float64).sigma(torch.full((len(inside),), i), points[inside])
     assert truth.depth is not None
     with open_tab(chromium, tmp_path / "p.html") as tab:
         found = tab.numbers(camera, mode="DEPTH")
         hit = truth.alpha.numpy() > 0.05
-        assert np.abs(found[..., 0] / np.maximum(1 - found[..., 3], 1e-12) - truth.depth.double().numpy())[hit].max() < 1e-4
+        assert (
+            np.abs(found[..., 0] / np.maximum(1 - found[..., 3], 1e-12) - truth.depth.double().numpy())[hit].max()
+            < 1e-4
+        )
         slices = tab.numbers(camera, mode="SLICE", plane=plane)[..., 0].reshape(-1)
         assert sigma.max() > 1 and np.abs(slices - sigma.numpy()).max() < 1e-4 * float(sigma.max())
 
@@ -199,7 +231,11 @@ def test_what_is_seen_is_the_display_s(chromium: Any, tmp_path: Path) -> None:
         truth = render(model, camera, {}, replace(SETTINGS, backend="reference"), background).rgb
     for linear in (False, True):
         page_of(model, tmp_path / "p.html", background=background.tolist(), linear=linear)
-        encoded = torch.where(truth > 0.0031308, 1.055 * truth.clamp_min(1e-9) ** (1 / 2.4) - 0.055, 12.92 * truth) if linear else truth
+        encoded = (
+            torch.where(truth > 0.0031308, 1.055 * truth.clamp_min(1e-9) ** (1 / 2.4) - 0.055, 12.92 * truth)
+            if linear
+            else truth
+        )
         with open_tab(chromium, tmp_path / "p.html") as tab:
             wrong = np.abs(tab.shown(camera).astype(int) - to_uint8(encoded).numpy().astype(int))
             assert wrong.max() <= 1 and (wrong > 0).mean() < 0.01

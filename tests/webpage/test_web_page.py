@@ -1,4 +1,5 @@
-"""What a page is made of: numbers that come back, what it refuses, no word of strangers that could run. Without a browser."""
+"""What a page is made of: numbers that come back, what it refuses, no word of strangers that could run. Without a
+browser."""
 
 from __future__ import annotations
 
@@ -48,7 +49,11 @@ def test_what_a_level_keeps(tmp_path: Path) -> None:
 @pytest.mark.parametrize("edge", [0, 1, 2])
 def test_polynomials_are_good_to_float32(edge: int) -> None:
     found, v = shader_constants(edge), torch.linspace(-0.5, 0.5, 1001, dtype=torch.float64)
-    truths = {"cos": (2 * torch.pi * v).cos(), "sinc": torch.special.sinc(2 * v), "edge": profile(2 * torch.pi * v, edge)}
+    truths = {
+        "cos": (2 * torch.pi * v).cos(),
+        "sinc": torch.special.sinc(2 * v),
+        "edge": profile(2 * torch.pi * v, edge),
+    }
     for name, truth in truths.items():
         value = torch.zeros_like(v)
         for coefficient in found[name]:
@@ -58,12 +63,16 @@ def test_polynomials_are_good_to_float32(edge: int) -> None:
 
 
 def test_a_field_without_a_script_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="density field GaussianDensity has no script for browsers; a page cannot show it"):
+    with pytest.raises(
+        ConfigError, match="density field GaussianDensity has no script for browsers; a page cannot show it"
+    ):
         page_of(random_model(GaussianDensity(), SphericalHarmonics(0)), tmp_path / "p.html")
 
 
 @pytest.mark.parametrize("text", ["() => 1</script><script>alert(1)", "() => '<!--'", 7])
-def test_a_script_that_would_end_its_element_is_refused(text: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_script_that_would_end_its_element_is_refused(
+    text: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(CosineDensity, "script", lambda self: text)
     with pytest.raises(ConfigError, match=r"density field CosineDensity: script\(\) must be a text of JavaScript"):
         page_of(random_model(CosineDensity(1), SphericalHarmonics(0)), tmp_path / "p.html")
@@ -73,7 +82,13 @@ def test_names_do_not_become_parts_of_the_page(tmp_path: Path) -> None:
     """Neither by HTML nor by the marks that parts are put in place of."""
     hostile = "</script><script>alert(1)</script>@numbers@"
     views = [PageView(hostile, camera_at((0.3, -3.0, 1.0)), {})]
-    page = page_of(random_model(CosineDensity(1), SphericalHarmonics(0)), tmp_path / "p.html", name=hostile, subtitle=hostile, views=views)
+    page = page_of(
+        random_model(CosineDensity(1), SphericalHarmonics(0)),
+        tmp_path / "p.html",
+        name=hostile,
+        subtitle=hostile,
+        views=views,
+    )
     plain = page_of(random_model(CosineDensity(1), SphericalHarmonics(0)), tmp_path / "q.html")
     assert page.text.count("<script") == plain.text.count("<script") == 4
     assert page.text.count("</script>") == plain.text.count("</script>")
@@ -85,14 +100,19 @@ def test_the_policy_lets_nothing_else_run_or_load(tmp_path: Path) -> None:
     text = page_of(random_model(CosineDensity(1), SphericalHarmonics(0)), tmp_path / "p.html").text
     policy = re.search(r'Content-Security-Policy" content="(.*?)"', text)
     assert (
-        policy and policy[1].startswith("default-src 'none'; script-src 'nonce-") and "unsafe-inline" not in policy[1].split("style-src")[0]
+        policy
+        and policy[1].startswith("default-src 'none'; script-src 'nonce-")
+        and "unsafe-inline" not in policy[1].split("style-src")[0]
     )
     assert "http:" not in text and "https:" not in text
     assert not re.search(r"<(script|link|img|iframe)[^>]*\s(src|href)=[\"'](?!data:|\")", text)
 
 
 def test_pages_are_the_same_bytes_again(tmp_path: Path) -> None:
-    made = [page_of(random_model(CosineDensity(2), SphericalHarmonics(1)), tmp_path / "p.html", level=2).text for _ in range(2)]
+    made = [
+        page_of(random_model(CosineDensity(2), SphericalHarmonics(1)), tmp_path / "p.html", level=2).text
+        for _ in range(2)
+    ]
     assert made[0] == made[1]
 
 

@@ -50,7 +50,9 @@ class BellDensity(DensityField):
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
         """sigma at points: what everything else is checked against."""
-        y = (geometry.rotations[prim].transpose(1, 2) @ (x - geometry.means[prim])[:, :, None])[..., 0] / geometry.scales[prim]
+        y = (geometry.rotations[prim].transpose(1, 2) @ (x - geometry.means[prim])[:, :, None])[
+            ..., 0
+        ] / geometry.scales[prim]
         return self._peak(params, geometry)[prim] * (-0.5 * self.deviations**2 * y.square().sum(-1)).exp()
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Opaque:
@@ -79,7 +81,10 @@ class BellDensity(DensityField):
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         """A factor of zero would be minus infinity here; 1e-30 is as good."""
-        return {**params, "log_kappa": params["log_kappa"] + factor.to(params["log_kappa"]).clamp_min(1e-30).log()[:, None]}
+        return {
+            **params,
+            "log_kappa": params["log_kappa"] + factor.to(params["log_kappa"]).clamp_min(1e-30).log()[:, None],
+        }
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
         """Each child holds half its parent's mass, kappa/m s1 s2 s3 up to a constant.

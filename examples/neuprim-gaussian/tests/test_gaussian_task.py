@@ -17,7 +17,9 @@ from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.runs.open import read_metrics
 from neuprim.runs.run import run
 
-SMALL = "scene.size=16 scene.train_views=4 scene.test_views=1 scene.supersampling=1 model.primitives=40 model.sh_degree=0"
+SMALL = (
+    "scene.size=16 scene.train_views=4 scene.test_views=1 scene.supersampling=1 model.primitives=40 model.sh_degree=0"
+)
 
 
 @checks(TASK)
@@ -33,7 +35,9 @@ def test_conforms_with_a_hard_edge(check: Callable[[], None]) -> None:
 def test_the_integral_keeps_its_digits() -> None:
     """Against Gauss-Legendre quadrature, relative to the integral itself: around 0, in the tails, on short intervals."""
     x, weights = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(100))
-    z, w = torch.meshgrid(torch.linspace(-6, 6, 49, dtype=torch.float64), torch.logspace(-9, 0.3, 60, dtype=torch.float64), indexing="ij")
+    z, w = torch.meshgrid(
+        torch.linspace(-6, 6, 49, dtype=torch.float64), torch.logspace(-9, 0.3, 60, dtype=torch.float64), indexing="ij"
+    )
     exact = (-((z[..., None] + w[..., None] * x) ** 2)).exp() @ weights * w
     assert float((bell(z, w) / exact - 1).abs().max()) < 1e-10
 
@@ -61,4 +65,14 @@ def test_wrong_settings_are_refused_before_data_are_loaded() -> None:
 
 def test_the_fast_backend_says_why_it_cannot(tmp_path: Path) -> None:
     with pytest.raises(BackendUnavailable, match="cannot draw Opaque density"):
-        run(compose(["task=gaussian", *SMALL.split(), "renderer.backend=cpu", "train.iterations=1", f"output_dir={tmp_path / 'r'}"]))
+        run(
+            compose(
+                [
+                    "task=gaussian",
+                    *SMALL.split(),
+                    "renderer.backend=cpu",
+                    "train.iterations=1",
+                    f"output_dir={tmp_path / 'r'}",
+                ]
+            )
+        )

@@ -1,7 +1,8 @@
 """A pinhole camera as attributes of an OpenEXR file.
 
-The standard ones (OpenEXR, "Standard Attributes") multiply row vectors from the right, as Imath does: the camera's space is left-handed, x right,
-y up, z forward, and normalised device coordinates run from (0, 0), the upper left corner of the image, to (1, 1).
+The standard ones (OpenEXR, "Standard Attributes") multiply row vectors from the right, as Imath does: the camera's
+space is left-handed, x right, y up, z forward, and normalised device coordinates run from (0, 0), the upper left corner
+of the image, to (1, 1).
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ __all__ = ["exr_attributes"]
 
 
 def exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
-    """Attribute name -> value: ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth`` as the standard has them, and
-    in float64, for cameras far from the origin, ``neuprim:worldToCamera``, and
-    in plain numbers ``neuprim:focalLength`` and ``neuprim:principalPoint`` (x, y, pixels), ``neuprim:near`` (camera z, units of the camera's position).
+    """Attribute name -> value: ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth`` as
+    the standard has them, and in float64, for cameras far from the origin, ``neuprim:worldToCamera``, and
+    in plain numbers ``neuprim:focalLength`` and ``neuprim:principalPoint`` (x, y, pixels), ``neuprim:near`` (camera z,
+    units of the camera's position).
     """
     view = camera.viewmat.detach().double().cpu().numpy()
     up = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -35,7 +37,9 @@ def exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
         "worldToCamera": np.ascontiguousarray((up @ view).T, dtype=np.float32),
         "neuprim:worldToCamera": np.ascontiguousarray((up @ view).T),
         "worldToNDC": np.ascontiguousarray((project @ view).T, dtype=np.float32),
-        "screenWindowCenter": np.array([(width / 2 - camera.cx) / camera.fx, (camera.cy - height / 2) / camera.fy], np.float32),
+        "screenWindowCenter": np.array(
+            [(width / 2 - camera.cx) / camera.fx, (camera.cy - height / 2) / camera.fy], np.float32
+        ),
         "screenWindowWidth": width / camera.fx,
         "neuprim:focalLength": np.array([camera.fx, camera.fy], np.float32),
         "neuprim:principalPoint": np.array([camera.cx, camera.cy], np.float32),

@@ -1,4 +1,5 @@
-"""COLMAP's sparse models, text or binary, by COLMAP's own package (the extra ``neuprim[colmap]``): its cameras, and poses of its images."""
+"""COLMAP's sparse models, text or binary, by COLMAP's own package (the extra ``neuprim[colmap]``): its cameras, and
+poses of its images."""
 
 from __future__ import annotations
 
@@ -16,7 +17,16 @@ from neuprim.core.cameras.colmap_files import check_binary_model
 from neuprim.core.cameras.pinhole import Camera
 from neuprim.core.errors import BackendUnavailable, DataError
 
-__all__ = ["PINHOLES", "is_model", "largest_model", "pinhole_of", "posed_cameras", "pycolmap_package", "read_model", "viewmat_of"]
+__all__ = [
+    "PINHOLES",
+    "is_model",
+    "largest_model",
+    "pinhole_of",
+    "posed_cameras",
+    "pycolmap_package",
+    "read_model",
+    "viewmat_of",
+]
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 """COLMAP's camera models without distortion."""
@@ -31,7 +41,9 @@ def pycolmap_package() -> Any:
     try:
         import pycolmap
     except ImportError as error:
-        raise BackendUnavailable(f"COLMAP scenes need the package pycolmap ({error}): pip install 'neuprim[colmap]'") from None
+        raise BackendUnavailable(
+            f"COLMAP scenes need the package pycolmap ({error}): pip install 'neuprim[colmap]'"
+        ) from None
     return pycolmap
 
 
@@ -93,11 +105,15 @@ def pinhole_of(lens: Any, where: str) -> tuple[float, float, float, float]:
         DataError: a model without focal lengths.
     """
     # asking a panorama for its focal length ends the process, so the parameters are taken by their names
-    named: dict[str, float | None] = dict(zip((n.strip() for n in lens.params_info.split(",")), map(float, lens.params), strict=False))
+    named: dict[str, float | None] = dict(
+        zip((n.strip() for n in lens.params_info.split(",")), map(float, lens.params), strict=False)
+    )
     named = {"fx": named.get("f"), "fy": named.get("f"), **named}
     fx, fy, cx, cy = (named.get(key) for key in ("fx", "fy", "cx", "cy"))
     if fx is None or fy is None or cx is None or cy is None:
-        raise DataError(f"{where}: model is {lens.model_name}; expected a model with focal lengths, which a pinhole can replace")
+        raise DataError(
+            f"{where}: model is {lens.model_name}; expected a model with focal lengths, which a pinhole can replace"
+        )
     return fx, fy, cx, cy
 
 
@@ -110,7 +126,8 @@ def viewmat_of(image: Any) -> Tensor:
 
 
 def largest_model(project: Path) -> tuple[Path | None, str]:
-    """The model with the most images of those in a project's ``sparse``, None for none, and a line for the user, which may be empty.
+    """The model with the most images of those in a project's ``sparse``, None for none, and a line for the user, which
+    may be empty.
 
     COLMAP writes one model for each group of images that it cannot join.
     """
@@ -142,14 +159,20 @@ def _count_images(model: Path) -> int:
 
 
 def is_model(path: Path) -> Path | None:
-    """The folder of the model that a path means: itself, one of its files, or a project with ``sparse``; None for anything else."""
+    """The folder of the model that a path means: itself, one of its files, or a project with ``sparse``; None for
+    anything else."""
     if path.is_dir():
         return path if _kind(path) is not None else largest_model(path)[0]
-    return path.parent if path.name in {f"{part}{kind}" for part in _PARTS for kind in (".txt", ".bin")} and _kind(path.parent) else None
+    return (
+        path.parent
+        if path.name in {f"{part}{kind}" for part in _PARTS for kind in (".txt", ".bin")} and _kind(path.parent)
+        else None
+    )
 
 
 def posed_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
-    """Name, without its suffix, and camera of every image with a pose, by name, and lines for the user. Points need not be there.
+    """Name, without its suffix, and camera of every image with a pose, by name, and lines for the user. Points need not
+    be there.
 
     Raises:
         BackendUnavailable: pycolmap is not installed.
@@ -161,15 +184,25 @@ def posed_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
         raise DataError(f"{folder}: has no images with a pose; expected at least one")
     found, bent = [], Counter[str]()
     for image in images:
-        lens, where = reconstruction.cameras[image.camera_id], f"{folder}: camera {image.camera_id} of image {image.name}"
+        lens, where = (
+            reconstruction.cameras[image.camera_id],
+            f"{folder}: camera {image.camera_id} of image {image.name}",
+        )
         if lens.model_name not in (*PINHOLES, *_DISTORTED):
-            raise DataError(f"{where}: model is {lens.model_name}; expected one of {', '.join((*PINHOLES, *_DISTORTED))}")
+            raise DataError(
+                f"{where}: model is {lens.model_name}; expected one of {', '.join((*PINHOLES, *_DISTORTED))}"
+            )
         names = [name.strip() for name in lens.params_info.split(",")]
-        if any(value for name, value in zip(names, lens.params, strict=True) if name not in ("f", "fx", "fy", "cx", "cy")):
+        if any(
+            value for name, value in zip(names, lens.params, strict=True) if name not in ("f", "fx", "fy", "cx", "cy")
+        ):
             bent[lens.model_name] += 1
         camera = Camera(viewmat_of(image), *pinhole_of(lens, where), int(lens.width), int(lens.height))
         found.append((str(PurePosixPath(image.name).with_suffix("")), camera.validate(where)))
-    notes = [f"the lens distortion of {count} of {len(found)} cameras ({model}) is left out" for model, count in sorted(bent.items())]
+    notes = [
+        f"the lens distortion of {count} of {len(found)} cameras ({model}) is left out"
+        for model, count in sorted(bent.items())
+    ]
     if folder.parent.name == "sparse":
         notes += [line for line in [largest_model(folder.parent.parent)[1].replace("takes", "the largest is")] if line]
     return found, notes

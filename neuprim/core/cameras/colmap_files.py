@@ -32,7 +32,9 @@ class _Bytes:
         """The position before moving on by ``size`` bytes."""
         start, self.at = self.at, self.at + size
         if size < 0 or self.at > len(self.data):
-            raise DataError(f"{self.path}: truncated or corrupt: a record ends at byte {self.at}, the file at {len(self.data)}")
+            raise DataError(
+                f"{self.path}: truncated or corrupt: a record ends at byte {self.at}, the file at {len(self.data)}"
+            )
         return start
 
     def number(self, kind: str) -> int:

@@ -17,12 +17,14 @@ __all__ = ["CameraViews", "read_camera_file", "read_cameras"]
 def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
     """The cameras of a file, or of a folder.
 
-    ===========================================================  ================================================================
+    ===========================================================
+    ================================================================
     JSON with ``frames``                                         :mod:`~neuprim.core.cameras.json_files`
     JSON with ``camera_path``                                    the same; nerfstudio's viewer
     .usd, .usda, .usdc, .usdz; ``FILE#/PRIM`` of several cameras :mod:`~neuprim.core.cameras.usd`
-    a folder with ``cameras`` and ``images``, .txt or .bin       :mod:`~neuprim.core.cameras.colmap`; also one of these files, or a project
-    ===========================================================  ================================================================
+    a folder with ``cameras`` and ``images``, .txt or .bin       :mod:`~neuprim.core.cameras.colmap`; also one of these
+    files, or a project ===========================================================
+    ================================================================
 
     Args:
         size: (width, height) where the file names none.
@@ -39,7 +41,9 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
             raise DataError(f"{path}: {len(named)} cameras; expected at most {MOST}")
         return CameraViews(tuple(named), notes=tuple(notes))
     if path.is_dir():
-        raise DataError(f"{path}: is a folder without cameras.txt or cameras.bin; expected a COLMAP model, or a file of cameras")
+        raise DataError(
+            f"{path}: is a folder without cameras.txt or cameras.bin; expected a COLMAP model, or a file of cameras"
+        )
     if is_usd(path):
         return read_usd_cameras(path, prim, size)
     return read_json_cameras(path, size)

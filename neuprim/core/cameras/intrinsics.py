@@ -1,13 +1,15 @@
 """Intrinsics and lenses as ``transforms.json`` files state them: one reader for every loader and for camera files.
 
 Focal lengths: ``fl_x fl_y`` in pixels, ``camera_angle_x camera_angle_y`` in radians, ``x_fov y_fov`` in degrees, or
-``camera_intrinsics`` [cx, cy, fx, fy]. Principal point: ``cx cy``. Size: ``w h``. Lens: ``camera_model``, ``is_fisheye``, ``k1 k2 k3 k4 p1 p2``.
+``camera_intrinsics`` [cx, cy, fx, fy]. Principal point: ``cx cy``. Size: ``w h``. Lens: ``camera_model``,
+``is_fisheye``, ``k1 k2 k3 k4 p1 p2``.
 
 Rules:
 
 * Each group of keys comes whole from the frame, or else whole from the file.
 * Keys of one record that state the same number must agree within 1 %.
-* Lengths in pixels belong to the size that their own record states. They are scaled where the image is a resized copy of that size.
+* Lengths in pixels belong to the size that their own record states. They are scaled where the image is a resized copy
+  of that size.
 """
 
 from __future__ import annotations
@@ -22,7 +24,18 @@ from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
 from neuprim.core.errors import DataError
 from neuprim.core.io.records import Record
 
-__all__ = ["COEFFICIENTS", "FOCAL", "MIDDLE", "MODELS", "SIZE", "Target", "camera_of", "is_fisheye", "lens_of", "same_shape"]
+__all__ = [
+    "COEFFICIENTS",
+    "FOCAL",
+    "MIDDLE",
+    "MODELS",
+    "SIZE",
+    "Target",
+    "camera_of",
+    "is_fisheye",
+    "lens_of",
+    "same_shape",
+]
 
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Camera models that are pinholes but for radial and tangential distortion."""
@@ -72,8 +85,12 @@ class _Level:
     def scales(self, keys: str, target: Target) -> tuple[float, float]:
         """Pixels of the target per pixel of this size, horizontally and vertically."""
         if not same_shape(self.size, target.size):
-            found = f"{keys} belong to w, h {self.size[0]}x{self.size[1]}, and the image is {target.width}x{target.height}"
-            raise DataError(f"{self.record.where}: {found}; expected them in the frame, beside its own w, h{target.hint}")
+            found = (
+                f"{keys} belong to w, h {self.size[0]}x{self.size[1]}, and the image is {target.width}x{target.height}"
+            )
+            raise DataError(
+                f"{self.record.where}: {found}; expected them in the frame, beside its own w, h{target.hint}"
+            )
         return target.width / self.size[0], target.height / self.size[1]
 
 
@@ -88,13 +105,15 @@ def _owner(group: tuple[str, ...], frame: Record, file: Record) -> Record:
     return frame if any(frame.has(key) for key in group) else file
 
 
-def camera_of(frame: Record, file: Record, target: Target, viewmat: Tensor | None = None, say: Say = lambda text: None) -> Camera:
+def camera_of(
+    frame: Record, file: Record, target: Target, viewmat: Tensor | None = None, say: Say = lambda text: None
+) -> Camera:
     """The pinhole of a frame.
 
     Args:
         file: the file's own fields, for what the frame leaves out.
-        viewmat: (4, 4) world to camera, OpenCV axes; None for the frame's ``transform_matrix``, camera to world with OpenGL axes.
-        say: takes lines for the user.
+        viewmat: (4, 4) world to camera, OpenCV axes; None for the frame's ``transform_matrix``, camera to world with
+        OpenGL axes. say: takes lines for the user.
 
     Raises:
         DataError: a field that is missing or wrong, or fields that contradict each other or the image.
@@ -106,7 +125,9 @@ def camera_of(frame: Record, file: Record, target: Target, viewmat: Tensor | Non
         if not same_shape(of_frame.size, target.size):
             found = f"image is {target.width}x{target.height}; expected {width}x{height} (w, h in {stated}) or a reduction of it"
             raise DataError(f"{target.image}: {found}{target.hint}")
-        say(f"{file.where}: w, h are {width}x{height} and the image {target.width}x{target.height}; cameras are scaled to the images")
+        say(
+            f"{file.where}: w, h are {width}x{height} and the image {target.width}x{target.height}; cameras are scaled to the images"
+        )
     focal = of_frame if of_frame.has(FOCAL) else of_file
     fx, fy = _focal(frame, focal, target, say)
     cx, cy = _middle(of_frame, of_file, focal, target)
@@ -151,7 +172,8 @@ def _focal(frame: Record, level: _Level, target: Target, say: Say) -> tuple[floa
             if _agree(found[key], value):
                 continue
             text = f"{where}: {first} means a focal length of {value:.5g} pixels, and {key} {found[key]:.5g}"
-            # BlenderNeRF writes the angles of Blender's sensor beside the right fl_x and fl_y: angle_x is that of the image's longer
+            # BlenderNeRF writes the angles of Blender's sensor beside the right fl_x and fl_y: angle_x is that of the
+            # image's longer
             # side, and angle_y has nothing to do with the image
             explained = key == "camera_angle_x" and _agree(found[key] * portrait, value)
             explained |= key == "camera_angle_y" and first == "fl_y" and _agree(fx, fy) and "camera_angle_x" in other
@@ -164,11 +186,14 @@ def _focal(frame: Record, level: _Level, target: Target, say: Say) -> tuple[floa
 
 
 def _stated(level: _Level, axis: int, target: Target) -> dict[str, float]:
-    """Every focal length along an axis that a record states, in pixels of the target, by its key; lengths in pixels first."""
+    """Every focal length along an axis that a record states, in pixels of the target, by its key; lengths in pixels
+    first."""
     record, name, side = level.record, "xy"[axis], target.size[axis]
     found = {}
     if record.has(key := f"fl_{name}"):
-        found[key] = record.number(key, "a focal length in pixels above 0", 0.0) * level.scales("fl_x, fl_y", target)[axis]
+        found[key] = (
+            record.number(key, "a focal length in pixels above 0", 0.0) * level.scales("fl_x, fl_y", target)[axis]
+        )
     if record.has(key := "camera_intrinsics"):
         found[key] = _intrinsics(record)[2 + axis] * level.scales(key, target)[axis]
     for key, unit, expected in (
@@ -185,7 +210,9 @@ def _intrinsics(record: Record) -> list[float]:
     """[cx, cy, fx, fy] of ``camera_intrinsics``, pixels."""
     values: list[float] = record.array("camera_intrinsics", (4,), "[cx, cy, fx, fy] in pixels").tolist()
     if not (values[2] > 0 and values[3] > 0):
-        raise DataError(f"{record.where}: camera_intrinsics is {values}; expected [cx, cy, fx, fy], focal lengths above 0")
+        raise DataError(
+            f"{record.where}: camera_intrinsics is {values}; expected [cx, cy, fx, fy], focal lengths above 0"
+        )
     return values
 
 
@@ -205,14 +232,21 @@ def _middle(frame: _Level, file: _Level, focal: _Level, target: Target) -> tuple
         return 0.5 * target.width, 0.5 * target.height
     record, keys = level.record, "camera_intrinsics" if array else "cx, cy"
     if level is frame and 0 < sum(record.has(key) for key in MIDDLE) < 2 and file.has(MIDDLE):
-        raise DataError(f"{record.where}: cx or cy is missing, and the file's belong to another camera; expected both in the frame")
+        raise DataError(
+            f"{record.where}: cx or cy is missing, and the file's belong to another camera; expected both in the frame"
+        )
     scale = level.scales(keys, target)
-    plain = [record.number(key) if record.has(key) else 0.5 * side for key, side in zip(MIDDLE, level.size, strict=True)]
+    plain = [
+        record.number(key) if record.has(key) else 0.5 * side for key, side in zip(MIDDLE, level.size, strict=True)
+    ]
     cx, cy = (value * s for value, s in zip(_intrinsics(record)[:2] if array else plain, scale, strict=True))
     if (
         array
         and level.has(MIDDLE)
-        and any(abs(a - b * s) > _TOLERANCE * side for a, b, s, side in zip((cx, cy), plain, scale, target.size, strict=True))
+        and any(
+            abs(a - b * s) > _TOLERANCE * side
+            for a, b, s, side in zip((cx, cy), plain, scale, target.size, strict=True)
+        )
     ):
         raise DataError(
             f"{record.where}: cx, cy are {plain}, and camera_intrinsics begins with {_intrinsics(record)[:2]}; expected the same"
@@ -229,19 +263,24 @@ def _check_middle(where: str, keys: str, point: tuple[float, float], stated: boo
     if not stated and min(kx, ky) > 0.0 and abs(kx - 1.0) > 0.05 and abs(kx - ky) <= 2 * _TOLERANCE * kx:
         size = f"{round(2 * cx)}x{round(2 * cy)}"
         found = f"{keys} are {cx:g}, {cy:g}, the middle of an image of {size} and not of {image}"
-        raise DataError(f"{where}: {found}; expected w, h of the images that the lengths in pixels are for, e.g. {size.replace('x', ', ')}")
+        raise DataError(
+            f"{where}: {found}; expected w, h of the images that the lengths in pixels are for, e.g. {size.replace('x', ', ')}"
+        )
     if max(cx, cy) <= 1.0 and min(target.width, target.height) > 8:
         raise DataError(f"{where}: {keys} are {cx:g}, {cy:g} on {image}; expected pixels, not shares of the image")
     if not (0.0 < cx < target.width and 0.0 < cy < target.height):
         order = "the order [cx, cy, fx, fy]" if keys == "camera_intrinsics" else "a point in the image"
-        raise DataError(f"{where}: {keys} put the principal point outside of {image}, at {cx:g}, {cy:g}; expected {order}")
+        raise DataError(
+            f"{where}: {keys} put the principal point outside of {image}, at {cx:g}, {cy:g}; expected {order}"
+        )
 
 
 # ---------------------------------------------------------------- lenses
 
 
 def _check_one_lens(frame: _Level, file: _Level, target: Target) -> None:
-    """Refuse a frame with another focal length than its file, whose principal point or distortion it does not replace."""
+    """Refuse a frame with another focal length than its file, whose principal point or distortion it does not
+    replace."""
     if file.record.has("camera_intrinsics") or not file.has(FOCAL):
         return
     left = []
@@ -252,7 +291,9 @@ def _check_one_lens(frame: _Level, file: _Level, target: Target) -> None:
         left += [key for key in COEFFICIENTS if file.record.number_or(key, 0.0) != 0.0]
     if not left:
         return
-    own, others = ([*_stated(level, 0, target).values(), *_stated(level, 1, target).values()] for level in (frame, file))
+    own, others = (
+        [*_stated(level, 0, target).values(), *_stated(level, 1, target).values()] for level in (frame, file)
+    )
     if not _agree(own[0], others[0]):
         found = f"has a focal length of its own, and {', '.join(left)} of the file belong to another one"
         raise DataError(f"{frame.record.where}: {found}; expected {', '.join(left)} in the frame, too")

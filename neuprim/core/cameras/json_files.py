@@ -1,4 +1,5 @@
-"""Cameras in JSON: frames as NeRF-synthetic, instant-ngp, nerfstudio and Blender's script have them, and camera paths of nerfstudio's viewer."""
+"""Cameras in JSON: frames as NeRF-synthetic, instant-ngp, nerfstudio and Blender's script have them, and camera paths
+of nerfstudio's viewer."""
 
 from __future__ import annotations
 
@@ -44,7 +45,10 @@ def _checked(document: Record, key: str) -> list[Record]:
 
 
 def _size(record: Record, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
-    found = [record.count(key) if record.has(key) or size is None else fallback for key, fallback in zip(keys, size or (0, 0), strict=True)]
+    found = [
+        record.count(key) if record.has(key) or size is None else fallback
+        for key, fallback in zip(keys, size or (0, 0), strict=True)
+    ]
     for key, value in zip(keys, found, strict=True):
         if not 0 < value <= LARGEST:
             raise DataError(f"{record.where}: {key} is {value}; expected 1 to {LARGEST} pixels")
@@ -71,16 +75,21 @@ def _rate(document: Record, count: int) -> float | None:
 
 
 def _frames(document: Record, size: tuple[int, int] | None) -> CameraViews:
-    """``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``; a frame may override every intrinsic."""
+    """``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``; a frame may override
+    every intrinsic."""
     records, found, bent = _checked(document, "frames"), [], 0
     notes: dict[str, None] = {}
     check_keys(document)
     for i, record in enumerate(records):
         check_keys(record)
         if is_fisheye(record, document, ()):
-            raise DataError(f"{record.where}: the camera is a fisheye (camera_model, is_fisheye); expected one of {', '.join(MODELS)}")
+            raise DataError(
+                f"{record.where}: the camera is a fisheye (camera_model, is_fisheye); expected one of {', '.join(MODELS)}"
+            )
         bent += any(lens_of(record, document).values())
-        stated = Record({key: r.values[key] for r in (document, record) for key in ("w", "h") if r.has(key)}, record.where)
+        stated = Record(
+            {key: r.values[key] for r in (document, record) for key in ("w", "h") if r.has(key)}, record.where
+        )
         target = Target(*_size(stated, ("w", "h"), size))
         own = record.has("transform_matrix") or not document.has("transform_matrix")
         view = None if own else opengl_to_viewmat(document.matrix("transform_matrix"))
@@ -95,8 +104,8 @@ def _frames(document: Record, size: tuple[int, int] | None) -> CameraViews:
 
 
 def _camera_path(document: Record, size: tuple[int, int] | None) -> CameraViews:
-    """``{"render_width", "render_height", "fps", "seconds", "camera_path": [{"camera_to_world": 16 numbers, "fov": degrees}]}``: ``fov`` is vertical,
-    the middle of the image is the principal point, and axes are OpenGL's.
+    """``{"render_width", "render_height", "fps", "seconds", "camera_path": [{"camera_to_world": 16 numbers, "fov":
+    degrees}]}``: ``fov`` is vertical, the middle of the image is the principal point, and axes are OpenGL's.
     """
     kind = document.values.get("camera_type", "perspective")
     if kind != "perspective":

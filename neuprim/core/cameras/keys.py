@@ -1,7 +1,8 @@
-"""What the keys of ``transforms.json`` files mean: those that are read, those that change nothing, and those that are refused.
+"""What the keys of ``transforms.json`` files mean: those that are read, those that change nothing, and those that are
+refused.
 
-The keys are the ones that instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints and GS³ write or read. A key that
-changes the picture is read or refused by name; a key that nobody here knows is named once in a warning.
+The keys are the ones that instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints and GS³ write or read.
+A key that changes the picture is read or refused by name; a key that nobody here knows is named once in a warning.
 """
 
 from __future__ import annotations
@@ -16,7 +17,18 @@ from neuprim.core.io.records import Record
 __all__ = ["READ", "check_keys", "unknown_keys"]
 
 READ = frozenset(
-    {*FOCAL, *MIDDLE, *SIZE, *COEFFICIENTS, "camera_model", "is_fisheye", "frames", "file_path", "transform_matrix", "mask_path"}
+    {
+        *FOCAL,
+        *MIDDLE,
+        *SIZE,
+        *COEFFICIENTS,
+        "camera_model",
+        "is_fisheye",
+        "frames",
+        "file_path",
+        "transform_matrix",
+        "mask_path",
+    }
 )
 """Keys that every loader reads, in the file or in a frame."""
 
@@ -48,7 +60,8 @@ _REFUSED = {
     ),
     **dict.fromkeys("k5 k6 s1 s2 s3 s4 sx1 sy1 b1 b2 skew sk_x sk_y".split(), _LENS),
     **dict.fromkeys(
-        "distortion distortion_params distortion_coefficients dist_coeffs radial_distortion tangential_distortion".split(), _LENS
+        "distortion distortion_params distortion_coefficients dist_coeffs radial_distortion tangential_distortion".split(),
+        _LENS,
     ),
     **dict.fromkeys(("rolling_shutter", "transform_matrix_start", "transform_matrix_end"), _MOVES),
     **dict.fromkeys("white_transparent black_transparent fix_premult alpha_path fg_mask_path".split(), _ALPHA),
@@ -73,7 +86,12 @@ def check_keys(record: Record) -> None:
         if key in record.values and _says(record.values[key]):
             raise DataError(f"{record.where}: {key} states {states}")
     for key in _KINDS:
-        if record.has(key) and str(record.values[key]).lower() not in ("perspective", "persp", "none", *(m.lower() for m in MODELS)):
+        if record.has(key) and str(record.values[key]).lower() not in (
+            "perspective",
+            "persp",
+            "none",
+            *(m.lower() for m in MODELS),
+        ):
             raise record.fail(key, "perspective (camera_model is read for lenses)")
     frames = record.values.get("frames")
     if record.has("n_frames") and isinstance(frames, list) and record.count("n_frames") < len(frames):

@@ -44,15 +44,19 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same view sampled on another pixel grid."""
         sx, sy = width / self.width, height / self.height
-        return replace(self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height)
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
 
     def reduced(self, factor: int) -> Camera:
-        """The view on pixels exactly ``factor`` times as large; what is left over at the right and at the bottom is cut off, not squeezed in."""
+        """The view on pixels exactly ``factor`` times as large; what is left over at the right and at the bottom is cut
+        off, not squeezed in."""
         fx, fy, cx, cy = (value / factor for value in (self.fx, self.fy, self.cx, self.cy))
         return Camera(self.viewmat, fx, fy, cx, cy, self.width // factor, self.height // factor)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 2) pixel positions x, y and (N,) depths of (N, 3) points, float64; positions mean nothing where the depth is not positive."""
+        """(N, 2) pixel positions x, y and (N,) depths of (N, 3) points, float64; positions mean nothing where the depth
+        is not positive."""
         view = self.viewmat.double()
         x, y, z = (points.double() @ view[:3, :3].T + view[:3, 3]).unbind(-1)
         return torch.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], dim=-1), z
@@ -63,7 +67,8 @@ class Camera:
         return (z > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([self.width, self.height])).all(1)
 
     def validate(self, where: str) -> Camera:
-        """Return self, or raise :class:`DataError` naming ``where`` for non-finite, singular, scaled or mirrored cameras."""
+        """Return self, or raise :class:`DataError` naming ``where`` for non-finite, singular, scaled or mirrored
+        cameras."""
         numbers = torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=torch.float64)
         if not (torch.isfinite(numbers).all() and self.fx > 0 and self.fy > 0):
             raise DataError(
@@ -76,14 +81,19 @@ class Camera:
 
 
 def check_viewmat(viewmat: Tensor, where: str) -> None:
-    """Raise :class:`DataError` naming ``where`` unless ``viewmat`` is a finite (4, 4) matrix with a rotation in its upper left."""
+    """Raise :class:`DataError` naming ``where`` unless ``viewmat`` is a finite (4, 4) matrix with a rotation in its
+    upper left."""
     view = viewmat.detach().double().cpu()
     if view.shape != (4, 4) or not torch.isfinite(view).all():
-        raise DataError(f"{where}: camera matrix has shape {tuple(view.shape)} or non-finite entries; expected finite 4x4")
+        raise DataError(
+            f"{where}: camera matrix has shape {tuple(view.shape)} or non-finite entries; expected finite 4x4"
+        )
     R = view[:3, :3]
     error = (R @ R.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
     if error > 1e-3:
-        raise DataError(f"{where}: camera rotation is singular or scaled (|R R^T - 1| = {error:.2g}); expected a rotation")
+        raise DataError(
+            f"{where}: camera rotation is singular or scaled (|R R^T - 1| = {error:.2g}); expected a rotation"
+        )
     if torch.linalg.det(R).item() < 0:
         raise DataError(f"{where}: camera rotation is mirrored (determinant -1); expected a rotation")
 
@@ -100,7 +110,8 @@ def opengl_to_viewmat(c2w: Tensor) -> Tensor:
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """(4, 4) world-to-camera OpenCV matrix of a camera at ``eye`` looking at ``target`` with ``up`` upwards in the image."""
+    """(4, 4) world-to-camera OpenCV matrix of a camera at ``eye`` looking at ``target`` with ``up`` upwards in the
+    image."""
     eye, target, up = eye.double(), target.double(), up.double()
     z = target - eye
     z = z / z.norm()
@@ -124,6 +135,8 @@ def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation
     views = []
     for i in range(count):
         t = 2 * math.pi * i / count
-        eye = center.double() + radius * (math.cos(elevation) * (math.cos(t) * a + math.sin(t) * b) + math.sin(elevation) * up)
+        eye = center.double() + radius * (
+            math.cos(elevation) * (math.cos(t) * a + math.sin(t) * b) + math.sin(elevation) * up
+        )
         views.append(replace(template, viewmat=look_at(eye, center, up)))
     return views

@@ -1,4 +1,5 @@
-"""Central cameras that are no pinholes: one unit direction per pixel (fisheye, equirectangular, any calibrated lens)."""
+"""Central cameras that are no pinholes: one unit direction per pixel (fisheye, equirectangular, any calibrated
+lens)."""
 
 from __future__ import annotations
 
@@ -20,18 +21,20 @@ _UNIT = 1e-6  # how far from 1 a direction's length may be: float32 rounding pas
 class RayCamera:
     """A view whose rays all leave one point, each in its own direction, backwards (z < 0) too.
 
-    There is no camera-z plane that all rays cross, so distances take its place: ``RenderSettings.near`` is a distance along
-    the ray, depth images hold the distance of the chord middles, and primitives are sorted by the distance of their
-    centres from the camera. Images therefore differ from a pinhole's where a near plane cuts chords or where the two
-    orders disagree. Only the reference backend draws these cameras; gradients reach ``viewmat`` and ``directions``.
+    There is no camera-z plane that all rays cross, so distances take its place: ``RenderSettings.near`` is a distance
+    along the ray, depth images hold the distance of the chord middles, and primitives are sorted by the distance of
+    their centres from the camera. Images therefore differ from a pinhole's where a near plane cuts chords or where the
+    two orders disagree. Only the reference backend draws these cameras; gradients reach ``viewmat`` and ``directions``.
 
     Attributes:
         viewmat: (4, 4) world-to-camera, OpenCV axes (x right, y down, z forward).
-        directions: (H, W, 3) unit vectors in camera axes, float64 for full accuracy; a zero vector marks a pixel that has no
+        directions: (H, W, 3) unit vectors in camera axes, float64 for full accuracy; a zero vector marks a pixel that
+        has no
             ray (outside a fisheye's image circle) and shows the background.
 
     Raises:
-        DataError: a matrix that is no rigid transform, or directions of another shape, non-finite or not of unit length.
+        DataError: a matrix that is no rigid transform, or directions of another shape, non-finite or not of unit
+        length.
     """
 
     viewmat: Tensor
@@ -41,7 +44,9 @@ class RayCamera:
         check_viewmat(self.viewmat, "RayCamera.viewmat")
         d = self.directions.detach().double()
         if d.dim() != 3 or d.shape[-1] != 3 or not d.numel():
-            raise DataError(f"RayCamera.directions has shape {tuple(d.shape)}; expected (H, W, 3) with at least one pixel")
+            raise DataError(
+                f"RayCamera.directions has shape {tuple(d.shape)}; expected (H, W, 3) with at least one pixel"
+            )
         length = d.norm(dim=-1)
         wrong = ~(((length - 1).abs() <= _UNIT) | (length == 0))
         if bool(wrong.any()):
@@ -68,10 +73,11 @@ class RayCamera:
 
     @classmethod
     def fisheye(cls, width: int, height: int, viewmat: Tensor, fov_degrees: float = 180.0) -> RayCamera:
-        """An equidistant fisheye: the angle to the optical axis grows in proportion to the distance from the image centre.
+        """An equidistant fisheye: the angle to the optical axis grows in proportion to the distance from the image
+        centre.
 
-        The field of view, up to 360 degrees, spans the shorter side. Pixels beyond it towards the corners go on by the same
-        law up to 180 degrees off the axis, straight backwards; beyond that they have no ray.
+        The field of view, up to 360 degrees, spans the shorter side. Pixels beyond it towards the corners go on by the
+        same law up to 180 degrees off the axis, straight backwards; beyond that they have no ray.
 
         Args:
             width, height: image size in pixels; pixel centres at +0.5.
@@ -97,7 +103,8 @@ class RayCamera:
     def equirectangular(cls, width: int, height: int, viewmat: Tensor) -> RayCamera:
         """A full panorama: columns are longitudes -180..180 degrees, rows latitudes from 90 (up, -y) to -90 degrees.
 
-        The image centre looks along +z, its right half to +x. Square pixels at the equator take ``width == 2 * height``.
+        The image centre looks along +z, its right half to +x. Square pixels at the equator take ``width == 2 *
+        height``.
 
         Args:
             width, height: image size in pixels; pixel centres at +0.5.

@@ -1,7 +1,8 @@
 """Cameras of USD stages (.usd, .usda, .usdc, .usdz), by Pixar's library (the extra ``neuprim[usd]``).
 
-The library is C++ that was not written for files of strangers, so a process of its own reads them (:mod:`neuprim.core.cameras.usd_stage`), with
-limits of time and memory, and what it prints is checked like any other file.
+The library is C++ that was not written for files of strangers, so a process of its own reads them
+(:mod:`neuprim.core.cameras.usd_stage`), with limits of time and memory, and what it prints is checked like any other
+file.
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ def is_usd(path: Path) -> bool:
 def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = None) -> CameraViews:
     """The camera of a stage, at every whole time code of its range where it moves.
 
-    Axes and units are those of the stage, and nothing is turned or scaled. The image shows the whole aperture: where its shape differs, it
-    shows more on two sides ("expandAperture" of UsdRender). Lens distortion, depth of field and exposure are not USD's pinhole.
+    Axes and units are those of the stage, and nothing is turned or scaled. The image shows the whole aperture: where
+    its shape differs, it shows more on two sides ("expandAperture" of UsdRender). Lens distortion, depth of field and
+    exposure are not USD's pinhole.
 
     Args:
         prim: path of the camera in a stage with several.
@@ -59,7 +61,10 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
     where = f"{path}: {stage.text('path')}"
     wanted = size or _resolution(stage, path)
     records = list(stage.objects("frames"))
-    cameras = [_camera(Record(r.values, where if len(records) == 1 else f"{where}, frame {i}"), wanted) for i, r in enumerate(records)]
+    cameras = [
+        _camera(Record(r.values, where if len(records) == 1 else f"{where}, frame {i}"), wanted)
+        for i, r in enumerate(records)
+    ]
     note = f"{stage.text('up')} is up and a unit is {stage.number('meters', 'metres per unit', 0.0):g} m in this file; taken as the axes and units of the run's data"
     fps = stage.number("fps", "time codes per second above 0", 0.0) if len(cameras) > 1 else None
     if fps is not None and not RATES[0] <= fps <= RATES[1]:  # some tools count in ticks
@@ -78,7 +83,9 @@ def _stage(path: Path, prim: str) -> Record:
     except subprocess.TimeoutExpired:
         raise DataError(f"{path}: not read after {_SECONDS:.0f} s; expected a USD file with a camera") from None
     if done.returncode < 0:
-        raise DataError(f"{path}: not a readable USD file (its reader ended by {signal.Signals(-done.returncode).name})")
+        raise DataError(
+            f"{path}: not a readable USD file (its reader ended by {signal.Signals(-done.returncode).name})"
+        )
     if done.returncode:
         said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
         raise DataError(f"{path}: {said[:300]}")
@@ -107,7 +114,9 @@ def _camera(record: Record, size: tuple[int, int]) -> Camera:
     width, height = size
     scale = min(width / wide, height / high)  # pixels per unit of the aperture; all of it is in the image
     pose = opengl_to_viewmat(_rigid(record.matrix("transform_matrix"), record.where))
-    camera = Camera(pose, focal * scale, focal * scale, width / 2 - right * scale, height / 2 + up * scale, width, height)
+    camera = Camera(
+        pose, focal * scale, focal * scale, width / 2 - right * scale, height / 2 + up * scale, width, height
+    )
     return camera.validate(record.where)
 
 

@@ -1,7 +1,9 @@
-"""Reads the camera of a USD stage and prints it as JSON; run as a process of its own, so that a damaged file can end no other.
+"""Reads the camera of a USD stage and prints it as JSON; run as a process of its own, so that a damaged file can end no
+other.
 
-It imports nothing of neuprim, and Pixar's ``pxr`` alone. USD's cameras look along -z with y up, as OpenGL's, and its matrices multiply row
-vectors. Arguments: file, path of the camera's prim or nothing, and the most frames; a line on standard error says what is wrong.
+It imports nothing of neuprim, and Pixar's ``pxr`` alone. USD's cameras look along -z with y up, as OpenGL's, and its
+matrices multiply row vectors. Arguments: file, path of the camera's prim or nothing, and the most frames; a line on
+standard error says what is wrong.
 """
 
 from __future__ import annotations
@@ -50,9 +52,14 @@ def times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any) -> list[An
     """Every whole time code from start to end where anything of the camera moves; else the default, or the start."""
     prim, moves = camera.GetPrim(), any(a.ValueMightBeTimeVarying() for a in camera.GetPrim().GetAttributes())
     while not moves and prim and not prim.IsPseudoRoot():
-        moves, prim = UsdGeom.Xformable(prim).TransformMightBeTimeVarying() if UsdGeom.Xformable(prim) else False, prim.GetParent()
+        moves, prim = (
+            UsdGeom.Xformable(prim).TransformMightBeTimeVarying() if UsdGeom.Xformable(prim) else False,
+            prim.GetParent(),
+        )
     if not moves:
-        return [Usd.TimeCode(stage.GetStartTimeCode()) if stage.HasAuthoredTimeCodeRange() else Usd.TimeCode.EarliestTime()]
+        return [
+            Usd.TimeCode(stage.GetStartTimeCode()) if stage.HasAuthoredTimeCodeRange() else Usd.TimeCode.EarliestTime()
+        ]
     if not stage.HasAuthoredTimeCodeRange():
         raise SystemExit("startTimeCode and endTimeCode are missing; expected them, as the camera moves")
     first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()

@@ -1,4 +1,5 @@
-"""Where a scene lies in the world of the user's files: one known transform, applied wherever coordinates come in or go out."""
+"""Where a scene lies in the world of the user's files: one known transform, applied wherever coordinates come in or go
+out."""
 
 from __future__ import annotations
 
@@ -27,8 +28,8 @@ _Camera = TypeVar("_Camera", Camera, RayCamera)
 class World:
     """How scene coordinates follow from those of the user's files, the *world*: a rotation, one scale and an offset.
 
-    Everything inside is in scene units, mostly float32. Coordinates that users give or get (cameras, lights, boxes, exported positions) are in
-    the world, float64, and are converted by this class alone.
+    Everything inside is in scene units, mostly float32. Coordinates that users give or get (cameras, lights, boxes,
+    exported positions) are in the world, float64, and are converted by this class alone.
 
     Attributes:
         scene_from_world: (4, 4) float64.
@@ -83,7 +84,8 @@ class World:
         return self.inverse.scene_points(points)
 
     def scene_camera(self, camera: _Camera) -> _Camera:
-        """The same view of the scene as ``camera`` has of the world. Its rotation stays one, and its depths are in scene units."""
+        """The same view of the scene as ``camera`` has of the world. Its rotation stays one, and its depths are in
+        scene units."""
         if self.identity:
             return camera
         view, back = camera.viewmat.detach().double(), self.world_from_scene
@@ -123,14 +125,22 @@ class World:
         if record is None:
             return World()
         try:
-            return World(torch.tensor(record["scene_from_world"], dtype=torch.float64)).validate(f"{where}: header field 'world'")
+            return World(torch.tensor(record["scene_from_world"], dtype=torch.float64)).validate(
+                f"{where}: header field 'world'"
+            )
         except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
             raise DataError(f"{where}: header field 'world' is damaged ({type(error).__name__})") from None
 
     def validate(self, where: str) -> World:
-        """Return self, or raise :class:`DataError` naming ``where`` for a matrix that is no rotation with one scale and an offset."""
+        """Return self, or raise :class:`DataError` naming ``where`` for a matrix that is no rotation with one scale and
+        an offset."""
         matrix = self.scene_from_world
-        fits = isinstance(matrix, Tensor) and matrix.shape == (4, 4) and matrix.dtype == torch.float64 and bool(matrix.isfinite().all())
+        fits = (
+            isinstance(matrix, Tensor)
+            and matrix.shape == (4, 4)
+            and matrix.dtype == torch.float64
+            and bool(matrix.isfinite().all())
+        )
         if fits and matrix[3].tolist() == [0, 0, 0, 1]:
             square = matrix[:3, :3] @ matrix[:3, :3].T
             scale = float(square.diagonal().mean())

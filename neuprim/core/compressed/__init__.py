@@ -1,11 +1,21 @@
 """Models in few bytes: codes of a few bits a number, the file that holds them, and the way back for every command.
 
-``bits`` says how many, ``columns`` and ``rotations`` what a code stands for, ``order`` in which order primitives are, ``sections`` how codes become
-bytes, ``file`` how these lie on disk, ``codec`` how a model is taken apart.
+``bits`` says how many, ``columns`` and ``rotations`` what a code stands for, ``order`` in which order primitives are,
+``sections`` how codes become bytes, ``file`` how these lie on disk, ``codec`` how a model is taken apart.
 """
 
 from neuprim.core.compressed.bits import LEVELS, USUAL_LEVEL, BitTable, bit_table
-from neuprim.core.compressed.codec import Schemes, Stored, bits_in_words, encode, file_order, folded, rounded, schemes, schemes_within
+from neuprim.core.compressed.codec import (
+    Schemes,
+    Stored,
+    bits_in_words,
+    encode,
+    file_order,
+    folded,
+    rounded,
+    schemes,
+    schemes_within,
+)
 from neuprim.core.compressed.file import CONFIG, is_compressed, read_compressed, read_head, write_compressed
 from neuprim.core.compressed.sections import TEXT, Section
 

@@ -21,10 +21,12 @@ class BitTable:
     """Bits of a number, by parameter.
 
     Attributes:
-        named: parameter -> bits; several numbers are for the bands of spherical harmonics, degrees 1, 2, ... in the order of 3D Gaussian
+        named: parameter -> bits; several numbers are for the bands of spherical harmonics, degrees 1, 2, ... in the
+        order of 3D Gaussian
             splatting, the last for all that follow.
         others: of every other parameter.
-        exact: parameters that get just that; of the others, columns that need more get more (:mod:`neuprim.core.compressed.codec`).
+        exact: parameters that get just that; of the others, columns that need more get more
+        (:mod:`neuprim.core.compressed.codec`).
     """
 
     named: Mapping[str, tuple[int, ...]]
@@ -40,9 +42,19 @@ class BitTable:
         return [bits[min(degree, len(bits)) - 1] for degree in degrees for _ in range(math.prod(shape[1:]))]
 
 
-def _level(means: int, shapes: int, quats: int, gain: int, W1: int, rest: int, sh_dc: int, sh_rest: int, others: int) -> BitTable:
+def _level(
+    means: int, shapes: int, quats: int, gain: int, W1: int, rest: int, sh_dc: int, sh_rest: int, others: int
+) -> BitTable:
     """``shapes`` of log_scales, ``rest`` of the density's other numbers."""
-    named = {"means": means, "log_scales": shapes, "quats": quats, "log_gain": gain, "W1": W1, "sh_dc": sh_dc, "sh_rest": sh_rest}
+    named = {
+        "means": means,
+        "log_scales": shapes,
+        "quats": quats,
+        "log_gain": gain,
+        "W1": W1,
+        "sh_dc": sh_dc,
+        "sh_rest": sh_rest,
+    }
     return BitTable({name: (bits,) for name, bits in (named | {"b1": rest, "w2": rest, "b2": rest}).items()}, others)
 
 
@@ -53,13 +65,15 @@ LEVELS: dict[int, BitTable] = {
     4: _level(means=12, shapes=7, quats=7, gain=7, W1=6, rest=5, sh_dc=6, sh_rest=5, others=5),
     5: _level(means=11, shapes=6, quats=6, gain=6, W1=5, rest=4, sh_dc=5, sh_rest=4, others=4),
 }
-"""From nearly everything to very little. What a primitive has few of and images depend on has more bits: its place, shape and strength."""
+"""From nearly everything to very little. What a primitive has few of and images depend on has more bits: its place,
+shape and strength."""
 
 USUAL_LEVEL = 3
 
 
 def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) -> BitTable:
-    """A level's table under a user's words NAME=BITS, where NAME is a parameter of the model or ``others``, and BITS a number or several.
+    """A level's table under a user's words NAME=BITS, where NAME is a parameter of the model or ``others``, and BITS a
+    number or several.
 
     Raises:
         ConfigError: no such level or parameter, or no such number of bits.
@@ -77,7 +91,9 @@ def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) 
             raise ConfigError(f"--bits {word}: {name} is given twice")
         bits = _numbers(word, text, name)
         if name == OTHERS:
-            table = replace(table, others=bits[0], exact=table.exact | {n for n in (*names, OTHERS) if n not in table.named})
+            table = replace(
+                table, others=bits[0], exact=table.exact | {n for n in (*names, OTHERS) if n not in table.named}
+            )
         else:
             table = replace(table, named={**table.named, name: bits}, exact=table.exact | {name})
     return table

@@ -21,7 +21,17 @@ from neuprim.core.model.fields import pieces_by_name
 from neuprim.core.model.pieces import alive
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["Schemes", "Stored", "bits_in_words", "encode", "file_order", "folded", "rounded", "schemes", "schemes_within"]
+__all__ = [
+    "Schemes",
+    "Stored",
+    "bits_in_words",
+    "encode",
+    "file_order",
+    "folded",
+    "rounded",
+    "schemes",
+    "schemes_within",
+]
 
 Schemes = dict[str, Columns | Rotations]
 """Parameter -> how its numbers are coded."""
@@ -36,10 +46,12 @@ class Stored:
 
 
 _SPIKY = 12.0
-"""Columns whose error is more times the usual one than this get twice the bits: a few of their numbers lie far from all others."""
+"""Columns whose error is more times the usual one than this get twice the bits: a few of their numbers lie far from all
+others."""
 
 _LABEL = 16
-"""Bits of a number that is not learned, at every level: it tells one thing from another, and half of it says nothing."""
+"""Bits of a number that is not learned, at every level: it tells one thing from another, and half of it says
+nothing."""
 
 _WORTH_A_MASK = 0.02
 """Share of the primitives without a piece from which on a bit for each says so."""
@@ -49,7 +61,8 @@ _FINE = 50.0
 
 
 def folded(model: Primitives) -> Primitives:
-    """The same model in the numbers that are stored (:meth:`~neuprim.core.model.fields.Field.folded`), detached and on the processor.
+    """The same model in the numbers that are stored (:meth:`~neuprim.core.model.fields.Field.folded`), detached and on
+    the processor.
 
     Raises:
         CheckpointError: numbers that cannot be stored: not float32, not finite, or a quaternion of zeros.
@@ -71,12 +84,15 @@ def folded(model: Primitives) -> Primitives:
             bad |= (value == 0).all(1)
         if bool(bad.any()):
             row = int(bad.nonzero()[0])
-            raise CheckpointError(f"parameter {name} of primitive {row} is {value[row].flatten()[:8].tolist()}, which cannot be compressed")
+            raise CheckpointError(
+                f"parameter {name} of primitive {row} is {value[row].flatten()[:8].tolist()}, which cannot be compressed"
+            )
     return Primitives(model.density, model.colour, params)
 
 
 def schemes(model: Primitives, table: BitTable) -> Schemes:
-    """How a folded model's numbers are coded: ends from its own numbers, bits from the table and, where it leaves it open, from them."""
+    """How a folded model's numbers are coded: ends from its own numbers, bits from the table and, where it leaves it
+    open, from them."""
     found: Schemes = {}
     sparse = _sparse(model)
     for spec in model.specs:
@@ -92,19 +108,24 @@ def schemes(model: Primitives, table: BitTable) -> Schemes:
             if spec.name not in table.exact and model.count:
                 spiky = spread_error(x, columns) > _SPIKY
                 if bool(spiky.any()):
-                    columns = fit_columns(x, [min(2 * b, 16) if more else b for b, more in zip(bits, spiky.tolist(), strict=True)])
+                    columns = fit_columns(
+                        x, [min(2 * b, 16) if more else b for b, more in zip(bits, spiky.tolist(), strict=True)]
+                    )
             found[spec.name] = keep_zero(columns) if spec.name in sparse else columns
     return found
 
 
 def schemes_within(model: Primitives, effects: Mapping[str, Tensor], error: float) -> Schemes:
-    """How a folded model's numbers are coded so that each of them brings the same error, as little as that is: a step is as long as images allow.
+    """How a folded model's numbers are coded so that each of them brings the same error, as little as that is: a step
+    is as long as images allow.
 
-    A number rounded to steps of length s is off by s^2 / 12 in the mean of squares. Of all ways to spend so many bits, those by which the last
-    bit of every number is worth as much are the best (reverse water filling), and codes that no number has take next to no bytes.
+    A number rounded to steps of length s is off by s^2 / 12 in the mean of squares. Of all ways to spend so many bits,
+    those by which the last bit of every number is worth as much are the best (reverse water filling), and codes that no
+    number has take next to no bytes.
 
     Args:
-        effects: parameter -> (C,) mean squared change of what is looked at, when its numbers change by independent amounts of variance 1
+        effects: parameter -> (C,) mean squared change of what is looked at, when its numbers change by independent
+        amounts of variance 1
             (:class:`~neuprim.core.train.sensitivity.Sensitivity`).
         error: mean squared change that the numbers of one column may bring together.
     """
@@ -112,11 +133,15 @@ def schemes_within(model: Primitives, effects: Mapping[str, Tensor], error: floa
     sparse = _sparse(model)
     for spec in model.specs:
         x = model.params[spec.name].reshape(model.count, spec.size)
-        own = effects[spec.name].double().nan_to_num(nan=torch.inf, posinf=torch.inf)  # what cannot be told is stored as finely as can be
+        own = (
+            effects[spec.name].double().nan_to_num(nan=torch.inf, posinf=torch.inf)
+        )  # what cannot be told is stored as finely as can be
         steps = (12.0 * error / own).sqrt()  # infinite where nothing changes
         if spec.name == "quats":
             turn = float((12.0 * 3.0 * error / own.sum()).sqrt())  # three numbers tell of four
-            found[spec.name] = Rotations(min(max(round(math.log2(2**0.5 / turn + 2)), LEAST_BITS), 16) if turn > 0 else 16)
+            found[spec.name] = Rotations(
+                min(max(round(math.log2(2**0.5 / turn + 2)), LEAST_BITS), 16) if turn > 0 else 16
+            )
         elif spec.fixed:
             found[spec.name] = fit_columns(x, [_LABEL] * spec.size, clips=(0.0,))
         elif spec.name == "means":
@@ -154,16 +179,22 @@ def _positions(model: Primitives, x: Tensor, bits: int, exact: bool) -> Columns:
 
 
 def file_order(model: Primitives, made: Schemes) -> Tensor:
-    """(N,) int64 rows of a folded model as they follow each other in a file: along a Z curve through the positions' codes."""
+    """(N,) int64 rows of a folded model as they follow each other in a file: along a Z curve through the positions'
+    codes."""
     places = made["means"]
     assert isinstance(places, Columns)
-    return torch.from_numpy(np.argsort(morton(places.codes(model.params["means"]).numpy(), int(places.bits[0])), kind="stable"))
+    return torch.from_numpy(
+        np.argsort(morton(places.codes(model.params["means"]).numpy(), int(places.bits[0])), kind="stable")
+    )
 
 
 def encode(model: Primitives, made: Schemes) -> list[Section]:
     """The sections of a folded model, in the order of the file."""
     order = file_order(model, made)
-    codes = {spec.name: made[spec.name].codes(model.params[spec.name].reshape(model.count, spec.size)[order]) for spec in model.specs}
+    codes = {
+        spec.name: made[spec.name].codes(model.params[spec.name].reshape(model.count, spec.size)[order])
+        for spec in model.specs
+    }
     masks, whose = _masks(model, made, codes)
     sections = [pack_rows(masks)] if masks else []
     for spec in model.specs:
@@ -177,21 +208,28 @@ def encode(model: Primitives, made: Schemes) -> list[Section]:
     return sections
 
 
-def _masks(model: Primitives, made: Schemes, codes: Mapping[str, Tensor]) -> tuple[list[np.ndarray], dict[str, list[int]]]:
-    """Who has which piece, of pieces that come back as zeros for some primitives, and of their parameters the number of each column's mask.
+def _masks(
+    model: Primitives, made: Schemes, codes: Mapping[str, Tensor]
+) -> tuple[list[np.ndarray], dict[str, list[int]]]:
+    """Who has which piece, of pieces that come back as zeros for some primitives, and of their parameters the number of
+    each column's mask.
 
     One bit then says what would else be the most frequent code of every column of the piece.
     """
     shapes = {spec.name: spec.shape for spec in model.specs}
     zero = {
-        n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n]) for n, s in made.items() if isinstance(s, Columns) and n != "means"
+        n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n])
+        for n, s in made.items()
+        if isinstance(s, Columns) and n != "means"
     }
     masks: list[np.ndarray] = []
     whose: dict[str, Tensor] = {}
     for piece in pieces_by_name(model.density, model.colour).values():
         if not model.count or not set(piece.places) <= zero.keys():
             continue
-        parts = [zero[name][(slice(None), *place)].reshape(model.count, -1).all(1) for name, place in piece.places.items()]
+        parts = [
+            zero[name][(slice(None), *place)].reshape(model.count, -1).all(1) for name, place in piece.places.items()
+        ]
         without = torch.stack(parts).all(0)
         if float(without.double().mean()) < _WORTH_A_MASK:
             continue
@@ -204,9 +242,13 @@ def _masks(model: Primitives, made: Schemes, codes: Mapping[str, Tensor]) -> tup
 def rounded(params: Mapping[str, Tensor], made: Schemes) -> dict[str, Tensor]:
     """Tensors as they would come back, row by row, with the gradients of the tensors themselves (straight through).
 
-    For training that knows what will be stored: the schemes are fixed meanwhile, and numbers beyond a column's ends come back as the end.
+    For training that knows what will be stored: the schemes are fixed meanwhile, and numbers beyond a column's ends
+    come back as the end.
     """
-    return {name: made[name].rounded(x.reshape(len(x), math.prod(x.shape[1:]))).reshape(x.shape) for name, x in params.items()}
+    return {
+        name: made[name].rounded(x.reshape(len(x), math.prod(x.shape[1:]))).reshape(x.shape)
+        for name, x in params.items()
+    }
 
 
 def bits_in_words(scheme: Columns | Rotations) -> str:

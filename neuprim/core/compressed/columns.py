@@ -4,8 +4,9 @@ What a code stands for is, with m = 2^bits - 1 and ends stored in float32,
 
     value = float32((low (m - code) + high code) / m)
 
-in double precision. Both products are exact there, so that whoever adds, divides and rounds by IEEE 754 gets the same bits, whether or not
-a compiler fuses product and sum; and the ends come back as they are, so that what was decoded is coded again as it was.
+in double precision. Both products are exact there, so that whoever adds, divides and rounds by IEEE 754 gets the same
+bits, whether or not a compiler fuses product and sum; and the ends come back as they are, so that what was decoded is
+coded again as it was.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
 
 @dataclass(frozen=True)
 class Columns:
-    """How C columns are coded: ``bits`` (C,) int64, and the first and the last value, ``low`` and ``high`` (C,) float32."""
+    """How C columns are coded: ``bits`` (C,) int64, and the first and the last value, ``low`` and ``high`` (C,)
+    float32."""
 
     bits: Tensor
     low: Tensor
@@ -56,7 +58,8 @@ class Columns:
         return ((self.low.double() * (m - c) + self.high.double() * c) / m).float()
 
     def rounded(self, x: Tensor) -> Tensor:
-        """x as it comes back, with the gradient of x itself (straight through): for training that knows what will be stored."""
+        """x as it comes back, with the gradient of x itself (straight through): for training that knows what will be
+        stored."""
         return self.values(self.codes(x)).to(x) + (x - x.detach())
 
     def to(self, device: torch.device) -> Columns:
@@ -88,10 +91,11 @@ def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) 
 
 
 def even_columns(x: Tensor, steps: Tensor, through: Tensor | float) -> Columns:
-    """Columns whose neighbouring values lie ``steps`` (C,) apart, or nearer where they would need more than :data:`MOST_BITS`, and that reach
-    all of x (N, C), finite, on the processor.
+    """Columns whose neighbouring values lie ``steps`` (C,) apart, or nearer where they would need more than
+    :data:`MOST_BITS`, and that reach all of x (N, C), finite, on the processor.
 
-    Codes that no number has are as good as free, so a step can be of any length. A column whose numbers all lie within one is a single value.
+    Codes that no number has are as good as free, so a step can be of any length. A column whose numbers all lie within
+    one is a single value.
 
     Args:
         through: (C,) or a number, what is one of the values, within the column's numbers.
@@ -111,11 +115,11 @@ def even_columns(x: Tensor, steps: Tensor, through: Tensor | float) -> Columns:
 
 
 def keep_zero(columns: Columns) -> Columns:
-    """The same with ends a little closer, by two steps at most, so that 0 is one of the values and comes back as 0: for columns that many
-    primitives do without.
+    """The same with ends a little closer, by two steps at most, so that 0 is one of the values and comes back as 0: for
+    columns that many primitives do without.
 
-    Ends are whole multiples of a step that is short enough in binary for both to be float32 numbers. As no end lies beyond what the numbers
-    reach, what was decoded is coded again as it was.
+    Ends are whole multiples of a step that is short enough in binary for both to be float32 numbers. As no end lies
+    beyond what the numbers reach, what was decoded is coded again as it was.
     """
     low, high, last = columns.low.double().clamp(max=0.0), columns.high.double().clamp(min=0.0), columns.last.double()
     width = high - low
@@ -140,7 +144,8 @@ def _quantile(ordered: np.ndarray, q: float) -> np.ndarray:
 
 
 def spread_error(x: Tensor, columns: Columns) -> Tensor:
-    """(C,) float64 root mean squares of the errors, over what even steps between -1 and 1 standard deviations would leave.
+    """(C,) float64 root mean squares of the errors, over what even steps between -1 and 1 standard deviations would
+    leave.
 
     A bell between its extremes has about 4; a column with a few numbers far from all others, tens and more.
     """

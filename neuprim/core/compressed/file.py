@@ -1,7 +1,8 @@
-"""The file ``.neuprim``: a JSON header, a table of sections, their bytes through zstd. Little-endian; docs/data_formats.md has every byte.
+"""The file ``.neuprim``: a JSON header, a table of sections, their bytes through zstd. Little-endian;
+docs/data_formats.md has every byte.
 
-For files of strangers: nothing is executed, every size is compared with the file's true one and with what the counts allow before memory
-is taken, and a file stands for numbers of at most :data:`MOST_TIMES` its own size.
+For files of strangers: nothing is executed, every size is compared with the file's true one and with what the counts
+allow before memory is taken, and a file stands for numbers of at most :data:`MOST_TIMES` its own size.
 """
 
 from __future__ import annotations
@@ -38,7 +39,16 @@ from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import atomic_path
 from neuprim.core.io.plain import load_json
 
-__all__ = ["CONFIG", "MAGIC", "MOST_TIMES", "VERSION", "is_compressed", "read_compressed", "read_head", "write_compressed"]
+__all__ = [
+    "CONFIG",
+    "MAGIC",
+    "MOST_TIMES",
+    "VERSION",
+    "is_compressed",
+    "read_compressed",
+    "read_head",
+    "write_compressed",
+]
 
 MAGIC = b"\x89NEUPRIM"
 VERSION = 1
@@ -59,7 +69,8 @@ _MOST_SECTIONS, _MOST_DIMENSIONS, _MOST_COLUMNS, _MOST_PRIMITIVES = 4096, 4, 2**
 
 @dataclass(frozen=True)
 class _Entry:
-    """A row of the table: a section without its bytes; those of its planes, how they are stored, the bytes of it all, and their check sum."""
+    """A row of the table: a section without its bytes; those of its planes, how they are stored, the bytes of it all,
+    and their check sum."""
 
     section: Section
     content: int
@@ -97,7 +108,9 @@ def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections
     for s in sections:
         if len(s.name.encode()) > 255 or len(s.shape) > _MOST_DIMENSIONS or max(*s.shape, s.columns, 0) > _MOST_COLUMNS:
             limits = f"a name of 255 bytes, {_MOST_DIMENSIONS} dimensions and {_MOST_COLUMNS} numbers"
-            raise CheckpointError(f"{path}: parameter {s.name!r} of shape {s.shape} cannot be stored; at most {limits} can be")
+            raise CheckpointError(
+                f"{path}: parameter {s.name!r} of shape {s.shape} cannot be stored; at most {limits} can be"
+            )
     plain = [b"".join(s.planes) for s in sections]
     packed = [packed_planes(s.planes) for s in sections]
     numbers = count * sum(s.columns for s in sections if s.coding != TEXT)
@@ -115,7 +128,9 @@ def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections
             file.write(MAGIC + start + struct.pack("<I", zlib.crc32(start + text + table)) + text + table)
             file.writelines(stored)
     except OSError as error:
-        raise CheckpointError(f"{path}: could not write the model: {error}; the previous one, if any, is untouched") from error
+        raise CheckpointError(
+            f"{path}: could not write the model: {error}; the previous one, if any, is untouched"
+        ) from error
     return {s.name: len(data) for s, data in zip(sections, stored, strict=True)}
 
 
@@ -225,7 +240,9 @@ def _head(path: Path, file: BinaryIO) -> _Head:
         ("bytes of table", table_size, min(_MOST_TABLE, size - file.tell() - text_size)),
     ):
         if value > most:
-            raise CheckpointError(f"{path}: claims {value} {what}; expected at most {max(most, 0)} in a file of {size} bytes")
+            raise CheckpointError(
+                f"{path}: claims {value} {what}; expected at most {max(most, 0)} in a file of {size} bytes"
+            )
     text, table = file.read(text_size), file.read(table_size)
     if zlib.crc32(start[:-4] + text + table) != checksum:
         raise CheckpointError(f"{path}: the check sum of header and table is not {checksum:08x}; the file is damaged")
@@ -258,7 +275,9 @@ def _entries(table: bytes, sections: int, count: int) -> list[_Entry]:
             shape = struct.unpack(f"<{dimensions}I", file.read(4 * dimensions))
             content, stored, checksum = _SIZES.unpack(file.read(_SIZES.size))
         except (struct.error, IndexError, UnicodeDecodeError) as error:
-            raise Damaged(f"row {number} of the table of {sections} sections is cut short or damaged ({error})") from error
+            raise Damaged(
+                f"row {number} of the table of {sections} sections is cut short or damaged ({error})"
+            ) from error
         if name in names:
             raise Damaged(f"section {name!r} is there twice")
         names.add(name)
@@ -271,13 +290,17 @@ def _entries(table: bytes, sections: int, count: int) -> list[_Entry]:
 
 def _named(name: str, coding: int, shape: tuple[int, ...]) -> Section:
     if coding not in CODINGS:
-        raise Damaged(f"section {name!r} has coding {coding}; expected {', '.join(f'{k} ({v})' for k, v in CODINGS.items())}")
+        raise Damaged(
+            f"section {name!r} has coding {coding}; expected {', '.join(f'{k} ({v})' for k, v in CODINGS.items())}"
+        )
     section, wanted = Section(name, coding, shape), {TEXT: (), POSITIONS: (3,), ROTATIONS: (4,)}.get(coding, shape)
     if shape != wanted:
         raise Damaged(f"section {name!r} of {CODINGS[coding]} has shape {shape}; expected {wanted}")
     if (coding == TEXT) != (name == CONFIG):
         raise Damaged(f"section {name!r} has coding {CODINGS[coding]}; the one text is {CONFIG!r}")
-    if (coding == ROWS) != (name == ROWS_NAME) or (coding == ROWS and not (len(shape) == 1 and 0 < shape[0] <= _MOST_MASKS)):
+    if (coding == ROWS) != (name == ROWS_NAME) or (
+        coding == ROWS and not (len(shape) == 1 and 0 < shape[0] <= _MOST_MASKS)
+    ):
         raise Damaged(
             f"section {name!r} of {CODINGS[coding]} has shape {shape}; the one of rows is {ROWS_NAME!r}, of 1 to {_MOST_MASKS} masks"
         )
@@ -291,13 +314,18 @@ def _check(entry: _Entry, count: int) -> None:
     section, head = entry.section, entry.section.head_size
     most = MOST_TEXT if section.coding == TEXT else _MOST_PLANES * count * section.columns
     if entry.content > most:
-        raise Damaged(f"section {section.name!r} has planes of {entry.content} bytes; expected at most {most} of {count} primitives")
+        raise Damaged(
+            f"section {section.name!r} has planes of {entry.content} bytes; expected at most {most} of {count} primitives"
+        )
     if entry.packing not in (_PLAIN, _ZSTD):
-        raise Damaged(f"section {section.name!r} has packing {entry.packing}; expected {_PLAIN} (plain) or {_ZSTD} (zstd)")
+        raise Damaged(
+            f"section {section.name!r} has packing {entry.packing}; expected {_PLAIN} (plain) or {_ZSTD} (zstd)"
+        )
     least = head + (entry.content if entry.packing == _PLAIN else 0)
     if entry.stored < least or (entry.packing == _PLAIN and entry.stored != least):
         raise Damaged(
-            f"section {section.name!r} is stored in {entry.stored} bytes; expected {least}" + " or more" * (entry.packing == _ZSTD)
+            f"section {section.name!r} is stored in {entry.stored} bytes; expected {least}"
+            + " or more" * (entry.packing == _ZSTD)
         )
 
 
@@ -307,4 +335,6 @@ def _fit(entries: Sequence[_Entry], count: int, size: int, left: int) -> None:
         raise Damaged(f"the sections take {stored} bytes by the table; {left} follow it")
     numbers = count * sum(entry.section.columns for entry in entries if entry.section.coding != TEXT)
     if not _allowed(numbers, size):
-        raise Damaged(f"stands for {count} primitives of {numbers // max(count, 1)} numbers; expected at most {MOST_TIMES} times its size")
+        raise Damaged(
+            f"stands for {count} primitives of {numbers // max(count, 1)} numbers; expected at most {MOST_TIMES} times its size"
+        )

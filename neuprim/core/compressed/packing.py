@@ -13,9 +13,11 @@ _LEVELS = 19, 1
 
 
 def packed_planes(planes: Sequence[bytes]) -> bytes:
-    """The smallest that was found: one zstd frame, which states its content's size, or the planes as they are where no frame is smaller.
+    """The smallest that was found: one zstd frame, which states its content's size, or the planes as they are where no
+    frame is smaller.
 
-    A block of a frame has one table of how often bytes occur. Columns that are alike share one best, others have their own.
+    A block of a frame has one table of how often bytes occur. Columns that are alike share one best, others have their
+    own.
     """
     whole = b"".join(planes)
     cuts = ([whole], _runs(planes), planes)

@@ -4,7 +4,8 @@ With h = 2^(bits-1) - 1, the three are u / (h sqrt 2) for whole u from -h to h, 
 
     sqrt(2 h^2 - u1^2 - u2^2 - u3^2) / (h sqrt 2)
 
-positive. Sum and difference are of whole numbers, a root and a quotient of double precision are rounded once: the same bits everywhere.
+positive. Sum and difference are of whole numbers, a root and a quotient of double precision are rounded once: the same
+bits everywhere.
 Zero is among the values, so that primitives which never turned come back as they were.
 """
 
@@ -34,7 +35,8 @@ class Rotations:
     def codes(self, quats: Tensor) -> Tensor:
         """(N, 4) int64 of wxyz (N, 4) of any norm but 0: which component is the largest, and the codes of the others.
 
-        Where rounding would leave another component as large as the largest, it is made smaller: what was decoded is coded as it was.
+        Where rounding would leave another component as large as the largest, it is made smaller: what was decoded is
+        coded as it was.
         """
         q = quats.detach().double()
         q = q / q.abs().amax(1, keepdim=True)  # squares of the tiniest norms would vanish
@@ -47,7 +49,9 @@ class Rotations:
             over = (self._left(u) < (most + 1).square()) & (most > 0)
             if not bool(over.any()):
                 return torch.cat([largest[:, None], u + self.half], 1)
-            u = u.scatter_add(1, which[:, None], torch.where(over, -u.gather(1, which[:, None])[:, 0].sign(), 0)[:, None])
+            u = u.scatter_add(
+                1, which[:, None], torch.where(over, -u.gather(1, which[:, None])[:, 0].sign(), 0)[:, None]
+            )
 
     def values(self, codes: Tensor) -> Tensor:
         """(N, 4) float32 unit quaternions wxyz that codes (N, 4) stand for."""

@@ -39,7 +39,14 @@ __all__ = [
 ]
 
 TEXT, COLUMNS, POSITIONS, ROTATIONS, ROWS, SPARSE = range(6)
-CODINGS = {TEXT: "text", COLUMNS: "columns", POSITIONS: "positions", ROTATIONS: "rotations", ROWS: "rows", SPARSE: "sparse columns"}
+CODINGS = {
+    TEXT: "text",
+    COLUMNS: "columns",
+    POSITIONS: "positions",
+    ROTATIONS: "rotations",
+    ROWS: "rows",
+    SPARSE: "sparse columns",
+}
 
 ROWS_NAME = "rows|"
 """Of the one section that says which primitives have what; no parameter is called so."""
@@ -61,8 +68,8 @@ class Section:
 
     Attributes:
         coding, shape: one of :data:`CODINGS`, and the shape of one primitive's row.
-        head: how its numbers are coded: a record per column, of sparse ones then whose they are, or the bits of rotations.
-        planes: its codes, a byte plane each; of a text all of it.
+        head: how its numbers are coded: a record per column, of sparse ones then whose they are, or the bits of
+        rotations. planes: its codes, a byte plane each; of a text all of it.
     """
 
     name: str
@@ -98,11 +105,18 @@ def pack(name: str, shape: tuple[int, ...], scheme: Columns | Rotations, codes: 
 
 def pack_rows(masks: Sequence[np.ndarray]) -> Section:
     """The section of (N,) bool masks: who has what, a bit per primitive, the lowest first."""
-    return Section(ROWS_NAME, ROWS, (len(masks),), planes=tuple(np.packbits(mask, bitorder="little").tobytes() for mask in masks))
+    return Section(
+        ROWS_NAME, ROWS, (len(masks),), planes=tuple(np.packbits(mask, bitorder="little").tobytes() for mask in masks)
+    )
 
 
 def pack_sparse(
-    name: str, shape: tuple[int, ...], scheme: Columns, codes: np.ndarray, whose: Sequence[int], masks: Sequence[np.ndarray]
+    name: str,
+    shape: tuple[int, ...],
+    scheme: Columns,
+    codes: np.ndarray,
+    whose: Sequence[int],
+    masks: Sequence[np.ndarray],
 ) -> Section:
     """The section of codes (N, C) of which column i has those of mask ``whose[i] - 1`` alone, or all of them for 0."""
     own = [codes[:, i] if of == 0 else codes[masks[of - 1], i] for i, of in enumerate(whose)]
@@ -111,12 +125,17 @@ def pack_sparse(
 
 
 def _head(scheme: Columns) -> bytes:
-    return b"".join(_RECORD.pack(*r) for r in zip(scheme.bits.tolist(), scheme.low.tolist(), scheme.high.tolist(), strict=True))
+    return b"".join(
+        _RECORD.pack(*r) for r in zip(scheme.bits.tolist(), scheme.low.tolist(), scheme.high.tolist(), strict=True)
+    )
 
 
 def _planes(codes: np.ndarray, bits: int) -> list[bytes]:
     """Low bytes of all codes, then the next, as many as so many bits need."""
-    return [((codes >> codes.dtype.type(8 * i)) & codes.dtype.type(255)).astype(np.uint8).tobytes() for i in range(_bytes(bits))]
+    return [
+        ((codes >> codes.dtype.type(8 * i)) & codes.dtype.type(255)).astype(np.uint8).tobytes()
+        for i in range(_bytes(bits))
+    ]
 
 
 def _bytes(bits: int) -> int:
@@ -150,14 +169,17 @@ def unpack_rows(section: Section, content: bytes, count: int) -> list[np.ndarray
     Raises:
         Damaged: bits of primitives that do not exist.
     """
-    bits = np.unpackbits(np.frombuffer(content, np.uint8).reshape(section.columns, (count + 7) // 8), axis=1, bitorder="little")
+    bits = np.unpackbits(
+        np.frombuffer(content, np.uint8).reshape(section.columns, (count + 7) // 8), axis=1, bitorder="little"
+    )
     if bits[:, count:].any():
         raise Damaged(f"bits beyond those of {count} primitives")
     return list(bits[:, :count].astype(bool))
 
 
 def unpack(section: Section, content: bytes, count: int, masks: Sequence[np.ndarray] = ()) -> Tensor:
-    """(count, *shape) float32 of a section's head and ``content``, :func:`content_size` bytes; what a sparse column does not have is 0.
+    """(count, *shape) float32 of a section's head and ``content``, :func:`content_size` bytes; what a sparse column
+    does not have is 0.
 
     Raises:
         Damaged: codes that do not exist.
@@ -192,8 +214,12 @@ def _counts(section: Section, count: int, masks: Sequence[np.ndarray]) -> list[i
     """Primitives that each column has numbers of."""
     whose = _whose(section)
     if max(whose, default=0) > len(masks):
-        raise Damaged(f"a column of the primitives of mask {max(whose)}; expected at most {len(masks)}, as many as there are before it")
-    sizes = {of: int(masks[of - 1].sum()) if of else count for of in set(whose)}  # no more work than the section has numbers
+        raise Damaged(
+            f"a column of the primitives of mask {max(whose)}; expected at most {len(masks)}, as many as there are before it"
+        )
+    sizes = {
+        of: int(masks[of - 1].sum()) if of else count for of in set(whose)
+    }  # no more work than the section has numbers
     return [sizes[of] for of in whose]
 
 
@@ -212,7 +238,11 @@ def _records(section: Section) -> Columns:
         if not -np.inf < low <= high < np.inf:
             raise Damaged(f"column {i} goes from {low} to {high}; expected two finite numbers, ascending")
     bits, low, high = zip(*found, strict=True) if found else ((), (), ())
-    return Columns(torch.tensor(bits, dtype=torch.int64), torch.tensor(low, dtype=torch.float32), torch.tensor(high, dtype=torch.float32))
+    return Columns(
+        torch.tensor(bits, dtype=torch.int64),
+        torch.tensor(low, dtype=torch.float32),
+        torch.tensor(high, dtype=torch.float32),
+    )
 
 
 def _cells(planes: _Planes, count: int, bits: int) -> np.ndarray:

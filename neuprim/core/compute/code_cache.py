@@ -1,7 +1,8 @@
 """Folders of compiled code that later processes run.
 
-Rule: whoever may write into such a folder, or put another in its place, decides what this user's processes execute. So it is used only if this
-user owns it and nobody else may do either; otherwise compiled code is kept in a folder of this process alone.
+Rule: whoever may write into such a folder, or put another in its place, decides what this user's processes execute. So
+it is used only if this user owns it and nobody else may do either; otherwise compiled code is kept in a folder of this
+process alone.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ def code_cache(folder: Path) -> Path:
 
 
 def weakness(folder: Path) -> str:
-    """Who else may change what a folder holds, in words; empty where nobody may. Windows keeps users' folders apart by itself."""
+    """Who else may change what a folder holds, in words; empty where nobody may. Windows keeps users' folders apart by
+    itself."""
     if not hasattr(os, "getuid"):
         return ""
     own = os.getuid()
@@ -49,7 +51,9 @@ def weakness(folder: Path) -> str:
         if there.st_uid != own and (place == whole or there.st_uid != 0):
             return f"belongs to user {there.st_uid}" if place == whole else f"{place} belongs to user {there.st_uid}"
         shared = there.st_mode & stat.S_IWOTH or (there.st_mode & stat.S_IWGRP and not _own_group(there.st_gid, own))
-        if shared and (place == whole or not there.st_mode & stat.S_ISVTX):  # others' entries of a sticky folder stay where they are
+        if shared and (
+            place == whole or not there.st_mode & stat.S_ISVTX
+        ):  # others' entries of a sticky folder stay where they are
             return "others may write it" if place == whole else f"others may write {place}"
     return ""
 

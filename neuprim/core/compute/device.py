@@ -1,7 +1,7 @@
 """Where tensors are: the processor's memory or a card's, and what follows from it.
 
-Everything else lets tensors' own ``device`` flow. Operations that are compiled for the processor ask :func:`fused` whether they may take
-what they are given; where they may not, a twin in torch code computes the same.
+Everything else lets tensors' own ``device`` flow. Operations that are compiled for the processor ask :func:`fused`
+whether they may take what they are given; where they may not, a twin in torch code computes the same.
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ def of_kind(kind: str) -> torch.device:
 
 
 def from_host(tensor: Tensor, device: torch.device) -> Tensor:
-    """The tensor on ``device``, itself if it is there already. Copies to a card go by pinned memory and do not wait for it."""
+    """The tensor on ``device``, itself if it is there already. Copies to a card go by pinned memory and do not wait for
+    it."""
     if tensor.device == device:
         return tensor
     if device.type != CARD or not tensor.is_cpu:
@@ -66,7 +67,8 @@ def from_host(tensor: Tensor, device: torch.device) -> Tensor:
 
 
 def beside(tensor: Tensor, like: Tensor) -> Tensor:
-    """A few numbers on the device of another tensor, and of its dtype; differentiable. Copies to a card do not wait for it."""
+    """A few numbers on the device of another tensor, and of its dtype; differentiable. Copies to a card do not wait for
+    it."""
     return tensor.to(like, non_blocking=tensor.is_cpu)
 
 

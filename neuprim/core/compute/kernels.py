@@ -1,8 +1,9 @@
 """How the kernels are compiled: flags, and where numba keeps the result.
 
-numba's cache notices edits of the file a kernel is in, but not of *other* files whose functions it inlined or whose constants it froze;
-and site-packages may be read-only. So the cache lives in the user's own cache folder, under a name made of the version and a hash of
-every source that can end up in compiled code: see :func:`kernel_sources`. ``NUMBA_CACHE_DIR``, where set, wins.
+numba's cache notices edits of the file a kernel is in, but not of *other* files whose functions it inlined or whose
+constants it froze; and site-packages may be read-only. So the cache lives in the user's own cache folder, under a name
+made of the version and a hash of every source that can end up in compiled code: see :func:`kernel_sources`.
+``NUMBA_CACHE_DIR``, where set, wins.
 """
 
 from __future__ import annotations
@@ -24,7 +25,18 @@ from neuprim.core.compute.code_cache import code_cache
 from neuprim.core.io import files
 from neuprim.version import __version__
 
-__all__ = ["FAST", "by_length", "cache_directory", "exact_kernel", "inline", "kernel", "kernel_sources", "sources_hash", "strict", "text"]
+__all__ = [
+    "FAST",
+    "by_length",
+    "cache_directory",
+    "exact_kernel",
+    "inline",
+    "kernel",
+    "kernel_sources",
+    "sources_hash",
+    "strict",
+    "text",
+]
 
 
 def _prefer_wide_vectors() -> None:
@@ -40,8 +52,9 @@ def _prefer_wide_vectors() -> None:
 def _one_vector_at_a_time() -> None:
     """Ask LLVM not to compute several vectors at a time, for the whole process.
 
-    In loops that sum it would, without counting what the loop already holds in registers: it spills, and leaves up to three vectors over to
-    a loop of half the width. Lanes come in whole vectors, so that one at a time leaves nothing over.
+    In loops that sum it would, without counting what the loop already holds in registers: it spills, and leaves up to
+    three vectors over to a loop of half the width. Lanes come in whole vectors, so that one at a time leaves nothing
+    over.
     """
     llvm.set_option("neuprim", "-force-vector-interleave=1")
 
@@ -57,13 +70,16 @@ _COMPILED = re.compile(rb"\bnumba\b|\bcompute\.kernels import [^\n]*\b(?:exact_k
 
 
 def kernel_sources(package: Path) -> list[Path]:
-    """Files of a package that can end up in compiled code: all of ``core/render/cpu``, and those that use its decorators or name numba.
+    """Files of a package that can end up in compiled code: all of ``core/render/cpu``, and those that use its
+    decorators or name numba.
 
-    A module of constants for kernels outside that folder says "numba" in its text, and is found by that; the tests compare this list with
-    all that the kernels refer to.
+    A module of constants for kernels outside that folder says "numba" in its text, and is found by that; the tests
+    compare this list with all that the kernels refer to.
     """
     own = package / "core" / "render" / "cpu"
-    return [file for file in sorted(package.rglob("*.py")) if own in file.parents or _COMPILED.search(file.read_bytes())]
+    return [
+        file for file in sorted(package.rglob("*.py")) if own in file.parents or _COMPILED.search(file.read_bytes())
+    ]
 
 
 @functools.cache
@@ -105,7 +121,8 @@ inline = njit(fastmath=FAST, error_model="numpy", forceinline=True)
 """Building block of a pixel kernel; ``forceinline`` so that a cold and a cached process compute the same bits."""
 
 text = njit(fastmath=FAST, error_model="numpy", inline="always")
-"""As if its text stood in the caller: LLVM sees both at once, and computes the bits that it would compute of one function."""
+"""As if its text stood in the caller: LLVM sees both at once, and computes the bits that it would compute of one
+function."""
 
 kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
 """A pixel kernel, called from worker threads."""
@@ -114,7 +131,8 @@ kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
 def by_length(*functions: Any) -> Any:
     """One function of (tuple, *arguments) for use in kernels, which calls ``functions[len(tuple)]`` of the arguments.
 
-    A tuple's length belongs to its type: the choice is made while a kernel is compiled, and what is not chosen leaves no trace in it.
+    A tuple's length belongs to its type: the choice is made while a kernel is compiled, and what is not chosen leaves
+    no trace in it.
     """
 
     def choose(key: Any, *arguments: Any) -> Any: ...

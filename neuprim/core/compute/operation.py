@@ -26,7 +26,8 @@ def asked(*arguments: Any) -> bool:
 
 
 def applied(operation: type[torch.autograd.Function], *arguments: Any) -> Any:
-    """``operation.apply(*arguments)``; its bookkeeping, which takes longer than the tensors of a small model, is left out where no gradient is asked for."""
+    """``operation.apply(*arguments)``; its bookkeeping, which takes longer than the tensors of a small model, is left
+    out where no gradient is asked for."""
     if asked(*arguments):
         return operation.apply(*arguments)
     return operation.forward(_Nowhere(), *arguments)

@@ -1,4 +1,5 @@
-"""Run a nogil kernel over a range on all cores. Results do not depend on the number of threads: chunks never share output."""
+"""Run a nogil kernel over a range on all cores. Results do not depend on the number of threads: chunks never share
+output."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ def core_count() -> int:
 
 @contextmanager
 def sharing(threads: int) -> Iterator[None]:
-    """Inside, the whole process has a share of the cores, as there are others that work beside it; 0: all. One at a time."""
+    """Inside, the whole process has a share of the cores, as there are others that work beside it; 0: all. One at a
+    time."""
     global _share
     before, _share = _share, threads
     try:
@@ -46,8 +48,8 @@ def sharing(threads: int) -> Iterator[None]:
 
 @contextmanager
 def limited(threads: int) -> Iterator[None]:
-    """Inside, "all cores" means ``threads`` of them, 0 for all: for code that is called without being told how many it may use, such as
-    a loss or a colour."""
+    """Inside, "all cores" means ``threads`` of them, 0 for all: for code that is called without being told how many it
+    may use, such as a loss or a colour."""
     token = _limit.set(threads)
     try:
         yield
@@ -68,7 +70,8 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: int, *args: Any) -> list[Any]:
-    """Call ``function(start, stop, *args)`` for chunks of ``range(count)``, drawn dynamically; returns the results in chunk order.
+    """Call ``function(start, stop, *args)`` for chunks of ``range(count)``, drawn dynamically; returns the results in
+    chunk order.
 
     ``threads`` 0 is all cores, or as many as :func:`limited` says.
     """

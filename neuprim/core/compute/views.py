@@ -13,7 +13,8 @@ from numba.np.arrayobj import make_array
 __all__ = ["copy16", "keep16", "lent", "returned"]
 
 _COMPRESSES = 19 <= binding.llvm_version_info[0] <= 22
-"""Whether LLVM moves the chosen elements of a vector together by one instruction; it is called experimental, and other versions are not asked."""
+"""Whether LLVM moves the chosen elements of a vector together by one instruction; it is called experimental, and other
+versions are not asked."""
 
 _SIXTEEN = ir.VectorType(ir.FloatType(), 16)
 
@@ -21,9 +22,9 @@ _SIXTEEN = ir.VectorType(ir.FloatType(), 16)
 def _lent(context, array):  # type: ignore[no-untyped-def]
     """The same array without its owner: views of it count no references.
 
-    Counting is atomic: it costs a pair of a few lanes as much as a vector of arithmetic, and threads that count views of one array wait for
-    each other. Only for arrays that somebody else keeps, such as the arguments of a kernel; a kernel's own are given back by :func:`returned`
-    after the last use of what was lent.
+    Counting is atomic: it costs a pair of a few lanes as much as a vector of arithmetic, and threads that count views
+    of one array wait for each other. Only for arrays that somebody else keeps, such as the arguments of a kernel; a
+    kernel's own are given back by :func:`returned` after the last use of what was lent.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -55,15 +56,18 @@ def _copy16(context, target, at, source, first):  # type: ignore[no-untyped-def]
 
 
 def _keep16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
-    """Moves those of array[first : first + 16] whose flag in array[flags : flags + 16] is not 0 to array[at:], side by side; returns how many.
+    """Moves those of array[first : first + 16] whose flag in array[flags : flags + 16] is not 0 to array[at:], side by
+    side; returns how many.
 
-    All sixteen are read before any is written, and sixteen are written, zeros behind those that are moved: ``at`` may be at most ``first``
-    where more is to be read.
+    All sixteen are read before any is written, and sixteen are written, zeros behind those that are moved: ``at`` may
+    be at most ``first`` where more is to be read.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         zeros, i32, i64 = ir.Constant(_SIXTEEN, [0.0] * 16), ir.IntType(32), ir.IntType(64)
-        value, flag = (builder.load(_place(context, builder, signature, arguments, 0, index), align=4) for index in (2, 3))
+        value, flag = (
+            builder.load(_place(context, builder, signature, arguments, 0, index), align=4) for index in (2, 3)
+        )
         kept = builder.fcmp_unordered("!=", flag, zeros)
         written = _place(context, builder, signature, arguments, 0, 1)
         count = builder.zext(builder.ctpop(builder.bitcast(kept, ir.IntType(16))), i64)
@@ -85,7 +89,8 @@ def _keep16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
 
 
 def _returned(context, array):  # type: ignore[no-untyped-def]
-    """Does nothing, after the last use of what an array of the kernel's own lent: numba lets go of it behind the last line that names it."""
+    """Does nothing, after the last use of what an array of the kernel's own lent: numba lets go of it behind the last
+    line that names it."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return context.get_dummy_value()

@@ -1,7 +1,9 @@
-"""Warp, started as the kernels of :mod:`neuprim.core.render.cuda` need it, and the only place that launches one of them.
+"""Warp, started as the kernels of :mod:`neuprim.core.render.cuda` need it, and the only place that launches one of
+them.
 
-A frame is a dozen launches with a hundred arrays. Warp's own way to make an array of a tensor and to pack it for a launch takes longer than
-the kernels of a small frame, so a kernel's launch is recorded once on each device, and its arguments are written over.
+A frame is a dozen launches with a hundred arrays. Warp's own way to make an array of a tensor and to pack it for a
+launch takes longer than the kernels of a small frame, so a kernel's launch is recorded once on each device, and its
+arguments are written over.
 """
 
 from __future__ import annotations
@@ -29,9 +31,9 @@ OPTIONS = {"enable_backward": False, "fast_math": False, "max_unroll": 16}
 """Of every kernel's module: adjoints are written by hand, and divisions and roots are rounded properly."""
 
 FAST = {**OPTIONS, "fast_math": True}
-"""Of the pixel kernels in float32: approximate division, root and exponential, which a card computes to one or two units in the last place. Errors
-on an H100 were the same with and without (``benchmarks/gpu.py --parts parity``), and a third of the time of small forms goes. The processor
-ignores it."""
+"""Of the pixel kernels in float32: approximate division, root and exponential, which a card computes to one or two
+units in the last place. Errors on an H100 were the same with and without (``benchmarks/gpu.py --parts parity``), and a
+third of the time of small forms goes. The processor ignores it."""
 
 
 def _start() -> None:
@@ -50,7 +52,8 @@ _Bare: Any = type(wp.from_torch(torch.empty(1), return_ctype=True))
 
 
 class _Array:
-    """A tensor that a kernel takes as an array of ``dtype``, which may hold several numbers, those of the last dimension."""
+    """A tensor that a kernel takes as an array of ``dtype``, which may hold several numbers, those of the last
+    dimension."""
 
     __slots__ = ("dtype", "tensor")
 
@@ -59,7 +62,8 @@ class _Array:
 
 
 def array(tensor: Tensor, dtype: Any) -> Any:
-    """A contiguous tensor as an argument of a kernel; ``dtype`` may take several numbers together, those of the last dimension."""
+    """A contiguous tensor as an argument of a kernel; ``dtype`` may take several numbers together, those of the last
+    dimension."""
     return _Array(tensor, dtype)
 
 
@@ -134,7 +138,9 @@ def _stream(device: torch.device) -> Any:
     return _streams[key]
 
 
-def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device: torch.device, block: int = BLOCK) -> None:
+def launch(
+    kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device: torch.device, block: int = BLOCK
+) -> None:
     """Run a kernel on the caller's stream; ``dim`` empty, nothing.
 
     Raises:
@@ -150,5 +156,7 @@ def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device:
     with _turn:
         recorded = _recorded.get(key)
         if recorded is None:
-            recorded = _recorded[key] = _Recorded(kernel, dims, inputs, "cpu" if stream is None else stream.device, block)
+            recorded = _recorded[key] = _Recorded(
+                kernel, dims, inputs, "cpu" if stream is None else stream.device, block
+            )
         recorded.launch(dims, inputs, stream)

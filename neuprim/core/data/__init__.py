@@ -1,6 +1,16 @@
 """What a data set hands to the trainer, and what loaders of posed images share."""
 
-from neuprim.core.data.dataset import Clip, Dataset, DataSource, Pixels, PointCloud, StartingPoints, View, ViewSet, camera_extent
+from neuprim.core.data.dataset import (
+    Clip,
+    Dataset,
+    DataSource,
+    Pixels,
+    PointCloud,
+    StartingPoints,
+    View,
+    ViewSet,
+    camera_extent,
+)
 from neuprim.core.data.points import PointSamples, PointSupervision
 
 __all__ = [

@@ -53,7 +53,11 @@ class BadViews:
         """
         bad = len(self._faults)
         if 2 * bad > count:
-            raise self._first if count == 1 else DataError(f"{self._first}; {bad} of {count} views of {self._where} are like this")
+            raise (
+                self._first
+                if count == 1
+                else DataError(f"{self._first}; {bad} of {count} views of {self._where} are like this")
+            )
         for fault in self._faults[:_LISTED]:
             warn_once(fault)
         if bad > _LISTED:

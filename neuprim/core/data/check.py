@@ -1,7 +1,8 @@
-"""What a data set promises (see :mod:`neuprim.core.data`), compared with what it holds: one line names view, member, found and expected.
+"""What a data set promises (see :mod:`neuprim.core.data`), compared with what it holds: one line names view, member,
+found and expected.
 
-Shapes and dtypes are compared wherever pixels are drawn, which costs nothing; values are looked through once, for the first view of
-each split, before a run starts.
+Shapes and dtypes are compared wherever pixels are drawn, which costs nothing; values are looked through once, for the
+first view of each split, before a run starts.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ Extra = TypeVar("Extra")
 
 
 class DatasetFault(DataError):
-    """A loader broke a promise of :class:`~neuprim.core.data.dataset.Dataset`; whoever knows the loader's package adds its name."""
+    """A loader broke a promise of :class:`~neuprim.core.data.dataset.Dataset`; whoever knows the loader's package adds
+    its name."""
 
 
 def check_dataset(dataset: Dataset, conditions: Sequence[ConditionSpec]) -> None:
@@ -63,7 +65,9 @@ def check_pixels(split: str, view: View, pixels: Pixels, channels: int) -> None:
     """
     size = (view.camera.height, view.camera.width)
     if not isinstance(pixels, Pixels):
-        raise DatasetFault(f"{split} view {view.name}: pixels are {_described(pixels)}; expected a neuprim.core.data.Pixels")
+        raise DatasetFault(
+            f"{split} view {view.name}: pixels are {_described(pixels)}; expected a neuprim.core.data.Pixels"
+        )
     rgb, alpha, mask = pixels.rgb, pixels.alpha, pixels.mask
     if not (_is(rgb, torch.float32) and rgb.shape == (*size, channels)):
         _refuse(f"{split} view {view.name}: rgb", rgb, torch.float32, (*size, channels), ", rows x columns x channels")
@@ -140,7 +144,9 @@ def extra_of(dataset: Dataset, kind: type[Extra]) -> Extra | None:
     extra = dataset.extra
     if extra is None or isinstance(extra, kind):
         return extra
-    raise DatasetFault(f"{dataset.name}: extra is {_described(extra)}; expected a {kind.__module__}.{kind.__qualname__}, or None")
+    raise DatasetFault(
+        f"{dataset.name}: extra is {_described(extra)}; expected a {kind.__module__}.{kind.__qualname__}, or None"
+    )
 
 
 # ---------------------------------------------------------------- members and views
@@ -153,7 +159,9 @@ def _members(dataset: Dataset) -> None:
         if not isinstance(value, ViewSet):
             raise DatasetFault(f"{who}: {split} is {_described(value)}; expected a neuprim.core.data.ViewSet")
     if not callable(dataset.start):
-        raise DatasetFault(f"{who}: start is {_described(dataset.start)}; expected a function of (views, count, generator)")
+        raise DatasetFault(
+            f"{who}: start is {_described(dataset.start)}; expected a function of (views, count, generator)"
+        )
     channels, extent, bounds = dataset.channels, dataset.extent, dataset.bounds
     if not isinstance(channels, int) or channels < 1:
         raise DatasetFault(f"{who}: channels is {channels!r}; expected a whole number, 1 or more")
@@ -167,14 +175,18 @@ def _members(dataset: Dataset) -> None:
     if bounds is not None:
         _floats(f"{who}: bounds", bounds, (2, 3), ", lower and upper corner, or None")
     if not isinstance(dataset.points, PointSupervision | None):
-        raise DatasetFault(f"{who}: points is {_described(dataset.points)}; expected a neuprim.core.data.PointSupervision, or None")
+        raise DatasetFault(
+            f"{who}: points is {_described(dataset.points)}; expected a neuprim.core.data.PointSupervision, or None"
+        )
     if not isinstance(dataset.exposure, (int, float)) or not 0 < dataset.exposure < float("inf"):
         raise DatasetFault(f"{who}: exposure is {dataset.exposure!r}; expected a positive number")
     if not isinstance(dataset.world, World):
         raise DatasetFault(f"{who}: world is {_described(dataset.world)}; expected a {World.__module__}.World")
     dataset.world.validate(f"{who}: world")
     if not isinstance(dataset.placement, Placement | None):
-        raise DatasetFault(f"{who}: placement is {_described(dataset.placement)}; expected a {Placement.__module__}.Placement, or None")
+        raise DatasetFault(
+            f"{who}: placement is {_described(dataset.placement)}; expected a {Placement.__module__}.Placement, or None"
+        )
 
 
 def _view(view: View, where: str, conditions: Sequence[ConditionSpec]) -> None:
@@ -209,7 +221,9 @@ def _camera(camera: AnyCamera, where: str) -> None:
         except DataError as error:
             raise DatasetFault(str(error)) from error
         except (TypeError, ValueError, RuntimeError) as error:
-            raise DatasetFault(f"{where}: camera is {camera!r}; expected numbers ({error})".replace("\n", " ")) from error
+            raise DatasetFault(
+                f"{where}: camera is {camera!r}; expected numbers ({error})".replace("\n", " ")
+            ) from error
     elif not isinstance(camera, RayCamera):
         raise DatasetFault(f"{where}: camera is {_described(camera)}; expected a neuprim.core.cameras.Camera")
 
@@ -233,7 +247,9 @@ def _finite(value: Tensor, where: str) -> None:
     if bool(bad.any()):
         place = bad.nonzero()[0].tolist()
         first = f", the first at {place}" if place else ""
-        raise DatasetFault(f"{where}: found {int(bad.sum())} values that are NaN or infinite{first}; expected finite numbers")
+        raise DatasetFault(
+            f"{where}: found {int(bad.sum())} values that are NaN or infinite{first}; expected finite numbers"
+        )
 
 
 def _one_of(where: str, value: object, choices: tuple[str, ...]) -> None:
@@ -248,7 +264,11 @@ def _refuse(where: str, value: Any, dtype: torch.dtype, shape: tuple[int | str, 
 def _described(value: Any) -> str:
     if isinstance(value, Tensor):
         return f"{_name(value.dtype)} {tuple(value.shape)}"
-    return "None" if value is None else f"a {type(value).__module__}.{type(value).__qualname__}".replace("a builtins.", "a ")
+    return (
+        "None"
+        if value is None
+        else f"a {type(value).__module__}.{type(value).__qualname__}".replace("a builtins.", "a ")
+    )
 
 
 def _name(dtype: torch.dtype) -> str:

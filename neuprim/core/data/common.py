@@ -45,7 +45,8 @@ class MissingFiles(DataError):
 
 
 def find_image(folder: Path, text: str) -> Path | None:
-    """The image that ``text`` names below ``folder``: as written, else with the usual suffixes added, else in another case; None if there is none."""
+    """The image that ``text`` names below ``folder``: as written, else with the usual suffixes added, else in another
+    case; None if there is none."""
     text = str(folder / text.replace("\\", "/"))
     try:
         found = next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
@@ -55,13 +56,15 @@ def find_image(folder: Path, text: str) -> Path | None:
 
 
 def _say_outside(where: str, home: Path, paths: Iterable[Path]) -> None:
-    """Warn of images that lie elsewhere than the data set that names them. Rule: other tools write such paths, so that they are read; but whoever
-    made the data set chose them, and not who trains on it, who is told once."""
+    """Warn of images that lie elsewhere than the data set that names them. Rule: other tools write such paths, so that
+    they are read; but whoever made the data set chose them, and not who trains on it, who is told once."""
     own = home.resolve()
     own = own if own.is_dir() else own.parent
     outside = [path for path in paths if not path.resolve().is_relative_to(own)]
     if outside:
-        warn_once(f"{where}: {len(outside)} of its images lie outside of {own}, the first {outside[0].resolve()}; they are read as it says")
+        warn_once(
+            f"{where}: {len(outside)} of its images lie outside of {own}, the first {outside[0].resolve()}; they are read as it says"
+        )
 
 
 def _other_case(folder: Path, path: Path) -> Path | None:
@@ -145,7 +148,8 @@ def posed_images(
         up: (3,) upward direction; None takes the mean of the cameras' own.
         points: starting points that the format brings, if any, in the coordinates of the file, float64.
         prefix: reduction already in the files, e.g. "images_4".
-        start: another rule for starting points; None takes ``points``, else the visual hull of the alpha masks, else a box in
+        start: another rule for starting points; None takes ``points``, else the visual hull of the alpha masks, else a
+        box in
             front of the cameras, which suits scenes at rest (:func:`neuprim.core.data.initial.initial_points`).
         to_linear: turn sRGB files into linear light.
         exposure: what linear values are divided by, or how that number follows from the training views.
@@ -154,7 +158,8 @@ def posed_images(
         home: the data set's folder, where it is not that of ``where``.
 
     Raises:
-        DataError: an empty split, an image without alpha beside one with, sRGB beside linear files, most images damaged, or any with
+        DataError: an empty split, an image without alpha beside one with, sRGB beside linear files, most images
+        damaged, or any with
             ``settings.strict``.
         ConfigError: a random background for images without alpha, or a down-sampling factor larger than an image.
     """
@@ -169,7 +174,9 @@ def posed_images(
     both = [*train, *test]
     for frame in both:
         if frame.info.linear != both[0].info.linear:
-            raise DataError(f"{frame.path}: mixes OpenEXR (linear) and PNG/JPEG (sRGB) with {both[0].path}; expected one kind")
+            raise DataError(
+                f"{frame.path}: mixes OpenEXR (linear) and PNG/JPEG (sRGB) with {both[0].path}; expected one kind"
+            )
         if frame.info.channels != both[0].info.channels:
             raise DataError(
                 f"{frame.path}: image has {frame.info.channels} channels, {both[0].path} has {both[0].info.channels}; expected all RGB or all RGBA"
@@ -180,7 +187,9 @@ def posed_images(
     if background == "auto":
         background = "white" if alpha else "black"
     if background == "random" and not alpha:
-        raise ConfigError(f"scene.background is 'random', but the images in {where} have no alpha; expected auto, white or black")
+        raise ConfigError(
+            f"scene.background is 'random', but the images in {where} have no alpha; expected auto, white or black"
+        )
     factor = settings.downsample
     world = world_around([f.camera for f in both], where) if context.world is None else context.world
     train, test = ([in_scene(f, world, places) for f in frames] for frames in (train, test))
@@ -209,7 +218,8 @@ def posed_images(
         color_space="linear" if to_linear or both[0].info.linear else "srgb",
         background=torch.full((3,), 0.0 if background == "black" else 1.0),
         random_background=background == "random",
-        downsampling=", then ".join(t for t in (prefix, _reduction(both, views[0].view(0).camera, factor)) if t) or "none",
+        downsampling=", then ".join(t for t in (prefix, _reduction(both, views[0].view(0).camera, factor)) if t)
+        or "none",
         up=_mean_up(cameras) if up is None else up,
         center=focus_point(cameras).float(),
         exposure=divisor,

@@ -23,7 +23,8 @@ class SceneContext:
         cache_dir: where generated data may be kept between runs (keyed by everything that matters).
         progress: called with (text, fraction 0..1) during long work.
         device: what may compute the ground truth where a loader has to; data sets are on the processor either way.
-        world: of the model that the scene is loaded for again, whose coordinates it keeps; None: the scene's own choice.
+        world: of the model that the scene is loaded for again, whose coordinates it keeps; None: the scene's own
+        choice.
     """
 
     seed: int

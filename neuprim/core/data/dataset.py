@@ -1,7 +1,8 @@
-"""What a loader hands over: two sets of posed images that load lazily, what is known of them, and where matter may be at the start.
+"""What a loader hands over: two sets of posed images that load lazily, what is known of them, and where matter may be
+at the start.
 
-A :class:`Dataset` describes and decides nothing: what a model is judged by, which films are made and what its file says about the data
-is the task's, see :class:`~neuprim.core.task.TaskSpec`.
+A :class:`Dataset` describes and decides nothing: what a model is judged by, which films are made and what its file says
+about the data is the task's, see :class:`~neuprim.core.task.TaskSpec`.
 """
 
 from __future__ import annotations
@@ -25,10 +26,22 @@ if TYPE_CHECKING:
     from neuprim.core.data.points import PointSupervision
     from neuprim.core.volumes.source import Placement
 
-__all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "StartingPoints", "View", "ViewSet", "camera_extent", "outlying"]
+__all__ = [
+    "Clip",
+    "DataSource",
+    "Dataset",
+    "Pixels",
+    "PointCloud",
+    "StartingPoints",
+    "View",
+    "ViewSet",
+    "camera_extent",
+    "outlying",
+]
 
 DataSource = Literal["real", "generated", "simulated"]
-"""Photographs or captures ("real"), our own ray-cast scenes ("generated"), stand-ins for data not given ("simulated")."""
+"""Photographs or captures ("real"), our own ray-cast scenes ("generated"), stand-ins for data not given
+("simulated")."""
 
 
 @dataclass(frozen=True)
@@ -92,13 +105,16 @@ class PointCloud:
     Attributes:
         means: (N, 3) scene units; of a file that was just read, float64 world units (:meth:`within`).
         colors: (N, C) in the data set's colour space.
-        conditions: condition name -> (N,) the value under which matter was found at each point, e.g. "time" -> times 0..1;
+        conditions: condition name -> (N,) the value under which matter was found at each point, e.g. "time" -> times
+        0..1;
             empty for scenes without conditions.
         axes, quats: (N, 3) semi-axes and (N, 4) orientations wxyz, where the points are ellipsoids.
         alphas: (N,) opacities 0..1 through their middles.
-        deviations: (N, 3) standard deviations along the axes in place of ``axes``, where the points are Gaussians: the density says how large
+        deviations: (N, 3) standard deviations along the axes in place of ``axes``, where the points are Gaussians: the
+        density says how large
             an ellipsoid looks like each.
-        steps: condition name -> from one value at which views show the scene from many sides to the next, where that is known: a sequence's frames.
+        steps: condition name -> from one value at which views show the scene from many sides to the next, where that is
+        known: a sequence's frames.
     """
 
     means: Tensor
@@ -119,12 +135,17 @@ class PointCloud:
         return PointCloud(self.means[index], self.colors[index], found, axes, quats, alphas, deviations, self.steps)
 
     def within(self, world: World) -> PointCloud:
-        """The points of a file, in the scene's coordinates as float32; subtracted in float64, so ``means`` should be of a file in doubles."""
+        """The points of a file, in the scene's coordinates as float32; subtracted in float64, so ``means`` should be of
+        a file in doubles."""
         means = world.scene_points(self.means).float()
-        axes, deviations = (x if x is None or world.scale == 1.0 else x * world.scale for x in (self.axes, self.deviations))
+        axes, deviations = (
+            x if x is None or world.scale == 1.0 else x * world.scale for x in (self.axes, self.deviations)
+        )
         quats = self.quats
         if quats is not None and world.rotation is not None:
-            turned = Rotation.from_matrix(world.rotation.numpy()) * Rotation.from_quat(quats[:, [1, 2, 3, 0]].double().numpy())
+            turned = Rotation.from_matrix(world.rotation.numpy()) * Rotation.from_quat(
+                quats[:, [1, 2, 3, 0]].double().numpy()
+            )
             quats = torch.from_numpy(turned.as_quat()[:, [3, 0, 1, 2]]).float()
         return replace(self, means=means, axes=axes, deviations=deviations, quats=quats)
 
@@ -145,7 +166,8 @@ class Clip:
 
 
 StartingPoints = Callable[[ViewSet, int, torch.Generator], PointCloud]
-"""(training views, count, generator) -> at most ``count`` distinct starting points; the only randomness is the generator's."""
+"""(training views, count, generator) -> at most ``count`` distinct starting points; the only randomness is the
+generator's."""
 
 
 @final
@@ -157,7 +179,8 @@ class Dataset:
         name: shown in reports.
         train, test: the splits.
         start: where primitives start, see :data:`StartingPoints`.
-        extent: scene extent in scene units (see :func:`camera_extent`), the unit of position rates and size limits unless matter is a hundred times
+        extent: scene extent in scene units (see :func:`camera_extent`), the unit of position rates and size limits
+        unless matter is a hundred times
             as far.
         background: (C,) the colour that evaluation composites over.
         channels: colour channels C.
@@ -171,10 +194,12 @@ class Dataset:
         exposure: what the linear values of the files were divided by.
         world: how all these coordinates follow from those of the user's files; the same unless said.
         placement: which voxel files the scene was made from, in the same world; None without such files.
-        largest: the largest extinction anywhere, 1/scene unit, that no primitive goes beyond; None where it is not known.
-        points: points at which extinction and source radiance are known, for ``train.supervision=voxels`` and ``both``; None where they
+        largest: the largest extinction anywhere, 1/scene unit, that no primitive goes beyond; None where it is not
+        known. points: points at which extinction and source radiance are known, for ``train.supervision=voxels`` and
+        ``both``; None where they
             are not.
-        extra: what else the scene's own task likes to know, of the class that this task names, e.g. what pixels show or what the images
+        extra: what else the scene's own task likes to know, of the class that this task names, e.g. what pixels show or
+        what the images
             were made from. None is always enough: a task judges by images, cameras and conditions then.
     """
 
@@ -216,15 +241,19 @@ class Dataset:
             ConfigError: the data set has none.
         """
         if self.bounds is None:
-            raise ConfigError(f"model.init.points=box: {self.name} does not say which box its matter fills; expected matter")
+            raise ConfigError(
+                f"model.init.points=box: {self.name} does not say which box its matter fills; expected matter"
+            )
         low, high = self.bounds.float()
         means = low + torch.rand((count, 3), generator=generator) * (high - low)
         return PointCloud(means, torch.full((count, self.channels), 0.5))
 
     def orbit(self, frames: int) -> list[View]:
-        """Views circling the scene at the training cameras' mean distance and elevation; outward where these do not look at its centre.
+        """Views circling the scene at the training cameras' mean distance and elevation; outward where these do not
+        look at its centre.
 
-        Conditions that are one number go from their least to their greatest value over the training views; others stay as in the first.
+        Conditions that are one number go from their least to their greatest value over the training views; others stay
+        as in the first.
         """
         cameras = [self.train.view(i).camera for i in range(len(self.train))]
         far = outlying(torch.stack([c.position for c in cameras]))
@@ -237,7 +266,9 @@ class Dataset:
         outward = bool((units * forward).sum(-1).mean() > -0.5)
         sine = ((forward if outward else units) @ up).mean().clamp(-0.9, 0.9)
         if outward:
-            directions = [c.position for c in orbit(cameras[0], torch.zeros(3), self.up, 1.0, torch.asin(sine).item(), frames)]
+            directions = [
+                c.position for c in orbit(cameras[0], torch.zeros(3), self.up, 1.0, torch.asin(sine).item(), frames)
+            ]
             eyes = [self.center.double() + radius * d for d in directions]
             views = [replace(cameras[0], viewmat=look_at(e, e + d, up)) for e, d in zip(eyes, directions, strict=True)]
         else:
@@ -245,22 +276,31 @@ class Dataset:
         between = self._scalar_conditions()
         held = {name: value for name, value in self.train.view(0).conditions.items() if name not in between}
         return [
-            View(f"orbit_{i:03d}", c, {**held, **{n: low + i / max(frames - 1, 1) * (high - low) for n, (low, high) in between.items()}})
+            View(
+                f"orbit_{i:03d}",
+                c,
+                {**held, **{n: low + i / max(frames - 1, 1) * (high - low) for n, (low, high) in between.items()}},
+            )
             for i, c in enumerate(views)
         ]
 
     def _scalar_conditions(self) -> dict[str, tuple[Tensor, Tensor]]:
-        """Least and greatest value over the training views of every condition that is one number; an orbit goes from one to the other."""
+        """Least and greatest value over the training views of every condition that is one number; an orbit goes from
+        one to the other."""
         found: dict[str, list[Tensor]] = {}
         for i in range(len(self.train)):
             for name, value in self.train.view(i).conditions.items():
                 if value.numel() == 1:
                     found.setdefault(name, []).append(value)
-        return {name: (torch.stack(values).min(0).values, torch.stack(values).max(0).values) for name, values in found.items()}
+        return {
+            name: (torch.stack(values).min(0).values, torch.stack(values).max(0).values)
+            for name, values in found.items()
+        }
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """Radius of the bounding sphere of the cameras about their mean x 1.1 (the convention of 3D Gaussian splatting); 1.0 if zero.
+    """Radius of the bounding sphere of the cameras about their mean x 1.1 (the convention of 3D Gaussian splatting);
+    1.0 if zero.
 
     Cameras that are :func:`outlying` do not count.
     """
@@ -277,7 +317,8 @@ _OUTLYING_SHARE = 0.05
 def outlying(positions: Tensor) -> Tensor:
     """(N,) bool of the (N, 3) camera centres that say nothing about place and scale of a scene.
 
-    Rule: a few cameras (one, or 5 %) farther from the median centre than 100 times the median distance are mistakes of a reconstruction.
+    Rule: a few cameras (one, or 5 %) farther from the median centre than 100 times the median distance are mistakes of
+    a reconstruction.
     """
     distance = (positions - positions.median(0).values).norm(dim=-1)
     far = (distance > _OUTLYING * distance.median()) & (distance.median() > 0)

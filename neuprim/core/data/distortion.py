@@ -101,7 +101,8 @@ def _unfolded(camera: Camera, source: np.ndarray) -> np.ndarray:
 
 
 def resample(image: Tensor, source: Tensor) -> Tensor:
-    """(H', W', C) float32 bilinear samples of an (H, W, C) image at (H', W', 2) source pixels, clamped to the border."""
+    """(H', W', C) float32 bilinear samples of an (H, W, C) image at (H', W', 2) source pixels, clamped to the
+    border."""
     height, width = image.shape[:2]
     grid = source / torch.tensor([width, height]) * 2.0 - 1.0  # -1 and 1 are the outer edges of the outer pixels
     planes = image.float().permute(2, 0, 1)[None]

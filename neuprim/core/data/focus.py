@@ -31,8 +31,8 @@ def focus_point(cameras: Sequence[Camera]) -> Tensor:
 def axes_meet(cameras: Sequence[Camera]) -> bool:
     """Whether the optical axes determine a point in front of the cameras.
 
-    They do if they pass it closer than half the spread of the camera centres, and nine cameras of ten look towards it. Parallel axes,
-    cameras that look outward from their centre, and cameras that share one centre do not.
+    They do if they pass it closer than half the spread of the camera centres, and nine cameras of ten look towards it.
+    Parallel axes, cameras that look outward from their centre, and cameras that share one centre do not.
     """
     positions, forward = _axes(cameras)
     offsets = focus_point(cameras) - positions

@@ -1,4 +1,5 @@
-"""Ground truth that a loader renders frame by frame, as work that can be shared out before anything is learned from it."""
+"""Ground truth that a loader renders frame by frame, as work that can be shared out before anything is learned from
+it."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ __all__ = ["GroundTruth"]
 
 
 class GroundTruth(ABC):
-    """The images of a scene, as they will be when all frames are made. Any process that has the scene's settings can make any frame.
+    """The images of a scene, as they will be when all frames are made. Any process that has the scene's settings can
+    make any frame.
 
     Attributes:
         frames: their names, in order.

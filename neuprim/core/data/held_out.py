@@ -12,10 +12,11 @@ __all__ = ["held_out"]
 
 
 def held_out(dataset: Dataset, every: int) -> Dataset:
-    """The same without its test views: one of every ``every`` training views takes their place, and is not learned from.
+    """The same without its test views: one of every ``every`` training views takes their place, and is not learned
+    from.
 
-    Which one moves on by one from each group to the next: of cameras with as many frames as a multiple of ``every``, it is not always the
-    same moment that nobody learns from.
+    Which one moves on by one from each group to the next: of cameras with as many frames as a multiple of ``every``, it
+    is not always the same moment that nobody learns from.
 
     Args:
         every: 2 or more.
@@ -25,7 +26,9 @@ def held_out(dataset: Dataset, every: int) -> Dataset:
     """
     count = len(dataset.train)
     if every < 2 or count < 2:
-        raise ConfigError(f"{dataset.name}: every {every}. of {count} training views held out; expected 2 or more of 2 views or more")
+        raise ConfigError(
+            f"{dataset.name}: every {every}. of {count} training views held out; expected 2 or more of 2 views or more"
+        )
     test = [i for i in range(count) if i % every == i // every % every]
     train = [i for i in range(count) if i % every != i // every % every]
     return replace(dataset, train=SomeViews(dataset.train, train), test=SomeViews(dataset.train, test))

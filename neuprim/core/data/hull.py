@@ -83,7 +83,9 @@ def hull_surface(
 
 def _silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
     """Masks of evenly chosen views, in an order in which neighbours in the list look from different sides."""
-    chosen = sorted({round(i * (len(views) - 1) / max(1, min(len(views), _VIEWS) - 1)) for i in range(min(len(views), _VIEWS))})
+    chosen = sorted(
+        {round(i * (len(views) - 1) / max(1, min(len(views), _VIEWS) - 1)) for i in range(min(len(views), _VIEWS))}
+    )
     chosen.sort(key=lambda i: i * 0.6180339887 % 1.0)
     found = []
     for index in chosen:
@@ -96,13 +98,16 @@ def _silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
         n = -(-max(camera.width, camera.height) // _MASK_SIDE)
         small = F.max_pool2d(matter[None].float(), n, ceil_mode=True)[0]
         table = F.pad(small.to(torch.int32).cumsum(0).cumsum(1), (1, 0, 1, 0)).to(torch.int32)
-        scaled = Camera(camera.viewmat, camera.fx / n, camera.fy / n, camera.cx / n, camera.cy / n, small.shape[1], small.shape[0])
+        scaled = Camera(
+            camera.viewmat, camera.fx / n, camera.fy / n, camera.cx / n, camera.cy / n, small.shape[1], small.shape[0]
+        )
         found.append(_Silhouette(scaled, table))
     return found
 
 
 def _refined(grid: _Grid, resolution: int) -> _Grid:
-    """A grid over the box of what is full, ``resolution`` voxels along its longest side, full where the coarse one is."""
+    """A grid over the box of what is full, ``resolution`` voxels along its longest side, full where the coarse one
+    is."""
     cells = grid.full.nonzero()
     low, high = cells.min(0).values, cells.max(0).values + 1
     voxel = grid.voxel * float((high - low).max()) / resolution
@@ -138,7 +143,9 @@ def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float, seen_view
 
 
 @exact_kernel
-def _test_points(points: Any, poses: Any, lenses: Any, offsets: Any, tables: Any, reach: float, allowed: int, needed: float) -> Any:
+def _test_points(
+    points: Any, poses: Any, lenses: Any, offsets: Any, tables: Any, reach: float, allowed: int, needed: float
+) -> Any:
     """(M,) bool of the points that ``needed`` views look at and at most ``allowed`` of those rule out.
 
     Args:

@@ -25,7 +25,8 @@ __all__ = [
 ]
 
 _FPS_WORK = 5e8
-"""Distances that exact farthest-point sampling may evaluate (about 1.5 s on one core); above, a grid thins the points."""
+"""Distances that exact farthest-point sampling may evaluate (about 1.5 s on one core); above, a grid thins the
+points."""
 _COLOR_VIEWS = 100
 _CHUNK = 20_000
 _ROUNDS = 8
@@ -35,9 +36,9 @@ _ROUNDS = 8
 def initial_points(views: ViewSet, points: PointCloud | None, count: int, generator: torch.Generator) -> PointCloud:
     """At most ``count`` distinct starting points of a static scene, in scene units and the images' colour space.
 
-    Given points win. Cameras that do not look at one point begin along their rays, see :func:`~neuprim.core.data.rays.ray_points`. Else
-    data with alpha uses the surface of its visual hull, and data without a box about that point. Inferred points that fewer than two
-    cameras see do not count.
+    Given points win. Cameras that do not look at one point begin along their rays, see
+    :func:`~neuprim.core.data.rays.ray_points`. Else data with alpha uses the surface of its visual hull, and data
+    without a box about that point. Inferred points that fewer than two cameras see do not count.
 
     Raises:
         ConfigError: ``count`` is not positive.
@@ -80,7 +81,8 @@ def subset(points: PointCloud, count: int, generator: torch.Generator) -> PointC
 def hull_points(views: ViewSet, count: int, generator: torch.Generator, resolution: int = 128) -> PointCloud:
     """``count`` points spread over the surface of the visual hull, coloured by the pixels they project to.
 
-    Points are voxel centres with sub-voxel jitter; more points than surface voxels share voxels and differ by their jitter.
+    Points are voxel centres with sub-voxel jitter; more points than surface voxels share voxels and differ by their
+    jitter.
 
     Args:
         resolution: voxels along the hull's longest side.
@@ -99,10 +101,11 @@ def hull_points(views: ViewSet, count: int, generator: torch.Generator, resoluti
 
 
 def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
-    """``count`` points at most, uniform in a cube about the point the cameras look at, coloured by the pixels they project to.
+    """``count`` points at most, uniform in a cube about the point the cameras look at, coloured by the pixels they
+    project to.
 
-    The cube's half side is half the median distance of the cameras to that point. Points that fewer than two cameras see (one, where there
-    is one) do not count.
+    The cube's half side is half the median distance of the cameras to that point. Points that fewer than two cameras
+    see (one, where there is one) do not count.
     """
     cameras = [views.view(i).camera for i in range(len(views))]
     center = focus_point(cameras)
@@ -135,8 +138,8 @@ def distinct(points: PointCloud) -> PointCloud:
 def farthest_points(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """(count,) int64 rows of ``points`` (M, 3), M >= count, far from each other.
 
-    Exact farthest-point sampling from a random start while that is fast; for large sets one point per cell of a grid whose
-    cell size fits the count, filled up at random.
+    Exact farthest-point sampling from a random start while that is fast; for large sets one point per cell of a grid
+    whose cell size fits the count, filled up at random.
     """
     if count * len(points) > _FPS_WORK:
         return _thinned(points, count, generator)
@@ -179,11 +182,13 @@ def _thinned(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
 def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
     """(N, C) per-channel median of the pixels that the points (N, 3) project to, straight colour.
 
-    A view counts for a point that falls inside its image, on a pixel that counts and whose alpha is above ``matter``. Points
-    that no view shows get the median of the others, or mid-grey.
+    A view counts for a point that falls inside its image, on a pixel that counts and whose alpha is above ``matter``.
+    Points that no view shows get the median of the others, or mid-grey.
     """
     indices = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(len(views), _COLOR_VIEWS))})
-    samples = torch.stack([_sample(views, i, means, matter) for i in indices])  # (V, N, C), NaN where a view does not count
+    samples = torch.stack(
+        [_sample(views, i, means, matter) for i in indices]
+    )  # (V, N, C), NaN where a view does not count
     colors = torch.cat([samples[:, i : i + _CHUNK].nanmedian(dim=0).values for i in range(0, len(means), _CHUNK)])
     hidden = colors.isnan().any(dim=-1)
     typical = colors.nanmedian(dim=0).values.nan_to_num(nan=0.5)

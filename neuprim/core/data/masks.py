@@ -1,4 +1,5 @@
-"""Masks that lie beside images, as COLMAP, nerfstudio and instant-ngp find them: what is black in a mask does not count."""
+"""Masks that lie beside images, as COLMAP, nerfstudio and instant-ngp find them: what is black in a mask does not
+count."""
 
 from __future__ import annotations
 
@@ -27,18 +28,21 @@ class Mask:
 def masks_beside(folder: Path, files: Sequence[Path], images: Path | None = None) -> list[Mask | None]:
     """The mask of every image file, or None; a line says how many there are.
 
-    ``images/a/b.jpg`` has ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg``; ``images_4`` has ``masks_4`` before ``masks``.
-    instant-ngp has ``dynamic_mask_b.png`` beside the image, which is black where pixels count.
+    ``images/a/b.jpg`` has ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg``; ``images_4`` has ``masks_4``
+    before ``masks``. instant-ngp has ``dynamic_mask_b.png`` beside the image, which is black where pixels count.
 
     Args:
         folder: the data set's.
-        images: the images' own folder; None for the first part of their paths where it begins with "images", else ``folder``.
+        images: the images' own folder; None for the first part of their paths where it begins with "images", else
+        ``folder``.
     """
     masks = [_mask(folder, file, images) for file in files]
     found = [m for m in masks if m is not None]
     if found:
         black = "not black" if found[0].inverted else "black"
-        warn_once(f"{found[0].path.parent}: masks of {len(found)} of {len(files)} images are read; what is {black} there does not count")
+        warn_once(
+            f"{found[0].path.parent}: masks of {len(found)} of {len(files)} images are read; what is {black} there does not count"
+        )
     return masks
 
 
@@ -50,7 +54,9 @@ def _mask(folder: Path, file: Path, images: Path | None) -> Mask | None:
         name = file.relative_to(images)
     except ValueError:  # an image outside of the folder
         return None
-    places = dict.fromkeys((images.name.replace("images", "masks", 1) if images.name.startswith("images") else "masks", "masks"))
+    places = dict.fromkeys(
+        (images.name.replace("images", "masks", 1) if images.name.startswith("images") else "masks", "masks")
+    )
     for place in places:
         for candidate in (name.with_suffix(".png"), name.with_name(name.name + ".png"), name):
             if (folder / place / candidate).is_file():

@@ -15,14 +15,16 @@ from neuprim.core.notices import warn_once
 __all__ = ["FAR", "world_around"]
 
 FAR = 100.0
-"""Distance of the cameras from the origin, in extents of theirs, from which a scene is moved: float32 holds five digits of it there."""
+"""Distance of the cameras from the origin, in extents of theirs, from which a scene is moved: float32 holds five digits
+of it there."""
 
 
 def world_around(cameras: Sequence[Camera], where: str = "cameras") -> World:
     """Where the scene that cameras see lies in the world of their file.
 
-    Rule: where the mean of the camera centres is farther than :data:`FAR` extents from the origin, that mean, rounded to the power of ten from
-    one to ten extents, becomes the scene's origin; all other scenes keep the coordinates of their files, bit for bit. ``where`` names the file in warnings.
+    Rule: where the mean of the camera centres is farther than :data:`FAR` extents from the origin, that mean, rounded
+    to the power of ten from one to ten extents, becomes the scene's origin; all other scenes keep the coordinates of
+    their files, bit for bit. ``where`` names the file in warnings.
     """
     views = [c.viewmat.detach().double() for c in cameras]
     # solved, not transposed: far from the origin a transpose turns the rounding of a file's rotations into metres

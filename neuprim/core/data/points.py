@@ -23,10 +23,12 @@ class PointSamples:
         conditions: of the frame, the same for all points.
         points: (M, 3) float32, scene units.
         sigma: (M,) float32 extinction, 1/scene unit.
-        source: (M, C) float32 extinction times source radiance in the data set's colour space, where it is the same towards all directions;
+        source: (M, C) float32 extinction times source radiance in the data set's colour space, where it is the same
+        towards all directions;
             None where it is not, or not known: then the extinction alone is learned from points.
         sigma_scale, source_scale: typical sizes of both where there is matter, what errors are divided by.
-        components: name -> (M,) float32, the part of ``sigma`` that comes from the source grid of that name, and its typical size.
+        components: name -> (M,) float32, the part of ``sigma`` that comes from the source grid of that name, and its
+        typical size.
     """
 
     name: str

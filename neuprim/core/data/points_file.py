@@ -34,7 +34,8 @@ _FLATNESS = 0.1
 """Thickness of a Gaussian without a size along an axis, over its smallest size."""
 
 _FARTHEST = 1e4
-"""Distance of a point from the median point, over the median of all such distances, beyond which it does not belong to the scene."""
+"""Distance of a point from the median point, over the median of all such distances, beyond which it does not belong to
+the scene."""
 
 _COARSE = 1e-3
 """Of the size of the cloud: what coordinates may be rounded to without a word."""
@@ -43,13 +44,14 @@ _COARSE = 1e-3
 def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     """The vertices of a PLY file as starting points, in the file's own coordinates, ``means`` in float64.
 
-    Properties ``x y z`` are required. Colours come from ``f_dc_0..2`` or from ``red green blue`` (integers, or floats 0..1), both taken for
-    sRGB; points without are mid-grey. ``scale_0..2`` (logarithms of standard deviations) with ``rot_0..3`` (wxyz) make Gaussians of them,
-    and ``opacity`` (a logit, infinite for 0 and 1) says how opaque they are. ``scale_0..1`` alone are the discs of 2D Gaussian splatting,
+    Properties ``x y z`` are required. Colours come from ``f_dc_0..2`` or from ``red green blue`` (integers, or floats
+    0..1), both taken for sRGB; points without are mid-grey. ``scale_0..2`` (logarithms of standard deviations) with
+    ``rot_0..3`` (wxyz) make Gaussians of them, and ``opacity`` (a logit, infinite for 0 and 1) says how opaque they
+    are. ``scale_0..1`` alone are the discs of 2D Gaussian splatting,
     ``scale_0`` alone are balls. All else is ignored, view-dependent colour too.
 
-    A vertex that stands for no point is left out, and all such are counted in one warning: a NaN among what is read, a size or rotation
-    that is none, a place far from all others.
+    A vertex that stands for no point is left out, and all such are counted in one warning: a NaN among what is read, a
+    size or rotation that is none, a place far from all others.
 
     Args:
         channels: of the data set. color_space: "srgb" or "linear", what the colours become.
@@ -83,7 +85,9 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
         faults["place"] |= kept & (away > _FARTHEST * np.median(away[kept])) & (np.median(away[kept]) > 0)
         kept &= ~faults["place"]
     if not kept.all():
-        parts = [f"{rows.sum()} for their {what}, as vertex {rows.argmax()}" for what, rows in faults.items() if rows.any()]
+        parts = [
+            f"{rows.sum()} for their {what}, as vertex {rows.argmax()}" for what, rows in faults.items() if rows.any()
+        ]
         text = f"{path}: {(~kept).sum()} of {len(kept)} vertices are no usable points ({'; '.join(parts)})"
         if not kept.any():
             raise DataError(f"{text}; expected at least one with finite numbers")
@@ -119,7 +123,9 @@ def _sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
         return None
     if there != list(_SCALES[: len(there)]) or (len(there) > 1 and not set(_ROTATION) <= set(found.names)):
         lacking = [name for name in (*_SCALES, *_ROTATION) if name not in found.names]
-        warn_once(f"{path}: has {', '.join(there)}, but no {', '.join(lacking)}; sizes are ignored, and come from distances")
+        warn_once(
+            f"{path}: has {', '.join(there)}, but no {', '.join(lacking)}; sizes are ignored, and come from distances"
+        )
         return None
     scales = found.columns(there)
     if len(there) == 1:
@@ -151,12 +157,14 @@ def _colors(found: PlyVertices, path: Path) -> np.ndarray:
 
 
 def _warn_of_rounding(found: PlyVertices, means: np.ndarray, path: Path) -> None:
-    """Say where float32 coordinates far from the origin are too coarse for the cloud. Rule: coordinates are kept in float64 and moved by an
-    offset, but what the file itself rounded is lost."""
+    """Say where float32 coordinates far from the origin are too coarse for the cloud. Rule: coordinates are kept in
+    float64 and moved by an offset, but what the file itself rounded is lost."""
     largest = np.abs(means).max(initial=0.0)
     size, step = np.ptp(means, axis=0).max(), np.spacing(np.float32(largest))
     if found.rows.dtype["x"].itemsize == 4 and step > _COARSE * size > 0:
-        warn_once(f"{path}: x y z are float, which rounds coordinates as large as {largest:.7g} to {step:.2g}; expected double there")
+        warn_once(
+            f"{path}: x y z are float, which rounds coordinates as large as {largest:.7g} to {step:.2g}; expected double there"
+        )
 
 
 def _in_space(colors: Tensor, linear: bool, color_space: str) -> Tensor:

@@ -1,4 +1,5 @@
-"""Starting points along training rays, where cameras do not look at one point: an array, a ring that looks outward, a tripod."""
+"""Starting points along training rays, where cameras do not look at one point: an array, a ring that looks outward, a
+tripod."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ _SAME = 1.02
 _TRIED = 8
 """Depths of a ray, of which the one counts at which other views agree best."""
 _PRIOR = 0.5
-"""Weight of how well a depth fits all rays, beside how well it fits one: few views see a place, and some agree by chance."""
+"""Weight of how well a depth fits all rays, beside how well it fits one: few views see a place, and some agree by
+chance."""
 _ROUNDS = 8
 
 
@@ -41,11 +43,15 @@ def views_that_see(views: ViewSet, means: Tensor) -> Tensor:
     return torch.stack([views.view(i).camera.sees(means) for i in _some(len(views), _VIEWS)]).sum(0)
 
 
-def ray_points(views: ViewSet, count: int, generator: torch.Generator, matter: float = 0.5) -> tuple[PointCloud, Tensor]:
-    """At most ``count`` points on rays through random pixels, at depths even in 1/z, with the pixels' colours; and (N,) their views.
+def ray_points(
+    views: ViewSet, count: int, generator: torch.Generator, matter: float = 0.5
+) -> tuple[PointCloud, Tensor]:
+    """At most ``count`` points on rays through random pixels, at depths even in 1/z, with the pixels' colours; and (N,)
+    their views.
 
-    The nearest and farthest depth are those at which other views show the same colours. Where no depth fits better than infinity the
-    cameras count as one: depths have an arbitrary unit then. A point counts if two cameras see it, or one where they count as one.
+    The nearest and farthest depth are those at which other views show the same colours. Where no depth fits better than
+    infinity the cameras count as one: depths have an arbitrary unit then. A point counts if two cameras see it, or one
+    where they count as one.
 
     Args:
         matter: the alpha above which a pixel shows matter.
@@ -71,7 +77,9 @@ def ray_points(views: ViewSet, count: int, generator: torch.Generator, matter: f
             break
     means, colors, owner = (torch.cat(parts)[:count] for parts in zip(*found, strict=True))
     if not len(means):
-        raise DataError(f"no place is in the images of {needed} training cameras, so that no starting point can be inferred; {NOT_SEEN}")
+        raise DataError(
+            f"no place is in the images of {needed} training cameras, so that no starting point can be inferred; {NOT_SEEN}"
+        )
     return PointCloud(means, colors), owner
 
 
@@ -80,8 +88,11 @@ def _some(count: int, most: int) -> list[int]:
     return sorted({round(i * (count - 1) / max(min(count, most) - 1, 1)) for i in range(min(count, most))})
 
 
-def _pixels(views: ViewSet, count: int, generator: torch.Generator, matter: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Random pixels that show matter: eyes and rays of camera-z 1 (N, 3) in float64, straight colours (N, C), and (N,) the views."""
+def _pixels(
+    views: ViewSet, count: int, generator: torch.Generator, matter: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Random pixels that show matter: eyes and rays of camera-z 1 (N, 3) in float64, straight colours (N, C), and (N,)
+    the views."""
     drawn = torch.randint(len(views), (count,), generator=generator)
     spots = torch.rand((count, 2), generator=generator).double()
     found = []
@@ -97,13 +108,16 @@ def _pixels(views: ViewSet, count: int, generator: torch.Generator, matter: floa
         view = camera.viewmat.double()
         local = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, torch.ones_like(u)], dim=-1)
         eye = camera.position.double().expand(len(local), 3)
-        found.append((eye[keep], (local @ view[:3, :3])[keep], color[keep].float(), torch.full((int(keep.sum()),), index)))
+        found.append(
+            (eye[keep], (local @ view[:3, :3])[keep], color[keep].float(), torch.full((int(keep.sum()),), index))
+        )
     eyes, rays, colors, owner = (torch.cat(parts) for parts in zip(*found, strict=True))
     return eyes, rays, colors, owner
 
 
 def _fitting(views: ViewSet, generator: torch.Generator, matter: float) -> tuple[Tensor, Tensor, int]:
-    """Depths from the nearest to the farthest that fit, how much colours differ there on average, and how many cameras must see a point."""
+    """Depths from the nearest to the farthest that fit, how much colours differ there on average, and how many cameras
+    must see a point."""
     cameras = [views.view(i).camera for i in range(len(views))]
     same = all(torch.equal(c.position, cameras[0].position) for c in cameras)
     unit = camera_extent(cameras)
@@ -119,7 +133,9 @@ def _fitting(views: ViewSet, generator: torch.Generator, matter: float) -> tuple
         unit = max(1.0, 100.0 * unit) if len(cameras) > 1 and unit < 1 else 1.0
         return torch.tensor([1.0, 4.0], dtype=torch.float64) * unit, torch.zeros(2, dtype=torch.float64), 1
     fits = (mean <= (mean.min() + mean[-1]) / 2).nonzero()[:, 0]  # where colours agree better than half-way to infinity
-    chosen = slice(max(int(fits[0]) - 1, 0), int(fits[-1]) + 1)  # the nearest surfaces are few, and outweighed in the mean
+    chosen = slice(
+        max(int(fits[0]) - 1, 0), int(fits[-1]) + 1
+    )  # the nearest surfaces are few, and outweighed in the mean
     return depths[chosen], mean[chosen].clamp_max(mean[-1]), 2
 
 

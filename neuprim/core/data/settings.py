@@ -24,11 +24,13 @@ SplitName = Annotated[str, text("the name in transforms_NAME.json")]
 
 @dataclass(frozen=True)
 class FolderSettings:
-    """What every loader of a folder with posed images is told; a loader derives a class with its own settings beside these.
+    """What every loader of a folder with posed images is told; a loader derives a class with its own settings beside
+    these.
 
     Attributes:
         path: the data set's folder, ``~`` allowed.
-        background: "auto" (white for data with alpha, else black), "white", "black", or "random" (training composites random colours,
+        background: "auto" (white for data with alpha, else black), "white", "black", or "random" (training composites
+        random colours,
             evaluation white).
         downsample: whole factor, area filter on premultiplied values.
         preload: decode all images at once, so that damaged files are found before training.

@@ -21,8 +21,8 @@ _CELLS = (12, 17, 24, 34, 48, 68, 96, 136, 192)
 """Pixels looked at along an image's longer side, grid after grid."""
 _NEAREST = 8
 _FAR_SIDE = 0.75
-"""Of the depths of the nearest points. A wall's pixels beside an object lie beside points of both; a guess too far is hidden or moves
-forward as it learns, one too near stands in front of other cameras."""
+"""Of the depths of the nearest points. A wall's pixels beside an object lie beside points of both; a guess too far is
+hidden or moves forward as it learns, one too near stands in front of other cameras."""
 _SHELL = 0.1
 """Share of the points that surround everything."""
 
@@ -30,9 +30,9 @@ _SHELL = 0.1
 def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
     """At most ``count`` points on what the views show and ``points`` leave out, coloured by the pixels that show them.
 
-    A grid of pixels of every view that no point projects near is lifted to the depth of the points beside it, unless what has been lifted
-    from other views covers it already. A tenth are a shell around everything, where some view looks: the last resort of pixels of whose
-    depth nothing is known.
+    A grid of pixels of every view that no point projects near is lifted to the depth of the points beside it, unless
+    what has been lifted from other views covers it already. A tenth are a shell around everything, where some view
+    looks: the last resort of pixels of whose depth nothing is known.
     """
     if count <= 0 or not len(points.means):
         return points.rows(torch.zeros(0, dtype=torch.int64))
@@ -45,7 +45,8 @@ def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator
 
 
 def _lifted(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
-    """Pixels without points near, at the depth of those beside them; coarse grids first, so that the largest gaps are filled before small ones."""
+    """Pixels without points near, at the depth of those beside them; coarse grids first, so that the largest gaps are
+    filled before small ones."""
     order = torch.randperm(len(views), generator=generator)[:_VIEWS].tolist()
     known = given.double().numpy()
     means = np.zeros((0, 3))
@@ -54,14 +55,21 @@ def _lifted(views: ViewSet, given: Tensor, count: int, generator: torch.Generato
     for cells in _CELLS:
         for index in order:
             found, seen = _gaps(views, index, known, side / cells)
-            known, means, colors = np.concatenate([known, found]), np.concatenate([means, found]), np.concatenate([colors, seen])
+            known, means, colors = (
+                np.concatenate([known, found]),
+                np.concatenate([means, found]),
+                np.concatenate([colors, seen]),
+            )
         if len(means) >= count:
             break
     return PointCloud(torch.from_numpy(means[:count]).float(), torch.from_numpy(colors[:count]).float())
 
 
-def _gaps(views: ViewSet, index: int, known: NDArray[np.float64], cell: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """(N, 3) positions and (N, C) colours of pixels ``cell`` apart that have no known point within that distance, on the image and in space."""
+def _gaps(
+    views: ViewSet, index: int, known: NDArray[np.float64], cell: float
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """(N, 3) positions and (N, C) colours of pixels ``cell`` apart that have no known point within that distance, on
+    the image and in space."""
     camera, image = views.view(index).camera, views.pixels(index)
     rotation, shift = camera.viewmat[:3, :3].double().numpy(), camera.viewmat[:3, 3].double().numpy()
     spots = _grid(camera.width, camera.height, cell)
@@ -113,4 +121,6 @@ def _shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator
     if len(rows) > count:
         rows = rows[torch.randperm(len(rows), generator=generator)[:count]].sort().values
     chosen = means[rows].float()
-    return PointCloud(chosen, median_colors(views, chosen) if len(chosen) else torch.zeros(0, views.pixels(0).rgb.shape[-1]))
+    return PointCloud(
+        chosen, median_colors(views, chosen) if len(chosen) else torch.zeros(0, views.pixels(0).rgb.shape[-1])
+    )

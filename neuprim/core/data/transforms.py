@@ -1,7 +1,8 @@
-"""The frames of ``transforms.json`` files (instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints, GS³): cameras, lenses, masks, splits.
+"""The frames of ``transforms.json`` files (instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints, GS³):
+cameras, lenses, masks, splits.
 
-Intrinsics and lenses are read by :mod:`neuprim.core.cameras.intrinsics`; :mod:`neuprim.core.cameras.keys` knows all other keys. Poses
-are camera to world with OpenGL axes.
+Intrinsics and lenses are read by :mod:`neuprim.core.cameras.intrinsics`; :mod:`neuprim.core.cameras.keys` knows all
+other keys. Poses are camera to world with OpenGL axes.
 """
 
 from __future__ import annotations
@@ -57,9 +58,15 @@ class Layout:
 
 
 def read_frames(
-    folder: Path, document: Record, records: list[Record], settings: FolderSettings, layout: Layout, skip_missing: bool = False
+    folder: Path,
+    document: Record,
+    records: list[Record],
+    settings: FolderSettings,
+    layout: Layout,
+    skip_missing: bool = False,
 ) -> tuple[list[Record], list[ImageFrame]]:
-    """The frames whose images exist and are good, and their records, both in the order of ``records``; names are unique among them.
+    """The frames whose images exist and are good, and their records, both in the order of ``records``; names are unique
+    among them.
 
     Args:
         folder: what paths of images and masks are relative to.
@@ -67,14 +74,17 @@ def read_frames(
         skip_missing: leave frames without an image out, unless that leaves none.
 
     Raises:
-        DataError: missing images or masks, wrong or missing fields, keys that contradict each other or that nothing honours, an
+        DataError: missing images or masks, wrong or missing fields, keys that contradict each other or that nothing
+        honours, an
             unknown camera model, most views bad, or any with ``settings.strict``.
     """
     for record in (document, *records):
         check_keys(record)
     names = [layout.name(r) for r in records]
     files = [layout.image(folder, r) for r in records]
-    absent = [f"{n}{r.values.get('file_ext') or ''}" for n, r, f in zip(names, records, files, strict=True) if f is None]
+    absent = [
+        f"{n}{r.values.get('file_ext') or ''}" for n, r, f in zip(names, records, files, strict=True) if f is None
+    ]
     if absent and (not skip_missing or len(absent) == len(records)):
         raise missing_files(document.where, absent, "" if skip_missing else _skip_hint(settings))
     present = [(r, f, n) for r, f, n in zip(records, files, names, strict=True) if f is not None]
@@ -82,8 +92,12 @@ def read_frames(
     kept: list[Record] = []
     frames: list[ImageFrame] = []
     bad = BadViews(document.where, settings.strict)
-    for (record, file, _), mask, name in zip(present, masks, unique_names([n for *_, n in present], document.where), strict=True):
-        fisheye = is_fisheye(record, document)  # before anything else, as other keys mean nothing to a lens that is not known
+    for (record, file, _), mask, name in zip(
+        present, masks, unique_names([n for *_, n in present], document.where), strict=True
+    ):
+        fisheye = is_fisheye(
+            record, document
+        )  # before anything else, as other keys mean nothing to a lens that is not known
         if not _damaged(record):
             layout.viewmat(record)  # a field that is missing or of another kind is no damage, and refused
         info = bad.read(name, image_info, file)
@@ -92,9 +106,13 @@ def read_frames(
             continue
         target = Target(info.width, info.height, str(file), turned(info))
         camera = camera_of(record, document, target, viewmat, warn_once).validate(record.where)
-        told = any(r.has("w") for r in (record, document)) and info.width != info.height  # the size says which way up pixels are
+        told = (
+            any(r.has("w") for r in (record, document)) and info.width != info.height
+        )  # the size says which way up pixels are
         if info.orientation > 1 and not (told and info.orientation > 4):
-            warn_once(f"{file.parent}: images with an EXIF orientation are read as they are stored, as COLMAP reads them")
+            warn_once(
+                f"{file.parent}: images with an EXIF orientation are read as they are stored, as COLMAP reads them"
+            )
         kept.append(record)
         frames.append(ImageFrame(name, file, camera, info, mask, _distortion(record, document, fisheye)))
     bad.settle(len(present))
@@ -130,7 +148,8 @@ def _numbers(value: object) -> list[float]:
 
 
 def _masks(folder: Path, document: Record, present: Sequence[tuple[Record, Path]], layout: Layout) -> list[Mask | None]:
-    """The mask of every frame: what ``mask_path`` names, in the frame or in the file, else what lies beside the images."""
+    """The mask of every frame: what ``mask_path`` names, in the frame or in the file, else what lies beside the
+    images."""
     if layout.masks and not any(r.has("mask_path") for r in (document, *(r for r, _ in present))):
         return masks_beside(folder, [file for _, file in present])
     masks, lost = [], []
@@ -159,8 +178,11 @@ def _distortion(record: Record, document: Record, fisheye: bool) -> Distortion |
 Read = Callable[[str], list[ImageFrame]]
 
 
-def read_splits(folder: Path, train: str, test: str, hold_out: int, read: Read) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """(training, test) of ``transforms_SPLIT.json`` files; with ``hold_out`` every so many training views are the test split.
+def read_splits(
+    folder: Path, train: str, test: str, hold_out: int, read: Read
+) -> tuple[list[ImageFrame], list[ImageFrame]]:
+    """(training, test) of ``transforms_SPLIT.json`` files; with ``hold_out`` every so many training views are the test
+    split.
 
     Raises:
         ConfigError: nothing to hold out.
@@ -169,7 +191,9 @@ def read_splits(folder: Path, train: str, test: str, hold_out: int, read: Read) 
     frames = read(train)
     if hold_out:
         if len(frames) < 2:
-            raise ConfigError(f"scene.hold_out is {hold_out}, but {folder} has only {len(frames)} training view; expected at least 2")
+            raise ConfigError(
+                f"scene.hold_out is {hold_out}, but {folder} has only {len(frames)} training view; expected at least 2"
+            )
         return every_nth(frames, hold_out)
     path = folder / f"transforms_{test}.json"
     hint = "; scene.hold_out=8 holds out every 8th training view instead"
@@ -184,10 +208,11 @@ def read_splits(folder: Path, train: str, test: str, hold_out: int, read: Read) 
 def split_frames(
     document: Record, records: Sequence[Record], frames: Sequence[ImageFrame], every: int
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """(training, test) by ``train_filenames``, ``val_filenames`` and ``test_filenames``; without any every n-th is a test view.
+    """(training, test) by ``train_filenames``, ``val_filenames`` and ``test_filenames``; without any every n-th is a
+    test view.
 
-    The test views are those of ``test_filenames``, else of ``val_filenames``, else all that do not train. The training views are
-    those of ``train_filenames``, else all that no list names: views for validation never train.
+    The test views are those of ``test_filenames``, else of ``val_filenames``, else all that do not train. The training
+    views are those of ``train_filenames``, else all that no list names: views for validation never train.
 
     Raises:
         DataError: a list names an image that no frame has, or two that must be apart name the same.
@@ -204,11 +229,15 @@ def split_frames(
             raise missing_files(f"{document.where}: {key} names images that no frame has", unknown)
     held = [key for key in ("test_filenames", "val_filenames") if key in lists]
     judged = next((key for key in held if lists[key]), held[0] if held else "")
-    train_names = lists["train_filenames"] if "train_filenames" in lists else everything.difference(*(lists[key] for key in held))
+    train_names = (
+        lists["train_filenames"] if "train_filenames" in lists else everything.difference(*(lists[key] for key in held))
+    )
     test_names = lists[judged] if judged else everything - train_names
     shared = sorted(train_names & test_names)
     if shared:
-        raise DataError(f"{document.where}: train_filenames and {judged} share {len(shared)} images, e.g. {shared[0]}; expected none")
+        raise DataError(
+            f"{document.where}: train_filenames and {judged} share {len(shared)} images, e.g. {shared[0]}; expected none"
+        )
     return [f for n, f in listed.items() if n in train_names], [f for n, f in listed.items() if n in test_names]
 
 

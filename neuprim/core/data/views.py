@@ -80,8 +80,8 @@ def _premultiplied(rgba: Tensor) -> tuple[Tensor, Tensor]:
 class ImageViews(ViewSet):
     """One split of image files.
 
-    Copies are kept as uint8 (PNG, JPEG) or half (OpenEXR, where the values fit) up to ``cache_bytes``; beyond that images
-    are read again each time. Safe to use from several threads.
+    Copies are kept as uint8 (PNG, JPEG) or half (OpenEXR, where the values fit) up to ``cache_bytes``; beyond that
+    images are read again each time. Safe to use from several threads.
 
     Args:
         frames: of one split; sizes may differ.
@@ -95,7 +95,13 @@ class ImageViews(ViewSet):
         ConfigError: an image is smaller than the factor.
     """
 
-    def __init__(self, frames: Sequence[ImageFrame], downsample: int = 1, cache_bytes: int = _CACHE_BYTES, to_linear: bool = False) -> None:
+    def __init__(
+        self,
+        frames: Sequence[ImageFrame],
+        downsample: int = 1,
+        cache_bytes: int = _CACHE_BYTES,
+        to_linear: bool = False,
+    ) -> None:
         self._frames = list(frames)
         self._to_linear = to_linear
         self.scale = 1.0
@@ -121,7 +127,8 @@ class ImageViews(ViewSet):
         """Pixels of view ``index``.
 
         Raises:
-            DataError: the file is missing, damaged or changed size since the data set was opened, or its mask leaves nothing.
+            DataError: the file is missing, damaged or changed size since the data set was opened, or its mask leaves
+            nothing.
         """
         stored = self._load(range(len(self))[index])
         if self._to_linear:
@@ -134,7 +141,9 @@ class ImageViews(ViewSet):
         if data.shape[-1] == 3:
             return Pixels(data, None, stored.mask)
         rgb, alpha = data[..., :3], data[..., 3]
-        return Pixels(rgb.contiguous() if stored.premultiplied else rgb * alpha[..., None], alpha.contiguous(), stored.mask)
+        return Pixels(
+            rgb.contiguous() if stored.premultiplied else rgb * alpha[..., None], alpha.contiguous(), stored.mask
+        )
 
     def _linear(self, stored: _Stored) -> Pixels:
         rgb, alpha = stored.data[..., :3], stored.data[..., 3] if stored.data.shape[-1] == 4 else None
@@ -144,7 +153,9 @@ class ImageViews(ViewSet):
             rgb = rgb if stored.premultiplied else rgb * alpha[..., None]
         return Pixels((rgb * self.scale).contiguous(), alpha, stored.mask)
 
-    def preload(self, progress: Callable[[float], None] = lambda fraction: None, empty: bool = True) -> dict[int, DataError]:
+    def preload(
+        self, progress: Callable[[float], None] = lambda fraction: None, empty: bool = True
+    ) -> dict[int, DataError]:
         """Decode every image now, and keep copies while there is room: the errors of the bad ones, by index.
 
         Args:
@@ -191,8 +202,14 @@ class ImageViews(ViewSet):
         if image.shape[-1] != frame.info.channels or (image.dtype != torch.uint8) != frame.info.linear:
             raise DataError(f"{frame.path}: file changed while it was in use; expected {frame.info.channels} channels")
         mask = None if frame.mask is None else read_mask(frame.mask.path, size) ^ frame.mask.inverted
-        if frame.info.linear and image.shape[-1] == 4 and not bool(((image[..., 3] >= -1e-3) & (image[..., 3] <= 1.001)).all()):
-            raise DataError(f"{frame.path}: alpha reaches {image[..., 3].float().abs().max().item():.4g}; expected 0..1")
+        if (
+            frame.info.linear
+            and image.shape[-1] == 4
+            and not bool(((image[..., 3] >= -1e-3) & (image[..., 3] <= 1.001)).all())
+        ):
+            raise DataError(
+                f"{frame.path}: alpha reaches {image[..., 3].float().abs().max().item():.4g}; expected 0..1"
+            )
         if frame.distortion is not None or self._factor > 1:
             image, mask = self._process(frame, image, mask)
             premultiplied = True
@@ -209,7 +226,11 @@ class ImageViews(ViewSet):
         eight_bit = image.dtype == torch.uint8
         if eight_bit and self._to_linear:
             rgb = _LINEAR[image[..., :3].int()]
-            values = rgb if image.shape[-1] == 3 else torch.cat([rgb * (image[..., 3:] / 255.0), image[..., 3:] / 255.0], dim=-1)
+            values = (
+                rgb
+                if image.shape[-1] == 3
+                else torch.cat([rgb * (image[..., 3:] / 255.0), image[..., 3:] / 255.0], dim=-1)
+            )
             eight_bit = False
         else:
             values = image.float()
@@ -260,5 +281,7 @@ def _reduced(frame: ImageFrame, factor: int) -> Camera:
     """The camera of a frame after area reduction."""
     camera = frame.camera
     if min(camera.width, camera.height) < factor:
-        raise ConfigError(f"scene.downsample is {factor}, but {frame.path} has only {camera.width}x{camera.height} pixels")
+        raise ConfigError(
+            f"scene.downsample is {factor}, but {frame.path} has only {camera.width}x{camera.height} pixels"
+        )
     return camera.reduced(factor)

@@ -17,7 +17,9 @@ def picture_address(image: Tensor, widest: int, quality: int = 85) -> str:
     """An image (H, W, 3) of sRGB values 0..1 as WebP, made smaller where it is wider than ``widest`` pixels."""
     picture = Image.fromarray(to_uint8(image).numpy())
     if picture.width > widest:
-        picture = picture.resize((widest, max(1, round(picture.height * widest / picture.width))), Image.Resampling.LANCZOS)
+        picture = picture.resize(
+            (widest, max(1, round(picture.height * widest / picture.width))), Image.Resampling.LANCZOS
+        )
     file = io.BytesIO()
     picture.save(file, "WEBP", quality=quality)
     return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"

@@ -17,7 +17,8 @@ def default_names(count: int) -> tuple[str, ...]:
 
 
 def names_fault(names: Sequence[Any]) -> str | None:
-    """``"WHAT; expected WHAT"`` of the first name that an OpenEXR file could not hold or would take for another's; None if all will do.
+    """``"WHAT; expected WHAT"`` of the first name that an OpenEXR file could not hold or would take for another's; None
+    if all will do.
 
     A is left to alpha; whatever else is printable and at most 31 bytes long will do, ``450 nm`` for example.
     """

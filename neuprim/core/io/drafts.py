@@ -1,4 +1,5 @@
-"""Files that somebody else's code writes: first in a private folder, and in their place only when all is done and nothing is in the way."""
+"""Files that somebody else's code writes: first in a private folder, and in their place only when all is done and
+nothing is in the way."""
 
 from __future__ import annotations
 
@@ -21,7 +22,9 @@ def refuse_taken(final: Path, overwrite: bool) -> None:
     if not final.is_dir():
         raise ConfigError(f"{final}: exists; --force replaces it, --out PATH writes elsewhere")
     if any(final.iterdir()):
-        raise ConfigError(f"{final}: exists and is not empty; --force replaces files of the same name, --out PATH writes elsewhere")
+        raise ConfigError(
+            f"{final}: exists and is not empty; --force replaces files of the same name, --out PATH writes elsewhere"
+        )
 
 
 class Draft:
@@ -74,7 +77,8 @@ class Draft:
 
 @contextmanager
 def drafted(final: Path, overwrite: bool) -> Iterator[Draft]:
-    """A draft that is gone after the block, published or not; what errors say about its paths they say about the final ones."""
+    """A draft that is gone after the block, published or not; what errors say about its paths they say about the final
+    ones."""
     there = final if final.is_dir() else next(p for p in (*final.parents, Path(".")) if p.exists())
     try:
         folder = Path(tempfile.mkdtemp(prefix=f".neuprim.{os.getpid()}.", dir=there))

@@ -1,7 +1,9 @@
-"""OpenEXR files out: one image, or several layers of one, always linear light, whole or not at all, compressed without loss (ZIP).
+"""OpenEXR files out: one image, or several layers of one, always linear light, whole or not at all, compressed without
+loss (ZIP).
 
-Channels follow the format's own convention: those without a prefix are the image that every reader shows (R, G, B and premultiplied A),
-and a layer is a prefix and a dot, ``depth.Z`` (OpenEXR, "Technical Introduction": channel names and layers), as Nuke and Blender read them.
+Channels follow the format's own convention: those without a prefix are the image that every reader shows (R, G, B and
+premultiplied A), and a layer is a prefix and a dot, ``depth.Z`` (OpenEXR, "Technical Introduction": channel names and
+layers), as Nuke and Blender read them.
 """
 
 from __future__ import annotations
@@ -48,9 +50,14 @@ def check_finite(path: Path, pixels: np.ndarray) -> None:
 
 
 def write_exr(
-    path: Path, image: Tensor, half: bool = True, extra: Mapping[str, Tensor] | None = None, names: Sequence[str] | None = None
+    path: Path,
+    image: Tensor,
+    half: bool = True,
+    extra: Mapping[str, Tensor] | None = None,
+    names: Sequence[str] | None = None,
 ) -> None:
-    """Write (H, W, 3 or 4) *linear* values, alpha premultiplied, or channels of other names as OpenEXR without clamping; atomic.
+    """Write (H, W, 3 or 4) *linear* values, alpha premultiplied, or channels of other names as OpenEXR without
+    clamping; atomic.
 
     Args:
         half: store colour as 16-bit instead of 32-bit floats.
@@ -58,13 +65,20 @@ def write_exr(
         names: of the channels C of an (H, W, C) image that is not R, G, B(, A).
 
     Raises:
-        DataError: wrong shapes or names, colour values that are not finite or (with ``half``) beyond 65504, or the file cannot be written.
+        DataError: wrong shapes or names, colour values that are not finite or (with ``half``) beyond 65504, or the file
+        cannot be written.
     """
     wrong = None if names is None else names_fault(names)
     if wrong:
         raise DataError(f"{path}: names{wrong}")
-    if image.ndim != 3 or 0 in image.shape or (image.shape[-1] not in (3, 4) if names is None else image.shape[-1] != len(names)):
-        expected = "(H, W, 3) or (H, W, 4)" if names is None else f"(H, W, {len(names)}), for the channels {', '.join(names)}"
+    if (
+        image.ndim != 3
+        or 0 in image.shape
+        or (image.shape[-1] not in (3, 4) if names is None else image.shape[-1] != len(names))
+    ):
+        expected = (
+            "(H, W, 3) or (H, W, 4)" if names is None else f"(H, W, {len(names)}), for the channels {', '.join(names)}"
+        )
         raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected {expected}")
     check_finite(path, image.detach().cpu().float().numpy())
     channels = {c: _stored(path, c, image[..., i], half) for i, c in enumerate(names or "RGBA"[: image.shape[-1]])}
@@ -85,7 +99,8 @@ def write_layers(path: Path, planes: Mapping[str, Plane], attributes: Mapping[st
         attributes: of the file's header: texts, numbers, float32 arrays of 2, 3 or 4 x 4 numbers, lists of floats.
 
     Raises:
-        DataError: no channels, different sizes, values that are not finite or (where half) beyond 65504, or the file cannot be written.
+        DataError: no channels, different sizes, values that are not finite or (where half) beyond 65504, or the file
+        cannot be written.
     """
     shapes = sorted({tuple(plane.values.shape) for plane in planes.values()})
     if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:
@@ -94,8 +109,12 @@ def write_layers(path: Path, planes: Mapping[str, Plane], attributes: Mapping[st
         bad = (~plane.values.isfinite()).nonzero()
         if len(bad):
             y, x = bad[0].tolist()
-            raise DataError(f"{path}: channel {name}: value {float(plane.values[y, x])} at row {y}, column {x}; expected finite numbers")
-    _write(path, {name: _stored(path, name, plane.values, plane.half) for name, plane in planes.items()}, attributes or {})
+            raise DataError(
+                f"{path}: channel {name}: value {float(plane.values[y, x])} at row {y}, column {x}; expected finite numbers"
+            )
+    _write(
+        path, {name: _stored(path, name, plane.values, plane.half) for name, plane in planes.items()}, attributes or {}
+    )
 
 
 def _stored(path: Path, name: str, plane: Tensor, half: bool) -> np.ndarray:

@@ -76,15 +76,21 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def remove_left(folder: Path) -> None:
-    """Remove the temporary files and drafts of writers that were killed, from a folder and those in it; for whoever holds its lock.
+    """Remove the temporary files and drafts of writers that were killed, from a folder and those in it; for whoever
+    holds its lock.
 
     A writer of this machine that is at work keeps its files, any for a day.
     """
-    for place in (folder, *(path for path in folder.iterdir() if path.name[0] != "." and path.is_dir() and not path.is_symlink())):
+    for place in (
+        folder,
+        *(path for path in folder.iterdir() if path.name[0] != "." and path.is_dir() and not path.is_symlink()),
+    ):
         for path in place.iterdir():
             match = _TEMPORARY.fullmatch(path.name)
             with suppress(OSError):
-                if match is None or (_works(match["pid"] or match["draft"]) and time.time() - path.lstat().st_mtime < _DAY):
+                if match is None or (
+                    _works(match["pid"] or match["draft"]) and time.time() - path.lstat().st_mtime < _DAY
+                ):
                     continue
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path, ignore_errors=True)
@@ -128,7 +134,8 @@ def writing(path: Path) -> Iterator[Path]:
 def publish_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
     """Have ``write`` fill a folder that gets the name ``final`` only when it is done, unless a complete one is there.
 
-    An interrupted run leaves nothing behind. Of several processes at once the first one wins, so all must write the same files.
+    An interrupted run leaves nothing behind. Of several processes at once the first one wins, so all must write the
+    same files.
 
     Args:
         write: fills the empty folder that it is given.

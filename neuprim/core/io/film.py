@@ -30,9 +30,13 @@ def write_film(path: Path, frames: Sequence[Tensor], fps: float) -> None:
     try:
         import av
     except ImportError as error:
-        raise BackendUnavailable(f"{path}: MP4 needs the package av ({error}); pip install 'neuprim[video]', or use .webp") from error
+        raise BackendUnavailable(
+            f"{path}: MP4 needs the package av ({error}); pip install 'neuprim[video]', or use .webp"
+        ) from error
     if not frames or not 0.0 < fps < float("inf") or len({tuple(f.shape) for f in frames}) != 1:
-        raise DataError(f"{path}: {len(frames)} frames at {fps} frames per second; expected at least one, all of one shape")
+        raise DataError(
+            f"{path}: {len(frames)} frames at {fps} frames per second; expected at least one, all of one shape"
+        )
     height, width = frames[0].shape[:2]
     with atomic_path(path) as temporary:
         with av.open(str(temporary), "w", format="mp4") as container:

@@ -1,8 +1,10 @@
 """Image files at the edge: PNG, JPEG, WebP and OpenEXR in; PNG, OpenEXR, WebP and GIF out; the sRGB transfer curve.
 
-PNG, JPEG and WebP hold display-referred sRGB values with *straight* alpha; OpenEXR holds linear light with *premultiplied* alpha.
-Nothing here converts between the two silently. What 8-bit RGB or RGBA holds without loss is read as such (grey, palettes); all else
-is refused by name. Colour profiles and EXIF orientation are not applied, as in COLMAP and in the loaders of the data sets read here.
+PNG, JPEG and WebP hold display-referred sRGB values with *straight* alpha; OpenEXR holds linear light with
+*premultiplied* alpha.
+Nothing here converts between the two silently. What 8-bit RGB or RGBA holds without loss is read as such (grey,
+palettes); all else is refused by name. Colour profiles and EXIF orientation are not applied, as in COLMAP and in the
+loaders of the data sets read here.
 
 Every failure is a :class:`~neuprim.core.errors.DataError` that names the file, what was found and what was expected.
 """
@@ -23,7 +25,15 @@ from torch import Tensor
 from neuprim.core.errors import DataError
 from neuprim.core.io.exr import check_finite, write_exr, write_layers
 from neuprim.core.io.files import writing
-from neuprim.core.io.pictures import MAX_PIXELS, check_pixels, decode, enough_memory, open_picture, orientation_of, rgb_mode
+from neuprim.core.io.pictures import (
+    MAX_PIXELS,
+    check_pixels,
+    decode,
+    enough_memory,
+    open_picture,
+    orientation_of,
+    rgb_mode,
+)
 
 __all__ = [
     "MAX_PIXELS",
@@ -57,8 +67,8 @@ class ImageInfo:
     Attributes:
         width, height: pixels.
         channels: 3 (RGB) or 4 (RGBA), or as many as were asked for by name.
-        linear: True for OpenEXR (linear light, premultiplied alpha), False for PNG, JPEG and WebP (sRGB, straight alpha).
-        orientation: EXIF's, 1 to 8; pixels are read as they are stored whatever it says.
+        linear: True for OpenEXR (linear light, premultiplied alpha), False for PNG, JPEG and WebP (sRGB, straight
+        alpha). orientation: EXIF's, 1 to 8; pixels are read as they are stored whatever it says.
     """
 
     width: int
@@ -75,7 +85,8 @@ def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
     """Size and channels of an image from its header alone; ``channels`` as of :func:`read_image`.
 
     Raises:
-        DataError: missing, empty, not PNG/JPEG/WebP/OpenEXR, nothing that 8-bit RGB(A) or float RGB(A) holds, without a channel that was
+        DataError: missing, empty, not PNG/JPEG/WebP/OpenEXR, nothing that 8-bit RGB(A) or float RGB(A) holds, without a
+        channel that was
             asked for, or larger than :data:`MAX_PIXELS`.
     """
     if _is_exr(path, channels is not None):
@@ -96,10 +107,11 @@ def exr_channels(path: Path) -> tuple[str, ...]:
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequence[str] | None = None) -> Tensor:
-    """(H, W, 3 or 4) pixels as stored: uint8 sRGB with straight alpha (PNG, JPEG, WebP), or linear premultiplied float (OpenEXR).
+    """(H, W, 3 or 4) pixels as stored: uint8 sRGB with straight alpha (PNG, JPEG, WebP), or linear premultiplied float
+    (OpenEXR).
 
-    Grey and palette images come as RGB, or RGBA where they have alpha. OpenEXR values come as float16 or float32, as in the file, and are
-    never clamped.
+    Grey and palette images come as RGB, or RGBA where they have alpha. OpenEXR values come as float16 or float32, as in
+    the file, and are never clamped.
 
     Args:
         size: expected (width, height); any other is an error.
@@ -159,13 +171,17 @@ def _exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             parts = len(file.parts)
             header = dict(file.parts[0].header)  # the file's own is emptied when it closes
-            low, high, full_low, full_high = ([int(v) for v in c] for w in ("dataWindow", "displayWindow") for c in header[w])
+            low, high, full_low, full_high = (
+                [int(v) for v in c] for w in ("dataWindow", "displayWindow") for c in header[w]
+            )
             channels = {c.name: c for c in header["channels"]}
             flat = header.get("type", OpenEXR.scanlineimage) in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
     except Exception as error:  # also KeyError and UnicodeDecodeError, from damaged attributes
         raise DataError(f"{path}: OpenEXR header is truncated or corrupt ({type(error).__name__}: {error})") from None
     if parts != 1 or not flat:
-        raise DataError(f"{path}: OpenEXR file has {parts} parts of type {header.get('type')}; expected 1 part of flat scan lines or tiles")
+        raise DataError(
+            f"{path}: OpenEXR file has {parts} parts of type {header.get('type')}; expected 1 part of flat scan lines or tiles"
+        )
     if (low, high) != (full_low, full_high):
         raise DataError(
             f"{path}: OpenEXR data window {low}..{high} is not its display window {full_low}..{full_high}; expected equal windows"
@@ -184,12 +200,18 @@ def _exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[list[s
     channels, width, height = _exr_header(path)
     names, expected = list(wanted or ()), ", ".join(wanted or ())
     if wanted is None:
-        layers = [name[:-1] for name in channels if name.endswith("R") and {name[:-1] + "G", name[:-1] + "B"} <= channels.keys()]
+        layers = [
+            name[:-1]
+            for name in channels
+            if name.endswith("R") and {name[:-1] + "G", name[:-1] + "B"} <= channels.keys()
+        ]
         layers = [""] if "" in layers else layers
         names = [layers[0] + c for c in "RGBA" if layers[0] + c in channels] if len(layers) == 1 else []
         expected = "R, G, B and optionally A, of one layer"
     if not names or not set(names) <= channels.keys():
-        raise DataError(f"{path}: OpenEXR channels are {', '.join(channels) or 'none'}; expected {expected or 'some to be asked for'}")
+        raise DataError(
+            f"{path}: OpenEXR channels are {', '.join(channels) or 'none'}; expected {expected or 'some to be asked for'}"
+        )
     if any(channels[n].xSampling != 1 or channels[n].ySampling != 1 for n in names):
         raise DataError(f"{path}: OpenEXR colour channels are subsampled; expected one value per pixel")
     return names, width, height
@@ -202,11 +224,17 @@ def _read_exr(path: Path, names: list[str], width: int, height: int) -> Tensor:
     except MemoryError:
         raise
     except Exception as error:
-        raise DataError(f"{path}: OpenEXR data is truncated or corrupt ({error}); expected a complete {width}x{height} image") from None
+        raise DataError(
+            f"{path}: OpenEXR data is truncated or corrupt ({error}); expected a complete {width}x{height} image"
+        ) from None
     if any(p.dtype not in (np.float16, np.float32) for p in planes):
-        raise DataError(f"{path}: OpenEXR colour channels are {', '.join(str(p.dtype) for p in planes)}; expected half or float")
+        raise DataError(
+            f"{path}: OpenEXR colour channels are {', '.join(str(p.dtype) for p in planes)}; expected half or float"
+        )
     if any(p.shape != (height, width) for p in planes):
-        raise DataError(f"{path}: OpenEXR data is {planes[0].shape[1]}x{planes[0].shape[0]}; expected {width}x{height} as in its header")
+        raise DataError(
+            f"{path}: OpenEXR data is {planes[0].shape[1]}x{planes[0].shape[0]}; expected {width}x{height} as in its header"
+        )
     pixels = np.stack(planes, axis=-1)
     check_finite(path, pixels)
     return torch.from_numpy(pixels)
@@ -229,7 +257,8 @@ def to_uint8(image: Tensor) -> Tensor:
 
 
 def pillow_image(path: Path, image: Tensor) -> Image.Image:
-    """(H, W, 3 or 4) sRGB values as Pillow's image of 8 bits; ``path`` is for messages. Raises DataError: wrong shape, NaN values."""
+    """(H, W, 3 or 4) sRGB values as Pillow's image of 8 bits; ``path`` is for messages. Raises DataError: wrong shape,
+    NaN values."""
     if image.ndim != 3 or image.shape[-1] not in (3, 4) or 0 in image.shape:
         raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected (H, W, 3) or (H, W, 4)")
     try:
@@ -258,15 +287,19 @@ def write_webp(path: Path, image: Tensor, quality: int = 90, lossless: bool = Fa
 
 
 def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: int = 80) -> None:
-    """Write (H, W, 3 or 4) sRGB frames as an endless animation; the suffix ``.webp`` or ``.gif`` picks the format; atomic.
+    """Write (H, W, 3 or 4) sRGB frames as an endless animation; the suffix ``.webp`` or ``.gif`` picks the format;
+    atomic.
 
     GIF keeps 256 colours a frame and whole hundredths of a second, so its rate is the nearest it can hold.
 
     Raises:
-        DataError: no frames, frames of different shapes, an unknown suffix, a rate that is not positive, or as :func:`write_png`.
+        DataError: no frames, frames of different shapes, an unknown suffix, a rate that is not positive, or as
+        :func:`write_png`.
     """
     if not frames or not 0.0 < fps < float("inf"):
-        raise DataError(f"{path}: {len(frames)} frames at {fps} frames per second; expected at least one frame and a positive rate")
+        raise DataError(
+            f"{path}: {len(frames)} frames at {fps} frames per second; expected at least one frame and a positive rate"
+        )
     shapes = sorted({tuple(f.shape) for f in frames})
     if len(shapes) != 1:
         raise DataError(f"{path}: frames have shapes {shapes}; expected one shape")
@@ -274,7 +307,9 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
     save_animation(path, images[0], fps, quality, images[1:])
 
 
-def save_animation(path: Path, first: Image.Image, fps: float, quality: int = 80, rest: Sequence[Image.Image] = ()) -> None:
+def save_animation(
+    path: Path, first: Image.Image, fps: float, quality: int = 80, rest: Sequence[Image.Image] = ()
+) -> None:
     """Write Pillow's images, each with all of its own frames, as :func:`write_animation` does."""
     kind = {".webp": "WEBP", ".gif": "GIF"}.get(path.suffix.lower())
     if kind is None:
@@ -288,12 +323,14 @@ def save_animation(path: Path, first: Image.Image, fps: float, quality: int = 80
 
 
 def srgb_to_linear(values: Tensor) -> Tensor:
-    """IEC 61966-2-1 display-referred values to linear light, any shape; differentiable, not clamped (odd below 0 by its linear part)."""
+    """IEC 61966-2-1 display-referred values to linear light, any shape; differentiable, not clamped (odd below 0 by its
+    linear part)."""
     curve = ((values.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(values <= 0.04045, values / 12.92, curve)
 
 
 def linear_to_srgb(values: Tensor) -> Tensor:
-    """Linear light to IEC 61966-2-1 display-referred values, any shape; differentiable, not clamped; finite gradient at 0."""
+    """Linear light to IEC 61966-2-1 display-referred values, any shape; differentiable, not clamped; finite gradient at
+    0."""
     curve = 1.055 * values.clamp_min(0.0031308) ** (1.0 / 2.4) - 0.055
     return torch.where(values <= 0.0031308, values * 12.92, curve)

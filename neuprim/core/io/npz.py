@@ -31,13 +31,29 @@ def read_arrays(path: Path, wanted: Mapping[str, Wanted]) -> dict[str, np.ndarra
         size = path.stat().st_size
         with zipfile.ZipFile(path) as archive:
             entries = {entry.filename: entry for entry in archive.infolist()}
-            return {name: _array(archive, entries.get(f"{name}.npy"), name, *asked, size) for name, asked in wanted.items()}
-    except (OSError, ValueError, KeyError, EOFError, RuntimeError, SyntaxError, TokenError, zipfile.BadZipFile) as error:
+            return {
+                name: _array(archive, entries.get(f"{name}.npy"), name, *asked, size) for name, asked in wanted.items()
+            }
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        EOFError,
+        RuntimeError,
+        SyntaxError,
+        TokenError,
+        zipfile.BadZipFile,
+    ) as error:
         raise DataError(f"{path}: damaged ({' '.join(str(error).split()) or type(error).__name__})") from error
 
 
 def _array(
-    archive: zipfile.ZipFile, entry: zipfile.ZipInfo | None, name: str, dtype: Any, shape: tuple[int | None, ...], size: int
+    archive: zipfile.ZipFile,
+    entry: zipfile.ZipInfo | None,
+    name: str,
+    dtype: Any,
+    shape: tuple[int | None, ...],
+    size: int,
 ) -> np.ndarray:
     if entry is None:
         raise ValueError(f"no array {name!r}")

@@ -18,7 +18,8 @@ __all__ = ["ObjectStore", "is_url", "store_at"]
 _BUCKETS = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "oss")
 _LOCAL = ("file://", "local://")
 PROTOCOLS = ("file", "local", "memory", *_BUCKETS)
-"""Those that an address may have. Rule: what fsspec knows beyond these runs commands, opens archives or goes through other stores."""
+"""Those that an address may have. Rule: what fsspec knows beyond these runs commands, opens archives or goes through
+other stores."""
 
 
 def is_url(address: str) -> bool:
@@ -39,7 +40,9 @@ def store_at(address: str, copies: Path) -> Store:
     protocol = address.partition("://")[0]
     if is_url(address) and ("::" in address or protocol not in PROTOCOLS):
         found = "a chain of protocols" if "::" in address else f"protocol {cut(protocol)!r}"
-        raise ConfigError(f"{cut(address)}: {found}; expected a folder, or a URL of {', '.join(PROTOCOLS)}, as s3://BUCKET/FOLDER")
+        raise ConfigError(
+            f"{cut(address)}: {found}; expected a folder, or a URL of {', '.join(PROTOCOLS)}, as s3://BUCKET/FOLDER"
+        )
     for start in _LOCAL:
         if address.startswith(start):
             return LocalStore(Path(address.removeprefix(start)).absolute())
@@ -51,9 +54,13 @@ def store_at(address: str, copies: Path) -> Store:
         system, root = fsspec.core.url_to_fs(address)
     except ImportError as error:
         extra = ": pip install 'neuprim[s3]'" if protocol in ("s3", "s3a") else ""
-        raise BackendUnavailable(f"{address}: {protocol}:// needs a package that is not installed ({_line(error)}){extra}") from None
+        raise BackendUnavailable(
+            f"{address}: {protocol}:// needs a package that is not installed ({_line(error)}){extra}"
+        ) from None
     except ValueError as error:
-        raise ConfigError(f"{address}: {_line(error)}; expected a folder or a URL that fsspec knows, as s3://BUCKET/FOLDER") from None
+        raise ConfigError(
+            f"{address}: {_line(error)}; expected a folder or a URL that fsspec knows, as s3://BUCKET/FOLDER"
+        ) from None
     except Exception as error:
         raise DataError(f"{address}: cannot be reached ({_line(error)})") from error
     own = hashlib.sha256(address.rstrip("/").encode()).hexdigest()[:16]
@@ -61,7 +68,8 @@ def store_at(address: str, copies: Path) -> Store:
 
 
 class ObjectStore(Store):
-    """A place that fsspec reaches, with local copies of what was fetched. What lies there under a name never changes, so copies stay good.
+    """A place that fsspec reaches, with local copies of what was fetched. What lies there under a name never changes,
+    so copies stay good.
 
     Args:
         system: of fsspec. root: the place in it. path: folder for copies.
@@ -75,7 +83,9 @@ class ObjectStore(Store):
         return ObjectStore(f"{self.address}/{more}", self._system, f"{self._root}/{more}", self.path.joinpath(*names))
 
     def begin(self) -> None:
-        if self.address.partition("://")[0] in _BUCKETS:  # they have no folders, and a bucket is not made for a typing error
+        if (
+            self.address.partition("://")[0] in _BUCKETS
+        ):  # they have no folders, and a bucket is not made for a typing error
             return
         with self._said("written"):
             self._system.makedirs(self._root, exist_ok=True)

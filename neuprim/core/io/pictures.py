@@ -14,7 +14,8 @@ from neuprim.core.errors import DataError
 __all__ = ["MAX_PIXELS", "check_pixels", "decode", "enough_memory", "open_picture", "orientation_of", "rgb_mode"]
 
 MAX_PIXELS = 64 * 2**20
-"""Largest image read: 67,108,864 pixels (8192 x 8192). A header that claims more is refused before any pixel memory is taken."""
+"""Largest image read: 67,108,864 pixels (8192 x 8192). A header that claims more is refused before any pixel memory is
+taken."""
 
 _FOREIGN = {
     "AVIF": (4, (b"ftypavif", b"ftypavis")),
@@ -32,11 +33,14 @@ _PNG_KINDS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"
 
 @contextmanager
 def enough_memory(path: Path) -> Iterator[None]:
-    """Turns a lack of memory inside into a DataError that names the file; damaged files ask for more than they hold, too."""
+    """Turns a lack of memory inside into a DataError that names the file; damaged files ask for more than they hold,
+    too."""
     try:
         yield
     except MemoryError:
-        raise DataError(f"{path}: reading the image takes more memory than there is; is it damaged, or too large?") from None
+        raise DataError(
+            f"{path}: reading the image takes more memory than there is; is it damaged, or too large?"
+        ) from None
 
 
 @contextmanager
@@ -53,7 +57,9 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
             raise
         kind = _foreign(path)
         if kind:
-            raise DataError(f"{path}: image is {kind}; expected PNG, JPEG, WebP or OpenEXR: convert it to one of them") from None
+            raise DataError(
+                f"{path}: image is {kind}; expected PNG, JPEG, WebP or OpenEXR: convert it to one of them"
+            ) from None
         raise DataError(
             f"{path}: not a readable PNG or JPEG image ({type(error).__name__}: {error}); expected PNG, JPEG, WebP or OpenEXR"
         ) from None
@@ -77,7 +83,8 @@ def check_pixels(path: Path, width: int, height: int) -> None:
 
 
 def _png_header(path: Path) -> tuple[int, int]:
-    """(bit depth, colour type) of a PNG; (0, -1) for other files. Pillow opens 16-bit RGB as 8-bit without saying so."""
+    """(bit depth, colour type) of a PNG; (0, -1) for other files. Pillow opens 16-bit RGB as 8-bit without saying
+    so."""
     with open(path, "rb") as file:
         head = file.read(26)
     return (head[24], head[25]) if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 26 else (0, -1)
@@ -101,7 +108,9 @@ def rgb_mode(path: Path, image: Image.Image) -> str:
         raise DataError(f"{path}: image is {_describe(path, image)}; expected 8-bit RGB or RGBA")
     if image.mode != "P" and "transparency" in image.info:
         raise DataError(f"{path}: image is {image.mode} with a transparent colour key (tRNS); expected RGB or RGBA")
-    if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":  # cameras keep previews in the further pictures of a JPEG
+    if (
+        getattr(image, "n_frames", 1) > 1 and image.format != "MPO"
+    ):  # cameras keep previews in the further pictures of a JPEG
         raise DataError(f"{path}: image is an animation; expected one picture")
     return "RGBA" if image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info else "RGB"
 
@@ -109,7 +118,9 @@ def rgb_mode(path: Path, image: Image.Image) -> str:
 def orientation_of(image: Image.Image) -> int:
     """EXIF's orientation; 1 where there is none, or none that is readable."""
     try:
-        found = image.getexif().get(0x0112, 1) if "exif" in image.info else 1  # without the chunk in front, Pillow would decode a PNG
+        found = (
+            image.getexif().get(0x0112, 1) if "exif" in image.info else 1
+        )  # without the chunk in front, Pillow would decode a PNG
     except Exception:
         return 1
     return found if isinstance(found, int) and 1 <= found <= 8 else 1

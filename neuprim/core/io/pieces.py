@@ -1,7 +1,8 @@
 """Files of tensors that are written piece by piece, for whoever never has a whole tensor in memory.
 
-The format is that of safetensors (https://github.com/huggingface/safetensors): the length of a header as eight bytes, the header in JSON, then the tensors' bytes
-without gaps. The library writes whole tensors alone; it reads these files as its own.
+The format is that of safetensors (https://github.com/huggingface/safetensors): the length of a header as eight bytes,
+the header in JSON, then the tensors' bytes without gaps. The library writes whole tensors alone; it reads these files
+as its own.
 """
 
 from __future__ import annotations
@@ -20,7 +21,14 @@ __all__ = ["Kind", "in_order", "write_pieces"]
 Kind = tuple[torch.dtype, tuple[int, ...]]
 """Type and shape of a tensor."""
 
-_NAMES = {torch.float32: "F32", torch.float64: "F64", torch.int64: "I64", torch.int32: "I32", torch.uint8: "U8", torch.bool: "BOOL"}
+_NAMES = {
+    torch.float32: "F32",
+    torch.float64: "F64",
+    torch.int64: "I64",
+    torch.int32: "I32",
+    torch.uint8: "U8",
+    torch.bool: "BOOL",
+}
 
 
 def in_order(kinds: Mapping[str, Kind]) -> list[str]:
@@ -28,13 +36,16 @@ def in_order(kinds: Mapping[str, Kind]) -> list[str]:
     return sorted(kinds, key=lambda name: (-kinds[name][0].itemsize, name))
 
 
-def write_pieces(path: Path, kinds: Mapping[str, Kind], metadata: Mapping[str, str], pieces: Callable[[str], Iterable[Tensor]]) -> None:
+def write_pieces(
+    path: Path, kinds: Mapping[str, Kind], metadata: Mapping[str, str], pieces: Callable[[str], Iterable[Tensor]]
+) -> None:
     """Write a file of tensors.
 
     Args:
         kinds: of all of them.
         metadata: texts that join the header.
-        pieces: asked for each tensor, in the order of :func:`in_order`: its rows from first to last, in as many tensors as it likes.
+        pieces: asked for each tensor, in the order of :func:`in_order`: its rows from first to last, in as many tensors
+        as it likes.
 
     Raises:
         ValueError: pieces are of another type, or not as many numbers as announced.
@@ -55,7 +66,9 @@ def write_pieces(path: Path, kinds: Mapping[str, Kind], metadata: Mapping[str, s
             left = math.prod(shape)
             for piece in pieces(name):
                 if piece.dtype != dtype or piece.numel() > left:
-                    raise ValueError(f"{name}: a piece of {piece.numel()} {piece.dtype}; expected {dtype}, {left} at most")
+                    raise ValueError(
+                        f"{name}: a piece of {piece.numel()} {piece.dtype}; expected {dtype}, {left} at most"
+                    )
                 left -= piece.numel()
                 file.write(piece.detach().cpu().contiguous().numpy().tobytes())
             if left:

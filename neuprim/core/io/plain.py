@@ -1,8 +1,8 @@
 """JSON and YAML text as plain data.
 
-Rule: every JSON or YAML file that a run or a user's folder brings is parsed here. Its numbers are finite, and whole ones have at most 64 bits,
-so that no conversion of them can overflow later. YAML has neither anchors nor aliases, of which a few lines describe more than any memory
-holds. Nothing in the text is executed or looked up.
+Rule: every JSON or YAML file that a run or a user's folder brings is parsed here. Its numbers are finite, and whole
+ones have at most 64 bits, so that no conversion of them can overflow later. YAML has neither anchors nor aliases, of
+which a few lines describe more than any memory holds. Nothing in the text is executed or looked up.
 """
 
 from __future__ import annotations
@@ -41,7 +41,12 @@ def load_json(text: str | bytes, infinite: bool = False) -> Any:
     Raises:
         ValueError, RecursionError: no JSON, or a number beyond the limits.
     """
-    return json.loads(text, parse_int=_whole, parse_float=float if infinite else _float, parse_constant=float if infinite else _constant)
+    return json.loads(
+        text,
+        parse_int=_whole,
+        parse_float=float if infinite else _float,
+        parse_constant=float if infinite else _constant,
+    )
 
 
 def load_yaml(text: str) -> Any:
@@ -91,7 +96,9 @@ class _Loader(yaml.SafeLoader):
         except (ValueError, OverflowError):
             value = None
         if value is None or (kind == "int" and not -(2**63) <= value < 2**64):
-            raise yaml.constructor.ConstructorError(None, None, f"{cut(node.value)} is larger than any number here", node.start_mark)
+            raise yaml.constructor.ConstructorError(
+                None, None, f"{cut(node.value)} is larger than any number here", node.start_mark
+            )
         return value
 
 

@@ -1,6 +1,7 @@
 """PLY files (Turk 1994), with any properties; for untrusted files.
 
-Read are ASCII and binary files of either byte order, their elements in any order; written are the vertices of binary little-endian ones.
+Read are ASCII and binary files of either byte order, their elements in any order; written are the vertices of binary
+little-endian ones.
 No claim in a header makes memory be taken that the file's bytes do not pay for.
 """
 
@@ -40,7 +41,16 @@ _TYPES = {
     "float32": "f4",
     "float64": "f8",
 }
-_NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
+_NAMES = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
+    "f8": "double",
+}
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_BYTES = 4 * 2**20
 _PROPERTIES = 10_000
@@ -48,7 +58,8 @@ _PROPERTIES = 10_000
 
 @dataclass(frozen=True)
 class PlyVertices:
-    """``rows`` is a structured array (N,) with one field per scalar property, in the file's byte order; ``comments`` without the keyword."""
+    """``rows`` is a structured array (N,) with one field per scalar property, in the file's byte order; ``comments``
+    without the keyword."""
 
     rows: np.ndarray
     comments: tuple[str, ...] = ()
@@ -59,7 +70,11 @@ class PlyVertices:
 
     def columns(self, names: Sequence[str]) -> np.ndarray:
         """(N, len(names)) float64."""
-        return np.stack([self.rows[name].astype(np.float64) for name in names], -1) if names else np.zeros((len(self.rows), 0))
+        return (
+            np.stack([self.rows[name].astype(np.float64) for name in names], -1)
+            if names
+            else np.zeros((len(self.rows), 0))
+        )
 
 
 @dataclass(frozen=True)
@@ -95,7 +110,12 @@ def write_ply(path: Path, rows: np.ndarray, comments: Sequence[str] = ()) -> Non
     if any("\n" in c or "\r" in c for c in comments):
         raise ValueError("a PLY comment is one line")
     fields = [(name, rows.dtype[name].newbyteorder("<")) for name in rows.dtype.names or ()]
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments), f"element vertex {len(rows)}"]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {c}" for c in comments),
+        f"element vertex {len(rows)}",
+    ]
     lines += [f"property {_NAMES[dtype.str[1:]]} {name}" for name, dtype in fields] + ["end_header", ""]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join(lines).encode("utf-8"))
@@ -116,7 +136,8 @@ def read_ply(path: Path) -> PlyVertices:
 
 
 def read_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) -> dict[str, PlyElement]:
-    """Those of the ``wanted`` elements that a file has; vertices must be there. What follows the last of them is left alone.
+    """Those of the ``wanted`` elements that a file has; vertices must be there. What follows the last of them is left
+    alone.
 
     Args:
         size: of the file, in bytes. path: for messages.
@@ -148,7 +169,11 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, list[_Declared], tuple[str
         raw = file.readline(budget + 1)
         budget -= len(raw)
         if budget < 0 or not raw.endswith(b"\n"):
-            raise DataError(f"{path}: header has no end_header" + f" in {_HEADER_BYTES} bytes" * (budget < 0) + "; expected a PLY file")
+            raise DataError(
+                f"{path}: header has no end_header"
+                + f" in {_HEADER_BYTES} bytes" * (budget < 0)
+                + "; expected a PLY file"
+            )
         line = raw.decode("utf-8", "replace").rstrip("\r\n")
         words = line.split()
         if number == 0:
@@ -171,7 +196,9 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, list[_Declared], tuple[str
         elif words == ["end_header"]:
             break
         else:
-            raise DataError(f"{path}: header line {number + 1} is {line[:60]!r}; expected format, element, property or comment")
+            raise DataError(
+                f"{path}: header line {number + 1} is {line[:60]!r}; expected format, element, property or comment"
+            )
     vertices = next((element for element in elements if element.name == "vertex"), None)
     if order is None or vertices is None or not vertices.fields:
         missing = "format" if order is None else "element vertex" if vertices is None else "property of the vertices"
@@ -194,7 +221,9 @@ def _property(words: list[str], path: Path) -> tuple[str, str, str]:
         return words[2], _TYPES[words[1]], ""
     if len(words) == 5 and words[1] == "list" and words[3] in _TYPES and _TYPES.get(words[2], "f")[0] != "f":
         return words[4], _TYPES[words[3]], _TYPES[words[2]]
-    raise DataError(f"{path}: {' '.join(words)[:60]!r}; expected a property as 'property float x' or 'property list uchar int x'")
+    raise DataError(
+        f"{path}: {' '.join(words)[:60]!r}; expected a property as 'property float x' or 'property list uchar int x'"
+    )
 
 
 _Values = tuple[np.ndarray, dict[str, PlyList]]
@@ -213,9 +242,13 @@ def _binary(file: BinaryIO, path: Path, element: _Declared, order: str, left: in
     sizes = _first_sizes(file, fields, order)
     file.seek(start)
     if sizes is not None:
-        dtype = np.dtype([part for field_, size in zip(fields, sizes, strict=True) for part in _parts(field_, size, order)])
+        dtype = np.dtype(
+            [part for field_, size in zip(fields, sizes, strict=True) for part in _parts(field_, size, order)]
+        )
         if count * dtype.itemsize <= left:
-            table = np.frombuffer(bytearray(file.read(count * dtype.itemsize)), dtype)  # of a bytearray, that it may be written to
+            table = np.frombuffer(
+                bytearray(file.read(count * dtype.itemsize)), dtype
+            )  # of a bytearray, that it may be written to
             lists = [(name, size) for (name, _, length), size in zip(fields, sizes, strict=True) if length]
             if all((table["#" + name] == size).all() for name, size in lists):
                 scalars = [name for name, _, length in fields if not length]
@@ -288,7 +321,9 @@ def _walked(file: BinaryIO, path: Path, element: _Declared, order: str, left: in
 def _ascii(file: BinaryIO, path: Path, element: _Declared, left: int) -> _Values:
     count, fields = element.count, element.fields
     if count * (2 * len(fields)) > left + 1:  # a digit and a blank each
-        raise DataError(f"{path}: {count} {_what(element)} of {len(fields)} numbers; only {left} bytes follow; expected a complete file")
+        raise DataError(
+            f"{path}: {count} {_what(element)} of {len(fields)} numbers; only {left} bytes follow; expected a complete file"
+        )
     scalars = [(name, kind) for name, kind, length in fields if not length]
     if not count or not fields:
         return np.zeros(0, [(name, "<" + kind) for name, kind in scalars]), {}
@@ -309,7 +344,9 @@ def _ascii(file: BinaryIO, path: Path, element: _Declared, left: int) -> _Values
     for i, (name, kind) in enumerate(scalars):
         rows[name] = _typed(table[:, i], name, kind, path)
     kinds = {name: kind for name, kind, length in fields if length}
-    return rows, {name: PlyList(found.sizes, _typed(found.values, name, kinds[name], path)) for name, found in lists.items()}
+    return rows, {
+        name: PlyList(found.sizes, _typed(found.values, name, kinds[name], path)) for name, found in lists.items()
+    }
 
 
 def _typed(values: np.ndarray, name: str, kind: str, path: Path) -> np.ndarray:

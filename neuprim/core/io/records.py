@@ -50,7 +50,9 @@ class Record:
         found = "is missing" if value is _MISSING else f"is {_found(value)}"
         return DataError(f"{self.where}: {key} {found}; expected {expected}")
 
-    def number(self, key: str, expected: str = "a finite number", low: float = -math.inf, high: float = math.inf) -> float:
+    def number(
+        self, key: str, expected: str = "a finite number", low: float = -math.inf, high: float = math.inf
+    ) -> float:
         """A finite number strictly between ``low`` and ``high``."""
         value = finite(self.values.get(key))
         if value is None or not low < value < high:
@@ -83,14 +85,21 @@ class Record:
     def matrix(self, key: str) -> Tensor:
         """(4, 4) float64 from 3 or 4 rows of 4 finite numbers; a fourth row must be 0 0 0 1."""
         rows = self.values.get(key)
-        if not isinstance(rows, list) or len(rows) not in (3, 4) or not all(isinstance(r, list) and len(r) == 4 for r in rows):
+        if (
+            not isinstance(rows, list)
+            or len(rows) not in (3, 4)
+            or not all(isinstance(r, list) and len(r) == 4 for r in rows)
+        ):
             raise self.fail(key, "4 rows of 4 numbers")
         numbers = [[finite(v) for v in row] for row in rows]
         for i, row in enumerate(numbers):
             for j, number in enumerate(row):
                 if number is None:
                     raise DataError(f"{self.where}: {key}[{i}][{j}] is {_found(rows[i][j])}; expected a finite number")
-        if len(numbers) == 4 and max(abs(float(a or 0.0) - b) for a, b in zip(numbers[3], (0, 0, 0, 1), strict=True)) > 1e-6:
+        if (
+            len(numbers) == 4
+            and max(abs(float(a or 0.0) - b) for a, b in zip(numbers[3], (0, 0, 0, 1), strict=True)) > 1e-6
+        ):
             raise DataError(f"{self.where}: {key}[3] is {cut(str(rows[3]))}; expected 0 0 0 1")
         return torch.tensor([*numbers[:3], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
 

@@ -1,4 +1,5 @@
-"""A film that is drawn frame by frame: its frames wait in a temporary file, so that memory does not grow with its length."""
+"""A film that is drawn frame by frame: its frames wait in a temporary file, so that memory does not grow with its
+length."""
 
 from __future__ import annotations
 
@@ -23,7 +24,9 @@ class Reel:
 
     def __init__(self, folder: Path) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)
-        self._pages = TiffImagePlugin.AppendingTiffWriter(self._file, new=True)  # pages that are read back one at a time
+        self._pages = TiffImagePlugin.AppendingTiffWriter(
+            self._file, new=True
+        )  # pages that are read back one at a time
         self._size: tuple[int, int] | None = None
         self.count = 0
 
@@ -38,9 +41,12 @@ class Reel:
         self.count += 1
 
     def write(self, path: Path, fps: float) -> None:
-        """The same file as :func:`~neuprim.core.io.images.write_animation` of all frames, atomically, and no more after it; raises as that."""
+        """The same file as :func:`~neuprim.core.io.images.write_animation` of all frames, atomically, and no more after
+        it; raises as that."""
         if not self.count:
-            raise DataError(f"{path}: 0 frames at {fps} frames per second; expected at least one frame and a positive rate")
+            raise DataError(
+                f"{path}: 0 frames at {fps} frames per second; expected at least one frame and a positive rate"
+            )
         self._pages.finalize()
         self._file.seek(0)
         with Image.open(self._file, formats=["TIFF"]) as frames:

@@ -1,8 +1,9 @@
-"""Where files lie that several processes and machines make and read: a folder that all of them see, or an object store by its URL.
+"""Where files lie that several processes and machines make and read: a folder that all of them see, or an object store
+by its URL.
 
-A store holds folders of files. A folder counts as there when its last file is: in a file system it is renamed to its name as a whole, in an
-object store, where a put is atomic, the last file is put last. So a maker that is killed leaves nothing that is taken for a whole folder, and of
-two makers of one folder either may win, as both make the same files.
+A store holds folders of files. A folder counts as there when its last file is: in a file system it is renamed to its
+name as a whole, in an object store, where a put is atomic, the last file is put last. So a maker that is killed leaves
+nothing that is taken for a whole folder, and of two makers of one folder either may win, as both make the same files.
 """
 
 from __future__ import annotations
@@ -77,7 +78,8 @@ class Store(ABC):
 
     @abstractmethod
     def publish(self, name: str, write: Callable[[Path], None], last: str) -> None:
-        """Have ``write`` fill an empty folder, and give it its name when it is done, unless a whole one is there by then.
+        """Have ``write`` fill an empty folder, and give it its name when it is done, unless a whole one is there by
+        then.
 
         Raises:
             OSError, DataError: of ``write``, or the store cannot be written; nothing is there under that name then.
@@ -111,7 +113,9 @@ class LocalStore(Store):
     def whole(self, last: str) -> set[str]:
         try:
             return {
-                entry.name for entry in os.scandir(self.path) if entry.name[:1] != "." and os.path.isfile(os.path.join(entry.path, last))
+                entry.name
+                for entry in os.scandir(self.path)
+                if entry.name[:1] != "." and os.path.isfile(os.path.join(entry.path, last))
             }
         except FileNotFoundError:
             return set()
@@ -130,7 +134,9 @@ class LocalStore(Store):
 
     def publish(self, name: str, write: Callable[[Path], None], last: str) -> None:
         final = self.path / name
-        draft = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=self.path))  # of a folder that must be there: else it would be a new one
+        draft = Path(
+            tempfile.mkdtemp(prefix=f".{name}-", dir=self.path)
+        )  # of a folder that must be there: else it would be a new one
         try:
             draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared folder from its other users
             write(draft)
@@ -141,7 +147,9 @@ class LocalStore(Store):
             except OSError:
                 if not (final / last).is_file():
                     raise
-            for other in self.path.glob(f".{name}-*"):  # of makers that were killed, or are slower: what they make is there
+            for other in self.path.glob(
+                f".{name}-*"
+            ):  # of makers that were killed, or are slower: what they make is there
                 shutil.rmtree(other, ignore_errors=True)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
@@ -164,7 +172,8 @@ class LocalStore(Store):
             self._wait(tell)
 
     def _gone(self) -> bool:
-        """Whether it is not there, or does not answer. A mount that is lost has an empty folder in its place, so that this asks for what is in it."""
+        """Whether it is not there, or does not answer. A mount that is lost has an empty folder in its place, so that
+        this asks for what is in it."""
         try:
             return not self.path.is_dir()
         except OSError:

@@ -1,4 +1,5 @@
-"""FLIP, the perceptual difference of two images flipped between (Andersson et al. 2020), by the extra ``neuprim[flip]``."""
+"""FLIP, the perceptual difference of two images flipped between (Andersson et al. 2020), by the extra
+``neuprim[flip]``."""
 
 from __future__ import annotations
 
@@ -34,6 +35,10 @@ def flip(rendered: Tensor, truth: Tensor) -> float:
     try:
         from flip_evaluator import evaluate
     except ImportError as error:
-        raise BackendUnavailable(f"FLIP needs the package flip-evaluator ({error}); pip install 'neuprim[flip]'") from error
-    first, second = (np.ascontiguousarray(x.clamp(0.0, 1.0).numpy(), dtype=np.float32) for x in matched(rendered, truth))
+        raise BackendUnavailable(
+            f"FLIP needs the package flip-evaluator ({error}); pip install 'neuprim[flip]'"
+        ) from error
+    first, second = (
+        np.ascontiguousarray(x.clamp(0.0, 1.0).numpy(), dtype=np.float32) for x in matched(rendered, truth)
+    )
     return float(evaluate(second, first, "LDR", applyMagma=False, parameters={"ppd": PIXELS_PER_DEGREE})[1])

@@ -1,10 +1,13 @@
 """Image quality of one rendered view against its truth: PSNR and SSIM.
 
-Both take float images (H, W, C) with any number of channels and compare them as they are: nothing is clipped, quantised or converted
-between linear and sRGB, so the caller decides what is compared and says so. Sums are accumulated in float64.
+Both take float images (H, W, C) with any number of channels and compare them as they are: nothing is clipped, quantised
+or converted between linear and sRGB, so the caller decides what is compared and says so. Sums are accumulated in
+float64.
 
-A render equal to its truth has an infinite PSNR, for which JSON has no number. Files therefore hold ``null`` and a flag beside it:
-``{"psnr": null, "psnr_infinite": true}``. :func:`to_json` and :func:`from_json` convert; a ``null`` without the flag is a missing value.
+A render equal to its truth has an infinite PSNR, for which JSON has no number. Files therefore hold ``null`` and a flag
+beside it:
+``{"psnr": null, "psnr_infinite": true}``. :func:`to_json` and :func:`from_json` convert; a ``null`` without the flag is
+a missing value.
 """
 
 from __future__ import annotations
@@ -21,7 +24,18 @@ from torch.nn.functional import pad
 
 from neuprim.core.errors import DataError, NonFiniteError
 
-__all__ = ["SSIM_SIGMA", "SSIM_WINDOW", "from_json", "matched", "means", "psnr", "psnr_gain", "ssim", "ssim_3dgs", "to_json"]
+__all__ = [
+    "SSIM_SIGMA",
+    "SSIM_WINDOW",
+    "from_json",
+    "matched",
+    "means",
+    "psnr",
+    "psnr_gain",
+    "ssim",
+    "ssim_3dgs",
+    "to_json",
+]
 
 SSIM_WINDOW = 11
 """Taps of the Gaussian window per axis (Wang et al. 2004)."""
@@ -42,7 +56,9 @@ def matched(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
         if not image.is_floating_point():
             raise DataError(f"{name} image: expected floating-point values, found {image.dtype}")
         if image.ndim != 3 or image.numel() == 0:
-            raise DataError(f"{name} image: expected shape (H, W, C) with at least one pixel, found {tuple(image.shape)}")
+            raise DataError(
+                f"{name} image: expected shape (H, W, C) with at least one pixel, found {tuple(image.shape)}"
+            )
     if rendered.shape != truth.shape:
         raise DataError(f"rendered image has shape {tuple(rendered.shape)} but its truth has {tuple(truth.shape)}")
     for name, image in images.items():
@@ -70,7 +86,9 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
     squares = (first - second).square()
     if mask is not None:
         if mask.dtype != torch.bool or mask.shape != first.shape[:2]:
-            raise DataError(f"mask: expected bool of shape {tuple(first.shape[:2])}, found {mask.dtype} of {tuple(mask.shape)}")
+            raise DataError(
+                f"mask: expected bool of shape {tuple(first.shape[:2])}, found {mask.dtype} of {tuple(mask.shape)}"
+            )
         squares = squares[mask.cpu()]
         if squares.numel() == 0:
             raise DataError("mask leaves no pixel to compare")
@@ -79,8 +97,9 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
 
 
 def psnr_gain(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
-    """:func:`psnr` after the gain per channel that brings ``rendered`` closest to ``truth``: what is left when exposure and white balance are
-    taken away, which no model can know of a photograph that it has not seen. Arguments and errors as of :func:`psnr`."""
+    """:func:`psnr` after the gain per channel that brings ``rendered`` closest to ``truth``: what is left when exposure
+    and white balance are taken away, which no model can know of a photograph that it has not seen. Arguments and errors
+    as of :func:`psnr`."""
     first, second = matched(rendered, truth)
     counted = torch.ones(second.shape[:2], dtype=torch.bool) if mask is None else mask.cpu()
     square = first[counted].square().sum(0)
@@ -91,9 +110,11 @@ def psnr_gain(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak:
 def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
     """Structural similarity, the mean over pixels and channels of kornia's SSIM map, in -1..1 and 1 for equal images.
 
-    Fixed so that numbers compare across runs: an 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and only positions where
-    the window lies wholly inside the image ("valid", as in Wang et al. 2004, scikit-image and torchmetrics), so no padding takes part.
-    Where an image is lower or narrower than 11 pixels the window shrinks, on both axes, to the largest odd size that fits.
+    Fixed so that numbers compare across runs: an 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and only
+    positions where the window lies wholly inside the image ("valid", as in Wang et al. 2004, scikit-image and
+    torchmetrics), so no padding takes part.
+    Where an image is lower or narrower than 11 pixels the window shrinks, on both axes, to the largest odd size that
+    fits.
 
     Args:
         rendered, truth: (H, W, C) float images in the same colour space.
@@ -110,12 +131,14 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
 
 
 def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
-    """Structural similarity as the tools of 3D Gaussian splatting count it, those of the paper among them: for comparing with their tables.
+    """Structural similarity as the tools of 3D Gaussian splatting count it, those of the paper among them: for
+    comparing with their tables.
 
-    The window, its sigma and the constants are those of :func:`ssim`, for a data range of 1. What differs is the border: every pixel has
-    a window, and beyond the image both are black (zero padding), where :func:`ssim` counts only windows inside. Windows at the border so
-    see an edge that both images share, and often an empty background, so the mean is mostly higher. Images lower or narrower than 11
-    pixels keep the whole window. Those tools read images back from 8-bit files; here nothing is quantised.
+    The window, its sigma and the constants are those of :func:`ssim`, for a data range of 1. What differs is the
+    border: every pixel has a window, and beyond the image both are black (zero padding), where :func:`ssim` counts only
+    windows inside. Windows at the border so see an edge that both images share, and often an empty background, so the
+    mean is mostly higher. Images lower or narrower than 11 pixels keep the whole window. Those tools read images back
+    from 8-bit files; here nothing is quantised.
 
     Args:
         rendered, truth: (H, W, C) float images of 0 to 1, as displayed.
@@ -127,7 +150,8 @@ def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
 
 
 def to_json(key: str, value: float) -> dict[str, float | bool | None]:
-    """The entries that hold ``value`` under ``key`` in a JSON file: infinity becomes ``null`` and ``<key>_infinite: true``."""
+    """The entries that hold ``value`` under ``key`` in a JSON file: infinity becomes ``null`` and ``<key>_infinite:
+    true``."""
     return {key: None, f"{key}_infinite": True} if value == math.inf else {key: value}
 
 

@@ -1,8 +1,9 @@
 """LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), by weights of the user's own.
 
-neuprim has the arithmetic and no weights, and downloads none. What it reads are the state dictionaries that the authors of LPIPS and
-torchvision publish, as torch or safetensors files: that of a whole ``lpips.LPIPS(net="vgg")``, or its linear layers (``lpips/weights/v0.1/
-vgg.pth``) and the network's convolutions (torchvision's ``vgg16-*.pth``) side by side in a folder. AlexNet and VGG16 are told apart by shapes.
+neuprim has the arithmetic and no weights, and downloads none. What it reads are the state dictionaries that the authors
+of LPIPS and torchvision publish, as torch or safetensors files: that of a whole ``lpips.LPIPS(net="vgg")``, or its
+linear layers (``lpips/weights/v0.1/ vgg.pth``) and the network's convolutions (torchvision's ``vgg16-*.pth``) side by
+side in a folder. AlexNet and VGG16 are told apart by shapes.
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ class Lpips:
 
     @staticmethod
     def load(path: str | Path) -> Lpips:
-        """Weights of a file, or of all of a folder's ``.pth``, ``.pt`` and ``.safetensors`` files together; no code in them is run.
+        """Weights of a file, or of all of a folder's ``.pth``, ``.pt`` and ``.safetensors`` files together; no code in
+        them is run.
 
         Raises:
             DataError: unreadable, or not the weights of LPIPS; names what is missing.
@@ -111,19 +113,23 @@ class Lpips:
             rendered, truth: (H, W, 3) float display-referred sRGB values; clamped to 0..1.
 
         Raises:
-            DataError, NonFiniteError: as :func:`neuprim.core.metrics.psnr`; images smaller than :attr:`least`, or not of 3 channels.
+            DataError, NonFiniteError: as :func:`neuprim.core.metrics.psnr`; images smaller than :attr:`least`, or not
+            of 3 channels.
         """
         return self._distance(*(2.0 * image - 1.0 for image in self._images(rendered, truth)))
 
     def unmapped(self, rendered: Tensor, truth: Tensor) -> float:
-        """The distance as the tools of 3D Gaussian splatting take it: the network, made for -1 to 1, gets values 0 to 1 as they are."""
+        """The distance as the tools of 3D Gaussian splatting take it: the network, made for -1 to 1, gets values 0 to 1
+        as they are."""
         return self._distance(*self._images(rendered, truth))
 
     def _images(self, rendered: Tensor, truth: Tensor) -> list[Tensor]:
         """Both as (1, 3, H, W) float32 of 0..1."""
         images = [image.clamp(0.0, 1.0).permute(2, 0, 1)[None].float() for image in matched(rendered, truth)]
         if images[0].shape[1] != 3 or min(images[0].shape[2:]) < self.least:
-            raise DataError(f"LPIPS: images of shape {tuple(rendered.shape)}; expected at least ({self.least}, {self.least}, 3)")
+            raise DataError(
+                f"LPIPS: images of shape {tuple(rendered.shape)}; expected at least ({self.least}, {self.least}, 3)"
+            )
         return images
 
     def _distance(self, first: Tensor, second: Tensor) -> float:
@@ -168,7 +174,9 @@ def _made(found: Mapping[str, Any], where: Path) -> Lpips:
     for network, layers in _NETWORKS.items():
         if indices == {layer.number for layer in layers}:
             return _fitting(network, layers, parts, where)
-    raise DataError(f"{where}: convolutions {sorted(indices) or 'none'}; expected those of AlexNet or VGG16, as features.N or net.sliceM.N")
+    raise DataError(
+        f"{where}: convolutions {sorted(indices) or 'none'}; expected those of AlexNet or VGG16, as features.N or net.sliceM.N"
+    )
 
 
 def _fitting(network: str, layers: tuple[_Layer, ...], parts: Mapping[tuple[str, int], Tensor], where: Path) -> Lpips:
@@ -183,4 +191,6 @@ def _fitting(network: str, layers: tuple[_Layer, ...], parts: Mapping[tuple[str,
     weights = tuple(part("weight", l.number, l.outputs, l.inputs, l.side, l.side) for l in layers)
     biases = tuple(part("bias", l.number, l.outputs) for l in layers)
     taps = [l for l in layers if l.tap]
-    return Lpips(network, weights, biases, tuple(part("linear", i, 1, l.outputs, 1, 1).flatten() for i, l in enumerate(taps)))
+    return Lpips(
+        network, weights, biases, tuple(part("linear", i, 1, l.outputs, 1, 1).flatten() for i, l in enumerate(taps))
+    )

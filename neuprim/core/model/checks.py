@@ -1,11 +1,13 @@
-"""What fields hand to the renderer, checked at every entrance to it: one line that names field, tensor, found and expected.
+"""What fields hand to the renderer, checked at every entrance to it: one line that names field, tensor, found and
+expected.
 
-Compiled kernels index without looking. A tensor that is too short would be read and written beyond its end, one of another layout
-would be read as something else, and torch would broadcast what does not fit. Here every closed form says what its
-tensors must be, with the sizes they share, and the first that does not fit is named. That costs microseconds per frame
-(``benchmarks/form_checks.py``).
+Compiled kernels index without looking. A tensor that is too short would be read and written beyond its end, one of
+another layout would be read as something else, and torch would broadcast what does not fit. Here every closed form says
+what its tensors must be, with the sizes they share, and the first that does not fit is named. That costs microseconds
+per frame (``benchmarks/form_checks.py``).
 
-Tensors are float32 or float64, in any mix, dense and all on one device; their strides do not matter, as backends copy what is not contiguous.
+Tensors are float32 or float64, in any mix, dense and all on one device; their strides do not matter, as backends copy
+what is not contiguous.
 """
 
 from __future__ import annotations
@@ -18,7 +20,17 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.errors import FormError
-from neuprim.core.model.fields import ColourField, Constant, Cosine, DensityField, Field, Opaque, OpaqueColour, RayNet, Shading
+from neuprim.core.model.fields import (
+    ColourField,
+    Constant,
+    Cosine,
+    DensityField,
+    Field,
+    Opaque,
+    OpaqueColour,
+    RayNet,
+    Shading,
+)
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import Shaped, Sizes, tensor_fault
@@ -87,14 +99,17 @@ def check_colour(colour: Any, sizes: Sizes, field: str | None) -> None:
 def _check_form(kind: str, form: Any, kinds: tuple[type[Shaped], ...], sizes: Sizes, field: str | None) -> None:
     if not isinstance(form, kinds):
         names = ", ".join(k.__name__ for k in kinds[:-1])
-        raise FormError(f"{source(kind, field)} lowered to {type(form).__name__}; expected {names} or {kinds[-1].__name__}")
+        raise FormError(
+            f"{source(kind, field)} lowered to {type(form).__name__}; expected {names} or {kinds[-1].__name__}"
+        )
     fault = form.fault(sizes)
     if fault is not None:
         raise FormError(f"{source(kind, field)} lowered to {type(form).__name__}: {fault}")
 
 
 def check_channels(found: int, colour: ColourField) -> None:
-    """Raise :class:`FormError` unless a lowered colour has as many channels as its field says, which are the data set's."""
+    """Raise :class:`FormError` unless a lowered colour has as many channels as its field says, which are the data
+    set's."""
     if found != colour.channels:
         raise FormError(
             f"{method(colour, 'lower')} returned a colour of C={found}; expected {colour.channels}, as its member channels says"
@@ -111,7 +126,8 @@ def check_shape(name: str, value: Any, shape: tuple[int, ...], why: str = "") ->
 
 
 def check_rows(rows: Any, model: int | None, who: str, length: int | None = None) -> None:
-    """Raise :class:`FormError` unless ``rows`` are ascending int64 rows (M,) of a ``model`` of so many primitives, ``length`` of them."""
+    """Raise :class:`FormError` unless ``rows`` are ascending int64 rows (M,) of a ``model`` of so many primitives,
+    ``length`` of them."""
     found = None
     if not isinstance(rows, Tensor):
         found = f"type {type(rows).__name__}"
@@ -120,7 +136,9 @@ def check_rows(rows: Any, model: int | None, who: str, length: int | None = None
     elif length is not None and len(rows) != length:
         found = f"{len(rows)} rows for {length} primitives"
     elif len(rows) and not rows.is_cpu:
-        if model is not None and not bool((rows[0] >= 0) & (rows[-1] < model) & (rows[1:] > rows[:-1]).all()):  # one wait for a card
+        if model is not None and not bool(
+            (rows[0] >= 0) & (rows[-1] < model) & (rows[1:] > rows[:-1]).all()
+        ):  # one wait for a card
             found = f"rows that leave the model or do not ascend, {rows[:8].tolist()}{' ...' if len(rows) > 8 else ''}"
     elif len(rows):
         numbers = rows.numpy()  # whose overhead is a fraction of torch's
@@ -142,9 +160,17 @@ def check_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
     if isinstance(value, Tensor) and _kept(value) and value.layout is torch.strided and value.is_floating_point():
         if value.shape == shape:
             return value
-        raise FormError(f"{who} returned shape {tuple(value.shape)}; expected {shape}, a row for each of the {shape[0]} that it was given")
-    found = f"{value.dtype} {value.layout} on {value.device}" if isinstance(value, Tensor) else f"type {type(value).__name__}"
-    raise FormError(f"{who} returned {found}; expected a dense tensor of real numbers on the {' or '.join(device.KINDS)}")
+        raise FormError(
+            f"{who} returned shape {tuple(value.shape)}; expected {shape}, a row for each of the {shape[0]} that it was given"
+        )
+    found = (
+        f"{value.dtype} {value.layout} on {value.device}"
+        if isinstance(value, Tensor)
+        else f"type {type(value).__name__}"
+    )
+    raise FormError(
+        f"{who} returned {found}; expected a dense tensor of real numbers on the {' or '.join(device.KINDS)}"
+    )
 
 
 def check_shading(found: Any, count: int, who: str) -> Shading:
@@ -197,7 +223,9 @@ def check_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str,
     return dict(found)
 
 
-def check_halves(found: Any, like: Mapping[str, Tensor], place: Geometry, who: str) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+def check_halves(
+    found: Any, like: Mapping[str, Tensor], place: Geometry, who: str
+) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
     """What ``divide`` returned: a mask of P parents, and tensors and geometry of 2 P rows like ``like`` and ``place``.
 
     Raises:
@@ -207,8 +235,17 @@ def check_halves(found: Any, like: Mapping[str, Tensor], place: Geometry, who: s
         raise FormError(f"{who} returned type {type(found).__name__}; expected (mask, tensors, Geometry) or None")
     mask, halves, where = found
     parents = place.count // 2
-    if not isinstance(mask, Tensor) or mask.device != place.means.device or mask.dtype != torch.bool or mask.shape != (parents,):
-        of = f"{mask.dtype} {tuple(mask.shape)} on {mask.device}" if isinstance(mask, Tensor) else f"type {type(mask).__name__}"
+    if (
+        not isinstance(mask, Tensor)
+        or mask.device != place.means.device
+        or mask.dtype != torch.bool
+        or mask.shape != (parents,)
+    ):
+        of = (
+            f"{mask.dtype} {tuple(mask.shape)} on {mask.device}"
+            if isinstance(mask, Tensor)
+            else f"type {type(mask).__name__}"
+        )
         raise FormError(f"{who} returned a mask of {of}; expected torch.bool ({parents},)")
     if not isinstance(where, Geometry):
         raise FormError(f"{who} returned a geometry of type {type(where).__name__}; expected Geometry")

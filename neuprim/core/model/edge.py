@@ -1,13 +1,15 @@
 """The edge of a support: how a primitive's density, or its life in time, fades to nothing.
 
-With u the distance from the middle over the distance from the middle to the edge, the weight is (1 - u^2)^p. p = 0 is a hard edge, p = 1 and
-2 soft ones. Along an uncut chord, u in [-1, 1] and D = 1 - |y|^2 at its middle, a support (1 - |y|^2)^p becomes D^p (1 - u^2)^p, and
+With u the distance from the middle over the distance from the middle to the edge, the weight is (1 - u^2)^p. p = 0 is a
+hard edge, p = 1 and 2 soft ones. Along an uncut chord, u in [-1, 1] and D = 1 - |y|^2 at its middle, a support (1 -
+|y|^2)^p becomes D^p (1 - u^2)^p, and
 
     1/2 integral of (1 - u^2)^p cos(phase + z u) du = N_p/2 cos(phase) B_p(z),   N = 2, 4/3, 16/15
     B_0 = sin z / z,   B_1 = 3 (B_0 - cos z)/z^2,   B_2 = 15 (B_1 - B_0)/z^2        (all 1 at z = 0)
 
-which are spherical Bessel functions, B_p = (2p + 1)!! j_p(z)/z^p. Chords that a plane cuts have any quadratic c0 + c1 u + c2 u^2 for
-1 - |y|^2; its p-th power in Legendre polynomials, sum a_n P_n, gives the general case, as 1/2 integral of P_n exp(i z u) du = i^n j_n(z).
+which are spherical Bessel functions, B_p = (2p + 1)!! j_p(z)/z^p. Chords that a plane cuts have any quadratic c0 + c1 u
++ c2 u^2 for 1 - |y|^2; its p-th power in Legendre polynomials, sum a_n P_n, gives the general case, as 1/2 integral of
+P_n exp(i z u) du = i^n j_n(z).
 """
 
 from __future__ import annotations
@@ -25,7 +27,10 @@ EDGES = (0, 1, 2)
 NORMS = (2.0, 4 / 3, 16 / 15)
 """N_p: the integral of (1 - u^2)^p over [-1, 1]. numba freezes them into kernels."""
 
-_SERIES_BELOW, _TERMS = 2.0, 14  # upward recursion loses digits as z^-n; the series' last term is below 1e-17 of the first
+_SERIES_BELOW, _TERMS = (
+    2.0,
+    14,
+)  # upward recursion loses digits as z^-n; the series' last term is below 1e-17 of the first
 
 
 def fade(square: Tensor, edge: int) -> Tensor:
@@ -77,7 +82,8 @@ def legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]:
 def chord_integral(
     quadratic: tuple[Tensor, Tensor, Tensor], edge: int, phase: Tensor, z: Tensor, amplitude: Tensor, offset: Tensor
 ) -> Tensor:
-    """(M,) 1/2 integral over u in [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)), p = 1 or 2.
+    """(M,) 1/2 integral over u in [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)),
+    p = 1 or 2.
 
     Args:
         quadratic: c0, c1, c2, (M,) each; amplitude, phase, z: (M, K); offset: (M,).
@@ -101,4 +107,6 @@ def profile(z: Tensor, order: int) -> Tensor:
     small = z.abs() < 1e-3
     safe = torch.where(small, torch.ones_like(z), z)
     series = 1 - z.square() / (2 * (2 * order + 3))
-    return torch.where(small, series, math.prod(range(1, 2 * order + 2, 2)) * spherical_bessel(safe, order)[order] / safe**order)
+    return torch.where(
+        small, series, math.prod(range(1, 2 * order + 2, 2)) * spherical_bessel(safe, order)[order] / safe**order
+    )

@@ -1,4 +1,5 @@
-"""The two interfaces of the design: a density field and a colour field; the closed forms they lower to are in :mod:`neuprim.core.model.forms`.
+"""The two interfaces of the design: a density field and a colour field; the closed forms they lower to are in
+:mod:`neuprim.core.model.forms`.
 
 A *field* owns some per-primitive parameters. Before a frame is drawn it *lowers*: conditions such as time or light are
 folded into one of a few closed forms that the renderer knows. The renderer never sees a task.
@@ -17,7 +18,17 @@ from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.cameras.world import World
-from neuprim.core.model.forms import Constant, Cosine, LoweredColour, LoweredDensity, Opaque, OpaqueColour, RayNet, Shade, Shading
+from neuprim.core.model.forms import (
+    Constant,
+    Cosine,
+    LoweredColour,
+    LoweredDensity,
+    Opaque,
+    OpaqueColour,
+    RayNet,
+    Shade,
+    Shading,
+)
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import ParameterSpec, Params
@@ -53,16 +64,20 @@ class ConditionSpec:
 
     Attributes:
         name: of the flag, and the key in a frame's conditions.
-        range: lowest and highest value of every element. Numbers that are not finite are refused by every command; for numbers beyond
+        range: lowest and highest value of every element. Numbers that are not finite are refused by every command; for
+        numbers beyond
             the range there is a warning.
         parse: the text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame of an animation; raises
-            :class:`~neuprim.core.errors.ConfigError`. Where ``shape`` is ``()`` it is asked for each element of a list ``A,B,C``, and
-            need not know ranges ``A:B:COUNT`` (:mod:`neuprim.core.conditions`).
+            :class:`~neuprim.core.errors.ConfigError`. Where ``shape`` is ``()`` it is asked for each element of a list
+            ``A,B,C``, and need not know ranges ``A:B:COUNT`` (:mod:`neuprim.core.conditions`).
         strict: whether numbers beyond the range are refused, a data set's among them.
         sweep: a text of ``--NAME TEXT`` that animates the condition, for the commands a report offers; empty: none.
-        in_frames: (text, count) -> the text that means the same in so many frames, where the text does not say itself how many; None
-            where it does. So an animation without a length takes that of another one beside it. Not asked about ranges of numbers.
-        place: for conditions that are positions: ``parse`` of a text whose numbers are in the world of the user's files, (text, world) ->
+        in_frames: (text, count) -> the text that means the same in so many frames, where the text does not say itself
+        how many; None
+            where it does. So an animation without a length takes that of another one beside it. Not asked about ranges
+            of numbers.
+        place: for conditions that are positions: ``parse`` of a text whose numbers are in the world of the user's
+        files, (text, world) ->
             values in scene units; see :meth:`within`.
     """
 
@@ -77,7 +92,8 @@ class ConditionSpec:
     place: Callable[[str, World], list[Tensor]] | None = None
 
     def within(self, world: World) -> ConditionSpec:
-        """The condition of a model whose scene lies in ``world``: positions that users write are in the coordinates of their files."""
+        """The condition of a model whose scene lies in ``world``: positions that users write are in the coordinates of
+        their files."""
         place = self.place
         return self if place is None or world.identity else replace(self, parse=lambda text: place(text, world))
 
@@ -127,24 +143,29 @@ class Field(ABC):
         return dict(params)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        """Settings of which a fitted model can do with less, and the smaller values, the largest first: ``{"degree": (2, 1, 0)}``."""
+        """Settings of which a fitted model can do with less, and the smaller values, the largest first: ``{"degree":
+        (2, 1, 0)}``."""
         return {}
 
     def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[Self, dict[str, Tensor]]:
-        """A field with less of one of :meth:`reductions`, and its tensors: what is closest to this one's without training again.
+        """A field with less of one of :meth:`reductions`, and its tensors: what is closest to this one's without
+        training again.
 
         Args:
             params, geometry: of all primitives.
             name, value: a setting, and one of the values that it can have.
 
         Returns:
-            the field, and its tensors by name; with "means" among them where the primitives' centres (N, 3) change with it, as they do
-            where a density moves them.
+            the field, and its tensors by name; with "means" among them where the primitives' centres (N, 3) change with
+            it, as they do where a density moves them.
         """
-        raise NotImplementedError(f"{type(self).__name__} names {name} in reductions() and does not know how to reduce it")
+        raise NotImplementedError(
+            f"{type(self).__name__} names {name} in reductions() and does not know how to reduce it"
+        )
 
     def pieces(self) -> tuple[Piece, ...]:
-        """What single primitives can do without, each a set of numbers that mean nothing once they are zero; no number is in two of them."""
+        """What single primitives can do without, each a set of numbers that mean nothing once they are zero; no number
+        is in two of them."""
         return ()
 
     def earlier_pieces(self) -> tuple[Piece, ...]:
@@ -154,20 +175,22 @@ class Field(ABC):
     def folded(self, params: Params) -> dict[str, Tensor]:
         """The same field in numbers that lie as close together as they can, for files where each has few bits.
 
-        Where several sets of numbers mean the same field, as with the sign of a cosine's argument, one of them. Images may change by
-        rounding alone; folding what is folded changes no bit.
+        Where several sets of numbers mean the same field, as with the sign of a cosine's argument, one of them. Images
+        may change by rounding alone; folding what is folded changes no bit.
         """
         return dict(params)
 
     def script(self) -> str | None:
-        """JavaScript that folds conditions into the field's closed form as :meth:`DensityField.lower` and :meth:`ColourField.lower` do, for
-        pages that draw the model in a browser; docs/plugins.md says what it must evaluate to. None: such pages cannot show the field.
+        """JavaScript that folds conditions into the field's closed form as :meth:`DensityField.lower` and
+        :meth:`ColourField.lower` do, for pages that draw the model in a browser; docs/plugins.md says what it must
+        evaluate to. None: such pages cannot show the field.
         """
         return None
 
 
 def pieces_by_name(density: DensityField, colour: ColourField, earlier: bool = False) -> dict[str, Piece]:
-    """The pieces of both fields, as ``density.neuron 0`` and ``colour.coefficient 1 +0, channel 2``; ``earlier``: with those of earlier files."""
+    """The pieces of both fields, as ``density.neuron 0`` and ``colour.coefficient 1 +0, channel 2``; ``earlier``: with
+    those of earlier files."""
     found = {}
     for kind, own in (("density", density), ("colour", colour)):
         for piece in (*own.pieces(), *(own.earlier_pieces() if earlier else ())):
@@ -178,9 +201,9 @@ def pieces_by_name(density: DensityField, colour: ColourField, earlier: bool = F
 class DensityField(Field):
     """How much light a point absorbs.
 
-    ``exact_split`` says that children continue their parent's sigma inside their own support (see :meth:`on_split`). A family of
-    densities that is too small for that, such as Gaussians, sets it to False; its children must then hold their parent's mass, the
-    integral of sigma over space.
+    ``exact_split`` says that children continue their parent's sigma inside their own support (see :meth:`on_split`). A
+    family of densities that is too small for that, such as Gaussians, sets it to False; its children must then hold
+    their parent's mass, the integral of sigma over space.
     """
 
     exact_split: bool = True
@@ -191,7 +214,8 @@ class DensityField(Field):
 
     @abstractmethod
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
-        """World density sigma (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3) inside them."""
+        """World density sigma (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3) inside
+        them."""
 
     @abstractmethod
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
@@ -200,13 +224,15 @@ class DensityField(Field):
     def components(self, params: Params) -> dict[str, Tensor]:
         """Name -> (N,) share, 0..1, of each primitive's extinction that comes from the source grid of that name.
 
-        Only fields fitted to data in which several grids make the extinction have any (:attr:`neuprim.core.data.PointSamples.components`).
+        Only fields fitted to data in which several grids make the extinction have any
+        (:attr:`neuprim.core.data.PointSamples.components`).
         Images do not depend on them.
         """
         return {}
 
     def largest(self, params: Params, geometry: Geometry) -> Tensor | None:
-        """(N,) upper bound of each primitive's sigma, 1/scene unit, at any point and under any conditions; None where none is known."""
+        """(N,) upper bound of each primitive's sigma, 1/scene unit, at any point and under any conditions; None where
+        none is known."""
         return None
 
     def alive(self, params: Params, conditions: Conditions) -> Tensor | None:
@@ -221,8 +247,9 @@ class DensityField(Field):
         return geometry
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
-        """How fresh primitives look like Gaussians of opacities ``alphas`` (N,), 0..1: (N,) standard deviations from the middle to the edge of
-        the support, and (N,) opacities through the middle. By default those of an ellipsoid of constant density with the same covariance.
+        """How fresh primitives look like Gaussians of opacities ``alphas`` (N,), 0..1: (N,) standard deviations from
+        the middle to the edge of the support, and (N,) opacities through the middle. By default those of an ellipsoid
+        of constant density with the same covariance.
         """
         return torch.full_like(alphas, math.sqrt(5.0)), alphas
 
@@ -234,8 +261,8 @@ class DensityField(Field):
             geometry: the parents'.
 
         Returns:
-            (P,) bool of the parents that are better divided this way; this field's tensors and the geometry of 2 P rows, all
-            first halves then all second halves (rows of other parents are ignored). None: never.
+            (P,) bool of the parents that are better divided this way; this field's tensors and the geometry of 2 P
+            rows, all first halves then all second halves (rows of other parents are ignored). None: never.
         """
         return None
 
@@ -246,8 +273,8 @@ class ColourField(Field):
     channels: int
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None] | None:
-        """The colour as :func:`neuprim.core.model.colours.sh.colors` takes it under these conditions, for fields that are that: zero-order
-        coefficients (N, C) and those of the higher bands (N, B, C) or None. None for other fields.
+        """The colour as :func:`neuprim.core.model.colours.sh.colors` takes it under these conditions, for fields that
+        are that: zero-order coefficients (N, C) and those of the higher bands (N, B, C) or None. None for other fields.
         """
         return None
 
@@ -255,8 +282,10 @@ class ColourField(Field):
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> LoweredColour:
         """The frame's closed form."""
 
-    def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings) -> Shading | None:
-        """What else the frame's colours are multiplied by. Images drawn for it take their backend and threads from ``settings``, those
-        of the frame.
+    def shade(
+        self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
+    ) -> Shading | None:
+        """What else the frame's colours are multiplied by. Images drawn for it take their backend and threads from
+        ``settings``, those of the frame.
         """
         return None

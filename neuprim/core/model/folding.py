@@ -4,7 +4,8 @@ A strength b exp(g) is the sign of b times another gain, so that one number says
 
     sum_k w_k cos(rate (v_k . x + b_k))
 
-does not change when a (v_k, b_k) changes its sign, when rate b_k gains a whole turn, or when it gains half a turn and w_k changes its sign.
+does not change when a (v_k, b_k) changes its sign, when rate b_k gains a whole turn, or when it gains half a turn and
+w_k changes its sign.
 So every w_k may be positive and every b_k between 0 and half a turn, where few bits say more about it.
 """
 
@@ -24,7 +25,8 @@ _SLACK = 1e-6
 
 
 def fold_cosines(params: Params, inputs: tuple[str, ...], phase: str, weights: str, rate: float) -> dict[str, Tensor]:
-    """The same sums, every weight of the first output positive or zero and every phase between 0 and half a turn, pi/rate.
+    """The same sums, every weight of the first output positive or zero and every phase between 0 and half a turn,
+    pi/rate.
 
     Args:
         params: name -> (N, ...); those that are not named pass through.
@@ -38,7 +40,11 @@ def fold_cosines(params: Params, inputs: tuple[str, ...], phase: str, weights: s
     b = torch.where(negative, b + turn / 2, b)
     b = torch.where((b / turn).abs() <= 0.5 + _SLACK, b, b - turn * torch.round(b / turn))
     backward = b < 0
-    found = {**params, phase: b.abs().to(params[phase]), weights: torch.where(negative if w.dim() == 2 else negative[:, None], -w, w)}
+    found = {
+        **params,
+        phase: b.abs().to(params[phase]),
+        weights: torch.where(negative if w.dim() == 2 else negative[:, None], -w, w),
+    }
     for name in inputs:
         value = params[name].detach()
         found[name] = torch.where(backward.reshape(*backward.shape, *[1] * (value.dim() - 2)), -value, value)

@@ -1,8 +1,10 @@
-"""What a Gaussian of 3D Gaussian splatting becomes: the ellipsoid of constant f, K = 0, whose image is closest to its own.
+"""What a Gaussian of 3D Gaussian splatting becomes: the ellipsoid of constant f, K = 0, whose image is closest to its
+own.
 
-At r standard deviations from its middle, the footprint of a Gaussian of opacity o is alpha = o exp(-r^2/2). A primitive whose support ends c of
-them from the middle, and whose chord through the middle has optical depth tau, has D = 1 - r^2/c^2 there and so alpha = 1 - exp(-tau D^(p + 1/2)).
-tau is chosen such that both hide as much, the same integral of alpha over the screen; c such that the squares of their difference are least.
+At r standard deviations from its middle, the footprint of a Gaussian of opacity o is alpha = o exp(-r^2/2). A primitive
+whose support ends c of them from the middle, and whose chord through the middle has optical depth tau, has D = 1 -
+r^2/c^2 there and so alpha = 1 - exp(-tau D^(p + 1/2)). tau is chosen such that both hide as much, the same integral of
+alpha over the screen; c such that the squares of their difference are least.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[T
 
 @lru_cache
 def _table(edge: int, volume: bool) -> Tensor:
-    """(O, 2) c and the logarithm of tau over that of the opacity, -log(1 - o), for the tabulated opacities; by a golden section of c."""
+    """(O, 2) c and the logarithm of tau over that of the opacity, -log(1 - o), for the tabulated opacities; by a golden
+    section of c."""
     r = (torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES * _FAR
     opacity = torch.sigmoid(_LOGITS)[:, None]
     bell = (-r * r / 2).exp()

@@ -1,7 +1,8 @@
 """The closed forms that fields lower to: what a renderer draws, with its task's conditions folded in.
 
-Each knows its tensors, what shapes they must have, and its mathematics: the optical depth along chords of rays (:class:`Pairs`), the colour
-that is seen there. A renderer that asks for these draws any form; kernels know a few of them by name.
+Each knows its tensors, what shapes they must have, and its mathematics: the optical depth along chords of rays
+(:class:`Pairs`), the colour that is seen there. A renderer that asks for these draws any form; kernels know a few of
+them by name.
 """
 
 from __future__ import annotations
@@ -37,20 +38,27 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Cosine(Shaped):
-    """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, world density (1 - |y|^2)^p f/m inside the ellipsoid |y| < 1.
+    """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, world density (1 - |y|^2)^p f/m inside the ellipsoid |y|
+    < 1.
 
-    p = 0 is the paper's; p = 1 and 2 have a soft edge (:mod:`neuprim.core.model.edge`), and p = 2 with K = 0 is close to a
+    p = 0 is the paper's; p = 1 and 2 have a soft edge (:mod:`neuprim.core.model.edge`), and p = 2 with K = 0 is close
+    to a
     Gaussian.
 
     Attributes:
-        W1: (N, K, 3), b1: (N, K), w2: (N, K), b2: (N,) or (N, 1); K = 0 to :data:`MOST_UNITS`, and K = 0 is a constant f.
-        omega0: multiplies the whole phase.
+        W1: (N, K, 3), b1: (N, K), w2: (N, K), b2: (N,) or (N, 1); K = 0 to :data:`MOST_UNITS`, and K = 0 is a constant
+        f. omega0: multiplies the whole phase.
         edge: p, 0, 1 or 2.
 
     ``first + second`` is the sum of two densities of the same primitives, see :meth:`__add__`.
     """
 
-    shapes: ClassVar[Shapes] = {"W1": (("N", "K", 3),), "b1": (("N", "K"),), "w2": (("N", "K"),), "b2": (("N", 1), ("N",))}
+    shapes: ClassVar[Shapes] = {
+        "W1": (("N", "K", 3),),
+        "b1": (("N", "K"),),
+        "w2": (("N", "K"),),
+        "b2": (("N", 1), ("N",)),
+    }
 
     W1: Tensor
     b1: Tensor
@@ -67,10 +75,12 @@ class Cosine(Shaped):
     def __add__(self, other: Cosine) -> Cosine:
         """f + g, exactly: the neurons of both side by side. Differentiable.
 
-        Both have the first one's omega0 (the second one's if that is 0); frequencies and phases of the other are scaled to it.
+        Both have the first one's omega0 (the second one's if that is 0); frequencies and phases of the other are scaled
+        to it.
 
         Raises:
-            FormError: they are not of the same primitives, have different edges, or more than :data:`MOST_UNITS` neurons together.
+            FormError: they are not of the same primitives, have different edges, or more than :data:`MOST_UNITS`
+            neurons together.
         """
         if not isinstance(other, Cosine):
             return NotImplemented
@@ -82,14 +92,18 @@ class Cosine(Shaped):
                 raise FormError(f"sum of two Cosine forms: the {word}: {fault}")
         neurons = (self.W1.shape[1], other.W1.shape[1])
         if sum(neurons) > MOST_UNITS:
-            raise FormError(f"sum of two Cosine forms: {neurons[0]} + {neurons[1]} neurons; expected at most {MOST_UNITS}")
+            raise FormError(
+                f"sum of two Cosine forms: {neurons[0]} + {neurons[1]} neurons; expected at most {MOST_UNITS}"
+            )
         if self.edge != other.edge:
             raise FormError(f"sum of two Cosine forms: edges {self.edge} and {other.edge}; expected the same of both")
         omega0 = self.omega0 or other.omega0
         parts = [(f, f.omega0 / omega0 if f.omega0 != omega0 else 1.0) for f in (self, other)]
         W1 = torch.cat([f.W1 * scale for f, scale in parts], 1)
         b1 = torch.cat([f.b1 * scale for f, scale in parts], 1)
-        return Cosine(W1, b1, torch.cat([self.w2, other.w2], 1), self.b2 + other.b2.reshape(self.b2.shape), omega0, self.edge)
+        return Cosine(
+            W1, b1, torch.cat([self.w2, other.w2], 1), self.b2 + other.b2.reshape(self.b2.shape), omega0, self.edge
+        )
 
     def rows(self, index: Tensor | slice) -> Cosine:
         """Those of some primitives, (M,) int64 or first:end, without gradient."""
@@ -145,7 +159,8 @@ class Opaque(Shaped):
         return Opaque(line_integral)
 
     def optical_depth(self, pairs: Pairs) -> Tensor:
-        """Integrals of sigma along chords as the code returns them, unchecked: see :meth:`~neuprim.core.model.primitives.Lowered.optical_depth`."""
+        """Integrals of sigma along chords as the code returns them, unchecked: see
+        :meth:`~neuprim.core.model.primitives.Lowered.optical_depth`."""
         return self.line_integral(pairs.prim, pairs.origins, pairs.direction, *pairs.ends)
 
 
@@ -218,7 +233,8 @@ class OpaqueColour(Shaped):
         return OpaqueColour(radiance, self.channels)
 
     def seen(self, pairs: Pairs) -> Tensor:
-        """Colours that are seen along chords as the code returns them, unchecked: see :meth:`~neuprim.core.model.primitives.Lowered.seen`."""
+        """Colours that are seen along chords as the code returns them, unchecked: see
+        :meth:`~neuprim.core.model.primitives.Lowered.seen`."""
         return self.radiance(pairs.prim, pairs.points, pairs.direction)
 
     def at_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
@@ -234,9 +250,10 @@ class RayNet(Shaped):
 
         c(pixel) = max(0, base + Wout cos(Wx . x~_m + bias)),   x~_m = (x_m - mu)/m
 
-    with x_m the middle of the ray's chord, after the cut by the near plane if there is one: the point that the closed form of the
-    density is anchored at. One hidden layer of H cosine units, H = 0 to :data:`MOST_UNITS`, phases in radians; H = 0 is the constant colour
-    max(0, base). Whatever does not change within a primitive (view direction at its centre, light) a field folds into ``bias``,
+    with x_m the middle of the ray's chord, after the cut by the near plane if there is one: the point that the closed
+    form of the density is anchored at. One hidden layer of H cosine units, H = 0 to :data:`MOST_UNITS`, phases in
+    radians; H = 0 is the constant colour max(0, base). Whatever does not change within a primitive (view direction at
+    its centre, light) a field folds into ``bias``,
     ``Wout`` and ``base``. A colour of exactly 0 still passes its gradient, as ``clamp_min`` does.
 
     Attributes:
@@ -246,7 +263,12 @@ class RayNet(Shaped):
 
     per_primitive: ClassVar[bool] = True
     flat: ClassVar[None] = None
-    shapes: ClassVar[Shapes] = {"Wx": (("N", "H", 3),), "bias": (("N", "H"),), "base": (("N", "C"),), "Wout": (("N", "C", "H"),)}
+    shapes: ClassVar[Shapes] = {
+        "Wx": (("N", "H", 3),),
+        "bias": (("N", "H"),),
+        "base": (("N", "C"),),
+        "Wout": (("N", "C", "H"),),
+    }
 
     Wx: Tensor
     bias: Tensor
@@ -267,7 +289,8 @@ class RayNet(Shaped):
         return RayNet(self.Wx, self.bias, self.Wout * factors[:, None, None], self.base * factors[:, None])
 
     def radiance(self, prim: Tensor, local: Tensor) -> Tensor:
-        """(M, C) float64 colours of primitives ``prim`` (M,) at local chord middles ``local`` = x~_m (M, 3) float64; differentiable."""
+        """(M, C) float64 colours of primitives ``prim`` (M,) at local chord middles ``local`` = x~_m (M, 3) float64;
+        differentiable."""
         phase = (self.Wx.double()[prim] * local[:, None, :]).sum(-1) + self.bias.double()[prim]
         mixed = (self.Wout.double()[prim] * phase.cos()[:, None, :]).sum(-1)
         return (self.base.double()[prim] + mixed).clamp_min(0)
@@ -283,10 +306,12 @@ class RayNet(Shaped):
 
 
 LoweredColour = Constant | RayNet | OpaqueColour
-"""Of each: ``channels``, and ``per_primitive``, whether a colour at its centre says what a primitive looks like from a direction."""
+"""Of each: ``channels``, and ``per_primitive``, whether a colour at its centre says what a primitive looks like from a
+direction."""
 
 Shade = Callable[[Tensor], Tensor]
-"""(M, 3) float64 scene points that pixels show -> (M,) factors on the light that they send to the camera, without gradient."""
+"""(M, 3) float64 scene points that pixels show -> (M,) factors on the light that they send to the camera, without
+gradient."""
 
 
 @dataclass(frozen=True)
@@ -295,8 +320,10 @@ class Shading:
 
     Attributes:
         primitives: (M,) at least 0, one for each primitive of the frame; None: 1.
-        pixels: a factor that varies faster than primitives do, such as a shadow's edge: the renderer asks for it once per pixel, at the
-            mean depth of what the pixel shows (deferred shading). None: 1 everywhere, and no depth image is drawn for it.
+        pixels: a factor that varies faster than primitives do, such as a shadow's edge: the renderer asks for it once
+        per pixel, at the
+            mean depth of what the pixel shows (deferred shading). None: 1 everywhere, and no depth image is drawn for
+            it.
     """
 
     primitives: Tensor | None = None

@@ -1,4 +1,5 @@
-"""Models that do with less of something (:meth:`~neuprim.core.model.fields.Field.reductions`), and the words for it: ``density.neurons=0``."""
+"""Models that do with less of something (:meth:`~neuprim.core.model.fields.Field.reductions`), and the words for it:
+``density.neurons=0``."""
 
 from __future__ import annotations
 
@@ -35,12 +36,15 @@ def check_less(density: DensityField, colour: ColourField, kind: str, name: str,
         what = nearest(f"{kind}.{name}", less_of(density, colour)) or "; nothing of this model can be"
         raise ConfigError(f"{kind}.{name}: nothing that {type(own).__name__} can do with less of{what}")
     if isinstance(value, bool) or value not in offered[name]:
-        raise ConfigError(f"{kind}.{name}={value}: expected {' or '.join(map(str, offered[name]))}, less than the model has")
+        raise ConfigError(
+            f"{kind}.{name}={value}: expected {' or '.join(map(str, offered[name]))}, less than the model has"
+        )
     return int(value)
 
 
 def with_less(model: Primitives, kind: str, name: str, value: int) -> Primitives:
-    """The model whose field of this kind has less of something, as close to the whole as it can be; detached where it changes."""
+    """The model whose field of this kind has less of something, as close to the whole as it can be; detached where it
+    changes."""
     own = model.density if kind == KINDS[0] else model.colour
     mine = {key: value.detach() for key, value in model.of(own).items()}
     field, fewer = own.reduced(mine, model.geometry, name, value)
@@ -72,6 +76,8 @@ def fewer_fields(density: DensityField, colour: ColourField, words: Sequence[str
         none = torch.zeros(0, 3)
         empty = Geometry(none, none, torch.zeros(0, 4))
         own = density if kind == KINDS[0] else colour
-        field, _ = own.reduced({spec.name: torch.zeros(0, *spec.shape) for spec in own.parameters()}, empty, name, value)
+        field, _ = own.reduced(
+            {spec.name: torch.zeros(0, *spec.shape) for spec in own.parameters()}, empty, name, value
+        )
         density, colour = (field, colour) if kind == KINDS[0] else (density, field)  # type: ignore[assignment]
     return density, colour

@@ -25,7 +25,8 @@ class Pairs:
         origin: (M, 3) or (3,) starts of the rays, scene units.
         near, far: (M,) ends of the chords, and middle: (M,) their middles, as ray distances in m.
         m: (M,) scene units.
-        whitened: (M, 3) middles of the chords in whitened space, where the ellipsoids are the unit ball; pace: (M, 3) what a ray distance of
+        whitened: (M, 3) middles of the chords in whitened space, where the ellipsoids are the unit ball; pace: (M, 3)
+        what a ray distance of
             1 m moves a point there.
 
     What only code of a plugin needs, in scene units, is computed when it is asked for.
@@ -69,7 +70,8 @@ class Pairs:
 
     @property
     def support(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(M,) each: c0, c1, c2 of 1 - |y|^2 = c0 + c1 u + c2 u^2 along the chords, u in [-1, 1] from their starts to their ends."""
+        """(M,) each: c0, c1, c2 of 1 - |y|^2 = c0 + c1 u + c2 u^2 along the chords, u in [-1, 1] from their starts to
+        their ends."""
         step = self.half[:, None] * self.pace
         return 1 - self.whitened.square().sum(-1), -2 * (self.whitened * step).sum(-1), -step.square().sum(-1)
 

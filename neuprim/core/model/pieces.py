@@ -1,7 +1,9 @@
-"""Parts of a primitive's fields that it may do without: a coefficient of its colour, a neuron of its density, a wave in time.
+"""Parts of a primitive's fields that it may do without: a coefficient of its colour, a neuron of its density, a wave in
+time.
 
-A piece names numbers that mean nothing once they are zero, as few as can go by themselves. Pruning decides for every primitive which pieces it
-keeps; files leave out what is zero (:mod:`neuprim.core.model.zeros`), and compressed files have next to nothing to say about it.
+A piece names numbers that mean nothing once they are zero, as few as can go by themselves. Pruning decides for every
+primitive which pieces it keeps; files leave out what is zero (:mod:`neuprim.core.model.zeros`), and compressed files
+have next to nothing to say about it.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ def numbers_of(piece: Piece, params: Params) -> int:
 
 
 def worth(piece: Piece, params: Params, gradients: Params) -> Tensor:
-    """(N,) by how much a sum over pixels, whose gradients these are, changes when each primitive's piece is zero, to first order."""
+    """(N,) by how much a sum over pixels, whose gradients these are, changes when each primitive's piece is zero, to
+    first order."""
     total: Tensor | None = None
     slopes = piece.of(gradients)
     for name, value in piece.of(params).items():

@@ -45,9 +45,9 @@ __all__ = ["Living", "Lowered", "Primitives"]
 class Lowered:
     """What one frame hands to the renderer, whatever the task.
 
-    ``rows`` (M,) int64 says which primitives these are where a field left some out; None for all. ``shade``, if any, is a factor on
-    each pixel (see :meth:`~neuprim.core.model.fields.ColourField.shade`). ``fields`` are the class names of density and colour field, for
-    messages; None for forms that no field made.
+    ``rows`` (M,) int64 says which primitives these are where a field left some out; None for all. ``shade``, if any, is
+    a factor on each pixel (see :meth:`~neuprim.core.model.fields.ColourField.shade`). ``fields`` are the class names of
+    density and colour field, for messages; None for forms that no field made.
     """
 
     geometry: Geometry
@@ -129,7 +129,9 @@ class Lowered:
         Raises:
             FormError: the density's own code returned something else.
         """
-        return check_result(self.density.optical_depth(pairs), (len(pairs),), f"{self.source('density')}: line_integral").double()
+        return check_result(
+            self.density.optical_depth(pairs), (len(pairs),), f"{self.source('density')}: line_integral"
+        ).double()
 
     def seen(self, pairs: Pairs) -> Tensor:
         """(M, C) float64 colours that are seen along chords.
@@ -148,7 +150,8 @@ class Living:
     Attributes:
         rows: (M,) int64 ascending rows of the model; None where all are.
         params: all their tensors; own: those of the density field.
-        stored: their ellipsoids as stored, which :meth:`~neuprim.core.model.fields.DensityField.density` takes; geometry: where they are.
+        stored: their ellipsoids as stored, which :meth:`~neuprim.core.model.fields.DensityField.density` takes;
+        geometry: where they are.
     """
 
     field: DensityField
@@ -160,7 +163,8 @@ class Living:
     geometry: Geometry
 
     def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
-        """World density (P,), 1/scene unit, unclamped, of the living primitives ``prim`` (P,), 0..M-1, at points ``x`` (P, 3)."""
+        """World density (P,), 1/scene unit, unclamped, of the living primitives ``prim`` (P,), 0..M-1, at points ``x``
+        (P, 3)."""
         found = self.field.density(self.own, self.stored, prim, x, self.conditions)
         return check_result(found, (len(prim),), method(self.field, "density"))
 
@@ -230,7 +234,8 @@ class Primitives:
         return {name: params[name] for name in self._names[field is self.colour]}
 
     def lower(self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None) -> Lowered:
-        """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left out.
+        """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left
+        out.
 
         ``settings`` are for images that a colour field needs first, such as a shadow's; None: the defaults.
 
@@ -267,7 +272,8 @@ class Primitives:
             raise FormError(f"{method(self.density, 'lower')}: {error}") from error
 
     def component(self, name: str) -> Primitives:
-        """The part of the extinction that comes from the source grid ``name``: every density times its share. KeyError: there is none."""
+        """The part of the extinction that comes from the source grid ``name``: every density times its share. KeyError:
+        there is none."""
         own = {key: value.detach() for key, value in self.of(self.density).items()}
         scaled = self.density.scale_density(own, self.density.components(own)[name])
         return Primitives(self.density, self.colour, {**self.params, **scaled})
@@ -276,7 +282,8 @@ class Primitives:
     def limit(self, largest: float) -> None:
         """Scale, in place, every primitive that may have more than this extinction anywhere, so that it has no more.
 
-        The largest extinction of the data is none of a single primitive: needles between their voxels would show at other resolutions.
+        The largest extinction of the data is none of a single primitive: needles between their voxels would show at
+        other resolutions.
         """
         own = self.of(self.density)
         found = self.density.largest(own, self.geometry)
@@ -288,7 +295,8 @@ class Primitives:
                 own[name].copy_(value)
 
     def living(self, conditions: Conditions, dtype: torch.dtype | None = None) -> Living:
-        """Which primitives live in a frame, and where; differentiable. With ``dtype``, everything is detached and of that type."""
+        """Which primitives live in a frame, and where; differentiable. With ``dtype``, everything is detached and of
+        that type."""
         rows = self.density.alive(self.of(self.density), conditions)
         if rows is not None:
             check_rows(rows, self.count, f"{method(self.density, 'alive')} returned")
@@ -309,7 +317,8 @@ class Primitives:
         return Living(self.density, conditions, rows, params, own, stored, moved)
 
     def places(self, conditions: Conditions) -> tuple[Tensor | None, Geometry]:
-        """Rows of the primitives that live in a frame, None for all, and where they are; without gradient, and copying what places them alone."""
+        """Rows of the primitives that live in a frame, None for all, and where they are; without gradient, and copying
+        what places them alone."""
         own = {name: value.detach() for name, value in self.of(self.density).items()}
         rows = self.density.alive(own, conditions)
         geometry = Geometry(*(self.params[name].detach() for name in ("means", "log_scales", "quats")))
@@ -325,13 +334,17 @@ class Primitives:
         living = self.living(conditions)
         own = self._of(self.colour, living.params)
         density = self._lower_density(living, conditions)
-        return Lowered(living.geometry, density, self.colour.lower(own, living.geometry, camera, conditions), living.rows)
+        return Lowered(
+            living.geometry, density, self.colour.lower(own, living.geometry, camera, conditions), living.rows
+        )
 
     def to(self, device: torch.device) -> Primitives:
         """The same model on another device, without gradients; itself if it is there already."""
         if self.device == device:
             return self
-        return Primitives(self.density, self.colour, {name: value.detach().to(device) for name, value in self.params.items()})
+        return Primitives(
+            self.density, self.colour, {name: value.detach().to(device) for name, value in self.params.items()}
+        )
 
     def rows(self, index: Tensor) -> dict[str, Tensor]:
         """Detached copies of some rows of every parameter."""
@@ -344,4 +357,6 @@ class Primitives:
                 bad = ~torch.isfinite(value.detach()).reshape(self.count, -1).all(dim=1)
                 if bool(bad.any()):
                     row = int(bad.nonzero()[0])
-                    raise NonFiniteError(f"{what} {name} of primitive {row} is not finite: {value.detach()[row].flatten()[:8].tolist()}")
+                    raise NonFiniteError(
+                        f"{what} {name} of primitive {row} is not finite: {value.detach()[row].flatten()[:8].tolist()}"
+                    )

@@ -1,4 +1,5 @@
-"""Rotation matrices of quaternions and their gradient, for the kernels; :func:`~neuprim.core.model.geometry.quaternion_to_matrix` in torch."""
+"""Rotation matrices of quaternions and their gradient, for the kernels;
+:func:`~neuprim.core.model.geometry.quaternion_to_matrix` in torch."""
 
 from __future__ import annotations
 
@@ -11,7 +12,12 @@ __all__ = ["rotation", "rotation_backward"]
 
 @strict
 def rotation(q, out):  # type: ignore[no-untyped-def]
-    w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])  # float32 squares would scale the rotation
+    w, x, y, z = (
+        np.float64(q[0]),
+        np.float64(q[1]),
+        np.float64(q[2]),
+        np.float64(q[3]),
+    )  # float32 squares would scale the rotation
     n = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * n, x * n, y * n, z * n
     out[0, 0] = 1 - 2 * (y * y + z * z)

@@ -1,6 +1,7 @@
 """Some rows of many tensors as one differentiable operation: the primitives that live in a frame.
 
-Rows ascend, so that each is taken once: a gradient goes back by writing, in one pass, where torch adds up rows one by one.
+Rows ascend, so that each is taken once: a gradient goes back by writing, in one pass, where torch adds up rows one by
+one.
 """
 
 from __future__ import annotations
@@ -72,13 +73,22 @@ class _Rows(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.rows, ctx.shapes = rows.numpy(), [x.shape for x in tensors]
         taken = [torch.empty((len(rows), *x.shape[1:]), dtype=x.dtype) for x in tensors]
-        _each(_take, ctx.rows, [(x.detach().contiguous().numpy(), y.numpy()) for x, y in zip(tensors, taken, strict=True)])
+        _each(
+            _take, ctx.rows, [(x.detach().contiguous().numpy(), y.numpy()) for x, y in zip(tensors, taken, strict=True)]
+        )
         return tuple(taken)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        made = [None if g is None else torch.empty(shape, dtype=g.dtype) for g, shape in zip(gradients, ctx.shapes, strict=True)]
-        known = [(g.contiguous(), whole) for g, whole in zip(gradients, made, strict=True) if g is not None and whole is not None]
+        made = [
+            None if g is None else torch.empty(shape, dtype=g.dtype)
+            for g, shape in zip(gradients, ctx.shapes, strict=True)
+        ]
+        known = [
+            (g.contiguous(), whole)
+            for g, whole in zip(gradients, made, strict=True)
+            if g is not None and whole is not None
+        ]
         for g, whole in known:
             if not g.numel():
                 whole.zero_()  # nothing lives, or nothing is there

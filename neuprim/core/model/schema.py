@@ -36,8 +36,8 @@ class InitContext:
         generator: the only source of randomness initialisers may use.
         settings: free settings of the preset (``model.init``), e.g. ``{"alpha": 0.8}``.
         conditions: name -> (N,) condition at which each starting point was found ("time"), where the data set says so.
-        axes: (N, 3) initial semi-axes and quats: (N, 4) wxyz their orientations, where the starting points are ellipsoids.
-        alphas: (N,) opacities in 0..1 through their middles, where they have one.
+        axes: (N, 3) initial semi-axes and quats: (N, 4) wxyz their orientations, where the starting points are
+        ellipsoids. alphas: (N,) opacities in 0..1 through their middles, where they have one.
         steps: condition name -> from one of a sequence's frames to the next, where the data are one.
     """
 
@@ -54,9 +54,11 @@ class InitContext:
 
     @property
     def thickness(self) -> Tensor:
-        """(N,) float64 chord through the middle over the longest axis: the mean over the three axes, each weighted by what is seen along it.
+        """(N,) float64 chord through the middle over the longest axis: the mean over the three axes, each weighted by
+        what is seen along it.
 
-        1 for balls. So weighted, primitives hide as much from all sides together as they would if every chord were that long.
+        1 for balls. So weighted, primitives hide as much from all sides together as they would if every chord were that
+        long.
         """
         if self.axes is None:
             return torch.ones(self.count, dtype=torch.float64)
@@ -97,10 +99,12 @@ class ParameterSpec:
     Attributes:
         name: unique within a model; the key in checkpoints, rates and exports.
         shape: shape per primitive, ``()`` for a scalar.
-        lr: base learning rate; ``train.rates.NAME`` overrides it. 0: a label, which is not learned, has no gradient and is kept in every file.
-        init: draws the (N, *shape) float32 start value.
-        lr_unit: what ``lr`` and ``train.rates.NAME`` are multiplied by: "absolute", nothing, so that a position's rate is in scene units
-            a step; "extent", the data set's :attr:`~neuprim.core.data.Dataset.extent` (positions). ``train.rate_units.NAME`` overrides it.
+        lr: base learning rate; ``train.rates.NAME`` overrides it. 0: a label, which is not learned, has no gradient and
+        is kept in every file. init: draws the (N, *shape) float32 start value.
+        lr_unit: what ``lr`` and ``train.rates.NAME`` are multiplied by: "absolute", nothing, so that a position's rate
+        is in scene units
+            a step; "extent", the data set's :attr:`~neuprim.core.data.Dataset.extent` (positions).
+            ``train.rate_units.NAME`` overrides it.
     """
 
     name: str

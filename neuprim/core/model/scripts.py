@@ -1,4 +1,5 @@
-"""JavaScript that lies beside a field's own module: what the field is in a browser (docs/plugins.md, "In a browser")."""
+"""JavaScript that lies beside a field's own module: what the field is in a browser (docs/plugins.md, "In a
+browser")."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""What a tensor must be for a kernel to read it, in words: its shape in letters that tensors share, its dtype, layout and device.
+"""What a tensor must be for a kernel to read it, in words: its shape in letters that tensors share, its dtype, layout
+and device.
 
-Compiled kernels index without looking: a tensor that is too short would be read and written beyond its end. Here faults are told, None
-where there is none; :mod:`neuprim.core.model.checks` raises them.
+Compiled kernels index without looking: a tensor that is too short would be read and written beyond its end. Here faults
+are told, None where there is none; :mod:`neuprim.core.model.checks` raises them.
 """
 
 from __future__ import annotations
@@ -119,11 +120,15 @@ def _expected(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
     if not free:
         numbers = [tuple(sizes[d][0] if isinstance(d, str) else d for d in shape) for shape in shapes]
         tensors = dict.fromkeys(sizes[x][1] for x in known)
-        origins = " and ".join(f"{t} has " + " and ".join(f"{x}={sizes[x][0]}" for x in known if sizes[x][1] == t) for t in tensors)
+        origins = " and ".join(
+            f"{t} has " + " and ".join(f"{x}={sizes[x][0]}" for x in known if sizes[x][1] == t) for t in tensors
+        )
         return " or ".join(map(str, numbers)) + (f", as {origins}" if origins else "")
     text = " or ".join(str(shape).replace("'", "") for shape in shapes)
     origins = " and ".join(f"{x}={sizes[x][0]} as in {sizes[x][1]}" for x in known)
-    limits = [f", {x} {'at least' if low else 'at most'} {low or high}" for x, (low, high) in _RANGES.items() if x in free]
+    limits = [
+        f", {x} {'at least' if low else 'at most'} {low or high}" for x, (low, high) in _RANGES.items() if x in free
+    ]
     return text + (f" with {origins}" if origins else "") + "".join(limits)
 
 
@@ -150,8 +155,8 @@ class Shaped:
         return replace(self, **{name: getattr(self, name).to(device) for name in self.shapes})  # type: ignore[type-var]
 
     def fault(self, sizes: Sizes) -> str | None:
-        """The first part that does not fit, e.g. ``"w2 has shape (5,); expected (100, 3), as means has N=100 and W1 has K=3"``; None if
-        all do.
+        """The first part that does not fit, e.g. ``"w2 has shape (5,); expected (100, 3), as means has N=100 and W1 has
+        K=3"``; None if all do.
 
         Args:
             sizes: those known so far; gets the ones that this form adds.

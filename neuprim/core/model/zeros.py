@@ -1,7 +1,8 @@
 """Model files without what is zero, as pruning leaves it (:mod:`neuprim.core.model.pieces`).
 
-A parameter is stored as two tensors, if that is less: ``NAME|there``, uint8, a bit for each of its numbers, row by row and the lowest bit first,
-and ``NAME|numbers``, float32, those whose bit is set. Tensors in memory are whole. Earlier files name pieces instead, see :func:`of_pieces`.
+A parameter is stored as two tensors, if that is less: ``NAME|there``, uint8, a bit for each of its numbers, row by row
+and the lowest bit first, and ``NAME|numbers``, float32, those whose bit is set. Tensors in memory are whole. Earlier
+files name pieces instead, see :func:`of_pieces`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ _ROWS = "rows|"
 
 
 def split_off(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str, Tensor], list[str]]:
-    """Tensors as a file holds them, and the names of the parameters without their zeros; ``specs`` are those of the fields."""
+    """Tensors as a file holds them, and the names of the parameters without their zeros; ``specs`` are those of the
+    fields."""
     stored, sparse = dict(params), []
     for name in (spec.name for spec in specs):
         value = params[name]
@@ -61,14 +63,19 @@ def whole(stored: Params, names: object, specs: Sequence[ParameterSpec], where: 
         there = _bits(stored.get(name + _THERE), size, f"{where}: {name + _THERE}")
         numbers = _expected(stored.get(name + _NUMBERS), (int(there.sum()),), f"{where}: {name + _NUMBERS}")
         if name in found:
-            raise CheckpointError(f"{where}: {name} is there twice, as {name} and as {name + _NUMBERS}; expected one of them")
+            raise CheckpointError(
+                f"{where}: {name} is there twice, as {name} and as {name + _NUMBERS}; expected one of them"
+            )
         found[name] = torch.zeros(size).masked_scatter_(there, numbers).reshape(count, *shapes[name])
     _no_more(stored, {*found, *(name + part for name in names for part in (_THERE, _NUMBERS))}, where, "no parameter")
     return found
 
 
-def of_pieces(stored: Params, names: object, specs: Sequence[ParameterSpec], pieces: Mapping[str, Piece], where: str) -> dict[str, Tensor]:
-    """The same of a file of earlier, in which a piece was ``NAME|KIND.PIECE`` with the rows that have it, by ``rows|KIND.PIECE``, a bit for each primitive.
+def of_pieces(
+    stored: Params, names: object, specs: Sequence[ParameterSpec], pieces: Mapping[str, Piece], where: str
+) -> dict[str, Tensor]:
+    """The same of a file of earlier, in which a piece was ``NAME|KIND.PIECE`` with the rows that have it, by
+    ``rows|KIND.PIECE``, a bit for each primitive.
 
     Args:
         names: of the pieces that are stored apart.
@@ -78,7 +85,9 @@ def of_pieces(stored: Params, names: object, specs: Sequence[ParameterSpec], pie
         CheckpointError: they do not fit the model's fields or each other.
     """
     if not isinstance(names, list) or not all(isinstance(name, str) and name in pieces for name in names):
-        raise CheckpointError(f"{where}: header field 'apart' is {names!r}; expected pieces of the model's fields: {', '.join(pieces)}")
+        raise CheckpointError(
+            f"{where}: header field 'apart' is {names!r}; expected pieces of the model's fields: {', '.join(pieces)}"
+        )
     count, shapes = _count(stored, where), {spec.name: spec.shape for spec in specs}
     found = {name: value for name, value in stored.items() if "|" not in name}
     taken = set(found)

@@ -54,27 +54,34 @@ def render(
 
     Args:
         model: the primitives; each field lowers under ``conditions`` first.
-        camera: the view; rgb is (camera.height, camera.width, C). A :class:`RayCamera` (any central projection) is drawn
+        camera: the view; rgb is (camera.height, camera.width, C). A :class:`RayCamera` (any central projection) is
+        drawn
             by the reference backend alone.
         conditions: e.g. ``{"time": tensor(0.5)}``.
         settings: every speed/accuracy knob; None: the defaults, with ``near="auto"``.
         background: (C,) colour behind everything; None is black.
 
     Raises:
-        FormError: a field, the camera or the background has a tensor that does not fit (field, tensor, found and expected).
+        FormError: a field, the camera or the background has a tensor that does not fit (field, tensor, found and
+        expected).
         NonFiniteError: a parameter is NaN or infinite (named, with the primitive).
         BackendUnavailable: the backend asked for cannot draw this model or this camera, or cannot run here.
         ConfigError: there is no backend of the name asked for.
     """
     settings = settings or RenderSettings(near="auto")
-    with limited(settings.threads) if settings.threads else nullcontext():  # fields are lowered by as many threads as pixels
+    with (
+        limited(settings.threads) if settings.threads else nullcontext()
+    ):  # fields are lowered by as many threads as pixels
         lowered = model.lower(camera, conditions or {}, settings)
         lowered.check_seen(camera.viewmat, background)
         return _drawn(lowered, camera, settings, background)
 
 
-def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:
-    """Draw a model whose conditions are already folded in; refuses what does not fit or is not finite, see :func:`render`."""
+def render_lowered(
+    lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None
+) -> RenderOutput:
+    """Draw a model whose conditions are already folded in; refuses what does not fit or is not finite, see
+    :func:`render`."""
     lowered.check(camera.viewmat, background)
     return _drawn(lowered, camera, settings, background)
 
@@ -93,7 +100,9 @@ def _drawn(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, backgr
     paint: Draw = draw if lowered.shade is None else with_shade(draw)
     if settings.samples > 1:
         if isinstance(camera, RayCamera):
-            raise ConfigError(f"renderer.samples={settings.samples}: only pinhole cameras are sampled; give a RayCamera more directions")
+            raise ConfigError(
+                f"renderer.samples={settings.samples}: only pinhole cameras are sampled; give a RayCamera more directions"
+            )
         output = render_samples(paint, lowered, camera, background, settings)
     else:
         output = paint(lowered, camera, background, settings)

@@ -72,16 +72,18 @@ class Backend:
 
     Attributes:
         name: of the setting ``renderer.backend``.
-        load: imports it and returns its ``render(lowered, camera, background, settings)``, see :data:`~neuprim.core.render.shading.Draw`.
-        refuses: what it cannot draw of a model through a camera (None: any pinhole), as the rest of a sentence that starts with
+        load: imports it and returns its ``render(lowered, camera, background, settings)``, see
+        :data:`~neuprim.core.render.shading.Draw`. refuses: what it cannot draw of a model through a camera (None: any
+        pinhole), as the rest of a sentence that starts with
             "cannot draw"; None if it can.
         device: what it computes on, for a run's numbers.
         missing: why this machine cannot run it at all, such as a driver that is not there; None if it can. Cheap.
-        compiles: whether it compiles something once per installation, which a run then does beside its other preparations.
-        devices: kinds of device that it draws tensors of, its own first: frames whose tensors are elsewhere are moved there and back.
-        checks: whether it refuses numbers that are not finite itself, while it prepares a frame; the others get :func:`refuse_non_finite`.
-        parts: loads and returns what draws parts of a set of primitives in one frame, see :mod:`~neuprim.core.render.parts`; None without.
-        differentiates_intrinsics: whether gradients reach focal lengths and the principal point.
+        compiles: whether it compiles something once per installation, which a run then does beside its other
+        preparations. devices: kinds of device that it draws tensors of, its own first: frames whose tensors are
+        elsewhere are moved there and back. checks: whether it refuses numbers that are not finite itself, while it
+        prepares a frame; the others get :func:`refuse_non_finite`. parts: loads and returns what draws parts of a set
+        of primitives in one frame, see :mod:`~neuprim.core.render.parts`; None without. differentiates_intrinsics:
+        whether gradients reach focal lengths and the principal point.
     """
 
     name: str
@@ -180,7 +182,16 @@ def _reference() -> Draw:
 
 
 TABLE: tuple[Backend, ...] = (
-    Backend("cuda", _cuda, kernels_refuse, _card, _no_warp, checks=True, devices=(hardware.CARD, hardware.PROCESSOR), parts=_cuda_parts),
+    Backend(
+        "cuda",
+        _cuda,
+        kernels_refuse,
+        _card,
+        _no_warp,
+        checks=True,
+        devices=(hardware.CARD, hardware.PROCESSOR),
+        parts=_cuda_parts,
+    ),
     Backend("cpu", _cpu, kernels_refuse, compiles=True, checks=True, parts=_cpu_parts),
     Backend(ORACLE, _reference, differentiates_intrinsics=True),
 )
@@ -245,13 +256,16 @@ def no_card() -> str | None:
 
 
 def check_pair(settings: RenderSettings) -> None:
-    """Raise :class:`ConfigError` for a device that the backend asked for by name does not draw on, whatever the machine."""
+    """Raise :class:`ConfigError` for a device that the backend asked for by name does not draw on, whatever the
+    machine."""
     if AUTO in (settings.backend, settings.device):
         return
     backend = find(settings.backend)
     if settings.device not in backend.devices:
         own = " or ".join((*backend.devices, AUTO))
-        raise ConfigError(f"renderer.device={settings.device}: renderer.backend={backend.name} does not draw there; expected {own}")
+        raise ConfigError(
+            f"renderer.device={settings.device}: renderer.backend={backend.name} does not draw there; expected {own}"
+        )
 
 
 def check_device(settings: RenderSettings) -> None:
@@ -273,7 +287,8 @@ def check_device(settings: RenderSettings) -> None:
 
 
 def at_hand(settings: RenderSettings) -> RenderSettings:
-    """The same for what is drawn again later, perhaps on another machine: a card that is not there is not insisted on."""
+    """The same for what is drawn again later, perhaps on another machine: a card that is not there is not insisted
+    on."""
     gone = settings.device == hardware.CARD and no_card() is not None and settings.backend == AUTO
     return replace(settings, device="auto") if gone else settings
 
@@ -309,7 +324,8 @@ def run_device(settings: RenderSettings, forms: Callable[[], Lowered], camera: A
 
 
 def computing_device(settings: RenderSettings) -> torch.device:
-    """Where a run computes what is no frame of its model, such as the ground truth of volumes: a card that the settings allow and that is there."""
+    """Where a run computes what is no frame of its model, such as the ground truth of volumes: a card that the settings
+    allow and that is there."""
     kind: str = settings.device
     if kind == AUTO:
         kind = hardware.CARD if settings.backend == AUTO else find(settings.backend).devices[0]

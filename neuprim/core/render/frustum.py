@@ -1,4 +1,5 @@
-"""Which ellipsoids a camera can see, before anything is drawn: a bound that leaves none out that a pixel's ray meets."""
+"""Which ellipsoids a camera can see, before anything is drawn: a bound that leaves none out that a pixel's ray
+meets."""
 
 from __future__ import annotations
 
@@ -20,9 +21,9 @@ _ROUNDING = 1e-9
 def in_sight(geometry: Geometry, camera: AnyCamera, near: float) -> Tensor | None:
     """(M,) int64 ascending rows of the ellipsoids that reach into a camera's view; None for all of them.
 
-    A pinhole's view is bounded by the four planes through the edges of its image and by the near plane. An ellipsoid is left out where it lies wholly
-    behind one of them: its farthest point along a plane's normal n is n . mu + |S R^T n|. Those with numbers that are not finite stay in,
-    for the renderer to name. Other cameras may look anywhere.
+    A pinhole's view is bounded by the four planes through the edges of its image and by the near plane. An ellipsoid is
+    left out where it lies wholly behind one of them: its farthest point along a plane's normal n is n . mu + |S R^T n|.
+    Those with numbers that are not finite stay in, for the renderer to name. Other cameras may look anywhere.
 
     Args:
         near: depth below which nothing is drawn, scene units.
@@ -61,5 +62,6 @@ def in_sight(geometry: Geometry, camera: AnyCamera, near: float) -> Tensor | Non
 
 
 def _beyond(middle: Tensor, reach: Tensor) -> Tensor:
-    """(N,) whether (N, planes) distances of centres and reaches along normals leave something wholly behind one of the planes; never where one is NaN."""
+    """(N,) whether (N, planes) distances of centres and reaches along normals leave something wholly behind one of the
+    planes; never where one is NaN."""
     return (middle + reach < -_ROUNDING * (middle.abs() + reach)).any(dim=1)

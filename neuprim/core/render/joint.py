@@ -1,16 +1,19 @@
-"""Diagnostic: the volume that sorting approximates, marched. What do ``sort = "center"`` and ``sort = "entry"`` lose against it?
+"""Diagnostic: the volume that sorting approximates, marched. What do ``sort = "center"`` and ``sort = "entry"`` lose
+against it?
 
-Compositing draws primitives one behind the other, also where they overlap. In the volume that the primitives describe, all of
-them absorb and emit together: the density at a point is the sum of theirs, its colour their density-weighted mean. Neither
-order of compositing is that volume; this module renders it, slowly, in float64.
+Compositing draws primitives one behind the other, also where they overlap. In the volume that the primitives describe,
+all of them absorb and emit together: the density at a point is the sum of theirs, its colour their density-weighted
+mean. Neither order of compositing is that volume; this module renders it, slowly, in float64.
 
-Two choices make the comparison one of order alone. A density may be negative somewhere along a chord. Compositing does not see
-this, it clamps the chord's integral; a march must clamp at every point. And compositing clamps and cuts opacities. With
-``keep = "opacity"`` each chord's density is therefore clamped pointwise and then scaled so that the primitive keeps exactly the
-opacity which the renderer gives it, alpha_max and alpha_min included: every ray then ends with the same transmittance in all
-three images, and only where along the ray the absorption happens differs. Without negative densities, clamps and cuts the scale is 1
-and the image is that of the plain sum of densities. ``keep = "density"`` does not rescale: it draws the sum of the pointwise
-clamped densities, the field an exported volume holds, so that the error also counts what the clamps and cuts do.
+Two choices make the comparison one of order alone. A density may be negative somewhere along a chord. Compositing does
+not see this, it clamps the chord's integral; a march must clamp at every point. And compositing clamps and cuts
+opacities. With
+``keep = "opacity"`` each chord's density is therefore clamped pointwise and then scaled so that the primitive keeps
+exactly the opacity which the renderer gives it, alpha_max and alpha_min included: every ray then ends with the same
+transmittance in all three images, and only where along the ray the absorption happens differs. Without negative
+densities, clamps and cuts the scale is 1 and the image is that of the plain sum of densities. ``keep = "density"`` does
+not rescale: it draws the sum of the pointwise clamped densities, the field an exported volume holds, so that the error
+also counts what the clamps and cuts do.
 """
 
 from __future__ import annotations
@@ -87,18 +90,21 @@ def joint_volume(
 ) -> RenderOutput:
     """The emission-absorption image of the summed densities, float64, without gradients; see the module for ``keep``.
 
-    Each ray is cut into cells at the ends of all its chords and at ``steps`` even divisions from the first entry to the last exit.
-    Within a cell the set of primitives is fixed, the optical depth of each is its closed line integral, and only their mixture is
-    taken as constant. Constant densities are therefore exact for any ``steps``, others converge with steps^-2.
+    Each ray is cut into cells at the ends of all its chords and at ``steps`` even divisions from the first entry to the
+    last exit.
+    Within a cell the set of primitives is fixed, the optical depth of each is its closed line integral, and only their
+    mixture is taken as constant. Constant densities are therefore exact for any ``steps``, others converge with
+    steps^-2.
 
     Args:
         lowered, camera, background: as for :func:`~neuprim.core.render.render_lowered`.
-        settings: near, samples, depth, and alpha_max and alpha_min under ``keep = "opacity"``; rays are not stopped early.
-        steps: even divisions per ray, at least 1.
+        settings: near, samples, depth, and alpha_max and alpha_min under ``keep = "opacity"``; rays are not stopped
+        early. steps: even divisions per ray, at least 1.
         keep: "opacity" or "density".
 
     Returns:
-        the frame, comparable with a rendered one. Its depth is the mean camera-z of where light is emitted, not of chord middles.
+        the frame, comparable with a rendered one. Its depth is the mean camera-z of where light is emitted, not of
+        chord middles.
         A colour that varies along the ray is taken at each chord's middle, as the renderer does.
 
     Raises:
@@ -121,12 +127,16 @@ def joint_volume(
     return draw(lowered, camera, background, settings)
 
 
-def _draw(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings, steps: int, keep: Keep) -> RenderOutput:
+def _draw(
+    lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings, steps: int, keep: Keep
+) -> RenderOutput:
     colour, g = lowered.colour, lowered.geometry
     channels = colour.channels
     directions = pixel_directions(camera)
     boxes = screen_boxes(g, camera, settings.near_plane)
-    whiten = (quaternion_to_matrix(g.quats.double()) / g.log_scales.double().exp()[:, None, :]).transpose(1, 2)  # scene -> unit sphere
+    whiten = (quaternion_to_matrix(g.quats.double()) / g.log_scales.double().exp()[:, None, :]).transpose(
+        1, 2
+    )  # scene -> unit sphere
     image = torch.zeros(camera.height, camera.width, channels + 2, dtype=torch.float64)
     stats = RenderStats("joint", g.count)
     for y in range(0, camera.height, _BLOCK):
@@ -155,7 +165,8 @@ def _march(
     keep: Keep,
     stats: RenderStats,
 ) -> Tensor:
-    """(P, channels + 2): premultiplied colour, transmittance and sum of w z of P unit rays ``d`` (camera axes) against ``rows``."""
+    """(P, channels + 2): premultiplied colour, transmittance and sum of w z of P unit rays ``d`` (camera axes) against
+    ``rows``."""
     g = lowered.geometry
     origin = camera.position.detach().double()
     world = d @ camera.viewmat.detach().double()[:3, :3]
@@ -199,7 +210,9 @@ def _march(
     if keep == "opacity":
         total = torch.zeros_like(alpha).index_add(0, chord, tau)
         scale = torch.where(
-            total > 0, -torch.log1p(-alpha) / torch.where(total > 0, total, torch.ones_like(total)), torch.zeros_like(total)
+            total > 0,
+            -torch.log1p(-alpha) / torch.where(total > 0, total, torch.ones_like(total)),
+            torch.zeros_like(total),
         )
         tau = tau * scale[chord]
 

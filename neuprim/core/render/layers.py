@@ -19,7 +19,8 @@ from neuprim.core.render.shading import points_seen
 __all__ = ["LayerFrame"]
 
 _CLEAR = 2e-4
-"""A pixel whose transmittance stays above this has no clamped primitive: one alone, at ``alpha_max`` = 0.9999, would take it to half of that."""
+"""A pixel whose transmittance stays above this has no clamped primitive: one alone, at ``alpha_max`` = 0.9999, would
+take it to half of that."""
 
 _WEAKEN = 1 / 8
 _ROUNDS = 14  # at most: densities of 4e12 along a ray, and float32 knows hardly more
@@ -58,19 +59,24 @@ class LayerFrame:
     def emitted(self) -> Tensor | None:
         """(H, W, C) integral of sigma c along each ray, where each primitive has one colour in the frame; else None."""
         colours = self.lowered.colour.flat
-        return None if colours is None else torch.stack([self.integral(channel) for channel in colours.clamp_min(0.0).unbind(1)], -1)
+        return (
+            None
+            if colours is None
+            else torch.stack([self.integral(channel) for channel in colours.clamp_min(0.0).unbind(1)], -1)
+        )
 
     @cached_property
     def unshaded(self) -> Tensor:
-        """(H, W, C) the frame over black without what :meth:`~neuprim.core.model.fields.ColourField.shade` multiplies its colours by."""
+        """(H, W, C) the frame over black without what :meth:`~neuprim.core.model.fields.ColourField.shade` multiplies
+        its colours by."""
         with torch.no_grad():
             forms = self.model.forms(self.camera, self.conditions)
         return self._render(replace(self.lowered, colour=forms.colour, shade=None), self.settings).rgb
 
     @cached_property
     def shading(self) -> Tensor | None:
-        """(H, W) mean factor of :meth:`~neuprim.core.model.fields.ColourField.shade` over what a pixel shows, 0 where nothing is hit; None
-        for a colour that has none.
+        """(H, W) mean factor of :meth:`~neuprim.core.model.fields.ColourField.shade` over what a pixel shows, 0 where
+        nothing is hit; None for a colour that has none.
         """
         geometry, density = self.lowered.geometry, self.lowered.density
         with torch.no_grad():
@@ -88,7 +94,8 @@ class LayerFrame:
         return torch.where(self.drawn.alpha > 0, factor, 0.0)
 
     def seen(self, colour: LoweredColour) -> Tensor:
-        """(H, W, C') the frame over black with other colours: the sum along each ray of a primitive's weight alpha_i T_i times its colour.
+        """(H, W, C') the frame over black with other colours: the sum along each ray of a primitive's weight alpha_i
+        T_i times its colour.
 
         Args:
             colour: of the frame's primitives, those of :attr:`lowered`, any number of channels.
@@ -96,11 +103,13 @@ class LayerFrame:
         return self._render(replace(self.lowered, colour=colour, shade=None), self.settings).rgb
 
     def integral(self, weights: Tensor | None = None) -> Tensor:
-        """(H, W) the sum along each ray of the primitives' optical depths, each times its weight: the integral of weight times sigma.
+        """(H, W) the sum along each ray of the primitives' optical depths, each times its weight: the integral of
+        weight times sigma.
 
-        Optical depths are those of whole chords behind the near plane, at least 0 each; nothing is clamped at ``alpha_max``, left out below
-        ``alpha_min`` or cut where a ray ends. It is -log of the transmittance of a medium made as thin as that takes: exact in the optical
-        depths, in float32.
+        Optical depths are those of whole chords behind the near plane, at least 0 each; nothing is clamped at
+        ``alpha_max``, left out below
+        ``alpha_min`` or cut where a ray ends. It is -log of the transmittance of a medium made as thin as that takes:
+        exact in the optical depths, in float32.
 
         Args:
             weights: (N,) at least 0, one for each primitive of :attr:`lowered`; None for 1.
@@ -111,15 +120,20 @@ class LayerFrame:
         count = self.lowered.geometry.count
         weights = torch.ones(count, device=self.lowered.geometry.means.device) if weights is None else weights.detach()
         if weights.shape != (count,) or not bool((weights.isfinite() & (weights >= 0)).all()):
-            raise FormError(f"integral: weights have shape {tuple(weights.shape)}; expected ({count},) finite numbers, at least 0")
+            raise FormError(
+                f"integral: weights have shape {tuple(weights.shape)}; expected ({count},) finite numbers, at least 0"
+            )
         n, camera = self.settings.samples, self.camera
         camera = camera.resized(camera.width * n, camera.height * n)
-        settings = replace(self.settings, samples=1, alpha_min=0.0, transmittance_min=0.0, alpha_max=0.9999, depth=False)
+        settings = replace(
+            self.settings, samples=1, alpha_min=0.0, transmittance_min=0.0, alpha_max=0.9999, depth=False
+        )
         found = self._thin(lambda factor: self._transmittance(weights * factor, camera, settings))
         return found if n == 1 else found.reshape(self.camera.height, n, self.camera.width, n).mean((1, 3))
 
     def _thin(self, transmittance: Callable[[float], Tensor]) -> Tensor:
-        """-log of the transmittance for densities times 1, for the pixels that are opaque then for thinner ones, and so on."""
+        """-log of the transmittance for densities times 1, for the pixels that are opaque then for thinner ones, and so
+        on."""
         T = transmittance(1.0)
         found, opaque, factor = _depth(T), T <= _CLEAR, 1.0
         for _ in range(_ROUNDS):
@@ -131,7 +145,8 @@ class LayerFrame:
         return found.clamp_min(0.0).add(0.0).to(T.dtype)  # no -0
 
     def _transmittance(self, weights: Tensor, camera: Camera, settings: RenderSettings) -> Tensor:
-        """(H, W) of the frame with densities times ``weights``: what is left of a white background behind black primitives."""
+        """(H, W) of the frame with densities times ``weights``: what is left of a white background behind black
+        primitives."""
         lowered, means = self.lowered, self.lowered.geometry.means
         black = Constant(torch.zeros(len(means), 1, device=means.device))
         thin = replace(lowered, density=lowered.density.scaled(weights), colour=black, shade=None)

@@ -1,7 +1,9 @@
-"""Diagnostic: what the closed form is worth. The same model with the density of every chord sampled, as a splatter without the closed form would.
+"""Diagnostic: what the closed form is worth. The same model with the density of every chord sampled, as a splatter
+without the closed form would.
 
-A chord's optical depth is 2 half times the mean of f over it. The closed form gives that mean by one (cos, sinc) pair per neuron; sampling
-gives it by n cosines per neuron, at the middles of n equal parts. All else is the same, in float64 torch: rays, chords, compositing.
+A chord's optical depth is 2 half times the mean of f over it. The closed form gives that mean by one (cos, sinc) pair
+per neuron; sampling gives it by n cosines per neuron, at the middles of n equal parts. All else is the same, in float64
+torch: rays, chords, compositing.
 """
 
 from __future__ import annotations
@@ -77,16 +79,23 @@ class _Sampled(Cosine):
 
 @torch.no_grad()
 def compare_sampling(
-    lowered: Lowered, camera: Camera, settings: RenderSettings, samples: Sequence[int] = (1, 2, 4, 8, 16, 32, 64), rounds: int = 5
+    lowered: Lowered,
+    camera: Camera,
+    settings: RenderSettings,
+    samples: Sequence[int] = (1, 2, 4, 8, 16, 32, 64),
+    rounds: int = 5,
 ) -> list[Sampling]:
-    """The closed form first, then each number of samples: an image of each, and the time of its integrals, in turns, on the same chords.
+    """The closed form first, then each number of samples: an image of each, and the time of its integrals, in turns, on
+    the same chords.
 
     Raises:
         ConfigError: the model's density is no sum of cosines, which alone can be done both ways.
     """
     form = lowered.density
     if not isinstance(form, Cosine):
-        raise ConfigError(f"density {type(form).__name__} has no closed form that sampling could be compared with; expected Cosine")
+        raise ConfigError(
+            f"density {type(form).__name__} has no closed form that sampling could be compared with; expected Cosine"
+        )
     asked: list[Pairs] = []
     ways, images = [], []
     for count in (0, *samples):
@@ -95,7 +104,9 @@ def compare_sampling(
         images.append(render(replace(lowered, density=own, shade=None), camera, None, settings).rgb.double())
         ways.append(replace(own, asked=()))
     names = [field.name for field in fields(Pairs) if field.name != "origin"]
-    all_at_once = Pairs(**{name: torch.cat([getattr(p, name) for p in asked]) for name in names}, origin=camera.position.double())
+    all_at_once = Pairs(
+        **{name: torch.cat([getattr(p, name) for p in asked]) for name in names}, origin=camera.position.double()
+    )
     seconds: list[list[float]] = [[] for _ in ways]
     for number in range(rounds):
         for i in (*range(number % len(ways), len(ways)), *range(number % len(ways))):
@@ -103,6 +114,8 @@ def compare_sampling(
             ways[i].optical_depth(all_at_once)
             seconds[i].append(time.perf_counter() - start)
     return [
-        Sampling(way.samples, psnr(image, images[0]), float((image - images[0]).abs().max()), median(took), len(all_at_once))
+        Sampling(
+            way.samples, psnr(image, images[0]), float((image - images[0]).abs().max()), median(took), len(all_at_once)
+        )
         for way, image, took in zip(ways, images, seconds, strict=True)
     ]

@@ -1,4 +1,5 @@
-"""How far points lie from the cameras that see them, and the near plane and extent that follow: no length of a scene is known beforehand."""
+"""How far points lie from the cameras that see them, and the near plane and extent that follow: no length of a scene is
+known beforehand."""
 
 from __future__ import annotations
 
@@ -30,7 +31,9 @@ def seen_depths(means: Tensor, cameras: Sequence[AnyCamera]) -> tuple[float, flo
     Where no camera sees one, the distances of all points count.
     """
     means = means.detach().double().cpu()[:: max(len(means) // _POINTS, 1)]
-    cameras = [replace(c, viewmat=c.viewmat.detach().double().cpu()) for c in cameras[:: max(len(cameras) // _CAMERAS, 1)]]
+    cameras = [
+        replace(c, viewmat=c.viewmat.detach().double().cpu()) for c in cameras[:: max(len(cameras) // _CAMERAS, 1)]
+    ]
     found = []
     for camera in cameras:
         if isinstance(camera, Camera):
@@ -43,7 +46,8 @@ def seen_depths(means: Tensor, cameras: Sequence[AnyCamera]) -> tuple[float, flo
 
 
 def scene_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]) -> float:
-    """The data set's extent, or where that is below 1/100 of the median depth of points (N, 3), as on a tripod, that depth."""
+    """The data set's extent, or where that is below 1/100 of the median depth of points (N, 3), as on a tripod, that
+    depth."""
     _, depth = seen_depths(means, cameras)
     return extent if extent >= _LEAST_EXTENT * depth else depth
 

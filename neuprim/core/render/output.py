@@ -29,15 +29,19 @@ class Tally:
     rows: Tensor | None = None
 
     def of_all(self, count: int) -> tuple[Tensor, Tensor]:
-        """(count,) weight and error_weight of all primitives of the model, zero for those that were left out of the frame."""
+        """(count,) weight and error_weight of all primitives of the model, zero for those that were left out of the
+        frame."""
         if self.rows is None:
             return self.weight, self.error_weight
-        weight, error_weight = (sums.new_zeros(count).index_copy_(0, self.rows, sums) for sums in (self.weight, self.error_weight))
+        weight, error_weight = (
+            sums.new_zeros(count).index_copy_(0, self.rows, sums) for sums in (self.weight, self.error_weight)
+        )
         return weight, error_weight
 
 
 def together(tallies: Sequence[Tally], count: int) -> Tally:
-    """The sums over several frames of a model with ``count`` primitives, one after the other, as several processes add them up, too."""
+    """The sums over several frames of a model with ``count`` primitives, one after the other, as several processes add
+    them up, too."""
     weight, error = tallies[0].of_all(count)
     for tally in tallies[1:]:
         more = tally.of_all(count)
@@ -115,8 +119,8 @@ class RenderOutput:
     Attributes:
         rgb: (H, W, C) in the model's colour space, composited over the background.
         alpha: (H, W) accumulated opacity 1 - T.
-        depth: (H, W) weighted mean camera-z (ray distance for a ``RayCamera``) of the chord middles, 0 where nothing is hit; None unless asked for.
-        stats: see :class:`RenderStats`.
+        depth: (H, W) weighted mean camera-z (ray distance for a ``RayCamera``) of the chord middles, 0 where nothing is
+        hit; None unless asked for. stats: see :class:`RenderStats`.
     """
 
     rgb: Tensor
@@ -125,7 +129,8 @@ class RenderOutput:
     stats: RenderStats
 
     def watch(self, error: Tensor) -> Tally:
-        """Let the backward pass tell which primitives were seen, and which had a part in an error; call it before ``backward()``.
+        """Let the backward pass tell which primitives were seen, and which had a part in an error; call it before
+        ``backward()``.
 
         Args:
             error: (H, W) any measure of what is wrong at each pixel; constant, no gradient reaches it.
@@ -141,7 +146,8 @@ class RenderOutput:
 
 
 def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
-    """(H, W) sum of w z over sum of w; 0 where nothing is hit. The weights of a ray telescope: their sum is its alpha."""
+    """(H, W) sum of w z over sum of w; 0 where nothing is hit. The weights of a ray telescope: their sum is its
+    alpha."""
     hit = alpha > 0
     if not (torch.is_grad_enabled() and (weighted.requires_grad or alpha.requires_grad)):
         return (weighted / alpha).masked_fill_(~hit, 0.0)

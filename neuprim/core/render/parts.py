@@ -21,7 +21,8 @@ __all__ = ["render_parts"]
 def render_parts(
     geometry: Geometry, density: LoweredDensity, parts: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """(P, H, W) opacities and mean depths of the parts, in their order; those without any primitive may be left out. No gradients.
+    """(P, H, W) opacities and mean depths of the parts, in their order; those without any primitive may be left out. No
+    gradients.
 
     In one frame where the backend can, else in one for each part: the images are the same, bit for bit.
 
@@ -49,7 +50,9 @@ def render_parts(
                 continue
             own = slice(first, end)
             try:
-                output = render_lowered(Lowered(geometry[own], density.rows(own), Constant(black.rgb[own])), camera, settings)
+                output = render_lowered(
+                    Lowered(geometry[own], density.rows(own), Constant(black.rgb[own])), camera, settings
+                )
             except NonFiniteError:
                 refuse_non_finite(whole)
                 raise

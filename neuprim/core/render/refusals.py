@@ -29,7 +29,13 @@ def refuse_non_finite(lowered: Lowered) -> None:
             raise NonFiniteError(f"quats of primitive {int(zero.nonzero()[0])} is zero; expected a non-zero quaternion")
         logs = g.log_scales.double()
         top = logs.amax(dim=-1, keepdim=True) if g.count else logs
-        beyond = (top.exp() > torch.finfo(torch.float32).max) | (top.exp() == 0) | ((logs - top).exp() == 0).any(dim=-1, keepdim=True)
+        beyond = (
+            (top.exp() > torch.finfo(torch.float32).max)
+            | (top.exp() == 0)
+            | ((logs - top).exp() == 0).any(dim=-1, keepdim=True)
+        )
         if bool(beyond.any()):
             row = int(beyond[:, 0].nonzero()[0])
-            raise NonFiniteError(f"log_scales of primitive {row} is {g.log_scales[row].tolist()}: the semi-axes leave the range of float32")
+            raise NonFiniteError(
+                f"log_scales of primitive {row} is {g.log_scales[row].tolist()}: the semi-axes leave the range of float32"
+            )

@@ -21,10 +21,14 @@ def _pool(image: Tensor, n: int) -> Tensor:
     return image.reshape(h, n, w, n, *image.shape[2:]).mean((1, 3))
 
 
-def render_samples(draw: Draw, lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
-    """One frame of ``samples`` x ``samples`` rays per pixel by a backend's ``draw``; memory and time grow with samples^2.
+def render_samples(
+    draw: Draw, lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings
+) -> RenderOutput:
+    """One frame of ``samples`` x ``samples`` rays per pixel by a backend's ``draw``; memory and time grow with
+    samples^2.
 
-    rgb and alpha are means over the rays; depth is their mean weighted by alpha, the mean over everything the pixel shows.
+    rgb and alpha are means over the rays; depth is their mean weighted by alpha, the mean over everything the pixel
+    shows.
     """
     n = settings.samples
     fine = draw(lowered, camera.resized(camera.width * n, camera.height * n), background, replace(settings, samples=1))

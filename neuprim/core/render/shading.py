@@ -22,7 +22,8 @@ Draw = Callable[..., RenderOutput]
 
 
 def points_seen(depth: Tensor, camera: AnyCamera) -> Tensor:
-    """(H, W, 3) float64 scene points at a depth image (H, W): camera-z, or distance for a ``RayCamera``; no gradient."""
+    """(H, W, 3) float64 scene points at a depth image (H, W): camera-z, or distance for a ``RayCamera``; no
+    gradient."""
     depth = depth.detach().double()
     view = device.beside(camera.viewmat.detach(), depth)
     if isinstance(camera, RayCamera):
@@ -37,7 +38,9 @@ def points_seen(depth: Tensor, camera: AnyCamera) -> Tensor:
 def with_shade(draw: Draw) -> Draw:
     """The same, with the frame's matter, not its background, times ``lowered.shade`` at each pixel's mean depth."""
 
-    def shaded(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
+    def shaded(
+        lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings
+    ) -> RenderOutput:
         assert lowered.shade is not None
         output = draw(lowered, camera, background, replace(settings, depth=True))
         assert output.depth is not None

@@ -1,5 +1,6 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Adam over all parameters of a model in two launches on a card: one that looks for numbers that are not finite, one that moves.
+"""Adam over all parameters of a model in two launches on a card: one that looks for numbers that are not finite, one
+that moves.
 
 In torch code a step is a hundred launches, which take longer than a small frame. Warp is imported with this module.
 """
@@ -65,7 +66,8 @@ def _kernels() -> tuple[Any, Any]:
         values: _POINTERS, grads: _POINTERS, firsts: _POINTERS, seconds: _POINTERS, ends: _LONGS, widths: _LONGS, rates: _FLOATS,
         beta1: float, beta2: float, rest1: float, rest2: float, log1: float, log2: float, age: wp.array(dtype=wp.int64), bad: wp.array(dtype=wp.int32),
     ):  # fmt: skip
-        """``widths``: numbers per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of the betas; ``age``: steps of each row, this one included."""
+        """``widths``: numbers per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of
+        the betas; ``age``: steps of each row, this one included."""
         n = wp.int64(wp.tid())
         if bad[0] == 0:
             k = int(0)
@@ -89,7 +91,8 @@ def adam_rows(
     values: Sequence[Tensor], grads: Sequence[Tensor], firsts: Sequence[Tensor], seconds: Sequence[Tensor], rates: Sequence[float],
     age: Tensor, betas: tuple[float, float], logs: tuple[float, float],
 ) -> bool:  # fmt: skip
-    """One step in place; whether all gradients were finite, and if not nothing has changed. The host waits for the device once.
+    """One step in place; whether all gradients were finite, and if not nothing has changed. The host waits for the
+    device once.
 
     Args:
         values, grads, firsts, seconds: (N, ...) float32, contiguous, none empty.
@@ -108,14 +111,21 @@ def adam_rows(
             total += value.numel()
             ends.append(total)
         spare = TOGETHER - len(ends)
-        pointers = [_POINTERS(*[x.data_ptr() for x in group[some]], *[0] * spare) for group in (values, grads, firsts, seconds)]
+        pointers = [
+            _POINTERS(*[x.data_ptr() for x in group[some]], *[0] * spare) for group in (values, grads, firsts, seconds)
+        ]
         widths = _LONGS(*[value.numel() // value.shape[0] for value in values[some]], *[1] * spare)
-        groups.append((total, pointers, _LONGS(*ends, *[total + 1] * spare), widths, _FLOATS(*rates[some], *[0.0] * spare)))
+        groups.append(
+            (total, pointers, _LONGS(*ends, *[total + 1] * spare), widths, _FLOATS(*rates[some], *[0.0] * spare))
+        )
     flag = array(bad, wp.int32)
     for total, pointers, ends_, _, _ in groups:
         launch(check, total, (pointers[1], ends_, flag), device)
     for total, pointers, ends_, widths, own in groups:
         launch(
-            move, total, (*pointers, ends_, widths, own, *betas, *(1 - beta for beta in betas), *logs, array(age, wp.int64), flag), device
+            move,
+            total,
+            (*pointers, ends_, widths, own, *betas, *(1 - beta for beta in betas), *logs, array(age, wp.int64), flag),
+            device,
         )
     return int(bad) == 0

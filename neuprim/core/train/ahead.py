@@ -12,11 +12,13 @@ __all__ = ["Ahead"]
 
 
 class Ahead:
-    """Reads pixels one view ahead, in a thread of its own; which views are looked at, and in which order, does not depend on it.
+    """Reads pixels one view ahead, in a thread of its own; which views are looked at, and in which order, does not
+    depend on it.
 
     Args:
         read: (index of a view) -> its pixels, where they are needed; the same every time.
-        room: bytes of pixels that are kept instead of read again: decoding and copying a large view takes longer than a step.
+        room: bytes of pixels that are kept instead of read again: decoding and copying a large view takes longer than a
+        step.
     """
 
     def __init__(self, read: Callable[[int], Pixels], room: int) -> None:
@@ -26,7 +28,8 @@ class Ahead:
         self._next: tuple[int, Future[Pixels]] | None = None
 
     def take(self, index: int, following: int | None) -> Pixels:
-        """Pixels of a view, after which comes ``following``, if that is known; what went wrong in reading them is raised here."""
+        """Pixels of a view, after which comes ``following``, if that is known; what went wrong in reading them is
+        raised here."""
         found, self._next = self._next, None
         if index in self._kept:
             pixels = self._kept[index]

@@ -14,8 +14,9 @@ __all__ = ["AngularSize"]
 class AngularSize:
     """Keeps every primitive's largest semi-axis below a share of its distance to the nearest training camera.
 
-    What hovers in front of one camera covers few of the others' pixels, so that images alone do not keep it from growing: it learns the mean of
-    what is behind it and veils the subject in a view from between two cameras. What is far may be large.
+    What hovers in front of one camera covers few of the others' pixels, so that images alone do not keep it from
+    growing: it learns the mean of what is behind it and veils the subject in a view from between two cameras. What is
+    far may be large.
 
     Args:
         views: the training views.

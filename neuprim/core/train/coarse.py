@@ -14,8 +14,8 @@ _SMALLEST = 16
 
 
 def reduction(progress: float, coarse: int, until: float) -> int:
-    """Whole factor at this used share of the budget: ``coarse`` at first, then half of it, rounded down, and so on, each for an equal
-    share, 1 from ``until`` on."""
+    """Whole factor at this used share of the budget: ``coarse`` at first, then half of it, rounded down, and so on,
+    each for an equal share, 1 from ``until`` on."""
     if coarse <= 1 or progress >= until:
         return 1
     stages = coarse.bit_length() - 1
@@ -23,9 +23,11 @@ def reduction(progress: float, coarse: int, until: float) -> int:
 
 
 def reduced(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
-    """The view on pixels ``factor`` times as large, averaged; what is left over at the right and at the bottom is cut off.
+    """The view on pixels ``factor`` times as large, averaged; what is left over at the right and at the bottom is cut
+    off.
 
-    Colours are premultiplied, so that the mean is that of what a camera would see. A large pixel counts where all of its parts do.
+    Colours are premultiplied, so that the mean is that of what a camera would see. A large pixel counts where all of
+    its parts do.
     """
     camera = view.camera
     while factor > 1 and min(camera.width, camera.height) // factor < _SMALLEST:

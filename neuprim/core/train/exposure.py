@@ -16,8 +16,8 @@ _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 class Exposures:
     """A factor per training view and channel, with which a drawn image is multiplied before it is compared.
 
-    Factors are learned beside the model, by Adam, each when its view is seen. Their geometric mean over the views stays 1, so that the model keeps the
-    photographs' mean exposure, which is what held-out views are drawn with.
+    Factors are learned beside the model, by Adam, each when its view is seen. Their geometric mean over the views stays
+    1, so that the model keeps the photographs' mean exposure, which is what held-out views are drawn with.
 
     Args:
         views: training views.
@@ -39,7 +39,8 @@ class Exposures:
         return rgb * gain.exp()
 
     def gradient(self, index: int) -> list[float] | None:
-        """Of the factors of a view that was applied, after its backward pass: a number per channel; None where nothing came back."""
+        """Of the factors of a view that was applied, after its backward pass: a number per channel; None where nothing
+        came back."""
         grad = self._now.pop(index).grad
         return None if grad is None else [float(x) for x in grad.tolist()]
 
@@ -70,7 +71,12 @@ class Exposures:
         """
         for name, own in self.state().items():
             given = state.get(name)
-            if given is None or given.shape != own.shape or given.dtype != own.dtype or not bool(torch.isfinite(given.double()).all()):
+            if (
+                given is None
+                or given.shape != own.shape
+                or given.dtype != own.dtype
+                or not bool(torch.isfinite(given.double()).all())
+            ):
                 found = "missing" if given is None else f"{given.dtype} {tuple(given.shape)}"
                 raise ValueError(f"exposure.{name} is {found}; expected finite {own.dtype} {tuple(own.shape)}")
         device = self.log_gain.device

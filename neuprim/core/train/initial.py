@@ -26,12 +26,16 @@ _USUAL_OPACITY = 0.5
 """Of Gaussians that say how large they are, but not how opaque."""
 
 
-def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, settings: ModelSettings, seed: int) -> Primitives:
-    """Primitives on the data set's starting points, as large as their neighbours are far (RMS distance to the 3 nearest).
+def initial_model(
+    density: DensityField, colour: ColourField, dataset: Dataset, settings: ModelSettings, seed: int
+) -> Primitives:
+    """Primitives on the data set's starting points, as large as their neighbours are far (RMS distance to the 3
+    nearest).
 
-    ``model.init.points``: "matter" (the data set's own), "box" (anywhere in its box), or a .ply file of points or 3D Gaussians in the
-    coordinates of the data's files; the latter bring sizes, orientations and opacities of their own. ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``:
-    share of the primitives that start where views show something and the data set has no points, for photographs; 0 unless said.
+    ``model.init.points``: "matter" (the data set's own), "box" (anywhere in its box), or a .ply file of points or 3D
+    Gaussians in the coordinates of the data's files; the latter bring sizes, orientations and opacities of their own.
+    ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``: share of the primitives that start where
+    views show something and the data set has no points, for photographs; 0 unless said.
 
     Raises:
         ConfigError: no such setting, or a setting with an impossible value.
@@ -55,15 +59,21 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
     if len(cloud.means) == 0:
         raise DataError(f"{dataset.name}: no starting points found; expected points or images with visible content")
     if not bool((views_that_see(dataset.train, cloud.means) > 0).any()):
-        raise DataError(f"{dataset.name}: none of {len(cloud.means)} starting points is in the image of a training camera; {NOT_SEEN}")
-    extent = scene_extent(dataset.extent, cloud.means, [dataset.train.view(i).camera for i in range(len(dataset.train))])
+        raise DataError(
+            f"{dataset.name}: none of {len(cloud.means)} starting points is in the image of a training camera; {NOT_SEEN}"
+        )
+    extent = scene_extent(
+        dataset.extent, cloud.means, [dataset.train.view(i).camera for i in range(len(dataset.train))]
+    )
     if len(cloud.means) == 1:
         scales = torch.full((1,), 0.1 * extent)
     else:
         neighbours = min(3, len(cloud.means) - 1)
         distance = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=neighbours + 1)[0][:, 1:])
         scales = distance.square().mean(dim=1).sqrt().clamp_min(1e-6 * extent).float()
-    context = InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions, steps=cloud.steps)
+    context = InitContext(
+        cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions, steps=cloud.steps
+    )
     factor = context.number("scale", 1.0, 0)
     context.scales, context.quats, context.alphas = scales * factor, cloud.quats, cloud.alphas
     axes = cloud.axes
@@ -81,12 +91,16 @@ def _surrounded(cloud: PointCloud, dataset: Dataset, settings: ModelSettings, ge
     """The points, a share of them (``model.init.surroundings``) replaced by what views show where there are none."""
     share = settings.init.get("surroundings", 0.0)
     if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
-        raise ConfigError(f"model.init.surroundings={share!r}: expected a share of the primitives, at least 0 and below 1")
+        raise ConfigError(
+            f"model.init.surroundings={share!r}: expected a share of the primitives, at least 0 and below 1"
+        )
     if not share:
         return cloud
     if cloud.conditions:
         named = ", ".join(cloud.conditions)
-        raise ConfigError(f"model.init.surroundings={share!r}: matter of {dataset.name} depends on {named}; expected a scene at rest")
+        raise ConfigError(
+            f"model.init.surroundings={share!r}: matter of {dataset.name} depends on {named}; expected a scene at rest"
+        )
     own = subset(cloud, min(len(cloud.means), round((1.0 - share) * settings.primitives)), generator)
     more = surrounding_points(dataset.train, own, settings.primitives - len(own.means), generator)
     return PointCloud(torch.cat([own.means, more.means]), torch.cat([own.colors, more.colors]))

@@ -1,7 +1,8 @@
-"""Losses of an image: the photometric one, (1 - lambda) L1 + lambda (1 - SSIM), and three for linear light of high dynamic range.
+"""Losses of an image: the photometric one, (1 - lambda) L1 + lambda (1 - SSIM), and three for linear light of high
+dynamic range.
 
-Each factory takes the settings that a :class:`~neuprim.core.extensions.LossExtension` or a task's ``loss`` gets. Of what a step knows
-beside the images they read nothing: masked pixels are equal in both.
+Each factory takes the settings that a :class:`~neuprim.core.extensions.LossExtension` or a task's ``loss`` gets. Of
+what a step knows beside the images they read nothing: masked pixels are equal in both.
 """
 
 from __future__ import annotations
@@ -74,8 +75,12 @@ def compressed(settings: Mapping[str, Any]) -> Loss:
 
 
 def relative(settings: Mapping[str, Any]) -> Loss:
-    """Squared error over the squared rendered value (Mildenhall et al. 2022, RawNeRF), which carries no gradient itself."""
-    return _named("relative", lambda rendered, truth: ((rendered - truth) / (rendered.detach().clamp_min(0.0) + _DARK)).square().mean())
+    """Squared error over the squared rendered value (Mildenhall et al. 2022, RawNeRF), which carries no gradient
+    itself."""
+    return _named(
+        "relative",
+        lambda rendered, truth: ((rendered - truth) / (rendered.detach().clamp_min(0.0) + _DARK)).square().mean(),
+    )
 
 
 def _named(name: str, measure: Callable[[Tensor, Tensor], Tensor]) -> Loss:

@@ -26,8 +26,11 @@ BETA1, EPS = 0.9, 1e-15
 _CHUNK_NUMBERS = 65_536  # numbers per unit of work; fixed, although the result does not depend on it
 
 
-def adam_step_reference(value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate: float, age: Tensor, beta2: float = 0.999) -> None:
-    """One in-place Adam step (Kingma and Ba 2015) of an (N, ...) tensor; ``age`` (N,) counts each row's steps, this one included."""
+def adam_step_reference(
+    value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate: float, age: Tensor, beta2: float = 0.999
+) -> None:
+    """One in-place Adam step (Kingma and Ba 2015) of an (N, ...) tensor; ``age`` (N,) counts each row's steps, this one
+    included."""
     shape = (-1, *[1] * (value.dim() - 1))
     m.mul_(BETA1).add_(grad, alpha=1 - BETA1)
     v.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
@@ -38,17 +41,30 @@ def adam_step_reference(value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate:
 
 @exact_kernel
 def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, correction, root):  # type: ignore[no-untyped-def]
-    """The same on flat float32 arrays of ``width`` numbers per row; of each age, correction = 1 / c1 and root = sqrt(1 / c2).
+    """The same on flat float32 arrays of ``width`` numbers per row; of each age, correction = 1 / c1 and root = sqrt(1
+    / c2).
 
-    Rows of one age stand together nearly everywhere, so they are taken in runs, which end at ``breaks``: long loops that vectorise.
+    Rows of one age stand together nearly everywhere, so they are taken in runs, which end at ``breaks``: long loops
+    that vectorise.
     """
-    b1, b2, one_b1, one_b2, eps = np.float32(BETA1), np.float32(beta2), np.float32(1 - BETA1), np.float32(1 - beta2), np.float32(EPS)
+    b1, b2, one_b1, one_b2, eps = (
+        np.float32(BETA1),
+        np.float32(beta2),
+        np.float32(1 - BETA1),
+        np.float32(1 - beta2),
+        np.float32(EPS),
+    )
     i, run = start, np.searchsorted(breaks, start, "right")
     while i < stop:
         j = min(stop, breaks[run]) if run < breaks.shape[0] else stop
         run += 1
         a, r = np.float32(rate * correction[age[i]]), np.float32(root[age[i]])
-        x, g, mi, vi = value[i * width : j * width], grad[i * width : j * width], m[i * width : j * width], v[i * width : j * width]
+        x, g, mi, vi = (
+            value[i * width : j * width],
+            grad[i * width : j * width],
+            m[i * width : j * width],
+            v[i * width : j * width],
+        )
         for k in range(x.shape[0]):
             mk = b1 * mi[k] + one_b1 * g[k]
             vk = b2 * vi[k] + one_b2 * g[k] * g[k]
@@ -63,7 +79,9 @@ def _largest_bits(x):  # type: ignore[no-untyped-def]
     """The largest of float32 numbers' bits without their signs: those of infinity or more where one is not finite."""
     bits = x.view(np.uint32)
     largest = np.uint32(0)
-    for k in range(bits.shape[0]):  # of whole numbers the largest is found in any order: a loop that vectorises, which a sum is not
+    for k in range(
+        bits.shape[0]
+    ):  # of whole numbers the largest is found in any order: a loop that vectorises, which a sum is not
         largest = max(largest, bits[k] & np.uint32(0x7FFFFFFF))
     return largest
 
@@ -90,7 +108,8 @@ def _all_finite(gradients: list[Tensor]) -> bool:
 
 @lru_cache(maxsize=4)
 def _corrections(beta2: float, ages: int) -> tuple[np.ndarray, np.ndarray]:
-    """1 / c1 and sqrt(1 / c2) of the ages 0 to ``ages`` - 1; powers take longer than all else that a step does per row."""
+    """1 / c1 and sqrt(1 / c2) of the ages 0 to ``ages`` - 1; powers take longer than all else that a step does per
+    row."""
     age = np.arange(1.0, ages)
     return np.append(0.0, 1 / (1 - BETA1**age)), np.append(0.0, np.sqrt(1 / (1 - beta2**age)))
 
@@ -143,7 +162,19 @@ class RowAdam:
                 rows = max(_CHUNK_NUMBERS // spec.size, 1)
                 starts = range(0, value.shape[0], rows)
                 work += [
-                    (r, min(r + rows, value.shape[0]), spec.size, *flat, rate, self.beta2, age, breaks, correction, root) for r in starts
+                    (
+                        r,
+                        min(r + rows, value.shape[0]),
+                        spec.size,
+                        *flat,
+                        rate,
+                        self.beta2,
+                        age,
+                        breaks,
+                        correction,
+                        root,
+                    )
+                    for r in starts
                 ]
             else:
                 adam_step_reference(value, grad, m, v, rate, self.age, self.beta2)
@@ -155,7 +186,8 @@ class RowAdam:
         parallel_for(share, len(work), 1, 0)
 
     def _step_kernels(self, updates: list[tuple[ParameterSpec, Tensor, Tensor]], rates: dict[str, float]) -> bool:
-        """The update in two launches on a card; False, and nothing done, where it cannot be or a gradient is not finite."""
+        """The update in two launches on a card; False, and nothing done, where it cannot be or a gradient is not
+        finite."""
         from neuprim.core.train.adam_warp import adam_rows
 
         values, grads = [value for _, value, _ in updates], [grad for _, _, grad in updates]
@@ -167,7 +199,14 @@ class RowAdam:
             return False
         age, betas = self.age + 1, (BETA1, self.beta2)
         if not adam_rows(
-            values, grads, first, second, [rates[s.name] for s, _, _ in updates], age, betas, (math.log(BETA1), math.log(self.beta2))
+            values,
+            grads,
+            first,
+            second,
+            [rates[s.name] for s, _, _ in updates],
+            age,
+            betas,
+            (math.log(BETA1), math.log(self.beta2)),
         ):
             return False
         self.age = age
@@ -191,7 +230,8 @@ class RowAdam:
             value.sub_((m * step).div_(size.mul_(slow).add_(EPS)))
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
-        """Follow a change of population: keep ``rows`` (in their new order); where ``fresh`` is set, start again from nothing."""
+        """Follow a change of population: keep ``rows`` (in their new order); where ``fresh`` is set, start again from
+        nothing."""
         for moments in (self.m, self.v):
             for name in moments:
                 moments[name] = moments[name][rows]

@@ -18,7 +18,8 @@ from neuprim.core.volumes.points import Shares, values_at
 __all__ = ["PointStep", "point_step"]
 
 _COMPONENT = 0.1
-"""Weight of an extinction's components: it teaches the primitives' shares, whose rate does not depend on it, and hardly moves primitives."""
+"""Weight of an extinction's components: it teaches the primitives' shares, whose rate does not depend on it, and hardly
+moves primitives."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,9 @@ def point_step(
 ) -> PointStep:
     """Look what the model holds at points, and compare.
 
-    The loss is the mean square of errors over their scale: the extinction's, which is the square of its relative L2 error but for how
-    the points are spread, :data:`_COMPONENT` times that of each of its components, and ``train.voxel_colour`` times the source's.
+    The loss is the mean square of errors over their scale: the extinction's, which is the square of its relative L2
+    error but for how the points are spread, :data:`_COMPONENT` times that of each of its components, and
+    ``train.voxel_colour`` times the source's.
     """
     check_samples(samples, dataset)
     colour = samples.source is not None and settings.voxel_colour > 0

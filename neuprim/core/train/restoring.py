@@ -1,4 +1,5 @@
-"""A training's state on its way to a file and back: what is kept by row, and whether what was read can be gone on from."""
+"""A training's state on its way to a file and back: what is kept by row, and whether what was read can be gone on
+from."""
 
 from __future__ import annotations
 
@@ -82,13 +83,23 @@ def restored(
         for name, value in (*model.params.items(), *optimizer.m.items(), *optimizer.v.items()):
             shape = model.params[name].shape
             if value.shape != shape or value.dtype != torch.float32 or not bool(torch.isfinite(value).all()):
-                raise ValueError(f"{name} or a moment of it is {value.dtype} {tuple(value.shape)}; expected finite float32 {tuple(shape)}")
+                raise ValueError(
+                    f"{name} or a moment of it is {value.dtype} {tuple(value.shape)}; expected finite float32 {tuple(shape)}"
+                )
         if optimizer.age.shape != (model.count,) or optimizer.age.dtype != torch.int64:
-            raise ValueError(f"ages are {optimizer.age.dtype} {tuple(optimizer.age.shape)}; expected int64 ({model.count},)")
+            raise ValueError(
+                f"ages are {optimizer.age.dtype} {tuple(optimizer.age.shape)}; expected int64 ({model.count},)"
+            )
         if model.count and not 0 <= int(optimizer.age.min()) <= int(optimizer.age.max()) <= step:
-            raise ValueError(f"ages are {int(optimizer.age.min())} to {int(optimizer.age.max())} steps; expected 0 to {step}")
+            raise ValueError(
+                f"ages are {int(optimizer.age.min())} to {int(optimizer.age.max())} steps; expected 0 to {step}"
+            )
         order = tensors["order"]
-        if order.dim() != 1 or order.dtype != torch.int64 or (len(order) and (int(order.min()) < 0 or int(order.max()) >= views)):
+        if (
+            order.dim() != 1
+            or order.dtype != torch.int64
+            or (len(order) and (int(order.min()) < 0 or int(order.max()) >= views))
+        ):
             raise ValueError("the order of views is out of range")
         generator = torch.Generator()
         generator.set_state(tensors["generator"])

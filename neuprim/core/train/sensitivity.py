@@ -1,10 +1,11 @@
 """What images would lose without a primitive, or without a piece of it, found by one backward pass per view.
 
-An image is J delta different when numbers change by delta, to first order. For random signs z per pixel and channel, the mean of (z . J delta)^2
-is the sum of squares |J delta|^2 (Hutchinson 1990, for the trace), and z . J is what a backward pass gives. So views are enough to know every
-piece's squared effect at once. A whole primitive's part in a pixel is its weight w = alpha T times how much its colour differs from what is
-behind it; its sum of w^2 comes the same way out of the frame's tally. Squares matter: primitives of equal summed weight differ much in it, and
-on a trained chair those with the least w^2 cost a third of what those with the least w cost (docs/tradeoffs.md).
+An image is J delta different when numbers change by delta, to first order. For random signs z per pixel and channel,
+the mean of (z . J delta)^2 is the sum of squares |J delta|^2 (Hutchinson 1990, for the trace), and z . J is what a
+backward pass gives. So views are enough to know every piece's squared effect at once. A whole primitive's part in a
+pixel is its weight w = alpha T times how much its colour differs from what is behind it; its sum of w^2 comes the same
+way out of the frame's tally. Squares matter: primitives of equal summed weight differ much in it, and on a trained
+chair those with the least w^2 cost a third of what those with the least w cost (docs/tradeoffs.md).
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class Sensitivity:
         whole: (N,) of each primitive being gone; in views, for a difference of colour of 1 from what is behind it.
         seen: (N,) in how many of the views, or frames, a primitive was; of those in none nothing is known.
         pieces: name -> (N,) of each primitive's piece being zero.
-        columns: parameter -> (C,) float64, of each of its numbers when those of all primitives change by independent amounts of variance 1; of
+        columns: parameter -> (C,) float64, of each of its numbers when those of all primitives change by independent
+        amounts of variance 1; of
             "quats" by amounts across a quaternion of unit norm.
     """
 
@@ -60,7 +62,9 @@ class _Sums:
 
     def add(self, params: dict[str, Tensor]) -> None:
         """One pass: ``params`` with their gradients."""
-        gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()}
+        gradients = {
+            name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()
+        }
         for name, piece in self._pieces.items():
             self.pieces[name] += worth(piece, params, gradients).square().cpu()
         for name, own in self.columns.items():
@@ -71,11 +75,15 @@ class _Sums:
 
     def over(self, count: float, whole: Tensor, seen: Tensor) -> Sensitivity:
         """Means."""
-        pieces, columns = ({name: value / count for name, value in sums.items()} for sums in (self.pieces, self.columns))
+        pieces, columns = (
+            {name: value / count for name, value in sums.items()} for sums in (self.pieces, self.columns)
+        )
         return Sensitivity(whole / count, seen, pieces, columns)
 
 
-def sensitivity(model: Primitives, dataset: Dataset, views: Sequence[int], settings: RenderSettings, seed: int = 0) -> Sensitivity:
+def sensitivity(
+    model: Primitives, dataset: Dataset, views: Sequence[int], settings: RenderSettings, seed: int = 0
+) -> Sensitivity:
     """Effects over training views, on the processor.
 
     Args:
@@ -102,7 +110,8 @@ def sensitivity(model: Primitives, dataset: Dataset, views: Sequence[int], setti
 
 
 def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: int = 0, threads: int = 0) -> Sensitivity:
-    """Effects on the extinction at points, in units of its typical size: what images do not show of a volume that is known inside.
+    """Effects on the extinction at points, in units of its typical size: what images do not show of a volume that is
+    known inside.
 
     Args:
         draws: points of some frames.
@@ -112,7 +121,9 @@ def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: in
     whole, there, sums = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64), _Sums(model)
     for samples in draws:
         params = {name: value.detach().requires_grad_() for name, value in model.params.items()}
-        values = values_at(Primitives(model.density, model.colour, params), samples.conditions, samples.points, False, threads)
+        values = values_at(
+            Primitives(model.density, model.colour, params), samples.conditions, samples.points, False, threads
+        )
         signs = (2 * torch.randint(0, 2, (len(samples.points),), generator=generator) - 1).float()
         signs = device.from_host(signs / samples.sigma_scale / len(signs) ** 0.5, values.sigma.device)
         shares = values.watch(signs)

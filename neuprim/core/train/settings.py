@@ -32,7 +32,8 @@ class ModelSettings:
         sh_degree: spherical-harmonics degree of the colour, 0..3.
         sh_every: fraction of the budget after which one more SH band is unlocked; 0 unlocks all at once.
         init: free settings of the fields' initialisers, see the preset files.
-        reduced: what density and colour do with less of than the settings above say, as ``density.neurons=0`` and ``colour.degree=1``, one
+        reduced: what density and colour do with less of than the settings above say, as ``density.neurons=0`` and
+        ``colour.degree=1``, one
             after the other; what ``neuprim prune`` found that a scene does not require.
     """
 
@@ -43,7 +44,9 @@ class ModelSettings:
     sh_degree: Annotated[int, Range(0, 3)] = 3
     sh_every: Annotated[float, Range(at_least=0, says="a fraction of the budget, 0 for all bands at once")] = 0.1
     init: dict[str, Any] = field(default_factory=dict)
-    reduced: Annotated[list, Accepts(_says_less, "a list such as [density.neurons=0, colour.degree=1]")] = field(default_factory=list)
+    reduced: Annotated[list, Accepts(_says_less, "a list such as [density.neurons=0, colour.degree=1]")] = field(
+        default_factory=list
+    )
 
     def __post_init__(self) -> None:
         verify(self, "model")
@@ -54,15 +57,19 @@ class PopulationSettings:
     """How primitives are born, moved and removed. ``start`` and ``stop`` are fractions of the training budget.
 
     Attributes:
-        strategy: "fixed", "relocate" (the least used move to where the error is; the count is constant once it is reached) or "gradient" (clone,
+        strategy: "fixed", "relocate" (the least used move to where the error is; the count is constant once it is
+        reached) or "gradient" (clone,
             split and prune by the density network's gradient norm, as the authors do).
         every: steps between two interventions.
         fraction: relocate: the largest share of primitives moved at once.
-        idle: relocate: only primitives whose weight in the images since the last intervention is below this share of the mean
+        idle: relocate: only primitives whose weight in the images since the last intervention is below this share of
+        the mean
             primitive's move; null moves the least used ones, however much they do.
-        grow_to: relocate: how many primitives there are to be; where the start has fewer, those with the largest error split. null is
+        grow_to: relocate: how many primitives there are to be; where the start has fewer, those with the largest error
+        split. null is
             as many as ``model.primitives``, of which data may not offer enough points.
-        grow_from: relocate: how many of ``model.primitives`` there are at the start, as a share; the others are born where the error turns
+        grow_from: relocate: how many of ``model.primitives`` there are at the start, as a share; the others are born
+        where the error turns
             out to be largest. 1 starts with all that the data offer points for.
         grow_threshold, prune_threshold: gradient: on the mean norm of the density gradient.
         clone_scale, prune_scale: gradient: in units of the scene's extent.
@@ -76,7 +83,9 @@ class PopulationSettings:
     fraction: Annotated[float, Range(0, 1)] = 0.05
     idle: NotNegative | None = None
     grow_to: Annotated[int, Range(at_least=1)] | None = None
-    grow_from: Annotated[float, Range(above=0, at_most=1, says="a share of model.primitives, above 0 and at most 1")] = 1.0
+    grow_from: Annotated[
+        float, Range(above=0, at_most=1, says="a share of model.primitives, above 0 and at most 1")
+    ] = 1.0
     grow_threshold: NotNegative = 1e-5
     prune_threshold: NotNegative = 1e-6
     clone_scale: NotNegative = 0.01
@@ -97,30 +106,34 @@ class TrainSettings:
     elapsed/max_seconds.
 
     Attributes:
-        iterations: steps, each of ``views_per_step`` views; null leaves the budget to ``max_seconds``. A command line that types ``max_seconds``
+        iterations: steps, each of ``views_per_step`` views; null leaves the budget to ``max_seconds``. A command line
+        that types ``max_seconds``
             alone means that: all the seconds are used, however fast the machine.
         views_per_step: views that a step looks at; gradients are their mean. A card has room for several small images.
-        shard: under torchrun, whether each rank has a part of the primitives, with their gradients and moments, instead of all of them.
-        max_seconds: stop after this many seconds of training, if given (such a run is not bit-reproducible).
-        rates: learning rate by parameter name, over the specs' own.
-        rate_units: unit of a parameter's rate by its name, over the spec's own: "absolute" (a position's is in scene units a step), or
+        shard: under torchrun, whether each rank has a part of the primitives, with their gradients and moments, instead
+        of all of them. max_seconds: stop after this many seconds of training, if given (such a run is not
+        bit-reproducible). rates: learning rate by parameter name, over the specs' own.
+        rate_units: unit of a parameter's rate by its name, over the spec's own: "absolute" (a position's is in scene
+        units a step), or
             "extent" (the rate times the scene's extent, so that it does not depend on how large the scene is).
         coarse: factor by which training views are reduced at first; 1 for none. It is halved, rounded down, until
             ``coarse_until``, a fraction of the budget, from which on views are as they are.
-        angular_size: no primitive's largest semi-axis is more than this share of its distance to the nearest training camera; null for no limit.
-        exposure_rate: learning rate of a gain per training view and channel, for photographs that are not exposed alike, per step in
+        angular_size: no primitive's largest semi-axis is more than this share of its distance to the nearest training
+        camera; null for no limit. exposure_rate: learning rate of a gain per training view and channel, for photographs
+        that are not exposed alike, per step in
             which a view is seen; 0 for none. Held-out views are drawn with the training views' mean gain.
-        final_rate: the rates decay exponentially to this fraction of themselves at the end of the budget; 1 is constant.
-        cooldown: the last share of the budget, over which the rates also fall linearly to next to nothing, so that numbers settle; 0 for none.
-        adam_beta2: decay of Adam's second moment per step, in [0, 1).
+        final_rate: the rates decay exponentially to this fraction of themselves at the end of the budget; 1 is
+        constant. cooldown: the last share of the budget, over which the rates also fall linearly to next to nothing, so
+        that numbers settle; 0 for none. adam_beta2: decay of Adam's second moment per step, in [0, 1).
         warmup_steps: steps over which the rates rise linearly from zero.
-        supervision: what is learned from: "images", "voxels" (points of the files that the images were made of, where the data set has
+        supervision: what is learned from: "images", "voxels" (points of the files that the images were made of, where
+        the data set has
             them), "both", or "auto": both where the data set has voxels, else images.
         voxels_per_step: points of one frame that a step looks at.
         voxels_every: both: steps from one look at points to the next; each sees an image.
         voxel_weight: both: weight of the points' loss beside the images'.
-        voxel_colour: weight of the source radiance at the points beside their extinction; 0 leaves colours to the images.
-        loss: name of a loss that a package provides (``neuprim tasks`` lists them), or null for the task's own.
+        voxel_colour: weight of the source radiance at the points beside their extinction; 0 leaves colours to the
+        images. loss: name of a loss that a package provides (``neuprim tasks`` lists them), or null for the task's own.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
         anisotropy_weight, anisotropy_from: weight of mean(std over axes of s / min s), and the step it starts at.
         background: "white", "black", "random" or "auto" (the data set's own choice).
@@ -161,4 +174,6 @@ class TrainSettings:
     def __post_init__(self) -> None:
         verify(self, "train")
         if self.iterations is None and self.max_seconds is None:
-            raise ConfigError("train.iterations and train.max_seconds are both null; expected a budget, in steps, in seconds or both")
+            raise ConfigError(
+                "train.iterations and train.max_seconds are both null; expected a budget, in steps, in seconds or both"
+            )

@@ -1,8 +1,8 @@
 """L1 + SSIM with its analytic gradient, fused and separable, on all cores.
 
 SSIM over an 11-tap Gaussian window (sigma 1.5), valid windows only. With window means a = E[x], b = E[y],
-A = 2ab + c1, B = 2(E[xy] - ab) + c2, C = a^2 + b^2 + c1, D = E[xx] - a^2 + E[yy] - b^2 + c2: SSIM = AB/(CD). Its derivatives
-with respect to E[x], E[xx] and E[xy] are spread back with the adjoint of the same blur.
+A = 2ab + c1, B = 2(E[xy] - ab) + c2, C = a^2 + b^2 + c1, D = E[xx] - a^2 + E[yy] - b^2 + c2: SSIM = AB/(CD). Its
+derivatives with respect to E[x], E[xx] and E[xy] are spread back with the adjoint of the same blur.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ def _horizontal(out, V, step, count):  # type: ignore[no-untyped-def]
 
 @inline
 def _derivatives(s, n, scale):  # type: ignore[no-untyped-def]
-    """In place on blocks E[x], E[y], E[xx], E[yy], E[xy]: derivatives of scale x SSIM for E[x], E[xx], E[xy]; returns the sum of SSIM."""
+    """In place on blocks E[x], E[y], E[xx], E[yy], E[xy]: derivatives of scale x SSIM for E[x], E[xx], E[xy]; returns
+    the sum of SSIM."""
     total = f(0)
     for j in range(n):
         a, b = s[_EX + j], s[_EY + j]
@@ -149,7 +150,8 @@ _buffers = threading.local()
 
 
 def _bordered(rows: int, columns: int) -> Any:
-    """Three maps with a zero border. Reused by the next image of the same size in this thread: only the inside is ever written."""
+    """Three maps with a zero border. Reused by the next image of the same size in this thread: only the inside is ever
+    written."""
     maps = getattr(_buffers, "maps", None)
     if maps is None or maps.shape != (3, rows, columns):
         maps = _buffers.maps = np.zeros((3, rows, columns), np.float32)
@@ -178,7 +180,8 @@ class _Photometric(torch.autograd.Function):
 
 
 def photometric_fused(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, float]]:
-    """Same value and gradient as :func:`~neuprim.core.train.losses.photometric_reference`, float32 CPU images of at least 11 x 11."""
+    """Same value and gradient as :func:`~neuprim.core.train.losses.photometric_reference`, float32 CPU images of at
+    least 11 x 11."""
     parts: dict[str, float] = {}
     loss: Tensor = _Photometric.apply(rendered, truth, ssim_weight, parts)
     return loss, parts

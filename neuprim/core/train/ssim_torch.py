@@ -1,7 +1,8 @@
-"""L1 + SSIM with its analytic gradient in torch code: the twin of :mod:`neuprim.core.train.ssim_cpu`, see there for the derivation.
+"""L1 + SSIM with its analytic gradient in torch code: the twin of :mod:`neuprim.core.train.ssim_cpu`, see there for the
+derivation.
 
-The gradient is found with the value, as there, and blurs keep away from cuDNN, which may round to ten bits (TF32): variances are differences of
-blurs.
+The gradient is found with the value, as there, and blurs keep away from cuDNN, which may round to ten bits (TF32):
+variances are differences of blurs.
 """
 
 from __future__ import annotations
@@ -71,7 +72,8 @@ class _Photometric(torch.autograd.Function):
 
 
 def photometric_torch(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, float]]:
-    """Same value and gradient as :func:`~neuprim.core.train.losses.photometric_reference`, of images of at least 11 x 11 on any device."""
+    """Same value and gradient as :func:`~neuprim.core.train.losses.photometric_reference`, of images of at least 11 x
+    11 on any device."""
     parts: dict[str, float] = {}
     loss: Tensor = _Photometric.apply(rendered, truth, ssim_weight, parts)
     return loss, parts

@@ -1,8 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""L1 + SSIM with its analytic gradient in four launches on a card: the twin of :mod:`neuprim.core.train.ssim_cpu`, see there for the derivation.
+"""L1 + SSIM with its analytic gradient in four launches on a card: the twin of :mod:`neuprim.core.train.ssim_cpu`, see
+there for the derivation.
 
-Blurs are separable: a thread a number, eleven taps along a row, then along a column, and back again for the gradient. Warp is imported with
-this module.
+Blurs are separable: a thread a number, eleven taps along a row, then along a column, and back again for the gradient.
+Warp is imported with this module.
 """
 
 import functools
@@ -25,7 +26,9 @@ _C1, _C2 = wp.constant(0.01**2), wp.constant(0.03**2)
 @functools.cache
 def _kernels() -> tuple[Any, Any, Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
-    def along_rows(a: wp.array3d(dtype=float), b: wp.array3d(dtype=float), window: _Window, out: wp.array3d(dtype=_vec5)):
+    def along_rows(
+        a: wp.array3d(dtype=float), b: wp.array3d(dtype=float), window: _Window, out: wp.array3d(dtype=_vec5)
+    ):
         """(x, y, xx, yy, xy) blurred along rows of pixels; (H, W - 10, C)."""
         y, x, c = wp.tid()
         total = _vec5()
@@ -41,7 +44,9 @@ def _kernels() -> tuple[Any, Any, Any, Any]:
         out[y, x, c] = total
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
-    def compare(rows: wp.array3d(dtype=_vec5), window: _Window, S: wp.array3d(dtype=float), maps: wp.array3d(dtype=wp.vec3)):
+    def compare(
+        rows: wp.array3d(dtype=_vec5), window: _Window, S: wp.array3d(dtype=float), maps: wp.array3d(dtype=wp.vec3)
+    ):
         """SSIM of every window, (H - 10, W - 10, C), and its derivatives by the means of x, of x^2 and of x y."""
         y, x, c = wp.tid()
         total = _vec5()
@@ -95,7 +100,8 @@ def _kernels() -> tuple[Any, Any, Any, Any]:
 
 
 def similarity(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-    """Means of the absolute difference and of SSIM, (2,) float64, and (H, W, C) the gradient of (1 - weight) L1 + weight (1 - SSIM).
+    """Means of the absolute difference and of SSIM, (2,) float64, and (H, W, C) the gradient of (1 - weight) L1 +
+    weight (1 - SSIM).
 
     Args:
         rendered, truth: (H, W, C) float32 of at least 11 x 11 pixels, on one device.

@@ -15,8 +15,8 @@ __all__ = ["ImageStep", "StepReport", "of_views"]
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one step did. ``psnr`` is of the training view just seen (the mean of several), or of the extinction at points where no view was; ``change`` says what
-    the population did, if anything."""
+    """What one step did. ``psnr`` is of the training view just seen (the mean of several), or of the extinction at
+    points where no view was; ``change`` says what the population did, if anything."""
 
     step: int
     seconds: float

@@ -1,7 +1,7 @@
 """The training loop, for every task, in one sitting.
 
-A step: draw a view, render it, compare, go back, move the parameters, let the population react; ``train.supervision`` may put points of
-known extinction in a view's place or beside it. Everything that shapes
+A step: draw a view, render it, compare, go back, move the parameters, let the population react; ``train.supervision``
+may put points of known extinction in a view's place or beside it. Everything that shapes
 the next step is in :meth:`Trainer.state`, so that 2N steps equal N steps, a kill, a resume and N more, bit for bit.
 """
 
@@ -50,20 +50,26 @@ COLD = 0.02
 class Trainer:
     """Fits a model to the training views of a data set.
 
-    The model's tensors move to the device that the renderer's settings choose, and so does all that belongs to them; random numbers are
-    drawn on the processor, so that they are the same on every device.
+    The model's tensors move to the device that the renderer's settings choose, and so does all that belongs to them;
+    random numbers are drawn on the processor, so that they are the same on every device.
 
     Attributes:
         device: where the training's tensors are.
         extent: the unit of position rates and size limits, see :func:`~neuprim.core.render.near.scene_extent`.
         step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
-        stored: parameters -> what will be kept of them, with the gradients of the parameters: images are drawn of that. None: of themselves.
-        zeros: parameter -> (N, ...) bool of the numbers that stay zero; empty for none.
+        stored: parameters -> what will be kept of them, with the gradients of the parameters: images are drawn of that.
+        None: of themselves. zeros: parameter -> (N, ...) bool of the numbers that stay zero; empty for none.
         ranks: the processes that share a step's views; see :meth:`join`.
     """
 
     def __init__(
-        self, model: Primitives, dataset: Dataset, loss: Loss, settings: TrainSettings, renderer: RenderSettings, seed: int
+        self,
+        model: Primitives,
+        dataset: Dataset,
+        loss: Loss,
+        settings: TrainSettings,
+        renderer: RenderSettings,
+        seed: int,
     ) -> None:
         if len(dataset.train) == 0:
             raise DataError(f"{dataset.name}: the training split is empty")
@@ -75,7 +81,9 @@ class Trainer:
         if settings.supervision == "auto":
             settings = replace(settings, supervision="images" if dataset.points is None else "both")
         if settings.supervision != "images" and dataset.points is None:
-            raise ConfigError(f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images")
+            raise ConfigError(
+                f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images"
+            )
         self.model, self.dataset, self.loss = model, dataset, loss
         cameras = [dataset.train.view(i).camera for i in range(len(dataset.train))]
         self.settings, self.renderer = settings, replace(decided(renderer, model.params["means"], cameras), depth=False)
@@ -83,7 +91,9 @@ class Trainer:
         first = dataset.train.view(0)
         self.device = device_of(model, self.renderer, first.camera, first.conditions)
         model.params = model.to(self.device).params
-        self._ahead = Ahead(self._pixels, device.spare_memory(self.device) // 4) if self.device.type == device.CARD else None
+        self._ahead = (
+            Ahead(self._pixels, device.spare_memory(self.device) // 4) if self.device.type == device.CARD else None
+        )
         self.population = make_population(settings.population)
         self.angles = None if settings.angular_size is None else AngularSize(dataset.train, settings.angular_size)
         self.exposures = None
@@ -104,14 +114,16 @@ class Trainer:
         self._watch()
 
     def join(self, ranks: Alone) -> None:
-        """Train with others from here on: a step looks at ``train.views_per_step`` views of every rank. Where each has a part of the primitives, this
-        one keeps its own.
+        """Train with others from here on: a step looks at ``train.views_per_step`` views of every rank. Where each has
+        a part of the primitives, this one keeps its own.
 
         Raises:
             ConfigError: there are no views to share, or what is trained cannot be in parts.
         """
         if ranks.size > 1 and self.settings.supervision == "voxels":
-            raise ConfigError(f"train.supervision=voxels: there are no views that {ranks.size} ranks could share; expected one process")
+            raise ConfigError(
+                f"train.supervision=voxels: there are no views that {ranks.size} ranks could share; expected one process"
+            )
         self.ranks = ranks
         if ranks.parts:
             refuse_parts(self.settings, ranks.size)
@@ -152,7 +164,8 @@ class Trainer:
         return self.progress >= 1.0
 
     def rates(self) -> dict[str, float]:
-        """Learning rate of every parameter now: warm-up, exponential decay to ``final_rate`` at the end of the budget, cool-down."""
+        """Learning rate of every parameter now: warm-up, exponential decay to ``final_rate`` at the end of the budget,
+        cool-down."""
         s = self.settings
         factor = s.final_rate**self.progress
         if s.cooldown and self.progress > 1 - s.cooldown:
@@ -182,7 +195,9 @@ class Trainer:
         try:
             with limited(self.renderer.threads):
                 return self._train_step()
-        except RankError as error:  # the step is not done: what it drew is drawn again, by whoever goes on from this state
+        except (
+            RankError
+        ) as error:  # the step is not done: what it drew is drawn again, by whoever goes on from this state
             self.order = drawn[0]
             if drawn[1] is not None:
                 self.generator.set_state(drawn[1])
@@ -258,8 +273,8 @@ class Trainer:
         return self.ranks.count(self.model)
 
     def _deal(self, looks: int) -> list[tuple[int, int, Tensor, int | None, list[int]]]:
-        """Draw the views of a step; of this rank's, by turns: place in the step, view, background, the view that this rank looks at next, and those that
-        all ranks look at now.
+        """Draw the views of a step; of this rank's, by turns: place in the step, view, background, the view that this
+        rank looks at next, and those that all ranks look at now.
 
         All ranks draw all of them, so that their random numbers stay the same.
         """
@@ -268,7 +283,11 @@ class Trainer:
         later = int(self.order[self.ranks.rank]) if len(self.order) > self.ranks.rank else None
         following = [*(drawn[place][0] for place in mine[1:]), later]
         peers = [[index for index, _ in drawn[place - self.ranks.rank :][: self.ranks.size]] for place in mine]
-        return [(place, *drawn[place], then, now) for place, then, now in zip(mine, following, peers, strict=True)] if looks else []
+        return (
+            [(place, *drawn[place], then, now) for place, then, now in zip(mine, following, peers, strict=True)]
+            if looks
+            else []
+        )
 
     def _looks(self, peers: list[int], samples: PointSamples | None) -> list[Look]:
         """What all ranks look at now; points go with the last one's."""
@@ -296,7 +315,9 @@ class Trainer:
         loss.backward()
         return cost
 
-    def _look(self, progress: float, index: int, background: Tensor, following: int | None, shown: Primitives) -> ImageStep:
+    def _look(
+        self, progress: float, index: int, background: Tensor, following: int | None, shown: Primitives
+    ) -> ImageStep:
         """Draw a view and compare."""
         pixels = self._pixels(index) if self._ahead is None else self._ahead.take(index, following)
         factor = reduction(progress, self.settings.coarse, self.settings.coarse_until)
@@ -329,7 +350,8 @@ class Trainer:
         return pixels.to(self.device)
 
     def _points_due(self) -> bool:
-        """Whether this step looks at points, too; the last one before each multiple of ``voxels_every`` does, which is what logs show."""
+        """Whether this step looks at points, too; the last one before each multiple of ``voxels_every`` does, which is
+        what logs show."""
         source = self.settings.supervision
         return source == "voxels" or (source == "both" and (self.step + 1) % self.settings.voxels_every == 0)
 
@@ -382,7 +404,8 @@ class Trainer:
     # ------------------------------------------------------------ exact state
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Tensors and JSON-able numbers from which :meth:`load_state` goes on exactly, on any device; all of them on the processor."""
+        """Tensors and JSON-able numbers from which :meth:`load_state` goes on exactly, on any device; all of them on
+        the processor."""
         tensors = {f"params.{k}": v.detach() for k, v in self.model.params.items()}
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
@@ -390,7 +413,12 @@ class Trainer:
         tensors |= {f"zeros.{k}": v for k, v in self.zeros.items()}
         tensors |= {"generator": self.generator.get_state(), "order": self.order}
         tensors = {name: value.cpu() for name, value in tensors.items()}
-        header = {"step": self.step, "elapsed": self.elapsed, "views": len(self.dataset.train), "names": names_of(self.dataset.train)}
+        header = {
+            "step": self.step,
+            "elapsed": self.elapsed,
+            "views": len(self.dataset.train),
+            "names": names_of(self.dataset.train),
+        }
         return tensors, header
 
     def load_state(self, tensors: dict[str, Tensor], header: dict[str, Any], where: str) -> None:
@@ -399,7 +427,9 @@ class Trainer:
         Raises:
             CheckpointError: the state belongs to other settings or data; names what differs. The trainer is unchanged.
         """
-        found = restored(tensors, header, where, self.model, self.settings.adam_beta2, self.dataset.train, self.exposures)
+        found = restored(
+            tensors, header, where, self.model, self.settings.adam_beta2, self.dataset.train, self.exposures
+        )
         model, self.optimizer = found.model, found.optimizer
         self.model.params = model.to(self.device).params
         if self.device != model.device:

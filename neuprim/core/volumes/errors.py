@@ -1,6 +1,8 @@
-"""How far a model's extinction is from that of a frame, on all the points that the truth names: of files, their own voxels.
+"""How far a model's extinction is from that of a frame, on all the points that the truth names: of files, their own
+voxels.
 
-Both are asked for in blocks of planes, so that beside the truth's own memory a comparison takes a few tens of MB, however large the grid.
+Both are asked for in blocks of planes, so that beside the truth's own memory a comparison takes a few tens of MB,
+however large the grid.
 """
 
 from __future__ import annotations
@@ -53,8 +55,9 @@ class Comparison:
     def numbers(self) -> dict[str, float] | None:
         """See :data:`NUMBERS`; None where the truth is the same everywhere.
 
-        ``correlation`` is Pearson's, ``relative_l2`` |found - truth| / |truth|, both over all points; ``psnr_active`` is over those where the
-        truth is not 0, against its largest value; ``max_error`` is the largest error anywhere, as a share of that value.
+        ``correlation`` is Pearson's, ``relative_l2`` |found - truth| / |truth|, both over all points; ``psnr_active``
+        is over those where the truth is not 0, against its largest value; ``max_error`` is the largest error anywhere,
+        as a share of that value.
         """
         n = max(self.points, 1)
         a, b, aa, bb, ab = (float(x) for x in self.sums)
@@ -80,7 +83,8 @@ def frame_errors(
     where: torch.device = device.HOST,
     component: str | None = None,
 ) -> dict[str, float] | None:
-    """The model under ``conditions`` against a frame of the truth, see :meth:`Comparison.numbers`; None where there is nothing to compare with.
+    """The model under ``conditions`` against a frame of the truth, see :meth:`Comparison.numbers`; None where there is
+    nothing to compare with.
 
     Args:
         where: the device that computes the model's extinction.

@@ -1,9 +1,11 @@
-"""The model's extinction on a regular grid: sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m, inside their ellipsoids.
+"""The model's extinction on a regular grid: sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m, inside
+their ellipsoids.
 
 A primitive's f may be negative in places, where it is clamped at 0; a renderer clamps the integral along a ray instead.
 
-Along an axis of the grid a neuron's phase is linear in the index, so its cosine at a grid point is a product of one complex number per
-axis: a primitive that spans n^3 points costs 3 n sines and cosines per neuron, and two multiplications per neuron and point.
+Along an axis of the grid a neuron's phase is linear in the index, so its cosine at a grid point is a product of one
+complex number per axis: a primitive that spans n^3 points costs 3 n sines and cosines per neuron, and two
+multiplications per neuron and point.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ POINTS_LIMIT = 2**30
 
 
 def lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, tuple[int, int, int]]:
-    """(4, 4) scene_from_index and shape of a regular grid of cell centres that fills a (2, 3) box, ``resolution`` along its longest side."""
+    """(4, 4) scene_from_index and shape of a regular grid of cell centres that fills a (2, 3) box, ``resolution`` along
+    its longest side."""
     low, high = np.asarray(bounds, np.float64)
     step = float((high - low).max()) / resolution
     x, y, z = (max(1, round(float(side) / step)) for side in high - low)
@@ -42,7 +45,8 @@ def lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, tuple
 
 
 def voxels_within(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> tuple[Tensor, tuple[int, int, int]]:
-    """(4, 4) scene_from_index and shape of the voxels whose centres lie in a (2, 3) box of the scene; of turned ones all in a box around it.
+    """(4, 4) scene_from_index and shape of the voxels whose centres lie in a (2, 3) box of the scene; of turned ones
+    all in a box around it.
 
     Args:
         scene_from_index: (4, 4) float64, of the voxels' own indices.
@@ -58,7 +62,8 @@ def voxels_within(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> 
 
 
 def agreement(truth: np.ndarray, found: np.ndarray) -> dict[str, float] | None:
-    """Pearson ``correlation`` and ``relative_l2`` = |found - truth| / |truth| of two grids; None where the truth is the same everywhere."""
+    """Pearson ``correlation`` and ``relative_l2`` = |found - truth| / |truth| of two grids; None where the truth is the
+    same everywhere."""
     a, b = truth.astype(np.float64), found.astype(np.float64)
     if a.std() == 0:
         return None
@@ -76,8 +81,9 @@ def density_grid(
 ) -> Tensor:
     """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``; on the processor.
 
-    What lowers to a :class:`~neuprim.core.model.forms.Cosine` runs in compiled code on all cores, or on a card; any other density is asked
-    point by point, in blocks, on the processor. Beside the grid it takes a few MB, of a card's memory up to 500.
+    What lowers to a :class:`~neuprim.core.model.forms.Cosine` runs in compiled code on all cores, or on a card; any
+    other density is asked point by point, in blocks, on the processor. Beside the grid it takes a few MB, of a card's
+    memory up to 500.
 
     Args:
         conditions: of the frame, e.g. ``{"time": tensor(0.5)}``.
@@ -105,7 +111,9 @@ def density_grid(
                 from neuprim.core.volumes import grid_warp
 
                 ways = torch.from_numpy(forward[:3]), torch.from_numpy(back[:3])
-                return torch.from_numpy(grid_warp.filled(ellipsoids, neurons, form.omega0, form.edge, *ways, shape, where))
+                return torch.from_numpy(
+                    grid_warp.filled(ellipsoids, neurons, form.omega0, form.edge, *ways, shape, where)
+                )
         wide = [x.detach().numpy() for x in ellipsoids]
         grid = np.zeros(shape, np.float32)
         if not isinstance(form, Cosine):
@@ -118,7 +126,8 @@ def density_grid(
 
 
 def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Tensor:
-    """(M,) float64 extinction, 1/scene unit, at (M, 3) points: every primitive at every point, in float64. Slow, short, and the oracle."""
+    """(M,) float64 extinction, 1/scene unit, at (M, 3) points: every primitive at every point, in float64. Slow, short,
+    and the oracle."""
     with torch.no_grad():
         living = model.to(device.HOST).living(conditions, torch.float64)
         geometry = living.geometry
@@ -132,8 +141,11 @@ def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Ten
     return total
 
 
-def _ask(model: Primitives, conditions: Conditions, wide: list[Any], P: np.ndarray, Q: np.ndarray, grid: np.ndarray) -> None:
-    """Adds a density in torch code, primitive by primitive in a fixed order, so that the sums are the same every time."""
+def _ask(
+    model: Primitives, conditions: Conditions, wide: list[Any], P: np.ndarray, Q: np.ndarray, grid: np.ndarray
+) -> None:
+    """Adds a density in torch code, primitive by primitive in a fixed order, so that the sums are the same every
+    time."""
     living = model.living(conditions, torch.float64)
     means, scales, R = wide
     limit = np.array(grid.shape)
@@ -165,7 +177,12 @@ def _fill(
     K = W1.shape[1]
     longest = max(grid.shape[1], grid.shape[2], stop - start)
     low, high, steps, y = np.empty(3, np.int64), np.empty(3, np.int64), np.empty((3, 3)), np.empty(3)
-    cosines, sines, row, origin = np.empty((3, K, longest)), np.empty((3, K, longest)), np.empty(grid.shape[2]), np.empty(3)
+    cosines, sines, row, origin = (
+        np.empty((3, K, longest)),
+        np.empty((3, K, longest)),
+        np.empty(grid.shape[2]),
+        np.empty(3),
+    )
     for n in range(means.shape[0]):
         empty = False
         for a in range(3):  # the ellipsoid's box in indices
@@ -192,7 +209,9 @@ def _fill(
                 rate = omega0 * (W1[n, q, 0] * P[0, a] + W1[n, q, 1] * P[1, a] + W1[n, q, 2] * P[2, a]) / m
                 first = 0.0
                 if a == 0:
-                    first = omega0 * ((W1[n, q, 0] * origin[0] + W1[n, q, 1] * origin[1] + W1[n, q, 2] * origin[2]) / m + b1[n, q])
+                    first = omega0 * (
+                        (W1[n, q, 0] * origin[0] + W1[n, q, 1] * origin[1] + W1[n, q, 2] * origin[2]) / m + b1[n, q]
+                    )
                 for i in range(high[a] - low[a]):
                     cosines[a, q, i] = np.cos(first + rate * i)
                     sines[a, q, i] = np.sin(first + rate * i)

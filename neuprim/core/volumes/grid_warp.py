@@ -1,9 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Extinction on a regular grid on a card: the twin of the kernel in :mod:`neuprim.core.volumes.grid`. Warp is imported with it.
+"""Extinction on a regular grid on a card: the twin of the kernel in :mod:`neuprim.core.volumes.grid`. Warp is imported
+with it.
 
-A block adds up a tile of the grid, a thread a point, primitive by primitive in their order, float64 inside and float32 sums, as the processor
-does it. Which primitives reach which tile is listed by sorting whole numbers, so that no bit depends on which block comes first, nor on how
-much of the grid or how many primitives are taken at a time.
+A block adds up a tile of the grid, a thread a point, primitive by primitive in their order, float64 inside and float32
+sums, as the processor does it. Which primitives reach which tile is listed by sorting whole numbers, so that no bit
+depends on which block comes first, nor on how much of the grid or how many primitives are taken at a time.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ def _kernel() -> Any:
         phase: wp.array2d(dtype=wp.float64), amplitude: wp.array2d(dtype=wp.float64), offset: wp.array(dtype=wp.float64), edge: int,
         grid: wp.array3d(dtype=wp.float32),
     ):  # fmt: skip
-        """``tiles``: how many there are across and deep; ``first``: index of the grid's first plane; P: rows of (3, 4), indices to the scene."""
+        """``tiles``: how many there are across and deep; ``first``: index of the grid's first plane; P: rows of (3, 4),
+        indices to the scene."""
         tile, lane = wp.tid()
         begin, end = starts[tile], starts[tile + 1]
         i = tile // (tiles[0] * tiles[1]) * wp.static(_TILE[0]) + lane // wp.static(across * deep)
@@ -77,7 +79,8 @@ def _kernel() -> Any:
 
 @dataclass(frozen=True)
 class _Boxes:
-    """Which tiles the ellipsoids' boxes of indices touch: (N, 3) int64 first ones, and ones behind the last; none where there is no point."""
+    """Which tiles the ellipsoids' boxes of indices touch: (N, 3) int64 first ones, and ones behind the last; none where
+    there is no point."""
 
     low: Tensor
     high: Tensor
@@ -90,17 +93,23 @@ class _Boxes:
         low = (center - reach).nan_to_num(nan=1e9).clamp(-1e9, 1e9).ceil().long().clamp_min(0)
         high = ((center + reach).nan_to_num(nan=-1e9).clamp(-1e9, 1e9).floor().long() + 1).minimum(limit)
         there = (low < high).all(1, keepdim=True)
-        return cls(low.div(tile, rounding_mode="floor"), torch.where(there, (high - 1).div(tile, rounding_mode="floor") + 1, 0))
+        return cls(
+            low.div(tile, rounding_mode="floor"), torch.where(there, (high - 1).div(tile, rounding_mode="floor") + 1, 0)
+        )
 
     def within(self, first: int, end: int) -> tuple[Tensor, Tensor]:
-        """First tiles and numbers of tiles, (N, 3) each, in the planes ``first`` to ``end`` - 1 of tiles; the planes are counted from ``first``."""
+        """First tiles and numbers of tiles, (N, 3) each, in the planes ``first`` to ``end`` - 1 of tiles; the planes
+        are counted from ``first``."""
         low, high = self.low.clone(), self.high.clone()
         low[:, 0], high[:, 0] = low[:, 0].clamp_min(first) - first, high[:, 0].clamp_max(end) - first
         return low, (high - low).clamp_min(0)
 
 
-def _lists(low: Tensor, wide: Tensor, counts: Tensor, tiles: tuple[int, ...], begin: int, end: int) -> tuple[Tensor, Tensor]:
-    """``starts`` (tiles + 1,) and ``ids``, int32: of every tile the primitives begin … end - 1 that reach it, in their order."""
+def _lists(
+    low: Tensor, wide: Tensor, counts: Tensor, tiles: tuple[int, ...], begin: int, end: int
+) -> tuple[Tensor, Tensor]:
+    """``starts`` (tiles + 1,) and ``ids``, int32: of every tile the primitives begin … end - 1 that reach it, in their
+    order."""
     own = counts[begin:end]
     prim = torch.repeat_interleave(torch.arange(begin, end, device=low.device), own)
     number = torch.arange(len(prim), device=low.device) - (own.cumsum(0) - own)[prim - begin]
@@ -113,7 +122,8 @@ def _lists(low: Tensor, wide: Tensor, counts: Tensor, tiles: tuple[int, ...], be
 
 
 def _parts(counts: Tensor) -> Iterator[tuple[int, int]]:
-    """Ranges of primitives that reach at most so many tiles together, in order; those that reach none at all left out."""
+    """Ranges of primitives that reach at most so many tiles together, in order; those that reach none at all left
+    out."""
     ends = np.cumsum(counts.cpu().numpy())
     begin = 0
     while begin < len(ends):
@@ -131,7 +141,8 @@ def filled(
     """(X, Y, Z) float32 extinction, computed on ``where``.
 
     Args:
-        ellipsoids: means (N, 3), scales (N, 3) and rotations (N, 3, 3), float64, on the processor. neurons: W1 (N, K, 3), b1 (N, K),
+        ellipsoids: means (N, 3), scales (N, 3) and rotations (N, 3, 3), float64, on the processor. neurons: W1 (N, K,
+        3), b1 (N, K),
             w2 (N, K) and b2 (N,), the same.
         P: (3, 4) float64, indices to the scene. Q: (3, 4), back.
     """

@@ -1,11 +1,12 @@
 """A model's extinction and source radiance at scattered points of one frame, differentiable.
 
-sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m inside their ellipsoids, as :func:`~neuprim.core.volumes.grid.density_grid`
-has it, and the source q(x) = sum of sigma_i(x) c_i: what a ray's image integrates, L = integral of T q. c_i is the part of a primitive's
-colour that is the same from all directions.
+sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m inside their ellipsoids, as
+:func:`~neuprim.core.volumes.grid.density_grid` has it, and the source q(x) = sum of sigma_i(x) c_i: what a ray's image
+integrates, L = integral of T q. c_i is the part of a primitive's colour that is the same from all directions.
 
-What lowers to a :class:`~neuprim.core.model.forms.Cosine` runs in compiled code, forward and backward; any other density is asked pair by
-pair in torch code. Both find the pairs of points and primitives that meet in a uniform grid over the points.
+What lowers to a :class:`~neuprim.core.model.forms.Cosine` runs in compiled code, forward and backward; any other
+density is asked pair by pair in torch code. Both find the pairs of points and primitives that meet in a uniform grid
+over the points.
 """
 
 from __future__ import annotations
@@ -69,12 +70,15 @@ class PointValues(NamedTuple):
     components: dict[str, Tensor]
 
     def watch(self, error: Tensor) -> Shares:
-        """Let the backward pass sum up each primitive's part in an ``error`` (M,), which gets no gradient; call it before ``backward()``."""
+        """Let the backward pass sum up each primitive's part in an ``error`` (M,), which gets no gradient; call it
+        before ``backward()``."""
         self.shares.error = error.detach()
         return self.shares
 
 
-def values_at(model: Primitives, conditions: Conditions, points: Tensor, colour: bool = True, threads: int = 0) -> PointValues:
+def values_at(
+    model: Primitives, conditions: Conditions, points: Tensor, colour: bool = True, threads: int = 0
+) -> PointValues:
     """The values at (M, 3) ``points``, scene units; without gradient for the points.
 
     Args:
@@ -88,7 +92,10 @@ def values_at(model: Primitives, conditions: Conditions, points: Tensor, colour:
     living = model.living(conditions)
     colors = _flat_colours(model.colour, living, conditions) if colour else None
     named = model.density.components(living.own)
-    columns = [*([] if colors is None else [colors]), *(share[:, None] for share in named.values())]  # what sums are weighted by, alike
+    columns = [
+        *([] if colors is None else [colors]),
+        *(share[:, None] for share in named.values()),
+    ]  # what sums are weighted by, alike
     weights = torch.cat(columns, 1) if columns else None
     form = model.density.lower(living.own, living.geometry, conditions)
     shares = Shares(living.geometry.count, living.geometry.means.device)
@@ -111,7 +118,13 @@ def values_at(model: Primitives, conditions: Conditions, points: Tensor, colour:
         sigma, sums = _asked(living, places, weights, shares)
     width = 0 if colors is None else colors.shape[1]
     source = None if colors is None or sums is None else sums[:, :width]
-    return PointValues(sigma, source, living.rows, shares, {} if sums is None else dict(zip(named, sums[:, width:].unbind(1), strict=True)))
+    return PointValues(
+        sigma,
+        source,
+        living.rows,
+        shares,
+        {} if sums is None else dict(zip(named, sums[:, width:].unbind(1), strict=True)),
+    )
 
 
 def _flat_colours(field: ColourField, living: Living, conditions: Conditions) -> Tensor | None:
@@ -169,27 +182,42 @@ class Cells(NamedTuple):
 def cells_of(points: np.ndarray) -> Cells:
     """A grid over (M, 3) points, fine enough that a cell holds few of them."""
     if len(points) == 0:
-        return Cells(np.zeros(0, np.int64), np.zeros(2, np.int64), np.zeros(3), 1.0, np.ones(3, np.int64), np.zeros((0, 3)))
+        return Cells(
+            np.zeros(0, np.int64), np.zeros(2, np.int64), np.zeros(3), 1.0, np.ones(3, np.int64), np.zeros((0, 3))
+        )
     low, high = points.min(0), points.max(0)
     across = min(_MOST_CELLS, max(1, round((len(points) / _POINTS_PER_CELL) ** (1 / 3))))
     step = float((high - low).max()) / across or 1.0
     counts = np.floor((high - low) / step).astype(np.int64) + 1
-    starts, order, placed = np.zeros(int(counts.prod()) + 1, np.int64), np.empty(len(points), np.int64), np.empty((len(points), 3))
+    starts, order, placed = (
+        np.zeros(int(counts.prod()) + 1, np.int64),
+        np.empty(len(points), np.int64),
+        np.empty((len(points), 3)),
+    )
     sort_points(points, low, step, counts, starts, order, placed)
     return Cells(order, starts, low, step, counts, placed)
 
 
 class _Values(torch.autograd.Function):
-    """(M, 1 + C) float32 extinction and source, of (means, log_scales, quats, W1, b1, w2, b2, colours), each a row per primitive."""
+    """(M, 1 + C) float32 extinction and source, of (means, log_scales, quats, W1, b1, w2, b2, colours), each a row per
+    primitive."""
 
     @staticmethod
-    def forward(ctx: Any, places: np.ndarray, omega0: float, edge: int, shares: Shares, threads: int, *tensors: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(
+        ctx: Any, places: np.ndarray, omega0: float, edge: int, shares: Shares, threads: int, *tensors: Tensor
+    ) -> Tensor:  # type: ignore[override]
         given = [np.ascontiguousarray(x.detach().numpy()) for x in tensors]
         if len({x.dtype for x in given}) > 1:  # a mix would compile kernels of its own
             given = [x.astype(np.float64, copy=False) for x in given]
         count, K, width = len(given[0]), given[3].shape[1], 1 + given[7].shape[1]
         axes = _Axes.of(threads, *given[:3])
-        neurons = np.empty((count, K, 3)), np.empty((count, K)), np.empty((count, K)), np.empty(count), np.empty((count, width - 1))
+        neurons = (
+            np.empty((count, K, 3)),
+            np.empty((count, K)),
+            np.empty((count, K)),
+            np.empty(count),
+            np.empty((count, width - 1)),
+        )
         finite = parallel_for(prepare_values, count, _ROWS_PREPARED, threads, *given[3:], omega0, axes.m, *neurons)
         if not (axes.finite and all(finite)):
             raise NonFiniteError("extinction at points: a product of finite parameters is not finite")
@@ -212,14 +240,28 @@ class _Values(torch.autograd.Function):
         made = tuple(np.zeros_like(x) for x in ctx.prims)
         sums = np.zeros((count, 2))
         parallel_for(
-            pull_values, count, _ROWS, threads, cells.placed, cells.grid, ctx.axes.reach, ctx.prims, edge, pulled, error, made, sums
+            pull_values,
+            count,
+            _ROWS,
+            threads,
+            cells.placed,
+            cells.grid,
+            ctx.axes.reach,
+            ctx.prims,
+            edge,
+            pulled,
+            error,
+            made,
+            sums,
         )
         shares.weight, shares.error_weight = (torch.from_numpy(sums[:, i]).float() for i in range(2))
         own = tuple(np.empty(x.shape, x.dtype) for x in ctx.given[1:7])
         rest = (omega0, ctx.axes.m, ctx.prims[1:6], made[1:6], own)
         parallel_for(pull_parameters, count, _ROWS_PREPARED, threads, *ctx.given[1:3], *rest)
         gradients = (made[0], *own, made[6])
-        return (None,) * 5 + tuple(torch.from_numpy(x).to(dtype) for x, dtype in zip(gradients, ctx.dtypes, strict=True))
+        return (None,) * 5 + tuple(
+            torch.from_numpy(x).to(dtype) for x, dtype in zip(gradients, ctx.dtypes, strict=True)
+        )
 
 
 # ---------------------------------------------------------------- any other density
@@ -228,7 +270,9 @@ class _Values(torch.autograd.Function):
 def pairs_of(geometry: Geometry, points: np.ndarray) -> tuple[Tensor, Tensor]:
     """(P,) int64 rows of points and of primitives that contain them, primitive by primitive."""
     cells = cells_of(points)
-    axes = _Axes.of(0, *(np.ascontiguousarray(x.detach().numpy()) for x in (geometry.means, geometry.log_scales, geometry.quats)))
+    axes = _Axes.of(
+        0, *(np.ascontiguousarray(x.detach().numpy()) for x in (geometry.means, geometry.log_scales, geometry.quats))
+    )
     given = (cells.placed, cells.grid, axes.reach, axes.means, axes.whiten)
     counts = np.zeros(geometry.count, np.int64)
     parallel_for(count_pairs, geometry.count, _ROWS, 0, *given, counts)

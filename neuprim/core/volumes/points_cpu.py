@@ -1,4 +1,5 @@
-"""The kernels of :mod:`neuprim.core.volumes.points`: primitives one by one, each with the points of the cells that its box meets."""
+"""The kernels of :mod:`neuprim.core.volumes.points`: primitives one by one, each with the points of the cells that its
+box meets."""
 
 from __future__ import annotations
 
@@ -23,11 +24,21 @@ def _last(center, reach, low, step, count):  # type: ignore[no-untyped-def]
 
 @inline
 def _met(cells, reach, means, n):  # type: ignore[no-untyped-def]
-    """First and last cell along each axis that the box of primitive n meets; along z none where the last comes before the first."""
+    """First and last cell along each axis that the box of primitive n meets; along z none where the last comes before
+    the first."""
     _, low, step, counts = cells
-    x0, x1 = _first(means[n, 0], reach[n, 0], low[0], step, counts[0]), _last(means[n, 0], reach[n, 0], low[0], step, counts[0])
-    y0, y1 = _first(means[n, 1], reach[n, 1], low[1], step, counts[1]), _last(means[n, 1], reach[n, 1], low[1], step, counts[1])
-    z0, z1 = _first(means[n, 2], reach[n, 2], low[2], step, counts[2]), _last(means[n, 2], reach[n, 2], low[2], step, counts[2])
+    x0, x1 = (
+        _first(means[n, 0], reach[n, 0], low[0], step, counts[0]),
+        _last(means[n, 0], reach[n, 0], low[0], step, counts[0]),
+    )
+    y0, y1 = (
+        _first(means[n, 1], reach[n, 1], low[1], step, counts[1]),
+        _last(means[n, 1], reach[n, 1], low[1], step, counts[1]),
+    )
+    z0, z1 = (
+        _first(means[n, 2], reach[n, 2], low[2], step, counts[2]),
+        _last(means[n, 2], reach[n, 2], low[2], step, counts[2]),
+    )
     return x0, x1, y0, y1, z0, z1
 
 
@@ -54,9 +65,11 @@ def add_values(start, stop, points, cells, reach, prims, edge, chunk, sums):  # 
     """Adds sigma and source of primitives start:stop to part ``start // chunk`` of ``sums`` (parts, M, 1 + C).
 
     Args:
-        points: (M, 3) float64, cell by cell. cells: starts, low, step and counts of :class:`~neuprim.core.volumes.points.Cells`.
-        reach: (N, 3) half sides of the primitives' boxes. prims: means (N, 3), A (N, 3, 3), and what
-            :func:`~neuprim.core.volumes.points_prepare.prepare_values` fills: rate, phase, amplitude, offset and colours.
+        points: (M, 3) float64, cell by cell. cells: starts, low, step and counts of
+        :class:`~neuprim.core.volumes.points.Cells`. reach: (N, 3) half sides of the primitives' boxes. prims: means (N,
+        3), A (N, 3, 3), and what
+            :func:`~neuprim.core.volumes.points_prepare.prepare_values` fills: rate, phase, amplitude, offset and
+            colours.
     """
     starts, counts = cells[0], cells[3]
     means, A, rate, phase, amplitude, offset, colors = prims
@@ -86,8 +99,8 @@ def add_values(start, stop, points, cells, reach, prims, edge, chunk, sums):  # 
 
 @kernel
 def pull_values(start, stop, points, cells, reach, prims, edge, pulled, error, gradients, shares):  # type: ignore[no-untyped-def]
-    """Gradients of primitives start:stop, a tuple like ``prims``, from those of the sums, ``pulled`` (M, 1 + C), and the sums of sigma and
-    sigma x error, ``shares`` (N, 2).
+    """Gradients of primitives start:stop, a tuple like ``prims``, from those of the sums, ``pulled`` (M, 1 + C), and
+    the sums of sigma and sigma x error, ``shares`` (N, 2).
     """
     starts, counts = cells[0], cells[3]
     means, A, rate, phase, amplitude, offset, colors = prims
@@ -179,7 +192,9 @@ def _each(n, points, cells, reach, means, A, begin, point):  # type: ignore[no-u
         for j in range(y0, y1 + 1):
             row = (i * counts[1] + j) * counts[2]
             for p in range(starts[row + z0], starts[row + z1 + 1]):
-                a, b, c = _inside(A, n, points[p, 0] - means[n, 0], points[p, 1] - means[n, 1], points[p, 2] - means[n, 2])
+                a, b, c = _inside(
+                    A, n, points[p, 0] - means[n, 0], points[p, 1] - means[n, 1], points[p, 2] - means[n, 2]
+                )
                 if a * a + b * b + c * c < 1.0:
                     if point.shape[0]:
                         point[begin + found] = p

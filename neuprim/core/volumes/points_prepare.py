@@ -1,4 +1,5 @@
-"""What the kernels of :mod:`neuprim.core.volumes.points` need of each primitive, in float64, its gradient, and points sorted into cells."""
+"""What the kernels of :mod:`neuprim.core.volumes.points` need of each primitive, in float64, its gradient, and points
+sorted into cells."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ __all__ = ["merge_parts", "prepare_axes", "prepare_values", "pull_parameters", "
 
 @exact_kernel
 def prepare_axes(start, stop, means, log_scales, quats, centers, A, m, reach):  # type: ignore[no-untyped-def]
-    """Ellipsoids start:stop: ``centers`` (N, 3), A (N, 3, 3) with y = A (x - mu), longest semi-axes m (N,), and half sides of their boxes,
+    """Ellipsoids start:stop: ``centers`` (N, 3), A (N, 3, 3) with y = A (x - mu), longest semi-axes m (N,), and half
+    sides of their boxes,
     ``reach`` (N, 3). Returns whether all of that is finite.
     """
     R, s, total = np.empty((3, 3)), np.empty(3), 0.0
@@ -34,7 +36,8 @@ def prepare_axes(start, stop, means, log_scales, quats, centers, A, m, reach):  
 @exact_kernel
 def prepare_values(start, stop, W1, b1, w2, b2, colors, omega0, m, rate, phase, amplitude, offset, shown):  # type: ignore[no-untyped-def]
     """Of each neuron of primitives start:stop rate (N, K, 3), phase and amplitude (N, K), and offset (N,), so that
-    f/m = offset + sum of amplitude cos(phase + rate . (x - mu)); and the colours in float64. Returns whether all are finite.
+    f/m = offset + sum of amplitude cos(phase + rate . (x - mu)); and the colours in float64. Returns whether all are
+    finite.
     """
     total = 0.0
     for n in range(start, stop):
@@ -54,7 +57,8 @@ def prepare_values(start, stop, W1, b1, w2, b2, colors, omega0, m, rate, phase, 
 
 @exact_kernel
 def pull_parameters(start, stop, log_scales, quats, omega0, m, prims, pulled, gradients):  # type: ignore[no-untyped-def]
-    """Gradients of (log_scales, quats, W1, b1, w2, b2) of primitives start:stop from those of ``prims``, (A, rate, phase, amplitude, offset)."""
+    """Gradients of (log_scales, quats, W1, b1, w2, b2) of primitives start:stop from those of ``prims``, (A, rate,
+    phase, amplitude, offset)."""
     A, rate, phase, amplitude, offset = prims
     p_A, p_rate, p_phase, p_amplitude, p_offset = pulled
     g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2 = gradients
@@ -72,7 +76,9 @@ def pull_parameters(start, stop, log_scales, quats, omega0, m, prims, pulled, gr
             g_b1[n, k], g_w2[n, k] = omega0 * p_phase[n, k], p_amplitude[n, k] / m[n]
         g_b2[n] = p_offset[n] / m[n]
         for a in range(3):
-            if log_scales[n, a] > log_scales[n, first]:  # of equals the first is the longest, as in Geometry.log_length_scale
+            if (
+                log_scales[n, a] > log_scales[n, first]
+            ):  # of equals the first is the longest, as in Geometry.log_length_scale
                 first = a
         for a in range(3):
             s, total = np.exp(np.float64(log_scales[n, a])), 0.0
@@ -87,7 +93,8 @@ def pull_parameters(start, stop, log_scales, quats, omega0, m, prims, pulled, gr
 
 @exact_kernel
 def sort_points(points, low, step, counts, starts, order, placed):  # type: ignore[no-untyped-def]
-    """A counting sort by cell: fills ``starts`` (X Y Z + 1,), zeros before, ``order`` (M,), and ``placed`` (M, 3), the points in that order."""
+    """A counting sort by cell: fills ``starts`` (X Y Z + 1,), zeros before, ``order`` (M,), and ``placed`` (M, 3), the
+    points in that order."""
     cells = np.empty(points.shape[0], np.int64)
     for p in range(points.shape[0]):
         cell = 0
@@ -108,7 +115,8 @@ def sort_points(points, low, step, counts, starts, order, placed):  # type: igno
 
 @exact_kernel
 def merge_parts(start, stop, parts, order, merged):  # type: ignore[no-untyped-def]
-    """Sums over the ``parts`` (P, M, W) of points start:stop, one after the other, to where ``order`` says that they came from."""
+    """Sums over the ``parts`` (P, M, W) of points start:stop, one after the other, to where ``order`` says that they
+    came from."""
     for p in range(start, stop):
         for q in range(parts.shape[2]):
             total = 0.0

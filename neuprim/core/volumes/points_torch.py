@@ -1,5 +1,6 @@
-"""Points and primitives that meet, and what the primitives hold there, in torch code: for tensors that :mod:`neuprim.core.volumes.points_cpu`
-cannot read. Sums go by :func:`summed`, in an order that does not change from one time to the next."""
+"""Points and primitives that meet, and what the primitives hold there, in torch code: for tensors that
+:mod:`neuprim.core.volumes.points_cpu` cannot read. Sums go by :func:`summed`, in an order that does not change from one
+time to the next."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ Grid = tuple[np.ndarray, np.ndarray, float, np.ndarray]
 
 
 def pairs_on(geometry: Geometry, sorted_by: np.ndarray, grid: Grid, sorted_points: np.ndarray) -> tuple[Tensor, Tensor]:
-    """(P,) int64 rows of points and of primitives that contain them, primitive by primitive, on the device of the geometry; three waits for it.
+    """(P,) int64 rows of points and of primitives that contain them, primitive by primitive, on the device of the
+    geometry; three waits for it.
 
     The points are those of :class:`~neuprim.core.volumes.points.Cells`: their ``order``, ``grid`` and ``placed``.
     """
@@ -39,7 +41,10 @@ def pairs_on(geometry: Geometry, sorted_by: np.ndarray, grid: Grid, sorted_point
     begin = starts[row + first[prim, 2]]
     length = starts[row + last[prim, 2] + 1] - begin
     column = torch.repeat_interleave(length)
-    prim, place = prim[column], begin[column] + torch.arange(len(column), device=column.device) - (length.cumsum(0) - length)[column]
+    prim, place = (
+        prim[column],
+        begin[column] + torch.arange(len(column), device=column.device) - (length.cumsum(0) - length)[column],
+    )
     inner = (axes[prim].transpose(1, 2) @ (placed[place] - means[prim])[:, :, None])[..., 0] / scales[prim]
     inside = (inner.square().sum(1) < 1.0).nonzero()[:, 0]
     return order[place[inside]], prim[inside]
@@ -53,7 +58,8 @@ def numbers_finite(geometry: Geometry, form: LoweredDensity) -> bool:
 
 
 def cosine_values(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) -> Tensor:
-    """(P,) float64 world density, unclamped, of primitives ``prim`` at points ``x`` (P, 3) inside them; differentiable."""
+    """(P,) float64 world density, unclamped, of primitives ``prim`` at points ``x`` (P, 3) inside them;
+    differentiable."""
     W1, b1, w2, b2 = (value.double() for value in (form.W1, form.b1, form.w2, form.b2))
     place = Geometry(*(value.double() for value in (geometry.means, geometry.log_scales, geometry.quats)))
     return cosine_density(Cosine(W1, b1, w2, b2, form.omega0, form.edge), place, prim, x.double())
@@ -61,4 +67,6 @@ def cosine_values(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) -> 
 
 def summed(count: int, rows: Tensor, values: Tensor) -> Tensor:
     """(count, ...) sums of ``values`` (P, ...) by ``rows`` (P,), in the order of P; differentiable."""
-    return torch.zeros((count, *values.shape[1:]), dtype=values.dtype, device=values.device).index_put((rows,), values, accumulate=True)
+    return torch.zeros((count, *values.shape[1:]), dtype=values.dtype, device=values.device).index_put(
+        (rows,), values, accumulate=True
+    )

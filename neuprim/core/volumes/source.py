@@ -17,7 +17,8 @@ __all__ = ["Extent", "Placement", "VolumeSource"]
 
 
 class Extent(NamedTuple):
-    """What the absorbing grid of a frame holds: its largest value, and the (2, 3) box around its active voxels, world units; None: nothing."""
+    """What the absorbing grid of a frame holds: its largest value, and the (2, 3) box around its active voxels, world
+    units; None: nothing."""
 
     largest: float
     box: np.ndarray | None
@@ -41,8 +42,9 @@ class Placement:
         sigma_per_unit: extinction, 1/scene unit, of a grid value of 1.
         grid: name of the grid that absorbs.
         exact: whether that grid alone makes the extinction; if not, other grids add to it.
-        component: the name of that grid's part of the extinction in models (:meth:`~neuprim.core.model.fields.DensityField.components`).
-        extents: of that grid in every frame; none: not known.
+        component: the name of that grid's part of the extinction in models
+        (:meth:`~neuprim.core.model.fields.DensityField.components`). extents: of that grid in every frame; none: not
+        known.
     """
 
     scene_from_world: np.ndarray
@@ -56,7 +58,9 @@ class Placement:
 
     def same(self, other: Placement) -> bool:
         """Whether both mean the same frames, places and values."""
-        a, b = ((p.scene_from_world.tolist(), list(p.numbers), p.sigma_per_unit, p.grid, p.exact) for p in (self, other))
+        a, b = (
+            (p.scene_from_world.tolist(), list(p.numbers), p.sigma_per_unit, p.grid, p.exact) for p in (self, other)
+        )
         return a == b
 
     def to_json(self) -> dict[str, Any]:
@@ -97,10 +101,14 @@ class Placement:
             raise DataError(f"{where}: header field 'world' is damaged ({error!r})") from None
         matrix = made.scene_from_world
         sound = np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all() and abs(np.linalg.det(matrix)) > 0
-        sound = sound and all(0 <= one.largest < np.inf and (one.box is None or np.isfinite(one.box).all()) for one in made.extents)
+        sound = sound and all(
+            0 <= one.largest < np.inf and (one.box is None or np.isfinite(one.box).all()) for one in made.extents
+        )
         per_frame = [*made.times.values(), *([made.extents] if made.extents else [])]
         if not sound or not 0 < made.sigma_per_unit < np.inf or any(len(v) != len(made.numbers) for v in per_frame):
-            raise DataError(f"{where}: header field 'world' is damaged; expected an invertible affine matrix, and a time per frame")
+            raise DataError(
+                f"{where}: header field 'world' is damaged; expected an invertible affine matrix, and a time per frame"
+            )
         return made
 
 

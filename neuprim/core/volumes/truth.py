@@ -39,14 +39,17 @@ class DensityTruth(ABC):
 
     @abstractmethod
     def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
-        """(4, 4) float64 scene_from_index and shape of the regular grid on which models are compared with a frame: of files, all their
-        own voxels in the box. None where the frame holds nothing.
+        """(4, 4) float64 scene_from_index and shape of the regular grid on which models are compared with a frame: of
+        files, all their own voxels in the box. None where the frame holds nothing.
         """
 
     @abstractmethod
-    def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None) -> Tensor:
+    def grid(
+        self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
+    ) -> Tensor:
         """(X, Y, Z) float32 extinction of a frame at the points ``scene_from_index @ (i, j, k, 1)``, float64 (4, 4).
 
         Args:
-            component: the part alone that comes from the source grid of this name (:meth:`~neuprim.core.model.fields.DensityField.components`).
+            component: the part alone that comes from the source grid of this name
+            (:meth:`~neuprim.core.model.fields.DensityField.components`).
         """

@@ -1,4 +1,5 @@
-"""What formats with colours need of any model: its colours as spherical harmonics, and cameras to compare images from."""
+"""What formats with colours need of any model: its colours as spherical harmonics, and cameras to compare images
+from."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ class Harmonics:
 
     Attributes:
         dc: (M, C), rest: (M, 15, C) float64 coefficients in the order and signs of 3D Gaussian splatting.
-        residual: RMS error of the fit over directions and primitives; 0.0 where the model's colours are harmonics themselves.
+        residual: RMS error of the fit over directions and primitives; 0.0 where the model's colours are harmonics
+        themselves.
     """
 
     def __init__(self, dc: Tensor, rest: Tensor | None, residual: float) -> None:
@@ -44,12 +46,15 @@ class Harmonics:
         return (mixed + 0.5).clamp_min(0.0)
 
     def turned(self, rotation: Tensor | None) -> Harmonics:
-        """The same colours on axes that are turned by ``rotation`` (3, 3): exact, as every band is closed under rotation."""
+        """The same colours on axes that are turned by ``rotation`` (3, 3): exact, as every band is closed under
+        rotation."""
         if rotation is None:
             return self
         directions = sphere(_DIRECTIONS)
         after, before = (sh.basis(d, _DEGREE)[:, 1:] for d in (directions @ rotation.T, directions))
-        return Harmonics(self.dc, torch.einsum("bk,nkc->nbc", torch.linalg.pinv(after) @ before, self.rest), self.residual)
+        return Harmonics(
+            self.dc, torch.einsum("bk,nkc->nbc", torch.linalg.pinv(after) @ before, self.rest), self.residual
+        )
 
     def picked(self, channels: tuple[int, ...]) -> Harmonics:
         """The same with these channels alone, in this order."""
@@ -58,7 +63,8 @@ class Harmonics:
 
 
 def rgb_of(run: TrainedModel, hint: str = "") -> tuple[int, int, int]:
-    """Which of the model's channels are red, green and blue; a grey one is all three. For formats to ask before anything takes time.
+    """Which of the model's channels are red, green and blue; a grey one is all three. For formats to ask before
+    anything takes time.
 
     Raises:
         ConfigError: none is; ``hint`` says what else the format would take.
@@ -73,8 +79,8 @@ def rgb_of(run: TrainedModel, hint: str = "") -> tuple[int, int, int]:
 
 
 def harmonics_of(run: TrainedModel, conditions: Conditions) -> Harmonics:
-    """Exact where the colour field is made of harmonics; else fitted, degree 3 by least squares, to the colours at the primitives'
-    centres seen from 64 directions far away, under the given conditions.
+    """Exact where the colour field is made of harmonics; else fitted, degree 3 by least squares, to the colours at the
+    primitives' centres seen from 64 directions far away, under the given conditions.
 
     Raises:
         ConfigError: the colours are of a form that has no value per primitive.
@@ -94,7 +100,8 @@ def harmonics_of(run: TrainedModel, conditions: Conditions) -> Harmonics:
 
 
 def _from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> Tensor:
-    """(M, C) float64 colours at the primitives' centres from a camera so far away that all are seen along one direction."""
+    """(M, C) float64 colours at the primitives' centres from a camera so far away that all are seen along one
+    direction."""
     means = run.model.params["means"].double()
     middle = means.mean(0)
     reach = float((means - middle).norm(dim=-1).max()) + 1.0
@@ -102,7 +109,9 @@ def _from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> 
     camera = Camera(look_at(middle - 1e4 * reach * direction, middle, up), 1e4, 1e4, 32, 32, 64, 64)
     lowered = run.model.lower(camera, conditions, run.settings)
     if not lowered.colour.per_primitive:
-        raise ConfigError(f"{run.directory}: colours of the form {type(lowered.colour).__name__} have no value per primitive")
+        raise ConfigError(
+            f"{run.directory}: colours of the form {type(lowered.colour).__name__} have no value per primitive"
+        )
     return lowered.center_colors(camera.position).double()
 
 
@@ -116,9 +125,11 @@ def sphere(count: int) -> Tensor:
 
 
 def comparison_views(job: ExportJob, which: str, conditions: Conditions) -> tuple[list[View], str]:
-    """At most eight views under the given conditions, and what they are: "test" cameras of the scene or an "orbit" of the model.
+    """At most eight views under the given conditions, and what they are: "test" cameras of the scene or an "orbit" of
+    the model.
 
-    ``which`` = "auto" takes test cameras where the scene can be loaded without conditions (a sequence would be drawn anew).
+    ``which`` = "auto" takes test cameras where the scene can be loaded without conditions (a sequence would be drawn
+    anew).
     """
     if which == "test" or (which == "auto" and not job.run.task.conditions):
         try:

@@ -1,13 +1,18 @@
 """``gaussian-ply``: one Gaussian per primitive in the layout of 3D Gaussian splatting, for its viewers; lossy.
 
-Binary little-endian vertices of floats ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``: centre in the
-coordinates of the run's data (``double x y z`` where float32 would lose more than 1e-4 of the scene's size, as in UTM), normals 0, SH coefficients of degree 3 (``f_rest`` channel by channel: 15 of red, 15 of green, 15 of blue), logit of the opacity,
-natural logarithm of the standard deviations, quaternion wxyz. How the Gaussians are fitted: :mod:`neuprim.plugins.export.gaussians`.
-Colours are those of the model in its own colour space; viewers show numbers as sRGB. A grey model is written as three equal channels;
-other channels than red, green and blue are refused. A model that depends on time or light is written
-under one value of each (``time=0.5``, ``light=1,2,3 light_intensity=10,10,10``); colours that are no harmonics are fitted by harmonics.
+Binary little-endian vertices of floats ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``: centre in
+the coordinates of the run's data (``double x y z`` where float32 would lose more than 1e-4 of the scene's size, as in
+UTM), normals 0, SH coefficients of degree 3 (``f_rest`` channel by channel: 15 of red, 15 of green, 15 of blue), logit
+of the opacity,
+natural logarithm of the standard deviations, quaternion wxyz. How the Gaussians are fitted:
+:mod:`neuprim.plugins.export.gaussians`.
+Colours are those of the model in its own colour space; viewers show numbers as sRGB. A grey model is written as three
+equal channels; other channels than red, green and blue are refused. A model that depends on time or light is written
+under one value of each (``time=0.5``, ``light=1,2,3 light_intensity=10,10,10``); colours that are no harmonics are
+fitted by harmonics.
 
-The error is the PSNR of images of the fitted Gaussians, drawn as the 3DGS rasteriser draws them, against the model's own.
+The error is the PSNR of images of the fitted Gaussians, drawn as the 3DGS rasteriser draws them, against the model's
+own.
 """
 
 from __future__ import annotations
@@ -59,7 +64,9 @@ def _write(job: ExportJob) -> ExportReport:
     job.progress("fitting Gaussians", 0.0)
     fits = {name: fit_gaussians(job.run, conditions, name) for name in SIZES if size in ("auto", name)}
     if not all(len(g.means) for g in fits.values()):
-        raise ConfigError(f"{job.run.directory}: no primitive absorbs anything under these conditions; nothing to export")
+        raise ConfigError(
+            f"{job.run.directory}: no primitive absorbs anything under these conditions; nothing to export"
+        )
     colours = harmonics_of(job.run, conditions).picked(rgb)
     images, seen = _images(job, which, conditions, rgb)
     scores = {name: _psnrs(job, fit, colours, images, rgb, name) for name, fit in fits.items()}
@@ -67,7 +74,9 @@ def _write(job: ExportJob) -> ExportReport:
     gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}
     rows = _rows(gaussians, colours, job.run.world)
     space = channels.color_space
-    comments = ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"] + [LINEAR] * (space == "linear")
+    comments = ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"] + [LINEAR] * (
+        space == "linear"
+    )
     write_ply(job.out, rows, comments)
     notes = [
         f"{len(gaussians.means)} Gaussians, size={size}; PSNR of them drawn as the 3DGS rasteriser does, against the model's images, {seen}, {space} values",
@@ -75,11 +84,17 @@ def _write(job: ExportJob) -> ExportReport:
     ]
     if rows.dtype["x"] == np.float64:
         kept = float(np.spacing(np.abs(np.stack([rows[axis] for axis in "xyz"])).max().astype(np.float32)))
-        notes.append(f"x y z are double: the coordinates are so large that a program which takes them for float rounds them to {kept:.2g}")
+        notes.append(
+            f"x y z are double: the coordinates are so large that a program which takes them for float rounds them to {kept:.2g}"
+        )
     if colours.residual > 0:
-        notes.append(f"the model's colours are no harmonics of the view; fitted at the centres with an RMS error of {colours.residual:.2g}")
+        notes.append(
+            f"the model's colours are no harmonics of the view; fitted at the centres with an RMS error of {colours.residual:.2g}"
+        )
     if channels.own is not None:
-        notes.append(f"red, green and blue are the channels {channels.listed}, not what the display of task {job.run.task.name!r} shows")
+        notes.append(
+            f"red, green and blue are the channels {channels.listed}, not what the display of task {job.run.task.name!r} shows"
+        )
     elif channels.shown:
         notes.append(f"colours: {channels.shown}")
     if space == "linear":
@@ -88,7 +103,8 @@ def _write(job: ExportJob) -> ExportReport:
 
 
 def _rows(gaussians: Gaussians, colours: Harmonics, world: World) -> np.ndarray:
-    """The vertices, in the world of the user's files; centres in doubles where that world is too far away for floats."""
+    """The vertices, in the world of the user's files; centres in doubles where that world is too far away for
+    floats."""
     gaussians, colours = gaussians.within(world.inverse), colours.turned(world.inverse.rotation)
     scales, quats = gaussians.axes()
     opacity = gaussians.opacities.numpy()
@@ -96,7 +112,16 @@ def _rows(gaussians: Gaussians, colours: Harmonics, world: World) -> np.ndarray:
     logit = np.log(opacity) - np.log1p(-opacity)
     zero = np.zeros((len(opacity), 3))
     table = np.concatenate(
-        [gaussians.means.numpy(), zero, colours.dc[gaussians.rows].numpy(), rest, logit[:, None], np.log(scales), quats], axis=1
+        [
+            gaussians.means.numpy(),
+            zero,
+            colours.dc[gaussians.rows].numpy(),
+            rest,
+            logit[:, None],
+            np.log(scales),
+            quats,
+        ],
+        axis=1,
     )
     lost = np.abs(table[:, :3].astype(np.float32) - table[:, :3]).max()
     place = "<f8" if lost > _LOST * np.ptp(table[:, :3], axis=0).max() else "<f4"
@@ -106,7 +131,9 @@ def _rows(gaussians: Gaussians, colours: Harmonics, world: World) -> np.ndarray:
     return rows
 
 
-def _images(job: ExportJob, which: str, conditions: Conditions, rgb: Sequence[int]) -> tuple[list[tuple[View, Tensor]], str]:
+def _images(
+    job: ExportJob, which: str, conditions: Conditions, rgb: Sequence[int]
+) -> tuple[list[tuple[View, Tensor]], str]:
     """The model's own images, red, green and blue, and what they show."""
     run = job.run
     views, what = comparison_views(job, which, conditions)
@@ -114,12 +141,19 @@ def _images(job: ExportJob, which: str, conditions: Conditions, rgb: Sequence[in
     for i, view in enumerate(views):
         job.progress("drawing the model", i / len(views))
         with torch.no_grad():
-            images.append((view, render(run.model, view.camera, view.conditions, run.settings, background).rgb[..., list(rgb)]))
+            images.append(
+                (view, render(run.model, view.camera, view.conditions, run.settings, background).rgb[..., list(rgb)])
+            )
     return images, what
 
 
 def _psnrs(
-    job: ExportJob, gaussians: Gaussians, colours: Harmonics, images: list[tuple[View, Tensor]], rgb: Sequence[int], name: str
+    job: ExportJob,
+    gaussians: Gaussians,
+    colours: Harmonics,
+    images: list[tuple[View, Tensor]],
+    rgb: Sequence[int],
+    name: str,
 ) -> list[float]:
     background, found = _background(job)[list(rgb)], []
     for i, (view, truth) in enumerate(images):

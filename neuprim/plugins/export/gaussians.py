@@ -1,4 +1,5 @@
-"""Gaussians of 3D Gaussian splatting (Kerbl et al. 2023) in place of neural primitives, and how that method draws them."""
+"""Gaussians of 3D Gaussian splatting (Kerbl et al. 2023) in place of neural primitives, and how that method draws
+them."""
 
 from __future__ import annotations
 
@@ -24,11 +25,19 @@ SIZES = ("moments", "footprint", "profile")
 
 
 _SIDE = 12
-"""Points of the quadrature along an axis of the unit ball; a density of 30 rad across a primitive has five waves in it."""
+"""Points of the quadrature along an axis of the unit ball; a density of 30 rad across a primitive has five waves in
+it."""
 _CHUNK = 512
 _FACTORS = [1.06**i for i in range(-24, 25)]
-"""On the covariance, a quarter to four: how much wider than its density's a footprint may be. Steps of three percent in size."""
-_NEAR, _BLUR, _ALPHA_MAX, _ALPHA_MIN, _TRANSMITTANCE_MIN = 0.2, 0.3, 0.99, 1.0 / 255.0, 1e-4  # of the authors' rasteriser
+"""On the covariance, a quarter to four: how much wider than its density's a footprint may be. Steps of three percent in
+size."""
+_NEAR, _BLUR, _ALPHA_MAX, _ALPHA_MIN, _TRANSMITTANCE_MIN = (
+    0.2,
+    0.3,
+    0.99,
+    1.0 / 255.0,
+    1e-4,
+)  # of the authors' rasteriser
 
 
 @dataclass(frozen=True)
@@ -64,11 +73,12 @@ class Gaussians:
 def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gaussians:
     """One Gaussian per primitive that absorbs anything.
 
-    By quadrature on the ellipsoid, with rho = max(0, sigma): mean and covariance are those of rho; the opacity is the mean over the
-    ellipsoid's three axes of 1 - exp(-tau), tau the integral of rho along the axis' ray through that mean. That is ``size="moments"``. A 3DGS
-    footprint is opacity x exp(-d^2/2) on the screen, never more than a bell, while an opaque primitive is flat with an edge, so the covariance
-    is scaled: with "footprint" so that both cover the same area, the mean over the axes of the integral of alpha across the screen; with
-    "profile" so that the bell is closest to alpha, by least squares over the three axes' screens, among those whose opacity makes up the area.
+    By quadrature on the ellipsoid, with rho = max(0, sigma): mean and covariance are those of rho; the opacity is the
+    mean over the ellipsoid's three axes of 1 - exp(-tau), tau the integral of rho along the axis' ray through that
+    mean. That is ``size="moments"``. A 3DGS footprint is opacity x exp(-d^2/2) on the screen, never more than a bell,
+    while an opaque primitive is flat with an edge, so the covariance is scaled: with "footprint" so that both cover the
+    same area, the mean over the axes of the integral of alpha across the screen; with "profile" so that the bell is
+    closest to alpha, by least squares over the three axes' screens, among those whose opacity makes up the area.
     """
     model = run.model
     with torch.no_grad():
@@ -93,7 +103,9 @@ def _fit(density, own, still: Geometry, moved: Geometry, conditions: Conditions,
     points = moved.means.double()[:, None] + torch.einsum("nij,pj->npi", R * scales[:, None, :], ball[inside])
     prim = torch.arange(n).repeat_interleave(int(inside.sum()))
     rho = torch.zeros(n, len(ball), dtype=torch.float64)
-    rho[:, inside] = density(own, still, prim, points.reshape(-1, 3).float(), conditions).double().reshape(n, -1).clamp_min(0)
+    rho[:, inside] = (
+        density(own, still, prim, points.reshape(-1, 3).float(), conditions).double().reshape(n, -1).clamp_min(0)
+    )
     total = rho.sum(1)
     kept = total * step**3 * scales.amin(1) > 1e-9  # an optical depth that no image shows
     weight = rho / total.clamp_min(1e-300)[:, None]
@@ -118,14 +130,23 @@ def _fit(density, own, still: Geometry, moved: Geometry, conditions: Conditions,
         wider, opacity = _closest(screens, torch.stack(areas), torch.stack(bells), ticks)
         spread = spread * wider[:, None, None]
     world = R * scales[:, None, :]
-    return moved.means.double() + (world @ mean[:, :, None])[..., 0], world @ spread @ world.transpose(1, 2), opacity, kept
+    return (
+        moved.means.double() + (world @ mean[:, :, None])[..., 0],
+        world @ spread @ world.transpose(1, 2),
+        opacity,
+        kept,
+    )
 
 
-def _closest(screens: Sequence[tuple[Tensor, ...]], areas: Tensor, bells: Tensor, ticks: Tensor) -> tuple[Tensor, Tensor]:
-    """(n,) factors on the covariance and (n,) opacities of the bells closest to what three screens show, (alpha, covariance, mean, area) each.
+def _closest(
+    screens: Sequence[tuple[Tensor, ...]], areas: Tensor, bells: Tensor, ticks: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(n,) factors on the covariance and (n,) opacities of the bells closest to what three screens show, (alpha,
+    covariance, mean, area) each.
 
-    For each of some factors, the opacity is that with the same integral of alpha over the screens, at most 0.99; taken is the factor with the
-    least squares of what is left, over the whole of the screens: the part of a bell that is outside the primitive's own is known in closed form.
+    For each of some factors, the opacity is that with the same integral of alpha over the screens, at most 0.99; taken
+    is the factor with the least squares of what is left, over the whole of the screens: the part of a bell that is
+    outside the primitive's own is known in closed form.
     """
     step = ticks[1] - ticks[0]
     weights = torch.stack([screen[3] for screen in screens])
@@ -150,9 +171,10 @@ def _closest(screens: Sequence[tuple[Tensor, ...]], areas: Tensor, bells: Tensor
 def draw_gaussians(gaussians: Gaussians, colours: Harmonics, camera: Camera, background: Tensor) -> Tensor:
     """(H, W, 3) float32 image as the 3DGS rasteriser makes it, in float64.
 
-    Projection by its local affine approximation (EWA), 0.3 square pixels of blur, alpha = min(0.99, opacity exp(-d^2/2)), pairs below
-    1/255 skipped, front to back by the depth of centres, stop before the transmittance falls below 1e-4; Gaussians nearer than 0.2
-    are left out. Unlike there, a footprint ends where alpha is 1/255, not at the tile around three standard deviations.
+    Projection by its local affine approximation (EWA), 0.3 square pixels of blur, alpha = min(0.99, opacity
+    exp(-d^2/2)), pairs below 1/255 skipped, front to back by the depth of centres, stop before the transmittance falls
+    below 1e-4; Gaussians nearer than 0.2 are left out. Unlike there, a footprint ends where alpha is 1/255, not at the
+    tile around three standard deviations.
     """
     view = camera.viewmat.double()
     W, t = view[:3, :3], gaussians.means @ view[:3, :3].T + view[:3, 3]
@@ -163,13 +185,21 @@ def draw_gaussians(gaussians: Gaussians, colours: Harmonics, camera: Camera, bac
     limits = 1.3 * 0.5 * camera.width / camera.fx, 1.3 * 0.5 * camera.height / camera.fy
     x, y = ((t[:, a] / z).clamp(-limits[a], limits[a]) * z for a in (0, 1))
     J = torch.zeros(len(t), 2, 3, dtype=torch.float64)
-    J[:, 0, 0], J[:, 0, 2], J[:, 1, 1], J[:, 1, 2] = camera.fx / z, -camera.fx * x / z**2, camera.fy / z, -camera.fy * y / z**2
+    J[:, 0, 0], J[:, 0, 2], J[:, 1, 1], J[:, 1, 2] = (
+        camera.fx / z,
+        -camera.fx * x / z**2,
+        camera.fy / z,
+        -camera.fy * y / z**2,
+    )
     flat = J @ W @ cov @ W.T @ J.transpose(1, 2) + _BLUR * torch.eye(2, dtype=torch.float64)
     centers = torch.stack([camera.fx * t[:, 0] / z + camera.cx, camera.fy * t[:, 1] / z + camera.cy], -1)
     away = gaussians.means[order] - camera.position.double()
     colors = colours.towards(gaussians.rows[order], away / away.norm(dim=-1, keepdim=True)).numpy()
     inverse, opacity = torch.linalg.inv(flat).numpy(), gaussians.opacities[order].numpy()
-    reach = np.sqrt(2 * np.log(np.maximum(opacity / _ALPHA_MIN, 1.0)))[:, None] * flat.diagonal(dim1=1, dim2=2).sqrt().numpy()
+    reach = (
+        np.sqrt(2 * np.log(np.maximum(opacity / _ALPHA_MIN, 1.0)))[:, None]
+        * flat.diagonal(dim1=1, dim2=2).sqrt().numpy()
+    )
     middle = centers.numpy()
     first = np.clip(np.floor(middle - reach), 0, [camera.width, camera.height]).astype(int)
     last = np.clip(np.ceil(middle + reach), 0, [camera.width, camera.height]).astype(int)

@@ -1,12 +1,13 @@
 """``html``: the model as one web page that draws it, in any browser with WebGL2; lossy by the level of its numbers.
 
-The page needs no network and no server: it opens from disk. It turns, zooms, plays the sequence, moves the light with its shadows, shows opacity, depth, a
-slice of the density and the ellipsoids, and jumps to held-out cameras with their true images beside. Every primitive is drawn over its exact silhouette with
-the closed form of its chord, in float32, blended front to back in the order of centres: the image of ``renderer.sort=center`` with one ray a pixel and
+The page needs no network and no server: it opens from disk. It turns, zooms, plays the sequence, moves the light with
+its shadows, shows opacity, depth, a slice of the density and the ellipsoids, and jumps to held-out cameras with their
+true images beside. Every primitive is drawn over its exact silhouette with the closed form of its chord, in float32,
+blended front to back in the order of centres: the image of ``renderer.sort=center`` with one ray a pixel and
 ``transmittance_min`` at 0, as blending cannot stop.
 
-``level`` is that of ``neuprim compress``, 1 to 5; 0 keeps every bit. The error is the PSNR of what the page holds against the model, on the page's own views,
-drawn by the run's backend.
+``level`` is that of ``neuprim compress``, 1 to 5; 0 keeps every bit. The error is the PSNR of what the page holds
+against the model, on the page's own views, drawn by the run's backend.
 
 Held-out cameras and their true images need the scene's data; without them the page begins with a camera of its own.
 """
@@ -34,7 +35,10 @@ from neuprim.webpage.scene import Draw, held_out, scene_page, start_of
 __all__ = ["EXPORTER"]
 
 OPTIONS = {
-    "level": (1, "digits of the model's numbers: 0 for all, or a level of `neuprim compress`, 1 (nearly all) to 5 (very few)"),
+    "level": (
+        1,
+        "digits of the model's numbers: 0 for all, or a level of `neuprim compress`, 1 (nearly all) to 5 (very few)",
+    ),
     "views": (6, "held-out cameras to jump to, with their true images, 0 to 100"),
 }
 _MEASURED = 4
@@ -71,9 +75,13 @@ def _write(job: ExportJob) -> ExportReport:
     moment = fullest(run.model, [Condition(spec, start[spec.name]) for spec in run.task.conditions])
     errors = {} if level == 0 else {"psnr": _error(job, page.model, views, moment)}
     write_text(job.out, page.text)
-    notes.append(f"{len(page.text.encode()) / 1e6:.2f} MB, {page.numbers / 1e6:.2f} MB of them the model's numbers before base64")
+    notes.append(
+        f"{len(page.text.encode()) / 1e6:.2f} MB, {page.numbers / 1e6:.2f} MB of them the model's numbers before base64"
+    )
     if run.settings.sort != "center" or run.settings.samples > 1:
-        notes.append(f"the run draws with sort={run.settings.sort} samples={run.settings.samples}; the page by centres, one ray a pixel")
+        notes.append(
+            f"the run draws with sort={run.settings.sort} samples={run.settings.samples}; the page by centres, one ray a pixel"
+        )
     return ExportReport((job.out,), False, errors, tuple(notes))
 
 

@@ -1,17 +1,21 @@
 """``mesh``: the surface where the density passes a level, with vertex colours, as .glb, .ply or .obj; lossy.
 
-The density is sampled on a lattice of ``grid`` voxels along the longest side, blurred by ``smooth`` voxels (primitives end in a step,
-which would leave stairs), and contoured by VTK's flying edges (Schroeder et al. 2015). The default level is the one whose silhouettes
-along the three axes agree best with where the model is more than half opaque: for each axis, a column of voxels is opaque if its
-optical depth passes ln 2, and shows matter if its densest voxel passes the level. Pieces with less than ``keep`` of the largest
-piece's area are left out.
+The density is sampled on a lattice of ``grid`` voxels along the longest side, blurred by ``smooth`` voxels (primitives
+end in a step, which would leave stairs), and contoured by VTK's flying edges (Schroeder et al. 2015). The default level
+is the one whose silhouettes along the three axes agree best with where the model is more than half opaque: for each
+axis, a column of voxels is opaque if its optical depth passes ln 2, and shows matter if its densest voxel passes the
+level. Pieces with less than ``keep`` of the largest piece's area are left out.
 
-A vertex has the mean colour of the primitives around it, weighted by their density there, seen from outside along its normal.
-Coordinates are those of the run's data; a .glb is turned from z up to glTF's y up (but data that are y up already: ``up=y``, or where the model was fitted to such a mesh), as its
-readers turn it back, and has what moves it far from the origin in its node, as its vertices are float32. A .ply has ``double x y z`` there. Colours are sRGB in .ply and .obj and linear in .glb, as glTF wants them; they are what the
+A vertex has the mean colour of the primitives around it, weighted by their density there, seen from outside along its
+normal.
+Coordinates are those of the run's data; a .glb is turned from z up to glTF's y up (but data that are y up already:
+``up=y``, or where the model was fitted to such a mesh), as its readers turn it back, and has what moves it far from the
+origin in its node, as its vertices are float32. A .ply has ``double x y z`` there. Colours are sRGB in .ply and .obj
+and linear in .glb, as glTF wants them; they are what the
 task's display shows, or red, green and blue, or grey. Other channels are refused.
 
-The error is the intersection over union of silhouettes against where the model's alpha passes one half, over views of an orbit.
+The error is the intersection over union of silhouettes against where the model's alpha passes one half, over views of
+an orbit.
 """
 
 from __future__ import annotations
@@ -43,10 +47,16 @@ __all__ = ["EXPORTER", "best_level"]
 
 OPTIONS = {
     "grid": (192, "voxels along the longest side, 8 to 1024"),
-    "level": (None, "extinction of the surface, 1/scene unit (default: the silhouettes that agree best with the opaque parts)"),
+    "level": (
+        None,
+        "extinction of the surface, 1/scene unit (default: the silhouettes that agree best with the opaque parts)",
+    ),
     "smooth": (1.0, "standard deviation of the blur before contouring, voxels, 0 to 4"),
     "keep": (0.01, "least area of a piece, as a part of the largest one's"),
-    "up": ("auto", "upward axis of the data, z or y; only .glb files are turned by it (auto: that of a mesh that was fitted, else z)"),
+    "up": (
+        "auto",
+        "upward axis of the data, z or y; only .glb files are turned by it (auto: that of a mesh that was fitted, else z)",
+    ),
 }
 _SUFFIXES = (".glb", ".ply", ".obj")
 _CHUNK = 2_000_000
@@ -59,12 +69,22 @@ def _write(job: ExportJob) -> ExportReport:
     path = job.out
     (conditions,) = job.frames()
     channels = job.run.channels
-    rgb = None if channels.own is not None else rgb_of(job.run, f", and task {job.run.task.name!r} has no display that makes these")
+    rgb = (
+        None
+        if channels.own is not None
+        else rgb_of(job.run, f", and task {job.run.task.name!r} has no display that makes these")
+    )
     contour = _contour()
-    smooth, keep, up = job.number("smooth", 0, 4) or 0.0, job.number("keep", 0, 1) or 0.0, job.choice("up", "auto", "z", "y")
+    smooth, keep, up = (
+        job.number("smooth", 0, 4) or 0.0,
+        job.number("keep", 0, 1) or 0.0,
+        job.choice("up", "auto", "z", "y"),
+    )
     turn = job.run.world.rotation
     if up == "auto":
-        up = "y" if turn is not None and float(turn[2, 1]) > 0.5 else "z"  # of the world's axes, the one that is the scene's z
+        up = (
+            "y" if turn is not None and float(turn[2, 1]) > 0.5 else "z"
+        )  # of the world's axes, the one that is the scene's z
     seen = harmonics_of(job.run, conditions)
     job.progress("sampling the density", 0.0)
     sigma, scene_from_index = _sample(job, conditions, job.count("grid", 8, 1024) or 192)
@@ -76,7 +96,9 @@ def _write(job: ExportJob) -> ExportReport:
     job.progress("contouring", 0.3)
     points, faces = contour(field, level)
     if not len(faces):
-        raise ConfigError(f"level={level:.4g}: no surface; the densest of the sampled points has {float(field.max()):.4g} per scene unit")
+        raise ConfigError(
+            f"level={level:.4g}: no surface; the densest of the sampled points has {float(field.max()):.4g} per scene unit"
+        )
     import trimesh
 
     mesh = trimesh.Trimesh(points @ scene_from_index[:3, :3].T + scene_from_index[:3, 3], faces, process=False)
@@ -84,12 +106,16 @@ def _write(job: ExportJob) -> ExportReport:
     if mesh.volume < 0:
         mesh.invert()
     job.progress("colouring", 0.5)
-    colours = torch.from_numpy(_colours(job, conditions, seen, np.array(mesh.vertices), np.array(mesh.vertex_normals))).float()
+    colours = torch.from_numpy(
+        _colours(job, conditions, seen, np.array(mesh.vertices), np.array(mesh.vertex_normals))
+    ).float()
     colours = channels.display_rows(colours) if rgb is None else colours[:, list(rgb)]
     iou = _silhouettes(job, conditions, mesh)
     _save(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up, job.run.world)
     notes.append(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles; {dropped} small pieces left out")
-    notes.append("colours: of the primitives around each vertex, weighted by density, seen along the normal from outside")
+    notes.append(
+        "colours: of the primitives around each vertex, weighted by density, seen along the normal from outside"
+    )
     if channels.shown:
         notes.append(f"colours: {channels.shown}")
     if path.suffix.lower() == ".glb" and up == "z":
@@ -105,7 +131,9 @@ def _contour() -> Any:
     try:
         import pyvista
     except ImportError as error:
-        raise BackendUnavailable(f"--format mesh needs the package pyvista ({error}): pip install 'neuprim[mesh]'") from error
+        raise BackendUnavailable(
+            f"--format mesh needs the package pyvista ({error}): pip install 'neuprim[mesh]'"
+        ) from error
 
     def contour(values: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
         image = pyvista.ImageData(dimensions=values.shape)
@@ -128,12 +156,15 @@ def _sample(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndar
     matrix = np.diag([step, step, step, 1.0])
     matrix[:3, 3] = low - 3 * step
     size, settings = (shape[0], shape[1], shape[2]), job.run.settings
-    sigma = density_grid(job.run.model, conditions, torch.from_numpy(matrix), size, settings.threads, computing_device(settings))
+    sigma = density_grid(
+        job.run.model, conditions, torch.from_numpy(matrix), size, settings.threads, computing_device(settings)
+    )
     return sigma.numpy(), matrix
 
 
 def best_level(sigma: np.ndarray, step: float) -> float:
-    """The level at which "the column's densest voxel passes it" agrees in most columns with "the column is more than half opaque".
+    """The level at which "the column's densest voxel passes it" agrees in most columns with "the column is more than
+    half opaque".
 
     Columns along all three axes count. Where nothing is half opaque, half of the largest optical depth stands for ln 2.
 
@@ -144,7 +175,8 @@ def best_level(sigma: np.ndarray, step: float) -> float:
     peaks = np.concatenate([sigma.max(a).ravel() for a in range(3)]).astype(np.float64)
     opaque = depths > min(math.log(2), 0.5 * float(depths.max()))
     order = np.argsort(peaks)
-    # with the level just below the i-th peak, columns i.. show matter: wrong are opaque ones before i and clear ones from i on
+    # with the level just below the i-th peak, columns i.. show matter: wrong are opaque ones before i and clear ones
+    # from i on
     missed = np.concatenate([[0], np.cumsum(opaque[order])])
     false = np.concatenate([np.cumsum(~opaque[order][::-1])[::-1], [0]])
     i = int(np.argmin((missed + false)[:-1]))
@@ -168,13 +200,18 @@ def _larger_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
 # ---------------------------------------------------------------- colour
 
 
-def _colours(job: ExportJob, conditions: Conditions, colours: Harmonics, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def _colours(
+    job: ExportJob, conditions: Conditions, colours: Harmonics, points: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
     """(V, C) of the primitives around each point, weighted by density; of the nearest one where none reaches."""
     with torch.no_grad():
         living = job.run.model.living(conditions)
         moved = living.geometry
         whiten = moved.rotations.double().transpose(1, 2) / moved.scales.double()[:, :, None]
-        total, weight = torch.zeros(len(points), colours.dc.shape[1], dtype=torch.float64), torch.zeros(len(points), dtype=torch.float64)
+        total, weight = (
+            torch.zeros(len(points), colours.dc.shape[1], dtype=torch.float64),
+            torch.zeros(len(points), dtype=torch.float64),
+        )
         tree = cKDTree(points)
         around = tree.query_ball_point(moved.means.double().numpy(), moved.scales.double().amax(1).numpy())
         counts = np.array([len(a) for a in around])
@@ -239,7 +276,8 @@ def _far(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
     wide = np.empty(len(points), [("place", "<f8", 3), ("rest", rest)])
     wide["place"], wide["rest"] = points, rows["rest"]
     return head.replace(
-        b"property float x\nproperty float y\nproperty float z", b"property double x\nproperty double y\nproperty double z"
+        b"property float x\nproperty float y\nproperty float z",
+        b"property double x\nproperty double y\nproperty double z",
     ) + (b"end_header\n" + wide.tobytes() + body[rows.nbytes :])
 
 
@@ -259,7 +297,9 @@ def _silhouettes(job: ExportJob, conditions: Conditions, mesh: Any) -> float:
         rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1).reshape(-1, 3)
         rays = rays @ camera.viewmat[:3, :3].double().numpy()
         origin: Tensor = camera.position.double()
-        hit = mesh.ray.intersects_any(np.broadcast_to(origin.numpy(), rays.shape), rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        hit = mesh.ray.intersects_any(
+            np.broadcast_to(origin.numpy(), rays.shape), rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        )
         solid = alpha.reshape(-1) > 0.5
         both, either = both + int((hit & solid).sum()), either + int((hit | solid).sum())
     return both / either if either else 0.0

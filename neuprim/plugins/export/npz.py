@@ -1,7 +1,9 @@
 """``npz``: the model itself as numpy arrays; lossless.
 
-``numpy.load(FILE, allow_pickle=False)`` gives one float32 array (N, ...) per parameter under its own name, and ``header``, a text of
-JSON: the model's header (where "world" has ``scene_from_world``, if the arrays are in other coordinates than the run's data), the shapes of the parameters and the text of the run's ``config.yaml``, paths to its data included. ``neuprim
+``numpy.load(FILE, allow_pickle=False)`` gives one float32 array (N, ...) per parameter under its own name, and
+``header``, a text of
+JSON: the model's header (where "world" has ``scene_from_world``, if the arrays are in other coordinates than the run's
+data), the shapes of the parameters and the text of the run's ``config.yaml``, paths to its data included. ``neuprim
 import`` reads it back bit for bit.
 """
 
@@ -29,7 +31,9 @@ def _write(job: ExportJob) -> ExportReport:
     arrays = {name: value.detach().float().contiguous().numpy() for name, value in job.run.model.params.items()}
     with atomic_path(job.out) as temporary, open(temporary, "wb") as file:
         np.savez(file, header=np.array(pack_header(job)), **arrays)  # type: ignore[arg-type]
-    note = "holds the text of config.yaml, paths to the run's data included; `neuprim import` makes a run directory of it"
+    note = (
+        "holds the text of config.yaml, paths to the run's data included; `neuprim import` makes a run directory of it"
+    )
     return ExportReport((job.out,), True, notes=(note,))
 
 
@@ -50,9 +54,13 @@ def _read(path: Path) -> StoredModel:
                 entry = entries.get(f"{name}.npy")
                 if entry is None:
                     raise DataError(f"{path}: no array {name!r}, which the header names")
-                value = _array(archive, entry, path, path.stat().st_size)  # arrays are stored as they are, so no file is smaller
+                value = _array(
+                    archive, entry, path, path.stat().st_size
+                )  # arrays are stored as they are, so no file is smaller
                 if value.dtype != np.float32 or value.ndim != len(shape) + 1 or value.shape[1:] != shape:
-                    raise DataError(f"{path}: {name} is {value.dtype} of shape {value.shape}; expected float32 of (N, {str(shape)[1:]}")
+                    raise DataError(
+                        f"{path}: {name} is {value.dtype} of shape {value.shape}; expected float32 of (N, {str(shape)[1:]}"
+                    )
                 tensors[name] = np.ascontiguousarray(value)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
         raise DataError(f"{path}: not a readable .npz ({' '.join(str(error).split())[:120]})") from error
@@ -70,7 +78,9 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path, most: i
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read(file)
         if dtype.hasobject or math.prod(shape) * dtype.itemsize > entry.file_size:
-            raise DataError(f"{path}: {entry.filename} claims {dtype} of shape {shape}; the entry has {entry.file_size} bytes")
+            raise DataError(
+                f"{path}: {entry.filename} claims {dtype} of shape {shape}; the entry has {entry.file_size} bytes"
+            )
     with archive.open(entry) as file:
         result: np.ndarray = np.lib.format.read_array(file, allow_pickle=False)
     return result

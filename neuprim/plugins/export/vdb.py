@@ -1,15 +1,16 @@
 """``vdb``: the density as an OpenVDB fog volume, one file per frame for models that change in time; lossy (sampled).
 
-Grid ``density`` is the sum over primitives of their density clamped at 0, at the voxels' centres; what is below ``threshold`` is not
-stored (background 0, inactive). Where flames add to the extinction of the source's grid, only that grid's part is written: what absorbs
-because it burns is no density. A model that was fitted to .vdb files is written on the voxels and in the units of these files, frame by
-frame, so that both overlay each other, with no value above the source frame's largest and nothing outside its active voxels; else in the
-coordinates of the run's data on cubic voxels whose lattice has a corner of its index space in the scene's origin, one lattice for all
-frames. Axes are those of the data; nothing is turned.
+Grid ``density`` is the sum over primitives of their density clamped at 0, at the voxels' centres; what is below
+``threshold`` is not stored (background 0, inactive). Where flames add to the extinction of the source's grid, only that
+grid's part is written: what absorbs because it burns is no density. A model that was fitted to .vdb files is written on
+the voxels and in the units of these files, frame by frame, so that both overlay each other, with no value above the
+source frame's largest and nothing outside its active voxels; else in the coordinates of the run's data on cubic voxels
+whose lattice has a corner of its index space in the scene's origin, one lattice for all frames. Axes are those of the
+data; nothing is turned.
 
-Units (metadata ``neuprim_units``): ``source``: sigma divided by the extinction per unit of the file's grid, as the scene's look has
-it; ``world``: extinction per world unit of the file, what a volume shader multiplies with a length; ``scene``: extinction per scene
-unit, sigma itself. Where nothing is known of a world, that is the scene.
+Units (metadata ``neuprim_units``): ``source``: sigma divided by the extinction per unit of the file's grid, as the
+scene's look has it; ``world``: extinction per world unit of the file, what a volume shader multiplies with a length;
+``scene``: extinction per scene unit, sigma itself. Where nothing is known of a world, that is the scene.
 """
 
 from __future__ import annotations
@@ -46,7 +47,10 @@ OPTIONS = {
     "threshold": (None, "values below it are not stored (default: an optical depth of 0.001 along the box)"),
     "half": (False, "16-bit floats"),
     "name": ("density", "of the grid"),
-    "source": (True, "whether to look for the files that the model was fitted to: their voxels, and errors against them"),
+    "source": (
+        True,
+        "whether to look for the files that the model was fitted to: their voxels, and errors against them",
+    ),
 }
 _SLAB_BYTES = 64 * 2**20
 _MOST_VOXELS = 2**34
@@ -78,7 +82,9 @@ def _write(job: ExportJob) -> ExportReport:
     threshold = 1e-3 / float((box[1] - box[0]).max()) * factor if threshold is None else threshold
     name = str(job.options["name"])
     own = job.number("grid") is None and job.number("voxel_size") is None and source is not None
-    fallback = _transform(job, box, scene_from_world, np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy())
+    fallback = _transform(
+        job, box, scene_from_world, np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy()
+    )
     model = _component(job, placement)
     cut = _Cut(0, 0)
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
@@ -102,7 +108,9 @@ def _write(job: ExportJob) -> ExportReport:
         "world": "extinction per world unit",
         "scene": "extinction per scene unit",
     }
-    notes.append(f"grid {name!r} is {said[units]}: extinction per scene unit = value x {1 / factor:g}; clamped at 0 per primitive")
+    notes.append(
+        f"grid {name!r} is {said[units]}: extinction per scene unit = value x {1 / factor:g}; clamped at 0 per primitive"
+    )
     if placement is not None and not placement.exact:
         notes.append(f"flames absorb, too: written is the part of the extinction that comes from {what!r} alone")
     if cut != _Cut(0, 0):
@@ -163,7 +171,11 @@ def _within(grid: Grid, extent: Extent, per_unit: float) -> tuple[Grid, _Cut]:
         return grid, _Cut(0, 0)
     offsets = np.stack(np.meshgrid(*(np.arange(8),) * 3, indexing="ij"), -1)
     centres = (grid.origins[:, None, None, None] + offsets) @ grid.transform[:3, :3].T + grid.transform[:3, 3]
-    inside = np.zeros(grid.masks.shape, bool) if extent.box is None else ((centres >= extent.box[0]) & (centres <= extent.box[1])).all(-1)
+    inside = (
+        np.zeros(grid.masks.shape, bool)
+        if extent.box is None
+        else ((centres >= extent.box[0]) & (centres <= extent.box[1])).all(-1)
+    )
     kept, largest = grid.masks & inside, np.float32(extent.largest * per_unit)
     above = kept & (grid.values > largest)
     values = np.where(kept, np.minimum(grid.values, largest), np.float32(0))
@@ -189,7 +201,9 @@ def _origin(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placemen
     if isinstance(record, dict) and "grid" in record:
         kept = Placement.from_json(record, str(job.run.directory / "model.safetensors"))
     if source is not None and kept is not None and not kept.same(source.placement):
-        notes.append("the source's files are not those that the model was fitted to, so neither their voxels nor errors against them")
+        notes.append(
+            "the source's files are not those that the model was fitted to, so neither their voxels nor errors against them"
+        )
         source = None
     return source, kept if source is None else source.placement, notes
 
@@ -214,7 +228,9 @@ def _same(conditions: Conditions, placement: Placement | None) -> int | None:
         return None
     for i in range(len(placement.numbers)):
         known = _conditions(placement, i)
-        if known.keys() == conditions.keys() and all(torch.allclose(known[k].float(), v.float(), atol=1e-6) for k, v in conditions.items()):
+        if known.keys() == conditions.keys() and all(
+            torch.allclose(known[k].float(), v.float(), atol=1e-6) for k, v in conditions.items()
+        ):
             return i
     return None
 
@@ -279,8 +295,14 @@ def sampled_grid(
     last = (np.ceil(index.max(0)).astype(np.int64) & ~7) + 8
     size = last - first
     if math.prod(size.tolist()) > _MOST_VOXELS:
-        raise ConfigError(f"{' x '.join(map(str, size))} voxels around the model; expected at most {_MOST_VOXELS:.0e} (voxel_size, grid)")
-    parts = [g for g in _slabs(job, model, conditions, scene_from_index, first, size, name, factor, threshold) if len(g.origins)]
+        raise ConfigError(
+            f"{' x '.join(map(str, size))} voxels around the model; expected at most {_MOST_VOXELS:.0e} (voxel_size, grid)"
+        )
+    parts = [
+        g
+        for g in _slabs(job, model, conditions, scene_from_index, first, size, name, factor, threshold)
+        if len(g.origins)
+    ]
     leaves = (
         np.concatenate([g.origins for g in parts]) if parts else np.zeros((0, 3), np.int32),
         np.concatenate([g.values for g in parts]) if parts else np.zeros((0, 8, 8, 8), np.float32),
@@ -320,12 +342,15 @@ def _slabs(
 def _errors(
     job: ExportJob, source: VolumeSource, frame: _GridFrame, path: Path, scene_from_world: np.ndarray, factor: float
 ) -> dict[str, float]:
-    """The model and the written file, each against the source on the source's own voxels, as ``metrics.json`` has it."""
+    """The model and the written file, each against the source on the source's own voxels, as ``metrics.json`` has
+    it."""
     assert frame.source is not None
     settings = job.run.settings
     component = None if source.placement.exact else source.placement.component
     part: dict[str, str] = {} if component is None else {"component": component}
-    found = frame_errors(job.run.model, frame.conditions, source, frame.source, settings.threads, computing_device(settings), **part)
+    found = frame_errors(
+        job.run.model, frame.conditions, source, frame.source, settings.threads, computing_device(settings), **part
+    )
     place = source.points(frame.source)
     if found is None or place is None:
         return {}
@@ -346,5 +371,11 @@ def _errors(
 
 
 EXPORTER = Exporter(
-    API_VERSION, "vdb", "the density as OpenVDB, one file per frame; lossy (sampled)", _write, OPTIONS, conditions=True, default="vdb"
+    API_VERSION,
+    "vdb",
+    "the density as OpenVDB, one file per frame; lossy (sampled)",
+    _write,
+    OPTIONS,
+    conditions=True,
+    default="vdb",
 )

@@ -1,4 +1,5 @@
-"""Ground truth to hold a model against, and the model's own grids as OpenVDB files, which are read back the same way."""
+"""Ground truth to hold a model against, and the model's own grids as OpenVDB files, which are read back the same
+way."""
 
 from __future__ import annotations
 
@@ -31,8 +32,8 @@ def open_truth(path: str, volume: Callable[[], VolumeSource | None], world: Worl
 
     Args:
         path: an OpenVDB file or a folder of them, or "scene" for what the run's scene itself was made from.
-        volume: opens the files of the run's scene, None if it has none; called unless ``path`` is in scene units by its own word.
-        world: of the run's model, in which files lie.
+        volume: opens the files of the run's scene, None if it has none; called unless ``path`` is in scene units by its
+        own word. world: of the run's model, in which files lie.
 
     Raises:
         DataError: no such file, or the scene has no truth of its own.
@@ -52,7 +53,9 @@ def open_truth(path: str, volume: Callable[[], VolumeSource | None], world: Worl
     if scene is not None:
         return scene.of(place), f"ground truth: {path}, placed and scaled by the rules of the run's scene"
     per_world = (
-        f", its world as that of the run's data, of {world.scale:g} scene units" if not world.identity else ", its world as the scene"
+        f", its world as that of the run's data, of {world.scale:g} scene units"
+        if not world.identity
+        else ", its world as the scene"
     )
     return SceneUnits(frames, world), f"ground truth: {path}, taken as extinction in 1/scene unit{per_world}"
 
@@ -80,7 +83,8 @@ def _distance(a: Conditions, b: Conditions) -> float:
 
 
 class SceneUnits(DensityTruth):
-    """OpenVDB files in the world of a model, whose values are extinction, 1/scene unit; trilinear between voxels, 0 outside.
+    """OpenVDB files in the world of a model, whose values are extinction, 1/scene unit; trilinear between voxels, 0
+    outside.
 
     Raises:
         DataError: no float grid to take, or nothing in it.
@@ -91,7 +95,9 @@ class SceneUnits(DensityTruth):
         self.frames, lows, highs = [], [], []
         for frame in frames:
             grid = self._read(frame)
-            found = {k.removeprefix(_CONDITION): torch.tensor(v) for k, v in grid.metadata.items() if _is_condition(k, v)}
+            found = {
+                k.removeprefix(_CONDITION): torch.tensor(v) for k, v in grid.metadata.items() if _is_condition(k, v)
+            }
             self.frames.append(TruthFrame(frame.path.name, found))
             bounds = grid.world_bounds()
             if bounds is not None:
@@ -107,7 +113,9 @@ class SceneUnits(DensityTruth):
         names = [g.name for g in read_header(frame.path).grids if g.refusal() is None]
         chosen = next((name for name in _USUAL if name in names), names[0] if len(names) == 1 else None)
         if chosen is None:
-            raise DataError(f"{frame.path}: grids {', '.join(map(repr, names)) or 'none'}; expected one, or one of {', '.join(_USUAL)}")
+            raise DataError(
+                f"{frame.path}: grids {', '.join(map(repr, names)) or 'none'}; expected one, or one of {', '.join(_USUAL)}"
+            )
         grid = read_grid(frame.path, chosen)
         if grid.channels != 1:
             raise DataError(f"{frame.path}: grid {chosen!r} has {grid.channels} channels; expected one")
@@ -121,12 +129,16 @@ class SceneUnits(DensityTruth):
         source = self._read(self._files[frame])
         return None if source.bounds is None else voxels_within(self.bounds, self._placed(source))
 
-    def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None) -> Tensor:
+    def grid(
+        self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
+    ) -> Tensor:
         source = self._read(self._files[frame])
         if source.bounds is None:
             return torch.zeros(shape)
         (x0, y0, z0), (x1, y1, z1) = source.bounds
-        values = np.nan_to_num(source.to_dense(((x0 - 1, y0 - 1, z0 - 1), (x1 + 1, y1 + 1, z1 + 1))), nan=0.0, posinf=0.0, neginf=0.0)
+        values = np.nan_to_num(
+            source.to_dense(((x0 - 1, y0 - 1, z0 - 1), (x1 + 1, y1 + 1, z1 + 1))), nan=0.0, posinf=0.0, neginf=0.0
+        )
         chain = np.linalg.inv(self._placed(source)) @ scene_from_index.numpy()
         offset = chain[:3, 3] - (np.array(source.bounds[0]) - 1)
         found = ndimage.affine_transform(values, chain[:3, :3], offset, shape, order=1, mode="constant")
@@ -143,7 +155,8 @@ def _is_ours(path: Path) -> bool:
 
 
 def write_volume(path: Path, frame: FieldFrame, world: World) -> None:
-    """The frame's extinction, 1/scene unit, as an OpenVDB file in the world of its model: voxel centres are the grid's points."""
+    """The frame's extinction, 1/scene unit, as an OpenVDB file in the world of its model: voxel centres are the grid's
+    points."""
     scalars = {_CONDITION + name: float(value) for name, value in frame.conditions.items() if value.numel() == 1}
     meaning = {_MARK: "scene", "neuprim_value": "extinction, 1/scene unit; each primitive clamped at 0 from below"}
     transform = world.world_from_scene.numpy() @ frame.scene_from_index.numpy()

@@ -7,7 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from neuprim.plugins.inspect.layers import Ellipsoids, Grid, Isosurfaces, Layer, Lines, Mesh, Painted, Points, Scale, Slices, Text, Volume
+from neuprim.plugins.inspect.layers import (
+    Ellipsoids,
+    Grid,
+    Isosurfaces,
+    Layer,
+    Lines,
+    Mesh,
+    Painted,
+    Points,
+    Scale,
+    Slices,
+    Text,
+    Volume,
+)
 from neuprim.plugins.inspect.paint import painted
 from neuprim.plugins.inspect.shapes import ellipsoids
 
@@ -112,7 +125,9 @@ def _ellipsoids(plotter: Any, layer: Ellipsoids) -> None:
 def _mesh(plotter: Any, layer: Mesh) -> None:
     if len(layer.faces):
         data = _poly(layer.vertices, faces=_cells(layer.faces))
-        plotter.add_mesh(data, smooth_shading=True, ambient=0.5, diffuse=0.6, opacity=layer.opacity, **_paint(layer, data))
+        plotter.add_mesh(
+            data, smooth_shading=True, ambient=0.5, diffuse=0.6, opacity=layer.opacity, **_paint(layer, data)
+        )
 
 
 def _points(plotter: Any, layer: Points) -> None:

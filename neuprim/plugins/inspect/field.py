@@ -49,8 +49,8 @@ class FieldFrame:
         top: largest extinction shown, 1/scene unit; the same for all frames, so that colours mean the same.
         focus: (3,) middle of the matter of all frames, scene units.
         channels: of the model's colours.
-        gain: by which a volume's opacity is stronger than the density's own, for the same reason the same for all frames.
-        needed: names of the conditions of the model's task.
+        gain: by which a volume's opacity is stronger than the density's own, for the same reason the same for all
+        frames. needed: names of the conditions of the model's task.
         truth: (X, Y, Z) float32 ground truth on the grid, or None; computed when called.
         device: what computes the extinction on the grid.
         side: "model", or "truth" in the panel that shows the ground truth in the model's place.
@@ -101,7 +101,8 @@ class FieldFrame:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(X, Y, Z) float32 extinction of the model, each primitive clamped at 0 from below; or of the truth in its panel."""
+        """(X, Y, Z) float32 extinction of the model, each primitive clamped at 0 from below; or of the truth in its
+        panel."""
         if self.side not in self._kept:
             if self.side == "truth":
                 if self.truth is None:
@@ -183,15 +184,20 @@ class FieldFrame:
         if wanted is None:
             return int(self.masses.argmax())
         if wanted >= self.model.count:
-            raise ConfigError(f"--primitive {wanted}: the model has {self.model.count} primitives, 0 to {self.model.count - 1}")
+            raise ConfigError(
+                f"--primitive {wanted}: the model has {self.model.count} primitives, 0 to {self.model.count - 1}"
+            )
         found = np.flatnonzero(self.alive == wanted)
         if not len(found):
-            raise ConfigError(f"--primitive {wanted}: it absorbs nothing at {self.title}; choose another one or another frame")
+            raise ConfigError(
+                f"--primitive {wanted}: it absorbs nothing at {self.title}; choose another one or another frame"
+            )
         return int(found[0])
 
 
 def absorbed(living: Living) -> np.ndarray:
-    """(M,) float64 what each living primitive absorbs in all: its clamped extinction times its volume, from 33 points inside."""
+    """(M,) float64 what each living primitive absorbs in all: its clamped extinction times its volume, from 33 points
+    inside."""
     geometry = living.geometry
     every = torch.arange(geometry.count)
     total = torch.zeros(len(every))

@@ -27,8 +27,11 @@ class Given(dict[str, Tensor]):
         raise ConfigError(f"this needs the {name}; give {flag(name)}")
 
 
-def condition_frames(specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = lambda text: None) -> list[Conditions]:
-    """One entry per frame. A number may be several, as "0:1:5" or "0,0.5"; the middle of its range where it is not given.
+def condition_frames(
+    specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = lambda text: None
+) -> list[Conditions]:
+    """One entry per frame. A number may be several, as "0:1:5" or "0,0.5"; the middle of its range where it is not
+    given.
 
     Of two animated conditions the shorter is stretched. What is not a number and was not given is left out.
 
@@ -62,12 +65,15 @@ def corners(numbers: Sequence[float]) -> np.ndarray:
         ConfigError: not six numbers, or a box without a volume.
     """
     if len(numbers) != 6 or not all(a < b for a, b in zip(numbers[:3], numbers[3:], strict=True)):
-        raise ConfigError(f"--box {','.join(f'{x:g}' for x in numbers)}: expected the lower and the upper corner, as -1,-1,-1,1,1,1")
+        raise ConfigError(
+            f"--box {','.join(f'{x:g}' for x in numbers)}: expected the lower and the upper corner, as -1,-1,-1,1,1,1"
+        )
     return np.array(numbers, np.float64).reshape(2, 3)
 
 
 def box_of(model: Primitives, frames: Sequence[Conditions]) -> np.ndarray:
-    """(2, 3) float64 box around nearly all that the model absorbs in some of the frames; a few far primitives do not widen it.
+    """(2, 3) float64 box around nearly all that the model absorbs in some of the frames; a few far primitives do not
+    widen it.
 
     Raises:
         DataError: the model absorbs nothing.

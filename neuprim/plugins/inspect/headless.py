@@ -1,4 +1,5 @@
-"""Whether VTK can draw without a display. It ends the process where a library is missing, so another process tries first."""
+"""Whether VTK can draw without a display. It ends the process where a library is missing, so another process tries
+first."""
 
 from __future__ import annotations
 
@@ -78,7 +79,9 @@ def _try(way: str) -> str | None:
     """Why one way does not work; None if it does."""
     environment = {**os.environ, **({_VARIABLE: way} if way else {})}
     try:
-        done = subprocess.run([sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True, timeout=_SECONDS)
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True, timeout=_SECONDS
+        )
     except subprocess.TimeoutExpired:
         return f"no picture after {_SECONDS:.0f} s"
     if done.returncode < 0:

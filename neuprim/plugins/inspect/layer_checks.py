@@ -7,7 +7,20 @@ from typing import Any, get_args
 
 import numpy as np
 
-from neuprim.plugins.inspect.layers import Ellipsoids, Grid, Isosurfaces, Layer, Lines, Mesh, Painted, Points, Scale, Slices, Text, Volume
+from neuprim.plugins.inspect.layers import (
+    Ellipsoids,
+    Grid,
+    Isosurfaces,
+    Layer,
+    Lines,
+    Mesh,
+    Painted,
+    Points,
+    Scale,
+    Slices,
+    Text,
+    Volume,
+)
 
 __all__ = ["fault"]
 
@@ -42,14 +55,20 @@ def _text(layer: Text) -> str:
 
 
 def _grid(layer: Grid) -> str | None:
-    wrong = _array("values", layer.values, (None, None, None)) or _array("origin", layer.origin, (3,)) or _scale(layer.scale)
+    wrong = (
+        _array("values", layer.values, (None, None, None))
+        or _array("origin", layer.origin, (3,))
+        or _scale(layer.scale)
+    )
     if wrong:
         return wrong
     if min(layer.values.shape) < 1:
         return f"values has shape {layer.values.shape}; expected at least one point along each axis"
     spacing = layer.spacing
     parts: list[Any] = (
-        list(spacing) if isinstance(spacing, tuple | list | np.ndarray) and np.ndim(spacing) == 1 and len(spacing) == 3 else [spacing]
+        list(spacing)
+        if isinstance(spacing, tuple | list | np.ndarray) and np.ndim(spacing) == 1 and len(spacing) == 3
+        else [spacing]
     )
     if not all(_number(part) and part > 0 for part in parts):
         return f"spacing is {spacing!r}; expected a positive number of scene units, or three"
@@ -114,7 +133,9 @@ def _scale(scale: Any) -> str | None:
 def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> str | None:
     if not isinstance(value, np.ndarray):
         return f"{name} is {_a(value)}; expected a numpy array"
-    if len(value.shape) != len(shape) or any(want not in (None, got) for got, want in zip(value.shape, shape, strict=True)):
+    if len(value.shape) != len(shape) or any(
+        want not in (None, got) for got, want in zip(value.shape, shape, strict=True)
+    ):
         letters = iter("NPQ")
         wanted = ", ".join(next(letters) if want is None else str(want) for want in shape) + "," * (len(shape) == 1)
         return f"{name} has shape {value.shape}; expected ({wanted})"

@@ -1,8 +1,8 @@
 """What an inspector returns: a frame as layers, which a window, a picture, a film and a page draw alike.
 
-Positions are in scene units, in the scene's axes. Arrays are numpy arrays of finite numbers. Colours are display-referred (what a screen
-shows), red, green and blue from 0 to 1. The box of the frame's grid, its title and a bar for every :class:`Scale` that has a title are
-drawn around the layers; they need none of their own.
+Positions are in scene units, in the scene's axes. Arrays are numpy arrays of finite numbers. Colours are
+display-referred (what a screen shows), red, green and blue from 0 to 1. The box of the frame's grid, its title and a
+bar for every :class:`Scale` that has a title are drawn around the layers; they need none of their own.
 """
 
 from __future__ import annotations
@@ -12,7 +12,20 @@ from typing import Literal
 
 import numpy as np
 
-__all__ = ["Ellipsoids", "Grid", "Isosurfaces", "Layer", "Lines", "Mesh", "Painted", "Points", "Scale", "Slices", "Text", "Volume"]
+__all__ = [
+    "Ellipsoids",
+    "Grid",
+    "Isosurfaces",
+    "Layer",
+    "Lines",
+    "Mesh",
+    "Painted",
+    "Points",
+    "Scale",
+    "Slices",
+    "Text",
+    "Volume",
+]
 
 
 @dataclass(frozen=True)
@@ -91,7 +104,8 @@ class Isosurfaces(Grid):
     """Surfaces of equal value, closed as if values were 0 outside the grid.
 
     Attributes:
-        levels: their values, at least one. A page shows one surface, of the level that its slider is at: of the lowest of these at first.
+        levels: their values, at least one. A page shows one surface, of the level that its slider is at: of the lowest
+        of these at first.
     """
 
     levels: tuple[float, ...] = ()

@@ -9,7 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from neuprim.plugins.inspect.layers import Ellipsoids, Grid, Isosurfaces, Layer, Lines, Mesh, Points, Scale, Slices, Text, Volume
+from neuprim.plugins.inspect.layers import (
+    Ellipsoids,
+    Grid,
+    Isosurfaces,
+    Layer,
+    Lines,
+    Mesh,
+    Points,
+    Scale,
+    Slices,
+    Text,
+    Volume,
+)
 from neuprim.plugins.inspect.paint import painted
 
 __all__ = ["ELLIPSOIDS_LIMIT", "Packed", "encoded"]
@@ -49,7 +61,9 @@ class Packed:
 
     def __init__(self) -> None:
         self.arrays: list[str] = []
-        self._grids: dict[tuple[int, float, float], tuple[np.ndarray, int, str]] = {}  # the grid itself, so that its id stays its own
+        self._grids: dict[
+            tuple[int, float, float], tuple[np.ndarray, int, str]
+        ] = {}  # the grid itself, so that its id stays its own
 
     @property
     def size(self) -> int:
@@ -65,13 +79,26 @@ class Packed:
             return {"kind": "text", "text": layer.text, "corner": layer.corner}
         if isinstance(layer, Grid):
             return self._grid(layer)
-        found: dict[str, Any] = {"opacity": float(layer.opacity), "scale": None if layer.values is None else _scale(layer.scale)}
+        found: dict[str, Any] = {
+            "opacity": float(layer.opacity),
+            "scale": None if layer.values is None else _scale(layer.scale),
+        }
         if isinstance(layer, Ellipsoids):
             count = min(len(layer.centres), ELLIPSOIDS_LIMIT)
-            colours = layer.colours if layer.colours is not None and layer.values is None and layer.colours.ndim == 2 else None
+            colours = (
+                layer.colours
+                if layer.colours is not None and layer.values is None and layer.colours.ndim == 2
+                else None
+            )
             rgb = painted(layer, len(layer.centres))[:count] / 255.0 if colours is None else colours[:count]
             rows = np.c_[layer.centres[:count], layer.axes[:count].reshape(-1, 9), rgb]
-            return {**found, "kind": "ellipsoids", "rows": self._keep(rows, "<f4"), "count": count, "of": len(layer.centres)}
+            return {
+                **found,
+                "kind": "ellipsoids",
+                "rows": self._keep(rows, "<f4"),
+                "count": count,
+                "of": len(layer.centres),
+            }
         points = layer.centres if isinstance(layer, Points) else layer.vertices
         found |= {"points": self._keep(points, "<f4"), "rgb": self._keep(painted(layer, len(points)), "u1")}
         if isinstance(layer, Points):
@@ -87,7 +114,13 @@ class Packed:
             stored, code = encoded(layer.values.astype(np.float32, copy=False), scale)
             self._grids[key] = (layer.values, self._keep(stored.ravel(order="F"), "u1"), code)
         _, place, code = self._grids[key]
-        found = {"grid": place, "code": code, "shape": layer.values.shape, "low": box[0].tolist(), "size": (box[1] - box[0]).tolist()}
+        found = {
+            "grid": place,
+            "code": code,
+            "shape": layer.values.shape,
+            "low": box[0].tolist(),
+            "size": (box[1] - box[0]).tolist(),
+        }
         found |= {"step": float(layer.steps.min()), "scale": _scale(scale)}
         if isinstance(layer, Volume):
             return {**found, "kind": "volume", "depth": float(layer.depth)}

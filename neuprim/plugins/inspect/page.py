@@ -1,4 +1,5 @@
-"""One HTML file that draws the layers of all frames in any browser with WebGL 2, without a network: grids in 8 bits, a ray march, sliders."""
+"""One HTML file that draws the layers of all frames in any browser with WebGL 2, without a network: grids in 8 bits, a
+ray march, sliders."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ class Frames(Protocol):
 
 
 def write_page(path: Path, film: Frames, inspectors: Sequence[Inspector]) -> None:
-    """Writes the page, whole or not at all. It shows what was asked for first, and offers the built-in views of the same grids beside it.
+    """Writes the page, whole or not at all. It shows what was asked for first, and offers the built-in views of the
+    same grids beside it.
 
     Raises:
         ConfigError: more frames than one page holds.
@@ -59,7 +61,10 @@ def write_page(path: Path, film: Frames, inspectors: Sequence[Inspector]) -> Non
     data = {
         "up": film.up,
         "box": first.box.tolist(),
-        "views": {view.name: {"numbers": view.shows in ("sigma", "both"), "alone": view.shows == "primitive"} for view in views},
+        "views": {
+            view.name: {"numbers": view.shows in ("sigma", "both"), "alone": view.shows == "primitive"}
+            for view in views
+        },
         "first": inspectors[0].name,
         "maps": {name: table(name).ravel().tolist() for name in sorted(set(_maps(frames)))},
         "ball": {"points": points.ravel().round(6).tolist(), "faces": faces.ravel().tolist()},
@@ -67,12 +72,20 @@ def write_page(path: Path, film: Frames, inspectors: Sequence[Inspector]) -> Non
     }
     template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
     text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
-    write_text(path, template.replace("__TITLE__", html.escape(f"neuprim inspect: {film.name}")).replace("__DATA__", text))
+    write_text(
+        path, template.replace("__TITLE__", html.escape(f"neuprim inspect: {film.name}")).replace("__DATA__", text)
+    )
 
 
 def _frame(frame: FieldFrame, views: Sequence[Inspector], up: str, packed: Packed) -> dict[str, Any]:
-    sides = {view.name: ("model", "truth") if view.shows == "sigma" and frame.truth is not None else ("model",) for view in views}
-    layers = {view.name: {side: packed.layers(view.layers(frame.of_side(side))) for side in sides[view.name]} for view in views}
+    sides = {
+        view.name: ("model", "truth") if view.shows == "sigma" and frame.truth is not None else ("model",)
+        for view in views
+    }
+    layers = {
+        view.name: {side: packed.layers(view.layers(frame.of_side(side))) for side in sides[view.name]}
+        for view in views
+    }
     stands = {view.name: _stand(stand_of(view, frame, up)) for view in views if view.shows == "primitive"}
     numbers = None if frame.numbers is None else dict(frame.numbers)
     words = {"title": frame.title, "truthName": frame.truth_name, "numbers": numbers}

@@ -29,16 +29,22 @@ def ellipsoids(centres: np.ndarray, axes: np.ndarray, subdivisions: int) -> tupl
 
 
 def cut_ball(rings: int = 48) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The unit ball without the quarter x > 0 > y: (P, 3) float64 points through all of it, (F, 3) int64 triangles of its surface, and
-    (P, 3) float64 normals outward, 0 inside.
+    """The unit ball without the quarter x > 0 > y: (P, 3) float64 points through all of it, (F, 3) int64 triangles of
+    its surface, and (P, 3) float64 normals outward, 0 inside.
 
     The sphere and the two planes of the cut share no points, so that the edges between them stay sharp.
     """
-    radius, around, down = np.linspace(0, 1, rings // 2), np.radians(np.linspace(0, 270, 2 * rings + 1)), np.linspace(0, np.pi, rings)
+    radius, around, down = (
+        np.linspace(0, 1, rings // 2),
+        np.radians(np.linspace(0, 270, 2 * rings + 1)),
+        np.linspace(0, np.pi, rings),
+    )
     r, a, d = np.meshgrid(radius, around, down, indexing="ij")
     solid = np.stack([r * np.sin(d) * np.cos(a), r * np.sin(d) * np.sin(a), r * np.cos(d)], -1)
     index = np.arange(r.size).reshape(r.shape)
-    edges = np.concatenate([solid[-1, 0], solid[-1, -1]])  # the planes' own copies of the points where they meet the sphere
+    edges = np.concatenate(
+        [solid[-1, 0], solid[-1, -1]]
+    )  # the planes' own copies of the points where they meet the sphere
     first, last = index[:, 0].copy(), index[:, -1].copy()
     first[-1], last[-1] = r.size + np.arange(rings), r.size + rings + np.arange(rings)
     faces = [_triangles(index[-1].T), _triangles(first.T), _triangles(last)]
@@ -54,8 +60,11 @@ def _triangles(index: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
-def level_lines(points: np.ndarray, faces: np.ndarray, values: np.ndarray, level: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """(2 S, 3) ends and (S, 2) int64 pairs of the straight pieces along which a surface has a value, linear inside each triangle.
+def level_lines(
+    points: np.ndarray, faces: np.ndarray, values: np.ndarray, level: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """(2 S, 3) ends and (S, 2) int64 pairs of the straight pieces along which a surface has a value, linear inside each
+    triangle.
 
     Args:
         values: (P,) at the points.

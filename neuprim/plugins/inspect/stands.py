@@ -41,9 +41,15 @@ def stand_of(inspector: Inspector, frame: FieldFrame, up: str) -> Stand:
     if inspector.shows == "primitive":
         one = frame.geometry[frame.row() : frame.row() + 1]
         axes = one.rotations[0].double().numpy()
-        away = axes @ np.array([1.0, -1.0, 0.9])  # into the quarter that is missing, between the first two axes of the ellipsoid
-        return Stand(one.means[0].double().numpy(), 1.12 * float(one.length_scale), away / np.linalg.norm(away), axes[:, 2])
+        away = axes @ np.array(
+            [1.0, -1.0, 0.9]
+        )  # into the quarter that is missing, between the first two axes of the ellipsoid
+        return Stand(
+            one.means[0].double().numpy(), 1.12 * float(one.length_scale), away / np.linalg.norm(away), axes[:, 2]
+        )
     low, high = frame.box
     radius, upward = float(np.linalg.norm(high - low)) / 2, np.eye(3)["xyz".index(up)]
     away = np.array(_DIRECTIONS[up]) / np.linalg.norm(_DIRECTIONS[up])
-    return Stand((low + high) / 2 - 0.08 * radius * upward, 1.02 * radius, away, upward)  # at an angle, with the scalar bar below
+    return Stand(
+        (low + high) / 2 - 0.08 * radius * upward, 1.02 * radius, away, upward
+    )  # at an angle, with the scalar bar below

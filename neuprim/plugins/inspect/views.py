@@ -44,7 +44,8 @@ def _slices(frame: FieldFrame) -> list[Layer]:
 
 
 def strongest(frame: FieldFrame) -> np.ndarray:
-    """Positions in ``frame.alive`` of the ellipsoids that are drawn: those that can be seen at all, those that absorb most first."""
+    """Positions in ``frame.alive`` of the ellipsoids that are drawn: those that can be seen at all, those that absorb
+    most first."""
     visible = opacity_of(frame) >= FAINT
     order = frame.masses.argsort()[::-1]
     return np.asarray(order[visible[order]][: frame.options.limit])
@@ -66,8 +67,9 @@ def _primitives(frame: FieldFrame) -> list[Layer]:
 
 
 def _factor(frame: FieldFrame, position: int, unit: np.ndarray) -> np.ndarray:
-    """(P,) a primitive's density at points (P, 3) of the unit ball, less the weight that a soft edge fades it by: it has the same zeros inside,
-    but does not vanish with the weight, whose rounding would draw the line on the surface. There, it is that of a point just below.
+    """(P,) a primitive's density at points (P, 3) of the unit ball, less the weight that a soft edge fades it by: it
+    has the same zeros inside, but does not vanish with the weight, whose rounding would draw the line on the surface.
+    There, it is that of a point just below.
     """
     _, form = frame.model.lower_density(frame.conditions)
     edge = form.edge
@@ -89,7 +91,13 @@ def _primitive(frame: FieldFrame) -> list[Layer]:
     sigma = frame.density(int(frame.alive[position]), placed)
     low, high = float(sigma.min()), float(sigma.max())
     reach = max(abs(low), abs(high)) or 1.0
-    scale = Scale(-reach if low < 0 else 0.0, reach, SIGNED if low < 0 else frame.scale.colours, frame.scale.title, frame.scale.unit)
+    scale = Scale(
+        -reach if low < 0 else 0.0,
+        reach,
+        SIGNED if low < 0 else frame.scale.colours,
+        frame.scale.title,
+        frame.scale.unit,
+    )
     used, surface = np.unique(faces, return_inverse=True)
     points, sigma, surface = placed.numpy()[used], sigma[used], surface.reshape(faces.shape)
     found: list[Layer] = [Mesh(points, surface, values=sigma, scale=scale)]
@@ -106,5 +114,7 @@ VOLUME = Inspector(API_VERSION, "volume", "the extinction as a cloud", _volume)
 ISOSURFACE = Inspector(API_VERSION, "isosurface", "surfaces of equal extinction", _isosurface)
 SLICES = Inspector(API_VERSION, "slices", "three planes through the middle of the matter", _slices)
 PRIMITIVES = Inspector(API_VERSION, "primitives", "the ellipsoids in their own colours", _primitives, shows="model")
-PRIMITIVE = Inspector(API_VERSION, "primitive", "the density inside one primitive, cut open", _primitive, shows="primitive")
+PRIMITIVE = Inspector(
+    API_VERSION, "primitive", "the density inside one primitive, cut open", _primitive, shows="primitive"
+)
 DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _difference, shows="both")

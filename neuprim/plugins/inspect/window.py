@@ -20,11 +20,16 @@ _PANEL = (720, 640)
 
 def panels_of(inspectors: Sequence[Inspector], with_truth: bool) -> list[Panel]:
     """(inspector, side) of each panel: a view of the extinction is shown twice where there is a truth."""
-    return [(i, side) for i in inspectors for side in (("model", "truth") if with_truth and i.shows == "sigma" else ("model",))]
+    return [
+        (i, side)
+        for i in inspectors
+        for side in (("model", "truth") if with_truth and i.shows == "sigma" else ("model",))
+    ]
 
 
 class Window:
-    """A plotter with one panel per (inspector, side); panels of the scene share one camera, that of a single primitive has its own.
+    """A plotter with one panel per (inspector, side); panels of the scene share one camera, that of a single primitive
+    has its own.
 
     Args:
         size: of the picture in pixels; None for 720 x 640 per panel.
@@ -34,7 +39,9 @@ class Window:
         import pyvista
 
         self.panels = list(panels)
-        paired = any(side == "truth" for _, side in panels)  # then each row has a view of the model and the same of the truth
+        paired = any(
+            side == "truth" for _, side in panels
+        )  # then each row has a view of the model and the same of the truth
         columns = len(panels) if len(panels) <= 3 else 2 if paired else -(-len(panels) // 2)
         self.shape = (-(-len(panels) // columns), columns)
         asked = size or (columns * _PANEL[0], self.shape[0] * _PANEL[1])
@@ -59,7 +66,9 @@ class Window:
             add_layers(self.plotter, inspector.layers(part), panel)
             if inspector.shows != "primitive":
                 add_box(self.plotter, part.box)
-            self.plotter.add_text(_caption(inspector, part), position="upper_left", font_size=10, color="white", name="caption")
+            self.plotter.add_text(
+                _caption(inspector, part), position="upper_left", font_size=10, color="white", name="caption"
+            )
             self.plotter.add_axes(color="white", line_width=2)
         if not self._placed:
             self._place(frame)

@@ -21,7 +21,8 @@ FOLDER = "chunks"
 """Of a run directory: the runs of its chunks."""
 
 TOGETHER = 0.2
-"""Share of the budget in which the joined model is trained as one: what lies on both sides of a seam gets used to each other, and numbers settle.
+"""Share of the budget in which the joined model is trained as one: what lies on both sides of a seam gets used to each
+other, and numbers settle.
 More of it is a loss, as chunks are what learns (docs/dynamic.md)."""
 
 _FEWEST = 8
@@ -78,7 +79,9 @@ def plan_of(config: RunConfig, chunks: Chunks) -> Plan:
     """
     least = _FEWEST * len(chunks.parts)
     if config.model.primitives < least:
-        raise ConfigError(f"model.primitives={config.model.primitives}: expected at least {least} for {len(chunks.parts)} chunks")
+        raise ConfigError(
+            f"model.primitives={config.model.primitives}: expected at least {least} for {len(chunks.parts)} chunks"
+        )
     primitives = _shared(config.model.primitives - least, [part.primitives for part in chunks.parts])
     configs = []
     for part, own in zip(chunks.parts, primitives, strict=True):
@@ -91,7 +94,8 @@ def plan_of(config: RunConfig, chunks: Chunks) -> Plan:
 
 
 def _schedule(config: RunConfig, share: float) -> dict[str, Any]:
-    """The training of a part in a share of the whole's budget; it has as many interventions into its population as the whole has."""
+    """The training of a part in a share of the whole's budget; it has as many interventions into its population as the
+    whole has."""
     train = config.train
     found: dict[str, Any] = {"train.population.every": max(round(share * train.population.every), 1)}
     if train.iterations is not None:

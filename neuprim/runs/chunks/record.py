@@ -1,4 +1,5 @@
-"""What became of each chunk of a run: ``chunks.json`` in its directory, kept while they work, so that nothing that is done is done again."""
+"""What became of each chunk of a run: ``chunks.json`` in its directory, kept while they work, so that nothing that is
+done is done again."""
 
 from __future__ import annotations
 
@@ -56,7 +57,10 @@ class ChunkRecord:
 
     def write(self, folder: Path) -> None:
         """Raises OSError where it cannot be written; what was there is intact."""
-        write_json(folder / FILE, {"format": FORMAT, "chunks": [asdict(row) for row in self.rows], "joined_steps": self.joined_steps})
+        write_json(
+            folder / FILE,
+            {"format": FORMAT, "chunks": [asdict(row) for row in self.rows], "joined_steps": self.joined_steps},
+        )
 
     def ended(self, number: int, result: Result) -> ChunkRecord:
         """With how a chunk ended."""
@@ -97,11 +101,15 @@ def read_record(folder: Path) -> ChunkRecord | None:
         if data["format"] != FORMAT:
             raise DataError(f"{file}: format {data['format']!r}; this neuprim reads {FORMAT}; {_INSTEAD}")
         steps = data["joined_steps"]
-        return ChunkRecord(tuple(checked(Row, row, "chunks") for row in data["chunks"]), converted(steps, int | None, "joined_steps"))
+        return ChunkRecord(
+            tuple(checked(Row, row, "chunks") for row in data["chunks"]), converted(steps, int | None, "joined_steps")
+        )
     except (KeyError, TypeError, ValueError, AttributeError, ConfigError) as error:
         raise DataError(f"{file}: not {_WHAT} ({type(error).__name__}: {error}); {_INSTEAD}") from error
 
 
 def _said(rows: list[tuple[Any, ...]]) -> str:
     budget = [f"{iterations} steps" if seconds is None else f"{seconds:g} s" for _, _, iterations, seconds in rows]
-    return ", ".join(f"{name} ({primitives} primitives, {said})" for (name, primitives, _, _), said in zip(rows, budget, strict=True))
+    return ", ".join(
+        f"{name} ({primitives} primitives, {said})" for (name, primitives, _, _), said in zip(rows, budget, strict=True)
+    )

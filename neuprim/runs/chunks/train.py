@@ -1,4 +1,5 @@
-"""The training half of a run in chunks: every chunk a run of its own, then all of them as one model, trained on together for the last of the budget."""
+"""The training half of a run in chunks: every chunk a run of its own, then all of them as one model, trained on
+together for the last of the budget."""
 
 from __future__ import annotations
 
@@ -57,7 +58,8 @@ def train_in_chunks(
     Raises:
         ChunksMissing: some of them failed; the others went on.
         KeyboardInterrupt: Ctrl-C came before all chunks were there; those at work have their checkpoints.
-        NeuprimError: what a run may raise, a launcher that cannot work here, or chunks other than those that the run was begun with.
+        NeuprimError: what a run may raise, a launcher that cannot work here, or chunks other than those that the run
+        was begun with.
     """
     before_training(config, launcher, lambda text, fraction: events(Preparing(text, fraction)))
     chunks = chunks_of(config, events)
@@ -81,7 +83,9 @@ def train_in_chunks(
     return train(config, suspects, events, between=between, make=make)
 
 
-def _fitted(config: RunConfig, plan: Plan, record: ChunkRecord, events: Events, launcher: LauncherSettings) -> ChunkRecord:
+def _fitted(
+    config: RunConfig, plan: Plan, record: ChunkRecord, events: Events, launcher: LauncherSettings
+) -> ChunkRecord:
     """Have every chunk fitted that is not there yet."""
     folder = config.output_dir
     todo = [n for n, own in enumerate(plan.configs) if not _is_done(record, n, own)]
@@ -101,7 +105,13 @@ def _fitted(config: RunConfig, plan: Plan, record: ChunkRecord, events: Events, 
         if result.state == "failed":
             events(Note(f"{plan.configs[todo[number]].output_dir}: {result.line}"))
 
-    launch([_job(plan.configs[n]) for n in todo], launcher, folder / LAUNCH, lambda n, status: shown(todo[n], status), ended)
+    launch(
+        [_job(plan.configs[n]) for n in todo],
+        launcher,
+        folder / LAUNCH,
+        lambda n, status: shown(todo[n], status),
+        ended,
+    )
     for result in results.values():
         if result.trace:
             raise RuntimeError(f"in a chunk's run:\n{result.trace}")
@@ -128,7 +138,9 @@ def _is_done(record: ChunkRecord, number: int, config: RunConfig) -> bool:
 
 def _joined(plan: Plan, task: TaskSpec, suspects: Suspects) -> Primitives:
     models = [load_model(model_file(config.output_dir), task)[0] for config in plan.configs]
-    with blamed(suspects.scene.origin, f"join of {suspects.scene.what}", plan.configs[0].output_dir.parent.parent / LOGS):
+    with blamed(
+        suspects.scene.origin, f"join of {suspects.scene.what}", plan.configs[0].output_dir.parent.parent / LOGS
+    ):
         return plan.chunks.join(models)
 
 
@@ -143,7 +155,13 @@ class _Shown:
 
     def __call__(self, number: int, status: Status) -> None:
         self._statuses[number] = status
-        counts = Counter("waiting" if s.state == "waiting" else s.state if s.state in ENDED else "at work" for s in self._statuses)
-        said = ", ".join(f"{counts[state]} {state}" for state in ("done", "at work", "waiting", "failed", "interrupted") if counts[state])
+        counts = Counter(
+            "waiting" if s.state == "waiting" else s.state if s.state in ENDED else "at work" for s in self._statuses
+        )
+        said = ", ".join(
+            f"{counts[state]} {state}"
+            for state in ("done", "at work", "waiting", "failed", "interrupted")
+            if counts[state]
+        )
         progress = sum(1.0 if s.state in ENDED else s.progress for s in self._statuses) / len(self._statuses)
         self._events(Preparing(f"fitting {len(self._statuses)} chunks ({said})", progress))

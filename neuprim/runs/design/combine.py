@@ -1,4 +1,5 @@
-"""From single knobs to combinations: down from the centre along the fronts of time and of bytes, and up along that of quality."""
+"""From single knobs to combinations: down from the centre along the fronts of time and of bytes, and up along that of
+quality."""
 
 from __future__ import annotations
 
@@ -28,9 +29,21 @@ def combinations(found: Sequence[Model], most: int) -> list[Variant]:
     centre = found[0]
     single = [m for m in found if m.knob not in (CENTRE, COMBINED) and m.length == 1.0 and len(m.turned) == 1]
     lost = {id(m): centre.quality["psnr"] - m.quality["psnr"] for m in single}
-    faster = [Move(m.knob, m.turned[0], -math.log(m.ratio), lost[id(m)]) for m in single if m.ratios and 0 < m.ratio < 1.0 - m.doubt]
-    smaller = [Move(m.knob, m.turned[0], math.log(centre.bytes / m.bytes), lost[id(m)]) for m in single if m.bytes < centre.bytes]
-    better = [Move(m.knob, m.turned[0], -lost[id(m)], math.log(m.bytes / centre.bytes)) for m in single if lost[id(m)] < -_BETTER]
+    faster = [
+        Move(m.knob, m.turned[0], -math.log(m.ratio), lost[id(m)])
+        for m in single
+        if m.ratios and 0 < m.ratio < 1.0 - m.doubt
+    ]
+    smaller = [
+        Move(m.knob, m.turned[0], math.log(centre.bytes / m.bytes), lost[id(m)])
+        for m in single
+        if m.bytes < centre.bytes
+    ]
+    better = [
+        Move(m.knob, m.turned[0], -lost[id(m)], math.log(m.bytes / centre.bytes))
+        for m in single
+        if lost[id(m)] < -_BETTER
+    ]
     known = {frozenset(m.turned) for m in found}
     ways = []
     for moves in (smaller, faster, better):

@@ -57,11 +57,15 @@ def check_folder(folder: Path, before: Record | None, centre: RunConfig, request
             raise ConfigError(f"output_dir={folder}: holds something else; expected a new directory, or that of a set")
         return
     if before.same.get("kind") != "models":
-        raise DataError(f"{folder / 'tradeoff.json'}: of a finished run's drawing; expected another output_dir=DIR for trainings")
+        raise DataError(
+            f"{folder / 'tradeoff.json'}: of a finished run's drawing; expected another output_dir=DIR for trainings"
+        )
     asked = {"centre": _settings(centre), "seeds": request.seeds}
     changed = [name for name, value in asked.items() if before.same.get(name) != value]
     if changed:
-        raise ConfigError(f"{folder}: holds a set with another {' and '.join(changed)}; expected the same words, or another output_dir=DIR")
+        raise ConfigError(
+            f"{folder}: holds a set with another {' and '.join(changed)}; expected the same words, or another output_dir=DIR"
+        )
 
 
 def same_of(centre: RunConfig, dataset: Dataset, request: DesignRequest) -> dict[str, Any]:
@@ -76,7 +80,12 @@ def same_of(centre: RunConfig, dataset: Dataset, request: DesignRequest) -> dict
         "image_size": [camera.width, camera.height],
         "lpips": str(request.lpips or centre.metrics.lpips or ""),
         "machine": {"cpu": cpu_name(), "cores": core_count()},
-        "versions": {"neuprim": __version__, "python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
+        "versions": {
+            "neuprim": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
     }
 
 
@@ -87,13 +96,21 @@ def kept_record(folder: Path, before: Record | None, same: dict[str, Any], tell:
     facts: dict[str, Any] = {name: before.facts[name] for name in ("spent_seconds", "exact") if name in before.facts}
     changed = [name for name in same if before.same.get(name) != same[name]]
     if changed:
-        tell(f"{folder / 'tradeoff.json'}: measured with {' and '.join(changed)} of before; models are kept, and measured anew")
+        tell(
+            f"{folder / 'tradeoff.json'}: measured with {' and '.join(changed)} of before; models are kept, and measured anew"
+        )
         return Record(same, facts)
-    points = [point for point in before.points if isinstance(point, Model) and (folder / point.run_dir / "model.safetensors").exists()]
+    points = [
+        point
+        for point in before.points
+        if isinstance(point, Model) and (folder / point.run_dir / "model.safetensors").exists()
+    ]
     if not points or points[0].name != CENTRE:
         points = []
     if points:
-        tell(f"{folder / 'tradeoff.json'}: {len(points)} models trained already are kept; delete the folder to train anew")
+        tell(
+            f"{folder / 'tradeoff.json'}: {len(points)} models trained already are kept; delete the folder to train anew"
+        )
     return Record(same, facts, list[Measured](points))
 
 
@@ -104,7 +121,9 @@ def old_plan(folder: Path, before: Record | None) -> Plan | None:
         return Plan.from_dict(before.facts["plan"])
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         what = f"{type(error).__name__}: {error}"
-        raise DataError(f"{folder / 'tradeoff.json'}: plan is damaged ({what}); delete the folder to train anew") from error
+        raise DataError(
+            f"{folder / 'tradeoff.json'}: plan is damaged ({what}); delete the folder to train anew"
+        ) from error
 
 
 def number_of(record: Record, name: str) -> float:

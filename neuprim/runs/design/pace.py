@@ -1,4 +1,5 @@
-"""How long a training step of a model takes, as a multiple of the centre's: a few of each in turns, so that both meet the same noise."""
+"""How long a training step of a model takes, as a multiple of the centre's: a few of each in turns, so that both meet
+the same noise."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from neuprim.runs.training import make_ready
 __all__ = ["Pace", "Paces"]
 
 _TURN, _ROUNDS, _MOST_ROUNDS = 4, 4, 20
-"""Steps of a turn, and turns at least: together as many as the presets have between two looks at voxels; and at most."""
+"""Steps of a turn, and turns at least: together as many as the presets have between two looks at voxels; and at
+most."""
 
 _SECONDS = 0.4
 """Turns go on until steps of the centre have taken as long."""
@@ -46,8 +48,8 @@ class Paces:
     Steps are taken in the middle of the budget, where every band of colour is in use and images have their full size.
 
     Attributes:
-        seconds: per step of the centre, the median of all its turns so far: what else the machine did for a moment does not shorten trainings.
-        centre: its own pace.
+        seconds: per step of the centre, the median of all its turns so far: what else the machine did for a moment does
+        not shorten trainings. centre: its own pace.
         compiling: seconds that compiling kernels took, or finding them on disk.
     """
 
@@ -86,13 +88,19 @@ class Paces:
     def _ready(self, config: RunConfig) -> tuple[Trainer, float, tuple[Any, ...]]:
         begun = time.perf_counter()
         population = replace(config.train.population, grow_from=1.0)  # by the middle all have been born
-        trainer = start(replace(config, train=replace(config.train, population=population)), dataset=self._dataset).trainer
+        trainer = start(
+            replace(config, train=replace(config.train, population=population)), dataset=self._dataset
+        ).trainer
         started = time.perf_counter()
         make_ready(trainer)
         self.compiling += time.perf_counter() - started
         model, settings = trainer.model, trainer.settings
         trainer.step, trainer.elapsed = (settings.iterations or 0) // 2, (settings.max_seconds or 0.0) / 2
-        like = (model.count, settings.population.grow_to, *(type(f).__name__ + repr(f.settings()) for f in (model.density, model.colour)))
+        like = (
+            model.count,
+            settings.population.grow_to,
+            *(type(f).__name__ + repr(f.settings()) for f in (model.density, model.colour)),
+        )
         return trainer, started - begun, like
 
 

@@ -14,8 +14,8 @@ __all__ = ["pictures"]
 
 
 def pictures(measured: SideBySide, models: Sequence[Model], numbers: Sequence[int]) -> dict[int, Picture]:
-    """Number of a model -> what it shows of the view that has most to show, with the truth that it is compared with; and the truth under -1;
-    all as displayed."""
+    """Number of a model -> what it shows of the view that has most to show, with the truth that it is compared with;
+    and the truth under -1; all as displayed."""
     channels: Channels = measured.subject(measured.folder / models[0].run_dir)[0].channels
     truth = max(measured.truths, key=lambda one: float(channels.display(one.image).var()))
     wanted = channels.display(truth.image).clamp(0.0, 1.0)

@@ -43,7 +43,8 @@ class Plan:
     def words_of(self, variant: Variant, words: Sequence[str], centre: RunConfig) -> list[str]:
         """What trains a variant, after ``neuprim run``.
 
-        Interventions into the population come as often in a run as they would in one of the length that the preset says.
+        Interventions into the population come as often in a run as they would in one of the length that the preset
+        says.
         """
         steps = self.steps_of(variant)
         said = {assignment.key for assignment in parse(words)}
@@ -51,7 +52,11 @@ class Plan:
         if centre.train.max_seconds is not None:
             budget.append("train.max_seconds=null")
         every = "train.population.every"
-        scaled = max(1, round(centre.train.population.every * steps / self.whole)) if self.whole else centre.train.population.every
+        scaled = (
+            max(1, round(centre.train.population.every * steps / self.whole))
+            if self.whole
+            else centre.train.population.every
+        )
         if every not in said and scaled != centre.train.population.every:
             budget.append(word(every, scaled))
         return merged(words, [*variant.turned, *budget])
@@ -75,8 +80,9 @@ class Plan:
 
 
 def planned(centre: RunConfig, pace: float, available: float, lengths: Sequence[float], starting: float) -> Plan:
-    """Steps of the centre with which trainings of these lengths take the seconds that there are, but no more steps than its words or preset
-    say, and not much less than a tenth of them: of a budget that is too small for that, variants are left out.
+    """Steps of the centre with which trainings of these lengths take the seconds that there are, but no more steps than
+    its words or preset say, and not much less than a tenth of them: of a budget that is too small for that, variants
+    are left out.
 
     Args:
         pace: seconds per step of the centre.

@@ -31,8 +31,8 @@ class Model(Measured):
         steps, seconds: of its training.
         steps_in_turns: seconds per step over the centre's beside it, of each round in which both took turns.
         centre_ms: median milliseconds per frame of the centre over all its rounds.
-        seeds: PSNR of the training with each seed; ``quality`` has the means of PSNR and SSIM over them, and the other numbers of the first.
-        run_dir: the first seed's, inside the folder of the set.
+        seeds: PSNR of the training with each seed; ``quality`` has the means of PSNR and SSIM over them, and the other
+        numbers of the first. run_dir: the first seed's, inside the folder of the set.
     """
 
     turned: tuple[str, ...] = ()
@@ -56,7 +56,8 @@ class Model(Measured):
 
     @property
     def time(self) -> float:
-        """Milliseconds per frame: the centre's, times the ratio; models that were timed in different rounds, under another load, compare so."""
+        """Milliseconds per frame: the centre's, times the ratio; models that were timed in different rounds, under
+        another load, compare so."""
         return self.ratio * self.centre_ms if self.centre_ms else super().time
 
     @property
@@ -77,7 +78,10 @@ class Model(Measured):
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         hints = hints_of(cls)
-        return replace(super().from_dict(data), **{name: converted(data[name], hints[name], f"points.{name}") for name in (*_OWN, *_LISTS)})
+        return replace(
+            super().from_dict(data),
+            **{name: converted(data[name], hints[name], f"points.{name}") for name in (*_OWN, *_LISTS)},
+        )
 
 
 _OWN = ("length", "primitives", "parameters_per_primitive", "steps", "seconds", "centre_ms", "run_dir")

@@ -1,4 +1,5 @@
-"""Train a designed set of models, measure them side by side, find the fronts, and write it all into one folder that can be gone on with."""
+"""Train a designed set of models, measure them side by side, find the fronts, and write it all into one folder that can
+be gone on with."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ from neuprim.runs.tradeoff.record import Record, read_record, write_csv
 __all__ = ["TRIALS", "DesignRequest", "design_run"]
 
 _SINGLES, _TIMED, _COMBINED = 0.58, 0.64, 0.88
-"""Parts of the budget that remains after paces are known, by which single knobs are trained and timed, and combinations trained, which a single knob has none of."""
+"""Parts of the budget that remains after paces are known, by which single knobs are trained and timed, and combinations
+trained, which a single knob has none of."""
 
 
 def design_run(
@@ -39,17 +41,20 @@ def design_run(
     tell: Tell = lambda text: None,
     progress: Progress = lambda text, fraction: None,
 ) -> tuple[Path, Record]:
-    """Train and measure, and write ``tradeoff.json``, ``tradeoff.csv``, ``tradeoff.html`` and ``front.png`` into the set's folder, beside
-    :data:`TRIALS`; returns the folder and the record, whose points are :class:`~neuprim.runs.design.record.Model`.
+    """Train and measure, and write ``tradeoff.json``, ``tradeoff.csv``, ``tradeoff.html`` and ``front.png`` into the
+    set's folder, beside :data:`TRIALS`; returns the folder and the record, whose points are
+    :class:`~neuprim.runs.design.record.Model`.
 
-    The same request goes on where it was left: what is trained stays as it is, and a larger budget adds what did not fit.
+    The same request goes on where it was left: what is trained stays as it is, and a larger budget adds what did not
+    fit.
 
     Args:
         tell: called with lines for the user.
         progress: called with (text, fraction 0..1 of what the text names).
 
     Raises:
-        NeuprimError: words that do not fit, no such knob, data that cannot be read, or a folder that holds something else.
+        NeuprimError: words that do not fit, no such knob, data that cannot be read, or a folder that holds something
+        else.
     """
     begun = time.monotonic()
     words, folder, centre = centre_of(request)
@@ -69,7 +74,9 @@ def design_run(
         record = kept_record(folder, before, same_of(centre, dataset, request), tell)
         spent = number_of(record, "spent_seconds")
         session = Session(request, folder, words, centre, dataset, record, tell, progress, begun, spent, plan)
-        record.left_out += [LeftOut(name, (), "nothing but what the centre has") for name, ladder in ladders.items() if not ladder]
+        record.left_out += [
+            LeftOut(name, (), "nothing but what the centre has") for name, ladder in ladders.items() if not ladder
+        ]
         wanted = session.with_paces([Variant(CENTRE), *in_turn(ladders)])
         several = len([ladder for ladder in ladders.values() if ladder]) > 1
         session.make_plan(wanted, several)
@@ -81,7 +88,9 @@ def design_run(
         _describe(session)
         record.speed, record.size = fronts(session.models)
         session.write()
-        write_csv(folder / "tradeoff.csv", record, lambda number: session.models[number].primitives, _columns(session.models))
+        write_csv(
+            folder / "tradeoff.csv", record, lambda number: session.models[number].primitives, _columns(session.models)
+        )
         progress("pictures of the front", 0.0)
         shown = pictures(session.measuring, session.models, [*record.speed, *record.size])
     write_models(folder, record.to_dict(), shown, command)

@@ -39,7 +39,8 @@ _SLOW = 10.0
 """Seconds of compiling that are said."""
 
 _TRAINED, _TOGETHER = 0.5, 0.22
-"""Parts of what remains then for training single knobs, and for training combinations; a knob that is the only one has both."""
+"""Parts of what remains then for training single knobs, and for training combinations; a knob that is the only one has
+both."""
 
 _EXACT = 0.08
 """Part of it for the exact images of all models together, of which there are about so many."""
@@ -105,12 +106,14 @@ class Session:
 
     @property
     def spent(self) -> float:
-        """Seconds of the budget so far, those of earlier sessions included, but not those that went into compiling kernels."""
+        """Seconds of the budget so far, those of earlier sessions included, but not those that went into compiling
+        kernels."""
         return self._before + time.monotonic() - self._begun - self.compiling
 
     @property
     def remaining(self) -> float:
-        """Seconds of the budget that were left when the lengths were chosen, or when this session began, if that was later."""
+        """Seconds of the budget that were left when the lengths were chosen, or when this session began, if that was
+        later."""
         return max(self.request.budget - self._planned_at, 0.0)
 
     def left(self, part: float) -> float:
@@ -188,7 +191,8 @@ class Session:
         return self._paces
 
     def make_plan(self, wanted: Sequence[Variant], combined: bool = True) -> None:
-        """Choose lengths with which all of these fit, unless that was done by an earlier session: then the same models are trained.
+        """Choose lengths with which all of these fit, unless that was done by an earlier session: then the same models
+        are trained.
 
         ``combined``: whether combinations will follow.
         """
@@ -199,7 +203,9 @@ class Session:
             lengths = [variant.length for variant in wanted for _ in range(self.request.seeds)]
             starting = sum(self._known[variant.name].starting for variant in wanted) / len(wanted)
             part = _TRAINED if combined else _TRAINED + _TOGETHER
-            self.plan = planned(self.centre, self._all_paces().seconds, part * self.remaining * self._workers, lengths, starting)
+            self.plan = planned(
+                self.centre, self._all_paces().seconds, part * self.remaining * self._workers, lengths, starting
+            )
             for variant in wanted:
                 self.plan = self.plan.knowing(variant, self._known[variant.name].ratio)
         self.write()
@@ -207,8 +213,8 @@ class Session:
     # ------------------------------------------------------------ training
 
     def train(self, wanted: Sequence[Variant], part: float) -> None:
-        """Train what is not there yet and ends by that part of what remained, and look at its images. What an earlier session has begun is
-        ended in any case, and so is the centre, without which nothing can be said."""
+        """Train what is not there yet and ends by that part of what remained, and look at its images. What an earlier
+        session has begun is ended in any case, and so is the centre, without which nothing can be said."""
         assert self.plan is not None
         todo = [variant for variant in wanted if not any(model.variant == variant for model in self.models)]
         while todo:
@@ -228,8 +234,8 @@ class Session:
                 self._make(fits, f"training {first} of {len(wanted)}, {names}")
 
     def _fitting(self, todo: Sequence[Variant], part: float) -> int:
-        """How many of them to begin together: one in this process; elsewhere as many as are at work at once, some rounds of them where there is
-        time, as workers take a while to begin."""
+        """How many of them to begin together: one in this process; elsewhere as many as are at work at once, some
+        rounds of them where there is time, as workers take a while to begin."""
         if self._workers == 1:
             return 1
         most = max(self._workers // self.request.seeds, 1)
@@ -263,7 +269,9 @@ class Session:
         trials = [[self._trial(variant, seed) for seed in range(self.request.seeds)] for variant in variants]
         made: list[list[Outcome] | NeuprimError] = []
         if self.request.launcher.name != "inline":
-            return launched_trials(trials, self.request.launcher, self.folder, lambda fraction: self.progress(text, fraction))
+            return launched_trials(
+                trials, self.request.launcher, self.folder, lambda fraction: self.progress(text, fraction)
+            )
         for several in trials:
             try:
                 made.append([run_trial(trial, self.dataset, self._hear(text)) for trial in several])
@@ -344,7 +352,9 @@ class Session:
         assert self.plan is not None
         old = [model.variant for model in self.models if model.knob == COMBINED]
         seconds = self._workers * min(_TOGETHER * self.remaining, self.left(part))
-        most = min(int(seconds / max(self._late * self.plan.seconds * self.request.seeds, 1e-9)), _COMBINATIONS - len(old))
+        most = min(
+            int(seconds / max(self._late * self.plan.seconds * self.request.seeds, 1e-9)), _COMBINATIONS - len(old)
+        )
         found = combinations(self.models, most)
         return [*old, *(variant for variant in found if self._allowed(variant))]
 

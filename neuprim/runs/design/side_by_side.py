@@ -24,7 +24,12 @@ class SideBySide:
     """
 
     def __init__(
-        self, folder: Path, dataset: Dataset, truths: list[Truth], lpips: Path | None, progress: Callable[[str, float], None]
+        self,
+        folder: Path,
+        dataset: Dataset,
+        truths: list[Truth],
+        lpips: Path | None,
+        progress: Callable[[str, float], None],
     ) -> None:
         self.folder, self.dataset, self.truths, self.lpips, self.progress = folder, dataset, truths, lpips, progress
         self._open: dict[Path, tuple[Subject, Models]] = {}
@@ -41,7 +46,9 @@ class SideBySide:
         """Of the backend that draws the first model opened; empty before that."""
         return next((subject.backend(subject.reference).name for subject, _ in self._open.values()), "")
 
-    def look(self, run_dir: Path, knob: str, allowed: float, float64: bool | None) -> tuple[Measured, dict[str, object]]:
+    def look(
+        self, run_dir: Path, knob: str, allowed: float, float64: bool | None
+    ) -> tuple[Measured, dict[str, object]]:
         """Images, bytes and memory of a model, against its own exact images, and how these were drawn.
 
         Args:
@@ -66,4 +73,6 @@ class SideBySide:
         def tell(number: int, count: int) -> None:
             self.progress(f"round {number} of {count}, {len(found)} models", (number - 1) / count)
 
-        take_turns(self.truths, self.ready, [(model, model) for model in found], lambda model: repeats, deadline, tell, done)
+        take_turns(
+            self.truths, self.ready, [(model, model) for model in found], lambda model: repeats, deadline, tell, done
+        )

@@ -52,7 +52,8 @@ class Variant:
 
     @property
     def folder(self) -> str:
-        """A file-name-safe name; two variants of one set have different ones unless their words are longer than any that knobs make."""
+        """A file-name-safe name; two variants of one set have different ones unless their words are longer than any
+        that knobs make."""
         text = re.sub(r"[^A-Za-z0-9._+-]+", "-", "_".join(self.name.split(" "))).strip("._-")
         return text[:_NAME]
 
@@ -64,12 +65,15 @@ def merged(words: Sequence[str], over: Sequence[str]) -> list[str]:
 
 
 def singles(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]:
-    """Knob -> its variants, those next to the centre first; without the centre's own values as far as its settings name them."""
+    """Knob -> its variants, those next to the centre first; without the centre's own values as far as its settings name
+    them."""
     own = traded(task, build_settings(task, centre.model, centre.options))
     counts = dict.fromkeys(max(1, round(part * centre.model.primitives)) for part in _PARTS["model.primitives"])
     found: dict[str, list[Variant]] = {
         "model.primitives": [
-            Variant("model.primitives", (word("model.primitives", count),)) for count in counts if count != centre.model.primitives
+            Variant("model.primitives", (word("model.primitives", count),))
+            for count in counts
+            if count != centre.model.primitives
         ]
     }
     for knob, values in own.items():

@@ -1,4 +1,5 @@
-"""What is asked of an engine that runs tasks elsewhere, and the loop that hands them over, looks after them and collects what came out."""
+"""What is asked of an engine that runs tasks elsewhere, and the loop that hands them over, looks after them and
+collects what came out."""
 
 from __future__ import annotations
 
@@ -59,7 +60,9 @@ class Engine(Protocol):
         """Let go of everything; ``now``: what still works is killed."""
 
 
-def through(engine: Engine, jobs: Sequence[Job], folder: Path, retries: int, hear: Hear, ended: Ended) -> list[Result | None]:
+def through(
+    engine: Engine, jobs: Sequence[Job], folder: Path, retries: int, hear: Hear, ended: Ended
+) -> list[Result | None]:
     """Results in the order of the jobs; None of those that were not begun when Ctrl-C came.
 
     The first Ctrl-C has every run finish its step and write its checkpoint; the second ends their processes.
@@ -73,7 +76,8 @@ def through(engine: Engine, jobs: Sequence[Job], folder: Path, retries: int, hea
     stop.unlink(missing_ok=True)
     variables = environment(engine.threads)
     tasks = [
-        Task(job, engine.threads, folder.absolute() / f"{number}.json", stop, Path.cwd(), variables) for number, job in enumerate(jobs)
+        Task(job, engine.threads, folder.absolute() / f"{number}.json", stop, Path.cwd(), variables)
+        for number, job in enumerate(jobs)
     ]
     watch = _Watch(hear)
     waiting = deque(enumerate(tasks))
@@ -134,7 +138,8 @@ def finished(status: Status, result: Result) -> Status:
 
 
 class _Watch:
-    """Tells what is new of each job, and of whom nothing was heard for long; by this machine's clock alone, as others may go differently."""
+    """Tells what is new of each job, and of whom nothing was heard for long; by this machine's clock alone, as others
+    may go differently."""
 
     def __init__(self, hear: Hear) -> None:
         self._hear = hear

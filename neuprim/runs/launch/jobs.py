@@ -1,4 +1,5 @@
-"""What is launched: the name of a function and plain values for it, so that any process that has the package can do it."""
+"""What is launched: the name of a function and plain values for it, so that any process that has the package can do
+it."""
 
 from __future__ import annotations
 
@@ -23,9 +24,11 @@ class Job:
 
     Attributes:
         name: unique among those launched together, and good as a file's name.
-        call: ``module:function``, which is called with ``data``, the number of times that its worker died before, and a listener of events.
+        call: ``module:function``, which is called with ``data``, the number of times that its worker died before, and a
+        listener of events.
             From the second time on it should go on where it was left.
-        data: values that another process can have: numbers, texts, lists, dictionaries, paths. Objects of plugins are named, not sent.
+        data: values that another process can have: numbers, texts, lists, dictionaries, paths. Objects of plugins are
+        named, not sent.
     """
 
     name: str
@@ -72,4 +75,6 @@ def perform(job: Job, attempt: int, events: Events) -> Result:
         if line is not None:
             return result("failed", line=line)
         said = " ".join(str(error).split())
-        return result("failed", line=": ".join(filter(None, (type(error).__name__, said))), trace=traceback.format_exc())
+        return result(
+            "failed", line=": ".join(filter(None, (type(error).__name__, said))), trace=traceback.format_exc()
+        )

@@ -1,6 +1,7 @@
 """``launcher=processes``: processes of this machine.
 
-Every worker is a pool of its own with one process (concurrent.futures): when the system kills one, its pool breaks and no other's.
+Every worker is a pool of its own with one process (concurrent.futures): when the system kills one, its pool breaks and
+no other's.
 """
 
 from __future__ import annotations
@@ -76,8 +77,12 @@ class Processes:
             result = handle.future.result()
         except BrokenProcessPool:
             handle.pool.executor.shutdown(wait=False)
-            where = f"; it printed {handle.pool.log}" if handle.pool.log.exists() and handle.pool.log.stat().st_size else ""
-            raise WorkerDied(f"its process was killed, as the system does when memory is full, or it crashed{where}") from None
+            where = (
+                f"; it printed {handle.pool.log}" if handle.pool.log.exists() and handle.pool.log.stat().st_size else ""
+            )
+            raise WorkerDied(
+                f"its process was killed, as the system does when memory is full, or it crashed{where}"
+            ) from None
         self._idle.append(handle.pool)
         return result
 
@@ -114,7 +119,8 @@ def _set(variables: Mapping[str, str]) -> Iterator[None]:
 
 
 def _begin(log: Path) -> None:
-    """In a new worker: out of reach of the terminal's Ctrl-C, which the launcher hands on, its output in a file, and not left alone."""
+    """In a new worker: out of reach of the terminal's Ctrl-C, which the launcher hands on, its output in a file, and
+    not left alone."""
     if hasattr(os, "setsid"):
         os.setsid()
     for stream in (sys.stdout, sys.stderr):

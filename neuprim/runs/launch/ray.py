@@ -1,4 +1,5 @@
-"""``launcher=ray``: tasks of Ray, on this machine or on a cluster whose machines have neuprim and see the output directory under the same path."""
+"""``launcher=ray``: tasks of Ray, on this machine or on a cluster whose machines have neuprim and see the output
+directory under the same path."""
 
 from __future__ import annotations
 
@@ -62,7 +63,9 @@ class Ray:
         try:
             result: Result = self._ray.get(handle)
             return result
-        except self._ray.exceptions.RayTaskError as error:  # the worker lacks something: a job's own errors are in its result
+        except (
+            self._ray.exceptions.RayTaskError
+        ) as error:  # the worker lacks something: a job's own errors are in its result
             return Result("failed", line=f"the worker cannot do it: {_line(error.cause)}", trace=str(error))
         except self._ray.exceptions.RayError as error:
             raise WorkerDied(_line(error)) from None
@@ -121,7 +124,9 @@ def _shared_out(ray: Any, settings: LauncherSettings, jobs: int) -> tuple[int, i
     workers = settings.workers or jobs
     threads = settings.threads or max(min(cores // workers, most), 1)
     if threads > most:
-        raise ConfigError(f"launcher.threads={threads}: no machine of this Ray cluster has as many; expected at most {most}")
+        raise ConfigError(
+            f"launcher.threads={threads}: no machine of this Ray cluster has as many; expected at most {most}"
+        )
     return workers, threads
 
 

@@ -23,7 +23,11 @@ def shared_out(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
     if threads is None:
         threads = max(cores // workers, 1)
     if workers * threads > cores:
-        said = {name: value for name, value in (("workers", settings.workers), ("threads", settings.threads)) if value is not None}
+        said = {
+            name: value
+            for name, value in (("workers", settings.workers), ("threads", settings.threads))
+            if value is not None
+        }
         found = " with ".join(f"launcher.{name}={value}" for name, value in said.items())
         raise ConfigError(
             f"{found}: more than the {cores} core{'s' * (cores > 1)} of this machine; expected at most {cores} threads together"
@@ -34,7 +38,8 @@ def shared_out(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
 def at_once(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
     """(runs at once, threads of each, 0 for all) that a search may count on; raises as :func:`shared_out`.
 
-    What a cluster has at a given time nobody knows: there it is what the user says, else as many as this machine has cores, with one thread.
+    What a cluster has at a given time nobody knows: there it is what the user says, else as many as this machine has
+    cores, with one thread.
     """
     if settings.name == "inline":
         return 1, settings.threads or 0
@@ -45,5 +50,6 @@ def at_once(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
 
 
 def own_share(settings: LauncherSettings) -> AbstractContextManager[None]:
-    """Inside, this process has the threads that runs in it shall have; where nothing is said, or they work elsewhere, those that it has."""
+    """Inside, this process has the threads that runs in it shall have; where nothing is said, or they work elsewhere,
+    those that it has."""
     return sharing(settings.threads) if settings.name == "inline" and settings.threads is not None else nullcontext()

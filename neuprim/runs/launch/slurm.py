@@ -1,7 +1,8 @@
-"""``launcher=slurm``: jobs of a Slurm cluster, by submitit; its local executor does the same in processes of this machine.
+"""``launcher=slurm``: jobs of a Slurm cluster, by submitit; its local executor does the same in processes of this
+machine.
 
-Every machine of the cluster has neuprim and sees the output directory under the same path. A job that Slurm preempts, or whose time is up, is
-queued again by submitit and goes on from its run's checkpoint.
+Every machine of the cluster has neuprim and sees the output directory under the same path. A job that Slurm preempts,
+or whose time is up, is queued again by submitit and goes on from its run's checkpoint.
 """
 
 from __future__ import annotations
@@ -61,9 +62,12 @@ class Slurm:
         if address not in _EXECUTORS:
             raise ConfigError(f"launcher.address={address}: expected {' or '.join(_EXECUTORS)}")
         local = address == "local"
-        self.workers, self.threads = shared_out(settings, jobs) if local else (settings.workers or jobs, settings.threads or 1)
+        self.workers, self.threads = (
+            shared_out(settings, jobs) if local else (settings.workers or jobs, settings.threads or 1)
+        )
         folder.mkdir(parents=True, exist_ok=True)
-        # Results are pickles, which run code when they are read: they come from a folder that only this launch and its user write.
+        # Results are pickles, which run code when they are read: they come from a folder that only this launch and its
+        # user write.
         self._folder, self._died = Path(tempfile.mkdtemp(prefix="submitit-", dir=folder.absolute())), False
         self._jobs: list[Any] = []
         try:
@@ -72,7 +76,9 @@ class Slurm:
             self.close(False)
             with suppress(OSError):  # it has files of others
                 folder.rmdir()
-            raise BackendUnavailable(f"launcher=slurm: {_line(error)}; launcher.address=local does without a cluster") from None
+            raise BackendUnavailable(
+                f"launcher=slurm: {_line(error)}; launcher.address=local does without a cluster"
+            ) from None
         try:
             self._executor.update_parameters(
                 **{"name": "neuprim", "cpus_per_task": self.threads, "timeout_min": _MINUTES, **settings.options}
@@ -99,7 +105,9 @@ class Slurm:
             return Result("failed", line=f"the worker cannot do it: {last}", trace=str(error))
         except UncompletedJobError:
             self._died = True
-            raise WorkerDied(f"job {handle.job_id} ended without a result ({handle.state}); it printed {handle.paths.stderr}") from None
+            raise WorkerDied(
+                f"job {handle.job_id} ended without a result ({handle.state}); it printed {handle.paths.stderr}"
+            ) from None
 
     def cancel(self, handle: Any) -> None:
         handle.cancel()

@@ -62,7 +62,8 @@ class Listener:
 
 
 def write_status(file: Path, status: Status) -> None:
-    """Replaces the file. What cannot be written is left out: a display must not end a run, which finds out by itself that its disk is full."""
+    """Replaces the file. What cannot be written is left out: a display must not end a run, which finds out by itself
+    that its disk is full."""
     draft = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         draft.write_text(json.dumps(asdict(status)), encoding="utf-8")

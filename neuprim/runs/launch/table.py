@@ -87,8 +87,8 @@ def launch(
     Ctrl-C stops all of them as it stops a run: the step is finished and a checkpoint written.
 
     Args:
-        folder: where launcher and workers meet; every worker sees it under this path. It is gone afterwards, unless workers printed something.
-        hear: told (number of a job, its status) whenever there is something new.
+        folder: where launcher and workers meet; every worker sees it under this path. It is gone afterwards, unless
+        workers printed something. hear: told (number of a job, its status) whenever there is something new.
         ended: told (number of a job, its result) once it is over, before ``hear`` is.
 
     Returns:

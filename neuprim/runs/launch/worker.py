@@ -1,6 +1,8 @@
-"""Where a job works that is not in the launcher's own process: its share of the cores, its status in a file, and an eye on whether to stop.
+"""Where a job works that is not in the launcher's own process: its share of the cores, its status in a file, and an eye
+on whether to stop.
 
-Launcher and worker meet in a folder that both see. That works between processes, containers and machines alike, and outlives either.
+Launcher and worker meet in a folder that both see. That works between processes, containers and machines alike, and
+outlives either.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ def interrupt(blocked: bool = False) -> None:
     """As Ctrl-C in this process, called beside its main thread: a run finishes its step and writes a checkpoint.
 
     Args:
-        blocked: whether the main thread lets no such signal through, as Ray has it; then what it waits for is waited for.
+        blocked: whether the main thread lets no such signal through, as Ray has it; then what it waits for is waited
+        for.
     """
     main = threading.main_thread().ident
     if hasattr(signal, "pthread_kill") and main is not None and not blocked:
@@ -56,7 +59,8 @@ def interrupt(blocked: bool = False) -> None:
 
 
 def _can_be_stopped() -> bool:
-    """In the main thread: whether it lets Ctrl-C through. A process whose parent ignored it, as in the background of a script, heeds it again."""
+    """In the main thread: whether it lets Ctrl-C through. A process whose parent ignored it, as in the background of a
+    script, heeds it again."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     return not (hasattr(signal, "pthread_sigmask") and signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
@@ -123,7 +127,9 @@ class _Attendant:
         self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._over.set()
         self._thread.join()
         _working.clear()

@@ -1,4 +1,5 @@
-"""Controls made of what a task's frames depend on: time, light and their like, in the grammar of ``--time`` and ``--light``."""
+"""Controls made of what a task's frames depend on: time, light and their like, in the grammar of ``--time`` and
+``--light``."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ def shown(spec: ConditionSpec, value: Tensor, world: World) -> str:
 
 
 class ConditionControls:
-    """A text per condition, a slider for a number within a range, a handle in the scene for a place, and a button that plays."""
+    """A text per condition, a slider for a number within a range, a handle in the scene for a place, and a button that
+    plays."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -50,16 +52,22 @@ class ConditionControls:
         if not spec.shape and high - low <= _WIDE:
             slider = gui.add_slider(name, low, high, (high - low) / 1000, float(self._value(spec).clamp(low, high)))
             slider.on_update(lambda _: self._slid(spec, slider.value))
-        text = gui.add_text(flag(name), self._shown(spec, self._value(spec)), hint=f"{spec.unit}; as `neuprim render` takes it")
+        text = gui.add_text(
+            flag(name), self._shown(spec, self._value(spec)), hint=f"{spec.unit}; as `neuprim render` takes it"
+        )
         handle = self._handle(spec)
-        play = gui.add_checkbox(f"play {name}", False, hint=f"{flag(name)} {spec.sweep}, or the values above where they are several")
+        play = gui.add_checkbox(
+            f"play {name}", False, hint=f"{flag(name)} {spec.sweep}, or the values above where they are several"
+        )
 
         def show(value: Tensor, typed: bool = False) -> None:
             # Setting a value calls back as typing it does; what is there already is left alone, so that this ends.
             near = float(value.clamp(low, high)) if slider is not None else 0.0
             if slider is not None and not math.isclose(slider.value, near, abs_tol=1e-6):
                 slider.value = near
-            if text.value != self._shown(spec, value) and not play.value and not typed:  # a text of several values stays as it was typed
+            if (
+                text.value != self._shown(spec, value) and not play.value and not typed
+            ):  # a text of several values stays as it was typed
                 text.value = self._shown(spec, value)
             if handle is not None:
                 handle.position = tuple(value.tolist())
@@ -89,7 +97,9 @@ class ConditionControls:
         return handle
 
     def _slid(self, spec: ConditionSpec, value: float) -> None:
-        if not math.isclose(value, float(self._value(spec).clamp(*spec.range)), abs_tol=1e-6):  # beyond its ends the slider says nothing
+        if not math.isclose(
+            value, float(self._value(spec).clamp(*spec.range)), abs_tol=1e-6
+        ):  # beyond its ends the slider says nothing
             self._set(spec, torch.tensor(value, dtype=torch.float32).clamp(*spec.range))
 
     def _typed(self, spec: ConditionSpec, text: str) -> None:

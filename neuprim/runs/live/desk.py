@@ -1,4 +1,5 @@
-"""Work that pages ask for, done one at a time by whoever has the model: a thread of its own, or the training between two steps."""
+"""Work that pages ask for, done one at a time by whoever has the model: a thread of its own, or the training between
+two steps."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ class _Job:
 
 
 class Desk:
-    """Jobs by key: a newer one takes the place of an older one that nobody began, so that a camera that moves leaves no queue behind it.
+    """Jobs by key: a newer one takes the place of an older one that nobody began, so that a camera that moves leaves no
+    queue behind it.
 
     Every method may be called from any thread; jobs run on the thread that calls :meth:`work`.
     """
@@ -30,7 +32,12 @@ class Desk:
         self._jobs: dict[Hashable, _Job] = {}
 
     def ask(
-        self, key: Hashable, do: Callable[[], None], failed: Callable[[Exception], None], after: float = 0.0, soft: bool = False
+        self,
+        key: Hashable,
+        do: Callable[[], None],
+        failed: Callable[[Exception], None],
+        after: float = 0.0,
+        soft: bool = False,
     ) -> None:
         """Have something done, ``after`` seconds from now at the earliest.
 
@@ -57,7 +64,8 @@ class Desk:
         return bool(self._jobs)
 
     def work(self, patience: float) -> bool:
-        """Do one job that is due, waiting for at most so many seconds; whether there was one. What it raises goes to its ``failed``."""
+        """Do one job that is due, waiting for at most so many seconds; whether there was one. What it raises goes to
+        its ``failed``."""
         job = self._take(patience)
         if job is None:
             return False

@@ -20,7 +20,12 @@ def free_name(path: Path) -> Path:
 
 
 def film(
-    run_dir: Path, cameras: Path, conditions: Mapping[str, str], format: str, fps: float, progress: Callable[[str, float], None]
+    run_dir: Path,
+    cameras: Path,
+    conditions: Mapping[str, str],
+    format: str,
+    fps: float,
+    progress: Callable[[str, float], None],
 ) -> Path:
     """Draw the film of a file of cameras into the run's ``renders``, beside what is there.
 

@@ -61,7 +61,8 @@ class Picture:
 
 
 def quantities(channels: Channels) -> list[str]:
-    """What can be shown of a model: its colour as people see it, alpha, depth, and every channel alone where there are several."""
+    """What can be shown of a model: its colour as people see it, alpha, depth, and every channel alone where there are
+    several."""
     return [COLOUR, ALPHA, DEPTH, *(f"channel {name}" for name in channels.names if channels.count > 1)]
 
 
@@ -78,7 +79,9 @@ def draw_look(model: Primitives, look: Look, point: OperatingPoint, background: 
     settings = replace(point.settings, depth=look.shows == DEPTH)
     width, height = view.camera.width, view.camera.height
     if width * height * settings.samples**2 > _RAYS:
-        raise ConfigError(f"{width} x {height} pixels with renderer.samples={settings.samples} take more than {_RAYS:,} rays; lower either")
+        raise ConfigError(
+            f"{width} x {height} pixels with renderer.samples={settings.samples} take more than {_RAYS:,} rays; lower either"
+        )
     with torch.no_grad():
         output = render(model, view.camera, view.conditions, settings, background)
     caption = ""

@@ -1,8 +1,10 @@
-"""Who may talk to the page's server: those who know its token, from the server's own page under one of its names, and nobody else.
+"""Who may talk to the page's server: those who know its token, from the server's own page under one of its names, and
+nobody else.
 
-viser itself lets everybody in, also every web page that its user has open (browsers let any page open a WebSocket to this machine). Its server
-asks a function of viser's about each request before anything is sent; the gate stands before that function. The address that is printed holds
-the token once; the page that it opens gets it as a cookie, which other sites' pages cannot send.
+viser itself lets everybody in, also every web page that its user has open (browsers let any page open a WebSocket to
+this machine). Its server asks a function of viser's about each request before anything is sent; the gate stands before
+that function. The address that is printed holds the token once; the page that it opens gets it as a cookie, which other
+sites' pages cannot send.
 """
 
 from __future__ import annotations
@@ -27,8 +29,8 @@ _POLICY = (
     "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
     "connect-src 'self' ws://{host} data: blob:; worker-src 'self' blob:; frame-ancestors 'none'; form-action 'none'; base-uri 'none'"
 )
-"""The page loads nothing from elsewhere and is in nobody's frame. viser's client is one inline script whose WebAssembly makes its functions of
-texts, which takes 'unsafe-eval'."""
+"""The page loads nothing from elsewhere and is in nobody's frame. viser's client is one inline script whose WebAssembly
+makes its functions of texts, which takes 'unsafe-eval'."""
 
 
 class Gate:
@@ -56,8 +58,8 @@ class Gate:
         Args:
             refusal, refused: of messages, see :class:`~neuprim.runs.live.incoming.CheckedConnection`.
 
-        viser hands its check of requests to ``websockets.asyncio.server.serve`` and has no place for another one; so it finds there, for the
-        moment of its start, a ``serve`` that puts the gate in front.
+        viser hands its check of requests to ``websockets.asyncio.server.serve`` and has no place for another one; so it
+        finds there, for the moment of its start, a ``serve`` that puts the gate in front.
         """
         from websockets.asyncio import server
 
@@ -102,7 +104,9 @@ class Gate:
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
             return "no host, or several"
-        if not self._answers(hosts[0]):  # a name of somebody else's that leads here, by which his page would pass for ours
+        if not self._answers(
+            hosts[0]
+        ):  # a name of somebody else's that leads here, by which his page would pass for ours
             return f"this server's name is {' or '.join(self._hosts)}"
         if origins and (len(origins) != 1 or origins[0] != f"http://{hosts[0]}"):
             return "another site's page may not come in here"
@@ -112,7 +116,8 @@ class Gate:
         return None
 
     def _answers(self, host: str) -> bool:
-        """Whether a Host header has one of the server's names; where it listens on every address, also one of those, as nobody can bend it."""
+        """Whether a Host header has one of the server's names; where it listens on every address, also one of those, as
+        nobody can bend it."""
         name = re.sub(r":\d+$", "", host).lower()
         return name in self._hosts or (_is_everywhere(self._hosts[-1]) and _is_address(name))
 

@@ -1,7 +1,8 @@
 """Messages of pages, checked before anything acts on them.
 
-Rule: a message is handed on only if it is one that the page's own code sends, and the value of a control only if the control, as it was made,
-takes it. Every message of every page passes :class:`CheckedConnection`; viser itself checks nothing.
+Rule: a message is handed on only if it is one that the page's own code sends, and the value of a control only if the
+control, as it was made, takes it. Every message of every page passes :class:`CheckedConnection`; viser itself checks
+nothing.
 """
 
 from __future__ import annotations
@@ -97,7 +98,10 @@ _DECODER = msgspec.msgpack.Decoder(functools.reduce(operator.or_, _KINDS))  # ty
 def known(messages: Any) -> bool:
     """Whether the module of viser's messages has these kinds with these fields; another version of viser may not."""
     kinds = ((kind, getattr(messages, kind.__name__, None)) for kind in _KINDS)
-    return all(own is not None and {f.name for f in dataclasses.fields(own)} == set(kind.__struct_fields__) for kind, own in kinds)
+    return all(
+        own is not None and {f.name for f in dataclasses.fields(own)} == set(kind.__struct_fields__)
+        for kind, own in kinds
+    )
 
 
 class CheckedConnection(ServerConnection):
@@ -107,7 +111,11 @@ class CheckedConnection(ServerConnection):
     """
 
     def __init__(
-        self, *args: Any, refusal: Callable[[Any], str | None], refused: Callable[[ServerConnection, str], None], **more: Any
+        self,
+        *args: Any,
+        refusal: Callable[[Any], str | None],
+        refused: Callable[[ServerConnection, str], None],
+        **more: Any,
     ) -> None:
         super().__init__(*args, **more)
         self._refusal, self._refused = refusal, refused
@@ -130,7 +138,10 @@ def refusal(message: bytes | str, control: Callable[[str], Any]) -> str | None:
         decoded = _DECODER.decode(message)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         return f"a message that this page does not send: {' '.join(str(error).split())[:200]}"
-    if isinstance(decoded, ViewerCameraMessage | TransformControlsUpdateMessage) and not 0.99 < math.hypot(*decoded.wxyz) < 1.01:
+    if (
+        isinstance(decoded, ViewerCameraMessage | TransformControlsUpdateMessage)
+        and not 0.99 < math.hypot(*decoded.wxyz) < 1.01
+    ):
         return "a message that this page does not send: expected a unit quaternion - at `$.wxyz`"
     if not isinstance(decoded, GuiUpdateMessage):
         return None
@@ -166,11 +177,15 @@ def value_refusal(handle: Any, value: Any) -> str | None:
     return "takes no value"
 
 
-def _number_refusal(now: float, value: Any, low: float | None, high: float | None, step: float | None = None) -> str | None:
+def _number_refusal(
+    now: float, value: Any, low: float | None, high: float | None, step: float | None = None
+) -> str | None:
     kind = "a whole number" if isinstance(now, int) else "a number"
     slack = step / 2 if isinstance(now, float) and step is not None else 0.0  # a page rounds to the digits of its steps
     bounds = Range(None if low is None else low - slack, None if high is None else high + slack)
-    whole = isinstance(value, int) or (isinstance(value, float) and math.isfinite(value) and (isinstance(now, float) or value.is_integer()))
+    whole = isinstance(value, int) or (
+        isinstance(value, float) and math.isfinite(value) and (isinstance(now, float) or value.is_integer())
+    )
     if whole and not isinstance(value, bool) and abs(value) <= 1e15 and bounds.accepts(value):
         return None
     return f"expected {Range(low, high).words(kind)}"

@@ -1,7 +1,7 @@
 """How accurately a picture is drawn: fully when nothing moves, and as well as there is time for while something does.
 
-Levels come from the front of ``neuprim tradeoff RUN_DIR`` where there is one, which knows what is cheap for this model; else from lower
-resolutions alone.
+Levels come from the front of ``neuprim tradeoff RUN_DIR`` where there is one, which knows what is cheap for this model;
+else from lower resolutions alone.
 """
 
 from __future__ import annotations
@@ -79,7 +79,8 @@ class Levels:
         tell: Callable[[str], None] = lambda text: None,
         words: Sequence[str] = (),
     ) -> Levels:
-        """The full picture with these settings and words over them, the points of the front, and lower resolutions of the last of these.
+        """The full picture with these settings and words over them, the points of the front, and lower resolutions of
+        the last of these.
 
         Raises:
             ConfigError: the words do not fit the model.
@@ -103,10 +104,13 @@ class Levels:
         return self.all[0]
 
     def seconds(self, level: Level, pixels: int) -> float | None:
-        """What a picture will take: by its own pace where that is known, else the least that other levels' paces promise, as what a picture
-        takes whatever its level would count several times; None where nothing was drawn yet."""
+        """What a picture will take: by its own pace where that is known, else the least that other levels' paces
+        promise, as what a picture takes whatever its level would count several times; None where nothing was drawn
+        yet."""
         known = [level] if level.pace is not None else [other for other in self.all if other.pace is not None]
-        return min((other.pace * pixels * level.ratio / other.ratio for other in known if other.pace is not None), default=None)
+        return min(
+            (other.pace * pixels * level.ratio / other.ratio for other in known if other.pace is not None), default=None
+        )
 
     def within(self, seconds: float, pixels: int) -> Level:
         """The best level whose picture of a window of so many pixels takes no longer, else the cheapest one."""

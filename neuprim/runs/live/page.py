@@ -30,7 +30,12 @@ class Page:
     """
 
     def __init__(
-        self, server: PageServer, subject: Subject, desk: Desk, run_dir: Path | None, more: Callable[[Session], None] | None = None
+        self,
+        server: PageServer,
+        subject: Subject,
+        desk: Desk,
+        run_dir: Path | None,
+        more: Callable[[Session], None] | None = None,
     ) -> None:
         """Opens the doors.
 
@@ -47,7 +52,9 @@ class Page:
 
     def _come(self, client: Any) -> None:
         """A page was opened: what it needs of the model is asked of the desk."""
-        self.desk.ask((client.client_id, "come"), lambda: self._receive(client), lambda error: self._failed(client, error))
+        self.desk.ask(
+            (client.client_id, "come"), lambda: self._receive(client), lambda error: self._failed(client, error)
+        )
 
     def _gone(self, client: Any) -> None:
         with self._lock:

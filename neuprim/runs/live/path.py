@@ -1,4 +1,5 @@
-"""A camera path: keys that a person sets, a smooth way through them, and the file of cameras that ``neuprim render --camera`` reads."""
+"""A camera path: keys that a person sets, a smooth way through them, and the file of cameras that ``neuprim render
+--camera`` reads."""
 
 from __future__ import annotations
 
@@ -61,7 +62,8 @@ class CameraPath:
         return index
 
     def poses(self, count: int) -> list[Pose]:
-        """So many poses along the path: positions and fields of view on a natural cubic spline, orientations on a rotation spline.
+        """So many poses along the path: positions and fields of view on a natural cubic spline, orientations on a
+        rotation spline.
 
         Raises:
             ConfigError: there is no key.
@@ -96,7 +98,8 @@ class CameraPath:
         return frames
 
     def to_json(self, size: tuple[int, int], world: World) -> dict[str, Any]:
-        """What :func:`~neuprim.core.cameras.file.read_cameras` reads, one frame per image of the film, in the coordinates of ``world``.
+        """What :func:`~neuprim.core.cameras.file.read_cameras` reads, one frame per image of the film, in the
+        coordinates of ``world``.
 
         Raises:
             ConfigError: there is no key.
@@ -114,8 +117,11 @@ class CameraPath:
         write_json(path, self.to_json(size, world))
 
 
-def condition_texts(frames: Sequence[Mapping[str, Tensor]], specs: Sequence[ConditionSpec], world: World) -> dict[str, str]:
-    """What ``neuprim render`` is given for the conditions of a film's frames: ``{"time": "0,0.1,0.2"}``, or one value where they are equal.
+def condition_texts(
+    frames: Sequence[Mapping[str, Tensor]], specs: Sequence[ConditionSpec], world: World
+) -> dict[str, str]:
+    """What ``neuprim render`` is given for the conditions of a film's frames: ``{"time": "0,0.1,0.2"}``, or one value
+    where they are equal.
 
     Raises:
         ConfigError: a condition of several numbers changes, for which the command has no list.
@@ -125,10 +131,14 @@ def condition_texts(frames: Sequence[Mapping[str, Tensor]], specs: Sequence[Cond
         values = [frame[spec.name] for frame in frames]
         same = all(torch.equal(value, values[0]) for value in values)
         if not same and math.prod(spec.shape) != 1:
-            raise ConfigError(f"{spec.name}: changes along the path; a film has one {spec.name}, or several that are single numbers")
+            raise ConfigError(
+                f"{spec.name}: changes along the path; a film has one {spec.name}, or several that are single numbers"
+            )
         shown = values[:1] if same else values
         digits = 6 if spec.place is None or world.identity else 12
-        texts[spec.name] = ",".join(f"{x:.{digits}g}" for value in shown for x in spec.given(value, world).flatten().tolist())
+        texts[spec.name] = ",".join(
+            f"{x:.{digits}g}" for value in shown for x in spec.given(value, world).flatten().tolist()
+        )
     return texts
 
 

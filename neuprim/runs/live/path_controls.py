@@ -39,10 +39,14 @@ class PathControls:
         self._format = gui.add_dropdown("film", ["webp", "mp4", "gif", "png"], initial_value="webp")
         write = gui.add_button_group("write", ["cameras", "film"])
         edit.on_click(
-            lambda _: self._guarded({"add": self._add, "set": self._set, "remove": self._remove, "clear": self._clear}[edit.value])
+            lambda _: self._guarded(
+                {"add": self._add, "set": self._set, "remove": self._remove, "clear": self._clear}[edit.value]
+            )
         )
         order.on_click(
-            lambda _: self._guarded({"earlier": lambda: self._move(-1), "later": lambda: self._move(1), "go to": self._go}[order.value])
+            lambda _: self._guarded(
+                {"earlier": lambda: self._move(-1), "later": lambda: self._move(1), "go to": self._go}[order.value]
+            )
         )
         write.on_click(lambda _: self._guarded({"cameras": self._write, "film": self._film}[write.value]))
         self._play.on_update(lambda _: self._guarded(self._preview) if self._play.value else None)
@@ -121,7 +125,11 @@ class PathControls:
             way = np.stack([pose.position for pose in self.path.poses(20 * len(keys))])
             self._marks.append(
                 scene.add_line_segments(
-                    "/path/way", np.stack([way[:-1], way[1:]], 1), (255, 160, 60), thickness=2.0, thickness_units="screen"
+                    "/path/way",
+                    np.stack([way[:-1], way[1:]], 1),
+                    (255, 160, 60),
+                    thickness=2.0,
+                    thickness_units="screen",
                 )
             )
 
@@ -177,6 +185,11 @@ class PathControls:
     def _draw_film(self) -> None:
         file, texts = self._written()
         out = film(
-            self.run_dir, file, texts, str(self._format.value), self.path.fps, lambda text, done: self.session.say(f"{text}, {done:.0%}")
+            self.run_dir,
+            file,
+            texts,
+            str(self._format.value),
+            self.path.fps,
+            lambda text, done: self.session.say(f"{text}, {done:.0%}"),
         )
         self.session.tell(f"{out}")

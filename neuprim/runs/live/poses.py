@@ -34,7 +34,9 @@ class Pose:
         """That of a camera; where its principal point lies is lost."""
         view = camera.viewmat.detach().double().cpu().numpy()
         x, y, z, w = Rotation.from_matrix(view[:3, :3].T).as_quat()
-        return cls(np.array([w, x, y, z]), -view[:3, :3].T @ view[:3, 3], 2 * math.atan(0.5 * camera.height / camera.fy))
+        return cls(
+            np.array([w, x, y, z]), -view[:3, :3].T @ view[:3, 3], 2 * math.atan(0.5 * camera.height / camera.fy)
+        )
 
     @property
     def rotation(self) -> Rotation:

@@ -27,7 +27,9 @@ class PrimitiveControls:
         self._mark: Any = None
         self._how = gui.add_dropdown("ellipsoids", [_NONE, _WIRE, _SOLID], initial_value=_NONE)
         self._most = gui.add_slider("at most", 100, _MOST, 100, _FIRST, hint="those that absorb most")
-        self._click = gui.add_checkbox("choose by a click", False, hint="the primitive that contributes most under the mouse")
+        self._click = gui.add_checkbox(
+            "choose by a click", False, hint="the primitive that contributes most under the mouse"
+        )
         self._row = gui.add_number("primitive", -1, min=-1, step=1, hint="its number; -1 for none")
         self._text = gui.add_text("its parameters", "", multiline=True, disabled=True)
         for control in (self._how, self._most):

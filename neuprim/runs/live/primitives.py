@@ -1,4 +1,5 @@
-"""Single primitives of a frame: the ellipsoids that one sees, which of them lies under the mouse, and its numbers in words."""
+"""Single primitives of a frame: the ellipsoids that one sees, which of them lies under the mouse, and its numbers in
+words."""
 
 from __future__ import annotations
 
@@ -50,7 +51,9 @@ def ellipsoids_of(model: Primitives, look: Look, channels: Channels, most: int) 
         if count > most:
             mass = absorbed(model.to(torch.device("cpu")).living(look.conditions))
             keep = torch.from_numpy(np.sort(np.argsort(-mass, kind="stable")[:most]))
-        colours = channels.display_rows(lowered.center_colors(look.camera.position.to(lowered.geometry.means)).float().cpu().clamp_min(0))
+        colours = channels.display_rows(
+            lowered.center_colors(look.camera.position.to(lowered.geometry.means)).float().cpu().clamp_min(0)
+        )
         rows = torch.arange(count) if lowered.rows is None else lowered.rows.cpu()
         return _of(lowered.geometry, keep, rows, np.rint(255 * colours.numpy()).astype(np.uint8))
 
@@ -79,9 +82,11 @@ def _of(geometry: Geometry, keep: Tensor, rows: Tensor, colours: np.ndarray) -> 
 
 
 def strongest(model: Primitives, look: Look, direction: np.ndarray, settings: RenderSettings) -> int | None:
-    """The row of the primitive that contributes most to what is seen along a ray from the look's camera; None where nothing is.
+    """The row of the primitive that contributes most to what is seen along a ray from the look's camera; None where
+    nothing is.
 
-    The ray is drawn as the reference renderer draws it: chords cut at the near plane, composited by the depth of the centres.
+    The ray is drawn as the reference renderer draws it: chords cut at the near plane, composited by the depth of the
+    centres.
 
     Args:
         direction: (3,) of the ray, scene axes, any norm.
@@ -95,14 +100,18 @@ def strongest(model: Primitives, look: Look, direction: np.ndarray, settings: Re
         near = decided(settings, g.means, [look.camera]).near_plane / max(float(forward @ d), 1e-9)
         offset = origin - g.means.double()
         axes = g.scales.double()
-        p, v = ((g.rotations.double().transpose(1, 2) @ x[..., None])[..., 0] / axes for x in (offset, d.expand_as(offset)))
+        p, v = (
+            (g.rotations.double().transpose(1, 2) @ x[..., None])[..., 0] / axes for x in (offset, d.expand_as(offset))
+        )
         a = v.square().sum(-1)
         middle = -(p * v).sum(-1) / a
         D = 1 - (p + middle[:, None] * v).square().sum(-1)
         half = (D.clamp_min(0) / a).sqrt()
         t0, t1 = (middle - half).clamp_min(near), middle + half
         prim = ((D > 0) & (t1 > near)).nonzero()[:, 0]
-        prim = prim[torch.argsort((offset[prim] @ forward), descending=True, stable=True)]  # front to back: offset is from the centre
+        prim = prim[
+            torch.argsort((offset[prim] @ forward), descending=True, stable=True)
+        ]  # front to back: offset is from the centre
         if not len(prim):
             return None
         pairs = Pairs.of(g, prim, origin, d.expand(len(prim), 3), t0[prim], t1[prim])

@@ -58,7 +58,9 @@ class TrainingProgress:
                 report = event.report
                 self.step, self.fraction = report.step, event.progress
                 if math.isfinite(report.psnr):
-                    self._smooth = report.psnr if self._smooth is None else _SMOOTH * self._smooth + (1 - _SMOOTH) * report.psnr
+                    self._smooth = (
+                        report.psnr if self._smooth is None else _SMOOTH * self._smooth + (1 - _SMOOTH) * report.psnr
+                    )
                     self.seen.add(report.step, self._smooth)
                 self.text = f"step {report.step}, {report.primitives:,} primitives, {report.seconds:.0f} s of training"
             case Evaluated():

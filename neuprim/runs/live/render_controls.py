@@ -19,7 +19,8 @@ _AS_SET = "settings below"
 
 
 class RenderControls:
-    """A list of quantities, a slider of pixels, and the renderer's settings; with ``words`` also those of operating points."""
+    """A list of quantities, a slider of pixels, and the renderer's settings; with ``words`` also those of operating
+    points."""
 
     def __init__(self, session: Session, words: bool) -> None:
         self.session = session
@@ -31,19 +32,27 @@ class RenderControls:
         longest.on_update(lambda _: self._pixels(int(longest.value)))
         with gui.add_folder("accuracy", expand_by_default=False):
             settings = session.settings
-            self._inputs: dict[str, Any] = {"sort": gui.add_dropdown("sort", list(get_args(SortOrder)), initial_value=settings.sort)}
+            self._inputs: dict[str, Any] = {
+                "sort": gui.add_dropdown("sort", list(get_args(SortOrder)), initial_value=settings.sort)
+            }
             for name in _NUMBERS:
                 value = getattr(settings, name)
-                self._inputs[name] = gui.add_number(name, value, step=1 if isinstance(value, int) else min(1e-6, 1e-3 * value or 1e-6))
+                self._inputs[name] = gui.add_number(
+                    name, value, step=1 if isinstance(value, int) else min(1e-6, 1e-3 * value or 1e-6)
+                )
             self._words = (
-                gui.add_text("operating point", "", hint="as `neuprim render` takes it: resolution=0.5 density.neurons=1")
+                gui.add_text(
+                    "operating point", "", hint="as `neuprim render` takes it: resolution=0.5 density.neurons=1"
+                )
                 if words
                 else None
             )
             front = session.subject.front.points if words else ()
             if front:
                 names = [_AS_SET, *(" ".join(point) for point, _ in front)]
-                chosen = gui.add_dropdown("measured", names, initial_value=_AS_SET, hint="the front that `neuprim tradeoff` found")
+                chosen = gui.add_dropdown(
+                    "measured", names, initial_value=_AS_SET, hint="the front that `neuprim tradeoff` found"
+                )
                 chosen.on_update(lambda _: self._choose("" if chosen.value == _AS_SET else chosen.value))
             for name, control in self._inputs.items():
                 control.on_update(lambda event, name=name: self._set(name, event.target.value))

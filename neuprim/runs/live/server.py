@@ -26,7 +26,9 @@ def require_viser() -> Any:
     try:
         import viser
     except ImportError as error:
-        raise BackendUnavailable(f"a viewer in the browser needs the package viser ({error}): pip install 'neuprim[viewer]'") from error
+        raise BackendUnavailable(
+            f"a viewer in the browser needs the package viser ({error}): pip install 'neuprim[viewer]'"
+        ) from error
     return viser
 
 
@@ -49,7 +51,8 @@ class PageServer:
     """
 
     def __init__(self, settings: ViewerSettings, title: str) -> None:
-        """Raises :class:`ConfigError` where host or port are not to be had, :class:`BackendUnavailable` without viser."""
+        """Raises :class:`ConfigError` where host or port are not to be had, :class:`BackendUnavailable` without
+        viser."""
         viser = require_viser()
         self._refused_to: Callable[[int, str], None] = lambda client, reason: None
         gate = Gate(settings.host)
@@ -65,14 +68,17 @@ class PageServer:
                 "pip install -c constraints.txt 'neuprim[viewer]' has a version that does"
             )
         self.viser.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="large")
-        self.viser.scene.configure_environment_map(hdri=None)  # ellipsoids nearly in their own colours, and not darker below
+        self.viser.scene.configure_environment_map(
+            hdri=None
+        )  # ellipsoids nearly in their own colours, and not darker below
         self.viser.scene.configure_default_lights(cast_shadow=False)
         self.viser.scene.add_light_ambient("/light", intensity=1.0)
         self.viser.gui.main_panel.dock_right()  # beside the picture, not over it
         self.address = gate.address(settings.host, port)
 
     def _tunnels_off(self) -> bool:
-        """viser can be asked by a page to pass itself on through a server elsewhere; afterwards it cannot. Whether that is certain."""
+        """viser can be asked by a page to pass itself on through a server elsewhere; afterwards it cannot. Whether that
+        is certain."""
         try:
             from viser import _messages
 
@@ -89,8 +95,11 @@ class PageServer:
 
         return known(_messages)
 
-    def on_visit(self, come: Callable[[Any], None], gone: Callable[[Any], None], refused: Callable[[int, str], None]) -> None:
-        """Be told of every page that is opened and closed, as a ``viser.ClientHandle``, and why a message was refused, with a page's number."""
+    def on_visit(
+        self, come: Callable[[Any], None], gone: Callable[[Any], None], refused: Callable[[int, str], None]
+    ) -> None:
+        """Be told of every page that is opened and closed, as a ``viser.ClientHandle``, and why a message was refused,
+        with a page's number."""
         self._refused_to = refused
         self.viser.on_client_connect(come)
         self.viser.on_client_disconnect(gone)
@@ -102,7 +111,9 @@ class PageServer:
 
     def _control(self, uuid: str) -> Any:
         guis = (client.gui for client in self.viser.get_clients().values())
-        return next((gui._gui_input_handle_from_uuid[uuid] for gui in guis if uuid in gui._gui_input_handle_from_uuid), None)
+        return next(
+            (gui._gui_input_handle_from_uuid[uuid] for gui in guis if uuid in gui._gui_input_handle_from_uuid), None
+        )
 
     def _refused(self, connection: Any, reason: str) -> None:
         for number, own in self.viser._websock_server._live_connections.items():
@@ -122,7 +133,9 @@ def _free_port(host: str, port: int) -> int:
         ConfigError: the host is not an address of this machine, or the port is taken.
     """
     try:
-        family, kind, number, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        family, kind, number, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
         with socket.socket(family, kind, number) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)

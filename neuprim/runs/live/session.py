@@ -25,7 +25,8 @@ _STILL = 0.2
 """Seconds without a change after which the full picture is drawn."""
 
 _AGAIN, _SHARE = 1.0, 9.0
-"""A model that grows is drawn again after so many seconds, or so many times what drawing took: a tenth of the time at most."""
+"""A model that grows is drawn again after so many seconds, or so many times what drawing took: a tenth of the time at
+most."""
 
 _SHARP, _FAST = 95, 75
 """Quality of JPEG."""
@@ -136,7 +137,8 @@ class Session:
         self.desk.ask((self.client.client_id, what), do, self.failed, after, soft)
 
     def changed(self) -> None:
-        """Something that the picture depends on is another: draw what there is time for, and all of it once nothing changes any more."""
+        """Something that the picture depends on is another: draw what there is time for, and all of it once nothing
+        changes any more."""
         self.ask("picture", self._coarse)
 
     def failed(self, error: Exception) -> None:
@@ -148,7 +150,8 @@ class Session:
             self.tell(f"{type(error).__name__}: {error}", "red")
 
     def draw(self, level: Level | None = None, pose: Pose | None = None) -> None:
-        """Draw and send a picture at a level, by default the best one that is smooth; on the thread that has the model."""
+        """Draw and send a picture at a level, by default the best one that is smooth; on the thread that has the
+        model."""
         levels, look = self.levels(), self.look(pose)
         pixels = look.camera.width * look.camera.height
         level = level or levels.within(SMOOTH, pixels)
@@ -159,7 +162,9 @@ class Session:
         full = level is levels.full
         self.client.scene.set_background_image(picture.image, format="jpeg", jpeg_quality=_SHARP if full else _FAST)
         height, width = picture.image.shape[:2]
-        self.say(f"{width} x {height} in {1e3 * picture.seconds:.0f} ms{'; ' if picture.caption else ''}{picture.caption}")
+        self.say(
+            f"{width} x {height} in {1e3 * picture.seconds:.0f} ms{'; ' if picture.caption else ''}{picture.caption}"
+        )
 
     def levels(self) -> Levels:
         """Ways of drawing with the settings of now."""

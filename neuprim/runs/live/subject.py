@@ -1,4 +1,5 @@
-"""What a page looks at: a model, how its task names and shows things, and the held-out views that it may be compared with."""
+"""What a page looks at: a model, how its task names and shows things, and the held-out views that it may be compared
+with."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ _FOV = 0.7  # radians, of a first view that no data set gives
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A held-out view beside its truth: (H, W, 3) uint8 sRGB each, and the model's PSNR there, dB, as ``metrics.json`` has it."""
+    """A held-out view beside its truth: (H, W, 3) uint8 sRGB each, and the model's PSNR there, dB, as ``metrics.json``
+    has it."""
 
     truth: np.ndarray
     drawn: np.ndarray
@@ -52,8 +54,8 @@ class Subject:
         background: (C,) behind everything.
         up: (3,) upward in the scene.
         center: (3,) its middle, which a camera turns around.
-        world: in whose coordinates a person types and reads positions, and files of cameras are written; everything else here is the scene's.
-        dataset: for held-out views; None where its files are gone.
+        world: in whose coordinates a person types and reads positions, and files of cameras are written; everything
+        else here is the scene's. dataset: for held-out views; None where its files are gone.
         front: of ``neuprim tradeoff``, where that was run.
     """
 
@@ -73,7 +75,13 @@ class Subject:
     def prepared(self, point: OperatingPoint, view: View) -> Primitives:
         """The model as a point draws it, where it is best drawn; the last few are kept."""
         model = self.model()
-        key = (id(model), tuple(point.reduced.items()), tuple(point.stored.items()), point.settings.device, point.settings.backend)
+        key = (
+            id(model),
+            tuple(point.reduced.items()),
+            tuple(point.stored.items()),
+            point.settings.device,
+            point.settings.backend,
+        )
         if not point.reduced and not point.stored and model.device.type != "cpu":
             return model  # a training's, where it is
         if key not in self._kept:

@@ -1,7 +1,9 @@
-"""A page beside a training: it draws between two steps, on the training's own thread, and leaves every bit of the model as it would be without.
+"""A page beside a training: it draws between two steps, on the training's own thread, and leaves every bit of the model
+as it would be without.
 
-No step runs while a picture is drawn, so there is nothing to copy and nobody to wait for; the time of the budget stands still meanwhile, as it
-does for the points of the held-out curve. Without anybody who looks, a step costs one question: whether somebody asked for something.
+No step runs while a picture is drawn, so there is nothing to copy and nobody to wait for; the time of the budget stands
+still meanwhile, as it does for the points of the held-out curve. Without anybody who looks, a step costs one question:
+whether somebody asked for something.
 """
 
 from __future__ import annotations
@@ -46,7 +48,9 @@ class LiveTraining:
         address: of the page, with its token.
     """
 
-    def __init__(self, settings: ViewerSettings, config: RunConfig, opened: Callable[[str], None], events: Events) -> None:
+    def __init__(
+        self, settings: ViewerSettings, config: RunConfig, opened: Callable[[str], None], events: Events
+    ) -> None:
         """Opens the page; raises as :class:`~neuprim.runs.live.server.PageServer`.
 
         Args:
@@ -66,7 +70,9 @@ class LiveTraining:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._server.close()
 
     def __call__(self, event: Event) -> None:
@@ -75,7 +81,9 @@ class LiveTraining:
         self.events(event)
         if isinstance(event, Finishing):
             for controls in self._controls:
-                controls.session.tell(f"the training has ended, {event.text}; afterwards `neuprim view {self.config.output_dir}` shows it")
+                controls.session.tell(
+                    f"the training has ended, {event.text}; afterwards `neuprim view {self.config.output_dir}` shows it"
+                )
 
     # ------------------------------------------------------------ what a page may order, from any thread
 
@@ -144,5 +152,18 @@ class LiveTraining:
         dataset = fitted.dataset
         x, y, z = (float(value) for value in dataset.up)
         task = replace(fitted.task, conditions=tuple(spec.within(dataset.world) for spec in fitted.task.conditions))
-        own = (task, lambda: fitted.trainer.model, fitted.channels, fitted.trainer.renderer, dataset.background, (x, y, z))
-        return Subject(self.config.output_dir.name, *own, center=np.asarray(dataset.center.numpy()), world=dataset.world, dataset=dataset)
+        own = (
+            task,
+            lambda: fitted.trainer.model,
+            fitted.channels,
+            fitted.trainer.renderer,
+            dataset.background,
+            (x, y, z),
+        )
+        return Subject(
+            self.config.output_dir.name,
+            *own,
+            center=np.asarray(dataset.center.numpy()),
+            world=dataset.world,
+            dataset=dataset,
+        )

@@ -36,7 +36,9 @@ class TrainingControls:
         self._bar = gui.add_progress_bar(100 * orders.progress.fraction)
         self._pause = gui.add_checkbox("pause", orders.paused)
         self._pause.on_update(lambda _: orders.pause(bool(self._pause.value)))
-        buttons = gui.add_button_group("", ["one step", "checkpoint", "stop"], hint="stop ends it as Ctrl-C does: it can be resumed")
+        buttons = gui.add_button_group(
+            "", ["one step", "checkpoint", "stop"], hint="stop ends it as Ctrl-C does: it can be resumed"
+        )
         calls = {"one step": self._one, "checkpoint": orders.checkpoint, "stop": self._stop}
         buttons.on_click(lambda _: calls[buttons.value]())
         self._curves = {"training views": orders.progress.seen, "held-out views": orders.progress.held_out}

@@ -34,7 +34,9 @@ _PATIENCE = 0.25
 
 
 def open_subject(
-    run_dir: Path, tell: Callable[[str], None] = lambda text: None, progress: Callable[[str, float], None] = lambda text, fraction: None
+    run_dir: Path,
+    tell: Callable[[str], None] = lambda text: None,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
 ) -> Subject:
     """A finished run, to be looked at. Without its data there are no held-out views, which is told.
 
@@ -60,7 +62,9 @@ def open_subject(
         up, center = dataset.up, dataset.center
     x, y, z = (float(value) for value in up)
     own = (task, now, channels, config.renderer, background, (x, y, z), np.asarray(center.double().numpy()))
-    return Subject(run_dir.resolve().name, *own, World.of(header, str(run_dir)), dataset=dataset, front=read_front(run_dir, tell))
+    return Subject(
+        run_dir.resolve().name, *own, World.of(header, str(run_dir)), dataset=dataset, front=read_front(run_dir, tell)
+    )
 
 
 def _fact(header: Mapping[str, Any], name: str, otherwise: torch.Tensor) -> torch.Tensor:

@@ -18,7 +18,8 @@ from neuprim.runs.prune.judge import Judge
 __all__ = ["cut_to", "numbers", "priced", "steps_down", "zeros_of"]
 
 _CONTRAST = 0.05
-"""Mean square of a primitive's difference of colour from what is behind it, to begin with; :func:`priced` measures it."""
+"""Mean square of a primitive's difference of colour from what is behind it, to begin with; :func:`priced` measures
+it."""
 
 _PROBE = 0.02
 """Share of the primitives whose removal tells the contrast."""
@@ -32,7 +33,9 @@ def _pieces(model: Primitives) -> dict[str, Piece]:
 
 def numbers(model: Primitives) -> int:
     """Numbers that a file has to hold: all but the pieces that are zero."""
-    left_out = sum(numbers_of(piece, model.params) * int((~alive(piece, model.params)).sum()) for piece in _pieces(model).values())
+    left_out = sum(
+        numbers_of(piece, model.params) * int((~alive(piece, model.params)).sum()) for piece in _pieces(model).values()
+    )
     return model.count * model.parameters_per_primitive - left_out
 
 
@@ -51,7 +54,9 @@ def zeros_of(model: Primitives) -> dict[str, Tensor]:
 def steps_down(model: Primitives) -> list[tuple[str, str, int]]:
     """(kind, name, value) of all that the whole model could have less of, what saves most first."""
     fields = (("density", model.density), ("colour", model.colour))
-    words = [(kind, name, value) for kind, own in fields for name, values in own.reductions().items() for value in values]
+    words = [
+        (kind, name, value) for kind, own in fields for name, values in own.reductions().items() for value in values
+    ]
     return sorted(words, key=lambda word: with_less(model, *word).parameters_per_primitive)
 
 
@@ -77,8 +82,8 @@ def cut_to(model: Primitives, prices: Sensitivity, quality: Callable[[Primitives
 
 
 def priced(model: Primitives, views: Sensitivity, inside: Sensitivity | None, judge: Judge) -> Sensitivity:
-    """Mean squared changes of the views without each primitive and piece, for the differences of colour that there are; what changes inside
-    counts as much as it is of the error inside, beside that of the views."""
+    """Mean squared changes of the views without each primitive and piece, for the differences of colour that there are;
+    what changes inside counts as much as it is of the error inside, beside that of the views."""
     whole = views.whole * _contrast(model, views, lambda m: judge.images(m, quick=True))
     found = replace(views, whole=whole)
     return found if inside is None else found.beside(inside, judge.apart(model))
@@ -103,7 +108,10 @@ def _at(model: Primitives, prices: Sensitivity, share: _Share, price: float) -> 
     known = prices.seen > 0
     kept = (~known | (prices.whole / own >= price)).nonzero()[:, 0]
     pieces = _pieces(model)
-    gone = {name: (pieces[name], (prices.pieces[name] / max(sizes[name], 1) < price) & there[name] & known) for name in pieces}
+    gone = {
+        name: (pieces[name], (prices.pieces[name] / max(sizes[name], 1) < price) & there[name] & known)
+        for name in pieces
+    }
     rows = Primitives(model.density, model.colour, without(gone, model.params)).rows(kept.to(model.device))
     return Primitives(model.density, model.colour, rows)
 

@@ -21,14 +21,16 @@ _JUDGED, _QUICK = 24, 8
 """Views that decide, and how many of them a search in between looks at."""
 
 _LOOKED_AT = 160
-"""Views that sensitivities come from, at most: primitives that live for a moment, or in a corner, are in few of them."""
+"""Views that sensitivities come from, at most: primitives that live for a moment, or in a corner, are in few of
+them."""
 
 _MOST = 200.0
 """dB that stand for equal images."""
 
 
 _FRAMES, _QUICK_FRAMES, _POINTS = 64, 8, 4096
-"""Frames whose points decide where a volume is known inside, at most, how many a search in between looks at, and points of each."""
+"""Frames whose points decide where a volume is known inside, at most, how many a search in between looks at, and points
+of each."""
 
 _DRAWS = 6
 """Draws for each such frame: each is of any frame, and most frames are to be there once."""
@@ -40,17 +42,18 @@ def judge_of(config: RunConfig, dataset: Dataset) -> Judge:
 
 
 class Judge:
-    """Mean PSNR over some training views, as ``metrics.json`` has it over test views; and of a volume that a run learned from its voxels, too,
-    how well its extinction is met, so that what images do not show is not lost.
+    """Mean PSNR over some training views, as ``metrics.json`` has it over test views; and of a volume that a run
+    learned from its voxels, too, how well its extinction is met, so that what images do not show is not lost.
 
-    Which views is drawn by lot, as they often are in an order (all times of a camera, all cameras of a time) that even steps would fall in with.
+    Which views is drawn by lot, as they often are in an order (all times of a camera, all cameras of a time) that even
+    steps would fall in with.
 
     Args:
         inside: whether points of known extinction count; the data set has them.
 
     Attributes:
-        views: those that decide; others: of the remaining ones, as far as there are some, those that sensitivities come from.
-        draws: points that decide; none unless ``inside``.
+        views: those that decide; others: of the remaining ones, as far as there are some, those that sensitivities come
+        from. draws: points that decide; none unless ``inside``.
     """
 
     def __init__(self, dataset: Dataset, settings: RenderSettings, inside: bool = False) -> None:
@@ -62,7 +65,8 @@ class Judge:
         self._apart: float | None = None
 
     def __call__(self, model: Primitives, quick: bool = False) -> float:
-        """dB: of the views, or of the points if these lost more since the first model that was asked for; with ``quick`` over some of them."""
+        """dB: of the views, or of the points if these lost more since the first model that was asked for; with
+        ``quick`` over some of them."""
         images = self.images(model, quick)
         if not self.draws:
             return images
@@ -92,7 +96,8 @@ class Judge:
         return float(np.mean(found))
 
     def apart(self, model: Primitives) -> float:
-        """How many times as large the error of the views is as that inside: what a change inside counts as much as one of images by."""
+        """How many times as large the error of the views is as that inside: what a change inside counts as much as one
+        of images by."""
         return 10 ** ((self.inside(model) - self.images(model)) / 10)
 
 

@@ -43,10 +43,11 @@ class Request:
 
     Attributes:
         tolerance: dB that the judged training views may lose.
-        seconds: of fine-tuning, about, in which as many steps are made as fit; steps: so many instead, which gives the same model again.
-        out: the new run directory; None: beside the run, its name with "-pruned".
+        seconds: of fine-tuning, about, in which as many steps are made as fit; steps: so many instead, which gives the
+        same model again. out: the new run directory; None: beside the run, its name with "-pruned".
         overwrite: whether files there may be replaced.
-        hold_out: n > 1: one of n training views neither decides nor is trained on, as in :func:`~neuprim.core.data.held_out.held_out`; 0: all do.
+        hold_out: n > 1: one of n training views neither decides nor is trained on, as in
+        :func:`~neuprim.core.data.held_out.held_out`; 0: all do.
     """
 
     run_dir: Path
@@ -64,10 +65,11 @@ class Pruning:
 
     Attributes:
         run_dir: the new run's; None where nothing could go, and nothing was written.
-        before, after: "primitives", "numbers" (that are not left out), "bytes" (of the model file), "psnr" and "ssim" (means over the held-out
+        before, after: "primitives", "numbers" (that are not left out), "bytes" (of the model file), "psnr" and "ssim"
+        (means over the held-out
             views) and "frames_per_second" (of these, one model after the other).
-        words: what fields do with less of, as in ``model.reduced``; kept: piece -> share of the primitives left that have it.
-        judged: dB on the training views that decided, before and after; stages: what was tried.
+        words: what fields do with less of, as in ``model.reduced``; kept: piece -> share of the primitives left that
+        have it. judged: dB on the training views that decided, before and after; stages: what was tried.
     """
 
     run_dir: Path | None
@@ -82,7 +84,8 @@ class Pruning:
 
 
 def prune_run(request: Request, progress: Callable[[str, float], None] = lambda text, fraction: None) -> Pruning:
-    """Remove primitives, pieces of primitives and parts of fields as far as training views allow, fine-tuning in between.
+    """Remove primitives, pieces of primitives and parts of fields as far as training views allow, fine-tuning in
+    between.
 
     What decides are training views alone; held-out views are measured before and after.
 
@@ -92,7 +95,9 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
     Raises:
         NeuprimError: no such run, data that cannot be read, or files in the way.
     """
-    final = request.run_dir.with_name(f"{request.run_dir.resolve().name}-pruned") if request.out is None else request.out
+    final = (
+        request.run_dir.with_name(f"{request.run_dir.resolve().name}-pruned") if request.out is None else request.out
+    )
     if final.exists() and not final.is_dir():
         raise ConfigError(f"--out {final}: is a file; expected a new folder")
     if final.exists() and final.resolve() == request.run_dir.resolve():
@@ -116,7 +121,10 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
         judged = (search.base, search.judge(small))
         if numbers(small) >= numbers(model):
             there = _facts(
-                model, model_file(request.run_dir), quality(model, task, dataset, config.renderer), _paces(config, dataset, (model,))[0]
+                model,
+                model_file(request.run_dir),
+                quality(model, task, dataset, config.renderer),
+                _paces(config, dataset, (model,))[0],
             )
             return Pruning(None, there, there, (), kept_pieces(model), judged, tuple(search.stages), steps, seconds)
         progress("measuring held-out views", 1.0)
@@ -135,7 +143,8 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
 
 
 def _paces(config: RunConfig, dataset: Dataset, models: Sequence[Primitives]) -> list[float]:
-    """Median frames/s of each over some held-out views, drawn in turns, so that whatever else the machine does meets all of them."""
+    """Median frames/s of each over some held-out views, drawn in turns, so that whatever else the machine does meets
+    all of them."""
     there = [placed(model, config.renderer, dataset.test.view(0)) for model in models]
     seconds: list[list[float]] = [[] for _ in there]
     for turn in range(_TURNS + 1):
@@ -164,7 +173,8 @@ def _written(
     steps: int,
     seconds: float,
 ) -> None:
-    """The run directory: configuration, model, a checkpoint that training can go on from, metrics, pictures and report."""
+    """The run directory: configuration, model, a checkpoint that training can go on from, metrics, pictures and
+    report."""
     reduced = [*config.model.reduced, *words]
     typed = [f"model.primitives={model.count}"]
     typed += [f"model.reduced=[{','.join(repr(word) for word in reduced)}]"] if reduced else []
@@ -175,7 +185,9 @@ def _written(
         output_dir=final,
         overrides=[*(word for word in config.overrides if not word.startswith(known)), *typed],
     )
-    trainer = Trainer(model, dataset, make_loss(small, task), settings_for(small.train, task, model), small.renderer, small.seed)
+    trainer = Trainer(
+        model, dataset, make_loss(small, task), settings_for(small.train, task, model), small.renderer, small.seed
+    )
     trainer.zeros = zeros_of(trainer.model)
     trainer.step = int(header.get("iterations") or 0) + steps
     trainer.elapsed = float(header.get("train_seconds") or 0.0) + seconds

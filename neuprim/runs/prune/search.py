@@ -18,11 +18,12 @@ from neuprim.runs.prune.judge import judge_of
 __all__ = ["ROUNDS", "Search", "Stage"]
 
 ROUNDS = 3
-"""Of training, at most (but see :data:`_MORE`), each with its share of the steps, and nearly each after a cut. Every one goes down to the rates of the run's end, so that what is
-judged is as well trained as it was."""
+"""Of training, at most (but see :data:`_MORE`), each with its share of the steps, and nearly each after a cut. Every
+one goes down to the rates of the run's end, so that what is judged is as well trained as it was."""
 
 _MORE = 1300
-"""Steps of a round where there are so many that :data:`ROUNDS` would be longer: what a scene does not require at all goes a doubled cut at a time."""
+"""Steps of a round where there are so many that :data:`ROUNDS` would be longer: what a scene does not require at all
+goes a doubled cut at a time."""
 
 _LEAST = 600
 """Steps of a round, at least: few of them leave a model worse than they found it."""
@@ -37,7 +38,8 @@ _GROWTH = 1.5
 """Times the last bite that the next one may be."""
 
 _LEFT = 0.3
-"""Share of a bite that is still lost after a round of enough steps, but for what the round would have brought without a cut."""
+"""Share of a bite that is still lost after a round of enough steps, but for what the round would have brought without a
+cut."""
 
 _AGAIN = 0.35
 """Share of what a round would have brought without a cut that the next one is expected to bring."""
@@ -46,7 +48,8 @@ _LARGEST_BITE = 10.0
 """dB: a bite smaller than this that takes nothing is doubled."""
 
 _ENOUGH = 0.1
-"""Share of the tolerance below which there is nothing to cut for: what is left is trained for a round instead, which wins a little back."""
+"""Share of the tolerance below which there is nothing to cut for: what is left is trained for a round instead, which
+wins a little back."""
 
 _FREE = 0.02
 """Share of the tolerance that counts as nothing."""
@@ -94,7 +97,8 @@ class _State:
 
 
 def _saved(model: Primitives, less: Primitives, size: int) -> float:
-    """Share that is saved: of a file's numbers, or of those that every frame works through, where single ones of them are zero already."""
+    """Share that is saved: of a file's numbers, or of those that every frame works through, where single ones of them
+    are zero already."""
     return max(1 - numbers(less) / size, 1 - less.parameters_per_primitive / model.parameters_per_primitive)
 
 
@@ -121,7 +125,8 @@ class Search:
         self.judge, self._looks = judge_of(self.config, self.dataset), 0
 
     def __call__(self, model: Primitives) -> tuple[Primitives, tuple[str, ...]]:
-        """The smallest model found whose judged views are at most the tolerance worse, and the words for what its fields have less of."""
+        """The smallest model found whose judged views are at most the tolerance worse, and the words for what its
+        fields have less of."""
         self.base = self.judge(model)
         best, tried = _State(model), None
         apart: tuple[str, ...] = ()
@@ -140,8 +145,12 @@ class Search:
                     tried = replace(best, cut=self.base - best.lost)
                 else:
                     tried = self._cut(best, bite if self.steps else left, number / rounds)
-                    while numbers(tried.model) >= numbers(best.model) and 0.0 < tried.bite < _LARGEST_BITE and self.steps:
-                        tried = self._cut(best, 2.0 * tried.bite, number / rounds)  # of a few large parts each is worth more than the bite
+                    while (
+                        numbers(tried.model) >= numbers(best.model) and 0.0 < tried.bite < _LARGEST_BITE and self.steps
+                    ):
+                        tried = self._cut(
+                            best, 2.0 * tried.bite, number / rounds
+                        )  # of a few large parts each is worth more than the bite
                     if numbers(tried.model) >= numbers(best.model):
                         break
                 bite = tried.bite
@@ -158,14 +167,16 @@ class Search:
                 best, tried = replace(tried, bite=bite), None
             elif tried.lost > self._hopeless(before, tried, best):
                 apart = () if tried.alone else tried.words[len(best.words) :]
-                bite *= 1.0 if tried.alone else min(max(0.7 * (self.tolerance - best.lost) / max(spent, 1e-9), 0.2), 0.7)
+                bite *= (
+                    1.0 if tried.alone else min(max(0.7 * (self.tolerance - best.lost) / max(spent, 1e-9), 0.2), 0.7)
+                )
                 tried = None
         last = {word.partition("=")[0]: word for word in best.words}  # degree 0 after degree 2 is degree 0
         return best.model, tuple(last.values())
 
     def _hopeless(self, before: _State, now: _State, best: _State) -> float:
-        """dB from which on what was lost after a round is taken back: more than another round like it would win, or anything where the model
-        before the cut has room left, as a smaller cut of that is sure to save something."""
+        """dB from which on what was lost after a round is taken back: more than another round like it would win, or
+        anything where the model before the cut has room left, as a smaller cut of that is sure to save something."""
         if best.rounds and best.lost < 0:
             return self.tolerance
         return self.tolerance * _PATIENCE if now.rounds == 1 else self.tolerance + before.lost - now.lost
@@ -225,6 +236,8 @@ class Search:
                 trainer.train_step()
                 if done % 20 == 0:
                     self.progress(f"training what is left, {left:,} numbers", (number + done / steps) / rounds)
-            model = Primitives(model.density, model.colour, {name: value.detach() for name, value in trainer.model.params.items()})
+            model = Primitives(
+                model.density, model.colour, {name: value.detach() for name, value in trainer.model.params.items()}
+            )
         found = self.judge(model) if steps else state.cut
         return replace(state, model=model, lost=self.base - found, rounds=state.rounds + 1)

@@ -20,7 +20,8 @@ def job_of(config: RunConfig) -> Job:
 
 
 def fit_one(data: Mapping[str, Any], attempt: int, events: Events) -> str:
-    """Fit, measure and report; the run's directory. After its worker died it goes on from its checkpoint, if it had one."""
+    """Fit, measure and report; the run's directory. After its worker died it goes on from its checkpoint, if it had
+    one."""
     from neuprim.runs.run import run
 
     config = RunConfig.from_dict(data)

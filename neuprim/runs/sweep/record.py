@@ -76,7 +76,9 @@ class SweepRecord:
         for row in self.rows:
             if row.name in old and old[row.name].words != row.words:
                 was = " ".join(old[row.name].words)
-                raise ConfigError(f"{file}: {row.name} was begun with {was}; expected the same words, or another output_dir")
+                raise ConfigError(
+                    f"{file}: {row.name} was begun with {was}; expected the same words, or another output_dir"
+                )
         own = tuple(old.get(row.name, row) for row in self.rows)
         names = {row.name for row in own}
         return replace(self, rows=(*own, *(row for row in before.rows if row.name not in names)))
@@ -111,7 +113,9 @@ def begun_words(words: Sequence[str]) -> list[str]:
     before = None if where is None or given.get("resume") is not True else read_sweep(Path(str(where)).expanduser())
     if before is None:
         said = " ".join(words) or "nothing"
-        raise ConfigError(f"{said}: no values to sweep; expected KEY=A,B,C, or output_dir=DIR resume=true of a sweep ({FILE} in it)")
+        raise ConfigError(
+            f"{said}: no values to sweep; expected KEY=A,B,C, or output_dir=DIR resume=true of a sweep ({FILE} in it)"
+        )
     for word in before.words:
         if "${" in word:  # what a file says is data; see neuprim.config.composing
             raise ConfigError(

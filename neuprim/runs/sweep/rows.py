@@ -18,7 +18,10 @@ __all__ = ["sweep_rows", "write_csv"]
 
 def sweep_rows(folder: Path, record: SweepRecord) -> list[Compared]:
     """The runs as they lie in a sweep's directory, in the record's order."""
-    return [Compared(row.name, row.swept, row.state, row.line, row.seconds, row.attempts, _run(folder / row.name)) for row in record.rows]
+    return [
+        Compared(row.name, row.swept, row.state, row.line, row.seconds, row.attempts, _run(folder / row.name))
+        for row in record.rows
+    ]
 
 
 def _run(directory: Path) -> RunRecord | None:
@@ -29,7 +32,8 @@ def _run(directory: Path) -> RunRecord | None:
 
 
 def write_csv(path: Path, rows: Sequence[Compared]) -> None:
-    """A row for every run: its name, its swept words, its state, every number of its ``metrics.json``, and its directory below the sweep's.
+    """A row for every run: its name, its swept words, its state, every number of its ``metrics.json``, and its
+    directory below the sweep's.
 
     Cells of what a run does not have are empty.
     """

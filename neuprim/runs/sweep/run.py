@@ -1,4 +1,5 @@
-"""A sweep: its runs launched together, ``sweep.json`` kept while they work, ``sweep.csv`` and ``sweep.html`` at the end."""
+"""A sweep: its runs launched together, ``sweep.json`` kept while they work, ``sweep.csv`` and ``sweep.html`` at the
+end."""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ def sweep_run(
         the record, and a result for each configuration; None of those that Ctrl-C came before.
 
     Raises:
-        NeuprimError: a directory in which another sweep, or another process, is at work; a launcher that cannot work here.
+        NeuprimError: a directory in which another sweep, or another process, is at work; a launcher that cannot work
+        here.
         OSError: the sweep's own files cannot be written.
     """
     folder = configs[0].output_dir.parent
@@ -94,15 +96,21 @@ class _Keeper:
     def put(self, number: int, result: Result) -> None:
         """How a run ended."""
         row = self.record.rows[number]
-        self.record = self.record.put(replace(row, state=result.state, line=result.line, seconds=result.seconds, attempts=result.attempts))
-        with suppress(OSError):  # a full disk must not end the other runs; it is written again at the end, where that is told
+        self.record = self.record.put(
+            replace(row, state=result.state, line=result.line, seconds=result.seconds, attempts=result.attempts)
+        )
+        with suppress(
+            OSError
+        ):  # a full disk must not end the other runs; it is written again at the end, where that is told
             self.record.write(self._folder)
 
 
 def _row(config: RunConfig, words: Sequence[str]) -> Row:
     own = without_place(config.overrides)
     keys = set(swept_keys(words))
-    return Row(config.output_dir.name, tuple(own), {a.key: a.text.partition("=")[2] for a in parse(own) if a.key in keys})
+    return Row(
+        config.output_dir.name, tuple(own), {a.key: a.text.partition("=")[2] for a in parse(own) if a.key in keys}
+    )
 
 
 def _is_done(row: Row, config: RunConfig) -> bool:

@@ -21,7 +21,8 @@ ROOM = ALLOWANCE / 2
 """dB above the target without which a full run leaves no room for few bits."""
 
 _ALIKE = 0.7
-"""For each doubling of the primitives between two sizes, the share of what one turned out otherwise by that is expected of the other."""
+"""For each doubling of the primitives between two sizes, the share of what one turned out otherwise by that is expected
+of the other."""
 
 _FULL_FILE = 0.97
 """Of the bytes allowed, those that are planned with."""
@@ -52,10 +53,11 @@ class Judge:
         return min(decibels(name, values[name]) - decibels(name, goal) for name, goal in wanted.items())
 
     def forecasts(self) -> dict[int, dict[str, Forecast]]:
-        """Primitives -> measure -> what a full run would have, with the settings that were turned, on the scale of decibels.
+        """Primitives -> measure -> what a full run would have, with the settings that were turned, on the scale of
+        decibels.
 
-        Counts that were tried longer are known better; by how much these turned out otherwise than their short trials had promised, all others
-        are moved.
+        Counts that were tried longer are known better; by how much these turned out otherwise than their short trials
+        had promised, all others are moved.
         """
         found = {name: self._of(name) for name in self.measures}
         counts = next(iter(found.values())).keys()
@@ -75,12 +77,18 @@ class Judge:
 
         length = self.record.length
         best = {n: told(n, values) for n, values in lengths.items()}
-        short = {n: told(n, {s: v for s, v in values.items() if s <= length} or values) for n, values in lengths.items()}
-        moved = {n: best[n].value - short[n].value for n, values in lengths.items() if min(values) <= length < max(values)}
+        short = {
+            n: told(n, {s: v for s, v in values.items() if s <= length} or values) for n, values in lengths.items()
+        }
+        moved = {
+            n: best[n].value - short[n].value for n, values in lengths.items() if min(values) <= length < max(values)
+        }
         made = {}
         for n, values in lengths.items():
             longer = max(values) > self.record.length
-            doubt = best[n].doubt if longer or not moved else max(short[n].doubt / 2, min(f.doubt for f in best.values()))
+            doubt = (
+                best[n].doubt if longer or not moved else max(short[n].doubt / 2, min(f.doubt for f in best.values()))
+            )
             made[n] = best[n] if longer else Forecast(short[n].value + _shift(moved, n), doubt)
         curve = Curve.through([(n, f.value) for n, f in made.items()]) if made else None
         misses = [self._now(name, a) - curve.at(a.count) for a in full.values()] if curve is not None else []
@@ -96,12 +104,19 @@ class Judge:
         return found
 
     def _done(self, *purposes: Purpose) -> list[Attempt]:
-        """Trainings that tell something about the settings of now: made with these, or with others that were turned to them since."""
-        return [a for a in self.record.done(*purposes) if all(value in self.record.way(key) for key, value in a.words.items())]
+        """Trainings that tell something about the settings of now: made with these, or with others that were turned to
+        them since."""
+        return [
+            a
+            for a in self.record.done(*purposes)
+            if all(value in self.record.way(key) for key, value in a.words.items())
+        ]
 
     def _now(self, name: str, attempt: Attempt) -> float:
         """What a training would have had with the settings of now."""
-        return decibels(name, attempt.quality(name)) - sum(turn.loss.get(name, 0.0) for turn in self._turned_since(attempt))
+        return decibels(name, attempt.quality(name)) - sum(
+            turn.loss.get(name, 0.0) for turn in self._turned_since(attempt)
+        )
 
     def _turned_since(self, attempt: Attempt) -> list[Turn]:
         def own(turn: Turn) -> bool:
@@ -115,8 +130,9 @@ class Judge:
         return Curve.through(self.tried())
 
     def tried(self) -> list[tuple[int, float]]:
-        """(primitives, margin) of every size; of those between two full runs, one too small and one large enough, these two alone. A size that is
-        only forecast is no worse than a full run of a smaller one, and no better than one of a larger."""
+        """(primitives, margin) of every size; of those between two full runs, one too small and one large enough, these
+        two alone. A size that is only forecast is no worse than a full run of a smaller one, and no better than one of
+        a larger."""
         found = [(n, self._margin(values)) for n, values in self.forecasts().items()]
         full = {a.count for a in self._done("full")}
         known = [(n, margin) for n, margin in found if n in full]
@@ -176,7 +192,8 @@ class Judge:
 
 
 def _shift(moved: Mapping[int, float], primitives: int) -> float:
-    """What longer trials say of a size's forecast, the nearest of them: less of a size far from it, as few primitives are sooner as good as they can be."""
+    """What longer trials say of a size's forecast, the nearest of them: less of a size far from it, as few primitives
+    are sooner as good as they can be."""
     if not moved:
         return 0.0
     near = min(moved, key=lambda n: abs(math.log2(n / primitives)))

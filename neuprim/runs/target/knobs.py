@@ -26,8 +26,8 @@ _REFUSED = 2
 
 
 def ladders(config: RunConfig, task: TaskSpec, dataset: Dataset) -> dict[str, tuple[Setting, ...]]:
-    """Setting -> values with which a primitive has fewer numbers, the least first and the value of now last; that setting first on which most of
-    a primitive's numbers hang."""
+    """Setting -> values with which a primitive has fewer numbers, the least first and the value of now last; that
+    setting first on which most of a primitive's numbers hang."""
     whole = _numbers(config, task, dataset)
     made: dict[str, tuple[Setting, ...]] = {}
     least: dict[str, int] = {}
@@ -58,7 +58,8 @@ def _numbers(config: RunConfig, task: TaskSpec, dataset: Dataset) -> int:
 def next_turn(known: Mapping[str, Sequence[Setting]], turns: Sequence[Turn]) -> tuple[str, Setting, Setting] | None:
     """(setting, value now, value to try); None when all are through.
 
-    A setting goes down by about half its ladder at a time while that pays; where it does not, the value between is tried once.
+    A setting goes down by about half its ladder at a time while that pays; where it does not, the value between is
+    tried once.
     """
     for key, ladder in known.items():
         own = [turn for turn in turns if turn.key == key]

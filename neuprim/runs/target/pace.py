@@ -19,7 +19,8 @@ _FIXED = 0.5
 
 
 def linear(known: Sequence[tuple[int, float]], primitives: float) -> float:
-    """A time at a number of primitives, from (primitives, time) pairs: a least-squares line that neither falls nor starts below nothing.
+    """A time at a number of primitives, from (primitives, time) pairs: a least-squares line that neither falls nor
+    starts below nothing.
 
     Of one number alone half is taken to be the same for all.
     """

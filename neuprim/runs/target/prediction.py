@@ -1,8 +1,9 @@
-"""How good a run will be after more steps than were tried: every doubling of the steps gains a share of what the one before it gained.
+"""How good a run will be after more steps than were tried: every doubling of the steps gains a share of what the one
+before it gained.
 
-The share is that of the doublings behind ``docs/budgets.md``, drawn towards what the trials themselves show where they have three lengths. It is
-rough: over two doublings of surfaces it is off by about 0.6 dB, and scenes of smoke gain more with every doubling for long. So a forecast has a
-doubt, and what is forecast is checked by a full run.
+The share is that of the doublings behind ``docs/budgets.md``, drawn towards what the trials themselves show where they
+have three lengths. It is rough: over two doublings of surfaces it is off by about 0.6 dB, and scenes of smoke gain more
+with every doubling for long. So a forecast has a doubt, and what is forecast is checked by a full run.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ class Forecast:
 
 
 def decibels(name: str, value: float) -> float:
-    """PSNR as it is; SSIM as dB of what is missing to 1, -10 log10(1 - ssim), on which equal steps are about equal work, too."""
+    """PSNR as it is; SSIM as dB of what is missing to 1, -10 log10(1 - ssim), on which equal steps are about equal
+    work, too."""
     if name == "psnr":
         return value
     return -10 * math.log10(max(1.0 - value, _EQUAL))

@@ -1,4 +1,5 @@
-"""What a search asked, tried, predicted and achieved, as ``target.json`` holds it; a search that was interrupted goes on from there."""
+"""What a search asked, tried, predicted and achieved, as ``target.json`` holds it; a search that was interrupted goes
+on from there."""
 
 from __future__ import annotations
 
@@ -56,7 +57,9 @@ class Attempt:
         """Its name in the search's folder."""
         turned = [f"{key.rpartition('.')[2]}-{value}" for key, value in sorted(self.words.items())]
         limit = [] if self.max_seconds is None else [f"{self.max_seconds:g}s"]
-        return "_".join([f"{'full-' if self.purpose == 'full' else ''}{self.primitives}", *turned, f"{self.steps}-steps", *limit])
+        return "_".join(
+            [f"{'full-' if self.purpose == 'full' else ''}{self.primitives}", *turned, f"{self.steps}-steps", *limit]
+        )
 
     def quality(self, name: str) -> float:
         """A measure of what came out."""
@@ -165,7 +168,9 @@ def _record(data: Mapping[str, Any]) -> Record:
     made = checked(Record, own)
     for attempt in made.attempts:
         if not (attempt.primitives > 0 and attempt.steps > 0 and Path(attempt.folder).name == attempt.folder):
-            raise ValueError("attempts: expected positive numbers of primitives and steps, and settings that name a folder")
+            raise ValueError(
+                "attempts: expected positive numbers of primitives and steps, and settings that name a folder"
+            )
         if attempt.outcome is not None:
             [float(attempt.outcome[name]) for name in ("psnr", "ssim", "primitives", "bytes", "ms_per_frame")]
     return made

@@ -34,13 +34,14 @@ def target_run(
     clock: Callable[[], float] = time.monotonic,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
 ) -> Record:
-    """Find and train the smallest model that meets a target; leaves a run directory with ``target.json`` and ``model.neuprim``.
+    """Find and train the smallest model that meets a target; leaves a run directory with ``target.json`` and
+    ``model.neuprim``.
 
     Only training views decide: some are held out. The test views are measured once, at the end.
 
     Args:
-        config: what the search starts from; its primitives are the first size tried, its iterations the most that a run may have.
-        budget: seconds of search, training and measuring.
+        config: what the search starts from; its primitives are the first size tried, its iterations the most that a run
+        may have. budget: seconds of search, training and measuring.
         events: told what happens; a line of each trial and decision is a Note.
         clock: seconds, monotonic.
         launcher: where trainings work; each of them has the same number of threads, so that their paces compare.
@@ -91,7 +92,9 @@ def _check(config: RunConfig) -> None:
             "train.population.strategy=gradient: it decides by itself how many primitives there are, so that a target cannot; expected relocate or fixed"
         )
     if population.grow_to is not None:
-        raise ConfigError(f"train.population.grow_to={population.grow_to}: a target decides how many primitives there are; expected null")
+        raise ConfigError(
+            f"train.population.grow_to={population.grow_to}: a target decides how many primitives there are; expected null"
+        )
 
 
 def _same(config: RunConfig) -> dict[str, Any]:
@@ -127,5 +130,7 @@ def hold_out(dataset: Dataset) -> int:
     """Every how many-th training view judges: one of eight, more of few, as the mean of a few views says little."""
     count = len(dataset.train)
     if count < 4:
-        raise DataError(f"{dataset.name}: {count} training views; a target needs 4 or more, as some are held out to judge by")
+        raise DataError(
+            f"{dataset.name}: {count} training views; a target needs 4 or more, as some are held out to judge by"
+        )
     return min(8, max(2, count // 8))

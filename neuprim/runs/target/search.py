@@ -1,7 +1,9 @@
 """How many primitives to try next: bisection on the logarithm of the count, along a curve that never falls.
 
-A size is judged by its *margin*: the forecast of its full run less the target, dB; of several targets the least. Zero is the size wanted.
-Between sizes that were tried the curve is straight in log2 of the count; beyond them every doubling gains a share of what the last one did.
+A size is judged by its *margin*: the forecast of its full run less the target, dB; of several targets the least. Zero
+is the size wanted.
+Between sizes that were tried the curve is straight in log2 of the count; beyond them every doubling gains a share of
+what the last one did.
 """
 
 from __future__ import annotations
@@ -104,7 +106,9 @@ class Proposal:
     primitives: int
 
 
-def propose(tried: Sequence[tuple[int, float]], lowest: int, highest: int, wanted: float = 0.0, doubt: float = 0.0) -> Proposal:
+def propose(
+    tried: Sequence[tuple[int, float]], lowest: int, highest: int, wanted: float = 0.0, doubt: float = 0.0
+) -> Proposal:
     """The next step towards the least count whose margin is ``wanted``.
 
     Args:
@@ -123,7 +127,9 @@ def propose(tried: Sequence[tuple[int, float]], lowest: int, highest: int, wante
     furthest = (2.0**_FURTHEST * counts[-1], counts[0] / 2.0**_FURTHEST)
     found = round(min(max(found, lowest, furthest[1]), highest, furthest[0]))
     if len(counts) == 1:
-        return Proposal("try", _apart(counts[0], found, lowest, highest)) if lowest < highest else Proposal("take", found)
+        return (
+            Proposal("try", _apart(counts[0], found, lowest, highest)) if lowest < highest else Proposal("take", found)
+        )
     if any(abs(math.log2(found / count)) <= _CLOSE for count in counts):
         return Proposal("take", found)
     return Proposal("try", found)
@@ -142,7 +148,9 @@ def climb(tried: Sequence[tuple[int, float]], lowest: int, highest: int, worth: 
     if top >= highest / 2**_CLOSE:
         if len(counts) > 1 or highest <= lowest:
             return Proposal("take", _best(tried, lowest, highest, worth))
-        return Proposal("try", max(lowest, round(highest / 2)) if top != round(highest / 2) else max(lowest, highest // 4))
+        return Proposal(
+            "try", max(lowest, round(highest / 2)) if top != round(highest / 2) else max(lowest, highest // 4)
+        )
     if len(counts) > 1 and Curve.through(tried).slope < worth:
         return Proposal("take", _best(tried, lowest, highest, worth))
     return Proposal("try", min(highest, round(top * 2**_FURTHEST / 2)))
@@ -158,7 +166,8 @@ def _best(tried: Sequence[tuple[int, float]], lowest: int, highest: int, worth: 
 
 
 def _tried_up_to(counts: Sequence[int], highest: int, curve: Curve, wanted: float, doubt: float) -> bool:
-    """Whether more trials cannot change that the target is missed: the largest count was tried, or is hopeless from here."""
+    """Whether more trials cannot change that the target is missed: the largest count was tried, or is hopeless from
+    here."""
     return math.log2(highest / counts[-1]) <= _CLOSE or curve.at(highest) + 2 * doubt + _FIRST_SLOPE < wanted
 
 

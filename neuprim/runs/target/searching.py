@@ -1,7 +1,7 @@
 """The stages of a search: how fast the machine is, sizes, other settings, one longer trial, full runs.
 
-Every stage reads what is known from the record and asks for the next training; so a search that was interrupted takes the same way again, past
-trainings that are done already.
+Every stage reads what is known from the record and asks for the next training; so a search that was interrupted takes
+the same way again, past trainings that are done already.
 """
 
 from __future__ import annotations
@@ -38,14 +38,16 @@ _PACE_STEPS = 24
 _MOST_SIZES, _MOST_TURNS, _MOST_FULL = 6, 4, 5
 
 _OVER, _NEAR = 0.3, 1.08
-"""dB above the target that are close enough, if the size is within that of the one that would be closer: where decibels come slowly, a tenth of one is a
-tenth of the bytes."""
+"""dB above the target that are close enough, if the size is within that of the one that would be closer: where decibels
+come slowly, a tenth of one is a tenth of the bytes."""
 
 _LEAST_SLOPE = 0.8
-"""dB that twice as many primitives gain at least, in full runs of sizes that a target is met with; short trials may show less."""
+"""dB that twice as many primitives gain at least, in full runs of sizes that a target is met with; short trials may
+show less."""
 
 _BEYOND, _BELOW = 2.0, 3.0
-"""How many times more, and fewer, primitives than any training had a full run may have: curves are not known further away."""
+"""How many times more, and fewer, primitives than any training had a full run may have: curves are not known further
+away."""
 
 _MORE = 1.25
 """How many times more primitives limits must allow for another full run to be worth it."""
@@ -137,7 +139,9 @@ class Search:
     def probe(self, primitives: int) -> None:
         """A size at two lengths, so that what more steps bring is known."""
         words = self.record.words
-        self.told(*(Attempt("size", words, primitives, steps) for steps in (self.record.length // 2, self.record.length)))
+        self.told(
+            *(Attempt("size", words, primitives, steps) for steps in (self.record.length // 2, self.record.length))
+        )
 
     def told(self, *attempts: Attempt) -> None:
         for several in [attempts] if self.trying.together else [(attempt,) for attempt in attempts]:
@@ -147,12 +151,17 @@ class Search:
                     self.trying.tell(described(done, self.judge.predicted(done.count)))
 
     def sizes(self) -> None:
-        """Sizes, until the one that meets the target is known, the budget's share is used or the target is out of reach."""
+        """Sizes, until the one that meets the target is known, the budget's share is used or the target is out of
+        reach."""
         first = min(self.config.model.primitives, self.highest())
         self.probe(first)
         if self.longer_trials():
             self.probe(first)
-        begun = list(dict.fromkeys(a.primitives for a in self.record.attempts if a.purpose == "size" and a.words == self.record.words))
+        begun = list(
+            dict.fromkeys(
+                a.primitives for a in self.record.attempts if a.purpose == "size" and a.words == self.record.words
+            )
+        )
         for count in begun:  # before an interruption
             self.probe(count)
         for _ in range(_MOST_SIZES - len(begun)):
@@ -166,7 +175,9 @@ class Search:
             if not self.fits(proposal.primitives, 1.5 * self.record.length):
                 self.because("no time for more sizes")
                 break
-            if any(a.primitives == proposal.primitives and a.words == self.record.words for a in self.record.done("size")):
+            if any(
+                a.primitives == proposal.primitives and a.words == self.record.words for a in self.record.done("size")
+            ):
                 break
             self.probe(proposal.primitives)
 
@@ -180,7 +191,8 @@ class Search:
         return self.record.length > before
 
     def far(self, proposal: Proposal) -> bool:
-        """Whether a proposal leaps, or gives up, by what short trials say of long runs: networks of light gain more with every doubling for long."""
+        """Whether a proposal leaps, or gives up, by what short trials say of long runs: networks of light gain more
+        with every doubling for long."""
         largest = max(a.count for a in self.record.done("size"))
         return proposal.kind == "unreachable" or (proposal.kind == "try" and proposal.primitives > _LEAP * largest)
 
@@ -194,15 +206,17 @@ class Search:
         return True
 
     def promising(self) -> int | None:
-        """Where no size seems to have the target, and before full runs: the least that is as good as any tried, if it may have it by the doubt
-        about it. A full run of it tells more than trials of larger ones."""
+        """Where no size seems to have the target, and before full runs: the least that is as good as any tried, if it
+        may have it by the doubt about it. A full run of it tells more than trials of larger ones."""
         judge = self.judge
         if not self.target.quality or self.record.done("full") or len(judge.tried()) < 2:
             return None
         if judge.curve().count_for(ALLOWANCE, 1, self.highest()) is not None:
             return None
         best = max(margin for _, margin in judge.tried())
-        return min(n for n, margin in judge.tried() if margin >= best - NOISE) if best + judge.doubt >= ALLOWANCE else None
+        return (
+            min(n for n, margin in judge.tried() if margin >= best - NOISE) if best + judge.doubt >= ALLOWANCE else None
+        )
 
     def proposal(self) -> Proposal:
         judge, highest = self.judge, self.highest()
@@ -231,9 +245,12 @@ class Search:
         return self.beside(more)
 
     def down_to(self) -> int:
-        """The size below which another full run need not be, while all of them have more than the target: short trials of sizes far apart are
-        often alike, and full runs are not."""
-        full = [(a.count, self.judge.margin({name: a.quality(name) for name in self.judge.measures})) for a in self.record.done("full")]
+        """The size below which another full run need not be, while all of them have more than the target: short trials
+        of sizes far apart are often alike, and full runs are not."""
+        full = [
+            (a.count, self.judge.margin({name: a.quality(name) for name in self.judge.measures}))
+            for a in self.record.done("full")
+        ]
         if not full or min(margin for _, margin in full) < ROOM:
             return 1
         count, margin = min(full)
@@ -260,7 +277,11 @@ class Search:
                 return
             key, before, after = turn
             wanted = self.wanted()
-            bases = [a for a in self.record.done("size", "knob") if a.words == self.record.words and a.steps == self.record.length]
+            bases = [
+                a
+                for a in self.record.done("size", "knob")
+                if a.words == self.record.words and a.steps == self.record.length
+            ]
             if not bases:
                 return
             base = min(bases, key=lambda a: abs(math.log2(a.count / wanted)))
@@ -269,7 +290,10 @@ class Search:
                 return
             words = {**self.record.words, key: after}
             tried = self.trying.run(Attempt("knob", words, base.primitives, self.record.length))
-            loss = {name: decibels(name, base.quality(name)) - decibels(name, tried.quality(name)) for name in ("psnr", "ssim")}
+            loss = {
+                name: decibels(name, base.quality(name)) - decibels(name, tried.quality(name))
+                for name in ("psnr", "ssim")
+            }
             size = (tried.packed / tried.count) / (base.packed / base.count)
             slope = max(self.judge.curve().slope_at(wanted), 0.2)
             adopted = pays(max(loss[name] for name in self.judge.measures), size, slope)
@@ -284,7 +308,11 @@ class Search:
         if self.record.done("longer") or self.record.done("full"):
             return
         wanted = self.wanted()
-        near = [a.primitives for a in self.record.done("size", "knob") if a.words == self.record.words and a.steps == self.record.length]
+        near = [
+            a.primitives
+            for a in self.record.done("size", "knob")
+            if a.words == self.record.words and a.steps == self.record.length
+        ]
         count = min(near, key=lambda n: abs(math.log2(n / wanted)), default=wanted)
         if steps > self.steps(count) or not self.fits(count, steps, _SEARCH + 0.07):
             return
@@ -293,7 +321,8 @@ class Search:
     # ------------------------------------------------------------ full runs
 
     def full_runs(self) -> None:
-        """One full run, and others of a better size while the target is missed, or met with more than it needs, and time is left."""
+        """One full run, and others of a better size while the target is missed, or met with more than it needs, and
+        time is left."""
         for _ in range(_MOST_FULL - (len(self.record.done("full")) - self.record.before)):
             done = self.record.done("full")
             unfinished = [a for a in self.record.attempts if a.purpose == "full" and a.outcome is None]
@@ -307,7 +336,9 @@ class Search:
                     return
                 attempt = planned
             expected = ", ".join(promised(name, *pair) for name, pair in attempt.predicted.items())
-            self.trying.tell(f"full run: {attempt.primitives:,} primitives, {attempt.steps:,} steps; expected {expected}")
+            self.trying.tell(
+                f"full run: {attempt.primitives:,} primitives, {attempt.steps:,} steps; expected {expected}"
+            )
             done_now = self.trying.run(attempt)
             self.trying.tell(described(done_now, {}))
 
@@ -316,7 +347,11 @@ class Search:
         if not self.target.quality:
             return shortfall(self.target, attempt) is None and self.wanted() <= _MORE * attempt.count
         margin = self.judge.margin({name: attempt.quality(name) for name in self.judge.measures})
-        return ROOM <= margin <= _OVER and attempt.count <= _NEAR * self.wanted() and shortfall(self.target, attempt) is None
+        return (
+            ROOM <= margin <= _OVER
+            and attempt.count <= _NEAR * self.wanted()
+            and shortfall(self.target, attempt) is None
+        )
 
     def plan(self) -> Attempt | None:
         """The next full run; None where another would not change anything, or has no time."""
@@ -334,7 +369,9 @@ class Search:
             self.because("another size promises nothing better")
             return None
         steps = max(steps, least)
-        seconds = round(max(min(_SLOWER * steps * self.trying.pace(wanted), left), 0.02 * self.record.asked["budget"], 1.0), 1)
+        seconds = round(
+            max(min(_SLOWER * steps * self.trying.pace(wanted), left), 0.02 * self.record.asked["budget"], 1.0), 1
+        )
         return Attempt("full", self.record.words, wanted, steps, seconds, self.judge.predicted(wanted))
 
     def reserve(self) -> float:

@@ -1,4 +1,5 @@
-"""What becomes of the full run that was chosen: a usual run directory, and a model in as few bytes as the target lets it have."""
+"""What becomes of the full run that was chosen: a usual run directory, and a model in as few bytes as the target lets
+it have."""
 
 from __future__ import annotations
 
@@ -93,7 +94,8 @@ class Workshop:
 
 
 def publish(trying: Trying, target: Target, judge: Judge) -> None:
-    """Makes the run's directory of the full run that is best by the target, takes it through :data:`STAGES`, and records what was achieved."""
+    """Makes the run's directory of the full run that is best by the target, takes it through :data:`STAGES`, and
+    records what was achieved."""
     attempt = chosen(judge)
     trying.record.chosen = attempt.folder
     finished = _directory(trying, attempt)
@@ -133,7 +135,8 @@ def publish(trying: Trying, target: Target, judge: Judge) -> None:
 
 
 def chosen(judge: Judge) -> Attempt:
-    """Of the full runs that meet the target the smallest, of those with room for few bits before others; if none does, the best."""
+    """Of the full runs that meet the target the smallest, of those with room for few bits before others; if none does,
+    the best."""
     done = judge.record.done("full")
     within = [a for a in done if shortfall(judge.target, a) is None] or done
 
@@ -151,7 +154,9 @@ def _directory(trying: Trying, attempt: Attempt) -> Finished:
     """The run's directory from that of the training: its files, and what every run has beside them."""
     config = trying.config_of(attempt)
     trying.events(Finishing("measuring held-out views"))
-    fitted, _ = train(replace(config, resume=True), suspects_of(config), dataset=trying.dataset, hold_out=trying.record.hold_out)
+    fitted, _ = train(
+        replace(config, resume=True), suspects_of(config), dataset=trying.dataset, hold_out=trying.record.hold_out
+    )
     for name in _KEPT:
         with atomic_path(trying.folder / name) as temporary:
             shutil.copyfile(config.output_dir / name, temporary)
@@ -170,8 +175,8 @@ def _directory(trying: Trying, attempt: Attempt) -> Finished:
 
 
 def quantised(shop: Workshop, before: Finished) -> Finished:
-    """The model in numbers as coarse as the target lets them be; where it is missed anyway, so coarse that it costs next to nothing. With a limit of
-    bytes alone, as fine as that allows."""
+    """The model in numbers as coarse as the target lets them be; where it is missed anyway, so coarse that it costs
+    next to nothing. With a limit of bytes alone, as fine as that allows."""
     trying, target, judge = shop.trying, shop.target, shop.judge
     task, file = task_of(trying.config), before.run_dir / COMPRESSED
     model, header = load_model(before.run_dir / "model.safetensors", task)
@@ -197,12 +202,18 @@ def quantised(shop: Workshop, before: Finished) -> Finished:
     size = stored(made)
     again = load_model(file, task)[0]
     test = dict(zip(("psnr", "ssim"), quality(again, task, trying.dataset, trying.config.renderer), strict=True))
-    return replace(before, held=shop.measured(again), packed=size, test=test, facts={**before.facts, "rounding": share, "file": str(file)})
+    return replace(
+        before,
+        held=shop.measured(again),
+        packed=size,
+        test=test,
+        facts={**before.facts, "rounding": share, "file": str(file)},
+    )
 
 
 def pruned(shop: Workshop, before: Finished) -> Finished:
-    """Without what its views do not require, as far as the target lets it, in half of the time that is left; as it was where that is not enough, or
-    what is left misses the target."""
+    """Without what its views do not require, as far as the target lets it, in half of the time that is left; as it was
+    where that is not enough, or what is left misses the target."""
     trying, attempt, margin = shop.trying, shop.attempt, shop.judge.margin(before.held)
     if not shop.target.quality or margin < 0:
         return before
@@ -211,7 +222,14 @@ def pruned(shop: Workshop, before: Finished) -> Finished:
         trying.record.why.append(f"no time to prune: {max(trying.left, 0):.0f} s are left")
         return before
     folder = before.run_dir / "pruned"
-    request = Request(before.run_dir, max(margin - ROOM, ROOM), steps=steps, out=folder, overwrite=True, hold_out=trying.record.hold_out)
+    request = Request(
+        before.run_dir,
+        max(margin - ROOM, ROOM),
+        steps=steps,
+        out=folder,
+        overwrite=True,
+        hold_out=trying.record.hold_out,
+    )
     made = prune_run(request, lambda text, fraction: trying.events(Finishing(f"pruning: {text}")))
     if made.run_dir is None:
         trying.record.why.append("nothing could be pruned")
@@ -226,7 +244,10 @@ def pruned(shop: Workshop, before: Finished) -> Finished:
     if not kept:
         return before
     test = {name: float(metrics[name]) for name in ("psnr", "ssim")}
-    facts = {**before.facts, "pruned": {"primitives": model.count, "bytes_usual": sizes[1], "bytes_usual_before": sizes[0]}}
+    facts = {
+        **before.facts,
+        "pruned": {"primitives": model.count, "bytes_usual": sizes[1], "bytes_usual_before": sizes[0]},
+    }
     return Finished(made.run_dir, held, int(made.after["bytes"]), test, facts)
 
 

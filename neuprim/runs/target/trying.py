@@ -103,7 +103,8 @@ class Trying:
         return replace(made, output_dir=self.folder / FOLDER / attempt.folder, resume=attempt.purpose == "full")
 
     def _population(self, steps: int) -> PopulationSettings:
-        """With as many interventions as in a run of whole length: with fewer, short runs are half a decibel worse than they need be."""
+        """With as many interventions as in a run of whole length: with fewer, short runs are half a decibel worse than
+        they need be."""
         whole, settings = self.config.train.iterations, self.config.train.population
         if whole is None or steps >= whole:
             return settings
@@ -117,7 +118,8 @@ class Trying:
         return self.run_all([attempt])[0]
 
     def run_all(self, wanted: Sequence[Attempt]) -> list[Attempt]:
-        """Several attempts as :meth:`run` has one: one after the other in this process, together where the launcher has them elsewhere."""
+        """Several attempts as :meth:`run` has one: one after the other in this process, together where the launcher has
+        them elsewhere."""
         attempts = [self._find(attempt) or attempt for attempt in wanted]
         todo = [attempt for attempt in attempts if attempt.outcome is None]
         for attempt in todo:
@@ -144,7 +146,10 @@ class Trying:
         self._keep(attempt, outcome)
 
     def _elsewhere(self, attempts: Sequence[Attempt]) -> None:
-        jobs = [Job(attempt.folder, f"{__name__}:{do_attempt.__name__}", words_of(self._trial(attempt))) for attempt in attempts]
+        jobs = [
+            Job(attempt.folder, f"{__name__}:{do_attempt.__name__}", words_of(self._trial(attempt)))
+            for attempt in attempts
+        ]
         threads = at_once(self.launcher, TOGETHER)[1]  # the same whether one works or several: paces must compare
         done = [0.0] * len(jobs)
 
@@ -187,7 +192,8 @@ class Trying:
     # ------------------------------------------------------------ time
 
     def pace(self, primitives: float) -> float:
-        """Seconds of a step with so many primitives. The pace of trials counts by the primitives they had, the last of equal ones alone."""
+        """Seconds of a step with so many primitives. The pace of trials counts by the primitives they had, the last of
+        equal ones alone."""
         known = {a.count: a.pace for a in self.record.done("pace", "size", "longer", "full") if a.pace is not None}
         if len(known) > 1:  # a few steps of a young model are the poorest guess
             known = {a.count: a.pace for a in self.record.done("size", "longer", "full") if a.pace is not None} or known

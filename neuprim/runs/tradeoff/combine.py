@@ -23,12 +23,17 @@ Found = Sequence[tuple[OperatingPoint, Measured]]
 
 
 def speed_points(reference: OperatingPoint, found: Found) -> list[OperatingPoint]:
-    """Combinations along the front of time: knobs that save more of it than chance does. What storage changes is left out."""
+    """Combinations along the front of time: knobs that save more of it than chance does. What storage changes is left
+    out."""
 
     def gain(measured: Measured) -> float:
         return -math.log(measured.ratio) if measured.ratio < 1.0 - measured.doubt else 0.0
 
-    own = [(p, m, gain(m)) for p, m in found if m.knob != COMBINED and m.ratios and p.stored == reference.stored and p != reference]
+    own = [
+        (p, m, gain(m))
+        for p, m in found
+        if m.knob != COMBINED and m.ratios and p.stored == reference.stored and p != reference
+    ]
     return _together(reference, found, [(p, m, g) for p, m, g in own if g > 0])
 
 
@@ -38,12 +43,17 @@ def size_points(reference: OperatingPoint, found: Found, subject: Subject) -> li
     own = [
         (p, m, math.log(whole / m.bytes))
         for p, m in found
-        if m.knob != COMBINED and p.settings == reference.settings and p.resolution == reference.resolution and m.bytes < whole
+        if m.knob != COMBINED
+        and p.settings == reference.settings
+        and p.resolution == reference.resolution
+        and m.bytes < whole
     ]
     return _together(reference, found, own)
 
 
-def _together(reference: OperatingPoint, found: Found, gaining: Sequence[tuple[OperatingPoint, Measured, float]]) -> list[OperatingPoint]:
+def _together(
+    reference: OperatingPoint, found: Found, gaining: Sequence[tuple[OperatingPoint, Measured, float]]
+) -> list[OperatingPoint]:
     """The combinations of :func:`~neuprim.runs.tradeoff.front.chain`, without points that were measured alone."""
     best = found[0][1].quality["psnr"]
     usual = found[0][0]
@@ -78,5 +88,7 @@ def fronts(reference: OperatingPoint, points: Sequence[OperatingPoint], record: 
 
     every = range(len(measured))
     speed = front([i for i in every if measured[i].ratios and points[i].stored == reference.stored], in_time)
-    same = [i for i in every if points[i].settings == reference.settings and points[i].resolution == reference.resolution]
+    same = [
+        i for i in every if points[i].settings == reference.settings and points[i].resolution == reference.resolution
+    ]
     return speed, front(same, in_bytes)

@@ -14,7 +14,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Spot:
-    """Where a point lies: what it costs (less is better), how uncertain that is, and how good it is (more is better)."""
+    """Where a point lies: what it costs (less is better), how uncertain that is, and how good it is (more is
+    better)."""
 
     cost: float
     quality: float
@@ -24,8 +25,9 @@ class Spot:
 def front(points: Sequence[T], spot: Callable[[T], Spot]) -> list[T]:
     """The Pareto front, best quality first: no other point is at least as good and costs less.
 
-    A point must be cheaper than the next better one on the front by more than the doubt about both, as measured costs of equal ones differ by
-    chance; of equally good ones the first stays unless another is cheaper by as much. Without doubt it is the plain front.
+    A point must be cheaper than the next better one on the front by more than the doubt about both, as measured costs
+    of equal ones differ by chance; of equally good ones the first stays unless another is cheaper by as much. Without
+    doubt it is the plain front.
     """
     known = [p for p in points if not (math.isnan(spot(p).cost) or math.isnan(spot(p).quality))]
     kept: list[T] = []
@@ -43,7 +45,8 @@ def front(points: Sequence[T], spot: Callable[[T], Spot]) -> list[T]:
 
 @dataclass(frozen=True)
 class Move:
-    """A knob turned alone: how much it gains (the logarithm of how many times less the point costs) and loses (of quality)."""
+    """A knob turned alone: how much it gains (the logarithm of how many times less the point costs) and loses (of
+    quality)."""
 
     knob: str
     name: str
@@ -52,8 +55,9 @@ class Move:
 
 
 def chain(moves: Sequence[Move], least: float = 0.01) -> list[tuple[Move, ...]]:
-    """Combinations along the front, cheapest loss first: from the reference, always the turn that loses least for what it gains, whether of
-    another knob or of one further. Gains and losses are taken to add up, which the combinations' own measurement then corrects.
+    """Combinations along the front, cheapest loss first: from the reference, always the turn that loses least for what
+    it gains, whether of another knob or of one further. Gains and losses are taken to add up, which the combinations'
+    own measurement then corrects.
 
     Args:
         least: gains of a turn that are not counted as such.

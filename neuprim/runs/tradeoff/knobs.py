@@ -83,7 +83,8 @@ LADDERS: Mapping[str, Ladder] = {
     "threads": _threads,
     "store": _stored,
 }
-"""The knobs that every model has. What its fields can do with less of comes to these, as density.NAME and colour.NAME."""
+"""The knobs that every model has. What its fields can do with less of comes to these, as density.NAME and
+colour.NAME."""
 
 
 def _less(kind: str, name: str, values: Sequence[int]) -> Ladder:
@@ -97,7 +98,11 @@ def _less(kind: str, name: str, values: Sequence[int]) -> Ladder:
 def knobs_of(model: Primitives) -> dict[str, Ladder]:
     """The knobs of a model by name."""
     fields = (("density", model.density), ("colour", model.colour))
-    own = {f"{kind}.{name}": _less(kind, name, values) for kind, field in fields for name, values in field.reductions().items()}
+    own = {
+        f"{kind}.{name}": _less(kind, name, values)
+        for kind, field in fields
+        for name, values in field.reductions().items()
+    }
     return {**LADDERS, **own}
 
 
@@ -109,7 +114,11 @@ def check_knobs(names: Sequence[str], model: Primitives) -> None:
 
 
 def candidates(
-    names: Sequence[str], reference: OperatingPoint, model: Primitives, fault: Callable[[OperatingPoint], str | None], usual: RenderSettings
+    names: Sequence[str],
+    reference: OperatingPoint,
+    model: Primitives,
+    fault: Callable[[OperatingPoint], str | None],
+    usual: RenderSettings,
 ) -> tuple[list[Candidate], list[LeftOut]]:
     """Every point that turns one of these knobs, without the reference itself, and what cannot be.
 
@@ -135,12 +144,17 @@ def candidates(
                 out.append(LeftOut(name, point.words(usual), reason))
     for kind, field in (("density", model.density), ("colour", model.colour)):
         if not names and not field.reductions():
-            out.append(LeftOut(kind, (), f"{type(field).__name__} as it is has nothing that a finished model can do with less of"))
+            out.append(
+                LeftOut(
+                    kind, (), f"{type(field).__name__} as it is has nothing that a finished model can do with less of"
+                )
+            )
     return found, out
 
 
 def joined(reference: OperatingPoint, points: Iterable[OperatingPoint]) -> OperatingPoint:
-    """The point that has everything in which any of these differs from the reference; the last one's, where they disagree."""
+    """The point that has everything in which any of these differs from the reference; the last one's, where they
+    disagree."""
     result = reference
     for point in points:
         changed = {

@@ -32,7 +32,8 @@ _BESIDE = 6
 """Points to each drawing of the reference in a round."""
 
 _TINY = 16
-"""Pixels on a side of an image that is drawn beforehand, so that what is compiled and loaded at a first one is no part of a frame."""
+"""Pixels on a side of an image that is drawn beforehand, so that what is compiled and loaded at a first one is no part
+of a frame."""
 
 
 Drawing = Callable[[View], Tensor]
@@ -67,10 +68,11 @@ class Models:
 
 
 def look(subject: Subject, models: Models, knob: str, point: OperatingPoint, exact: Exact) -> tuple[Measured, float]:
-    """A point's images against ground truth and exact images, its size and memory; and the seconds that all images took together.
+    """A point's images against ground truth and exact images, its size and memory; and the seconds that all images took
+    together.
 
-    Numbers are means over views; PSNR against the exact images is that of the mean squared error over all of them, and no more than the
-    exact images themselves are known to.
+    Numbers are means over views; PSNR against the exact images is that of the mean squared error over all of them, and
+    no more than the exact images themselves are known to.
     """
     model = models.of(point)
     card = model.device if model.device.type != "cpu" else None
@@ -90,7 +92,9 @@ def look(subject: Subject, models: Models, knob: str, point: OperatingPoint, exa
         if subject.lpips is not None and min(shown.shape[:2]) >= subject.lpips.least:
             row |= {"lpips": subject.lpips(shown, goal), "lpips_3dgs": subject.lpips.unmapped(shown, goal)}
         rows.append(row)
-    quality = {name: float(np.mean([row[name] for row in rows])) for name in rows[0] if all(name in row for row in rows)}
+    quality = {
+        name: float(np.mean([row[name] for row in rows])) for name in rows[0] if all(name in row for row in rows)
+    }
     error = quality.pop("mse_exact")
     against = -10.0 * math.log10(error) if error > 0 else math.inf
     quality["psnr_exact"] = against if exact.error is None else min(against, exact.error)
@@ -107,17 +111,19 @@ def take_turns(
     tell: Callable[[int, int], None],
     done: Callable[[], None],
 ) -> None:
-    """Time points in rounds: of every view every point once and the reference several times, in another order each time; then the next view.
+    """Time points in rounds: of every view every point once and the reference several times, in another order each
+    time; then the next view.
 
-    Before a frame that counts the same one is drawn, so that it finds what it would in a film: its own model in the processor's caches, and
-    not that of whatever came before it. A round gives each point its mean milliseconds per frame, and a ratio: of each view its time over the
-    median of the reference's beside it, of these the median over the views, so that what else the machine does for a moment decides nothing.
+    Before a frame that counts the same one is drawn, so that it finds what it would in a film: its own model in the
+    processor's caches, and not that of whatever came before it. A round gives each point its mean milliseconds per
+    frame, and a ratio: of each view its time over the median of the reference's beside it, of these the median over the
+    views, so that what else the machine does for a moment decides nothing.
 
     Args:
         truths: of the views to draw.
         ready: a point -> what draws it; finding that is no part of a frame's time.
-        points: what is drawn, an operating point or a model, and its numbers; the reference first. It is drawn in every round; others until they have their ``rounds``.
-        rounds: how many a point is to have.
+        points: what is drawn, an operating point or a model, and its numbers; the reference first. It is drawn in every
+        round; others until they have their ``rounds``. rounds: how many a point is to have.
         deadline: of :func:`time.monotonic`, after which no round is begun; but one always is.
         tell: called with (round, of how many) before each.
         done: called after each.

@@ -20,8 +20,8 @@ _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 def peak_bytes(call: Callable[[], T], card: torch.device | None = None) -> tuple[T, int | None]:
     """What a call returns, and by how many bytes memory in use rose at its peak; None where this system does not tell.
 
-    On a card, what torch has given out. On the processor the resident set of the process, after memory that was freed has gone back to the
-    system; whatever other threads of the process do meanwhile counts too.
+    On a card, what torch has given out. On the processor the resident set of the process, after memory that was freed
+    has gone back to the system; whatever other threads of the process do meanwhile counts too.
     """
     if card is not None:
         torch.cuda.reset_peak_memory_stats(card)

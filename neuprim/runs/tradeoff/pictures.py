@@ -13,7 +13,8 @@ __all__ = ["pictures"]
 
 
 def pictures(subject: Subject, record: Record, models: Models) -> dict[int, Picture]:
-    """Number of a point -> what it shows of the view that has most to show, and of the truth under -1; both as displayed."""
+    """Number of a point -> what it shows of the view that has most to show, and of the truth under -1; both as
+    displayed."""
     truth = max(subject.truths, key=lambda one: float(subject.channels.display(one.image).var()))
     wanted = subject.channels.display(truth.image).clamp(0.0, 1.0)
     found = {-1: Picture(wanted, None)}

@@ -1,4 +1,5 @@
-"""What was measured, as ``tradeoff.json`` holds it, and as ``tradeoff.csv`` with the columns of the 3DGS compression survey."""
+"""What was measured, as ``tradeoff.json`` holds it, and as ``tradeoff.csv`` with the columns of the 3DGS compression
+survey."""
 
 from __future__ import annotations
 
@@ -85,8 +86,8 @@ class Measured:
 
     @property
     def doubt(self) -> float:
-        """How uncertain the median of the ratios is: 1.57 times the range between the quartiles over the root of their number (McGill's
-        notches; medians farther apart than both of theirs differ). All of it, of fewer than three."""
+        """How uncertain the median of the ratios is: 1.57 times the range between the quartiles over the root of their
+        number (McGill's notches; medians farther apart than both of theirs differ). All of it, of fewer than three."""
         if self.spread is None:
             return self.ratio if len(self.ratios) else 0.0
         return 3.14 * self.spread / len(self.ratios) ** 0.5
@@ -104,7 +105,10 @@ class Measured:
         names = [name.removesuffix("_infinite") for name in data["quality"]]
         quality = {name: value for name in names if (value := from_json(data["quality"], name)) is not None}
         own = {name: data[name] for name in ("bytes", "peak_bytes", "ms", "ratios", "rounds")}
-        return replace(checked(cls, {"knob": data["knob"], "words": data["words"], "quality": {}, **own}, "points"), quality=quality)
+        return replace(
+            checked(cls, {"knob": data["knob"], "words": data["words"], "quality": {}, **own}, "points"),
+            quality=quality,
+        )
 
 
 @dataclass
@@ -175,7 +179,9 @@ def read_record(path: Path, kind: type[Measured] = Measured) -> Record | None:
         return None
     try:
         if data["format"] != FORMAT:
-            raise DataError(f"{path}: format {data['format']!r}; this neuprim reads {FORMAT}; delete it to measure anew")
+            raise DataError(
+                f"{path}: format {data['format']!r}; this neuprim reads {FORMAT}; delete it to measure anew"
+            )
         points = [kind.from_dict(entry) for entry in data["points"]]
         out = [checked(LeftOut, entry, "left_out") for entry in data["left_out"]]
         speed, size = (converted(data["front"][name], list[int], f"front.{name}") for name in ("speed", "size"))
@@ -190,9 +196,13 @@ def read_record(path: Path, kind: type[Measured] = Measured) -> Record | None:
 
 
 def write_csv(
-    path: Path, record: Record, primitives: Callable[[int], int], more: Mapping[str, Callable[[int], object]] = MappingProxyType({})
+    path: Path,
+    record: Record,
+    primitives: Callable[[int], int],
+    more: Mapping[str, Callable[[int], object]] = MappingProxyType({}),
 ) -> None:
-    """The table, a row per point; empty cells are not measured. LPIPS is the survey's, of VGG; another network's is left out.
+    """The table, a row per point; empty cells are not measured. LPIPS is the survey's, of VGG; another network's is
+    left out.
 
     Args:
         primitives: number of a point -> how many it has.
@@ -204,11 +214,20 @@ def write_csv(
     writer.writerow((*COLUMNS, *_MORE, *more))
     for number, point in enumerate(record.points):
         q = point.quality
-        own = (point.name, _cell(q.get("psnr")), _cell(q.get("ssim_3dgs")), _cell(q.get(perceived)), point.bytes, primitives(number))
+        own = (
+            point.name,
+            _cell(q.get("psnr")),
+            _cell(q.get("ssim_3dgs")),
+            _cell(q.get(perceived)),
+            point.bytes,
+            primitives(number),
+        )
         times = (f"{point.ratio:.4f}", f"{point.time:.4f}", f"{1e3 / point.time:.2f}") if point.ms else ("", "", "")
         peak = "" if point.peak_bytes is None else point.peak_bytes
         fronts = (int(number in record.speed), int(number in record.size))
-        writer.writerow((*own, *times, _cell(q.get("psnr_exact")), peak, *fronts, *(cell(number) for cell in more.values())))
+        writer.writerow(
+            (*own, *times, _cell(q.get("psnr_exact")), peak, *fronts, *(cell(number) for cell in more.values()))
+        )
     write_text(path, buffer.getvalue())
 
 

@@ -1,4 +1,5 @@
-"""Measure a finished run's operating points, find the front, and write ``RUN_DIR/tradeoff/``; what is measured already is kept."""
+"""Measure a finished run's operating points, find the front, and write ``RUN_DIR/tradeoff/``; what is measured already
+is kept."""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ FOLDER = "tradeoff"
 """Of a run directory."""
 
 _EXACT, _SEEN, _TIMED, _COMBINED = 0.2, 0.45, 0.65, 0.85
-"""Parts of the budget by which the exact images, the single knobs' images and their times, and the combinations' images are to be there."""
+"""Parts of the budget by which the exact images, the single knobs' images and their times, and the combinations' images
+are to be there."""
 
 _ONE_POINT = 0.1
 """Part of the budget that one point's times may take."""
@@ -148,7 +150,11 @@ class _Work:
         known = self.record.facts.get("exact")
         seconds = (known["oracle_seconds"] if known else self.exact.oracle_seconds) * len(self.subject.truths)
         allowed = _ONE_POINT * self.request.budget
-        return f"its images would take about {seconds:.0f} s, of {allowed:.0f} s that a point may have" if seconds > allowed else None
+        return (
+            f"its images would take about {seconds:.0f} s, of {allowed:.0f} s that a point may have"
+            if seconds > allowed
+            else None
+        )
 
     def take_times(self, part: float) -> None:
         """Rounds of all points that lack some."""
@@ -174,7 +180,8 @@ def tradeoff_run(
     tell: Callable[[str], None] = lambda text: None,
     progress: Progress = lambda text, fraction: None,
 ) -> Record:
-    """Measure, and write ``tradeoff.json``, ``tradeoff.csv``, ``tradeoff.html`` and ``front.png`` into the run's folder :data:`FOLDER`.
+    """Measure, and write ``tradeoff.json``, ``tradeoff.csv``, ``tradeoff.html`` and ``front.png`` into the run's folder
+    :data:`FOLDER`.
 
     Args:
         tell: called with lines for the user.
@@ -201,7 +208,9 @@ def tradeoff_run(
         work.look_at(singles, _SEEN)
         work.take_times(_TIMED)
         found = [(read_point(m.words, subject.config.renderer, subject.model), m) for m in record.points]
-        together = {subject.words(p): p for p in (*speed_points(reference, found), *size_points(reference, found, subject))}
+        together = {
+            subject.words(p): p for p in (*speed_points(reference, found), *size_points(reference, found, subject))
+        }
         work.look_at([Candidate(COMBINED, point) for point in together.values()], _COMBINED)
         work.take_times(1.0)
         if not record.marching:
@@ -228,7 +237,10 @@ def _same(subject: Subject) -> dict[str, Any]:
         "model": model,
         "settings": asdict(subject.config.renderer),
         "reference": list(subject.words(subject.reference)),
-        "scene": {"name": subject.config.scene_name, **{key: str(value) for key, value in subject.config.scene.items()}},
+        "scene": {
+            "name": subject.config.scene_name,
+            **{key: str(value) for key, value in subject.config.scene.items()},
+        },
         "views": [truth.view.name for truth in subject.truths],
         "image_size": [camera.width, camera.height],
         "lpips": None if subject.lpips is None else subject.lpips.network,
@@ -237,7 +249,12 @@ def _same(subject: Subject) -> dict[str, Any]:
             "cores": core_count(),
             "device": subject.backend(subject.reference).computer(subject.reference.settings),
         },
-        "versions": {"neuprim": __version__, "python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
+        "versions": {
+            "neuprim": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
     }
 
 
@@ -267,7 +284,10 @@ def _describe(record: Record, subject: Subject) -> None:
         "shown": subject.channels.shown,
         "not_measured": {} if subject.lpips is not None else {"lpips": "no weights were given (--lpips FILE)"},
     }
-    if not Path("/proc/self/clear_refs").exists() and subject.prepared(subject.reference).device.type == device.PROCESSOR:
+    if (
+        not Path("/proc/self/clear_refs").exists()
+        and subject.prepared(subject.reference).device.type == device.PROCESSOR
+    ):
         record.facts["not_measured"]["peak_bytes"] = UNKNOWN
 
 
@@ -281,7 +301,12 @@ def _marching(subject: Subject) -> dict[str, Any]:
     except NeuprimError as error:
         return {"not_measured": str(error)}
     rows = [
-        {"samples": way.samples, "psnr": None if math.isinf(way.psnr) else way.psnr, "max_abs": way.max_abs, "seconds": way.seconds}
+        {
+            "samples": way.samples,
+            "psnr": None if math.isinf(way.psnr) else way.psnr,
+            "max_abs": way.max_abs,
+            "seconds": way.seconds,
+        }
         for way in found
     ]
     return {"image_size": [camera.width, camera.height], "chords": found[0].chords, "rows": rows}

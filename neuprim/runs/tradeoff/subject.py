@@ -62,7 +62,9 @@ class Subject:
     @property
     def double(self) -> Primitives:
         """The model in float64."""
-        return Primitives(self.model.density, self.model.colour, {n: v.detach().double() for n, v in self.model.params.items()})
+        return Primitives(
+            self.model.density, self.model.colour, {n: v.detach().double() for n, v in self.model.params.items()}
+        )
 
     def small(self, longer: int) -> View:
         """The first view with at most so many pixels on its longer side."""
@@ -101,7 +103,11 @@ class Subject:
 
 
 def load_subject(
-    run_dir: Path, words: Sequence[str], views: int, lpips: str | Path | None = None, shown: tuple[Dataset, list[Truth]] | None = None
+    run_dir: Path,
+    words: Sequence[str],
+    views: int,
+    lpips: str | Path | None = None,
+    shown: tuple[Dataset, list[Truth]] | None = None,
 ) -> Subject:
     """A finished run with ``views`` of its held-out views, evenly spread.
 
@@ -138,7 +144,8 @@ class Exact:
 
     Attributes:
         images: (H, W, C) float64, one per view.
-        float64: whether the reference backend drew them from float64 parameters. Else the reference point's backend did, in float32, and
+        float64: whether the reference backend drew them from float64 parameters. Else the reference point's backend
+        did, in float32, and
             ``error`` is how close it comes, dB, in an image of ``checked`` pixels.
         seconds: that an image took; oracle_seconds: that one of the reference backend takes, about.
     """
@@ -153,15 +160,20 @@ class Exact:
     def record(self) -> dict[str, Any]:
         """JSON-able facts."""
         how = "reference backend, float64" if self.float64 else "nothing cut, float32"
-        known = {"psnr_against_float64": self.error, "checked_size": list(self.checked), "oracle_seconds": self.oracle_seconds}
+        known = {
+            "psnr_against_float64": self.error,
+            "checked_size": list(self.checked),
+            "oracle_seconds": self.oracle_seconds,
+        }
         return {"drawn_by": how, "float64": self.float64, **known}
 
 
 def exact_images(subject: Subject, allowed: float, float64: bool | None = None) -> Exact:
-    """The exact images of all views: by the float64 oracle where ``allowed`` seconds are enough for it, else by the reference point's own
-    backend without any cut, whose error against the oracle is measured on one small image.
+    """The exact images of all views: by the float64 oracle where ``allowed`` seconds are enough for it, else by the
+    reference point's own backend without any cut, whose error against the oracle is measured on one small image.
 
-    The opacity clamp, the order and the rays per pixel are the reference point's: they say what is drawn, not how exactly.
+    The opacity clamp, the order and the rays per pixel are the reference point's: they say what is drawn, not how
+    exactly.
 
     Args:
         float64: which of both, where that is decided already.

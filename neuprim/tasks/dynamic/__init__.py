@@ -25,7 +25,9 @@ __all__ = ["TASK"]
 
 def _check(model: Mapping[str, Any]) -> None:
     choose(model["density"], "model.density", {"time": str, "divide_above": float, **DENSITY_OPTIONS})
-    colour = {key: RENAMED.get(value, value) if key == "frequencies" else value for key, value in model["colour"].items()}
+    colour = {
+        key: RENAMED.get(value, value) if key == "frequencies" else value for key, value in model["colour"].items()
+    }
     choose(colour, "model.colour", {"frequencies": tuple(FREQUENCIES), "powers": int, "waves": int})
     try:
         _density(model)
@@ -43,13 +45,19 @@ def _density(model: Mapping[str, Any], components: tuple[str, ...] = ()) -> Time
 
 def _trade(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
     parts = ("none", "phase", "window", "window+motion", "phase+window+motion")
-    bands: dict[str, tuple[Any, ...]] = {"model.sh_degree": (0, 1, 2, 3), "model.colour.powers": (0, 2, 4), "model.colour.waves": (0, 2, 4)}
+    bands: dict[str, tuple[Any, ...]] = {
+        "model.sh_degree": (0, 1, 2, 3),
+        "model.colour.powers": (0, 2, 4),
+        "model.colour.waves": (0, 2, 4),
+    }
     return {**DENSITY_TRADE, "model.density.time": parts, **bands}
 
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     components = () if dataset.points is None else dataset.points.components
-    return _density(model, components), TimeHarmonics(model["sh_degree"], dataset.channels, model["sh_every"], **model["colour"])
+    return _density(model, components), TimeHarmonics(
+        model["sh_degree"], dataset.channels, model["sh_every"], **model["colour"]
+    )
 
 
 # Loaders are imported when used: each pulls in modules of its own.
@@ -91,12 +99,38 @@ TASK = TaskSpec(
     summary="Smoke and fire over time, from OpenVDB sequences or images with a time each (time inside the density)",
     config_package="neuprim.tasks.dynamic.conf",
     scenes=(
-        SceneSpec("smoke_fire", "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth, _chunks),
-        SceneSpec("colorful_smoke", "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth, _chunks),
         SceneSpec(
-            "ground_explosion", "a blast and its cloud, 130 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth, _chunks
+            "smoke_fire",
+            "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR",
+            _volume,
+            _files,
+            _truth,
+            _chunks,
         ),
-        SceneSpec("dust_tornado", "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth, _chunks),
+        SceneSpec(
+            "colorful_smoke",
+            "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR",
+            _volume,
+            _files,
+            _truth,
+            _chunks,
+        ),
+        SceneSpec(
+            "ground_explosion",
+            "a blast and its cloud, 130 timesteps; simulated, or scene.vdb=DIR",
+            _volume,
+            _files,
+            _truth,
+            _chunks,
+        ),
+        SceneSpec(
+            "dust_tornado",
+            "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR",
+            _volume,
+            _files,
+            _truth,
+            _chunks,
+        ),
         SceneSpec("vdb", "any sequence of .vdb files: scene.vdb=DIR", _volume, _files, _truth, _chunks),
         SceneSpec("multiview", "images with a time per frame (D-NeRF layout): scene.path=DIR", _multiview),
     ),

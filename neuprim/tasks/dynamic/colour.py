@@ -1,4 +1,5 @@
-"""Colour that changes in time: the zero-order spherical-harmonics coefficient is a function of it (equations 10 to 12)."""
+"""Colour that changes in time: the zero-order spherical-harmonics coefficient is a function of it (equations 10 to
+12)."""
 
 from __future__ import annotations
 
@@ -21,8 +22,8 @@ from neuprim.tasks.dynamic.density import time_of
 __all__ = ["TimeHarmonics"]
 
 FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
-"""Angle of the first Fourier term at xi = 1. The paper prints i xi, whose basis is nearly rank-deficient on [0, 1] (condition
-5e13); whole periods are well conditioned (2e5)."""
+"""Angle of the first Fourier term at xi = 1. The paper prints i xi, whose basis is nearly rank-deficient on [0, 1]
+(condition 5e13); whole periods are well conditioned (2e5)."""
 
 _TIME = ("time_poly", "time_cos", "time_sin")
 """The tensors of the terms in time."""
@@ -31,17 +32,20 @@ _TIMES = 256
 """At which fewer terms are fitted to all of them."""
 
 _CONDITION = 1e-7
-"""Directions of the terms that are weaker than this are left out of a fit: their coefficients would not survive float32."""
+"""Directions of the terms that are weaker than this are left out of a fit: their coefficients would not survive
+float32."""
 
 RENAMED = {"turns": "periods"}
 """Words of before, which configurations and models on disk still hold."""
 
 
 class TimeHarmonics(ColourField):
-    """c = max(0, C0 S(xi) + sum of higher bands + 1/2), S(xi) = S0 + sum_i a_i xi^i + sum_i b_i cos(w i xi) + c_i sin(w i xi).
+    """c = max(0, C0 S(xi) + sum of higher bands + 1/2), S(xi) = S0 + sum_i a_i xi^i + sum_i b_i cos(w i xi) + c_i sin(w
+    i xi).
 
-    Per channel 1 + n + 2 l parameters in the zero-order coefficient, i = 1..n and 1..l; the higher bands do not change. With
-    n = l = 4, three channels and degree 3: 84 parameters, 39 at degree 0. ``frequencies`` chooses w, see :data:`FREQUENCIES`.
+    Per channel 1 + n + 2 l parameters in the zero-order coefficient, i = 1..n and 1..l; the higher bands do not change.
+    With n = l = 4, three channels and degree 3: 84 parameters, 39 at degree 0. ``frequencies`` chooses w, see
+    :data:`FREQUENCIES`.
     """
 
     def __init__(
@@ -87,14 +91,17 @@ class TimeHarmonics(ColourField):
         most = {"degree": self.degree, "powers": self.powers, "waves": self.waves}
         return {name: tuple(range(value - 1, -1, -1)) for name, value in most.items() if value}
 
-    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[TimeHarmonics, dict[str, Tensor]]:
+    def reduced(
+        self, params: Params, geometry: Geometry, name: str, value: int
+    ) -> tuple[TimeHarmonics, dict[str, Tensor]]:
         """Fewer terms in time are those that are closest to all of them, by least squares over the sequence."""
         field = TimeHarmonics(**{**self.settings(), name: value})
         if name == "degree":
             return field, sh.fewer_bands(params, "sh_rest", value)
         times = (torch.arange(_TIMES, dtype=torch.float64) + 0.5) / _TIMES
         all_terms, fewer = (
-            torch.stack([torch.cat([torch.ones_like(x)[None], *f._terms(x).values()]) for x in times]) for f in (self, field)
+            torch.stack([torch.cat([torch.ones_like(x)[None], *f._terms(x).values()]) for x in times])
+            for f in (self, field)
         )
         fit = torch.linalg.pinv(fewer, rtol=_CONDITION) @ all_terms  # coefficients of all terms -> of those that stay
         stored = torch.cat([params["sh_dc"][:, None], *(params[key] for key in _TIME if key in params)], 1)
@@ -106,7 +113,9 @@ class TimeHarmonics(ColourField):
 
     def _terms(self, xi: Tensor) -> dict[str, Tensor]:
         """Basis of each tensor at a time, float64."""
-        waves = FREQUENCIES[self.frequencies] * xi * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
+        waves = (
+            FREQUENCIES[self.frequencies] * xi * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
+        )
         powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)
         return dict(zip(_TIME, (powers, waves.cos(), waves.sin()), strict=True))
 

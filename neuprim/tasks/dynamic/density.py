@@ -1,19 +1,21 @@
-"""A cosine density that changes in time: one frame's is a static one, so time costs nothing per pixel (method: "Density").
+"""A cosine density that changes in time: one frame's is a static one, so time costs nothing per pixel (method:
+"Density").
 
 What varies is chosen by name, several joined by "+":
 
     phase    b1 + xi W_t                                        equation 13 of the paper; K parameters
     offset   b2 + sum_j p_j cos(pi j xi) + q_j sin(pi j xi)     j = 1..4; 8 parameters
-    window   (w2, b2) (1 - u^2)^2, u = (xi - c)/tau, |u| < 1    the primitive lives from c - tau to c + tau; 2 parameters
-    motion   mu + v (xi - c) + a (xi - c)^2                     c of the window, else 1/2; 6 parameters
+    window   (w2, b2) (1 - u^2)^2, u = (xi - c)/tau, |u| < 1    the primitive lives from c - tau to c + tau; 2
+    parameters motion   mu + v (xi - c) + a (xi - c)^2                     c of the window, else 1/2; 6 parameters
 
 xi is time over the sequence, 0..1. Primitives outside their window are left out of a frame before anything is computed.
 
-A model joined from chunks of a sequence has seams between them, and for every primitive the chunk that it was fitted in, a number that is not
-learned: what it lives of its own accord counts within its chunk alone, and is faded over at the seams (:mod:`neuprim.tasks.dynamic.seams`).
+A model joined from chunks of a sequence has seams between them, and for every primitive the chunk that it was fitted
+in, a number that is not learned: what it lives of its own accord counts within its chunk alone, and is faded over at
+the seams (:mod:`neuprim.tasks.dynamic.seams`).
 
-Where several grids make the extinction (smoke and flames), each of ``components`` adds one parameter, share_NAME: the primitive's share of
-that grid, as a logit.
+Where several grids make the extinction (smoke and flames), each of ``components`` adds one parameter, share_NAME: the
+primitive's share of that grid, as a logit.
 """
 
 from __future__ import annotations
@@ -26,7 +28,14 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, amplified, cosine_density, split_cosine, split_scale
+from neuprim.core.model.densities.cosine import (
+    OMEGA0,
+    CosineDensity,
+    amplified,
+    cosine_density,
+    split_cosine,
+    split_scale,
+)
 from neuprim.core.model.densities.fewer import fewer_neurons
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.folding import fold_cosines
@@ -60,14 +69,16 @@ def time_of(conditions: Conditions) -> Tensor:
 
 
 class TimeDensity(DensityField):
-    """f(x~, xi) of K cosine neurons whose ``time`` parts vary, see the module; 5K + 1 parameters and those of the parts.
+    """f(x~, xi) of K cosine neurons whose ``time`` parts vary, see the module; 5K + 1 parameters and those of the
+    parts.
 
-    ``init`` of the model settings: as :class:`~neuprim.core.model.densities.cosine.CosineDensity`, and ``window``, the half width tau of a fresh
-    window in units of the sequence, ``window_frames``, how many frames of a sequence it is at most, and ``rate``, the bound of U(-rate, rate) that W_t starts from.
+    ``init`` of the model settings: as :class:`~neuprim.core.model.densities.cosine.CosineDensity`, and ``window``, the
+    half width tau of a fresh window in units of the sequence, ``window_frames``, how many frames of a sequence it is at
+    most, and ``rate``, the bound of U(-rate, rate) that W_t starts from.
 
     Args:
-        seams: (from, to) of the times over which one chunk of the sequence hands over to the next, ascending; none: the model is of one piece.
-        components: names of the source grids whose share of the extinction each primitive keeps.
+        seams: (from, to) of the times over which one chunk of the sequence hands over to the next, ascending; none: the
+        model is of one piece. components: names of the source grids whose share of the extinction each primitive keeps.
     """
 
     init_settings = (*CosineDensity.init_settings, "window", "window_frames", "rate")
@@ -101,7 +112,9 @@ class TimeDensity(DensityField):
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
-        return cls(time="+".join(PARTS), gain=True, seams=[(0.0, 1.0)], components=("density", "temperature")).parameters()
+        return cls(
+            time="+".join(PARTS), gain=True, seams=[(0.0, 1.0)], components=("density", "temperature")
+        ).parameters()
 
     def parameters(self) -> list[ParameterSpec]:
         K = self.static.neurons
@@ -109,7 +122,10 @@ class TimeDensity(DensityField):
         if "phase" in self.parts:
             specs.append(ParameterSpec("W_t", (K,), 3e-3, lambda c: c.uniform(K, bound=c.number("rate", 0.1))))
         if "offset" in self.parts:
-            specs += [ParameterSpec(name, (OFFSET_TERMS,), 3e-3, _zeros(OFFSET_TERMS)) for name in ("offset_cos", "offset_sin")]
+            specs += [
+                ParameterSpec(name, (OFFSET_TERMS,), 3e-3, _zeros(OFFSET_TERMS))
+                for name in ("offset_cos", "offset_sin")
+            ]
         if "window" in self.parts:
             specs.append(ParameterSpec("window_center", (1,), 3e-3, _initial_center))
             specs.append(ParameterSpec("log_window", (1,), 1e-2, _initial_log_window))
@@ -164,7 +180,10 @@ class TimeDensity(DensityField):
             b2 = params["b2"]
             own["b2"] = (
                 b2
-                + (params["offset_cos"] @ device.beside(angle.cos(), b2) + params["offset_sin"] @ device.beside(angle.sin(), b2))[:, None]
+                + (
+                    params["offset_cos"] @ device.beside(angle.cos(), b2)
+                    + params["offset_sin"] @ device.beside(angle.sin(), b2)
+                )[:, None]
             )
         w2, b2 = amplified(own["w2"], own["b2"], own.get("log_gain"))
         if "window" in self.parts:
@@ -177,7 +196,9 @@ class TimeDensity(DensityField):
         return Cosine(params["W1"], b1, w2, b2, self.static.omega0, self.static.edge)
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
-        return cosine_density(self.lower(params, geometry, conditions), self.move(params, geometry, conditions), prim, x)
+        return cosine_density(
+            self.lower(params, geometry, conditions), self.move(params, geometry, conditions), prim, x
+        )
 
     # ------------------------------------------------------------ population
 
@@ -221,7 +242,9 @@ class TimeDensity(DensityField):
         """Neurons, and every part of time, which is either there or not."""
         return {**self.static.reductions(), **{part: (0,) for part in PARTS if part in self.parts}}
 
-    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[TimeDensity, dict[str, Tensor]]:
+    def reduced(
+        self, params: Params, geometry: Geometry, name: str, value: int
+    ) -> tuple[TimeDensity, dict[str, Tensor]]:
         """Without a part of time: its mean over the sequence, see :mod:`neuprim.tasks.dynamic.stilled`."""
         if name == "neurons":
             field = TimeDensity(**{**self.settings(), "neurons": value})
@@ -235,7 +258,9 @@ class TimeDensity(DensityField):
     def pieces(self) -> tuple[Piece, ...]:
         """Neurons, and what changes in time but for windows, without which nothing would be left."""
         turning = ("W_t",) if "phase" in self.parts else ()
-        found = [Piece(one.name, {**one.places, **dict.fromkeys(turning, one.places["b1"])}) for one in self.static.pieces()]
+        found = [
+            Piece(one.name, {**one.places, **dict.fromkeys(turning, one.places["b1"])}) for one in self.static.pieces()
+        ]
         if "offset" in self.parts:
             found.append(Piece("offset", {"offset_cos": (), "offset_sin": ()}))
         if "motion" in self.parts:
@@ -257,7 +282,8 @@ class TimeDensity(DensityField):
 
 
 def _advance(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:
-    """b1 + xi W_t less whole turns, 2 pi/omega0 each: exact to float32 however far outside 0..1 the time lies, as only the remainder matters."""
+    """b1 + xi W_t less whole turns, 2 pi/omega0 each: exact to float32 however far outside 0..1 the time lies, as only
+    the remainder matters."""
     phase = b1.double() + xi * W_t.double()
     return (phase - turn * torch.round(phase.detach() / turn)).to(b1)
 
@@ -274,7 +300,8 @@ def _initial_center(ctx: InitContext) -> Tensor:
 
 
 def _initial_log_window(ctx: InitContext) -> Tensor:
-    """A sequence that is longer shows more events, not longer ones, so that frames say how long a fresh primitive should live."""
+    """A sequence that is longer shows more events, not longer ones, so that frames say how long a fresh primitive
+    should live."""
     half = ctx.number("window", 0.2, 0)
     if ctx.settings.get("window_frames") is not None and "time" in ctx.steps:
         half = min(half, ctx.number("window_frames", 1.0, 0) * ctx.steps["time"])

@@ -31,7 +31,8 @@ def _in_their_windows(center, log_window, xi, rows):  # type: ignore[no-untyped-
 
 
 def in_their_windows(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
-    """Ascending int64 rows of ``center`` and ``log_window`` (N, 1) with abs(xi - center) < exp(log_window), in float64; no gradient."""
+    """Ascending int64 rows of ``center`` and ``log_window`` (N, 1) with abs(xi - center) < exp(log_window), in float64;
+    no gradient."""
     center, log_window = center.detach(), log_window.detach()
     if not device.fused(center, log_window):
         return ((xi - center[:, 0].double()).abs() < log_window[:, 0].double().exp()).nonzero()[:, 0]
@@ -42,7 +43,9 @@ def in_their_windows(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
 
 class _Window(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+    def forward(
+        ctx: Any, w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor
+    ) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         tau = log_window.exp()
         u = (xi.to(b2) - center) / tau
         weight = fade(u.square(), WINDOW_EDGE)
@@ -101,7 +104,8 @@ class _Move(torch.autograd.Function):
 def fused_move(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:
     """(N, 3) means + velocity (xi - center) + acceleration (xi - center)^2.
 
-    ``velocity`` and ``acceleration`` are (N, 3), ``center`` (N, 1), all of one dtype; no gradient for the time ``xi`` ().
+    ``velocity`` and ``acceleration`` are (N, 3), ``center`` (N, 1), all of one dtype; no gradient for the time ``xi``
+    ().
     """
     if not device.fused(means, velocity, acceleration, center):
         since = xi.to(velocity.dtype) - center

@@ -1,4 +1,5 @@
-"""Primitives that never show: found, so that they can be counted (population control moves them to where they are needed)."""
+"""Primitives that never show: found, so that they can be counted (population control moves them to where they are
+needed)."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ _FAINT = 1.0 / 255.0
 def invisible_fraction(model: Primitives, times: Sequence[Tensor]) -> float:
     """Share of primitives whose opacity along none of their axes reaches 1/255 at any of these times.
 
-    The chord along axis j through the centre has half length s_j, so that I = (N_p s_j/m) (b2 + sum_k w2_k cos(omega0 b1_k)
+    The chord along axis j through the centre has half length s_j, so that I = (N_p s_j/m) (b2 + sum_k w2_k cos(omega0
+    b1_k)
     B_p(omega0 W1_k . r_j s_j/m)) with r_j the axis' direction (:mod:`neuprim.core.model.edge`).
     """
     brightest = torch.zeros(model.count, dtype=torch.float64)

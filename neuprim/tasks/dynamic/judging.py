@@ -1,6 +1,8 @@
-"""What models of moving scenes are judged by where a volume sequence was recorded: masks, films, and the files' own extinction.
+"""What models of moving scenes are judged by where a volume sequence was recorded: masks, films, and the files' own
+extinction.
 
-Of other data sets, images with a time each, nothing is known that is not in the images. What reads volumes is imported when used.
+Of other data sets, images with a time each, nothing is known that is not in the images. What reads volumes is imported
+when used.
 """
 
 from __future__ import annotations
@@ -45,7 +47,9 @@ def clips(dataset: Dataset) -> Sequence[Clip]:
     if recording is None:
         return ()
     frames = len(recording.capture.frames)
-    return [Clip(f"cam_{c:02d}", range(i * frames, (i + 1) * frames), 24.0) for i, c in enumerate(recording.test.cameras)]
+    return [
+        Clip(f"cam_{c:02d}", range(i * frames, (i + 1) * frames), 24.0) for i, c in enumerate(recording.test.cameras)
+    ]
 
 
 def diagnose(dataset: Dataset, model: Primitives) -> dict[str, Any]:

@@ -1,7 +1,8 @@
-"""Layers of a volume's image: the two terms of the equation of transfer, dL/ds = sigma c - sigma L, integrated along each ray.
+"""Layers of a volume's image: the two terms of the equation of transfer, dL/ds = sigma c - sigma L, integrated along
+each ray.
 
-What arrives is what was emitted less what was absorbed on the way, so that beauty = emission - absorption (over black). N. Max, "Optical
-models for direct volume rendering", 1995, has the emission alone as the model without absorption.
+What arrives is what was emitted less what was absorbed on the way, so that beauty = emission - absorption (over black).
+N. Max, "Optical models for direct volume rendering", 1995, has the emission alone as the model without absorption.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ def absorption(frame: LayerFrame) -> Tensor | None:
 
 LAYERS = (
     LayerSpec(
-        "emission", "all light that is emitted along the ray, as if nothing absorbed any: the integral of sigma c, linear light", emission
+        "emission",
+        "all light that is emitted along the ray, as if nothing absorbed any: the integral of sigma c, linear light",
+        emission,
     ),
     LayerSpec(
         "absorption",

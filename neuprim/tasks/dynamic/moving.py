@@ -1,13 +1,14 @@
 """Where matter is at the start of a moving scene: visual hulls of single moments, united over time.
 
-One hull of all masks would carve away whatever moves, as no place shows matter in all of them. Masks are taken together by
-their times instead. Where several cameras share each time, as in a rig, a moment is one time. Where every image has its own
-time, as in D-NeRF, a moment is a run of four neighbours in time: a thing that moves by less than its own size meanwhile keeps
-its middle, and the next runs, which overlap, supply the rest.
+One hull of all masks would carve away whatever moves, as no place shows matter in all of them. Masks are taken together
+by their times instead. Where several cameras share each time, as in a rig, a moment is one time. Where every image has
+its own time, as in D-NeRF, a moment is a run of four neighbours in time: a thing that moves by less than its own size
+meanwhile keeps its middle, and the next runs, which overlap, supply the rest.
 
-The other ways were tried with a moving ball: a hull of all masks that forgives most of them either loses the path's ends or
-fills the room, points in a box mostly miss the ball, and longer runs carve the more away the faster it moves; the tests compare
-them. A camera that moves slowly cannot tell depth and leaves cones: too many points, but few places without one.
+The other ways were tried with a moving ball: a hull of all masks that forgives most of them either loses the path's
+ends or fills the room, points in a box mostly miss the ball, and longer runs carve the more away the faster it moves;
+the tests compare them. A camera that moves slowly cannot tell depth and leaves cones: too many points, but few places
+without one.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ _RUN = 4
 _MOMENTS = 64
 _RESOLUTION = 64
 _SEEN = 0.75
-"""Of four cameras three must look: what lies at the side of a scene, in two frusta only, would often be taken for matter."""
+"""Of four cameras three must look: what lies at the side of a scene, in two frusta only, would often be taken for
+matter."""
 _MATTER = 0.1
 """Smoke is seldom more opaque than this at its edges."""
 
@@ -41,10 +43,12 @@ _MATTER = 0.1
 def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
     """At most ``count`` distinct starting points of a moving scene, in scene units and the images' colour space.
 
-    Where the cameras do not look at one point they begin along rays, see :func:`~neuprim.core.data.rays.ray_points`. With alpha they are spread evenly over the surfaces of all moments' hulls, each with the "time" and the colour of a moment
-    in which it was found (one of them at random); moments without matter give none. Without alpha, or where every image has
-    its own time and all hulls are empty because things move too fast, they fill a box in front of the cameras, with times of
-    random views.
+    Where the cameras do not look at one point they begin along rays, see :func:`~neuprim.core.data.rays.ray_points`.
+    With alpha they are spread evenly over the surfaces of all moments' hulls, each with the "time" and the colour of a
+    moment
+    in which it was found (one of them at random); moments without matter give none. Without alpha, or where every image
+    has its own time and all hulls are empty because things move too fast, they fill a box in front of the cameras, with
+    times of random views.
 
     Args:
         views: each with the condition "time", 0..1.
@@ -88,7 +92,11 @@ def _hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Gen
     centers, owner = torch.cat(surfaces), torch.cat(owners)
     voxel = torch.cat([torch.full((len(s),), side) for s, side in zip(surfaces, sides, strict=True)])
     rows = _one_per_cell(centers, float(np.median(sides)), generator)
-    rows = rows[farthest_points(centers[rows], count, generator)] if count <= len(rows) else rows[torch.arange(count) % len(rows)]
+    rows = (
+        rows[farthest_points(centers[rows], count, generator)]
+        if count <= len(rows)
+        else rows[torch.arange(count) % len(rows)]
+    )
     jitter = torch.rand((len(rows), 3), generator=generator) - 0.5
     means, owner = centers[rows] + jitter * voxel[rows, None], owner[rows]
     colors = torch.empty_like(means)
@@ -100,7 +108,8 @@ def _hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Gen
 
 
 def _moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:
-    """(views of a moment, its time) in order of time, evenly thinned to a bound; and whether moments are single times."""
+    """(views of a moment, its time) in order of time, evenly thinned to a bound; and whether moments are single
+    times."""
     values = times.tolist()
     sharing = Counter(values)
     shared = float(np.median(list(sharing.values()))) >= _SHARED
@@ -116,7 +125,8 @@ def _moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:
 
 
 def _one_per_cell(points: Tensor, side: float, generator: torch.Generator) -> Tensor:
-    """Rows of one random point in every cubic cell that holds some: what rests is found at all times, but counts once."""
+    """Rows of one random point in every cubic cell that holds some: what rests is found at all times, but counts
+    once."""
     shuffled = torch.randperm(len(points), generator=generator)
     cells = ((points[shuffled] - points.min(0).values) / side).floor().long().numpy()
     _, first = np.unique(cells, axis=0, return_index=True)

@@ -1,15 +1,16 @@
 """Posed images of a moving scene: ``transforms`` files in the layout of D-NeRF, with a ``time`` in every frame.
 
-Either ``transforms_SPLIT.json`` per split, whose scenes have z upwards, or one ``transforms.json``, of which every n-th frame by
-name is a test view unless it lists ``train_filenames``, ``val_filenames`` or ``test_filenames``; where both are there the splits count. Cameras,
-lenses and masks are those of :mod:`neuprim.core.data.transforms`; images are PNG, JPEG or OpenEXR.
+Either ``transforms_SPLIT.json`` per split, whose scenes have z upwards, or one ``transforms.json``, of which every n-th
+frame by name is a test view unless it lists ``train_filenames``, ``val_filenames`` or ``test_filenames``; where both
+are there the splits count. Cameras, lenses and masks are those of :mod:`neuprim.core.data.transforms`; images are PNG,
+JPEG or OpenEXR.
 
 Each view has the condition "time", a float32 tensor without dimensions, 0..1.
 
 Settings beside the common ones: ``train_split``, ``test_split`` (names in the files' names, default train and test),
-``test_every`` (default 8) and ``time_range``: the "LOW:HIGH" of the files' times that becomes 0..1 (default "0:1"), or "auto" for
-the lowest and highest time of all frames, those of a train, val or test split that is not used included, so that a scene has
-one clock whatever is evaluated.
+``test_every`` (default 8) and ``time_range``: the "LOW:HIGH" of the files' times that becomes 0..1 (default "0:1"), or
+"auto" for the lowest and highest time of all frames, those of a train, val or test split that is not used included, so
+that a scene has one clock whatever is evaluated.
 """
 
 from __future__ import annotations
@@ -61,7 +62,9 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         train, test = split_frames(document, records, frames, asked.test_every)
         return posed_images(str(single), name, train, test, asked, context, start=moving_points)
     if not any(path.is_file() for path in files.values()):
-        raise DataError(f"{folder}: has neither {files[asked.train_split].name} nor transforms.json; expected one of them")
+        raise DataError(
+            f"{folder}: has neither {files[asked.train_split].name} nor transforms.json; expected one of them"
+        )
     held_out = files[asked.test_split]
     if not held_out.is_file():
         hint = f"rename {files[asked.train_split].name} to transforms.json, of which every 8th frame is a test view (scene.test_every)"
@@ -82,13 +85,18 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     )
 
 
-def _frames(asked: MultiviewSettings, document: Record, records: list[Record], clock: _Range) -> tuple[list[Record], list[ImageFrame]]:
+def _frames(
+    asked: MultiviewSettings, document: Record, records: list[Record], clock: _Range
+) -> tuple[list[Record], list[ImageFrame]]:
     """The frames with their times 0..1, and their records."""
     layout = Layout(keys=("time", "train_filenames", "val_filenames", "test_filenames", "ply_file_path"), masks=True)
     records, frames = read_frames(data_folder(asked.path), document, records, asked, layout)
     low, high = clock
     times = [(r.number("time") - low) / (high - low) for r in records]
-    return records, [replace(f, conditions={"time": torch.tensor(t, dtype=torch.float32)}) for f, t in zip(frames, times, strict=True)]
+    return records, [
+        replace(f, conditions={"time": torch.tensor(t, dtype=torch.float32)})
+        for f, t in zip(frames, times, strict=True)
+    ]
 
 
 # ---------------------------------------------------------------- time
@@ -106,13 +114,17 @@ def _clock(records: Sequence[Record], others: Sequence[Path], setting: str) -> _
     """
     if not any("time" in r.values for r in records):
         where = records[0].where.rsplit(": ", 1)[0]
-        raise DataError(f"{where}: no frame has a time, so this is a static scene; expected a time in every frame, or task=static")
+        raise DataError(
+            f"{where}: no frame has a time, so this is a static scene; expected a time in every frame, or task=static"
+        )
     if setting != _AUTO:
         low, high = _parse_range(setting)
         for record in records:
             time = _time(record)
             if not low <= time <= high:
-                expected = f"a number from {low:g} to {high:g} for {record.text('file_path')} (scene.time_range is {setting!r}"
+                expected = (
+                    f"a number from {low:g} to {high:g} for {record.text('file_path')} (scene.time_range is {setting!r}"
+                )
                 raise record.fail("time", f"{expected}; LOW:HIGH or auto maps other times to 0..1)")
         return low, high
     times = [_time(r) for r in records]
@@ -121,7 +133,9 @@ def _clock(records: Sequence[Record], others: Sequence[Path], setting: str) -> _
     low, high = min(times), max(times)
     if low == high:
         where = records[0].where.rsplit(": ", 1)[0]
-        raise DataError(f"{where}: every frame has the time {low:g}; expected at least two different times for scene.time_range=auto")
+        raise DataError(
+            f"{where}: every frame has the time {low:g}; expected at least two different times for scene.time_range=auto"
+        )
     return low, high
 
 
@@ -165,4 +179,6 @@ class MultiviewSettings(FolderSettings):
     train_split: SplitName = "train"
     test_split: SplitName = "test"
     test_every: EveryNth = 8
-    time_range: Annotated[str, Accepts(_is_range, 'auto, or "LOW:HIGH" in quotes with LOW below HIGH, e.g. "0:1"')] = "0:1"
+    time_range: Annotated[str, Accepts(_is_range, 'auto, or "LOW:HIGH" in quotes with LOW below HIGH, e.g. "0:1"')] = (
+        "0:1"
+    )

@@ -1,8 +1,8 @@
 """Where the chunks of a sequence meet in time: how much of each counts at a time.
 
-Over a seam from a to b the earlier chunk's share falls from 1 to 0 on a line, and the later one's rises from 0 to 1: at every time the shares of
-all chunks add up to 1, and at most two are above 0. So a joined model's extinction and source are the chunks' own, weighted by their shares, and
-no primitive counts where its chunk has seen nothing.
+Over a seam from a to b the earlier chunk's share falls from 1 to 0 on a line, and the later one's rises from 0 to 1: at
+every time the shares of all chunks add up to 1, and at most two are above 0. So a joined model's extinction and source
+are the chunks' own, weighted by their shares, and no primitive counts where its chunk has seen nothing.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A part of time taken away: what is left is what the part did in the mean over the sequence.
 
-Means are over xi in 0..1; where primitives live in windows, over their lives, each time counting as much as the window lets through. A phase
-that advances by a over the sequence, cos(phi + xi a), is in the mean R cos(phi + psi) with R e^(i psi) the mean of e^(i xi a). A window leaves
-its mean behind. A motion leaves the mean place.
+Means are over xi in 0..1; where primitives live in windows, over their lives, each time counting as much as the window
+lets through. A phase that advances by a over the sequence, cos(phi + xi a), is in the mean R cos(phi + psi) with R e^(i
+psi) the mean of e^(i xi a). A window leaves its mean behind. A motion leaves the mean place.
 """
 
 from __future__ import annotations
@@ -25,11 +25,16 @@ _MIDDLE = 0.5
 
 
 def stilled(params: Params, geometry: Geometry, part: str, omega0: float) -> dict[str, Tensor]:
-    """The tensors of a :class:`~neuprim.tasks.dynamic.density.TimeDensity` without what the part did; those of the part are still among them.
+    """The tensors of a :class:`~neuprim.tasks.dynamic.density.TimeDensity` without what the part did; those of the part
+    are still among them.
 
-    With "motion", and with "window" where there is a motion, which is then about the middle of the sequence, "means" are there, too.
+    With "motion", and with "window" where there is a motion, which is then about the middle of the sequence, "means"
+    are there, too.
     """
-    return {**params, **{"phase": _phase, "offset": _offset, "window": _window, "motion": _motion}[part](params, geometry, omega0)}
+    return {
+        **params,
+        **{"phase": _phase, "offset": _offset, "window": _window, "motion": _motion}[part](params, geometry, omega0),
+    }
 
 
 def _times(like: Tensor) -> Tensor:
@@ -52,7 +57,8 @@ def _weights(params: Params) -> list[tuple[Tensor, Tensor]]:
     total = torch.stack(factors).sum(0)
     lives = total > 0
     return [
-        (xi, torch.where(lives, f / total.where(lives, torch.ones_like(total)), 1.0 / _TIMES)) for xi, f in zip(times, factors, strict=True)
+        (xi, torch.where(lives, f / total.where(lives, torch.ones_like(total)), 1.0 / _TIMES))
+        for xi, f in zip(times, factors, strict=True)
     ]
 
 
@@ -78,13 +84,21 @@ def _offset(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tens
 
 def _window(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
     mean = torch.stack([_let_through(params, xi) for xi in _times(params["b1"])]).mean(0)
-    faded = {name: (params[name].double() * mean).to(params[name]) for name in ("w2", "b2", "offset_cos", "offset_sin") if name in params}
+    faded = {
+        name: (params[name].double() * mean).to(params[name])
+        for name in ("w2", "b2", "offset_cos", "offset_sin")
+        if name in params
+    }
     if "velocity" not in params:
         return faded
     later = _MIDDLE - params["window_center"].double()
     velocity, acceleration = params["velocity"].double(), params["acceleration"].double()
     means = geometry.means.double() + (velocity + acceleration * later) * later
-    return {**faded, "means": means.to(geometry.means), "velocity": (velocity + 2 * acceleration * later).to(params["velocity"])}
+    return {
+        **faded,
+        "means": means.to(geometry.means),
+        "velocity": (velocity + 2 * acceleration * later).to(params["velocity"]),
+    }
 
 
 def _motion(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:

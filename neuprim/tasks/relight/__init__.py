@@ -51,14 +51,22 @@ def _check(model: Mapping[str, Any]) -> None:
 def _trade(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
     if model["colour"].get("form") == "harmonics":
         return {**DENSITY_TRADE, "model.colour.degree": (1, 2, 3, 5)}
-    return {**DENSITY_TRADE, "model.colour.hidden": (0, 4, 8, 12), "model.colour.visibility": ("none", "primitive", "pixel")}
+    return {
+        **DENSITY_TRADE,
+        "model.colour.hidden": (0, 4, 8, 12),
+        "model.colour.visibility": ("none", "primitive", "pixel"),
+    }
 
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     if dataset.channels != 3:
-        raise ConfigError(f"{dataset.name}: {dataset.channels} colour channels; task relight expects 3, as light_intensity has")
+        raise ConfigError(
+            f"{dataset.name}: {dataset.channels} colour channels; task relight expects 3, as light_intensity has"
+        )
     falloff = lighting_of(dataset).falloff == "inverse_square"
-    return CosineDensity(model["neurons"], **model["density"]), _colour(model, dataset.channels, falloff, typical_light(dataset, falloff))
+    return CosineDensity(model["neurons"], **model["density"]), _colour(
+        model, dataset.channels, falloff, typical_light(dataset, falloff)
+    )
 
 
 # Loaders are imported when used: each pulls in modules of its own.
@@ -82,7 +90,9 @@ TASK = TaskSpec(
     summary="A scene under any light, from images under one point light each (a colour network per primitive)",
     config_package="neuprim.tasks.relight.conf",
     scenes=(
-        SceneSpec("lit_solids", "built in: solids and a glossy ring under moving point lights, with shadows", _lit_solids),
+        SceneSpec(
+            "lit_solids", "built in: solids and a glossy ring under moving point lights, with shadows", _lit_solids
+        ),
         SceneSpec("olat", "GS3 / NRHints layout: a light position per image, PNG or EXR: scene.path=DIR", _olat),
     ),
     build=_build,

@@ -1,14 +1,15 @@
 """Colour under a point light: one hidden layer per primitive (equation 14), with or without a light-visibility factor.
 
-    h = cos(beta (W_x x~ + W_d d + W_l l + b))         x~ the local middle of the chord, d and l unit vectors at the centre:
+    h = cos(beta (W_x x~ + W_d d + W_l l + b))         x~ the local middle of the chord, d and l unit vectors at the
+    centre:
                                                        from the camera, and to the light
-    additive         c = V E max(0, c_dc + W_out h)                         equation 14: 9 -> H -> 3, 107 parameters at H = 8
-    multiplicative   c = V E max(0, albedo (1 + w_out . h))                 no tinting: 91 parameters
+    additive         c = V E max(0, c_dc + W_out h)                         equation 14: 9 -> H -> 3, 107 parameters at
+    H = 8 multiplicative   c = V E max(0, albedo (1 + w_out . h))                 no tinting: 91 parameters
 
-E is the light's intensity, divided by the squared distance where the data set says so, over that of a typical training light, so that
-learning rates do not depend on the data's unit of light; V the visibility of the light from the
-primitive (:mod:`neuprim.tasks.relight.visibility`) or 1. Everything but W_x x~ is constant over a primitive, so it folds into the
-closed form :class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
+E is the light's intensity, divided by the squared distance where the data set says so, over that of a typical training
+light, so that learning rates do not depend on the data's unit of light; V the visibility of the light from the
+primitive (:mod:`neuprim.tasks.relight.visibility`) or 1. Everything but W_x x~ is constant over a primitive, so it
+folds into the closed form :class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ class LightNetwork(ColourField):
     Args:
         hidden: H, 0..16.
         form: one of :data:`FORMS`.
-        visibility: where a depth image out of the light is asked whether light arrives: nowhere ("none": equation 14 as printed), at
+        visibility: where a depth image out of the light is asked whether light arrives: nowhere ("none": equation 14 as
+        printed), at
             the centres of primitives ("primitive"), or at the point that each pixel shows ("pixel").
         boost: beta. 1 starts flat in the light's direction, 30 overfits (method: relighting).
         falloff: whether the light's intensity is divided by the squared distance, in scene units.
@@ -81,7 +83,10 @@ class LightNetwork(ColourField):
         self.visibility, self.boost, self.falloff = visibility, float(boost), bool(falloff)
 
     def settings(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in ("hidden", "channels", "form", "visibility", "boost", "falloff", "typical")}
+        return {
+            name: getattr(self, name)
+            for name in ("hidden", "channels", "form", "visibility", "boost", "falloff", "typical")
+        }
 
     def parameters(self) -> list[ParameterSpec]:
         H, C = self.hidden, self.channels
@@ -95,7 +100,9 @@ class LightNetwork(ColourField):
             ParameterSpec("net_out", outputs, 2e-2, lambda c: c.uniform(*outputs, bound=_output(c))),
         ]
 
-    def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings) -> Shading | None:
+    def shade(
+        self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
+    ) -> Shading | None:
         if self.visibility == "none":
             return None
         visible = light_visibility(geometry, density, conditions["light"], settings)
@@ -128,12 +135,18 @@ class LightNetwork(ColourField):
         shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]
         net_x = params["net_x"].double()
         phase = params["net_phase"].double() + (net_x * shift[:, None]).sum(-1)
-        return {**params, "net_x": (net_x * r[:, None, None]).to(params["net_x"]), "net_phase": phase.to(params["net_phase"])}
+        return {
+            **params,
+            "net_x": (net_x * r[:, None, None]).to(params["net_x"]),
+            "net_phase": phase.to(params["net_phase"]),
+        }
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
         return {"hidden": smaller_counts(self.hidden)} if self.hidden else {}
 
-    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[LightNetwork, dict[str, Tensor]]:
+    def reduced(
+        self, params: Params, geometry: Geometry, name: str, value: int
+    ) -> tuple[LightNetwork, dict[str, Tensor]]:
         return LightNetwork(**{**self.settings(), "hidden": value}), fewer_units(
             params, geometry, value, self.boost, self.form == "multiplicative"
         )
@@ -141,7 +154,9 @@ class LightNetwork(ColourField):
     def pieces(self) -> tuple[Piece, ...]:
         """Hidden units."""
         inputs = ("net_x", "net_view", "net_light", "net_phase")
-        return tuple(Piece(f"unit {h}", {**dict.fromkeys(inputs, (h,)), "net_out": (slice(None), h)}) for h in range(self.hidden))
+        return tuple(
+            Piece(f"unit {h}", {**dict.fromkeys(inputs, (h,)), "net_out": (slice(None), h)}) for h in range(self.hidden)
+        )
 
     def script(self) -> str:
         return script_beside(__package__, "colour.js")
@@ -151,7 +166,8 @@ class LightNetwork(ColourField):
 
 
 _DARKEST = 1e-3
-"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays black."""
+"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays
+black."""
 
 
 def _output(ctx: InitContext) -> float:

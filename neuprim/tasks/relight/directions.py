@@ -9,7 +9,8 @@ from neuprim.core.model.geometry import Geometry
 __all__ = ["least_square", "unit"]
 
 _NEAREST = 1e-6
-"""Below this length, in units of ``size``, a vector's direction fades: its gradient, 1/length, stays below 1e6 per size."""
+"""Below this length, in units of ``size``, a vector's direction fades: its gradient, 1/length, stays below 1e6 per
+size."""
 _LEAST = 1e-4
 """Of a primitive's size: a light that is nearer to its centre does not get stronger."""
 

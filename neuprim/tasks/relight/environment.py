@@ -1,15 +1,16 @@
 """Light from all around as a sum of the point lights that the model was trained with.
 
-Each direction of the environment becomes a point light at the training lights' mean distance r from the scene's centre, of the radiant
-intensity that gives the centre the environment's irradiance E = radiance x solid angle:
+Each direction of the environment becomes a point light at the training lights' mean distance r from the scene's centre,
+of the radiant intensity that gives the centre the environment's irradiance E = radiance x solid angle:
 
     falloff inverse_square:  I = exposure E r^2    the model draws I/distance^2 over the exposure
-    falloff none:            I = exposure E / pi   an intensity of 1 is taken to light a white matt surface that faces it with 1
+    falloff none:            I = exposure E / pi   an intensity of 1 is taken to light a white matt surface that faces
+    it with 1
 
-In both, a uniform environment of radiance 1 shows a white matt surface that nothing shades with value 1: the environment is in the
-images' unit, linear light over the exposure. In lit_solids that is the renderer's own: a surface there sends out
-(albedo/pi + highlight) cosine I/distance^2. Light from a finite distance is not quite parallel: away from the centre it differs from that
-of a distant environment by about 2 offset/r.
+In both, a uniform environment of radiance 1 shows a white matt surface that nothing shades with value 1: the
+environment is in the images' unit, linear light over the exposure. In lit_solids that is the renderer's own: a surface
+there sends out (albedo/pi + highlight) cosine I/distance^2. Light from a finite distance is not quite parallel: away
+from the centre it differs from that of a distant environment by about 2 offset/r.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ def summary(lights: Tensor, center: Tensor, falloff: str, exposure: float) -> di
         exposure: of the data set.
 
     Returns:
-        mean ``distance`` from the centre; ``directions``, at most 256, each as far from those before it as can be, so that they
-        cover all of the lights' directions alike; ``falloff``; ``exposure``.
+        mean ``distance`` from the centre; ``directions``, at most 256, each as far from those before it as can be, so
+        that they cover all of the lights' directions alike; ``falloff``; ``exposure``.
     """
     offsets = lights.double() - center.double()
     distance = offsets.norm(dim=-1)
@@ -93,7 +94,8 @@ def illuminate(environment: Environment, count: int, facts: Mapping[str, Any]) -
     ]
     if not frames:
         return Illumination(
-            ({"light": (center + distance * up).float(), "light_intensity": torch.zeros(3)},), ("the environment is black",)
+            ({"light": (center + distance * up).float(), "light_intensity": torch.zeros(3)},),
+            ("the environment is black",),
         )
     unseen = environment.share_beyond(trained, FAR)
     guessed = ((beams.directions @ trained.T).amax(1) < math.cos(math.radians(FAR))).tolist()

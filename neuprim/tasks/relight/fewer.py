@@ -1,10 +1,13 @@
-"""A colour network with fewer units: those whose part of the colour varies most stay, the others leave their mean behind.
+"""A colour network with fewer units: those whose part of the colour varies most stay, the others leave their mean
+behind.
 
-A unit is cos(phi + beta (W_x x~ + W_d d + W_l l)). With x~ over the ellipsoid, and d and l over all directions, the mean is
+A unit is cos(phi + beta (W_x x~ + W_d d + W_l l)). With x~ over the ellipsoid, and d and l over all directions, the
+mean is
 
     cos(phi) b(|beta W_x diag|) sinc(|beta W_d|) sinc(|beta W_l|)
 
-with b the mean over a ball (:func:`~neuprim.core.model.densities.fewer.ball_mean`), and the variance follows from cos^2 = (1 + cos 2(.))/2.
+with b the mean over a ball (:func:`~neuprim.core.model.densities.fewer.ball_mean`), and the variance follows from cos^2
+= (1 + cos 2(.))/2.
 """
 
 from __future__ import annotations
@@ -24,7 +27,8 @@ def fewer_units(params: Params, geometry: Geometry, keep: int, boost: float, mul
     """The tensors of a :class:`~neuprim.tasks.relight.colour.LightNetwork` with ``keep`` units for each primitive.
 
     Args:
-        params: c_dc (N, C), net_x, net_view and net_light (N, H, 3), net_phase (N, H), and net_out (N, C, H), or (N, 1, H) of the
+        params: c_dc (N, C), net_x, net_view and net_light (N, H, 3), net_phase (N, H), and net_out (N, C, H), or (N, 1,
+        H) of the
             multiplicative form.
         multiplicative: which form it is; there the mean becomes part of the albedo.
     """
@@ -41,7 +45,10 @@ def fewer_units(params: Params, geometry: Geometry, keep: int, boost: float, mul
     variance = (1 + mean_of(2)) / 2 - mean.square()
     order = (out.square().sum(1) * variance).argsort(dim=1, descending=True, stable=True)
     kept, gone = order[:, :keep].sort(dim=1).values, order[:, keep:]
-    fewer = {name: params[name].gather(1, kept[..., None].expand(-1, -1, 3)).contiguous() for name in ("net_x", "net_view", "net_light")}
+    fewer = {
+        name: params[name].gather(1, kept[..., None].expand(-1, -1, 3)).contiguous()
+        for name in ("net_x", "net_view", "net_light")
+    }
     fewer["net_phase"] = params["net_phase"].gather(1, kept).contiguous()
     outputs = out.shape[1]
     stays = params["net_out"].gather(2, kept[:, None].expand(-1, outputs, -1))

@@ -22,7 +22,8 @@ __all__ = ["LightHarmonics", "real_harmonics"]
 
 
 class LightHarmonics(ColourField):
-    """c = E max(0, SH(direction mu -> light)), C (degree + 1)^2 parameters; degree 5 has as many as the network of 8 units.
+    """c = E max(0, SH(direction mu -> light)), C (degree + 1)^2 parameters; degree 5 has as many as the network of 8
+    units.
 
     It knows neither the view (no highlights move) nor what stands between (no shadows move).
     """
@@ -47,7 +48,9 @@ class LightHarmonics(ColourField):
     def reductions(self) -> dict[str, tuple[int, ...]]:
         return {"degree": tuple(range(self.degree - 1, -1, -1))} if self.degree else {}
 
-    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[LightHarmonics, dict[str, Tensor]]:
+    def reduced(
+        self, params: Params, geometry: Geometry, name: str, value: int
+    ) -> tuple[LightHarmonics, dict[str, Tensor]]:
         return LightHarmonics(**{**self.settings(), "degree": value}), fewer_bands(params, "light_sh", value)
 
     def pieces(self) -> tuple[Piece, ...]:
@@ -67,15 +70,19 @@ class LightHarmonics(ColourField):
         if self.degree:
             bands = real_harmonics(unit(to_light, geometry.length_scale.detach()[:, None]), self.degree)[:, 1:]
             color = color + (bands[:, :, None] * params["light_sh"]).sum(1)
-        strength = device.beside(conditions["light_intensity"], color) / self.typical / (squared if self.falloff else 1.0)
+        strength = (
+            device.beside(conditions["light_intensity"], color) / self.typical / (squared if self.falloff else 1.0)
+        )
         return Constant(color.clamp_min(0.0) * strength)
 
 
 def real_harmonics(directions: Tensor, degree: int) -> Tensor:
-    """(N, (degree + 1)^2) orthonormal real spherical harmonics of unit directions, bands in order, m = -l..l, by recurrence.
+    """(N, (degree + 1)^2) orthonormal real spherical harmonics of unit directions, bands in order, m = -l..l, by
+    recurrence.
 
-    The associated Legendre functions without the Condon-Shortley phase: P_m^m = (2m - 1)!! sin^m, P_{m+1}^m = (2m + 1) z P_m^m,
-    (l - m) P_l^m = (2l - 1) z P_{l-1}^m - (l + m - 1) P_{l-2}^m; sin^m cos(m phi) and sin^m sin(m phi) are polynomials in x, y.
+    The associated Legendre functions without the Condon-Shortley phase: P_m^m = (2m - 1)!! sin^m, P_{m+1}^m = (2m + 1)
+    z P_m^m, (l - m) P_l^m = (2l - 1) z P_{l-1}^m - (l + m - 1) P_{l-2}^m; sin^m cos(m phi) and sin^m sin(m phi) are
+    polynomials in x, y.
     """
     x, y, z = directions.unbind(-1)
     cosine, sine = [torch.ones_like(x)], [torch.zeros_like(x)]
@@ -93,6 +100,8 @@ def real_harmonics(directions: Tensor, degree: int) -> Tensor:
     for l in range(degree + 1):
         for m in range(-l, l + 1):
             a = abs(m)
-            scale = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - a) / math.factorial(l + a)) * (math.sqrt(2) if m else 1)
+            scale = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - a) / math.factorial(l + a)) * (
+                math.sqrt(2) if m else 1
+            )
             columns.append(scale * legendre[l, a] * (cosine[a] if m >= 0 else sine[a]))
     return torch.stack(columns, -1)

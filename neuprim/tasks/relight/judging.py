@@ -1,4 +1,5 @@
-"""What relit images are judged by, whichever scene they are of: scores, classes of pixels, baselines, films and an orbit of the light."""
+"""What relit images are judged by, whichever scene they are of: scores, classes of pixels, baselines, films and an
+orbit of the light."""
 
 from __future__ import annotations
 
@@ -29,8 +30,8 @@ def mask(dataset: Dataset, index: int) -> Tensor | None:
 
 
 def judge(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
-    """See :func:`neuprim.tasks.relight.measure.scores`; also the errors of each pixel class, and the PSNR again under the name of the
-    view's part of the test split, where the data set tells classes and parts."""
+    """See :func:`neuprim.tasks.relight.measure.scores`; also the errors of each pixel class, and the PSNR again under
+    the name of the view's part of the test split, where the data set tells classes and parts."""
     return _judged(dataset, index, rendered, truth, structure=True)
 
 
@@ -43,8 +44,8 @@ def _judged(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor, struc
 
 
 def diagnose(dataset: Dataset, model: Primitives) -> dict[str, Any]:
-    """How light is measured here, how good images without a model would be, and the share of each pixel class in the test split, in
-    percent of the pixels that show matter."""
+    """How light is measured here, how good images without a model would be, and the share of each pixel class in the
+    test split, in percent of the pixels that show matter."""
     known = lighting_of(dataset)
     result: dict[str, Any] = {"exposure": dataset.exposure, "falloff": known.falloff, "baselines": baselines(dataset)}
     if not flip_available():
@@ -55,7 +56,8 @@ def diagnose(dataset: Dataset, model: Primitives) -> dict[str, Any]:
 
 
 def baselines(dataset: Dataset) -> dict[str, dict[str, Any]]:
-    """Means over the test views of what images that need no model score, by name; SSIM and FLIP are left out, which take long."""
+    """Means over the test views of what images that need no model score, by name; SSIM and FLIP are left out, which
+    take long."""
     result = {"black": _guessed(dataset, lambda i, truth: torch.zeros_like(truth))}
     for name, guess in lighting_of(dataset).baselines.items():
         result[name] = _guessed(dataset, lambda i, truth, guess=guess: guess(i))  # type: ignore[misc]
@@ -77,7 +79,8 @@ def clips(dataset: Dataset) -> Sequence[Clip]:
 
 
 def facts(dataset: Dataset) -> dict[str, Any]:
-    """Where the training lights were, as the scene's centre sees them: see :func:`~neuprim.tasks.relight.environment.summary`."""
+    """Where the training lights were, as the scene's centre sees them: see
+    :func:`~neuprim.tasks.relight.environment.summary`."""
     lights = torch.stack([dataset.train.view(i).conditions["light"] for i in range(len(dataset.train))])
     return {"lights": summary(lights, dataset.center, lighting_of(dataset).falloff, dataset.exposure)}
 

@@ -16,11 +16,15 @@ def unshadowed(frame: LayerFrame) -> Tensor | None:
 
 def visibility(frame: LayerFrame) -> Tensor | None:
     """(H, W) mean visibility of the light; None for colours that know no shadows."""
-    return None if frame.shading is None else frame.shading.clamp(0.0, 1.0)  # a mean of factors up to 1, but for rounding
+    return (
+        None if frame.shading is None else frame.shading.clamp(0.0, 1.0)
+    )  # a mean of factors up to 1, but for rounding
 
 
 LAYERS = (
-    LayerSpec("unshadowed", "the image as if the light arrived everywhere, linear light, premultiplied by alpha", unshadowed),
+    LayerSpec(
+        "unshadowed", "the image as if the light arrived everywhere, linear light, premultiplied by alpha", unshadowed
+    ),
     LayerSpec(
         "visibility",
         "how much of the light arrives, 0 to 1: the mean over what the pixel shows, weighted by its part in the pixel; 0 where alpha is 0",

@@ -36,7 +36,9 @@ def parse_lights(text: str, world: World | None = None) -> list[Tensor]:
             raise ConfigError(f"--light {text}: {expected}")
         across, height = distance * math.sin(math.radians(polar)), distance * math.cos(math.radians(polar))
         turns = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames)
-        return list(torch.stack([across * turns.cos(), across * turns.sin(), torch.full_like(turns, height)], -1).float())
+        return list(
+            torch.stack([across * turns.cos(), across * turns.sin(), torch.full_like(turns, height)], -1).float()
+        )
     return [(world or World()).scene_points(_numbers(text, "light", expected)).float()]
 
 
@@ -72,7 +74,8 @@ def _numbers(text: str, name: str, expected: str) -> Tensor:
 
 
 def typical_light(dataset: Dataset, falloff: bool) -> float:
-    """Median over the training views of the light's mean intensity, over its squared distance from the scene's centre with ``falloff``.
+    """Median over the training views of the light's mean intensity, over its squared distance from the scene's centre
+    with ``falloff``.
 
     1 where that is zero: a data set in the dark has no unit of light.
     """

@@ -1,8 +1,9 @@
-"""Measures of relit images: PSNR over the exposure and on the display, per kind of shadow, and the same of simple baselines.
+"""Measures of relit images: PSNR over the exposure and on the display, per kind of shadow, and the same of simple
+baselines.
 
-Images are linear light over the exposure, in which 1 is as bright as a display shows. Everything here is clamped to 0..1 first:
-without that one highlight of 20 would decide an image's error. "linear_clamped" compares these values, "display" what they become
-by the sRGB curve. FLIP is measured where its package is installed (``neuprim[flip]``).
+Images are linear light over the exposure, in which 1 is as bright as a display shows. Everything here is clamped to
+0..1 first: without that one highlight of 20 would decide an image's error. "linear_clamped" compares these values,
+"display" what they become by the sRGB curve. FLIP is measured where its package is installed (``neuprim[flip]``).
 """
 
 from __future__ import annotations

@@ -1,29 +1,36 @@
-"""One light at a time: the layout of GS³ and NRHints, read as their files say, which is not always what their loaders do.
+"""One light at a time: the layout of GS³ and NRHints, read as their files say, which is not always what their loaders
+do.
 
 ``transforms_SPLIT.json`` holds, in the file or in a frame, which wins:
 
-* ``camera_intrinsics``: [cx, cy, fx, fy] in pixels, in this order; or ``camera_angle_x``, the horizontal field of view in radians,
+* ``camera_intrinsics``: [cx, cy, fx, fy] in pixels, in this order; or ``camera_angle_x``, the horizontal field of view
+  in radians,
   with square pixels and the principal point in the middle; or any other keys of :mod:`neuprim.core.cameras.intrinsics`.
 * ``pl_intensity``: three numbers or one; default 1. (GS³ does not read it.)
-* ``camera_near``, ``camera_far``: default 3 and 10 as in NRHints. Checked, but nothing depends on them: what lies in front of the
+* ``camera_near``, ``camera_far``: default 3 and 10 as in NRHints. Checked, but nothing depends on them: what lies in
+  front of the
   camera is drawn.
 
 and per frame:
 
-* ``img_path``: the image with its suffix, absolute or in the data set's folder. Files that GS³ saved on another machine name that
+* ``img_path``: the image with its suffix, absolute or in the data set's folder. Files that GS³ saved on another machine
+  name that
   machine's folders, so the longest tail of the path that is there counts. Where none is, or none is given:
-* ``file_path`` in the data set's folder, followed by ``file_ext``; without one, as written, else with .png, .jpg, .jpeg, .webp or .exr.
+* ``file_path`` in the data set's folder, followed by ``file_ext``; without one, as written, else with .png, .jpg,
+  .jpeg, .webp or .exr.
 * ``pl_pos``: the point light, world; required.
 * ``transform_matrix``: camera to world, OpenGL axes.
-* ``R_opt`` (3, 3) and ``T_opt`` (3,): an optimised pose that GS³ writes and reads *instead of* ``transform_matrix``: the world-to-camera
-  matrix with OpenCV axes is [R_opt^T | T_opt]. ``pl_pos`` in such a file is the optimised light. ``scene.ignore_corrections=true``
-  takes ``transform_matrix`` all the same.
+* ``R_opt`` (3, 3) and ``T_opt`` (3,): an optimised pose that GS³ writes and reads *instead of* ``transform_matrix``:
+  the world-to-camera
+  matrix with OpenCV axes is [R_opt^T | T_opt]. ``pl_pos`` in such a file is the optimised light.
+  ``scene.ignore_corrections=true`` takes ``transform_matrix`` all the same.
 
 PNG and JPEG hold sRGB with straight alpha and become linear light; OpenEXR is linear and premultiplied and stays so.
 
-Settings beside the common ones (``background`` is black by default): ``train_split``, ``test_split`` (names in the files' names),
-``hold_out`` (n > 1 makes every n-th training view the test split and leaves the real one unread, for tuning), ``falloff`` ("none" or
-"inverse_square"), ``exposure`` (a number or "auto") and ``ignore_corrections``.
+Settings beside the common ones (``background`` is black by default): ``train_split``, ``test_split`` (names in the
+files' names),
+``hold_out`` (n > 1 makes every n-th training view the test split and leaves the real one unread, for tuning),
+``falloff`` ("none" or "inverse_square"), ``exposure`` (a number or "auto") and ``ignore_corrections``.
 """
 
 from __future__ import annotations
@@ -59,11 +66,14 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
     Raises:
         ConfigError: unknown or impossible settings.
-        DataError: missing or damaged files, wrong or missing fields, impossible cameras, empty splits, black images with exposure=auto.
+        DataError: missing or damaged files, wrong or missing fields, impossible cameras, empty splits, black images
+        with exposure=auto.
     """
     asked = checked(OlatSettings, settings, "scene")
     folder = data_folder(asked.path)
-    train, test = read_splits(folder, asked.train_split, asked.test_split, asked.hold_out, lambda split: read_split(folder, split, asked))
+    train, test = read_splits(
+        folder, asked.train_split, asked.test_split, asked.hold_out, lambda split: read_split(folder, split, asked)
+    )
     return posed_images(
         str(folder),
         folder.resolve().name,
@@ -107,7 +117,9 @@ def _image(folder: Path, record: Record) -> Path | None:
     """A frame's file, or None."""
     if record.has("img_path"):
         parts = record.text("img_path").replace("\\", "/").split("/")
-        tails = (_file(folder / "/".join(parts[i:])) for i in range(len(parts)))  # a path from the root stays one when joined
+        tails = (
+            _file(folder / "/".join(parts[i:])) for i in range(len(parts))
+        )  # a path from the root stays one when joined
         found = next((file for file in tails if file is not None), None)
         if found is not None or not record.has("file_path"):
             return found
@@ -132,7 +144,9 @@ def _viewmat(record: Record, ignore_corrections: bool) -> Tensor:
     corrected = record.has("R_opt") or record.has("T_opt")
     if not corrected or ignore_corrections:
         if corrected and not record.has("transform_matrix"):
-            raise record.fail("transform_matrix", "4 rows of 4 numbers, as scene.ignore_corrections=true leaves R_opt and T_opt out")
+            raise record.fail(
+                "transform_matrix", "4 rows of 4 numbers, as scene.ignore_corrections=true leaves R_opt and T_opt out"
+            )
         return opengl_to_viewmat(record.matrix("transform_matrix"))
     view = torch.eye(4, dtype=torch.float64)
     view[:3, :3] = record.array("R_opt", (3, 3), "3 rows of 3 numbers, the camera's axes beside T_opt").T
@@ -161,8 +175,8 @@ class OlatSettings(FolderSettings):
     Attributes:
         train_split, test_split: names in transforms_NAME.json.
         hold_out: n: evaluate on every n-th training view instead of the test split, for tuning; 0 for that split.
-        falloff: "inverse_square" where the light weakens with the square of its distance, "none" where the images do not show that.
-        exposure: images are divided by this; "auto": by the 99.5th percentile of the training images.
+        falloff: "inverse_square" where the light weakens with the square of its distance, "none" where the images do
+        not show that. exposure: images are divided by this; "auto": by the 99.5th percentile of the training images.
         ignore_corrections: poses are transform_matrix, even where a frame has the optimised R_opt and T_opt.
     """
 

@@ -1,13 +1,16 @@
-"""How much of a point light arrives: depth images out of the light, by the renderer that draws everything else (layered shadow maps).
+"""How much of a point light arrives: depth images out of the light, by the renderer that draws everything else (layered
+shadow maps).
 
-The primitives are sorted into slabs across the light's direction, and each slab is drawn on its own, as opacity A_k and mean depth d_k.
+The primitives are sorted into slabs across the light's direction, and each slab is drawn on its own, as opacity A_k and
+mean depth d_k.
 What absorbs on the way to a point x at depth z is what lies in front of it, so the light's transmittance is
 
     V(x) = prod_k (1 - A_k s((z - d_k - bias)/softness)),      s a smooth step from 0 at -1 to 1 at 1,
 
-exactly 1 for what nothing lies in front of, and 1 - A behind something of opacity A, however translucent. One slab is a common shadow map
-with opacity, which knows only one mean depth per pixel: half way between a translucent thing and the floor below it. Depths are read as
-inverse depth, weighted by opacity, bilinearly: that is exact on planes, so that a lit floor does not shadow itself at grazing light.
+exactly 1 for what nothing lies in front of, and 1 - A behind something of opacity A, however translucent. One slab is a
+common shadow map with opacity, which knows only one mean depth per pixel: half way between a translucent thing and the
+floor below it. Depths are read as inverse depth, weighted by opacity, bilinearly: that is exact on planes, so that a
+lit floor does not shadow itself at grazing light.
 V carries no gradient: a shadow moves only as what casts it moves.
 """
 
@@ -38,22 +41,28 @@ LAYERS = 4
 """Slabs of equal depth: with more of them, depths within one are less of a mean, and a frame takes longer."""
 
 BIAS, SOFTNESS = 1 / 20, 1 / 20
-"""In scene diameters, as the light sees the scene: how far behind a depth image light has fallen to a half, and within what distance before
-and after that it fades. A compromise: surfaces made of ellipsoids are bumpy, and with a smaller bias the bumps shadow each other; with a
-larger one shadows begin further from what casts them. With both equal a point on a depth image itself keeps all of its light."""
+"""In scene diameters, as the light sees the scene: how far behind a depth image light has fallen to a half, and within
+what distance before and after that it fades. A compromise: surfaces made of ellipsoids are bumpy, and with a smaller
+bias the bumps shadow each other; with a larger one shadows begin further from what casts them. With both equal a point
+on a depth image itself keeps all of its light."""
 
 _FAR = 1e3  # scene radii
 _CHUNK = 1024  # points per unit of work
 
 
 def light_visibility(
-    geometry: Geometry, density: LoweredDensity, light: Tensor, settings: RenderSettings, bias: float = BIAS, softness: float = SOFTNESS
+    geometry: Geometry,
+    density: LoweredDensity,
+    light: Tensor,
+    settings: RenderSettings,
+    bias: float = BIAS,
+    softness: float = SOFTNESS,
 ) -> Shade:
     """The function (M, 3) scene points -> (M,) visibility 0..1, float32, of a point light (3,).
 
-    ``bias`` and ``softness`` are in scene diameters, see :data:`BIAS`. The light's camera looks at the middle of all centres and sees all
-    of them; a light among them looks the way most of them lie, and points behind it count as lit. ``settings`` are the frame's own: its
-    backend and threads draw the depth images too.
+    ``bias`` and ``softness`` are in scene diameters, see :data:`BIAS`. The light's camera looks at the middle of all
+    centres and sees all of them; a light among them looks the way most of them lie, and points behind it count as lit.
+    ``settings`` are the frame's own: its backend and threads draw the depth images too.
     """
     with torch.no_grad():
         means = geometry.means.detach().double()
@@ -70,7 +79,10 @@ def light_visibility(
             light, distance = center + (light - center) * (_FAR * radius / distance), _FAR * radius
         half = math.asin(min(radius / distance, 0.94))
         focal = 0.5 * SIZE / math.tan(half)
-        up = torch.tensor([0.0, 0.0, 1.0] if abs(float(light[2] - center[2])) < 0.9 * distance else [0.0, 1.0, 0.0], dtype=torch.float64)
+        up = torch.tensor(
+            [0.0, 0.0, 1.0] if abs(float(light[2] - center[2])) < 0.9 * distance else [0.0, 1.0, 0.0],
+            dtype=torch.float64,
+        )
         camera = Camera(look_at(light, center, up), focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
         near = max(1e-4 * radius, distance - 1.5 * radius)
         own = replace(settings, depth=True, near=near, samples=1)
@@ -86,14 +98,18 @@ def light_visibility(
         if device.kernels(points, opacities):
             from neuprim.tasks.relight import visibility_warp
 
-            return visibility_warp.arriving_light(points, device.beside(view, points), near, focal, opacities, distances, *limits)
+            return visibility_warp.arriving_light(
+                points, device.beside(view, points), near, focal, opacities, distances, *limits
+            )
         if not device.fused(points, opacities):
             return arriving(points, device.beside(view, points), near, focal, opacities, distances, *limits)
         from neuprim.tasks.relight.visibility_cpu import arriving_light  # numba, loaded when first needed
 
         found = np.empty(len(points), np.float32)
         arrays = [x.numpy() for x in (points, view, opacities, distances)]
-        parallel_for(arriving_light, len(found), _CHUNK, settings.threads, *arrays[:2], near, focal, *arrays[2:], *limits, found)
+        parallel_for(
+            arriving_light, len(found), _CHUNK, settings.threads, *arrays[:2], near, focal, *arrays[2:], *limits, found
+        )
         return torch.from_numpy(found)
 
     return visibility

@@ -26,7 +26,10 @@ def arriving_light(start, stop, points, view, near, focal, alphas, depths, bias,
         found[p] = 1.0
         if not z > near:  # behind the light's camera
             continue
-        u, v = focal * x / z + 0.5 * size - 0.5, focal * y / z + 0.5 * size - 0.5  # in pixels, 0 the middle of the first
+        u, v = (
+            focal * x / z + 0.5 * size - 0.5,
+            focal * y / z + 0.5 * size - 0.5,
+        )  # in pixels, 0 the middle of the first
         if not (-1.0 < u < size and -1.0 < v < size):
             continue
         i, j = int(np.floor(v)), int(np.floor(u))

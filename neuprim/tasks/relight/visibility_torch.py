@@ -1,4 +1,5 @@
-"""Depth images out of a light, read at points, in torch code: the twin of :mod:`neuprim.tasks.relight.visibility_cpu`."""
+"""Depth images out of a light, read at points, in torch code: the twin of
+:mod:`neuprim.tasks.relight.visibility_cpu`."""
 
 from __future__ import annotations
 
@@ -9,14 +10,25 @@ __all__ = ["arriving"]
 
 
 def arriving(
-    points: Tensor, view: Tensor, near: float, focal: float, alphas: Tensor, depths: Tensor, bias: float, softness: float
+    points: Tensor,
+    view: Tensor,
+    near: float,
+    focal: float,
+    alphas: Tensor,
+    depths: Tensor,
+    bias: float,
+    softness: float,
 ) -> Tensor:
-    """(M,) float32 visibility of ``points`` (M, 3) float64, see :func:`~neuprim.tasks.relight.visibility_cpu.arriving_light`."""
+    """(M,) float32 visibility of ``points`` (M, 3) float64, see
+    :func:`~neuprim.tasks.relight.visibility_cpu.arriving_light`."""
     slabs, size = alphas.shape[:2]
     x, y, z = ((view[a, :3] * points).sum(-1) + view[a, 3] for a in range(3))
     ahead = z > near
     depth = torch.where(ahead, z, 1.0)
-    u, v = focal * x / depth + 0.5 * size - 0.5, focal * y / depth + 0.5 * size - 0.5  # in pixels, 0 the middle of the first
+    u, v = (
+        focal * x / depth + 0.5 * size - 0.5,
+        focal * y / depth + 0.5 * size - 0.5,
+    )  # in pixels, 0 the middle of the first
     ahead &= (u > -1.0) & (u < size) & (v > -1.0) & (v < size)
     u, v = (torch.where(ahead, w, 0.0) for w in (u, v))
     i, j = v.floor().long(), u.floor().long()

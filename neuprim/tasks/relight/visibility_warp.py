@@ -1,5 +1,6 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Depth images out of a light, read at points on a card: the twin of :mod:`neuprim.tasks.relight.visibility_cpu`. Warp is imported with it."""
+"""Depth images out of a light, read at points on a card: the twin of :mod:`neuprim.tasks.relight.visibility_cpu`. Warp
+is imported with it."""
 
 import functools
 from typing import Any
@@ -47,7 +48,11 @@ def _kernel() -> Any:
                         if row >= 0 and row < size and column >= 0 and column < size:
                             own = d(alphas[k, row, column])
                             if own > d(0.0):
-                                weight = wp.where(corner // 2 == 1, down, one - down) * wp.where(corner % 2 == 1, right, one - right) * own
+                                weight = (
+                                    wp.where(corner // 2 == 1, down, one - down)
+                                    * wp.where(corner % 2 == 1, right, one - right)
+                                    * own
+                                )
                                 alpha += weight
                                 nearness += weight / wp.max(d(depths[k, row, column]), near)
                     behind = z - alpha / wp.max(nearness, d(1e-30))
@@ -59,9 +64,17 @@ def _kernel() -> Any:
 
 
 def arriving_light(
-    points: Tensor, view: Tensor, near: float, focal: float, alphas: Tensor, depths: Tensor, bias: float, softness: float
+    points: Tensor,
+    view: Tensor,
+    near: float,
+    focal: float,
+    alphas: Tensor,
+    depths: Tensor,
+    bias: float,
+    softness: float,
 ) -> Tensor:
-    """(M,) float32 visibility of ``points`` (M, 3) float64, see :func:`~neuprim.tasks.relight.visibility_cpu.arriving_light`."""
+    """(M,) float32 visibility of ``points`` (M, 3) float64, see
+    :func:`~neuprim.tasks.relight.visibility_cpu.arriving_light`."""
     found = torch.empty(len(points), dtype=torch.float32, device=points.device)
     launch(
         _kernel(), len(points),

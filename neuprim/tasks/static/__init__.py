@@ -29,7 +29,9 @@ def _check(model: Mapping[str, Any]) -> None:
     choose(model["density"], "model.density", {"form": ("cosine", "gaussian"), **DENSITY_OPTIONS})
     others = [key for key in model["density"] if key != "form"]
     if model["density"].get("form") == "gaussian" and others:
-        raise ConfigError(f"model.density.{others[0]}: of densities of the form cosine; expected none with model.density.form=gaussian")
+        raise ConfigError(
+            f"model.density.{others[0]}: of densities of the form cosine; expected none with model.density.form=gaussian"
+        )
     choose(model["colour"], "model.colour", {})
 
 
@@ -93,7 +95,9 @@ TASK = TaskSpec(
     config_package="neuprim.tasks.static.conf",
     scenes=(
         SceneSpec("solids", "built in: sharp edges, thin rods, a curved handle; generated in seconds", _solids),
-        SceneSpec("room", "built in: the solids in a textured room, taken like photographs: lens, exposures, points", _room),
+        SceneSpec(
+            "room", "built in: the solids in a textured room, taken like photographs: lens, exposures, points", _room
+        ),
         SceneSpec("mesh", "your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE", _mesh),
         SceneSpec("blender", "NeRF-synthetic layout: transforms_train.json, RGBA images", _blender),
         SceneSpec("nerfstudio", "instant-ngp / nerfstudio transforms.json", _nerfstudio),
@@ -105,6 +109,10 @@ TASK = TaskSpec(
     trade=_trade,
     facts=_facts,
     diagnose=lambda dataset, model: _facts(dataset),
-    fields={"CosineDensity": CosineDensity, "GaussianDensity": GaussianDensity, "SphericalHarmonics": SphericalHarmonics},
+    fields={
+        "CosineDensity": CosineDensity,
+        "GaussianDensity": GaussianDensity,
+        "SphericalHarmonics": SphericalHarmonics,
+    },
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
 )

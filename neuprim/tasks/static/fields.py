@@ -48,7 +48,9 @@ class SphericalHarmonics(ColourField):
     def reductions(self) -> dict[str, tuple[int, ...]]:
         return {"degree": tuple(range(self.degree - 1, -1, -1))} if self.degree else {}
 
-    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[SphericalHarmonics, dict[str, Tensor]]:
+    def reduced(
+        self, params: Params, geometry: Geometry, name: str, value: int
+    ) -> tuple[SphericalHarmonics, dict[str, Tensor]]:
         return SphericalHarmonics(value, self.channels), sh.fewer_bands(params, "sh_rest", value)
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:

@@ -26,7 +26,9 @@ def test_camera_space_is_left_handed_with_y_up_and_z_ahead() -> None:
     ahead = CAMERA.position - view[1, :3] + 2 * view[2, :3]  # up in the image is against the second row
     assert np.abs(np.append(ahead.numpy(), 1.0) @ matrix - (0.0, 1.0, 2.0, 1.0)).max() < 1e-5
     assert np.linalg.det(matrix[:3, :3].astype(float)) < 0
-    assert matrix.dtype == np.float32 and matrix.shape == (4, 4) and matrix.flags.c_contiguous, "it is written as it lies"
+    assert matrix.dtype == np.float32 and matrix.shape == (4, 4) and matrix.flags.c_contiguous, (
+        "it is written as it lies"
+    )
 
 
 def test_the_screen_window_is_that_of_the_pixels() -> None:

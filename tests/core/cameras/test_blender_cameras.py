@@ -63,7 +63,9 @@ class Camera:
         )
 
 
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, camera: Camera, size: tuple[int, int], percentage: int = 100) -> Path:
+def run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, camera: Camera, size: tuple[int, int], percentage: int = 100
+) -> Path:
     scene = SimpleNamespace(
         camera=camera,
         render=SimpleNamespace(
@@ -89,7 +91,9 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, camera: Camera, size: t
 
 
 @pytest.mark.parametrize("size", [(640, 480), (300, 500)])
-def test_points_are_where_blender_shows_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]) -> None:
+def test_points_are_where_blender_shows_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]
+) -> None:
     found = read_camera_file(run(tmp_path, monkeypatch, Camera(50.0, 36.0, (0.1, -0.05), scale=2.0), size))
     assert len(found.named) == 3 and found.fps == 24 and found.notes == ()
     (width, height), larger = size, max(size)

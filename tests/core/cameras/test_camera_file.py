@@ -13,8 +13,18 @@ import torch
 from neuprim.core.cameras.file import read_camera_file, read_cameras
 from neuprim.core.errors import DataError
 
-POSE = [[1.0, 0.0, 0.0, 0.5], [0.0, 0.0, -1.0, -4.0], [0.0, 1.0, 0.0, 0.25], [0.0, 0.0, 0.0, 1.0]]  # at (0.5, -4, 0.25), looking along +y
-GOOD: dict[str, Any] = {"w": 64, "h": 48, "camera_angle_x": math.pi / 2, "frames": [{"transform_matrix": POSE}, {"transform_matrix": POSE}]}
+POSE = [
+    [1.0, 0.0, 0.0, 0.5],
+    [0.0, 0.0, -1.0, -4.0],
+    [0.0, 1.0, 0.0, 0.25],
+    [0.0, 0.0, 0.0, 1.0],
+]  # at (0.5, -4, 0.25), looking along +y
+GOOD: dict[str, Any] = {
+    "w": 64,
+    "h": 48,
+    "camera_angle_x": math.pi / 2,
+    "frames": [{"transform_matrix": POSE}, {"transform_matrix": POSE}],
+}
 
 
 def write(path: Path, value: Any) -> Path:
@@ -36,7 +46,10 @@ def test_field_of_view(tmp_path: Path) -> None:
 
 
 def test_focal_lengths_and_overrides_by_frame(tmp_path: Path) -> None:
-    frames = [{"transform_matrix": POSE}, {"transform_matrix": POSE, "fl_x": 10, "fl_y": 11.5, "cx": -3, "cy": 7, "w": 20, "h": 30}]
+    frames = [
+        {"transform_matrix": POSE},
+        {"transform_matrix": POSE, "fl_x": 10, "fl_y": 11.5, "cx": -3, "cy": 7, "w": 20, "h": 30},
+    ]
     data = {"w": 64, "h": 48, "fl_x": 50.0, "frames": frames}
     (_, first), (_, second) = read_cameras(write(tmp_path / "c.json", data))
     assert (first.fx, first.fy, first.cx, first.cy) == (50.0, 50.0, 32.0, 24.0)
@@ -97,7 +110,11 @@ BAD: list[tuple[str, Any, str]] = [
     ("matrix of text", {**GOOD, "frames": [{"transform_matrix": [["a"] * 4] * 4}]}, "transform_matrix"),
     ("matrix ragged", {**GOOD, "frames": [{"transform_matrix": [*POSE[:3], [0, 1]]}]}, "transform_matrix"),
     ("matrix 2x4", {**GOOD, "frames": [{"transform_matrix": POSE[:2]}]}, "transform_matrix"),
-    ("matrix with a projection", {**GOOD, "frames": [{"transform_matrix": pose(m30=1.0)}]}, r"transform_matrix\[3\] is"),
+    (
+        "matrix with a projection",
+        {**GOOD, "frames": [{"transform_matrix": pose(m30=1.0)}]},
+        r"transform_matrix\[3\] is",
+    ),
     ("matrix number", {**GOOD, "frames": [{"transform_matrix": 3}]}, "transform_matrix"),
     ("matrix beyond floats", {**GOOD, "frames": [{"transform_matrix": pose(m03=HUGE)}]}, "transform_matrix"),
     (
@@ -120,7 +137,9 @@ def test_bad_files_are_refused_by_name_and_field(tmp_path: Path, data: Any, word
 
 
 def test_the_bad_frame_is_named(tmp_path: Path) -> None:
-    path = write(tmp_path / "c.json", {**GOOD, "frames": [{"transform_matrix": POSE}, {"transform_matrix": pose(m00=-1.0)}]})
+    path = write(
+        tmp_path / "c.json", {**GOOD, "frames": [{"transform_matrix": POSE}, {"transform_matrix": pose(m00=-1.0)}]}
+    )
     with pytest.raises(DataError, match=r"frames\[1\]"):
         read_cameras(path)
 
@@ -143,7 +162,9 @@ def test_a_file_too_large_is_not_read(tmp_path: Path) -> None:
 def test_three_rows_and_null_intrinsics_are_as_the_data_loaders_take_them(tmp_path: Path) -> None:
     data = {**GOOD, "fl_x": None, "frames": [{"transform_matrix": POSE[:3], "fl_x": None}]}
     ((_, camera),) = read_cameras(write(tmp_path / "c.json", data))
-    assert camera.fx == pytest.approx(32.0) and torch.allclose(camera.position, torch.tensor([0.5, -4.0, 0.25], dtype=torch.float64))
+    assert camera.fx == pytest.approx(32.0) and torch.allclose(
+        camera.position, torch.tensor([0.5, -4.0, 0.25], dtype=torch.float64)
+    )
 
 
 def test_times_rate_and_distortion_are_told(tmp_path: Path) -> None:
@@ -165,7 +186,10 @@ PATH: dict[str, Any] = {
     "render_width": 64,
     "fps": 24,
     "seconds": 4,
-    "camera_path": [{"camera_to_world": FLAT, "fov": 90.0, "aspect": 4 / 3}, {"camera_to_world": POSE, "fov": 60, "aspect": 1}],
+    "camera_path": [
+        {"camera_to_world": FLAT, "fov": 90.0, "aspect": 4 / 3},
+        {"camera_to_world": POSE, "fov": 60, "aspect": 1},
+    ],
 }
 
 
@@ -174,7 +198,9 @@ def test_a_camera_path_has_vertical_fields_of_view_in_degrees(tmp_path: Path) ->
     (_, first), (_, second) = found.named
     assert (first.width, first.height, first.cx, first.cy) == (64, 48, 32.0, 24.0)
     assert first.fx == first.fy == pytest.approx(24.0) and second.fy == pytest.approx(24.0 / math.tan(math.pi / 6))
-    pixels, z = first.project(torch.tensor([[0.5 + 1.0, -4.0 + 2.0, 0.25 + 0.5]], dtype=torch.float64))  # 1 right, 2 ahead, 0.5 up
+    pixels, z = first.project(
+        torch.tensor([[0.5 + 1.0, -4.0 + 2.0, 0.25 + 0.5]], dtype=torch.float64)
+    )  # 1 right, 2 ahead, 0.5 up
     assert pixels[0].tolist() == pytest.approx([32 + 12, 24 - 6]) and float(z) == pytest.approx(2.0)
     assert torch.equal(first.viewmat, second.viewmat), "rows, or numbers one by one"
     assert found.fps == 24 and found.times is None and "moved and scaled the scene" in found.notes[0]
@@ -202,10 +228,19 @@ def test_a_paths_times_and_seconds(tmp_path: Path) -> None:
             r"camera_path\[0\]: fov is 180; expected a vertical field of view in degrees",
         ),
         ({"camera_path": [{"camera_to_world": FLAT}]}, "fov is missing"),
-        ({"camera_path": [{"camera_to_world": FLAT[:15], "fov": 50}]}, "camera_to_world is a list of 15; expected 16 numbers"),
-        ({"camera_path": [{"camera_to_world": ["a"] * 16, "fov": 50}]}, r"camera_to_world\[0\]\[0\] is .*expected a finite number"),
+        (
+            {"camera_path": [{"camera_to_world": FLAT[:15], "fov": 50}]},
+            "camera_to_world is a list of 15; expected 16 numbers",
+        ),
+        (
+            {"camera_path": [{"camera_to_world": ["a"] * 16, "fov": 50}]},
+            r"camera_to_world\[0\]\[0\] is .*expected a finite number",
+        ),
         ({"camera_path": [{"camera_to_world": "here", "fov": 50}]}, 'camera_to_world is "here"; expected 16 numbers'),
-        ({"camera_path": [{"camera_to_world": [2 * x for x in FLAT[:15]] + [1], "fov": 50}]}, "rotation is singular or scaled"),
+        (
+            {"camera_path": [{"camera_to_world": [2 * x for x in FLAT[:15]] + [1], "fov": 50}]},
+            "rotation is singular or scaled",
+        ),
         ({"render_width": None}, "render_width is null; expected a positive whole number"),
         ({"render_height": 10**6}, "render_height is 1000000; expected 1 to 32768 pixels"),
         ({"fps": None, "seconds": 0}, "seconds is 0; expected a number above 0"),
@@ -227,7 +262,9 @@ def test_too_many_cameras_are_refused(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_a_file_of_something_else(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
-    with pytest.raises(DataError, match=r"folder: is a folder without cameras.txt or cameras.bin; expected a COLMAP model"):
+    with pytest.raises(
+        DataError, match=r"folder: is a folder without cameras.txt or cameras.bin; expected a COLMAP model"
+    ):
         read_camera_file(tmp_path / "folder")
     with pytest.raises(DataError, match=r"frames is missing; expected a non-empty list of objects .or camera_path"):
         read_camera_file(write(tmp_path / "c.json", {"cameras": []}))

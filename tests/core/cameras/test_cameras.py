@@ -49,7 +49,9 @@ def test_resizing_keeps_pixel_edges() -> None:
     # halves of an image stay halves: pixel centres are at +0.5, so coordinates scale without an offset
     point = torch.tensor([0.3, -0.2, 2.0])
     small = camera().resized(20, 10)
-    assert torch.allclose(project(small, point), project(camera(), point) * torch.tensor([0.5, 1 / 3], dtype=torch.float64))
+    assert torch.allclose(
+        project(small, point), project(camera(), point) * torch.tensor([0.5, 1 / 3], dtype=torch.float64)
+    )
     assert (small.width, small.height) == (20, 10)
 
 

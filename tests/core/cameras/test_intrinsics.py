@@ -22,7 +22,13 @@ ANGLE = 2 * math.atan(32 / 50)
 def camera(frame: dict[str, Any], file: dict[str, Any], target: Target = IMAGE) -> tuple[tuple[float, ...], list[str]]:
     """fx, fy, cx, cy and what was said."""
     said: list[str] = []
-    found = camera_of(Record({"transform_matrix": POSE, **frame}, "t.json: frames[0]"), Record(file, "t.json"), target, None, said.append)
+    found = camera_of(
+        Record({"transform_matrix": POSE, **frame}, "t.json: frames[0]"),
+        Record(file, "t.json"),
+        target,
+        None,
+        said.append,
+    )
     return tuple(round(v, 3) for v in (found.fx, found.fy, found.cx, found.cy)), said
 
 
@@ -49,7 +55,9 @@ def camera(frame: dict[str, Any], file: dict[str, Any], target: Target = IMAGE) 
         ({"w": 64, "h": 48}, {"camera_angle_x": ANGLE, "w": 100, "h": 20}, (50, 50, 32, 24)),
     ],
 )
-def test_the_frames_own_wins_whole_and_lengths_follow_the_size(frame: Any, file: Any, expected: tuple[float, ...]) -> None:
+def test_the_frames_own_wins_whole_and_lengths_follow_the_size(
+    frame: Any, file: Any, expected: tuple[float, ...]
+) -> None:
     assert camera(frame, file)[0] == expected
 
 
@@ -64,10 +72,18 @@ def test_a_resized_image_is_told_once_for_all_frames() -> None:
     ("frame", "file", "words"),
     [
         ({}, {}, "frames\\[0\\]: no focal length"),
-        ({}, {"fl_x": 50, "camera_angle_x": 0.9}, "t.json: fl_x means a focal length of 50 pixels, and camera_angle_x 66"),
+        (
+            {},
+            {"fl_x": 50, "camera_angle_x": 0.9},
+            "t.json: fl_x means a focal length of 50 pixels, and camera_angle_x 66",
+        ),
         ({"fl_x": 50, "x_fov": 40}, {}, "frames\\[0\\]: fl_x means .* x_fov 87.9"),
         ({}, {"fl_y": 50, "y_fov": 40}, "fl_y means .* y_fov 65.9"),
-        ({}, {"fl_x": 50, "fl_y": 90, "camera_angle_x": ANGLE, "camera_angle_y": 0.895}, "fl_y means .* camera_angle_y 50"),
+        (
+            {},
+            {"fl_x": 50, "fl_y": 90, "camera_angle_x": ANGLE, "camera_angle_y": 0.895},
+            "fl_y means .* camera_angle_y 50",
+        ),
         ({}, {"fl_x": 50, "camera_intrinsics": [32, 24, 60, 60]}, "fl_x means .* camera_intrinsics 60"),
         ({}, {"cx": 20, "camera_intrinsics": [32, 24, 60, 60]}, "cx, cy are .* camera_intrinsics begins"),
         ({}, {"camera_angle_x": ANGLE, "camera_angle_y": 0.6}, "pixels that are not square"),
@@ -92,10 +108,15 @@ def test_contradictions_are_refused(frame: Any, file: Any, words: str) -> None:
 
 
 def test_the_sensors_angles_of_blender_give_way_to_lengths_in_pixels() -> None:
-    """BlenderNeRF writes angle_x of the longer side of the image, and angle_y of a sensor that the image does not fill."""
+    """BlenderNeRF writes angle_x of the longer side of the image, and angle_y of a sensor that the image does not
+    fill."""
     angle = 2 * math.atan(36 / 2 / 50)
     focal = 72 * 50 / 36
-    found, said = camera({}, {"camera_angle_x": angle, "camera_angle_y": 0.471, "fl_x": focal, "fl_y": focal, "cx": 24, "cy": 36}, PORTRAIT)
+    found, said = camera(
+        {},
+        {"camera_angle_x": angle, "camera_angle_y": 0.471, "fl_x": focal, "fl_y": focal, "cx": 24, "cy": 36},
+        PORTRAIT,
+    )
     assert found == (100, 100, 24, 36) and len(said) == 2 and all("is taken" in line for line in said)
 
 
@@ -138,15 +159,28 @@ def test_keys_that_change_the_picture_are_refused_by_name(key: str, value: Any) 
 
 
 def test_the_same_keys_may_say_nothing() -> None:
-    nothing = {"latlong": False, "rolling_shutter": [0, 0, 0, 0], "k5": 0.0, "camera_type": "perspective", "shift_x": 0, "n_frames": 2}
+    nothing = {
+        "latlong": False,
+        "rolling_shutter": [0, 0, 0, 0],
+        "k5": 0.0,
+        "camera_type": "perspective",
+        "shift_x": 0,
+        "n_frames": 2,
+    }
     check_keys(Record({**nothing, "frames": [{}, {}]}, "t.json"))
     with pytest.raises(DataError, match="n_frames is 1; expected 2"):
         check_keys(Record({"n_frames": 1, "frames": [{}, {}]}, "t.json"))
 
 
 def test_unknown_keys_are_named_once_and_those_of_real_files_are_not() -> None:
-    file = Record({"aabb_scale": 16, "applied_transform": POSE, "frames": [], "orientation_override": "none", "exposures": 1}, "t.json")
-    frames = [Record({"file_path": "a", "colmap_im_id": i, "sharpness": 3.0, "time": 0.1, "depth_file_path": "d"}, "f") for i in range(3)]
+    file = Record(
+        {"aabb_scale": 16, "applied_transform": POSE, "frames": [], "orientation_override": "none", "exposures": 1},
+        "t.json",
+    )
+    frames = [
+        Record({"file_path": "a", "colmap_im_id": i, "sharpness": 3.0, "time": 0.1, "depth_file_path": "d"}, "f")
+        for i in range(3)
+    ]
     line = unknown_keys(file, frames, ())
     assert line.startswith("t.json: keys that are not read: exposures, frames[].time; task=dynamic")
     assert unknown_keys(file, frames, ("time", "exposures")) == ""

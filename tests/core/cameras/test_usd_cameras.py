@@ -71,7 +71,8 @@ def test_a_camera_that_stands_still(tmp_path: Path) -> None:
     assert close(camera, projected(path, "/World/Cam", 0, POINTS, (640, 480)))
     assert camera.fx == camera.fy == pytest.approx(35 / 36 * 640) and camera.cx < 320 and camera.cy < 240
     assert (
-        found.notes == ("Z is up and a unit is 0.01 m in this file; taken as the axes and units of the run's data",) and found.fps is None
+        found.notes == ("Z is up and a unit is 0.01 m in this file; taken as the axes and units of the run's data",)
+        and found.fps is None
     )
 
 
@@ -98,7 +99,9 @@ def test_a_camera_that_moves_has_a_frame_per_time_code(tmp_path: Path) -> None:
     found = read_camera_file(path, (640, 480))
     assert len(found.named) == 3 and found.fps == 25 and found.notes[0].startswith("Y is up")
     for i, (_, camera) in enumerate(found.named):
-        assert camera.position.tolist() == pytest.approx([i, -4, 0]) and camera.fx == pytest.approx((35 + 5 * i) / 36 * 640)
+        assert camera.position.tolist() == pytest.approx([i, -4, 0]) and camera.fx == pytest.approx(
+            (35 + 5 * i) / 36 * 640
+        )
         assert close(camera, projected(path, "/World/Cam", 1 + i, POINTS, (640, 480)))
 
 
@@ -127,7 +130,9 @@ def test_render_settings_say_the_size(tmp_path: Path) -> None:
 
 def test_one_of_several_by_its_path(tmp_path: Path) -> None:
     path = usd(tmp_path / "a.usda", CAMERA + CAMERA.replace('"Cam"', '"Other"').replace("35", "70"))
-    with pytest.raises(DataError, match="has 2 cameras; expected #PATH after the file's name, with one of /World/Cam, /World/Other"):
+    with pytest.raises(
+        DataError, match="has 2 cameras; expected #PATH after the file's name, with one of /World/Cam, /World/Other"
+    ):
         read_camera_file(path, (64, 48))
     assert read_camera_file(Path(f"{path}#/World/Other"), (64, 48)).named[0][1].fx == pytest.approx(70 / 36 * 64)
     with pytest.raises(DataError, match="has no camera /World/None; expected one of /World/Cam, /World/Other"):
@@ -136,7 +141,9 @@ def test_one_of_several_by_its_path(tmp_path: Path) -> None:
 
 def test_a_scale_of_all_axes_does_not_matter(tmp_path: Path) -> None:
     plain = read_camera_file(usd(tmp_path / "a.usda"), (64, 48)).named[0][1]
-    scaled = CAMERA.replace("(1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0)", "(100, 0, 0, 0), (0, 0, 100, 0), (0, -100, 0, 0)")
+    scaled = CAMERA.replace(
+        "(1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0)", "(100, 0, 0, 0), (0, 0, 100, 0), (0, -100, 0, 0)"
+    )
     found = read_camera_file(usd(tmp_path / "b.usda", scaled), (64, 48)).named[0][1]
     assert torch.allclose(found.viewmat, plain.viewmat) and found.fx == plain.fx
 
@@ -146,26 +153,49 @@ BAD: list[tuple[str, Callable[[Path], Any], str]] = [
     ("no camera", lambda p: (usd(p, ""), (64, 48)), "has no camera; expected one"),
     (
         "orthographic",
-        lambda p: (usd(p, CAMERA.replace("float focalLength", 'token projection = "orthographic"\n float focalLength')), (64, 48)),
+        lambda p: (
+            usd(p, CAMERA.replace("float focalLength", 'token projection = "orthographic"\n float focalLength')),
+            (64, 48),
+        ),
         'projection is "orthographic"; expected perspective',
     ),
-    ("focal zero", lambda p: (usd(p, CAMERA.replace("= 35", "= 0")), (64, 48)), "focal is 0.0; expected a focal length above 0"),
-    ("aperture zero", lambda p: (usd(p, CAMERA.replace("= 36", "= 0")), (64, 48)), "aperture is 0 x 27; expected numbers above 0"),
-    ("focal nan", lambda p: (usd(p, CAMERA.replace("= 35", "= nan")), (64, 48)), "focal is NaN; expected a focal length"),
+    (
+        "focal zero",
+        lambda p: (usd(p, CAMERA.replace("= 35", "= 0")), (64, 48)),
+        "focal is 0.0; expected a focal length above 0",
+    ),
+    (
+        "aperture zero",
+        lambda p: (usd(p, CAMERA.replace("= 36", "= 0")), (64, 48)),
+        "aperture is 0 x 27; expected numbers above 0",
+    ),
+    (
+        "focal nan",
+        lambda p: (usd(p, CAMERA.replace("= 35", "= nan")), (64, 48)),
+        "focal is NaN; expected a focal length",
+    ),
     (
         "stretched",
         lambda p: (usd(p, CAMERA.replace("(1, 0, 0, 0)", "(2, 0, 0, 0)")), (64, 48)),
         "its transform scales by 2, 1, 1; expected one scale",
     ),
     ("mirrored", lambda p: (usd(p, CAMERA.replace("(1, 0, 0, 0)", "(-1, 0, 0, 0)")), (64, 48)), "mirrored"),
-    ("flat", lambda p: (usd(p, CAMERA.replace("(1, 0, 0, 0)", "(0, 0, 0, 0)")), (64, 48)), "its transform scales by 0, 1, 1"),
+    (
+        "flat",
+        lambda p: (usd(p, CAMERA.replace("(1, 0, 0, 0)", "(0, 0, 0, 0)")), (64, 48)),
+        "its transform scales by 0, 1, 1",
+    ),
     ("no range", lambda p: (usd(p, MOVING), (64, 48)), "startTimeCode and endTimeCode are missing"),
     (
         "endless",
         lambda p: (usd(p, MOVING, "startTimeCode = 1\n    endTimeCode = 1e12"), (64, 48)),
         "expected a range of at most 100000 codes",
     ),
-    ("backwards", lambda p: (usd(p, MOVING, "startTimeCode = 3\n    endTimeCode = 1"), (64, 48)), "expected a range of at most"),
+    (
+        "backwards",
+        lambda p: (usd(p, MOVING, "startTimeCode = 3\n    endTimeCode = 1"), (64, 48)),
+        "expected a range of at most",
+    ),
     ("no syntax", lambda p: (usd(p, CAMERA.replace("{", "[", 1)), (64, 48)), "not a readable USD file"),
     (
         "not USD after all",

@@ -22,7 +22,9 @@ def turned(scale: float = 0.25, angle: float = 0.7) -> World:
 
 @pytest.mark.parametrize("world", [World.at([448250.0, 5411930.0, 210.0]), turned()])
 def test_a_camera_sees_the_same_in_both(world: World) -> None:
-    scene = Camera(look_at(torch.tensor([3.0, -4, 2]), POINTS[1], torch.tensor([0.0, 0, 1])), 90.0, 80.0, 33.0, 20.0, 64, 48)
+    scene = Camera(
+        look_at(torch.tensor([3.0, -4, 2]), POINTS[1], torch.tensor([0.0, 0, 1])), 90.0, 80.0, 33.0, 20.0, 64, 48
+    )
     other = world.world_camera(scene)
     check_viewmat(other.viewmat, "it")
     there = world.world_points(POINTS)
@@ -36,10 +38,16 @@ def test_a_camera_sees_the_same_in_both(world: World) -> None:
 
 def test_an_identity_changes_nothing() -> None:
     camera = Camera(torch.eye(4), 1.0, 1.0, 0.5, 0.5, 1, 1)
-    assert World().scene_camera(camera) is camera and World().world_points(POINTS) is POINTS and World.of({}, "it").identity
+    assert (
+        World().scene_camera(camera) is camera
+        and World().world_points(POINTS) is POINTS
+        and World.of({}, "it").identity
+    )
 
 
-@pytest.mark.parametrize("record", [{}, [], 3, {"scene_from_world": 1}, {"scene_from_world": [[1, 2]]}, {"scene_from_world": "a"}])
+@pytest.mark.parametrize(
+    "record", [{}, [], 3, {"scene_from_world": 1}, {"scene_from_world": [[1, 2]]}, {"scene_from_world": "a"}]
+)
 def test_a_damaged_header_is_refused(record: Any) -> None:
     with pytest.raises(DataError, match=r"^model: header field 'world' is damaged"):
         World.of({"world": record}, "model")

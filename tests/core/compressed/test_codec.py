@@ -1,4 +1,5 @@
-"""A model in few bits and back: every built-in field, errors as the steps allow, the same bytes and the same floats every time."""
+"""A model in few bits and back: every built-in field, errors as the steps allow, the same bytes and the same floats
+every time."""
 
 from __future__ import annotations
 
@@ -13,7 +14,16 @@ import torch
 import neuprim
 import neuprim.core.compressed.codec as codec
 from neuprim.core import checkpoint
-from neuprim.core.compressed import LEVELS, BitTable, bit_table, folded, read_compressed, rounded, schemes, schemes_within
+from neuprim.core.compressed import (
+    LEVELS,
+    BitTable,
+    bit_table,
+    folded,
+    read_compressed,
+    rounded,
+    schemes,
+    schemes_within,
+)
 from neuprim.core.compressed.columns import Columns
 from neuprim.core.errors import CheckpointError, ConfigError, FormError
 from neuprim.core.model.densities.cosine import CosineDensity
@@ -51,7 +61,9 @@ def test_a_model_comes_back_within_its_steps(tmp_path: Path, name: str, level: i
         inside = x.clamp(scheme.low, scheme.high)
         half = (scheme.high - scheme.low).double() / scheme.last / 2
         assert bool(((back - inside).double().abs() <= half * 1.001 + 1e-6).all()), key
-        assert float((x != inside).double().mean() if x.numel() else 0.0) <= 0.06, key  # at most 1% at either end, of 40 rows
+        assert float((x != inside).double().mean() if x.numel() else 0.0) <= 0.06, (
+            key
+        )  # at most 1% at either end, of 40 rows
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -69,7 +81,8 @@ def test_compressing_again_changes_nothing(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", FIELDS)
 def test_a_bit_says_who_does_without_a_piece(tmp_path: Path, name: str) -> None:
-    """The same numbers come back as from a file of whole columns, which takes more bytes; compressed again it is the same file."""
+    """The same numbers come back as from a file of whole columns, which takes more bytes; compressed again it is the
+    same file."""
     task, model = example(name, 2000)
     pruned = without_pieces(model)
     files = []
@@ -113,7 +126,14 @@ def test_more_bits_are_a_better_image(tmp_path: Path) -> None:
             sizes.append((tmp_path / "m").stat().st_size)
             errors.append(
                 float(
-                    (render(checkpoint.load_model(tmp_path / "m", task)[0], scenes.camera(), {}, RenderSettings()).rgb - true).abs().mean()
+                    (
+                        render(
+                            checkpoint.load_model(tmp_path / "m", task)[0], scenes.camera(), {}, RenderSettings()
+                        ).rgb
+                        - true
+                    )
+                    .abs()
+                    .mean()
                 )
             )
     assert sizes == sorted(sizes, reverse=True) and errors == sorted(errors) and errors[0] < 0.1 * errors[-1]
@@ -127,7 +147,9 @@ def test_fields_of_others_come_back(tmp_path: Path) -> None:
     again, _ = checkpoint.load_model(tmp_path / "m", task)
     wanted, made = stored(model, LEVELS[3])
     step = (made["log_amplitude"].high - made["log_amplitude"].low) / made["log_amplitude"].last
-    assert float((again.params["log_amplitude"] - wanted.params["log_amplitude"]).abs().max()) <= float(step) / 2 * 1.001
+    assert (
+        float((again.params["log_amplitude"] - wanted.params["log_amplitude"]).abs().max()) <= float(step) / 2 * 1.001
+    )
 
 
 # ---------------------------------------------------------------- bits
@@ -212,7 +234,9 @@ def test_rounded_tensors_are_what_comes_back_with_their_own_gradients(tmp_path: 
     found = rounded(leaves, made)
     for key, value in found.items():
         if key == "quats":
-            assert torch.allclose(angles(value.detach(), again.params[key]), torch.zeros(model.count, dtype=torch.float64), atol=1e-3)
+            assert torch.allclose(
+                angles(value.detach(), again.params[key]), torch.zeros(model.count, dtype=torch.float64), atol=1e-3
+            )
         else:
             assert torch.equal(value.detach(), again.params[key]), key
     total = torch.stack([(value * (i + 1)).sum() for i, value in enumerate(found.values())]).sum()
@@ -227,7 +251,10 @@ def test_rounded_tensors_are_what_comes_back_with_their_own_gradients(tmp_path: 
 def effects_of(model: Primitives) -> dict[str, torch.Tensor]:
     """Some effect of every number, of very different sizes."""
     generator = torch.Generator().manual_seed(3)
-    return {s.name: 10 ** (2 * torch.rand(s.size, generator=generator, dtype=torch.float64)) * model.count for s in model.specs}
+    return {
+        s.name: 10 ** (2 * torch.rand(s.size, generator=generator, dtype=torch.float64)) * model.count
+        for s in model.specs
+    }
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -264,7 +291,9 @@ def test_more_error_is_fewer_bytes(tmp_path: Path, name: str) -> None:
     whole = folded(model)
     sizes = []
     for error in (1e-7, 1e-5, 1e-3, 1e-1, 1e9):
-        checkpoint.save_compressed(tmp_path / "m", whole, task.name, {}, schemes_within(whole, effects_of(whole), error))
+        checkpoint.save_compressed(
+            tmp_path / "m", whole, task.name, {}, schemes_within(whole, effects_of(whole), error)
+        )
         sizes.append((tmp_path / "m").stat().st_size)
         assert checkpoint.load_model(tmp_path / "m", task)[0].count == 1000
     assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 0.2 * sizes[0]
@@ -272,7 +301,9 @@ def test_more_error_is_fewer_bytes(tmp_path: Path, name: str) -> None:
 
 def test_what_changes_nothing_takes_nothing_and_what_is_gone_stays_gone() -> None:
     model = folded(without_pieces(example("soft", 400)[1]))
-    effects = {name: torch.zeros_like(value) if name == "log_gain" else value for name, value in effects_of(model).items()}
+    effects = {
+        name: torch.zeros_like(value) if name == "log_gain" else value for name, value in effects_of(model).items()
+    }
     back = rounded(model.params, schemes_within(model, effects, 1e-3))
     assert len(back["log_gain"].unique()) == 1
     for name in ("sh_rest", "w2"):
@@ -298,8 +329,14 @@ def altered(**params: torch.Tensor) -> Primitives:
 @pytest.mark.parametrize(
     ("params", "message"),
     [
-        ({"b1": torch.full((40, 3), float("nan"))}, "parameter b1 of primitive 0 is [nan, nan, nan], which cannot be compressed"),
-        ({"b2": torch.cat([torch.zeros(39, 1), torch.full((1, 1), float("inf"))])}, "parameter b2 of primitive 39 is [inf]"),
+        (
+            {"b1": torch.full((40, 3), float("nan"))},
+            "parameter b1 of primitive 0 is [nan, nan, nan], which cannot be compressed",
+        ),
+        (
+            {"b2": torch.cat([torch.zeros(39, 1), torch.full((1, 1), float("inf"))])},
+            "parameter b2 of primitive 39 is [inf]",
+        ),
         ({"quats": torch.zeros(40, 4)}, "parameter quats of primitive 0 is [0.0, 0.0, 0.0, 0.0]"),
         ({"b2": torch.zeros(40, 1, dtype=torch.int64)}, "parameter b2 is torch.int64; only torch.float32"),
         ({"b2": torch.zeros(40, 1, dtype=torch.float64)}, "parameter b2 is torch.float64; only torch.float32"),
@@ -334,7 +371,9 @@ def test_a_model_of_nothing_but_zeros_is_no_bomb(tmp_path: Path) -> None:
     params = {name: torch.zeros_like(value) for name, value in model.params.items()}
     params["quats"][:, 0] = 1.0
     path = tmp_path / "m"
-    checkpoint.save_compressed(path, Primitives(model.density, model.colour, params), task.name, {}, LEVELS[3], "task: static\n")
+    checkpoint.save_compressed(
+        path, Primitives(model.density, model.colour, params), task.name, {}, LEVELS[3], "task: static\n"
+    )
     numbers = 4 * 40_000 * model.parameters_per_primitive
     assert numbers > 2**20 and path.stat().st_size * 64 + 2**20 >= numbers > 10 * path.stat().st_size
     assert all(torch.equal(value, params[name]) for name, value in read_compressed(path)[1].items())
@@ -342,7 +381,9 @@ def test_a_model_of_nothing_but_zeros_is_no_bomb(tmp_path: Path) -> None:
 
 def test_the_levels_are_those_of_the_documentation() -> None:
     text = (Path(neuprim.__file__).parents[1] / "docs" / "export.md").read_text(encoding="utf-8")
-    head, _, *rows = [line.strip("| \n").split(" | ") for line in text.split("| level |", 1)[1].split("\n\n", 1)[0].splitlines()]
+    head, _, *rows = [
+        line.strip("| \n").split(" | ") for line in text.split("| level |", 1)[1].split("\n\n", 1)[0].splitlines()
+    ]
     names = [re.findall(r"\w+", cell) for cell in head]
     found = {int(row[0]): [int(cell) for cell in row[1:]] for row in rows}
     assert found.keys() == LEVELS.keys() and "others" in names[-1]

@@ -36,7 +36,9 @@ def test_a_value_is_the_float32_nearest_to_the_fraction(a: float, b: float, bits
     exact = (Fraction(low) * (m - code) + Fraction(high) * code) / m
     assert low <= float(made) <= high
     near = np.float32(float(exact))
-    assert abs(Fraction(float(made)) - exact) <= abs(Fraction(float(near)) - exact) * (1 + Fraction(1, 2**20)) + Fraction(1, 2**150)
+    assert abs(Fraction(float(made)) - exact) <= abs(Fraction(float(near)) - exact) * (
+        1 + Fraction(1, 2**20)
+    ) + Fraction(1, 2**150)
 
 
 @given(st.lists(finite, min_size=1, max_size=40), st.integers(1, 16))
@@ -50,7 +52,9 @@ def test_what_was_decoded_is_decoded_again(values: list[float], bits: int) -> No
 
 @pytest.mark.parametrize("bits", [1, 4, 8, 12, 16])
 def test_errors_are_at_most_half_a_step_where_nothing_is_clipped(bits: int) -> None:
-    x = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 100.0, 1e-3]) + torch.tensor([0.0, 5.0, 1.0])
+    x = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [1.0, 100.0, 1e-3]
+    ) + torch.tensor([0.0, 5.0, 1.0])
     made = fit_columns(x, [bits] * 3, clips=(0.0,))
     assert torch.equal(made.low, x.amin(0)) and torch.equal(made.high, x.amax(0))
     half = (made.high - made.low).double() / (2**bits - 1) / 2
@@ -72,11 +76,17 @@ def test_the_clip_with_the_least_squares_is_taken() -> None:
 
 
 @given(st.lists(finite, min_size=1, max_size=30), st.floats(1e-30, 1e30), st.floats(0, 1))
-def test_even_steps_reach_every_number_and_pass_through_one_place(values: list[float], step: float, place: float) -> None:
+def test_even_steps_reach_every_number_and_pass_through_one_place(
+    values: list[float], step: float, place: float
+) -> None:
     x = torch.tensor(values)[:, None]
     through = (1 - place) * float(x.min()) + place * float(x.max())
     made = even_columns(x, torch.tensor([step]), through)
-    assert 1 <= int(made.bits) <= MOST_BITS and bool(made.low <= made.high) and bool(torch.isfinite(made.low) & torch.isfinite(made.high))
+    assert (
+        1 <= int(made.bits) <= MOST_BITS
+        and bool(made.low <= made.high)
+        and bool(torch.isfinite(made.low) & torch.isfinite(made.high))
+    )
     codes = made.codes(x)
     assert int(codes.max()) <= int(made.last) and int(codes.min()) >= 0
     size, width = float(x.double().abs().max()), float(x.double().max() - x.double().min())
@@ -100,7 +110,10 @@ def test_numbers_within_one_step_are_a_single_value() -> None:
     x = torch.tensor([[1.0, -3.0], [1.2, -3.0], [0.9, -3.0]])
     made = even_columns(x, torch.tensor([torch.inf, 5.0]), x.double().mean(0))
     assert torch.allclose(made.values(made.codes(x)), x.mean(0).expand(3, 2)) and torch.equal(made.low, made.high)
-    assert even_columns(torch.zeros(0, 2), torch.ones(2), 0.0).values(torch.zeros(0, 2, dtype=torch.int64)).shape == (0, 2)
+    assert even_columns(torch.zeros(0, 2), torch.ones(2), 0.0).values(torch.zeros(0, 2, dtype=torch.int64)).shape == (
+        0,
+        2,
+    )
     assert even_columns(torch.zeros(5, 0), torch.ones(0), 0.0).codes(torch.zeros(5, 0)).shape == (5, 0)
 
 
@@ -188,7 +201,9 @@ def test_the_curve_and_back(bits: int) -> None:
 
 
 @given(st.integers(0, 2**31 - 1), st.integers(1, 16), st.floats(-6, 6), st.floats(0, 1))
-def test_columns_with_a_zero_bring_it_back_and_are_coded_again_as_they_were(seed: int, bits: int, size: float, share: float) -> None:
+def test_columns_with_a_zero_bring_it_back_and_are_coded_again_as_they_were(
+    seed: int, bits: int, size: float, share: float
+) -> None:
     generator = torch.Generator().manual_seed(seed)
     x = (torch.randn(60, 4, generator=generator) + torch.randn(4, generator=generator)) * 10.0**size
     x[torch.rand(60, 4, generator=generator) < share] = 0.0

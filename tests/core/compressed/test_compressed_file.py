@@ -47,7 +47,8 @@ def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def refused(path: Path, *words: str) -> str:
-    """The message with which a file is refused, of one line; within a second of computing, whatever else the machine does."""
+    """The message with which a file is refused, of one line; within a second of computing, whatever else the machine
+    does."""
     start = time.thread_time()
     with pytest.raises(CheckpointError) as caught:
         checkpoint.load_model(path, TASK)
@@ -58,7 +59,8 @@ def refused(path: Path, *words: str) -> str:
     return message
 
 
-# ---------------------------------------------------------------- another reader, and another writer, from docs/data_formats.md alone
+# ---------------------------------------------------------------- another reader, and another writer, from
+# docs/data_formats.md alone
 
 
 def table_rows(table: bytes, sections: int) -> list[dict[str, Any]]:
@@ -72,7 +74,17 @@ def table_rows(table: bytes, sections: int) -> list[dict[str, Any]]:
         at += 3 + 4 * dimensions
         planes, size, crc = struct.unpack_from("<QQI", table, at)
         at += 20
-        rows.append({"name": name, "coding": coding, "packing": packing, "shape": shape, "planes": planes, "size": size, "crc": crc})
+        rows.append(
+            {
+                "name": name,
+                "coding": coding,
+                "packing": packing,
+                "shape": shape,
+                "planes": planes,
+                "size": size,
+                "crc": crc,
+            }
+        )
     assert at == len(table)
     return rows
 
@@ -124,7 +136,10 @@ def read_by_the_book(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]
             if row["coding"] == 2:
                 b = records[0][0]
                 keys = np.cumsum(codes(3 * b))
-                cells = [np.array([sum(int(key) >> (3 * i + axis) & 1 and 1 << i for i in range(b)) for key in keys]) for axis in range(3)]
+                cells = [
+                    np.array([sum(int(key) >> (3 * i + axis) & 1 and 1 << i for i in range(b)) for key in keys])
+                    for axis in range(3)
+                ]
             else:
                 cells = [codes(b, len(rows)) for (b, _, _), rows in zip(records, own, strict=True)]
             values = np.zeros((count, columns))
@@ -159,18 +174,26 @@ def test_a_pruned_model_is_read_by_the_book_as_well(tmp_path: Path, name: str) -
     for key, value in again.params.items():
         assert np.array_equal(found[key], value.numpy()), key
     for piece, gone in goners(model).values():
-        assert int((~alive(piece, again.params)).sum()) >= int(gone.sum())  # single numbers of others may be rounded to zero
+        assert int((~alive(piece, again.params)).sum()) >= int(
+            gone.sum()
+        )  # single numbers of others may be rounded to zero
 
 
 def by_hand(**changes: Any) -> bytes:
     """A model of two primitives without neurons, written from the page: see the comments."""
-    # means: 2 bits; codes (0, 1, 2) and (3, 3, 3): key 0 has bit 1 (y) and bit 5 (z, second), 34; key 1 all six, 63; steps 34, 29
+    # means: 2 bits; codes (0, 1, 2) and (3, 3, 3): key 0 has bit 1 (y) and bit 5 (z, second), 34; key 1 all six, 63;
+    # steps 34, 29
     record = lambda bits, low, high: struct.pack("<Bff", bits, low, high)  # noqa: E731
     constant = record(1, 0.5, 0.5)
     sections = {
         "means": (2, (3,), record(2, -1, 2) * 3, bytes([34, 29])),
         "log_scales": (1, (3,), record(8, -2.0, -1.0) + record(4, -3.0, 0.0) + constant, bytes([0, 255, 5, 15, 0, 1])),
-        "quats": (3, (4,), bytes([3]), bytes([0, 3, 3, 6, 3, 3, 3, 0])),  # h = 3: no turn; u = (3, 0, -3) before z, which is 0
+        "quats": (
+            3,
+            (4,),
+            bytes([3]),
+            bytes([0, 3, 3, 6, 3, 3, 3, 0]),
+        ),  # h = 3: no turn; u = (3, 0, -3) before z, which is 0
         "W1": (1, (0, 3), b"", b""),
         "b1": (1, (0,), b"", b""),
         "w2": (1, (0,), b"", b""),
@@ -200,13 +223,30 @@ def assembled(
     rows, parts = [], []
     for name, (coding, shape, head, planes) in sections.items():
         part = head + planes
-        sizes = {"planes": len(planes), "size": len(part), "crc": zlib.crc32(part), "packing": packing, **table.get(name, {})}
+        sizes = {
+            "planes": len(planes),
+            "size": len(part),
+            "crc": zlib.crc32(part),
+            "packing": packing,
+            **table.get(name, {}),
+        }
         label = sizes.get("label", name.encode())
-        row = bytes([len(label)]) + label + bytes([coding, sizes["packing"], len(shape)]) + struct.pack(f"<{len(shape)}I", *shape)
+        row = (
+            bytes([len(label)])
+            + label
+            + bytes([coding, sizes["packing"], len(shape)])
+            + struct.pack(f"<{len(shape)}I", *shape)
+        )
         rows.append(row + struct.pack("<QQI", sizes["planes"], sizes["size"], sizes["crc"]))
         parts.append(sizes.get("part", part))
     start = struct.pack("<IIQII", version, table.get("number", len(rows)), count, len(text), len(b"".join(rows)))
-    return b"\x89NEUPRIM" + start + struct.pack("<I", zlib.crc32(start + text + b"".join(rows))) + text + b"".join(rows + parts)
+    return (
+        b"\x89NEUPRIM"
+        + start
+        + struct.pack("<I", zlib.crc32(start + text + b"".join(rows)))
+        + text
+        + b"".join(rows + parts)
+    )
 
 
 def test_a_file_by_hand_is_read_as_the_page_says(tmp_path: Path) -> None:
@@ -218,7 +258,11 @@ def test_a_file_by_hand_is_read_as_the_page_says(tmp_path: Path) -> None:
     assert p["log_scales"].tolist() == [[-2.0, -2.0, 0.5], [-1.0, 0.0, 0.5]]
     assert p["quats"][0].tolist() == [1.0, 0.0, 0.0, 0.0]
     assert p["quats"][1].tolist() == pytest.approx([0.5**0.5, 0.0, -(0.5**0.5), 0.0])
-    assert p["b2"].tolist() == [[258.0], [4095.0]] and p["sh_dc"].tolist() == [[0.5] * 3] * 2 and p["W1"].shape == (2, 0, 3)
+    assert (
+        p["b2"].tolist() == [[258.0], [4095.0]]
+        and p["sh_dc"].tolist() == [[0.5] * 3] * 2
+        and p["W1"].shape == (2, 0, 3)
+    )
     assert header["task"] == "static" and checkpoint.stored_config(path) is None and is_compressed(path)
     assert checkpoint.read_header(path, "model") == header
     with pytest.raises(CheckpointError, match="kind is 'model'; expected 'checkpoint'"):
@@ -283,12 +327,17 @@ def resummed(data: bytearray) -> bytes:
     return bytes(data)
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
-@given(changes=st.lists(st.tuples(st.integers(0, 2**20), st.integers(0, 255)), min_size=1, max_size=6), near=st.booleans())
+@settings(
+    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
+)
+@given(
+    changes=st.lists(st.tuples(st.integers(0, 2**20), st.integers(0, 255)), min_size=1, max_size=6), near=st.booleans()
+)
 def test_what_has_the_right_check_sums_is_refused_or_a_model(
     tmp_path: Path, whole: bytes, changes: list[tuple[int, int]], near: bool
 ) -> None:
-    """Bytes changed by somebody who knows the format: never another error, and what is read is whole, finite and of the right shapes."""
+    """Bytes changed by somebody who knows the format: never another error, and what is read is whole, finite and of the
+    right shapes."""
     data = bytearray(whole)
     for place, value in changes:
         data[8 + place % (1800 if near else len(data) - 8)] = value
@@ -492,7 +541,9 @@ def test_blocks_are_cut_where_that_helps() -> None:
     numbers = np.random.default_rng(0)
     planes = [np.clip(numbers.normal(128, width, 3000), 0, 255).astype(np.uint8).tobytes() for width in (3, 12) * 12]
     found, whole = packed_planes(planes), b"".join(planes)
-    assert len(found) < 0.97 * len(zstd(whole, level=19)) and len(found) <= sum(len(packed_planes([plane])) for plane in planes)
+    assert len(found) < 0.97 * len(zstd(whole, level=19)) and len(found) <= sum(
+        len(packed_planes([plane])) for plane in planes
+    )
     assert zstandard.ZstdDecompressor().decompress(found) == whole
     noise = numbers.bytes(1000)
     assert packed_planes([noise]) == noise and packed_planes([]) == b""

@@ -1,4 +1,5 @@
-"""What a data set promises: every broken promise is one line that names view, member, what was found and what was expected."""
+"""What a data set promises: every broken promise is one line that names view, member, what was found and what was
+expected."""
 
 from __future__ import annotations
 
@@ -14,7 +15,15 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.rays import RayCamera
 from neuprim.core.data import Dataset, Pixels, PointCloud, PointSamples
-from neuprim.core.data.check import DatasetFault, check_dataset, check_mask, check_pixels, check_points, check_samples, extra_of
+from neuprim.core.data.check import (
+    DatasetFault,
+    check_dataset,
+    check_mask,
+    check_pixels,
+    check_points,
+    check_samples,
+    extra_of,
+)
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import ConditionSpec
@@ -134,7 +143,10 @@ def test_a_broken_promise_is_one_line(change: Callable[[Any], None], text: str) 
         (None, "train view 0 (v0): condition 'time' is missing; found none, the task needs it"),
         (torch.zeros(1), "train view 0 (v0): condition 'time' is float32 (1,); expected float32 ()"),
         (0.5, "train view 0 (v0): condition 'time' is a float; expected float32 ()"),
-        (torch.tensor(float("nan")), "train view 0 (v0): condition 'time': found 1 values that are NaN or infinite; expected finite"),
+        (
+            torch.tensor(float("nan")),
+            "train view 0 (v0): condition 'time': found 1 values that are NaN or infinite; expected finite",
+        ),
     ],
 )
 def test_conditions_that_the_task_declares(value: Any, text: str) -> None:
@@ -150,7 +162,9 @@ def test_a_condition_missing_in_one_later_view_is_found() -> None:
     data = tiny.two_primitives()
     for split in (data.train, data.test):
         plain = split.view
-        split.view = lambda index, plain=plain: replace(plain(index), conditions={} if index == 3 else {"time": torch.tensor(0.5)})  # type: ignore[method-assign, misc]
+        split.view = lambda index, plain=plain: replace(
+            plain(index), conditions={} if index == 3 else {"time": torch.tensor(0.5)}
+        )  # type: ignore[method-assign, misc]
     with pytest.raises(DatasetFault, match=r"train view 3 \(v3\): condition 'time' is missing"):
         check_dataset(data, [TIME])
 
@@ -163,12 +177,21 @@ def test_conditions_that_no_task_needs_and_ray_cameras_are_fine() -> None:
 
 
 POINTS: dict[str, tuple[dict[str, Any], str]] = {
-    "more points than colours": ({"colors": torch.zeros(4, 3)}, "two: starting points: colors is float32 (4, 3); expected float32 (5, 3)"),
+    "more points than colours": (
+        {"colors": torch.zeros(4, 3)},
+        "two: starting points: colors is float32 (4, 3); expected float32 (5, 3)",
+    ),
     "other channels": ({"colors": torch.zeros(5, 1)}, "colors is float32 (5, 1); expected float32 (5, 3)"),
     "planar": ({"means": torch.zeros(5, 2)}, "means is float32 (5, 2); expected float32 (5, 3)"),
-    "whole numbers": ({"means": torch.zeros(5, 3, dtype=torch.int64)}, "means is int64 (5, 3); expected float32 (5, 3)"),
+    "whole numbers": (
+        {"means": torch.zeros(5, 3, dtype=torch.int64)},
+        "means is int64 (5, 3); expected float32 (5, 3)",
+    ),
     "numpy": ({"means": np.zeros((5, 3))}, "means is a numpy.ndarray; expected float32"),
-    "nan": ({"means": torch.full((5, 3), float("nan"))}, "means: found 15 values that are NaN or infinite, the first at [0, 0]"),
+    "nan": (
+        {"means": torch.full((5, 3), float("nan"))},
+        "means: found 15 values that are NaN or infinite, the first at [0, 0]",
+    ),
     "too many": ({"means": torch.zeros(7, 3)}, "found 7 points; expected at most 6"),
     "quats": ({"quats": torch.zeros(5, 3)}, "quats is float32 (5, 3); expected float32 (5, 4)"),
     "conditions": ({"conditions": {"time": torch.zeros(2)}}, "condition 'time' is float32 (2,); expected float32 (5,)"),
@@ -228,14 +251,22 @@ def test_a_light_network_refuses_a_wrong_start_value_in_one_line() -> None:
 
     for value in ("abc", None, float("nan"), True):
         with pytest.raises(ConfigError, match=r"model\.init\.output=.*: expected a finite number"):
-            initial_model(CosineDensity(1), LightNetwork(2), tiny.two_primitives(), ModelSettings(primitives=4, init={"output": value}), 0)
+            initial_model(
+                CosineDensity(1),
+                LightNetwork(2),
+                tiny.two_primitives(),
+                ModelSettings(primitives=4, init={"output": value}),
+                0,
+            )
 
 
 def test_a_data_set_is_a_description_that_stays_as_it_is() -> None:
     data = tiny.two_primitives()
     with pytest.raises(FrozenInstanceError):
         data.name = "other"  # type: ignore[misc]
-    with pytest.raises(TypeError, match=r"^class Mine\(Dataset\): a data set is made by calling neuprim\.core\.data\.Dataset\(name="):
+    with pytest.raises(
+        TypeError, match=r"^class Mine\(Dataset\): a data set is made by calling neuprim\.core\.data\.Dataset\(name="
+    ):
         type("Mine", (Dataset,), {"judge": lambda self, index, rendered, truth: {}})
     with pytest.raises(TypeError, match="missing 1 required keyword-only argument: 'extent'"):
         Dataset(name="x", train=data.train, test=data.test, start=data.start, background=torch.ones(3))  # type: ignore[call-arg]
@@ -251,15 +282,21 @@ def test_starting_points_follow_the_training_views() -> None:
 
 def test_what_a_task_knows_of_a_data_set_is_of_its_own_class() -> None:
     data = tiny.two_primitives()
-    assert extra_of(data, Pixels) is None and extra_of(replace(data, extra=data.test.pixels(0)), Pixels) is data.test.pixels(0)
-    with pytest.raises(DatasetFault, match=r"^two: extra is a dict; expected a neuprim\.core\.data\.dataset\.Pixels, or None$"):
+    assert extra_of(data, Pixels) is None and extra_of(
+        replace(data, extra=data.test.pixels(0)), Pixels
+    ) is data.test.pixels(0)
+    with pytest.raises(
+        DatasetFault, match=r"^two: extra is a dict; expected a neuprim\.core\.data\.dataset\.Pixels, or None$"
+    ):
         extra_of(replace(data, extra={"rgb": 1}), Pixels)
 
 
 def test_an_orbit_has_every_condition_of_the_training_views() -> None:
     data = tiny.two_primitives()
     plain = data.train.view
-    data.train.view = lambda i: replace(plain(i), conditions={"time": torch.tensor(0.1 * i), "light": torch.tensor([i, 2.0, 3.0])})  # type: ignore[method-assign]
+    data.train.view = lambda i: replace(
+        plain(i), conditions={"time": torch.tensor(0.1 * i), "light": torch.tensor([i, 2.0, 3.0])}
+    )  # type: ignore[method-assign]
     views = data.orbit(3)
     torch.testing.assert_close(torch.stack([v.conditions["time"] for v in views]), torch.tensor([0.0, 0.25, 0.5]))
     assert [v.conditions["light"].tolist() for v in views] == [[0.0, 2.0, 3.0]] * 3
@@ -287,7 +324,9 @@ def test_points_to_learn_from(changes: dict[str, Any], text: str) -> None:
 
 
 def test_points_of_another_class_are_refused_before_training() -> None:
-    with pytest.raises(DatasetFault, match=r"^two: points is a int; expected a neuprim\.core\.data\.PointSupervision, or None$"):
+    with pytest.raises(
+        DatasetFault, match=r"^two: points is a int; expected a neuprim\.core\.data\.PointSupervision, or None$"
+    ):
         check_dataset(tiny.two_primitives(points=3), ())
     with pytest.raises(DatasetFault, match=r"^two: points: drew None; expected a neuprim\.core\.data\.PointSamples$"):
         check_samples(None, tiny.two_primitives())  # type: ignore[arg-type]

@@ -39,9 +39,13 @@ def test_what_is_near_stays(offset: tuple[float, ...]) -> None:
         ((1e9, 0, 12345.0), 4e3, (1e9, 0, 10000)),
     ],
 )
-def test_what_is_far_moves_by_a_round_number(offset: tuple[float, ...], radius: float, origin: tuple[float, ...]) -> None:
+def test_what_is_far_moves_by_a_round_number(
+    offset: tuple[float, ...], radius: float, origin: tuple[float, ...]
+) -> None:
     world = world_around(ring(offset, radius))
-    assert world.world_points(torch.zeros(3, dtype=torch.float64)).tolist() == [pytest.approx(x, rel=1e-12) for x in origin]
+    assert world.world_points(torch.zeros(3, dtype=torch.float64)).tolist() == [
+        pytest.approx(x, rel=1e-12) for x in origin
+    ]
     moved = world.scene_camera(ring(offset, radius)[0])
     assert torch.equal(moved.viewmat[:3, :3], ring(offset, radius)[0].viewmat[:3, :3])
     assert float(moved.position.norm()) < 20 * radius
@@ -74,9 +78,15 @@ def test_points_in_doubles_keep_their_digits(tmp_path) -> None:  # type: ignore[
 def test_gaussians_turn_and_grow_with_their_places() -> None:
     """World x is scene y, and a world unit is two scene units."""
     world = World(torch.tensor([[0, -2, 0, 5], [2, 0, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]], dtype=torch.float64))
-    cloud = PointCloud(torch.ones(1, 3), torch.ones(1, 3), quats=torch.tensor([[1.0, 0, 0, 0]]), deviations=torch.tensor([[1.0, 2, 3]]))
+    cloud = PointCloud(
+        torch.ones(1, 3), torch.ones(1, 3), quats=torch.tensor([[1.0, 0, 0, 0]]), deviations=torch.tensor([[1.0, 2, 3]])
+    )
     found = cloud.within(world)
-    assert found.means.tolist() == [[3, 8, 9]] and found.deviations is not None and found.deviations.tolist() == [[2, 4, 6]]
+    assert (
+        found.means.tolist() == [[3, 8, 9]]
+        and found.deviations is not None
+        and found.deviations.tolist() == [[2, 4, 6]]
+    )
     assert found.quats is not None and torch.allclose(found.quats.abs(), torch.tensor([[0.5**0.5, 0, 0, 0.5**0.5]]))
 
 
@@ -85,7 +95,8 @@ def test_floats_that_are_far_away_are_told(tmp_path) -> None:  # type: ignore[no
     rows["x"], rows["y"] = [0, 1, 2], 5411932.25
     write_ply(tmp_path / "p.ply", rows)
     with pytest.warns(
-        NeuprimWarning, match=r"x y z are float, which rounds coordinates as large as 5411932 to 0\.5; expected double there"
+        NeuprimWarning,
+        match=r"x y z are float, which rounds coordinates as large as 5411932 to 0\.5; expected double there",
     ):
         read_points(tmp_path / "p.ply", 3, "srgb")
 

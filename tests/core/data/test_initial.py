@@ -27,11 +27,15 @@ def rng(seed: int = 0) -> torch.Generator:
 class Views(ViewSet):
     """Cameras around CENTER whose pixels come from a function of the camera."""
 
-    def __init__(self, draw: Callable[[Camera], Pixels], count: int = 24, size: int = 96, seed: int = 0, distance: float = 4.0) -> None:
+    def __init__(
+        self, draw: Callable[[Camera], Pixels], count: int = 24, size: int = 96, seed: int = 0, distance: float = 4.0
+    ) -> None:
         directions = torch.randn((count, 3), generator=rng(seed), dtype=torch.float64)
         eyes = CENTER + distance * directions / directions.norm(dim=-1, keepdim=True)
         up = torch.tensor([0.0, 0.0, 1.0])
-        self.cameras = [Camera(look_at(e, CENTER, up), 1.6 * size, 1.6 * size, size / 2 + 3, size / 2 - 2, size, size) for e in eyes]
+        self.cameras = [
+            Camera(look_at(e, CENTER, up), 1.6 * size, 1.6 * size, size / 2 + 3, size / 2 - 2, size, size) for e in eyes
+        ]
         self.images = [draw(c) for c in self.cameras]
 
     def __len__(self) -> int:
@@ -46,11 +50,16 @@ class Views(ViewSet):
 
 def rays(camera: Camera) -> tuple[Tensor, Tensor]:
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    d = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1).double() @ camera.viewmat[:3, :3]
+    d = (
+        torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1).double()
+        @ camera.viewmat[:3, :3]
+    )
     return camera.position, d / d.norm(dim=-1, keepdim=True)
 
 
-def sphere(radius: float, color: tuple[float, float, float] = (0.8, 0.4, 0.2), shift: float = 0.0) -> Callable[[Camera], Pixels]:
+def sphere(
+    radius: float, color: tuple[float, float, float] = (0.8, 0.4, 0.2), shift: float = 0.0
+) -> Callable[[Camera], Pixels]:
     """A ball about CENTER, ray-cast; ``shift`` moves it in world x."""
     middle = CENTER + torch.tensor([shift, 0.0, 0.0])
 
@@ -109,7 +118,9 @@ def test_masked_pixels_rule_nothing_out() -> None:
     full, _ = hull_surface(views, 32)
     hidden = views.images[0]
     assert hidden.alpha is not None
-    views.images[0] = Pixels(hidden.rgb, torch.zeros_like(hidden.alpha), torch.zeros_like(hidden.alpha, dtype=torch.bool))
+    views.images[0] = Pixels(
+        hidden.rgb, torch.zeros_like(hidden.alpha), torch.zeros_like(hidden.alpha, dtype=torch.bool)
+    )
     assert abs(len(hull_surface(views, 32)[0]) - len(full)) < 0.2 * len(full)
 
 
@@ -131,7 +142,9 @@ def test_farthest_points_spread() -> None:
     gap = torch.cdist(cloud[rows], cloud[rows]).fill_diagonal_(9.0).min()
     drawn = cloud[torch.randperm(4000, generator=rng())[:200]]
     assert gap > 5 * torch.cdist(drawn, drawn).fill_diagonal_(9.0).min()
-    assert torch.cdist(cloud, cloud[rows]).min(dim=1).values.max() < gap + 1e-6, "farthest-point sampling covers to its own gap"
+    assert torch.cdist(cloud, cloud[rows]).min(dim=1).values.max() < gap + 1e-6, (
+        "farthest-point sampling covers to its own gap"
+    )
 
 
 def test_large_counts_are_distinct_too() -> None:
@@ -147,7 +160,9 @@ def test_farthest_points_where_all_coincide() -> None:
 
 def test_thinning_for_large_counts_spreads_too() -> None:
     # two clusters of very different density: even spreading takes more from the sparse one than its share
-    cloud = torch.cat([torch.rand((9000, 3), generator=rng()), torch.rand((1000, 3), generator=rng(1)) + torch.tensor([1.0, 0, 0])])
+    cloud = torch.cat(
+        [torch.rand((9000, 3), generator=rng()), torch.rand((1000, 3), generator=rng(1)) + torch.tensor([1.0, 0, 0])]
+    )
     rows = _thinned(cloud, 600, rng())
     assert len(rows) == 600 == len(rows.unique())
     assert 0.35 < (rows >= 9000).float().mean() < 0.6
@@ -178,10 +193,14 @@ def test_photographs_start_in_a_box_where_the_cameras_look() -> None:
 
     views = Views(draw)
     points = initial_points(views, None, 2000, rng())
-    assert (points.means - CENTER).abs().max() <= 2.0 + 1e-5 and (points.means.double().mean(0) - CENTER).abs().max() < 0.15
+    assert (points.means - CENTER).abs().max() <= 2.0 + 1e-5 and (
+        points.means.double().mean(0) - CENTER
+    ).abs().max() < 0.15
     assert torch.allclose(points.colors, torch.full((2000, 3), 0.3)) and points.means.unique(dim=0).shape[0] == 2000
     opaque = Views(lambda c: Pixels(draw(c).rgb, torch.ones(c.height, c.width)))
-    assert torch.equal(initial_points(opaque, None, 50, rng()).means, box_points(opaque, 50, rng()).means), "opaque alpha says nothing"
+    assert torch.equal(initial_points(opaque, None, 50, rng()).means, box_points(opaque, 50, rng()).means), (
+        "opaque alpha says nothing"
+    )
 
 
 def test_given_points_are_kept_or_thinned() -> None:

@@ -33,7 +33,15 @@ def fresh(path: Path | str, primitives: int = 50, edge: int = 0, **init: object)
 
 
 def splats(path: Path, **changes: float) -> Path:
-    names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    names = [
+        *"xyz",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
     rows = np.zeros(3, [(n, "<f4") for n in names])
     rows["x"], rows["y"], rows["z"] = [0.0, 1.0, 2.0], [0.5, 0.6, 0.7], [-1.0, 0.0, 1.0]
     rows["f_dc_0"], rows["opacity"] = 1.0, [0.0, 20.0, -20.0]
@@ -48,12 +56,15 @@ def splats(path: Path, **changes: float) -> Path:
 def test_gaussians_give_places_colours_shapes_and_opacities(tmp_path: Path) -> None:
     model = fresh(splats(tmp_path / "g.ply"))
     assert torch.equal(model.params["means"], torch.tensor([[0.0, 0.5, -1.0], [1.0, 0.6, 0.0], [2.0, 0.7, 1.0]]))
-    assert torch.allclose(model.params["sh_dc"][:, 0], torch.tensor(1.0), atol=1e-5) and not bool(model.params["sh_rest"].any())
+    assert torch.allclose(model.params["sh_dc"][:, 0], torch.tensor(1.0), atol=1e-5) and not bool(
+        model.params["sh_rest"].any()
+    )
 
 
 @pytest.mark.parametrize("edge", EDGES)
 def test_primitives_cover_what_their_gaussians_do(tmp_path: Path, edge: int) -> None:
-    """Axes and mass: seen along one of its axes, a primitive hides as much of the screen as the footprint o exp(-r^2/2), on the whole."""
+    """Axes and mass: seen along one of its axes, a primitive hides as much of the screen as the footprint o
+    exp(-r^2/2), on the whole."""
     model = fresh(splats(tmp_path / "g.ply"), edge=edge)
     geometry: Geometry = model.geometry
     alphas = torch.sigmoid(torch.tensor([0.0, 20.0, -20.0]))
@@ -81,7 +92,9 @@ def test_the_footprint_is_the_closest_of_those_that_hide_as_much(edge: int, volu
             low, high = 0.0, 50.0
             for _ in range(60):
                 middle = (low + high) / 2
-                low, high = (middle, high) if ((1 - (-middle * shape).exp()) * r).sum() < (target * r).sum() else (low, middle)
+                low, high = (
+                    (middle, high) if ((1 - (-middle * shape).exp()) * r).sum() < (target * r).sum() else (low, middle)
+                )
             return ((1 - (-low * shape).exp() - target).square() * r).sum(), torch.tensor(low)
 
         error, exact = left(c[i])
@@ -108,12 +121,16 @@ def test_gaussians_without_opacities_start_as_opaque_as_ever(tmp_path: Path) -> 
     write_ply(tmp_path / "bare.ply", rows)
     model = fresh(tmp_path / "bare.ply", edge=2)
     assert torch.allclose(1 - torch.exp(-NORMS[2] * model.params["b2"]), torch.tensor(0.8), atol=1e-5)
-    assert float(model.geometry.scales[0].max()) == pytest.approx(0.3 * float(gaussian_support(2, torch.tensor([0.5]))[0]), rel=1e-4)
+    assert float(model.geometry.scales[0].max()) == pytest.approx(
+        0.3 * float(gaussian_support(2, torch.tensor([0.5]))[0]), rel=1e-4
+    )
 
 
 def test_sizes_can_be_scaled_and_the_count_is_kept(tmp_path: Path) -> None:
     path = splats(tmp_path / "g.ply")
-    assert torch.allclose(fresh(path, scale=2.0).params["log_scales"], fresh(path).params["log_scales"] + math.log(2), atol=1e-5)
+    assert torch.allclose(
+        fresh(path, scale=2.0).params["log_scales"], fresh(path).params["log_scales"] + math.log(2), atol=1e-5
+    )
     assert fresh(path, primitives=2).count == 2
 
 
@@ -122,7 +139,9 @@ def test_plain_clouds(tmp_path: Path, form: str) -> None:
     path = tmp_path / "p.ply"
     if form == "ascii":
         head = "property float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
-        path.write_text(f"ply\nformat ascii 1.0\nelement vertex 2\n{head}end_header\n0 0 0 51 102 255\n1 2 3 51 102 255\n")
+        path.write_text(
+            f"ply\nformat ascii 1.0\nelement vertex 2\n{head}end_header\n0 0 0 51 102 255\n1 2 3 51 102 255\n"
+        )
     else:
         floats = [(c, "<f4") for c in ("red", "green", "blue")]
         kind = {"bytes": [("red", "u1"), ("green", "u1"), ("blue", "u1")], "floats": floats, "large floats": floats}
@@ -133,14 +152,21 @@ def test_plain_clouds(tmp_path: Path, form: str) -> None:
                 rows[name] = value / 255 if form == "floats" else value
         write_ply(path, rows)
     cloud = read_points(path, 3, "srgb")
-    assert cloud.means.tolist() == [[0, 0, 0], [1, 2, 3]] and cloud.axes is None and cloud.alphas is None and cloud.deviations is None
+    assert (
+        cloud.means.tolist() == [[0, 0, 0], [1, 2, 3]]
+        and cloud.axes is None
+        and cloud.alphas is None
+        and cloud.deviations is None
+    )
     expected = [0.5, 0.5, 0.5] if form == "none" else [0.2, 0.4, 1.0]
     assert torch.allclose(cloud.colors, torch.tensor(expected), atol=1e-6)
     linear = read_points(path, 3, "linear").colors
     assert torch.allclose(linear[:, 1], torch.tensor(0.214041 if form == "none" else 0.132868), atol=1e-4)
     model = fresh(path)
     assert torch.allclose(model.params["sh_dc"] * sh.C0 + 0.5, torch.tensor(expected), atol=1e-3)
-    assert model.count == 2 and torch.allclose(model.params["log_scales"].exp(), torch.tensor(math.sqrt(14.0)), rtol=1e-5)
+    assert model.count == 2 and torch.allclose(
+        model.params["log_scales"].exp(), torch.tensor(math.sqrt(14.0)), rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize(
@@ -160,7 +186,9 @@ def test_plain_clouds(tmp_path: Path, form: str) -> None:
 )
 def test_rows_that_are_no_points_are_left_out_and_counted(tmp_path: Path, what: str, changes: dict[str, float]) -> None:
     path = splats(tmp_path / "g.ply", **changes)
-    with pytest.warns(match=rf"g\.ply: 1 of 3 vertices are no usable points \(1 for their {what}, as vertex 1\); left out"):
+    with pytest.warns(
+        match=rf"g\.ply: 1 of 3 vertices are no usable points \(1 for their {what}, as vertex 1\); left out"
+    ):
         cloud = read_points(path, 3, "srgb")
     assert cloud.means.tolist() == [[0, 0.5, -1], [2, float(np.float32(0.7)), 1]] and fresh(path).count == 2
     rows = read_ply(path).rows
@@ -195,11 +223,13 @@ def test_discs_are_flat_along_their_third_axis_and_balls_are_round(tmp_path: Pat
     discs = rows[[n for n in rows.dtype.names or () if n != "scale_2"]]
     write_ply(tmp_path / "discs.ply", np.lib.recfunctions.repack_fields(discs))
     cloud = read_points(tmp_path / "discs.ply", 3, "srgb")
-    assert cloud.deviations is not None and torch.allclose(cloud.deviations, torch.tensor([0.1, 0.2, 0.01]).expand(3, 3))
-    assert torch.equal(cloud.quats, read_points(path, 3, "srgb").quats)
-    assert float(fresh(tmp_path / "discs.ply").geometry.scales.max() / fresh(path).geometry.scales[:, 1].max()) == pytest.approx(
-        1, rel=1e-5
+    assert cloud.deviations is not None and torch.allclose(
+        cloud.deviations, torch.tensor([0.1, 0.2, 0.01]).expand(3, 3)
     )
+    assert torch.equal(cloud.quats, read_points(path, 3, "srgb").quats)
+    assert float(
+        fresh(tmp_path / "discs.ply").geometry.scales.max() / fresh(path).geometry.scales[:, 1].max()
+    ) == pytest.approx(1, rel=1e-5)
     flat = read_points(splats(tmp_path / "flat.ply", scale_1=-math.inf), 3, "srgb").deviations
     assert flat is not None and torch.allclose(flat[1], torch.tensor([0.1, 0.01, 0.3]))
     balls = rows[[n for n in rows.dtype.names or () if n not in ("scale_1", "scale_2") and "rot" not in n]]
@@ -225,7 +255,9 @@ def test_compressed_formats_are_named_with_what_to_do(tmp_path: Path, name: str)
     path = tmp_path / name
     head = "element chunk 1\nproperty float min_x\nelement vertex 1\nproperty uint packed_position\nend_header\n"
     path.write_bytes(f"ply\nformat binary_little_endian 1.0\n{head}".encode() + bytes(8))
-    with pytest.raises(DataError, match=r"is not read; expected an uncompressed PLY. Convert it with SuperSplat .* or splat-transform"):
+    with pytest.raises(
+        DataError, match=r"is not read; expected an uncompressed PLY. Convert it with SuperSplat .* or splat-transform"
+    ):
         fresh(path)
 
 

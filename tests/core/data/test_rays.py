@@ -1,4 +1,5 @@
-"""Starting points of cameras that do not look at one point: seen by two cameras, at depths that the images agree with."""
+"""Starting points of cameras that do not look at one point: seen by two cameras, at depths that the images agree
+with."""
 
 from __future__ import annotations
 
@@ -69,7 +70,9 @@ def turned(count: int, radius: float, noise: float = 0.0) -> list[Camera]:
 
 def array(count: int, step: float) -> list[Camera]:
     return [
-        camera(step * torch.tensor([float(i), j, 0]), torch.tensor([0.0, 0, 0]) + UP.roll(2)) for i in range(count) for j in range(count)
+        camera(step * torch.tensor([float(i), j, 0]), torch.tensor([0.0, 0, 0]) + UP.roll(2))
+        for i in range(count)
+        for j in range(count)
     ]
 
 

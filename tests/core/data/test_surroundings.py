@@ -24,10 +24,21 @@ class Room(ViewSet):
 
     def __init__(self, count: int = 5, masked: bool = False) -> None:
         self.masked = masked
-        eyes = [torch.tensor([1.5 * math.sin(t), -2.0 * math.cos(t), 0.3]) for t in torch.linspace(-0.6, 0.6, count).tolist()]
+        eyes = [
+            torch.tensor([1.5 * math.sin(t), -2.0 * math.cos(t), 0.3])
+            for t in torch.linspace(-0.6, 0.6, count).tolist()
+        ]
         width, height = SIZE
         self.cameras = [
-            Camera(look_at(e, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 40.0, 40.0, width / 2, height / 2, width, height)
+            Camera(
+                look_at(e, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])),
+                40.0,
+                40.0,
+                width / 2,
+                height / 2,
+                width,
+                height,
+            )
             for e in eyes
         ]
 
@@ -39,7 +50,11 @@ class Room(ViewSet):
 
     def pixels(self, index: int) -> Pixels:
         hit = on_the_wall(self.cameras[index])
-        rgb = torch.stack([(hit[..., 0] / 10 + 0.5), (hit[..., 2] / 10 + 0.5), torch.zeros(hit.shape[:2])], -1).clamp(0, 1).float()
+        rgb = (
+            torch.stack([(hit[..., 0] / 10 + 0.5), (hit[..., 2] / 10 + 0.5), torch.zeros(hit.shape[:2])], -1)
+            .clamp(0, 1)
+            .float()
+        )
         mask = torch.ones(hit.shape[:2], dtype=torch.bool)
         mask[:, : SIZE[0] // 2] = False
         return Pixels(rgb, None, mask if self.masked else None)
@@ -58,7 +73,9 @@ def known(count: int = 40) -> PointCloud:
     """Points on a small textured spot of the wall."""
     generator = torch.Generator().manual_seed(3)
     spot = torch.rand(count, 2, generator=generator) - 0.5
-    return PointCloud(torch.stack([spot[:, 0], torch.full((count,), WALL), spot[:, 1]], -1), torch.full((count, 3), 0.5))
+    return PointCloud(
+        torch.stack([spot[:, 0], torch.full((count,), WALL), spot[:, 1]], -1), torch.full((count, 3), 0.5)
+    )
 
 
 def fill(views: ViewSet, count: int, seed: int = 0) -> PointCloud:
@@ -70,11 +87,15 @@ def test_gaps_on_a_wall_are_filled_on_the_wall() -> None:
     found = fill(views, 200)
     assert len(found.means) == 200
     wall = found.means[(found.means[:, 1] - WALL).abs() < 1.5]
-    assert len(wall) >= 170, "all but the shell and a few; cameras look at the wall askew, and depth is guessed from beside"
+    assert len(wall) >= 170, (
+        "all but the shell and a few; cameras look at the wall askew, and depth is guessed from beside"
+    )
     beside = (wall[:, 0].abs() > 0.6) | (wall[:, 2].abs() > 0.6)
     assert beside.float().mean() > 0.9, "the spot is known already"
     lifted = found.colors[:180]
-    assert (lifted[:, 0] - (found.means[:180, 0] / 10 + 0.5)).abs().mean() < 0.05, "coloured by the pixels that show them"
+    assert (lifted[:, 0] - (found.means[:180, 0] / 10 + 0.5)).abs().mean() < 0.05, (
+        "coloured by the pixels that show them"
+    )
     for i in range(len(views)):
         camera = views.cameras[i]
         hit = on_the_wall(camera).reshape(-1, 3).float()
@@ -128,7 +149,14 @@ def test_nothing_is_made_of_nothing() -> None:
 @pytest.mark.parametrize("share", ["1.5", "-0.1", "yes"])
 def test_a_share_is_a_share(share: str) -> None:
     config = compose(
-        ["task=static", "scene=solids", "scene.size=16", "scene.train_views=4", "scene.test_views=1", f"model.init.surroundings={share}"],
+        [
+            "task=static",
+            "scene=solids",
+            "scene.size=16",
+            "scene.train_views=4",
+            "scene.test_views=1",
+            f"model.init.surroundings={share}",
+        ],
         False,
     )
     with pytest.raises(ConfigError, match=r"model\.init\.surroundings"):
@@ -136,10 +164,18 @@ def test_a_share_is_a_share(share: str) -> None:
 
 
 def test_matter_that_moves_has_no_surroundings() -> None:
-    words = ["task=dynamic", "scene=smoke_fire", "scene.size=8", "scene.resolution=16", "scene.timesteps=2", "model.init.surroundings=0.2"]
+    words = [
+        "task=dynamic",
+        "scene=smoke_fire",
+        "scene.size=8",
+        "scene.resolution=16",
+        "scene.timesteps=2",
+        "model.init.surroundings=0.2",
+    ]
     config = compose(words, False)
     with pytest.raises(
-        ConfigError, match=r"model\.init\.surroundings=0\.2: matter of smoke_fire \(simulated\) depends on time; expected a scene at rest"
+        ConfigError,
+        match=r"model\.init\.surroundings=0\.2: matter of smoke_fire \(simulated\) depends on time; expected a scene at rest",
     ):
         make_trainer(config, task_of(config), load_dataset(config, task_of(config)))
 

@@ -21,7 +21,9 @@ def test_a_file_and_what_was_put_beside_it(tmp_path: Path) -> None:
         (draft.out.parent / "a.mtl").write_text("look")
         assert tree(tmp_path / "new") == {} and draft.out.name == "a.obj"
         assert draft.place(draft.out) == tmp_path / "new" / "a.obj" and draft.place(tmp_path / "else") is None
-        assert draft.words(f"{draft.out.parent}/a.mtl of {draft.out}") == f"{tmp_path}/new/a.mtl of {tmp_path}/new/a.obj"
+        assert (
+            draft.words(f"{draft.out.parent}/a.mtl of {draft.out}") == f"{tmp_path}/new/a.mtl of {tmp_path}/new/a.obj"
+        )
         draft.publish()
     assert tree(tmp_path) == {"new/a.mtl": "look", "new/a.obj": "mesh"} and os.listdir(tmp_path) == ["new"]
 
@@ -72,10 +74,16 @@ def test_a_failure_leaves_no_trace_and_says_where(tmp_path: Path, failure: type[
 def test_files_and_folders_do_not_replace_each_other(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("old")
-    with pytest.raises(ConfigError, match="folder: is a folder; expected a file"), drafted(tmp_path / "folder", True) as draft:
+    with (
+        pytest.raises(ConfigError, match="folder: is a folder; expected a file"),
+        drafted(tmp_path / "folder", True) as draft,
+    ):
         draft.out.write_text("new")
         draft.publish()
-    with pytest.raises(ConfigError, match="file: is a file; expected a folder"), drafted(tmp_path / "file", True) as draft:
+    with (
+        pytest.raises(ConfigError, match="file: is a file; expected a folder"),
+        drafted(tmp_path / "file", True) as draft,
+    ):
         draft.out.mkdir()
         (draft.out / "x").write_text("new")
         draft.publish()

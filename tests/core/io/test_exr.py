@@ -22,12 +22,21 @@ def test_layers_types_and_attributes_are_kept(tmp_path: Path) -> None:
         "B": Plane(values[..., 2], True),
         "depth.Z": Plane(values[..., 3]),
     }
-    said = {"worldToCamera": np.arange(16, dtype=np.float32).reshape(4, 4), "neuprim:run": "a run", "neuprim:near": 0.25}
+    said = {
+        "worldToCamera": np.arange(16, dtype=np.float32).reshape(4, 4),
+        "neuprim:run": "a run",
+        "neuprim:near": 0.25,
+    }
     write_layers(tmp_path / "a.exr", planes, said)
     with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
         header, stored = dict(file.header()), {name: np.array(c.pixels) for name, c in file.channels().items()}
-    assert {name: str(pixels.dtype) for name, pixels in stored.items()} == {**dict.fromkeys("RGB", "float16"), "depth.Z": "float32"}
-    assert np.array_equal(stored["depth.Z"], values[..., 3].numpy()) and np.array_equal(stored["G"], values[..., 1].half().numpy())
+    assert {name: str(pixels.dtype) for name, pixels in stored.items()} == {
+        **dict.fromkeys("RGB", "float16"),
+        "depth.Z": "float32",
+    }
+    assert np.array_equal(stored["depth.Z"], values[..., 3].numpy()) and np.array_equal(
+        stored["G"], values[..., 1].half().numpy()
+    )
     assert (
         np.array_equal(header["worldToCamera"], said["worldToCamera"])
         and header["neuprim:run"] == "a run"

@@ -62,7 +62,8 @@ def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
 
 @posix
 def test_what_is_flushed_may_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows refuses to flush a file that was opened for reading; asked here, where systems tell how a file was opened."""
+    """Windows refuses to flush a file that was opened for reading; asked here, where systems tell how a file was
+    opened."""
     import fcntl
 
     flushed = []

@@ -65,7 +65,9 @@ def test_exr_is_linear_and_never_clamped(tmp_path: Path, half: bool, dtype: torc
     read = images.read_image(tmp_path / "a.exr", (2, 1))
     assert read.dtype == dtype and torch.equal(read.float(), values)
     assert images.image_info(tmp_path / "a.exr") == images.ImageInfo(2, 1, 4, True)
-    assert OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()["Z"].pixels.tolist() == [[1.0, float("inf")]]
+    assert OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()["Z"].pixels.tolist() == [
+        [1.0, float("inf")]
+    ]
 
 
 def test_exr_of_one_named_layer(tmp_path: Path) -> None:

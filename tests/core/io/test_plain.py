@@ -25,7 +25,16 @@ def test_numbers_beyond_the_limits_are_refused_in_a_short_line(number: str) -> N
 
 def test_numbers_within_them_are_as_they_were() -> None:
     assert load_json("[1, -2.5, 1e300, 18446744073709551615, true, null]") == [1, -2.5, 1e300, 2**64 - 1, True, None]
-    assert load_yaml("a: [1, 0x10, 1_000, 1.5e+3, 1:30, .inf, yes, 2**3]")["a"] == [1, 16, 1000, 1500.0, 90, float("inf"), True, "2**3"]
+    assert load_yaml("a: [1, 0x10, 1_000, 1.5e+3, 1:30, .inf, yes, 2**3]")["a"] == [
+        1,
+        16,
+        1000,
+        1500.0,
+        90,
+        float("inf"),
+        True,
+        "2**3",
+    ]
 
 
 @pytest.mark.parametrize("value", [True, "1", [1], None, float("nan"), float("inf"), 10**400])

@@ -14,7 +14,10 @@ from hypothesis import strategies as st
 from neuprim.core.errors import DataError
 from neuprim.core.io.ply import read_elements, read_ply, write_ply
 
-ROWS = np.array([(1.5, -2, 250, 1e-300), (np.float32(0.1), 7, 3, 2.5)], [("x", "<f4"), ("count", "<i2"), ("red", "|u1"), ("mass", "<f8")])
+ROWS = np.array(
+    [(1.5, -2, 250, 1e-300), (np.float32(0.1), 7, 3, 2.5)],
+    [("x", "<f4"), ("count", "<i2"), ("red", "|u1"), ("mass", "<f8")],
+)
 
 
 def test_every_type_comes_back_to_the_bit(tmp_path: Path) -> None:
@@ -38,7 +41,11 @@ def test_ascii_big_endian_and_lists_after_the_vertices(tmp_path: Path) -> None:
     head = "element vertex 2\nproperty float x\nproperty uchar red\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
     (tmp_path / "a.ply").write_text("ply\r\nformat ascii 1.0\r\ncomment hi\r\n" + head + "0.5 7\n-1e-3 255\n3 0 1 0\n")
     found = read_ply(tmp_path / "a.ply")
-    assert found.rows["x"].tolist() == [0.5, np.float32(-1e-3)] and found.rows["red"].tolist() == [7, 255] and found.comments == ("hi",)
+    assert (
+        found.rows["x"].tolist() == [0.5, np.float32(-1e-3)]
+        and found.rows["red"].tolist() == [7, 255]
+        and found.comments == ("hi",)
+    )
     body = np.array([(0.5, 7), (-2, 255)], [("x", ">f4"), ("red", "u1")]).tobytes()
     (tmp_path / "b.ply").write_bytes(("ply\nformat binary_big_endian 1.0\n" + head).encode() + body + b"\x03rest")
     assert read_ply(tmp_path / "b.ply").rows["x"].tolist() == [0.5, -2.0]
@@ -55,14 +62,20 @@ def test_elements_in_any_order_with_lists_of_any_length(tmp_path: Path, order: s
     for more in ([1.5, 2.5], [1.5]), ([], [1.0, 2.0, 3.0]):
         if order:
             body = struct.pack(f"{order}BB3iBB4i", 7, 3, 0, 1, 2, 8, 4, 3, 2, 1, 0)
-            body += b"".join(struct.pack(f"{order}dh{len(m)}fB", 1e-300 + i, len(m), *m, 9 + i) for i, m in enumerate(more))
+            body += b"".join(
+                struct.pack(f"{order}dh{len(m)}fB", 1e-300 + i, len(m), *m, 9 + i) for i, m in enumerate(more)
+            )
         else:
             rows = "\n".join(" ".join(map(str, [1e-300 + i, len(m), *m, 9 + i])) for i, m in enumerate(more))
             body = f"7 3 0 1 2\n8 4 3 2 1 0\n{rows}\n".encode()
         path = tmp_path / "a.ply"
         path.write_bytes(head.encode() + body)
         found = read_ply(path)
-        assert found.names == ("x", "tag") and found.rows["x"].tolist() == [1e-300, 1.0] and found.rows["tag"].tolist() == [9, 10]
+        assert (
+            found.names == ("x", "tag")
+            and found.rows["x"].tolist() == [1e-300, 1.0]
+            and found.rows["tag"].tolist() == [9, 10]
+        )
         with open(path, "rb") as file:
             both = read_elements(file, path.stat().st_size, path, ("face", "vertex"))
         corners, numbers = both["face"].lists["vertex_indices"], both["vertex"].lists["more"]
@@ -75,7 +88,9 @@ def test_elements_in_any_order_with_lists_of_any_length(tmp_path: Path, order: s
 
 def test_rows_that_cost_nothing_are_not_counted_through(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
-    path.write_text("ply\nformat binary_little_endian 1.0\nelement none 999999999999\nelement vertex 1\nproperty uchar x\nend_header\n7")
+    path.write_text(
+        "ply\nformat binary_little_endian 1.0\nelement none 999999999999\nelement vertex 1\nproperty uchar x\nend_header\n7"
+    )
     assert read_ply(path).rows["x"].tolist() == [ord("7")]
 
 
@@ -100,9 +115,18 @@ HEAD = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nend_header\n"
         ("ply\nelement vertex 1\nproperty float x\nend_header\n", "no format"),
         ("ply\nformat ascii 1.0\nend_header\n", "no element vertex"),
         ("ply\nformat ascii 1.0\nelement face 1\nend_header\n", "expected vertex"),
-        (HEAD.format("ascii", 1).replace("float x", "list uchar x"), "as 'property float x' or 'property list uchar int x'"),
-        (HEAD.format("ascii", 1).replace("float x", "list float int x"), "as 'property float x' or 'property list uchar int x'"),
-        (HEAD.format("ascii", 1).replace("float x", "list uchar int x") + "3 1 2\n", "a list of 3 numbers, in a line of 3"),
+        (
+            HEAD.format("ascii", 1).replace("float x", "list uchar x"),
+            "as 'property float x' or 'property list uchar int x'",
+        ),
+        (
+            HEAD.format("ascii", 1).replace("float x", "list float int x"),
+            "as 'property float x' or 'property list uchar int x'",
+        ),
+        (
+            HEAD.format("ascii", 1).replace("float x", "list uchar int x") + "3 1 2\n",
+            "a list of 3 numbers, in a line of 3",
+        ),
         ("ply\nformat ascii 1.0\nelement a 1\nelement a 1\n", "element a twice"),
         (HEAD.format("ascii", 1).replace("float x", "float x\nproperty float x"), "twice"),
         (HEAD.format("ascii", 1).replace("float", "uchar") + "256\n", "outside its type"),

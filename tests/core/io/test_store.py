@@ -1,4 +1,5 @@
-"""Folders and object stores as places of files: whole or not at all, found again, and never larger than what belongs there."""
+"""Folders and object stores as places of files: whole or not at all, found again, and never larger than what belongs
+there."""
 
 from __future__ import annotations
 
@@ -23,7 +24,11 @@ Make = Callable[[], Store]
 @pytest.fixture(params=["folder", "file://", "memory://"])
 def make(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Make]:
     """The same place, as another process would open it."""
-    address = {"folder": str(tmp_path / "s"), "file://": f"file://{tmp_path}/s", "memory://": "memory://neuprim-tests/s"}[request.param]
+    address = {
+        "folder": str(tmp_path / "s"),
+        "file://": f"file://{tmp_path}/s",
+        "memory://": "memory://neuprim-tests/s",
+    }[request.param]
     copies = iter(range(100))
     yield lambda: store_at(address, tmp_path / f"copies-{next(copies)}").at("volumes", "key")
     if request.param == "memory://":
@@ -121,11 +126,15 @@ def test_addresses_that_nothing_can_be_made_of(tmp_path: Path, monkeypatch: pyte
             store_at(address, tmp_path)
         assert str(refused.value).startswith(f"{address}: {'a chain' if '::' in address else 'protocol'}")
     monkeypatch.setitem(sys.modules, "s3fs", None)
-    with pytest.raises(BackendUnavailable, match=r"^s3://bucket: s3:// needs a package .*: pip install 'neuprim\[s3\]'$"):
+    with pytest.raises(
+        BackendUnavailable, match=r"^s3://bucket: s3:// needs a package .*: pip install 'neuprim\[s3\]'$"
+    ):
         store_at("s3://bucket", tmp_path)
 
 
-def test_a_moments_absence_is_survived_and_other_errors_are_not_tried_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_moments_absence_is_survived_and_other_errors_are_not_tried_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(stores, "EVERY", 0.01)
     store, calls = LocalStore(tmp_path / "s"), []
     store.begin()

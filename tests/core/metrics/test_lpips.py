@@ -27,10 +27,18 @@ def test_it_is_the_distance_of_the_features_of_the_network(tmp_path: Path, netwo
     found = Lpips.load(written(tmp_path, state))
     assert found.network == network
     net = features(network)
-    net.load_state_dict({key.removeprefix("features."): value for key, value in state.items() if key.startswith("features.")})
+    net.load_state_dict(
+        {key.removeprefix("features."): value for key, value in state.items() if key.startswith("features.")}
+    )
     rendered, truth = images(33)
     for call, mapped in ((found, lambda x: 2 * x - 1), (found.unmapped, lambda x: x)):
-        total, xs = 0.0, [((mapped(i) - torch.tensor([-0.030, -0.088, -0.188])) / torch.tensor([0.458, 0.448, 0.450])) for i in images(33)]
+        total, xs = (
+            0.0,
+            [
+                ((mapped(i) - torch.tensor([-0.030, -0.088, -0.188])) / torch.tensor([0.458, 0.448, 0.450]))
+                for i in images(33)
+            ],
+        )
         xs = [x.permute(2, 0, 1)[None] for x in xs]
         with torch.no_grad():
             for index, layer in enumerate(net):
@@ -76,7 +84,9 @@ def test_every_published_form_of_the_weights_is_the_same(tmp_path: Path) -> None
     assert Lpips.load(tmp_path / "all.safetensors")(*images(40)) == plain
     parts = tmp_path / "parts"
     parts.mkdir()
-    backbone = {key: value for key, value in state.items() if key.startswith("features")} | {"classifier.1.weight": torch.zeros(2, 2)}
+    backbone = {key: value for key, value in state.items() if key.startswith("features")} | {
+        "classifier.1.weight": torch.zeros(2, 2)
+    }
     torch.save(backbone, parts / "alexnet-owt-7be5be79.pth")
     torch.save({key: value for key, value in state.items() if key.startswith("lin")}, parts / "alex.pth")
     (parts / "README.md").write_text("not weights")
@@ -86,10 +96,19 @@ def test_every_published_form_of_the_weights_is_the_same(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (lambda s: {k: v for k, v in s.items() if k != "lin3.model.1.weight"}, "lin3.model.1.weight of LPIPS (alex): missing"),
-        (lambda s: {k: v for k, v in s.items() if k.startswith("lin")}, "convolutions none; expected those of AlexNet or VGG16"),
+        (
+            lambda s: {k: v for k, v in s.items() if k != "lin3.model.1.weight"},
+            "lin3.model.1.weight of LPIPS (alex): missing",
+        ),
+        (
+            lambda s: {k: v for k, v in s.items() if k.startswith("lin")},
+            "convolutions none; expected those of AlexNet or VGG16",
+        ),
         (lambda s: s | {"features.3.bias": torch.zeros(3)}, "features.3.bias of LPIPS (alex): shape (3,)"),
-        (lambda s: s | {"features.3.bias": torch.full((192,), torch.nan)}, "or not finite; expected finite numbers of shape (192,)"),
+        (
+            lambda s: s | {"features.3.bias": torch.full((192,), torch.nan)},
+            "or not finite; expected finite numbers of shape (192,)",
+        ),
         (lambda s: s | {"features.12.weight": torch.zeros(1)}, "convolutions [0, 3, 6, 8, 10, 12]"),
         (lambda s: list(s), "found list; expected a state dictionary"),
         (lambda s: {"model": nn.Linear(2, 2)}, "cannot be read as weights"),
@@ -98,7 +117,11 @@ def test_every_published_form_of_the_weights_is_the_same(tmp_path: Path) -> None
 def test_other_files_are_refused_in_one_line(tmp_path: Path, change, text: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(DataError) as caught:
         Lpips.load(written(tmp_path, change(weights("alex"))))
-    assert str(caught.value).startswith(str(tmp_path / "weights.pth")) and text in str(caught.value) and "\n" not in str(caught.value)
+    assert (
+        str(caught.value).startswith(str(tmp_path / "weights.pth"))
+        and text in str(caught.value)
+        and "\n" not in str(caught.value)
+    )
 
 
 class _Hostile:

@@ -14,11 +14,17 @@ from neuprim.core.errors import DataError, NonFiniteError
 from neuprim.core.metrics import SSIM_SIGMA, SSIM_WINDOW, from_json, psnr, psnr_gain, ssim, ssim_3dgs, to_json
 
 
-def pair(height: int, width: int, channels: int, noise: float = 0.1, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+def pair(
+    height: int, width: int, channels: int, noise: float = 0.1, seed: int = 0
+) -> tuple[torch.Tensor, torch.Tensor]:
     """A smooth image with an edge, and the same with noise."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:height, :width]
-    base = 0.5 + 0.3 * np.sin(x / 3.0)[..., None] * np.cos(y[..., None] / 4.0 + np.arange(channels)) + 0.2 * (x > width // 2)[..., None]
+    base = (
+        0.5
+        + 0.3 * np.sin(x / 3.0)[..., None] * np.cos(y[..., None] / 4.0 + np.arange(channels))
+        + 0.2 * (x > width // 2)[..., None]
+    )
     return torch.from_numpy(base + noise * rng.standard_normal(base.shape)), torch.from_numpy(base)
 
 
@@ -98,7 +104,9 @@ def test_ssim_equals_the_plain_implementation(channels: int) -> None:
     assert ssim(rendered.float(), truth.float()) == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize(("height", "width", "window"), [(11, 11, 11), (10, 30, 9), (9, 12, 9), (30, 4, 3), (2, 2, 1), (1, 1, 1)])
+@pytest.mark.parametrize(
+    ("height", "width", "window"), [(11, 11, 11), (10, 30, 9), (9, 12, 9), (30, 4, 3), (2, 2, 1), (1, 1, 1)]
+)
 def test_ssim_window_shrinks_to_fit(height: int, width: int, window: int) -> None:
     rendered, truth = pair(height, width, 3)
     assert ssim(rendered, truth) == pytest.approx(plain_ssim(rendered.numpy(), truth.numpy(), window), abs=1e-12)
@@ -114,7 +122,11 @@ def test_ssim_of_3dgs_equals_a_convolution_over_black(height: int, width: int, c
     values = []
     for p, q in zip(rendered.permute(2, 0, 1).numpy(), truth.permute(2, 0, 1).numpy(), strict=True):
         mp, mq, pp, qq, pq = (convolve2d(z, window, "same", "fill", 0) for z in (p, q, p * p, q * q, p * q))
-        values.append((2 * mp * mq + 1e-4) * (2 * (pq - mp * mq) + 9e-4) / ((mp**2 + mq**2 + 1e-4) * (pp - mp**2 + qq - mq**2 + 9e-4)))
+        values.append(
+            (2 * mp * mq + 1e-4)
+            * (2 * (pq - mp * mq) + 9e-4)
+            / ((mp**2 + mq**2 + 1e-4) * (pp - mp**2 + qq - mq**2 + 9e-4))
+        )
     assert ssim_3dgs(rendered, truth) == pytest.approx(float(np.mean(values)), abs=1e-12)
     assert abs(ssim_3dgs(rendered, truth) - ssim(rendered, truth)) > 1e-3, "another convention"
     assert ssim_3dgs(truth, truth) == pytest.approx(1.0, abs=1e-12)
@@ -212,4 +224,6 @@ def test_psnr_after_the_best_gain() -> None:
     spoiled = truth / gain
     spoiled[:, 5:] = 0.0
     assert psnr_gain(spoiled, truth, mask) > 200
-    assert psnr_gain(torch.zeros_like(truth), truth) == pytest.approx(psnr(torch.zeros_like(truth), truth)), "black has no gain"
+    assert psnr_gain(torch.zeros_like(truth), truth) == pytest.approx(psnr(torch.zeros_like(truth), truth)), (
+        "black has no gain"
+    )

@@ -36,7 +36,8 @@ def model(t: dict[str, Tensor]) -> Primitives:
 
 
 def quadrature(t: dict[str, Tensor], origin: Tensor, d: Tensor, near_z: Tensor, points: int = 400) -> Tensor:
-    """(P,) optical depth of primitive 0 along unit rays ``d`` (P, 3), chord ends from the plain quadratic formula in float64."""
+    """(P,) optical depth of primitive 0 along unit rays ``d`` (P, 3), chord ends from the plain quadratic formula in
+    float64."""
     g = geometry(t)
     to_sphere = (quaternion_to_matrix(g.quats[0]) / g.scales[0]).T
     p, v = to_sphere @ (origin - g.means[0]), d @ to_sphere.T
@@ -47,7 +48,9 @@ def quadrature(t: dict[str, Tensor], origin: Tensor, d: Tensor, near_z: Tensor, 
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(points))
     s = t0[:, None] + length[:, None] * (x + 1) / 2
     where = (origin + s[..., None] * d[:, None, :]).reshape(-1, 3)
-    sigma = CosineDensity(t["W1"].shape[1]).density({k: t[k] for k in DENSITY}, g, torch.zeros(len(where), dtype=torch.int64), where, {})
+    sigma = CosineDensity(t["W1"].shape[1]).density(
+        {k: t[k] for k in DENSITY}, g, torch.zeros(len(where), dtype=torch.int64), where, {}
+    )
     return (sigma.reshape(s.shape) @ w) * length / 2
 
 
@@ -76,7 +79,9 @@ def test_density_is_the_formula_of_the_paper() -> None:
         u = [(x[0, j].item() - t["means"][row, j].item()) / m for j in range(3)]
         f = t["b2"][row, 0].item()
         for k in range(3):
-            f += t["w2"][row, k].item() * math.cos(30 * (sum(t["W1"][row, k, j].item() * u[j] for j in range(3)) + t["b1"][row, k].item()))
+            f += t["w2"][row, k].item() * math.cos(
+                30 * (sum(t["W1"][row, k, j].item() * u[j] for j in range(3)) + t["b1"][row, k].item())
+            )
         sigma = CosineDensity(3).density({n: t[n] for n in DENSITY}, geometry(t), torch.tensor([row]), x, {})
         assert sigma.item() == pytest.approx(f / m, rel=1e-12)
 
@@ -113,9 +118,9 @@ def test_split_carries_sigma(dtype: torch.dtype, bound: float, neurons: int, fac
 
     # the children lie inside their parents' support, apart from each other, and copying the weights would not have done
     g = geometry({k: v.double() for k, v in t.items()})
-    inside = ((child.means.double() - g.means[parents.repeat(2)])[:, None, :] @ g.rotations[parents.repeat(2)])[:, 0] / g.scales[
-        parents.repeat(2)
-    ]
+    inside = ((child.means.double() - g.means[parents.repeat(2)])[:, None, :] @ g.rotations[parents.repeat(2)])[
+        :, 0
+    ] / g.scales[parents.repeat(2)]
     assert torch.allclose(inside.norm(dim=1), torch.tensor(0.5, dtype=torch.float64), atol=1e-5)
     assert torch.allclose(inside[:40], -inside[40:], atol=1e-5)
     copies = {**children, **{k: t[k][parents.repeat(2)] for k in DENSITY}}
@@ -130,14 +135,22 @@ def test_split_wraps_phases_at_the_density_s_own_turn(omega0: float) -> None:
     density = CosineDensity(8, omega0)
     assert type(density)(**density.settings()).omega0 == omega0 and CosineDensity(8).settings() == {"neurons": 8}
     old = geometry(t)
-    new = Geometry(old.means + 0.3 * old.length_scale[:, None] * torch.tensor([1.0, 0.0, 0.0]), old.log_scales + math.log(0.6), old.quats)
+    new = Geometry(
+        old.means + 0.3 * old.length_scale[:, None] * torch.tensor([1.0, 0.0, 0.0]),
+        old.log_scales + math.log(0.6),
+        old.quats,
+    )
     own = {k: t[k] for k in DENSITY}
     child = density.on_split(own, old, new)
     assert child["b1"].abs().max() <= math.pi / omega0 * (1 + 1e-6) < t["b1"].abs().max()
     rows, x = points_inside(new, 20)
     before, after = (
         density.density(
-            {k: v.double() for k, v in p.items()}, Geometry(*(y.double() for y in (g.means, g.log_scales, g.quats))), rows, x, {}
+            {k: v.double() for k, v in p.items()},
+            Geometry(*(y.double() for y in (g.means, g.log_scales, g.quats))),
+            rows,
+            x,
+            {},
         )
         for p, g in ((own, old), (child, new))
     )
@@ -184,7 +197,9 @@ def test_scaling_the_scene_leaves_the_image(scale: float) -> None:
     view = camera.viewmat.clone()
     view[:3, 3] *= scale
     big = {**t, "means": t["means"] * scale, "log_scales": t["log_scales"] + math.log(scale)}
-    second = render_lowered(scenes.lowered(big), replace(camera, viewmat=view), replace(settings, near=settings.near * scale))
+    second = render_lowered(
+        scenes.lowered(big), replace(camera, viewmat=view), replace(settings, near=settings.near * scale)
+    )
     assert first.alpha.max() > 0.5
     assert (second.rgb - first.rgb).abs().max() < 1e-11
     assert first.depth is not None and second.depth is not None
@@ -205,7 +220,11 @@ def test_omega0_multiplies_the_whole_phase() -> None:
 def test_a_fresh_primitive_has_the_opacity_asked_for(neurons: int) -> None:
     n = 5
     context = InitContext(
-        torch.zeros(n, 3), torch.full((n,), 0.3), torch.full((n, 3), 0.5), torch.Generator().manual_seed(0), {"alpha": 0.6}
+        torch.zeros(n, 3),
+        torch.full((n,), 0.3),
+        torch.full((n, 3), 0.5),
+        torch.Generator().manual_seed(0),
+        {"alpha": 0.6},
     )
     fresh = Primitives.initialise(CosineDensity(neurons), SphericalHarmonics(0), context)
     b2 = fresh.params["b2"]

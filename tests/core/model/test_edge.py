@@ -42,7 +42,8 @@ def test_profiles_are_those_of_the_formulas(order: int) -> None:
 @pytest.mark.parametrize("edge", [1, 2])
 @pytest.mark.parametrize("reach", [1e-4, 0.5, 3.0, 40.0, 1000.0])
 def test_any_part_of_a_chord(edge: int, reach: float) -> None:
-    """Any quadratic, as a near plane leaves it, any phase, rates up to ``reach``; relative to the largest that the integral could be."""
+    """Any quadratic, as a near plane leaves it, any phase, rates up to ``reach``; relative to the largest that the
+    integral could be."""
     g = torch.Generator().manual_seed(edge)
     count, neurons = 60, 3
     middle, half = torch.rand(count, generator=g, dtype=F64) * 1.8 - 0.9, torch.rand(count, generator=g, dtype=F64)
@@ -78,11 +79,16 @@ def test_gradients_of_a_part_of_a_chord() -> None:
 def test_a_chord_is_the_integral_of_the_density(edge: int) -> None:
     """Whole chords and parts of them, of a lowered form, against quadrature of the density at points."""
     t = scenes.tensors(8, 4, seed=2, dtype=F64)
-    geometry, form = Geometry(t["means"], t["log_scales"], t["quats"]), Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 20.0, edge)
+    geometry, form = (
+        Geometry(t["means"], t["log_scales"], t["quats"]),
+        Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 20.0, edge),
+    )
     g = torch.Generator().manual_seed(3)
     prim = torch.arange(8).repeat(10)
     d = torch.nn.functional.normalize(torch.randn(80, 3, generator=g, dtype=F64), dim=-1)
-    y = torch.nn.functional.normalize(torch.randn(80, 3, generator=g, dtype=F64), dim=-1) * torch.rand(80, 1, generator=g, dtype=F64)
+    y = torch.nn.functional.normalize(torch.randn(80, 3, generator=g, dtype=F64), dim=-1) * torch.rand(
+        80, 1, generator=g, dtype=F64
+    )
     start = geometry.means[prim] + (geometry.rotations[prim] @ (geometry.scales[prim] * y)[:, :, None])[..., 0]
     v = (geometry.rotations[prim].transpose(1, 2) @ d[:, :, None])[..., 0] / geometry.scales[prim]
     a, b = v.square().sum(-1), (y * v).sum(-1)
@@ -92,7 +98,9 @@ def test_a_chord_is_the_integral_of_the_density(edge: int) -> None:
     found = form.optical_depth(Pairs.of(geometry, prim, start, d, t0, t1))
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(200))
     at = t0[:, None] + (t1 - t0)[:, None] * (x + 1) / 2
-    sigma = cosine_density(form, geometry, prim.repeat_interleave(200), (start[:, None] + at[..., None] * d[:, None]).reshape(-1, 3))
+    sigma = cosine_density(
+        form, geometry, prim.repeat_interleave(200), (start[:, None] + at[..., None] * d[:, None]).reshape(-1, 3)
+    )
     exact = (sigma.reshape(80, 200) * w).sum(-1) * (t1 - t0) / 2
     largest = (t1 - t0) * (t["b2"].abs()[:, 0] + t["w2"].abs().sum(-1))[prim] / geometry.length_scale[prim]
     assert ((found - exact).abs() / largest).max() <= 1e-12
@@ -126,7 +134,10 @@ def test_the_edge_is_0_1_or_2(wrong: object) -> None:
     ("words", "message"),
     [
         (["task=static", "model.density.edge=3"], "model.density.edge=3: expected 0, 1 or 2"),
-        (["task=relight", "model.density.edg=1"], "model.density.edg: no such setting; did you mean 'model.density.edge'?"),
+        (
+            ["task=relight", "model.density.edg=1"],
+            "model.density.edg: no such setting; did you mean 'model.density.edge'?",
+        ),
         (["task=dynamic", "model.density.omega0=-1"], "model.density.omega0=-1: expected a number above 0"),
         (["task=static", "model.density.gain=2"], "model.density.gain=2: expected true or false"),
         (
@@ -144,7 +155,9 @@ def test_another_form_takes_none_of_the_presets_settings() -> None:
     assert compose(["task=static"], check_output=False).model.density == {"form": "cosine", "edge": 2, "gain": True}
     for words in (["model.density.form=gaussian"], ["model.density={form: gaussian}"]):
         assert compose(["task=static", *words], check_output=False).model.density == {"form": "gaussian"}
-    own = compose(["task=static", "model.density.form=cosine", "model.density.edge=1"], check_output=False).model.density
+    own = compose(
+        ["task=static", "model.density.form=cosine", "model.density.edge=1"], check_output=False
+    ).model.density
     assert own == {"form": "cosine", "edge": 1, "gain": True}
 
 
@@ -160,7 +173,12 @@ def test_gains_beyond_the_limit_count_as_the_limit() -> None:
     w2, b2 = torch.ones(5, 2), torch.ones(5, 1)
     log_gain = torch.tensor([[-80.0], [-20.0], [0.0], [20.0], [80.0]], requires_grad=True)
     wide, offset = amplified(w2, b2, log_gain)
-    assert torch.isfinite(wide).all() and torch.equal(wide[0], wide[1]) and torch.equal(offset[4], offset[3]) and offset[2].item() == 1
+    assert (
+        torch.isfinite(wide).all()
+        and torch.equal(wide[0], wide[1])
+        and torch.equal(offset[4], offset[3])
+        and offset[2].item() == 1
+    )
     offset.log().sum().backward()
     grad = log_gain.grad
     assert grad is not None and grad[:, 0].tolist() == pytest.approx([0, 1, 1, 1, 0])

@@ -89,5 +89,9 @@ def test_strengths_that_do_not_fit_into_a_gain_stay() -> None:
 
 def test_fields_without_cosines_stay_as_they_are() -> None:
     model = example("harmonics")[1]
-    assert isinstance(model.colour.lower(model.of(model.colour), model.geometry, scenes.camera(), CONDITIONS["relight"]), Constant)
-    assert all(torch.equal(value, model.params[key]) for key, value in model.colour.folded(model.of(model.colour)).items())
+    assert isinstance(
+        model.colour.lower(model.of(model.colour), model.geometry, scenes.camera(), CONDITIONS["relight"]), Constant
+    )
+    assert all(
+        torch.equal(value, model.params[key]) for key, value in model.colour.folded(model.of(model.colour)).items()
+    )

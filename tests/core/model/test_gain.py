@@ -18,7 +18,10 @@ def formula(w2: Tensor, b2: Tensor, log_gain: Tensor) -> tuple[Tensor, Tensor]:
 
 def given(neurons: int, dtype: torch.dtype, flat: bool) -> list[Tensor]:
     g = torch.Generator().manual_seed(neurons)
-    w2, b2 = torch.randn(8, neurons, generator=g, dtype=torch.float64), torch.randn(8, 1, generator=g, dtype=torch.float64)
+    w2, b2 = (
+        torch.randn(8, neurons, generator=g, dtype=torch.float64),
+        torch.randn(8, 1, generator=g, dtype=torch.float64),
+    )
     log_gain = torch.tensor([0.0, 1.5, -3.0, GAIN_LIMIT, -GAIN_LIMIT, 25.0, -400.0, 1e-9], dtype=torch.float64)[:, None]
     b2[0] = 0.0
     tensors = [w2, b2.reshape(-1) if flat else b2, log_gain.reshape(-1) if flat else log_gain]
@@ -30,10 +33,15 @@ def given(neurons: int, dtype: torch.dtype, flat: bool) -> list[Tensor]:
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-6), (torch.float64, 1e-14)])
 def test_it_is_the_formula_forward_and_backward(dtype: torch.dtype, tolerance: float, neurons: int, flat: bool) -> None:
     """Beyond the limit a gain has no gradient, at it one."""
-    mine, exact = given(neurons, dtype, flat), [x.detach().double().requires_grad_() for x in given(neurons, dtype, flat)]
+    mine, exact = (
+        given(neurons, dtype, flat),
+        [x.detach().double().requires_grad_() for x in given(neurons, dtype, flat)],
+    )
     found, wanted = amplified(*mine), formula(*exact)
     same = formula(*given(neurons, dtype, flat))
-    assert all(torch.equal(a, b) for a, b in zip(found, same, strict=True)), "drawn values do not depend on how gradients are found"
+    assert all(torch.equal(a, b) for a, b in zip(found, same, strict=True)), (
+        "drawn values do not depend on how gradients are found"
+    )
     pull = [torch.randn(x.shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64) for x in wanted]
     torch.autograd.backward(list(found), [p.to(dtype) for p in pull])
     torch.autograd.backward(list(wanted), [p.to(dtype).double() for p in pull])

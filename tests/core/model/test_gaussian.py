@@ -1,4 +1,5 @@
-"""The Gaussian density: its closed line integral against quadrature, its mass, and the way it trains like any other field."""
+"""The Gaussian density: its closed line integral against quadrature, its mass, and the way it trains like any other
+field."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ def model(count: int = 20, dtype: torch.dtype = torch.float64) -> Primitives:
     return Primitives(GaussianDensity(), SphericalHarmonics(0), {k: v.requires_grad_() for k, v in t.items()})
 
 
-def integral(field: GaussianDensity, t: dict[str, Tensor], prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor) -> Tensor:
+def integral(
+    field: GaussianDensity, t: dict[str, Tensor], prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor
+) -> Tensor:
     form = field.lower(t, geometry(t), {})
     assert isinstance(form, Opaque)
     return form.line_integral(prim, o, d, t0, t1)
@@ -59,7 +62,10 @@ def chords(t: dict[str, Tensor], distance: float, seed: int = 0) -> tuple[Tensor
     g, n = geometry(t), len(t["means"])
     d = torch.nn.functional.normalize(torch.randn(n, 3, generator=gen, dtype=torch.float64), dim=1)
     u = torch.nn.functional.normalize(torch.randn(n, 3, generator=gen, dtype=torch.float64), dim=1)
-    inside = g.means + (g.rotations @ (g.scales * u * torch.rand(n, 1, generator=gen, dtype=torch.float64))[:, :, None])[..., 0]
+    inside = (
+        g.means
+        + (g.rotations @ (g.scales * u * torch.rand(n, 1, generator=gen, dtype=torch.float64))[:, :, None])[..., 0]
+    )
     o = inside - distance * d
     to_sphere = g.rotations.transpose(1, 2) / g.scales[:, :, None]
     y, v = (to_sphere @ (inside - g.means)[:, :, None])[..., 0], (to_sphere @ d[:, :, None])[..., 0]
@@ -99,7 +105,8 @@ def test_line_integral_equals_quadrature(deviations: float, distance: float) -> 
 
 
 def test_bell_integral_keeps_its_digits_everywhere() -> None:
-    """Against Gauss-Legendre on the interval, relative to the integral itself, in the far tails and on the seams of the three forms."""
+    """Against Gauss-Legendre on the interval, relative to the integral itself, in the far tails and on the seams of the
+    three forms."""
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(100))
     u, half = torch.meshgrid(
         torch.linspace(-7, 7, 57, dtype=torch.float64), torch.logspace(-9, 0.3, 80, dtype=torch.float64), indexing="ij"
@@ -126,7 +133,13 @@ def test_gradients_are_finite_differences() -> None:
         now = dict(zip(names, values[:4], strict=True))
         o, d, a, b = values[4:]
         whole = integral(field, now, prim, o, d, a, b)
-        return torch.cat([whole, integral(field, now, prim, o, d, middle, b), integral(field, now, prim, o, d, middle, middle + 1e-3)])
+        return torch.cat(
+            [
+                whole,
+                integral(field, now, prim, o, d, middle, b),
+                integral(field, now, prim, o, d, middle, middle + 1e-3),
+            ]
+        )
 
     inputs = [v.clone().requires_grad_() for v in (*(t[n] for n in names), o, d, t0, t1)]
     assert torch.autograd.gradcheck(both, inputs, atol=1e-7, rtol=1e-5)
@@ -142,7 +155,8 @@ def mass(t: dict[str, Tensor]) -> Tensor:
 
 @pytest.mark.parametrize("deviations", [1.0, 3.0])
 def test_total_mass(deviations: float) -> None:
-    """kappa/m prod s (2 pi)^(3/2)/c^3 (erf(c/sqrt 2) - sqrt(2/pi) c exp(-c^2/2)), summed over a grid of parallel rays."""
+    """kappa/m prod s (2 pi)^(3/2)/c^3 (erf(c/sqrt 2) - sqrt(2/pi) c exp(-c^2/2)), summed over a grid of parallel
+    rays."""
     field, t = GaussianDensity(deviations), tensors(1, seed=4)
     n = 400
     line = (torch.arange(n, dtype=torch.float64) + 0.5) / n * 2 - 1
@@ -165,14 +179,18 @@ def test_total_mass(deviations: float) -> None:
 
 def test_parameters_and_start() -> None:
     field = GaussianDensity()
-    whole = Primitives(field, SphericalHarmonics(3), {**tensors(2), "sh_rest": torch.zeros(2, 15, 3), "sh_dc": torch.zeros(2, 3)})
+    whole = Primitives(
+        field, SphericalHarmonics(3), {**tensors(2), "sh_rest": torch.zeros(2, 15, 3), "sh_dc": torch.zeros(2, 3)}
+    )
     assert whole.parameters_per_primitive == 11 + 48
     unit = {"means": torch.zeros(1, 3), "log_scales": torch.zeros(1, 3), "quats": torch.tensor([[1.0, 0, 0, 0]])}
     for settings, alpha in (({"alpha": 0.7}, 0.7), ({}, 0.8), ({"mode": "paper"}, 0.1)):
         context = InitContext(unit["means"], torch.ones(1), torch.ones(1, 3), torch.Generator(), settings)
         start = {**unit, "log_amplitude": field.parameters()[0].init(context)}
         ends = torch.tensor([1.0]), torch.tensor([3.0])
-        depth = integral(field, start, torch.tensor([0]), torch.tensor([[-2.0, 0, 0]]), torch.tensor([[1.0, 0, 0]]), *ends)
+        depth = integral(
+            field, start, torch.tensor([0]), torch.tensor([[-2.0, 0, 0]]), torch.tensor([[1.0, 0, 0]]), *ends
+        )
         assert 1 - math.exp(-depth.item()) == pytest.approx(alpha, rel=1e-6)
 
 
@@ -208,7 +226,10 @@ def test_scaled_density() -> None:
 def test_every_strategy_of_population() -> None:
     m = model()
     camera = scenes.camera(32, 24)
-    for strategy in (Relocate(PopulationSettings(fraction=0.2)), Gradient(PopulationSettings(grow_threshold=0.0, clone_scale=0.1))):
+    for strategy in (
+        Relocate(PopulationSettings(fraction=0.2)),
+        Gradient(PopulationSettings(grow_threshold=0.0, clone_scale=0.1)),
+    ):
         output = render(m, camera, {}, RenderSettings())
         tally = output.watch(torch.ones(24, 32))
         output.rgb.square().mean().backward()
@@ -273,7 +294,9 @@ def test_rates_are_still_checked(tmp_path: Path) -> None:
         f"output_dir={tmp_path / 'run'}",
         "train.rates.log_amplitud=1",
     ]
-    with pytest.raises(ConfigError, match=r"train\.rates\.log_amplitud: no such parameter; did you mean 'log_amplitude'"):
+    with pytest.raises(
+        ConfigError, match=r"train\.rates\.log_amplitud: no such parameter; did you mean 'log_amplitude'"
+    ):
         running.run(compose(words))
     with pytest.raises(ConfigError, match=r"model\.density\.form=gausian: expected cosine or gaussian"):
         compose(["model.density.form=gausian"])

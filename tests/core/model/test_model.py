@@ -99,7 +99,8 @@ def test_a_tensor_too_many() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "shape"), [("W1", (4, 7, 3)), ("b2", (4,)), ("quats", (4, 3)), ("sh_rest", (3, 15, 3)), ("log_scales", (4, 1))]
+    ("name", "shape"),
+    [("W1", (4, 7, 3)), ("b2", (4,)), ("quats", (4, 3)), ("sh_rest", (3, 15, 3)), ("log_scales", (4, 1))],
 )
 def test_a_wrong_shape_is_named(name: str, shape: tuple[int, ...]) -> None:
     model = build()

@@ -1,4 +1,5 @@
-"""Closed forms know their mathematics: what is asked along chords, against quadrature and against what the forms' tensors say."""
+"""Closed forms know their mathematics: what is asked along chords, against quadrature and against what the forms'
+tensors say."""
 
 from __future__ import annotations
 
@@ -88,7 +89,10 @@ def test_colours_along_chords_and_at_centres() -> None:
     assert isinstance(varies, RayNet) and varies.flat is None and varies.per_primitive
     phase = (varies.Wx[pairs.prim] * pairs.local[:, None]).sum(-1) + varies.bias[pairs.prim]
     expected = (varies.base[pairs.prim] + (varies.Wout[pairs.prim] * phase.cos()[:, None]).sum(-1)).clamp_min(0)
-    assert torch.allclose(net.seen(pairs), expected) and (net.seen(pairs) - net.center_colors(position)[pairs.prim]).abs().max() > 0.01
+    assert (
+        torch.allclose(net.seen(pairs), expected)
+        and (net.seen(pairs) - net.center_colors(position)[pairs.prim]).abs().max() > 0.01
+    )
     code = OpaqueColour(lambda prim, x, d: torch.cat([x, d[:, :1]], 1), 4)
     opaque = replace(low, colour=code)
     assert code.flat is None and not code.per_primitive
@@ -100,9 +104,13 @@ def test_colours_along_chords_and_at_centres() -> None:
 def test_code_that_returns_something_else_is_named() -> None:
     low = model()
     pairs = chords(low)[0]
-    with pytest.raises(FormError, match=rf"^density lowered to Opaque: line_integral returned shape \({M}, 1\); expected \({M},\)"):
+    with pytest.raises(
+        FormError, match=rf"^density lowered to Opaque: line_integral returned shape \({M}, 1\); expected \({M},\)"
+    ):
         replace(low, density=Opaque(lambda prim, o, d, t0, t1: t0[:, None])).optical_depth(pairs)
-    with pytest.raises(FormError, match=rf"^colour lowered to OpaqueColour: radiance returned shape \({M}, 3\); expected \({M}, 2\)"):
+    with pytest.raises(
+        FormError, match=rf"^colour lowered to OpaqueColour: radiance returned shape \({M}, 3\); expected \({M}, 2\)"
+    ):
         replace(low, colour=OpaqueColour(lambda prim, x, d: x, 2)).seen(pairs)
 
 
@@ -114,7 +122,8 @@ KERNELS = {
     "core/volumes/grid.py",
     "core/volumes/points.py",
 }
-"""Where code asks which form it has, as compiled kernels, and the samples that stand beside a closed form, know only some."""
+"""Where code asks which form it has, as compiled kernels, and the samples that stand beside a closed form, know only
+some."""
 
 OWN = {"core/model/forms.py", "tasks/dynamic/invisible.py"}
 """A sum of two of a kind; a density that is the task's own."""

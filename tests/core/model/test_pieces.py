@@ -59,7 +59,8 @@ def test_no_number_is_in_two_pieces_and_each_has_some(density: Field, colour: Fi
 
 @pytest.mark.parametrize(("density", "colour"), PAIRS, ids=lambda field: type(field).__name__)
 def test_of_a_piece_that_is_gone_nothing_is_left(density: Field, colour: Field) -> None:
-    """A primitive whose piece is zero looks like one whose other numbers of the piece never were: moving zeros elsewhere changes nothing."""
+    """A primitive whose piece is zero looks like one whose other numbers of the piece never were: moving zeros
+    elsewhere changes nothing."""
     model = made(density, colour)
     for name, piece in pieces_by_name(model.density, model.colour).items():
         everywhere = torch.ones(COUNT, dtype=torch.bool)
@@ -74,7 +75,10 @@ def test_a_neuron_that_is_gone_is_a_field_without_it() -> None:
     model = made(*PAIRS[0])
     piece = pieces_by_name(model.density, model.colour)["density.neuron 1"]
     empty = without({"": (piece, torch.ones(COUNT, dtype=torch.bool))}, model.params)
-    fewer = {name: value[:, [0, 2]] if name in ("W1", "b1", "w2") else value for name, value in model.of(model.density).items()}
+    fewer = {
+        name: value[:, [0, 2]] if name in ("W1", "b1", "w2") else value
+        for name, value in model.of(model.density).items()
+    }
     prim, x = torch.arange(COUNT), model.params["means"] + 0.02
     own = {name: empty[name] for name in model.of(model.density)}
     found = model.density.density(own, model.geometry, prim, x, {})
@@ -106,7 +110,9 @@ def test_files_leave_zeros_out_and_give_them_back(density: Field, colour: Field)
     stored, sparse = split_off(model.params, own)
     again = whole(stored, sparse, own, "file")
     assert sparse and again.keys() == model.params.keys()
-    assert all(torch.equal(again[name].view(torch.int32), value.view(torch.int32)) for name, value in model.params.items())
+    assert all(
+        torch.equal(again[name].view(torch.int32), value.view(torch.int32)) for name, value in model.params.items()
+    )
     assert sum(t.numel() * t.element_size() for t in stored.values()) < 4 * model.count * model.parameters_per_primitive
 
 
@@ -143,7 +149,9 @@ def test_files_of_pieces_as_they_were_load(density: Field, colour: Field) -> Non
     again = of_pieces(stored, names, own, pieces, "file")
     apart = {parameter for name in names for parameter in pieces[name].places}
     assert apart and again.keys() == model.params.keys()
-    assert all(torch.equal(again[name], taken[name] if name in apart else value) for name, value in model.params.items())
+    assert all(
+        torch.equal(again[name], taken[name] if name in apart else value) for name, value in model.params.items()
+    )
     stored.pop("rows|" + names[0])
     with pytest.raises(CheckpointError, match="is missing"):
         of_pieces(stored, names, own, pieces, "file")
@@ -157,7 +165,13 @@ def task() -> TaskSpec:
 @pytest.fixture
 def file(tmp_path: Path, task: TaskSpec) -> Path:
     path = tmp_path / "model.safetensors"
-    checkpoint.save_model(path, pruned(made(CosineDensity(2, edge=2, gain=True), SphericalHarmonics(3))), task.name, {}, without_zeros=True)
+    checkpoint.save_model(
+        path,
+        pruned(made(CosineDensity(2, edge=2, gain=True), SphericalHarmonics(3))),
+        task.name,
+        {},
+        without_zeros=True,
+    )
     return path
 
 
@@ -173,10 +187,16 @@ def test_a_pruned_model_loads_as_it_was(file: Path, task: TaskSpec) -> None:
 
 LIES = {
     "no mask": (lambda t: t.pop("sh_rest|there"), "sh_rest|there is missing"),
-    "a short mask": (lambda t: t.update({"sh_rest|there": torch.zeros(1, dtype=torch.uint8)}), f"expected torch.uint8 ({BITS},)"),
+    "a short mask": (
+        lambda t: t.update({"sh_rest|there": torch.zeros(1, dtype=torch.uint8)}),
+        f"expected torch.uint8 ({BITS},)",
+    ),
     "a mask of floats": (lambda t: t.update({"sh_rest|there": torch.zeros(BITS)}), f"expected torch.uint8 ({BITS},)"),
     "numbers too few": (lambda t: t.update({"sh_rest|numbers": t["sh_rest|numbers"][:-1]}), "sh_rest|numbers is"),
-    "numbers too many": (lambda t: t.update({"sh_rest|there": torch.zeros(BITS, dtype=torch.uint8)}), "expected torch.float32 (0,)"),
+    "numbers too many": (
+        lambda t: t.update({"sh_rest|there": torch.zeros(BITS, dtype=torch.uint8)}),
+        "expected torch.float32 (0,)",
+    ),
     "another type": (lambda t: t.update({"sh_rest|numbers": t["sh_rest|numbers"].double()}), "is torch.float64"),
     "a part missing": (lambda t: t.pop("W1|numbers"), "W1|numbers is missing"),
     "a part of nothing": (lambda t: t.update({"sh_all|numbers": torch.zeros(1)}), "belongs to no parameter"),

@@ -62,7 +62,9 @@ def test_every_reduction_is_a_model_that_can_be_stored_and_drawn(density: Field,
         assert smaller.parameters_per_primitive < model.parameters_per_primitive
         smaller.lower(camera(), CONDITIONS).check()
         values = getattr(model, kind).reductions()[name]
-        assert values == tuple(sorted(values, reverse=True)) and all(v < level(getattr(model, kind), name) for v in values)
+        assert values == tuple(sorted(values, reverse=True)) and all(
+            v < level(getattr(model, kind), name) for v in values
+        )
     offered = {(kind, name) for kind, name, _, _ in found}
     assert offered == {(kind, name) for kind in ("density", "colour") for name in getattr(model, kind).reductions()}
 
@@ -91,14 +93,21 @@ def test_dropped_bands_are_the_basis_cut_off() -> None:
 
 def test_counts() -> None:
     assert (
-        smaller_counts(8) == (6, 4, 2, 0) and smaller_counts(2) == (1, 0) and smaller_counts(1) == (0,) and smaller_counts(3) == (2, 1, 0)
+        smaller_counts(8) == (6, 4, 2, 0)
+        and smaller_counts(2) == (1, 0)
+        and smaller_counts(1) == (0,)
+        and smaller_counts(3) == (2, 1, 0)
     )
 
 
 def inside(geometry: Geometry, count: int, generator: torch.Generator) -> Tensor:
     """(N, count, 3) points, uniform in each ellipsoid."""
     y = torch.randn((geometry.count, count, 3), generator=generator, dtype=torch.float64)
-    y = y / y.norm(dim=-1, keepdim=True) * torch.rand((geometry.count, count, 1), generator=generator, dtype=torch.float64) ** (1 / 3)
+    y = (
+        y
+        / y.norm(dim=-1, keepdim=True)
+        * torch.rand((geometry.count, count, 1), generator=generator, dtype=torch.float64) ** (1 / 3)
+    )
     return (
         geometry.means.double()[:, None]
         + (geometry.rotations.double()[:, None] @ (geometry.scales.double()[:, None] * y)[..., None])[..., 0]
@@ -150,7 +159,11 @@ def test_means_of_phases_that_advance_are_those_over_the_sequence() -> None:
     weights = torch.ones(41, dtype=torch.float64)
     weights[0] = weights[-1] = 0.5
     mean = (
-        sum(w * cosine_density(f, wide, prim, x.reshape(-1, 3)).reshape(COUNT, -1).mean(1) for w, f in zip(weights, form, strict=True)) / 40
+        sum(
+            w * cosine_density(f, wide, prim, x.reshape(-1, 3)).reshape(COUNT, -1).mean(1)
+            for w, f in zip(weights, form, strict=True)
+        )
+        / 40
     )
     amplitude = model.params["w2"].abs().sum(1) / model.geometry.length_scale
     assert ((mean * model.geometry.length_scale - params["b2"][:, 0]).abs() / amplitude.clamp_min(1e-6)).median() < 0.05
@@ -200,7 +213,9 @@ def test_a_still_phase_is_the_mean_of_the_moving_one() -> None:
     assert field.settings()["time"] == "none" and "W_t" not in params
     prim, x = torch.arange(COUNT), model.params["means"] + 0.01
     times = (torch.arange(400) + 0.5) / 400
-    mean = torch.stack([density.density(model.of(density), model.geometry, prim, x, {"time": t}) for t in times]).mean(0)
+    mean = torch.stack([density.density(model.of(density), model.geometry, prim, x, {"time": t}) for t in times]).mean(
+        0
+    )
     still = field.density(params, model.geometry, prim, x, CONDITIONS)
     assert torch.allclose(still, mean, rtol=1e-3, atol=1e-3 * float(mean.abs().max()))
 

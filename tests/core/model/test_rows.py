@@ -22,7 +22,9 @@ ROWS = {
 def tensors(dtype: torch.dtype) -> dict[str, Tensor]:
     g = torch.Generator().manual_seed(0)
     shapes: dict[str, tuple[int, ...]] = {"means": (3,), "W1": (2, 3), "b2": (1,), "scalar": (), "nothing": (0, 3)}
-    return {n: torch.randn(9, *s, generator=g, dtype=torch.float64).to(dtype).requires_grad_() for n, s in shapes.items()}
+    return {
+        n: torch.randn(9, *s, generator=g, dtype=torch.float64).to(dtype).requires_grad_() for n, s in shapes.items()
+    }
 
 
 def pull(taken: dict[str, Tensor]) -> None:

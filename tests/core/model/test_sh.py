@@ -143,7 +143,9 @@ def test_settings_rebuild_the_field() -> None:
     assert (again.degree, again.channels, again.active) == (2, 4, 2)
 
 
-def on_blocks(means: torch.Tensor, dc: torch.Tensor, rest: torch.Tensor, origin: torch.Tensor, degree: int) -> torch.Tensor:
+def on_blocks(
+    means: torch.Tensor, dc: torch.Tensor, rest: torch.Tensor, origin: torch.Tensor, degree: int
+) -> torch.Tensor:
     """The card's kernels, on Warp's CPU blocks."""
     pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
     from neuprim.core.model.colours.sh_warp import fused_colors
@@ -157,8 +159,13 @@ def test_values_and_gradients_are_those_of_float64(degree: int, kernels: Callabl
     """Also of the camera's position, and for colours that are cut off at zero."""
     g = torch.Generator().manual_seed(degree)
     shapes = {"means": (50, 3), "dc": (50, 4), "rest": (50, 15, 4), "origin": (3,)}
-    exact = {name: torch.randn(shape, generator=g, dtype=torch.float64).requires_grad_() for name, shape in shapes.items()}
-    mine = {name: value.detach().to(torch.float64 if name == "origin" else torch.float32).requires_grad_() for name, value in exact.items()}
+    exact = {
+        name: torch.randn(shape, generator=g, dtype=torch.float64).requires_grad_() for name, shape in shapes.items()
+    }
+    mine = {
+        name: value.detach().to(torch.float64 if name == "origin" else torch.float32).requires_grad_()
+        for name, value in exact.items()
+    }
     with torch.no_grad():
         for name, value in exact.items():
             value.copy_(mine[name])

@@ -1,4 +1,5 @@
-"""A renderer backend is one row of one table: everything that names, chooses, compiles or judges backends reads it there."""
+"""A renderer backend is one row of one table: everything that names, chooses, compiles or judges backends reads it
+there."""
 
 from __future__ import annotations
 
@@ -74,7 +75,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_commands_know_it(fake: Fake, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
-    monkeypatch.setattr("neuprim.runs.compile.subprocess.Popen", lambda *a, **k: pytest.fail("nothing of this run compiles ahead"))
+    monkeypatch.setattr(
+        "neuprim.runs.compile.subprocess.Popen", lambda *a, **k: pytest.fail("nothing of this run compiles ahead")
+    )
     folder = tmp_path / "run"
     assert main(["run", *words(scene, folder, 3, "renderer.backend=fake")]) == 0
     drawn = fake.frames
@@ -89,7 +92,9 @@ def test_commands_know_it(fake: Fake, scene: Path, tmp_path: Path, monkeypatch: 
     assert fake.frames > evaluated
 
 
-def test_a_run_without_it_says_what_there_is(fake: Fake, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_without_it_says_what_there_is(
+    fake: Fake, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(backends, "TABLE", backends.TABLE[1:])
     with pytest.raises(ConfigError, match=r"^renderer\.backend=fake: expected auto, cuda, cpu or reference$"):
         compose(words(scene, tmp_path / "run", 3, "renderer.backend=fake"))
@@ -111,7 +116,10 @@ def test_auto_is_the_first_that_does_not_refuse(fake: Fake) -> None:
     assert backends.choose(low, RenderSettings(), camera).name == "fake"
     assert render_lowered(low, camera, RenderSettings()).stats.backend == "fake" and fake.frames == 1
     assert backends.choose(net, RenderSettings(), camera).name == "cpu"
-    assert backends.choose(replace(net, density=Opaque(lambda prim, o, d, t0, t1: t1 - t0)), RenderSettings(), camera).name == "reference"
+    assert (
+        backends.choose(replace(net, density=Opaque(lambda prim, o, d, t0, t1: t1 - t0)), RenderSettings(), camera).name
+        == "reference"
+    )
     fake.broken = "no such device"
     assert backends.choose(low, RenderSettings(), camera).name == "cpu"
     here = ["cpu", "reference"] if backends.no_card() else ["cuda", "cpu", "reference"]
@@ -120,10 +128,15 @@ def test_auto_is_the_first_that_does_not_refuse(fake: Fake) -> None:
 
 def test_a_refusal_names_it_and_one_that_can(fake: Fake) -> None:
     net, camera = scenes.lowered(scenes.tensors(3, hidden=2)), scenes.camera(8, 8)
-    with pytest.raises(BackendUnavailable, match=r"^renderer\.backend=fake cannot draw RayNet colour\. Use renderer\.backend=cpu$"):
+    with pytest.raises(
+        BackendUnavailable, match=r"^renderer\.backend=fake cannot draw RayNet colour\. Use renderer\.backend=cpu$"
+    ):
         render_lowered(net, camera, RenderSettings(backend="fake"))
     fake.broken = "no such device"
-    with pytest.raises(BackendUnavailable, match=r"^renderer\.backend=fake cannot run here: no such device\. Use renderer\.backend=cpu$"):
+    with pytest.raises(
+        BackendUnavailable,
+        match=r"^renderer\.backend=fake cannot run here: no such device\. Use renderer\.backend=cpu$",
+    ):
         render_lowered(scenes.lowered(scenes.tensors(3)), camera, RenderSettings(backend="fake"))
 
 
@@ -143,7 +156,9 @@ def diagnosis() -> dict[str, str]:
 
 
 def test_doctor_asks_every_row(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backends, "TABLE", tuple(b for b in backends.TABLE if b.name != "cpu"))  # whose kernels take long to load
+    monkeypatch.setattr(
+        backends, "TABLE", tuple(b for b in backends.TABLE if b.name != "cpu")
+    )  # whose kernels take long to load
     assert diagnosis() == {"fake": "works", "reference": "works"}
     assert fake.frames == 1
     fake.dim = 0.5
@@ -157,12 +172,16 @@ def test_gradients_of_intrinsics_are_asked_of_the_row(fake: Fake, monkeypatch: p
     t = scenes.tensors(4)
     t["b2"] = t["b2"][:, 0]
     camera = scenes.camera(8, 6)
-    K = torch.tensor([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], dtype=torch.float64, requires_grad=True)
+    K = torch.tensor(
+        [[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], dtype=torch.float64, requires_grad=True
+    )
 
     def draw() -> Any:
         return neuprim.rasterize(**t, viewmats=camera.viewmat[None], Ks=K, width=8, height=6, backend="fake")
 
-    with pytest.raises(BackendUnavailable, match=r'Ks requires a gradient, which backend="fake" .* pass backend="reference" or'):
+    with pytest.raises(
+        BackendUnavailable, match=r'Ks requires a gradient, which backend="fake" .* pass backend="reference" or'
+    ):
         draw()
     able = tuple(replace(b, differentiates_intrinsics=True) for b in backends.TABLE)
     monkeypatch.setattr(backends, "TABLE", able)
@@ -202,5 +221,7 @@ def test_nothing_else_names_a_backend(tmp_path: Path) -> None:
     """No code decides by a backend's name; who wants the oracle says so."""
     root = Path(neuprim.__file__).parent
     assert [f"{file.relative_to(root)}:{line}" for file in sorted(root.rglob("*.py")) for line in named(file)] == []
-    (tmp_path / "x.py").write_text('if settings.backend != "reference":\n    draw(RenderSettings(backend="cpu"))\nbackend = "cpu"\n')
+    (tmp_path / "x.py").write_text(
+        'if settings.backend != "reference":\n    draw(RenderSettings(backend="cpu"))\nbackend = "cpu"\n'
+    )
     assert list(named(tmp_path / "x.py")) == [1, 2]

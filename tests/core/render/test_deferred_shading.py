@@ -56,7 +56,8 @@ def test_matter_is_shaded_and_the_background_is_not(backend: str) -> None:
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_gradients_are_those_of_the_product(backend: str) -> None:
-    """Against a factor put on by hand to the picture over black; a depth image that nothing is asked of adds nothing."""
+    """Against a factor put on by hand to the picture over black; a depth image that nothing is asked of adds
+    nothing."""
     camera, settings = scenes.camera(), RenderSettings(**by(backend))
     weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
     grads = []

@@ -74,11 +74,15 @@ def test_a_card_that_nothing_draws_on_is_not_used(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(backends, "TABLE", tuple(b for b in backends.TABLE if b.devices[0] == "cpu"))
     assert backends.no_card() == "no backend draws there"
     assert tiny.trainer(tiny.two_primitives(), 1).device == torch.device("cpu")
-    broken = Backend("card", lambda: pytest.fail("loaded"), missing=lambda: "its package is not installed", devices=("cuda",))
+    broken = Backend(
+        "card", lambda: pytest.fail("loaded"), missing=lambda: "its package is not installed", devices=("cuda",)
+    )
     monkeypatch.setattr(backends, "TABLE", (broken, *backends.TABLE))
     assert backends.no_card() == "its package is not installed"
     assert tiny.trainer(tiny.two_primitives(), 1).device == torch.device("cpu")
-    with pytest.raises(BackendUnavailable, match=r"^renderer\.device=cuda: its package is not installed; expected cpu or auto$"):
+    with pytest.raises(
+        BackendUnavailable, match=r"^renderer\.device=cuda: its package is not installed; expected cpu or auto$"
+    ):
         backends.check_device(RenderSettings(device="cuda"))
 
 
@@ -131,7 +135,12 @@ def test_tensors_say_where_a_frame_is_drawn(card: Card) -> None:
 
 def test_the_setting_says_it_too(card: Card) -> None:
     """Then tensors are moved there and the image back; gradients go the same way, and so do sums that are watched."""
-    for own, kind, name in (("cpu", CARD.type, "card"), (CARD.type, "cpu", "cpu"), ("cpu", "auto", "cpu"), (CARD.type, "auto", "card")):
+    for own, kind, name in (
+        ("cpu", CARD.type, "card"),
+        (CARD.type, "cpu", "cpu"),
+        ("cpu", "auto", "cpu"),
+        (CARD.type, "auto", "card"),
+    ):
         low, camera = frame()
         low = low.to(torch.device(own))
         low.geometry.means.requires_grad_()
@@ -151,7 +160,8 @@ def test_a_backend_of_the_card_by_name_takes_tensors_there(card: Card) -> None:
 
 
 def test_code_of_a_model_stays_where_it_is(card: Card) -> None:
-    """What only the reference draws is not moved to it; a run keeps such a model on the processor in the first place."""
+    """What only the reference draws is not moved to it; a run keeps such a model on the processor in the first
+    place."""
     low, camera = frame()
     own = replace(low, density=Opaque(lambda prim, o, d, t0, t1: t1 - t0))
     assert render_lowered(own, camera, RenderSettings()).stats.backend == "reference"
@@ -167,9 +177,15 @@ def test_a_run_keeps_a_model_where_it_is_drawn(card: Card, monkeypatch: pytest.M
     model, camera = tiny.trainer(tiny.two_primitives(), 1).model.to(torch.device("cpu")), scenes.camera(12, 10)
     assert device_of(model, RenderSettings(), camera, {}) == CARD
     assert (
-        device_of(model, setting("cpu"), camera, {}) == device_of(model, RenderSettings(backend="cpu"), camera, {}) == torch.device("cpu")
+        device_of(model, setting("cpu"), camera, {})
+        == device_of(model, RenderSettings(backend="cpu"), camera, {})
+        == torch.device("cpu")
     )
-    assert device_of(model, RenderSettings(backend="card"), camera, {}) == device_of(model, setting(CARD.type), camera, {}) == CARD
+    assert (
+        device_of(model, RenderSettings(backend="card"), camera, {})
+        == device_of(model, setting(CARD.type), camera, {})
+        == CARD
+    )
     monkeypatch.setattr(backends.TABLE[0].__class__, "refuses", lambda self, low, camera: "this", raising=False)
     object.__setattr__(backends.TABLE[0], "refuses", lambda low, camera: "this model")
     assert device_of(model, RenderSettings(), camera, {}) == torch.device("cpu")

@@ -21,7 +21,11 @@ COUNT, NEAR = 300, 0.1
 def ellipsoids(seed: int) -> Geometry:
     """Needles, plates and balls on all sides of the origin."""
     g = torch.Generator().manual_seed(seed)
-    return Geometry(4 * torch.rand(COUNT, 3, generator=g) - 2, torch.randn(COUNT, 3, generator=g) - 2, torch.randn(COUNT, 4, generator=g))
+    return Geometry(
+        4 * torch.rand(COUNT, 3, generator=g) - 2,
+        torch.randn(COUNT, 3, generator=g) - 2,
+        torch.randn(COUNT, 4, generator=g),
+    )
 
 
 def camera(seed: int) -> Camera:
@@ -29,18 +33,24 @@ def camera(seed: int) -> Camera:
     g = torch.Generator().manual_seed(100 + seed)
     eye = torch.rand(3, generator=g, dtype=torch.float64) - 0.5
     towards = torch.randn(3, generator=g, dtype=torch.float64)
-    return Camera(look_at(eye, eye + towards, torch.tensor([0.1, 0.2, 1.0], dtype=torch.float64)), 30.0, 26.0, 9.0, 22.0, 32, 24)
+    return Camera(
+        look_at(eye, eye + towards, torch.tensor([0.1, 0.2, 1.0], dtype=torch.float64)), 30.0, 26.0, 9.0, 22.0, 32, 24
+    )
 
 
 def on_surface(geometry: Geometry, count: int = 2000) -> torch.Tensor:
     """(N, count, 3) float64 points of each ellipsoid's surface."""
-    unit = torch.nn.functional.normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64), dim=1)
+    unit = torch.nn.functional.normalize(
+        torch.randn(count, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64), dim=1
+    )
     g = Geometry(*(x.double() for x in (geometry.means, geometry.log_scales, geometry.quats)))
     return g.means[:, None] + (unit[None] * g.scales[:, None]) @ g.rotations.transpose(1, 2)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_what_has_a_point_in_view_is_in_sight_and_what_is_clearly_beyond_is_not(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_has_a_point_in_view_is_in_sight_and_what_is_clearly_beyond_is_not(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(frustum, "_AT_ONCE", 70)
     geometry, view = ellipsoids(seed), camera(seed)
     found = in_sight(geometry, view, NEAR)
@@ -62,7 +72,9 @@ def test_what_has_a_point_in_view_is_in_sight_and_what_is_clearly_beyond_is_not(
 def test_an_image_of_what_is_in_sight_has_the_same_bits(seed: int) -> None:
     geometry, view = ellipsoids(seed), camera(seed)
     g = torch.Generator().manual_seed(seed)
-    density = Cosine(torch.zeros(COUNT, 0, 3), torch.zeros(COUNT, 0), torch.zeros(COUNT, 0), 3 * torch.rand(COUNT, 1, generator=g))
+    density = Cosine(
+        torch.zeros(COUNT, 0, 3), torch.zeros(COUNT, 0), torch.zeros(COUNT, 0), 3 * torch.rand(COUNT, 1, generator=g)
+    )
     colours = torch.rand(COUNT, 3, generator=g)
     found = in_sight(geometry, view, NEAR)
     assert found is not None and len(found) < COUNT

@@ -43,7 +43,9 @@ def off(found: Tensor, expected: Tensor) -> float:
 
 
 @pytest.mark.parametrize("thick", [1.0, 40.0, 3000.0])
-@pytest.mark.parametrize("settings", [EXACT, RenderSettings(), RenderSettings(backend="reference")], ids=["exact", "usual", "reference"])
+@pytest.mark.parametrize(
+    "settings", [EXACT, RenderSettings(), RenderSettings(backend="reference")], ids=["exact", "usual", "reference"]
+)
 def test_the_density_integral_is_the_sum_of_whole_chords(thick: float, settings: RenderSettings) -> None:
     one = frame(settings, thick)
     tau = chords(one.lowered, CAMERA).tau.sum(0)

@@ -1,5 +1,5 @@
-"""Sampled chords come to the closed form as the midpoint rule does: four times closer for twice the samples, sixteen times where the density
-fades to nothing with its slope."""
+"""Sampled chords come to the closed form as the midpoint rule does: four times closer for twice the samples, sixteen
+times where the density fades to nothing with its slope."""
 
 from __future__ import annotations
 
@@ -28,7 +28,12 @@ def scene(edge: int = 0, neurons: int = 4, count: int = 12) -> Lowered:
 
     geometry = Geometry(0.6 * uniform(count, 3), 0.4 * uniform(count, 3) - 0.9, uniform(count, 4))
     density = Cosine(
-        0.25 * uniform(count, neurons, 3), uniform(count, neurons), uniform(count, neurons), 2 + 0.5 * uniform(count, 1), 12.0, edge
+        0.25 * uniform(count, neurons, 3),
+        uniform(count, neurons),
+        uniform(count, neurons),
+        2 + 0.5 * uniform(count, 1),
+        12.0,
+        edge,
     )
     return Lowered(geometry, density, Constant(uniform(count, 3).abs()))
 

@@ -65,7 +65,9 @@ def test_one_frame_launches_its_kernels_once(monkeypatch: pytest.MonkeyPatch) ->
     names: list[str] = []
     genuine = passes.launch
     monkeypatch.setattr(passes, "launch", lambda kernel, *rest: names.append(kernel.key) or genuine(kernel, *rest))
-    render_parts(low.geometry, low.density, parts, COUNT, camera, RenderSettings(backend="cuda", device="cpu", depth=True))
+    render_parts(
+        low.geometry, low.density, parts, COUNT, camera, RenderSettings(backend="cuda", device="cpu", depth=True)
+    )
     assert sum("forward" in name for name in names) == 1 and len(names) <= 3
 
 
@@ -78,4 +80,6 @@ def test_what_is_not_finite_has_its_number_among_all(backend: str) -> None:
     with torch.no_grad():
         low.geometry.means[41, 0] = torch.nan
     with pytest.raises(NonFiniteError, match=r"^means of primitive 41 is not finite"):
-        render_parts(low.geometry, low.density, parts, COUNT, camera, RenderSettings(backend=backend, device="cpu", depth=True))
+        render_parts(
+            low.geometry, low.density, parts, COUNT, camera, RenderSettings(backend=backend, device="cpu", depth=True)
+        )

@@ -1,4 +1,5 @@
-"""Training that is badly treated: it never leaves the finite, or it stops by name with the checkpoint before it intact."""
+"""Training that is badly treated: it never leaves the finite, or it stops by name with the checkpoint before it
+intact."""
 
 from __future__ import annotations
 
@@ -121,7 +122,9 @@ def test_an_image_that_is_not_finite_stops_training_by_name(value: float) -> Non
     assert 0 <= trainer.step < 30
 
 
-def test_a_run_forced_out_of_the_finite_keeps_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_forced_out_of_the_finite_keeps_the_checkpoint_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = tiny.write_blender(tmp_path / "two")
 
     class Forced(Trainer):

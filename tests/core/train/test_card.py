@@ -1,4 +1,5 @@
-"""Training on a card: every tensor of a step is there, it computes what the processor computes, and files know nothing of it."""
+"""Training on a card: every tensor of a step is there, it computes what the processor computes, and files know nothing
+of it."""
 
 from __future__ import annotations
 
@@ -31,7 +32,14 @@ from tests.shards import different
 from tests.short_runs import words
 from tests.tasks.dynamic.sequences import blob
 
-LIT = ["task=relight", "scene=lit_solids", "scene.size=24", "scene.train_views=6", "scene.test_views=2", "scene.supersampling=1"]
+LIT = [
+    "task=relight",
+    "scene=lit_solids",
+    "scene.size=24",
+    "scene.train_views=6",
+    "scene.test_views=2",
+    "scene.supersampling=1",
+]
 SMALL = ["model.primitives=80", "model.neurons=2", "train.max_seconds=null"]
 TASKS = {
     "lights": [*LIT, *SMALL, "model.colour.hidden=3"],
@@ -84,8 +92,9 @@ def trained(words: list[str], dataset: Dataset | None, steps: int) -> tuple[Fitt
 
 @pytest.mark.parametrize("task", ["static", "lights", "shadows per pixel", "time"])
 def test_a_card_trains_what_the_processor_trains(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps with interventions in the population, and looks at voxels. Bit for bit what the twins compute on the processor, and but for
-    rounding what its own kernels do: training multiplies that, as Adam's first steps are as long where a gradient is nothing but rounding.
+    """Steps with interventions in the population, and looks at voxels. Bit for bit what the twins compute on the
+    processor, and but for rounding what its own kernels do: training multiplies that, as Adam's first steps are as long
+    where a gradient is nothing but rounding.
     """
     config = configured(task, tmp_path, *(["train.voxels_every=2"] if task == "time" else []))
     own, told = trained(config, None, 8)
@@ -99,9 +108,14 @@ def test_a_card_trains_what_the_processor_trains(task: str, tmp_path: Path, monk
         waits = card.waits.total()
     mine, theirs = own.trainer.state()[0], twin.trainer.state()[0]
     assert all(type(value) is Tensor and value.is_cpu for value in tensors.values()) and waits > 0
-    assert {**header, "elapsed": 0} == {**own.trainer.state()[1], "elapsed": 0} and tensors.keys() == mine.keys() == theirs.keys()
+    assert {**header, "elapsed": 0} == {
+        **own.trainer.state()[1],
+        "elapsed": 0,
+    } and tensors.keys() == mine.keys() == theirs.keys()
     assert all(torch.equal(value, theirs[name]) for name, value in tensors.items())
-    assert [replace(r, seconds=0) for r in heard] == [replace(r, seconds=0) for r in twins] and any(r.change for r in heard)
+    assert [replace(r, seconds=0) for r in heard] == [replace(r, seconds=0) for r in twins] and any(
+        r.change for r in heard
+    )
     for a, b in zip(told, heard, strict=True):
         assert (a.view, a.primitives, a.change, a.parts.keys()) == (b.view, b.primitives, b.change, b.parts.keys())
         assert b.loss == pytest.approx(a.loss, rel=2e-2) and b.psnr == pytest.approx(a.psnr, abs=0.2)
@@ -127,7 +141,13 @@ def test_what_begins_on_one_goes_on_on_the_other(strategy: str, monkeypatch: pyt
     data = tiny.two_primitives(random_background=True)
 
     def fresh() -> Trainer:
-        population = {"strategy": strategy, "fraction": 0.2, "grow_threshold": 1e-4, "prune_threshold": 1e-9, "clone_scale": 0.05}
+        population = {
+            "strategy": strategy,
+            "fraction": 0.2,
+            "grow_threshold": 1e-4,
+            "prune_threshold": 1e-9,
+            "clone_scale": 0.05,
+        }
         return tiny.trainer(data, 40, population=population)
 
     whole = fresh()
@@ -148,7 +168,11 @@ def test_what_begins_on_one_goes_on_on_the_other(strategy: str, monkeypatch: pyt
     last = fresh()
     last.load_state(*state, "back")
     rest = [last.train_step() for _ in range(4)]
-    assert last.step == 14 and torch.equal(last.order, whole.order) and torch.equal(last.generator.get_state(), whole.generator.get_state())
+    assert (
+        last.step == 14
+        and torch.equal(last.order, whole.order)
+        and torch.equal(last.generator.get_state(), whole.generator.get_state())
+    )
     assert [r.view for r in rest] == [r.view for r in reports[10:]]
     assert rest[-1].loss == pytest.approx(reports[-1].loss, rel=0.02)
 
@@ -161,13 +185,23 @@ def test_a_run_on_a_card_is_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         folder = run(compose(config))
         again = evaluate_run(folder)
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert (metrics["backend"], metrics["device"]) == (again["backend"], again["device"]) == ("card", "a pretended card")
-    assert metrics["psnr"] == again["psnr"] and (folder / "report.html").exists() and (folder / "renders" / "orbit.webp").exists()
+    assert (
+        (metrics["backend"], metrics["device"]) == (again["backend"], again["device"]) == ("card", "a pretended card")
+    )
+    assert (
+        metrics["psnr"] == again["psnr"]
+        and (folder / "report.html").exists()
+        and (folder / "renders" / "orbit.webp").exists()
+    )
     here = evaluate_run(folder)
     assert here["backend"] == "cpu" and here["psnr"] == pytest.approx(metrics["psnr"], abs=1e-3)
     run(compose([*[w for w in config if "iterations" not in w], "train.iterations=12", "resume=true"]))
     resumed = json.loads((folder / "metrics.json").read_text())
-    assert resumed["iterations"] == 12 and resumed["backend"] == "cpu" and RunConfig.from_yaml(folder).renderer.device == "auto"
+    assert (
+        resumed["iterations"] == 12
+        and resumed["backend"] == "cpu"
+        and RunConfig.from_yaml(folder).renderer.device == "auto"
+    )
 
 
 # ---------------------------------------------------------------- waits, and views made ready ahead
@@ -177,10 +211,12 @@ def test_a_run_on_a_card_is_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_step_waits_for_the_card_as_seldom_as_it_did(
     task: str, waits: int, gradients: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of the trainer, without those of the renderer. The pretended one adds some: what is watched and the image's gradient on the way to the
-    processor, gradients of tensors and two sums on the way back.
+    """Of the trainer, without those of the renderer. The pretended one adds some: what is watched and the image's
+    gradient on the way to the processor, gradients of tensors and two sums on the way back.
     """
-    config = configured(task, tmp_path, "train.population.strategy=fixed", *(["train.voxels_every=1"] if task == "time" else []))
+    config = configured(
+        task, tmp_path, "train.population.strategy=fixed", *(["train.voxels_every=1"] if task == "time" else [])
+    )
     data = start(compose(config)).dataset
     with pretended(monkeypatch) as card:
         fitted, _ = trained(config, data, 1)
@@ -264,7 +300,8 @@ def test_the_pretended_card_refuses_what_a_card_refuses(monkeypatch: pytest.Monk
 
 
 def test_primitives_in_parts_stay_on_the_card(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One rank that has all of them as its part: what is sent, found, added up and moved never mixes devices, and is what the card trains without."""
+    """One rank that has all of them as its part: what is sent, found, added up and moved never mixes devices, and is
+    what the card trains without."""
     monkeypatch.setattr("neuprim.core.train.trainer.refuse_parts", lambda *_: None)
     dataset = tiny.two_primitives()
     population = {"strategy": "relocate", "fraction": 0.2, "grow_to": 16}

@@ -21,7 +21,8 @@ SIZES = [(11, 11), (12, 40), (64, 77), (11, 200), (45, 13)]
 
 
 def pair(height: int, width: int, channels: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """A textured image and a noisy render of it, float32. (Without texture SSIM divides by almost nothing, and float32 by less.)"""
+    """A textured image and a noisy render of it, float32. (Without texture SSIM divides by almost nothing, and float32
+    by less.)"""
     g = torch.Generator().manual_seed(seed)
     y, x = torch.meshgrid(torch.linspace(0, 9, height), torch.linspace(0, 7, width), indexing="ij")
     truth = 0.5 + 0.4 * torch.sin(x[..., None] + torch.arange(channels)) * torch.cos(y[..., None])
@@ -90,7 +91,11 @@ def test_upstream_factor_reaches_the_gradient() -> None:
     rendered, truth = pair(15, 15, 3)
     _, once, _ = value_and_grad(photometric({"ssim_weight": 0.2}), rendered, truth)
     _, thrice, _ = value_and_grad(
-        lambda a, b, frame: tuple(x if i else x * 3 for i, x in enumerate(photometric({"ssim_weight": 0.2})(a, b, frame))), rendered, truth
+        lambda a, b, frame: tuple(
+            x if i else x * 3 for i, x in enumerate(photometric({"ssim_weight": 0.2})(a, b, frame))
+        ),
+        rendered,
+        truth,
     )
     assert torch.allclose(thrice, 3 * once)
 

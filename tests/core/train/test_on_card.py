@@ -36,7 +36,9 @@ def test_adam_is_the_reference() -> None:
     age[:6] = 0  # fresh rows beside old ones
     rates = [10 ** -float(torch.rand(1, generator=generator) * 3) for _ in values]
     for _ in range(20):
-        grads = [torch.randn(v.shape, generator=generator) * 10 ** float(torch.randn(1, generator=generator)) for v in values]
+        grads = [
+            torch.randn(v.shape, generator=generator) * 10 ** float(torch.randn(1, generator=generator)) for v in values
+        ]
         age += 1
         assert adam_rows(values, grads, *moments, rates, age, BETAS, LOGS)
         for k, grad in enumerate(grads):

@@ -13,21 +13,26 @@ from neuprim.core.train import optimizer as optimizer_module
 from neuprim.core.train.optimizer import RowAdam, adam_step_reference
 
 SPECS = tuple(
-    ParameterSpec(n, s, 0.0, lambda c: torch.zeros(0)) for n, s in (("means", (3,)), ("W1", (4, 3)), ("b2", (1,)), ("none", (0, 3)))
+    ParameterSpec(n, s, 0.0, lambda c: torch.zeros(0))
+    for n, s in (("means", (3,)), ("W1", (4, 3)), ("b2", (1,)), ("none", (0, 3)))
 )
 RATES = {"means": 1e-2, "W1": 3e-3, "b2": 0.1, "none": 1.0}
 
 
 def params(count: int = 7, seed: int = 0, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
     g = torch.Generator().manual_seed(seed)
-    return {s.name: torch.randn(count, *s.shape, generator=g, dtype=torch.float64).to(dtype).requires_grad_() for s in SPECS}
+    return {
+        s.name: torch.randn(count, *s.shape, generator=g, dtype=torch.float64).to(dtype).requires_grad_() for s in SPECS
+    }
 
 
 def set_grads(p: dict[str, Tensor], seed: int) -> None:
     """Gradients of very different sizes, some exactly zero."""
     g = torch.Generator().manual_seed(seed)
     for v in p.values():
-        grad = torch.randn(v.shape, generator=g, dtype=torch.float64) * 10.0 ** torch.randint(-12, 3, v.shape, generator=g)
+        grad = torch.randn(v.shape, generator=g, dtype=torch.float64) * 10.0 ** torch.randint(
+            -12, 3, v.shape, generator=g
+        )
         v.grad = torch.where(torch.rand(v.shape, generator=g) < 0.2, torch.zeros_like(grad), grad).to(v.dtype)
 
 
@@ -158,7 +163,9 @@ def test_large_finite_gradients_are_allowed() -> None:
     p = params()
     for v in p.values():
         v.grad = torch.full_like(v, 1e19)
-    p["b2"].grad = torch.full_like(p["b2"], 3e38)  # the sum overflows, no value does; nor is it squared into anything but infinity
+    p["b2"].grad = torch.full_like(
+        p["b2"], 3e38
+    )  # the sum overflows, no value does; nor is it squared into anything but infinity
     RowAdam(SPECS, p).step(p, RATES)
     assert all(bool(torch.isfinite(v).all()) for v in p.values())
 

@@ -82,7 +82,9 @@ def test_coarse_steps_look_at_small_images(plain: Dataset, monkeypatch: pytest.M
     from neuprim.core.train import trainer as module
 
     drawn = module.render
-    monkeypatch.setattr(module, "render", lambda m, camera, *rest: sizes.append(camera.width) or drawn(m, camera, *rest))
+    monkeypatch.setattr(
+        module, "render", lambda m, camera, *rest: sizes.append(camera.width) or drawn(m, camera, *rest)
+    )
     for _ in tiny.trainer(plain, 20, coarse=2, coarse_until=0.5).run():
         pass
     full = plain.train.view(0).camera.width
@@ -129,7 +131,9 @@ def test_gains_are_saved_and_go_on(plain: Dataset, tmp_path: Path) -> None:
 
 
 def test_gains_are_for_photographs(plain: Dataset) -> None:
-    with pytest.raises(ConfigError, match=r"train\.exposure_rate=0\.01: images of two have alpha; expected opaque photographs"):
+    with pytest.raises(
+        ConfigError, match=r"train\.exposure_rate=0\.01: images of two have alpha; expected opaque photographs"
+    ):
         tiny.trainer(plain, 30, exposure_rate=0.01)
 
 

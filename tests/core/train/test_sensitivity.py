@@ -61,7 +61,9 @@ def test_whole_primitives_count_by_the_squares_of_their_weights() -> None:
         lit = torch.full((one.count, 3), -0.5 / 0.28209479177387814)  # black
         lit[row] = 0.5 / 0.28209479177387814  # white: its image is its weights
         weights = images(
-            Primitives(one.density, SphericalHarmonics(0), {**plain, "sh_dc": lit}), replace(dataset, background=torch.zeros(3)), views
+            Primitives(one.density, SphericalHarmonics(0), {**plain, "sh_dc": lit}),
+            replace(dataset, background=torch.zeros(3)),
+            views,
         )
         true = float(weights.square().mean())
         assert abs(float(mean[row]) - true) < 0.5 * true + 1e-9

@@ -40,7 +40,13 @@ def random_background() -> Dataset:
 STRATEGIES: dict[str, dict[str, Any]] = {
     "fixed": {},
     "relocate": {"strategy": "relocate", "fraction": 0.2},
-    "gradient": {"strategy": "gradient", "grow_threshold": 1e-4, "prune_threshold": 1e-9, "clone_scale": 0.05, "max_primitives": 20},
+    "gradient": {
+        "strategy": "gradient",
+        "grow_threshold": 1e-4,
+        "prune_threshold": 1e-9,
+        "clone_scale": 0.05,
+        "max_primitives": 20,
+    },
 }
 
 
@@ -137,7 +143,9 @@ def test_a_cool_down_is_a_line_from_the_usual_rate_to_next_to_nothing(plain: Dat
         return shares["means"]
 
     assert [share_left(step) for step in (0, 400, 800, 900, 950)] == pytest.approx([1, 1, 1, 0.5, 0.25])
-    assert [share_left(step) for step in (999, 1000)] == pytest.approx([COLD, COLD]), "never nothing: a step must move something"
+    assert [share_left(step) for step in (999, 1000)] == pytest.approx([COLD, COLD]), (
+        "never nothing: a step must move something"
+    )
 
 
 def test_without_a_cool_down_rates_end_where_they_decay_to(plain: Dataset) -> None:
@@ -147,7 +155,9 @@ def test_without_a_cool_down_rates_end_where_they_decay_to(plain: Dataset) -> No
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_a_step_works_on_as_many_threads_as_the_renderer_has(plain: Dataset, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_works_on_as_many_threads_as_the_renderer_has(
+    plain: Dataset, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its loss and its optimiser too, whatever the machine has."""
     trainer, other, asked = tiny.trainer(plain, 40), tiny.trainer(plain, 40), set()
     monkeypatch.setattr(threads, "core_count", lambda: 5)
@@ -165,7 +175,9 @@ def test_units_of_rates(plain: Dataset) -> None:
     assert plain.extent > 2, "otherwise the units could be mixed up"
     units = {"means": "absolute", "b2": "extent"}
     trainer = tiny.trainer(plain, 100, final_rate=1.0, rates={"means": 1.6e-4, "b2": 0.5}, rate_units=units)
-    assert trainer.rates()["means"] == pytest.approx(1.6e-4) and trainer.rates()["b2"] == pytest.approx(0.5 * plain.extent)
+    assert trainer.rates()["means"] == pytest.approx(1.6e-4) and trainer.rates()["b2"] == pytest.approx(
+        0.5 * plain.extent
+    )
     assert tiny.trainer(plain, 100, rates={"means": 1.6e-4}).rates()["means"] == pytest.approx(1.6e-4 * plain.extent)
     before = trainer.model.params["means"].detach().clone()
     trainer.train_step()  # the first step of Adam is the rate, whatever the gradient
@@ -202,7 +214,10 @@ def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count() -> None:
     mask[8:14, 5:20] = True
     dataset.train.images = [replace(p, mask=mask) for p in dataset.train.images]  # type: ignore[attr-defined]
     trainer = tiny.trainer(dataset, 3)
-    drawn = [draw(trainer.model, dataset.train.view(i), trainer.renderer, dataset.background) for i in range(len(dataset.train))]
+    drawn = [
+        draw(trainer.model, dataset.train.view(i), trainer.renderer, dataset.background)
+        for i in range(len(dataset.train))
+    ]
     report = trainer.train_step()
     index = [dataset.train.view(i).name for i in range(len(dataset.train))].index(report.view)
     expected = psnr(drawn[index], dataset.train.pixels(index).over(dataset.background), mask)
@@ -236,14 +251,20 @@ def test_gradients_of_several_views_are_their_mean(views: int, plain: Dataset) -
             if value.grad is not None:  # bands of colours that are locked have none
                 grads[name] = grads.get(name, torch.zeros_like(value)) + value.grad / views
     assert len(grads) >= 8
-    rounding = 1e-6 * max(float(grad.abs().max()) for grad in grads.values())  # of spheres, turning them is nothing else
+    rounding = 1e-6 * max(
+        float(grad.abs().max()) for grad in grads.values()
+    )  # of spheres, turning them is nothing else
     for name, value in several.model.params.items():
         assert (value.grad is not None) == (name in grads)
         assert value.grad is None or torch.allclose(value.grad, grads[name], rtol=1e-4, atol=rounding), name
-    assert len(together.weights) == 1 and torch.allclose(together.weights[0], sum(apart.weights, torch.zeros(())), rtol=1e-5)
+    assert len(together.weights) == 1 and torch.allclose(
+        together.weights[0], sum(apart.weights, torch.zeros(())), rtol=1e-5
+    )
     assert report.loss == pytest.approx(sum(r.loss for r in reports) / views, rel=1e-5)
     assert report.psnr == pytest.approx(sum(r.psnr for r in reports) / views, rel=1e-5)
-    assert report.parts == pytest.approx({k: sum(r.parts[k] for r in reports) / views for k in reports[0].parts}, rel=1e-5)
+    assert report.parts == pytest.approx(
+        {k: sum(r.parts[k] for r in reports) / views for k in reports[0].parts}, rel=1e-5
+    )
     assert report.view == f"{reports[-1].view} and {views - 1} more" and several.step == 1
 
 
@@ -294,9 +315,12 @@ def test_a_non_finite_gradient_stops_by_name(name: str) -> None:
 def test_a_full_card_is_one_line_that_says_what_to_lower(plain: Dataset) -> None:
     trainer = tiny.trainer(plain, views_per_step=2)
     trainer.train_step()
-    trainer.loss = lambda *_: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB"))
+    trainer.loss = lambda *_: (_ for _ in ()).throw(
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+    )
     with pytest.raises(
-        DeviceMemoryError, match=r"out of memory at step 1 with 12 primitives, images of \d+ x \d+ pixels and train.views_per_step=2; lower"
+        DeviceMemoryError,
+        match=r"out of memory at step 1 with 12 primitives, images of \d+ x \d+ pixels and train.views_per_step=2; lower",
     ):
         trainer.train_step()
 
@@ -325,7 +349,9 @@ def test_empty_splits_and_no_points(plain: Dataset) -> None:
     dataset.train.cameras = []  # type: ignore[attr-defined]
     with pytest.raises(DataError, match="training split is empty"):
         Trainer(model, dataset, lambda a, b: (a, {}), TrainSettings(), tiny.RenderSettings(), 0)
-    nowhere = replace(dataset, start=lambda views, count, generator: tiny.PointCloud(torch.zeros(0, 3), torch.zeros(0, 3)))
+    nowhere = replace(
+        dataset, start=lambda views, count, generator: tiny.PointCloud(torch.zeros(0, 3), torch.zeros(0, 3))
+    )
     with pytest.raises(DataError, match="two: no starting points"):
         initial_model(model.density, model.colour, nowhere, ModelSettings(), 0)
 
@@ -348,7 +374,9 @@ def test_few_points_still_make_a_model(plain: Dataset, count: int) -> None:
 )
 def test_impossible_starting_values_name_their_key(plain: Dataset, key: str, value: object, expected: str) -> None:
     with pytest.raises(ConfigError, match=rf"model\.init\.{key}={value}: expected .*{expected}"):
-        initial_model(tiny.CosineDensity(2), tiny.SphericalHarmonics(0), plain, ModelSettings(primitives=5, init={key: value}), 0)
+        initial_model(
+            tiny.CosineDensity(2), tiny.SphericalHarmonics(0), plain, ModelSettings(primitives=5, init={key: value}), 0
+        )
 
 
 def damaged(kind: str, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
@@ -424,7 +452,8 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(plain: Dataset
 def test_points_that_no_camera_sees_are_refused(plain: Dataset) -> None:
     away = PointCloud(torch.full((4, 3), 100.0) + torch.rand(4, 3), torch.full((4, 3), 0.5))
     with pytest.raises(
-        DataError, match=r"none of 4 starting points is in the image of a training camera; .*model\.init\.points.*ply_file_path"
+        DataError,
+        match=r"none of 4 starting points is in the image of a training camera; .*model\.init\.points.*ply_file_path",
     ):
         tiny.trainer(replace(plain, start=lambda views, count, generator: away))
 

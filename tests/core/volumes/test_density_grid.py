@@ -26,7 +26,9 @@ SHAPE = (13, 9, 11)
 def model(neurons: int = 5, edge: int = 0) -> Primitives:
     t = scenes.tensors(40, neurons, seed=2)
     return Primitives(
-        CosineDensity(neurons, edge=edge), SphericalHarmonics(0), {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]}
+        CosineDensity(neurons, edge=edge),
+        SphericalHarmonics(0),
+        {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]},
     )
 
 
@@ -82,7 +84,9 @@ def gaussians() -> Primitives:
     generator = torch.Generator().manual_seed(0)
     means = 0.3 * torch.rand(5, 3, generator=generator)
     return Primitives.initialise(
-        GaussianDensity(), SphericalHarmonics(0), InitContext(means, torch.full((5,), 0.4), torch.zeros(5, 3), generator)
+        GaussianDensity(),
+        SphericalHarmonics(0),
+        InitContext(means, torch.full((5,), 0.4), torch.zeros(5, 3), generator),
     )
 
 
@@ -100,7 +104,11 @@ def test_a_moving_density_is_where_it_has_moved_to() -> None:
     density = TimeDensity(2, "window+motion")
     generator = torch.Generator().manual_seed(3)
     context = InitContext(
-        torch.zeros(3, 3), torch.full((3,), 0.4), torch.zeros(3, 3), generator, conditions={"time": torch.full((3,), 0.5)}
+        torch.zeros(3, 3),
+        torch.full((3,), 0.4),
+        torch.zeros(3, 3),
+        generator,
+        conditions={"time": torch.full((3,), 0.5)},
     )
     m = Primitives.initialise(density, SphericalHarmonics(0), context)
     m.params["velocity"][:] = torch.tensor([1.0, 0.5, 0.0])

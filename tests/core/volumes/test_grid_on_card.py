@@ -1,4 +1,5 @@
-"""The kernel of a card that fills a grid, on Warp's CPU blocks: which block comes first, and how much is taken at a time, change no bit."""
+"""The kernel of a card that fills a grid, on Warp's CPU blocks: which block comes first, and how much is taken at a
+time, change no bit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Extinction and source at scattered points, forward and backward, against every primitive at every point in float64."""
+"""Extinction and source at scattered points, forward and backward, against every primitive at every point in
+float64."""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ def moving(seed: int = 0) -> Primitives:
     generator = torch.Generator().manual_seed(seed)
     density, colour = TimeDensity(3, "window+motion+offset", edge=2, gain=True), TimeHarmonics(0, powers=2, waves=1)
     means, times = torch.rand(60, 3, generator=generator) - 0.5, torch.rand(60, generator=generator)
-    context = InitContext(means, torch.full((60,), 0.3), torch.rand(60, 3, generator=generator), generator, conditions={"time": times})
+    context = InitContext(
+        means, torch.full((60,), 0.3), torch.rand(60, 3, generator=generator), generator, conditions={"time": times}
+    )
     model = Primitives.initialise(density, colour, context)
     for value in model.params.values():
         value += 0.05 * torch.randn(value.shape, generator=generator)
@@ -45,7 +48,10 @@ def moving(seed: int = 0) -> Primitives:
 def gaussians() -> Primitives:
     generator = torch.Generator().manual_seed(0)
     context = InitContext(
-        0.3 * torch.rand(5, 3, generator=generator), torch.full((5,), 0.4), torch.rand(5, 3, generator=generator), generator
+        0.3 * torch.rand(5, 3, generator=generator),
+        torch.full((5,), 0.4),
+        torch.rand(5, 3, generator=generator),
+        generator,
     )
     return wide(Primitives.initialise(GaussianDensity(), SphericalHarmonics(0), context))
 
@@ -76,7 +82,9 @@ def gradients(model: Primitives, sigma: Tensor, source: Tensor, seed: int = 5) -
     a = torch.randn(sigma.shape, generator=generator, dtype=torch.float64)
     b = torch.randn(source.shape, generator=generator, dtype=torch.float64)
     made = torch.autograd.grad((a * sigma).sum() + (b * source).sum(), list(model.params.values()), allow_unused=True)
-    return {name: torch.zeros_like(v) if g is None else g for (name, v), g in zip(model.params.items(), made, strict=True)}
+    return {
+        name: torch.zeros_like(v) if g is None else g for (name, v), g in zip(model.params.items(), made, strict=True)
+    }
 
 
 def agree(model: Primitives, conditions: Conditions, x: Tensor, tolerance: float = 2e-6) -> None:
@@ -134,7 +142,9 @@ def test_extremes(case: str) -> None:
         elif case == "one point":
             x = model.params["means"].detach()[:1] + 0.01
         elif case == "a line":
-            x = torch.linspace(-1, 1, 80, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+            x = torch.linspace(-1, 1, 80, dtype=torch.float64)[:, None] * torch.tensor(
+                [1.0, 0.0, 0.0], dtype=torch.float64
+            )
         else:
             axes = model.geometry.rotations[:, :, 0] * model.geometry.scales[:, :1]
             x = torch.cat([model.params["means"] + s * axes for s in (1 - 1e-9, 1.0, 1 + 1e-9, -1.0, 0.5)])
@@ -176,7 +186,8 @@ def test_it_does_not_depend_on_the_number_of_threads() -> None:
 
 
 def test_parameters_in_float32_lose_nothing_on_the_way() -> None:
-    """Turned needles, whose axes are a thousand apart: what is found of float32 parameters is right to the last rounding."""
+    """Turned needles, whose axes are a thousand apart: what is found of float32 parameters is right to the last
+    rounding."""
     model = static(2, 2)
     generator = torch.Generator().manual_seed(6)
     with torch.no_grad():
@@ -184,7 +195,9 @@ def test_parameters_in_float32_lose_nothing_on_the_way() -> None:
         model.params["b2"] += 3
         axes = model.geometry.rotations * model.geometry.scales[:, None, :]
         inside = 0.5 * torch.rand(20, 40, 3, generator=generator, dtype=torch.float64) - 0.25
-    narrow = Primitives(model.density, model.colour, {n: v.detach().float().requires_grad_() for n, v in model.params.items()})
+    narrow = Primitives(
+        model.density, model.colour, {n: v.detach().float().requires_grad_() for n, v in model.params.items()}
+    )
     exact = wide(Primitives(model.density, model.colour, {n: v.detach() for n, v in narrow.params.items()}))
     x = (exact.params["means"].detach() + torch.einsum("nij,pnj->pni", axes, inside)).reshape(-1, 3)
     found, (sigma, source) = values_at(narrow, {}, x), oracle(exact, {}, x)
@@ -208,10 +221,15 @@ def test_pairs_are_all_and_once() -> None:
 def test_cells_hold_every_point() -> None:
     x = cloud().numpy()
     cells = cells_of(x)
-    assert sorted(cells.order) == list(range(300)) and cells.starts[-1] == 300 and len(cells.starts) == cells.counts.prod() + 1
+    assert (
+        sorted(cells.order) == list(range(300))
+        and cells.starts[-1] == 300
+        and len(cells.starts) == cells.counts.prod() + 1
+    )
     corner = (
         cells.low
-        + np.stack(np.unravel_index(np.repeat(np.arange(cells.counts.prod()), np.diff(cells.starts)), cells.counts), 1) * cells.step
+        + np.stack(np.unravel_index(np.repeat(np.arange(cells.counts.prod()), np.diff(cells.starts)), cells.counts), 1)
+        * cells.step
     )
     away = x[cells.order] - corner
     assert (away >= -1e-12).all() and (away <= cells.step * (1 + 1e-12)).all()
@@ -233,7 +251,9 @@ def test_what_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         values_at(model, {}, cloud())
 
 
-def test_colour_is_left_out_where_it_is_not_wanted_or_has_no_part_without_direction(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_colour_is_left_out_where_it_is_not_wanted_or_has_no_part_without_direction(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     model, x = static(2, 1), cloud()
     assert values_at(model, {}, x, colour=False).source is None
     monkeypatch.setattr(SphericalHarmonics, "harmonics", lambda self, params, conditions: None)

@@ -23,7 +23,9 @@ SHAPE = (20, 14, 17)
 
 def model() -> Primitives:
     t = scenes.tensors(40, 5, seed=2)
-    return Primitives(CosineDensity(5), SphericalHarmonics(0), {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]})
+    return Primitives(
+        CosineDensity(5), SphericalHarmonics(0), {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]}
+    )
 
 
 class Known(DensityTruth):
@@ -71,7 +73,9 @@ def test_false_matter_in_empty_voxels_counts() -> None:
     b[0, 0, 0] = 5.0
     here, there = (_numbers(a, x) for x in (a, b))
     assert a[0, 0, 0] == 0 and here["relative_l2"] == here["max_error"] == 0 and here["psnr_active"] == 200
-    assert there["relative_l2"] == pytest.approx(5 / np.linalg.norm(a), rel=1e-6) and there["max_error"] == pytest.approx(5 / a.max())
+    assert there["relative_l2"] == pytest.approx(5 / np.linalg.norm(a), rel=1e-6) and there[
+        "max_error"
+    ] == pytest.approx(5 / a.max())
     assert there["psnr_active"] == 200
 
 
@@ -93,9 +97,15 @@ def test_blocks_are_the_points_in_their_order() -> None:
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = torch.tensor([[0.1, 0.02, 0], [0, 0.2, 0], [0.05, 0, 0.1]])
     parts: list[Any] = blocks(matrix, (5000, 60, 50))
-    assert sum(shape[0] for _, shape in parts) == 5000 and len(parts) > 2 and all(shape[1:] == (60, 50) for _, shape in parts)
+    assert (
+        sum(shape[0] for _, shape in parts) == 5000
+        and len(parts) > 2
+        and all(shape[1:] == (60, 50) for _, shape in parts)
+    )
     first = parts[0][1][0]
-    assert torch.allclose(parts[1][0] @ torch.tensor([0, 1, 2, 1.0]).double(), matrix @ torch.tensor([first, 1, 2, 1.0]).double())
+    assert torch.allclose(
+        parts[1][0] @ torch.tensor([0, 1, 2, 1.0]).double(), matrix @ torch.tensor([first, 1, 2, 1.0]).double()
+    )
 
 
 def test_voxels_of_a_box_are_those_whose_centres_lie_in_it() -> None:

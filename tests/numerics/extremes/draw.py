@@ -26,10 +26,14 @@ def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(math.exp(rng.uniform(math.log(low), math.log(high)))) if high > low else low
 
 
-def primitive(rng: np.random.Generator, ratio: float, kind: str, neurons: int, scale: float = 1.0, mean: float = 1.0) -> dict[str, Tensor]:
+def primitive(
+    rng: np.random.Generator, ratio: float, kind: str, neurons: int, scale: float = 1.0, mean: float = 1.0
+) -> dict[str, Tensor]:
     """One primitive with axis ratio ``ratio``: "needle" (one long axis), "disc" (one thin axis) or "any"."""
     a, b = 1.0, 1.0 / ratio
-    middle = {"needle": b * rng.uniform(1.05, 1.3), "disc": a * rng.uniform(0.75, 0.95), "any": log_uniform(rng, b, a)}[kind]
+    middle = {"needle": b * rng.uniform(1.05, 1.3), "disc": a * rng.uniform(0.75, 0.95), "any": log_uniform(rng, b, a)}[
+        kind
+    ]
     axes = np.array([a, min(middle, 0.95), b]) if ratio > 1.1 else np.array([1.0, 0.93, 0.85])
     rng.shuffle(axes)
     t = {
@@ -45,11 +49,13 @@ def primitive(rng: np.random.Generator, ratio: float, kind: str, neurons: int, s
     return {k: torch.from_numpy(v).float().double() for k, v in t.items()}
 
 
-def aimed(rng: np.random.Generator, t: dict[str, Tensor], distance: float, pixels: float, fov: float | None, off: float) -> Camera:
+def aimed(
+    rng: np.random.Generator, t: dict[str, Tensor], distance: float, pixels: float, fov: float | None, off: float
+) -> Camera:
     """A camera ``distance`` m from the centre that sees a random inner point at a random pixel.
 
-    ``pixels``: how many pixels wide a length of the *thinnest* axis is, unless ``fov`` is given. ``off``: the principal point's
-    distance from the middle of the image, in image widths.
+    ``pixels``: how many pixels wide a length of the *thinnest* axis is, unless ``fov`` is given. ``off``: the principal
+    point's distance from the middle of the image, in image widths.
     """
     s = t["log_scales"][0].exp()
     m = float(s.max())
@@ -86,7 +92,8 @@ def _basis(z: np.ndarray, rng: np.random.Generator) -> np.ndarray:  # type: igno
 
 
 def normalised(t: dict[str, Tensor], exact: Integrals, rate: float | None, depth: float) -> dict[str, Tensor]:
-    """Weights such that the largest S is ``depth`` and, if given, the fastest neuron turns ``rate`` radians along a chord."""
+    """Weights such that the largest S is ``depth`` and, if given, the fastest neuron turns ``rate`` radians along a
+    chord."""
     out = dict(t)
     factor = depth / float(exact.scale.max())
     out["w2"], out["b2"] = t["w2"] * factor, t["b2"] * factor
@@ -128,7 +135,8 @@ def grazing(rng: np.random.Generator) -> Case:
     """A view of a few pixels of the rim only, so that most chords have D < 0.01."""
     for _ in range(50):
         case = single(rng, pixels=(300.0, 3000.0), minimum=SIZE * SIZE)
-        # shift the principal point until the silhouette passes through the image: bisection between the centre and a miss
+        # shift the principal point until the silhouette passes through the image: bisection between the centre and a
+        # miss
         angle = rng.uniform(0, 2 * math.pi)
         inside, outside = 0.0, 4e6
 
@@ -141,12 +149,15 @@ def grazing(rng: np.random.Generator) -> Case:
             exact = long_integrals(found.tensors, 0, found.camera, found.settings.near)
             if 0.05 < exact.hit.mean() < 0.95:  # at once: going on would put a pixel on the silhouette to the last bit
                 return replace(found, tensors=normalised(found.tensors, exact, None, 1.0))
-            inside, outside = ((inside + outside) / 2, outside) if exact.hit.mean() > 0.5 else (inside, (inside + outside) / 2)
+            inside, outside = (
+                ((inside + outside) / 2, outside) if exact.hit.mean() > 0.5 else (inside, (inside + outside) / 2)
+            )
     raise RuntimeError("no view of a rim found")
 
 
 def silhouette(rng: np.random.Generator) -> Case:
-    """The same with one pixel on the rim itself, |D| of 1e-12 or less, where a hard edge has no bounded gradient; no floor under D."""
+    """The same with one pixel on the rim itself, |D| of 1e-12 or less, where a hard edge has no bounded gradient; no
+    floor under D."""
     case = grazing(rng)
     exact = long_integrals(case.tensors, 0, case.camera, case.settings.near)
     y, x = (int(i[0]) for i in np.nonzero(np.abs(exact.D) == np.abs(exact.D).min()))

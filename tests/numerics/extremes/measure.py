@@ -1,8 +1,8 @@
 """How far a backend is from the oracle on one case, in the units of the bounds.
 
-Optical depth is read from a colour channel of colour 1 over black, which keeps float32's relative precision where alpha is
-small: I = -log1p(-alpha), up to I = 1.5; beyond, the error of alpha itself counts. What one rounding of alpha explains is not
-counted against a float32 image.
+Optical depth is read from a colour channel of colour 1 over black, which keeps float32's relative precision where alpha
+is small: I = -log1p(-alpha), up to I = 1.5; beyond, the error of alpha itself counts. What one rounding of alpha
+explains is not counted against a float32 image.
 """
 
 from __future__ import annotations
@@ -20,12 +20,24 @@ from tests.backends import by
 from tests.numerics.compare import undecided
 from tests.numerics.extremes.oracle import Integrals, long_colours, long_integrals
 
-__all__ = ["Case", "Errors", "colour_errors", "compare", "drawn", "gradient_errors", "gradients", "integral_errors", "integrals"]
+__all__ = [
+    "Case",
+    "Errors",
+    "colour_errors",
+    "compare",
+    "drawn",
+    "gradient_errors",
+    "gradients",
+    "integral_errors",
+    "integrals",
+]
 
 OPEN = RenderSettings(alpha_min=0.0, transmittance_min=0.0, alpha_max=0.9999)
 SOLID = 0.45  # shorter chords, as a share of the central one, are thin: D < 0.2, or cut by a near plane
 OPAQUE = 1.5  # optical depth beyond which alpha is compared instead
-RIM = 1e-6  # |D| below which float32 may not know whether a ray meets an ellipsoid, which a hard edge's gradients hang on
+RIM = (
+    1e-6  # |D| below which float32 may not know whether a ray meets an ellipsoid, which a hard edge's gradients hang on
+)
 FUNCTIONALS = 4
 KEEPING = ("cpu", "reference")  # what others keep of a frame serves one backward pass
 _SHORTEST = 1e-2  # share of the central chord below which a soft edge's error is compared with that of one as long
@@ -52,7 +64,8 @@ class Errors:
 
     Attributes:
         forward: |dI|/S on solid chords.
-        thin: |dI|/S (S/S_c)^2 on thin ones, S_c the central chord's S, and the same for hits missed and misses hit. With a soft edge, whose
+        thin: |dI|/S (S/S_c)^2 on thin ones, S_c the central chord's S, and the same for hits missed and misses hit.
+        With a soft edge, whose
             integrals go as D^(p + 1/2), |dI|/S_c (S_c/S)^(2p - 1).
         at: S/S_c where ``forward`` was found.
         gradient: error of a parameter's gradient over the gradient's norm; ``parameter`` is the worst one.
@@ -113,7 +126,9 @@ def integral_errors(case: Case, backend: str, exact: Integrals | None = None) ->
     short = (exact.scale < SOLID * exact.central) & (exact.D > -1)
     share = np.where(short | ~exact.hit, 0, error / np.where(exact.hit, exact.scale, 1)).astype(np.float64)
     if case.edge == 0:
-        rim = np.where(short | ~exact.hit, error * np.maximum(exact.scale, error) / exact.central**2, 0).astype(np.float64)
+        rim = np.where(short | ~exact.hit, error * np.maximum(exact.scale, error) / exact.central**2, 0).astype(
+            np.float64
+        )
     else:
         length = np.maximum(exact.scale / exact.central, _SHORTEST)
         rim = np.where(short | ~exact.hit, error / exact.central / length ** (2 * case.edge - 1), 0).astype(np.float64)
@@ -125,7 +140,8 @@ def integral_errors(case: Case, backend: str, exact: Integrals | None = None) ->
 def colour_errors(case: Case, backend: str, exact: Integrals) -> Errors:
     """Worst error of a colour network of one primitive over the size of its numbers, on solid and on thin chords.
 
-    Colour is what a pixel has over what it has of colour 1, so that the opacity's own error does not count, nor that of 1 - T.
+    Colour is what a pixel has over what it has of colour 1, so that the opacity's own error does not count, nor that of
+    1 - T.
     """
     plain = case.tensors | {"Wout": 0 * case.tensors["Wout"], "base": torch.ones_like(case.tensors["base"])}
     with torch.no_grad():
@@ -158,8 +174,12 @@ def gradients(case: Case, backend: str, seed: int, keep: Tensor | None = None) -
         if number and backend not in KEEPING:
             out = render_lowered(lowered, case.camera, settings)
         rgb, alpha = ((torch.randn(h, w, n, generator=g, dtype=torch.float64) * keep).to(out.rgb.dtype) for n in (C, 1))
-        found = torch.autograd.grad((out.rgb, out.alpha), list(leaves.values()), (rgb, alpha[..., 0]), retain_graph=True, allow_unused=True)
-        grads.append({k: torch.zeros_like(v) if x is None else x for (k, v), x in zip(leaves.items(), found, strict=True)})
+        found = torch.autograd.grad(
+            (out.rgb, out.alpha), list(leaves.values()), (rgb, alpha[..., 0]), retain_graph=True, allow_unused=True
+        )
+        grads.append(
+            {k: torch.zeros_like(v) if x is None else x for (k, v), x in zip(leaves.items(), found, strict=True)}
+        )
     return grads
 
 
@@ -176,7 +196,9 @@ def gradient_errors(case: Case, backend: str, seed: int = 0, skip: Tensor | None
     worst, name = 0.0, ""
     for key in case.tensors:
         n = case.tensors[key].shape[0]
-        a, b = (torch.stack([g[key].double().reshape(n, -1) for g in grads], 1).reshape(n, -1) for grads in (found, exact))
+        a, b = (
+            torch.stack([g[key].double().reshape(n, -1) for g in grads], 1).reshape(n, -1) for grads in (found, exact)
+        )
         error, norm = (a - b).norm(dim=1), b.norm(dim=1)
         share = torch.where(error == 0, torch.zeros_like(error), error / norm.clamp_min(1e-300))
         share = torch.where(torch.isfinite(a).all(1), share, torch.full_like(share, float("inf")))
@@ -197,16 +219,23 @@ def frame_errors(case: Case, backend: str) -> tuple[Errors, Tensor]:
             for c, name in ((case, backend), (exact, "reference"))
         ]
     skip = undecided(exact.tensors, exact.camera, exact.settings)
-    difference = torch.maximum((images[0].rgb.double() - images[1].rgb).abs().amax(-1), (images[0].alpha.double() - images[1].alpha).abs())
+    difference = torch.maximum(
+        (images[0].rgb.double() - images[1].rgb).abs().amax(-1), (images[0].alpha.double() - images[1].alpha).abs()
+    )
     difference = torch.where(torch.isfinite(difference), difference, torch.full_like(difference, float("inf")))
     kept = torch.where(skip, torch.zeros_like(difference), difference)
     hits = int((images[1].alpha > 0).sum())
     return Errors(
-        float(kept.max()), hits=hits, wide=int(images[0].stats.extra.get("float64", 0)), primitives=len(case.tensors["means"])
+        float(kept.max()),
+        hits=hits,
+        wide=int(images[0].stats.extra.get("float64", 0)),
+        primitives=len(case.tensors["means"]),
     ), skip
 
 
-def compare(case: Case, backend: str, precision: str, whole: bool, gradients: bool, exact: Integrals | None = None) -> Errors:
+def compare(
+    case: Case, backend: str, precision: str, whole: bool, gradients: bool, exact: Integrals | None = None
+) -> Errors:
     """Everything about one case on one backend; ``exact`` are its :func:`integrals`, if they are there already."""
     with scenes.soft(case.edge):
         return _compare(case.cast(precision), backend, whole, gradients, None if whole else exact or integrals(case))

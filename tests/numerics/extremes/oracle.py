@@ -1,8 +1,9 @@
 """The line integral of one primitive in extended precision, independent of the renderers.
 
-``long_integrals`` is vectorised and runs in numpy's longdouble: 64 bits of mantissa on x86, so that its own rounding stays
-below the bound where float64's does not (distance over radius times axis ratio reaches 1e9). ``mp_integral`` takes one pixel,
-fifty digits and another form: the quadratic's two roots and the antiderivative at both, which cancel harmlessly there.
+``long_integrals`` is vectorised and runs in numpy's longdouble: 64 bits of mantissa on x86, so that its own rounding
+stays below the bound where float64's does not (distance over radius times axis ratio reaches 1e9). ``mp_integral``
+takes one pixel, fifty digits and another form: the quadratic's two roots and the antiderivative at both, which cancel
+harmlessly there.
 """
 
 from __future__ import annotations
@@ -30,11 +31,12 @@ class Integrals:
 
     Attributes:
         depth: the optical depth I, unclamped; 0 where the ray misses.
-        scale: S = (N_p h/m)(|b2| + sum |w2|), of the chord that the near plane leaves; N = 2, 4/3, 16/15 for edges 0, 1, 2.
-        central: the same for a chord through the centre in the same direction, uncut.
+        scale: S = (N_p h/m)(|b2| + sum |w2|), of the chord that the near plane leaves; N = 2, 4/3, 16/15 for edges 0,
+        1, 2. central: the same for a chord through the centre in the same direction, uncut.
         D: 1 - |x_m|^2 of the whole line; positive where it meets the ellipsoid.
         rate: the largest change of a neuron's phase along the chord, radians.
-        local: (H, W, 3) x~_m, the middle of the chord that the near plane leaves, in units of m from the centre, scene axes.
+        local: (H, W, 3) x~_m, the middle of the chord that the near plane leaves, in units of m from the centre, scene
+        axes.
     """
 
     depth: Array
@@ -80,7 +82,8 @@ _NODES = _nodes(16)
 
 
 def _faded(quadratic: Array, edge: int, phase: Array, change: Array) -> Array:
-    """1/2 integral over u in [-1, 1] of (c0 + c1 u + c2 u^2)^p cos(phase + change u): Gauss-Legendre, or by parts where that turns too fast.
+    """1/2 integral over u in [-1, 1] of (c0 + c1 u + c2 u^2)^p cos(phase + change u): Gauss-Legendre, or by parts where
+    that turns too fast.
 
     Shapes broadcast; ``quadratic`` holds c0, c1, c2 in its last axis.
     """
@@ -94,7 +97,9 @@ def _faded(quadratic: Array, edge: int, phase: Array, change: Array) -> Array:
     safe = np.where(np.abs(change) < _SLOW, L(_SLOW), change)
     fast = np.zeros(np.broadcast(phase, change, c0).shape, L)
     ends = [(sign, np.sin(phase + sign * safe), np.cos(phase + sign * safe)) for sign in (L(1), L(-1))]
-    for n in range(2 * edge + 1):  # the antiderivative: sum over n of q^(n)(u) sin(phase + change u + n pi/2)/change^(n + 1)
+    for n in range(
+        2 * edge + 1
+    ):  # the antiderivative: sum over n of q^(n)(u) sin(phase + change u + n pi/2)/change^(n + 1)
         for sign, sine, cosine in ends:
             value = sum(q[k] * sign**k for k in range(len(q)))
             fast = fast + sign * value * (sine, cosine, -sine, -cosine)[n % 4] / safe ** (n + 1)
@@ -116,7 +121,8 @@ def long_integrals(t: dict[str, Tensor], row: int, camera: Camera, near: float, 
     e = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width), L)], -1)  # camera-z is 1
     v = (e @ B) / axes
     a = (v * v).sum(-1)
-    # the rotation is orthogonal to float64's rounding only, so p and v are formed as the renderers define them, in more digits
+    # the rotation is orthogonal to float64's rounding only, so p and v are formed as the renderers define them, in more
+    # digits
     p = -(c @ B) / axes
     tm = -(v @ p) / a
     side = np.cross(np.broadcast_to(p, v.shape), v)
@@ -149,12 +155,18 @@ def long_integrals(t: dict[str, Tensor], row: int, camera: Camera, near: float, 
     amplitude = np.abs(b2).sum() + np.abs(w2).sum()
     rate = 2 * np.abs(change).max(-1) if W1.shape[0] else np.zeros_like(half)
     return Integrals(
-        2 * half * norm * field, 2 * half * norm * amplitude, 2 * norm / np.sqrt(a) * amplitude, D, rate, (middle * axes) @ local.T
+        2 * half * norm * field,
+        2 * half * norm * amplitude,
+        2 * norm / np.sqrt(a) * amplitude,
+        D,
+        rate,
+        (middle * axes) @ local.T,
     )
 
 
 def long_colours(t: dict[str, Tensor], row: int, exact: Integrals) -> tuple[Array, Array]:
-    """(H, W, C) colours of primitive ``row``'s network at the chords' middles, and (C,) |base| + sum |Wout|, their size."""
+    """(H, W, C) colours of primitive ``row``'s network at the chords' middles, and (C,) |base| + sum |Wout|, their
+    size."""
     Wx, bias, Wout, base = (_long(t[k][row]) for k in ("Wx", "bias", "Wout", "base"))
     waves = np.cos(exact.local @ Wx.T + bias)
     return np.maximum(base + waves @ Wout.T, 0), np.abs(base) + np.abs(Wout).sum(1)
@@ -163,7 +175,8 @@ def long_colours(t: dict[str, Tensor], row: int, exact: Integrals) -> tuple[Arra
 def mp_integral(
     t: dict[str, Tensor], row: int, camera: Camera, near: float, px: int, py: int, edge: int = 0, digits: int = 50
 ) -> tuple[Any, Any]:
-    """(I, S) of one pixel from the roots of |p + t v|^2 = 1 and the antiderivative of the density, in ``digits`` digits.
+    """(I, S) of one pixel from the roots of |p + t v|^2 = 1 and the antiderivative of the density, in ``digits``
+    digits.
 
     That of a soft edge is divided by the rate 2p + 1 times: it takes as many more digits as slow neurons then cost.
     """
@@ -175,7 +188,11 @@ def mp_integral(
             return [M(float(x)) for x in tensor.detach().double().flatten()]
 
         view = [numbers(r) for r in camera.viewmat[:3]]
-        mean, s, q = numbers(t["means"][row]), [mpmath.exp(x) for x in numbers(t["log_scales"][row])], numbers(t["quats"][row])
+        mean, s, q = (
+            numbers(t["means"][row]),
+            [mpmath.exp(x) for x in numbers(t["log_scales"][row])],
+            numbers(t["quats"][row]),
+        )
         m = max(s)
         local = _rotation(q)
         e = [(M(px) + M(0.5) - M(camera.cx)) / M(camera.fx), (M(py) + M(0.5) - M(camera.cy)) / M(camera.fy), M(1)]
@@ -195,12 +212,19 @@ def mp_integral(
         t0 = max(t0, M(near) * norm)
         if t1 <= t0:
             return M(0), M(0)
-        gain = mpmath.exp(min(max(numbers(t["log_gain"][row])[0], -M(GAIN_LIMIT)), M(GAIN_LIMIT))) if "log_gain" in t else M(1)
+        gain = (
+            mpmath.exp(min(max(numbers(t["log_gain"][row])[0], -M(GAIN_LIMIT)), M(GAIN_LIMIT)))
+            if "log_gain" in t
+            else M(1)
+        )
         b2 = numbers(t["b2"][row])[0] * gain
         weight = [M(1)]  # 1 - |p + t v|^2 to the power p, coefficients of t^0..t^2p
         for _ in range(edge):
             old = [*weight, M(0), M(0)]
-            weight = [-C * old[k] - 2 * Bh * (old[k - 1] if k > 0 else 0) - A * (old[k - 2] if k > 1 else 0) for k in range(len(old))]
+            weight = [
+                -C * old[k] - 2 * Bh * (old[k - 1] if k > 0 else 0) - A * (old[k - 2] if k > 1 else 0)
+                for k in range(len(old))
+            ]
         plain = sum(c * (t1 ** (k + 1) - t0 ** (k + 1)) / (k + 1) for k, c in enumerate(weight))
         total, amplitude = b2 * plain, abs(b2)
         for W, b, w in zip(t["W1"][row], numbers(t["b1"][row]), numbers(t["w2"][row]), strict=True):
@@ -213,7 +237,10 @@ def mp_integral(
             else:
                 q, n = weight, 0
                 while q:
-                    ends = [sum(c * at**k for k, c in enumerate(q)) * mpmath.sin(start + rate * at + n * mpmath.pi / 2) for at in (t1, t0)]
+                    ends = [
+                        sum(c * at**k for k, c in enumerate(q)) * mpmath.sin(start + rate * at + n * mpmath.pi / 2)
+                        for at in (t1, t0)
+                    ]
                     total += w * gain * (ends[0] - ends[1]) / rate ** (n + 1)
                     q, n = [k * c for k, c in enumerate(q)][1:], n + 1
             amplitude += abs(w) * gain

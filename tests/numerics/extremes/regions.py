@@ -9,7 +9,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neuprim.core.model.edge import EDGES
-from tests.numerics.extremes.draw import amplified, crowd, cut, grazing, log_uniform, networked, signed, silhouette, single
+from tests.numerics.extremes.draw import (
+    amplified,
+    crowd,
+    cut,
+    grazing,
+    log_uniform,
+    networked,
+    signed,
+    silhouette,
+    single,
+)
 from tests.numerics.extremes.measure import Case
 
 __all__ = ["COLOUR", "FORWARD", "GRADIENT", "REGIONS", "THIN", "Region"]
@@ -52,8 +62,9 @@ class Region:
     def gradient_at(self, edge: int) -> float:
         """The bound ``gradient`` for an edge.
 
-        Where only a rim lets light through, it is all that there is to differentiate. What float32 does not know about D, 4e-7, is
-        sqrt(4e-7) = 6e-4 of dI/dD on the rim itself at p = 1, beside 0.1 on the rim's other pixels; at p = 2 next to nothing.
+        Where only a rim lets light through, it is all that there is to differentiate. What float32 does not know about
+        D, 4e-7, is sqrt(4e-7) = 6e-4 of dI/dD on the rim itself at p = 1, beside 0.1 on the rim's other pixels; at p =
+        2 next to nothing.
         """
         if self.name == "huge densities":
             return self.gradient * (2 * edge + 1)
@@ -70,12 +81,19 @@ def _distances() -> list[Region]:
 
 def _rates() -> list[Region]:
     values = (0.0, 1e-12, 1e-6, 1e-3, 1.0, 10.0, 1e2, 1e3, 2e3)
-    regions = [Region(f"phase rate {v:g} rad per chord", lambda r, v=v: single(r, rate=v, neurons=int(r.choice([1, 8])))) for v in values]  # type: ignore[misc]
-    return [*regions, Region("phase rates where series end", lambda r: single(r, rate=_seam(r), neurons=int(r.choice([1, 8]))))]
+    regions = [
+        Region(f"phase rate {v:g} rad per chord", lambda r, v=v: single(r, rate=v, neurons=int(r.choice([1, 8]))))
+        for v in values
+    ]  # type: ignore[misc]
+    return [
+        *regions,
+        Region("phase rates where series end", lambda r: single(r, rate=_seam(r), neurons=int(r.choice([1, 8])))),
+    ]
 
 
 def _seam(rng: np.random.Generator) -> float:
-    """Twice a z at which some backend changes from a series or a polynomial of B_p to another form, less or more by a millionth."""
+    """Twice a z at which some backend changes from a series or a polynomial of B_p to another form, less or more by a
+    millionth."""
     return float(2 * rng.choice([1e-3, 2.0, np.pi, 3 * np.pi]) * (1 + 1e-6 * rng.choice([-1, 1])))
 
 
@@ -86,7 +104,9 @@ def _ratios() -> list[Region]:
             out.append(
                 Region(
                     f"axis ratio {q:g}, {kind}",
-                    lambda r, q=q, kind=kind: single(r, ratio=(q, q), kind=kind, pixels=(0.3, 12.0), distance=(1.5, 20.0)),  # type: ignore[misc]
+                    lambda r, q=q, kind=kind: single(
+                        r, ratio=(q, q), kind=kind, pixels=(0.3, 12.0), distance=(1.5, 20.0)
+                    ),  # type: ignore[misc]
                 )
             )
     return out
@@ -106,7 +126,10 @@ def _networks() -> list[Region]:
         "1000 rad": ({}, 1000.0),
         "needles": ({"ratio": (10.0, 1e4), "kind": "needle", "pixels": (0.3, 12.0)}, (0.5, 10.0)),
         "discs": ({"ratio": (10.0, 1e4), "kind": "disc", "pixels": (0.3, 12.0)}, (0.5, 10.0)),
-        "needles and discs, far, 100 rad": ({"ratio": (1e2, 1e4), "distance": (1e2, 1e5), "pixels": (0.3, 12.0)}, 100.0),
+        "needles and discs, far, 100 rad": (
+            {"ratio": (1e2, 1e4), "distance": (1e2, 1e5), "pixels": (0.3, 12.0)},
+            100.0,
+        ),
         "near plane through the chord": ({"distance": (0.02, 1.0), "ratio": (1.2, 20.0), "fov": 80.0}, (0.5, 10.0)),
         "scales 1e-20": ({"scale": 1e-20}, (0.5, 10.0)),
         "scales 1e20": ({"scale": 1e20}, (0.5, 10.0)),
@@ -120,7 +143,9 @@ def _networks() -> list[Region]:
                 lambda r, more=more, rate=rate: networked(r, single(r, **more), rate),  # type: ignore[misc, arg-type]
                 forward=COLOUR if fast else FORWARD,
                 thin=COLOUR if fast else FORWARD,
-                reason="float32 draws units of up to 4 turns over half a chord, whose phase it knows to 3e-6 rad" if fast else "",
+                reason="float32 draws units of up to 4 turns over half a chord, whose phase it knows to 3e-6 rad"
+                if fast
+                else "",
             )
         )
     return out
@@ -132,8 +157,13 @@ REGIONS: tuple[Region, ...] = (
     *_rates(),
     *_ratios(),
     Region("needles and discs, far", lambda r: single(r, ratio=(1e2, 1e4), distance=(1e2, 1e5), pixels=(0.3, 12.0))),
-    Region("needles and discs, inside or near", lambda r: single(r, ratio=(1e2, 1e4), distance=(1e-2, 1.5), pixels=(0.01, 12.0))),
-    Region("needles and discs, fast neurons", lambda r: single(r, ratio=(10.0, 1e3), rate=(10.0, 1e3), pixels=(0.3, 12.0))),
+    Region(
+        "needles and discs, inside or near",
+        lambda r: single(r, ratio=(1e2, 1e4), distance=(1e-2, 1.5), pixels=(0.01, 12.0)),
+    ),
+    Region(
+        "needles and discs, fast neurons", lambda r: single(r, ratio=(10.0, 1e3), rate=(10.0, 1e3), pixels=(0.3, 12.0))
+    ),
     Region("sub-pixel", lambda r: single(r, distance=(5.0, 1e4), pixels=(1e-3, 0.5), minimum=1)),
     Region("screen-filling", lambda r: single(r, distance=(1.2, 3.0), pixels=(30.0, 1e4))),
     Region("field of view 120", lambda r: single(r, distance=(0.5, 4.0), fov=120.0, minimum=2)),

@@ -43,24 +43,31 @@ class Result:
             ("gradient", "gradient", e.gradient, r.gradient_at(self.edge)),
         )
         texts = [
-            f"{label} {found:.1e} > {bound:.1e} in {e.worst.get(key, '?')}" for label, key, found, bound in parts if not found <= bound
+            f"{label} {found:.1e} > {bound:.1e} in {e.worst.get(key, '?')}"
+            for label, key, found, bound in parts
+            if not found <= bound
         ]
         return texts if e.hits else [*texts, "nothing was drawn"]
 
 
 def measure(region: Region, edge: int, cases: int) -> list[Result]:
-    """Worst of the first ``cases`` cases, per backend. Gradients are compared on the fast ones; the reference's are the standard."""
+    """Worst of the first ``cases`` cases, per backend. Gradients are compared on the fast ones; the reference's are the
+    standard."""
     found = [Result(region, backend, precision, edge, Errors()) for backend, precision in BACKENDS]
     for number in range(cases):
         case = region.case(number, edge)
         exact = None if region.whole else integrals(case)
         for result in found:
-            result.errors.absorb(compare(case, result.backend, result.precision, region.whole, result.backend != ORACLE, exact), case.name)
+            result.errors.absorb(
+                compare(case, result.backend, result.precision, region.whole, result.backend != ORACLE, exact),
+                case.name,
+            )
     return found
 
 
 def sweep(cases: int, names: Sequence[str] = (), edges: Sequence[int] = EDGES) -> Iterator[list[Result]]:
-    """Every region whose name contains one of ``names`` (all if none): what each backend found for each edge that the region is for."""
+    """Every region whose name contains one of ``names`` (all if none): what each backend found for each edge that the
+    region is for."""
     for region in REGIONS:
         if not names or any(n in region.name for n in names):
             columns = [measure(region, edge, cases) for edge in edges if edge in region.edges]
@@ -74,11 +81,17 @@ def line(row: Sequence[Result]) -> str:
     def beside(cells: Sequence[str]) -> str:
         """The cells of all edges; a dash where the region is not for one that others are for."""
         found = dict(zip((r.edge for r in row), cells, strict=True))
-        return " / ".join(found.get(edge, "–") for edge in (EDGES if len(region.edges) < len(EDGES) else found)) if any(cells) else ""
+        return (
+            " / ".join(found.get(edge, "–") for edge in (EDGES if len(region.edges) < len(EDGES) else found))
+            if any(cells)
+            else ""
+        )
 
     thin = "" if region.whole else beside([f"{r.errors.thin:.1e}" for r in row])
     gradient = "" if first.backend == ORACLE else beside([f"{r.errors.gradient:.1e}" for r in row])
-    wide = beside([f"{r.errors.wide}" for r in row]) + f" of {first.errors.primitives}" if first.backend != ORACLE else ""
+    wide = (
+        beside([f"{r.errors.wide}" for r in row]) + f" of {first.errors.primitives}" if first.backend != ORACLE else ""
+    )
     bounds = [f"{region.forward:.0e}"]
     if not region.whole:
         bounds.append(_once([f"{region.thin_at(r.edge):.0e}" for r in row]))
@@ -86,9 +99,7 @@ def line(row: Sequence[Result]) -> str:
         bounds.append(_once([f"{region.gradient_at(r.edge):.0e}" for r in row]))
     state = "**broken**" if any(r.broken for r in row) else "ok"
     forward = beside([f"{r.errors.forward:.1e}" for r in row])
-    return (
-        f"| {region.name} | {first.backend} {first.precision} | {forward} | {thin} | {gradient} | {wide} | {', '.join(bounds)} | {state} |"
-    )
+    return f"| {region.name} | {first.backend} {first.precision} | {forward} | {thin} | {gradient} | {wide} | {', '.join(bounds)} | {state} |"
 
 
 def _once(texts: Sequence[str]) -> str:

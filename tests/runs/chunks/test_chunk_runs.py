@@ -1,4 +1,5 @@
-"""Runs in chunks, small and whole: what they leave, that every command reads it, and that what is done is not done again."""
+"""Runs in chunks, small and whole: what they leave, that every command reads it, and that what is done is not done
+again."""
 
 from __future__ import annotations
 
@@ -72,7 +73,9 @@ def test_one_model_of_two_chunks_with_the_whole_number_of_primitives(finished: P
     counts = [int((model.params["chunk"] == number).sum()) for number in range(2)]
     assert counts == [chunk.count for _, _, chunk, _ in own]
     assert header["iterations"] == STEPS
-    assert [chunk.train.iterations for chunk, *_ in own] == [40, 40] and [chunk.train.population.every for chunk, *_ in own] == [4, 4]
+    assert [chunk.train.iterations for chunk, *_ in own] == [40, 40] and [
+        chunk.train.population.every for chunk, *_ in own
+    ] == [4, 4]
 
 
 def test_it_is_judged_on_all_frames_and_has_learned(finished: Path) -> None:
@@ -136,12 +139,16 @@ def test_one_that_fails_does_not_stop_the_others_and_is_all_that_is_made_again(
     monkeypatch.setattr(chunk_training, "_FIT_ONE", f"{__name__}:{_fail_first.__name__}")
     out, told = tmp_path / "run", list[Event]()
     with pytest.raises(
-        ChunksMissing, match=r"frames_1-4: no luck; 1 of 2 chunks are done, and resume=true with output_dir=\S+ makes the others"
+        ChunksMissing,
+        match=r"frames_1-4: no luck; 1 of 2 chunks are done, and resume=true with output_dir=\S+ makes the others",
     ):
         run(compose(words(files, out)), told.append)
     assert [event.text.partition("chunks/")[2] for event in told if isinstance(event, Note)] == ["frames_1-4: no luck"]
     record = read_record(out)
-    assert record is not None and [(row.state, row.line) for row in record.rows] == [("failed", "no luck"), ("done", "")]
+    assert record is not None and [(row.state, row.line) for row in record.rows] == [
+        ("failed", "no luck"),
+        ("done", ""),
+    ]
     monkeypatch.undo()
     when = (out / "chunks" / NAMES[1] / "model.safetensors").stat().st_mtime_ns
     run(compose(words(files, out, "resume=true")))
@@ -174,7 +181,10 @@ def test_a_killed_chunk_is_made_anew_by_the_command_that_goes_on(
 
 def test_other_chunks_than_it_was_begun_with_are_refused(finished: Path, files: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "copy")
-    with pytest.raises(ConfigError, match=r"chunks.json: begun with frames_1-4 \(\d+ primitives, 40 steps\), .* expected the same words"):
+    with pytest.raises(
+        ConfigError,
+        match=r"chunks.json: begun with frames_1-4 \(\d+ primitives, 40 steps\), .* expected the same words",
+    ):
         run(compose(words(files, tmp_path / "copy", "scene.chunks=3", "resume=true")))
     (tmp_path / "copy" / "chunks.json").write_text("{}")
     with pytest.raises(DataError, match=r"chunks.json: not the record of a run in chunks"):
@@ -193,7 +203,9 @@ def test_a_budget_in_seconds_is_shared_out_and_the_joined_steps_are_kept(files: 
 
 def test_few_frames_in_auto_are_one_run(files: Path, tmp_path: Path) -> None:
     told: list[Event] = []
-    automatic = run(compose([*words(files, tmp_path / "auto"), "train.iterations=10", "scene.chunks=auto"]), told.append)
+    automatic = run(
+        compose([*words(files, tmp_path / "auto"), "train.iterations=10", "scene.chunks=auto"]), told.append
+    )
     assert Note("scene.chunks=auto: fitted as one run") in told and not (automatic / "chunks.json").exists()
     plain = run(compose([*words(files, tmp_path / "plain"), "train.iterations=10", "scene.chunks=null"]))
     one = run(compose([*words(files, tmp_path / "one"), "train.iterations=10", "scene.chunks=1"]))
@@ -209,7 +221,10 @@ def test_few_frames_in_auto_are_one_run(files: Path, tmp_path: Path) -> None:
             "scene.chunks=4: there are 6 frames to learn from; expected at most 3, as a chunk has at least two of its own",
         ),
         (["model.primitives=9"], "model.primitives=9: expected at least 16 for 2 chunks"),
-        (["scene.chunks=2", "viewer=true"], "scene.chunks=2: viewer=true shows one training; expected scene.chunks=null"),
+        (
+            ["scene.chunks=2", "viewer=true"],
+            "scene.chunks=2: viewer=true shows one training; expected scene.chunks=null",
+        ),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(

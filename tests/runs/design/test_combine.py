@@ -10,7 +10,9 @@ from neuprim.runs.design.variants import CENTRE, LENGTH
 
 
 def model(knob: str, turned: str, psnr: float, size: int, ratio: float, length: float = 1.0) -> Model:
-    return Model(knob, (), {"psnr": psnr}, size, ms=[ratio] * 9, ratios=[ratio] * 9, turned=tuple(turned.split()), length=length)
+    return Model(
+        knob, (), {"psnr": psnr}, size, ms=[ratio] * 9, ratios=[ratio] * 9, turned=tuple(turned.split()), length=length
+    )
 
 
 FOUND = [
@@ -31,10 +33,14 @@ def names(found: list[Model], most: int) -> list[set[str]]:
 
 def test_down_by_what_loses_least_and_up_by_what_gains_most() -> None:
     found = names(FOUND, 12)
-    assert {"model.neurons=0", "model.primitives=50"} in found and {"model.neurons=0", "model.sh_degree=0"} in found, "smaller"
+    assert {"model.neurons=0", "model.primitives=50"} in found and {"model.neurons=0", "model.sh_degree=0"} in found, (
+        "smaller"
+    )
     assert {"model.neurons=0", "model.sh_degree=0", "model.primitives=25"} in found
     assert {"model.primitives=200", "model.neurons=8"} in found, "better"
-    assert all(len({word.partition("=")[0] for word in words}) == len(words) > 1 for words in found), "one value per knob, several knobs"
+    assert all(len({word.partition("=")[0] for word in words}) == len(words) > 1 for words in found), (
+        "one value per knob, several knobs"
+    )
     assert len({frozenset(words) for words in found}) == len(found)
 
 
@@ -57,7 +63,11 @@ def test_what_gains_nothing_is_not_joined() -> None:
 def test_the_fronts_are_those_of_all_models() -> None:
     speed, size = fronts(FOUND)
     assert [FOUND[i].quality["psnr"] for i in size] == [31.0, 30.3, 30.0, 29.9, 29.0, 28.0, 25.0]
-    assert [FOUND[i].turned for i in speed][:2] == [("model.primitives=200",), ("model.neurons=8",)] and 6 not in speed and 7 not in speed
+    assert (
+        [FOUND[i].turned for i in speed][:2] == [("model.primitives=200",), ("model.neurons=8",)]
+        and 6 not in speed
+        and 7 not in speed
+    )
     untimed = [*FOUND, Model("x", (), {"psnr": 40.0}, 1)]
     assert 8 not in fronts(untimed)[0] and fronts(untimed)[1] == [8]
 
@@ -78,5 +88,10 @@ def test_a_model_is_read_back_as_it_was() -> None:
     made.ratios, made.ms = [0.5, 0.6, 0.7], [9.0, 9.0, 9.0]
     assert made.time == pytest.approx(2.4), "of the centre's, whatever the load was"
     back = Model.from_dict(made.to_dict())
-    assert back == made and back.name == "neurons=0" and back.ms_per_step == 40.0 and back.seed_spread == pytest.approx(0.1414, abs=1e-4)
+    assert (
+        back == made
+        and back.name == "neurons=0"
+        and back.ms_per_step == 40.0
+        and back.seed_spread == pytest.approx(0.1414, abs=1e-4)
+    )
     assert Model.from_dict(FOUND[7].to_dict()).name == "0.5 of the length"

@@ -53,10 +53,21 @@ def test_words_have_the_length_and_as_many_interventions_as_a_whole_run() -> Non
     config = compose(typed, check_output=False)
     assert config.train.population.every == 200
     found = values(plan.words_of(variant, typed, config))
-    assert found == {"task": "static", "scene": "solids", "model.neurons": 4, "train.iterations": 500, "train.population.every": 100}
+    assert found == {
+        "task": "static",
+        "scene": "solids",
+        "model.neurons": 4,
+        "train.iterations": 500,
+        "train.population.every": 100,
+    }
     assert values(plan.words_of(variant, WORDS, centre()))["train.population.every"] == 100, "as typed"
     whole = Plan(1000, 10.0, 1000, {CENTRE: 1.0})
-    assert whole.words_of(Variant(CENTRE), typed, config) == ["task=static", "scene=solids", "model.neurons=2", "train.iterations=1000"]
+    assert whole.words_of(Variant(CENTRE), typed, config) == [
+        "task=static",
+        "scene=solids",
+        "model.neurons=2",
+        "train.iterations=1000",
+    ]
 
 
 def test_a_budget_in_seconds_becomes_one_in_steps() -> None:
@@ -64,7 +75,11 @@ def test_a_budget_in_seconds_becomes_one_in_steps() -> None:
     config = compose(words, check_output=False)
     plan = Plan(300, 3.0, 0, {CENTRE: 1.0})
     made = compose(plan.words_of(Variant(CENTRE), words, config), check_output=False)
-    assert made.train.iterations == 300 and made.train.max_seconds is None and made.train.population.every == config.train.population.every
+    assert (
+        made.train.iterations == 300
+        and made.train.max_seconds is None
+        and made.train.population.every == config.train.population.every
+    )
 
 
 def test_a_plan_is_read_back_as_it_was() -> None:

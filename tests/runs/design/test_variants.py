@@ -26,10 +26,14 @@ def turned(ladder: list[Variant]) -> list[str]:
 def test_the_static_task_has_its_knobs_next_to_the_centre_first() -> None:
     found = offered("task=static", "scene=solids")
     assert list(found) == ["model.primitives", "model.neurons", "model.density.edge", "model.sh_degree", LENGTH]
-    assert turned(found["model.primitives"]) == [f"model.primitives={count}" for count in (1400, 5600, 700, 11200, 350, 175, 88, 44)]
+    assert turned(found["model.primitives"]) == [
+        f"model.primitives={count}" for count in (1400, 5600, 700, 11200, 350, 175, 88, 44)
+    ]
     few = offered("task=static", "scene=solids", "model.primitives=4")["model.primitives"]
     assert turned(few) == [f"model.primitives={count}" for count in (2, 8, 1, 16)], "each once"
-    assert turned(found["model.neurons"]) == ["model.neurons=0", "model.neurons=4", "model.neurons=8"], "the preset has two"
+    assert turned(found["model.neurons"]) == ["model.neurons=0", "model.neurons=4", "model.neurons=8"], (
+        "the preset has two"
+    )
     assert turned(found["model.density.edge"]) == ["model.density.edge=1", "model.density.edge=0"]
     assert turned(found["model.sh_degree"]) == ["model.sh_degree=2", "model.sh_degree=1", "model.sh_degree=0"]
     assert [variant.length for variant in found[LENGTH]] == [0.5, 0.25]
@@ -42,12 +46,17 @@ def test_every_task_has_its_own_and_no_other() -> None:
     assert "model.density.time=phase" in turned(dynamic["model.density.time"])
     relight = offered("task=relight")
     assert "model.sh_degree" not in relight and "model.colour.degree" not in relight
-    assert turned(relight["model.colour.hidden"]) == ["model.colour.hidden=4", "model.colour.hidden=12", "model.colour.hidden=0"]
+    assert turned(relight["model.colour.hidden"]) == [
+        "model.colour.hidden=4",
+        "model.colour.hidden=12",
+        "model.colour.hidden=0",
+    ]
     assert "model.colour.hidden" not in offered("task=relight", "model.colour.form=harmonics")
 
 
 @pytest.mark.parametrize(
-    "words", [("task=static",), ("task=dynamic", "scene=smoke_fire"), ("task=relight",), ("task=static", "preset=paper")]
+    "words",
+    [("task=static",), ("task=dynamic", "scene=smoke_fire"), ("task=relight",), ("task=static", "preset=paper")],
 )
 def test_every_word_composes(words: tuple[str, ...]) -> None:
     for ladder in offered(*words).values():
@@ -102,6 +111,7 @@ def test_words_over_others_replace_them() -> None:
 
 def test_no_such_knob() -> None:
     with pytest.raises(
-        ConfigError, match=r"--knobs model\.neuron: no such knob of a model of task 'static'; did you mean 'model\.neurons'"
+        ConfigError,
+        match=r"--knobs model\.neuron: no such knob of a model of task 'static'; did you mean 'model\.neurons'",
     ):
         check_knobs(["model.neuron"], offered("task=static"), "static")

@@ -1,4 +1,5 @@
-"""Real Ray on this machine, and real submitit with its local executor: the same jobs as in processes, where the packages are installed."""
+"""Real Ray on this machine, and real submitit with its local executor: the same jobs as in processes, where the
+packages are installed."""
 
 from __future__ import annotations
 
@@ -84,7 +85,10 @@ def test_ctrl_c_reaches_what_ray_has_at_work(ray: Any, tmp_path: Path) -> None:
             threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
 
     first, second = launch(
-        [job(str(n), launching.toil, 60.0) for n in range(2)], LauncherSettings("ray", workers=1), tmp_path / "launch", hear
+        [job(str(n), launching.toil, 60.0) for n in range(2)],
+        LauncherSettings("ray", workers=1),
+        tmp_path / "launch",
+        hear,
     )
     assert first is not None and first.state == "interrupted" and second is None
 
@@ -97,7 +101,10 @@ def test_ray_that_does_not_answer_is_said_within_seconds(tmp_path: Path) -> None
         start = time.monotonic()
         with pytest.raises(BackendUnavailable) as error:
             launch([job("x", launching.double, 1)], LauncherSettings("ray", address=address), tmp_path / "launch")
-    assert str(error.value).startswith(f"launcher.address={address}: nothing answers there") and time.monotonic() - start < 20
+    assert (
+        str(error.value).startswith(f"launcher.address={address}: nothing answers there")
+        and time.monotonic() - start < 20
+    )
     assert not (tmp_path / "launch").exists()
 
 
@@ -112,7 +119,9 @@ def test_submitit_does_jobs(tmp_path: Path) -> None:
     pytest.importorskip("submitit")
     settings = LauncherSettings("slurm", workers=2, address="local")
     double, refused = launch(
-        [job("double", launching.double, 21), job("refused", launching.refuse, "no images")], settings, tmp_path / "launch"
+        [job("double", launching.double, 21), job("refused", launching.refuse, "no images")],
+        settings,
+        tmp_path / "launch",
     )
     assert double is not None and double.value == 42
     assert refused is not None and (refused.state, refused.line) == ("failed", "no images")
@@ -128,7 +137,10 @@ def test_submitits_results_come_from_a_folder_of_this_launch_alone(tmp_path: Pat
     engines = [Slurm(LauncherSettings("slurm", workers=1, address="local"), 1, tmp_path) for _ in range(2)]
     folders = [Path(engine._executor.folder) for engine in engines]
     assert len({*folders, tmp_path / "submitit"}) == 3
-    assert all(folder.parent == tmp_path and folder.stat().st_mode & 0o777 == 0o700 and not any(folder.iterdir()) for folder in folders)
+    assert all(
+        folder.parent == tmp_path and folder.stat().st_mode & 0o777 == 0o700 and not any(folder.iterdir())
+        for folder in folders
+    )
     for engine in engines:
         engine.close(False)
 
@@ -146,14 +158,18 @@ def test_submitit_queues_again_with_what_goes_on(tmp_path: Path) -> None:
     from neuprim.runs.launch.slurm import _Requeued
     from neuprim.runs.launch.worker import Task
 
-    again = _Requeued(Task(job("once", launching.die, 1), 1, tmp_path / "0.json", tmp_path / "stop", tmp_path)).checkpoint()
+    again = _Requeued(
+        Task(job("once", launching.die, 1), 1, tmp_path / "0.json", tmp_path / "stop", tmp_path)
+    ).checkpoint()
     assert again.function.task.attempt == 1
 
 
 def test_without_slurm_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("submitit")
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(BackendUnavailable, match=r"launcher=slurm: .*srun.*; launcher.address=local does without a cluster"):
+    with pytest.raises(
+        BackendUnavailable, match=r"launcher=slurm: .*srun.*; launcher.address=local does without a cluster"
+    ):
         launch([job("x", launching.double, 1)], LauncherSettings("slurm"), tmp_path / "launch")
     assert not (tmp_path / "launch").exists()
 
@@ -161,5 +177,7 @@ def test_without_slurm_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(("name", "package"), [("ray", "ray"), ("slurm", "submitit")])
 def test_a_package_that_is_missing_is_named(name: Any, package: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, package, None)
-    with pytest.raises(NeuprimError, match=rf"launcher={name} needs the package {package} .*: pip install 'neuprim\[{name}\]'"):
+    with pytest.raises(
+        NeuprimError, match=rf"launcher={name} needs the package {package} .*: pip install 'neuprim\[{name}\]'"
+    ):
         check_launcher(LauncherSettings(name), 1)

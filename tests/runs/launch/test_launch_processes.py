@@ -40,7 +40,8 @@ def states(results: list[Result | None]) -> list[str | None]:
 
 @posix
 def test_what_comes_back_and_what_stays(tmp_path: Path) -> None:
-    """All that may become of a job: done, slow, refused, a bug, killed once, killed too often. None of it holds up the others."""
+    """All that may become of a job: done, slow, refused, a bug, killed once, killed too often. None of it holds up the
+    others."""
     heard: list[tuple[int, Status]] = []
     ended: list[int] = []
     jobs = [
@@ -53,16 +54,22 @@ def test_what_comes_back_and_what_stays(tmp_path: Path) -> None:
     ]
     jobs.insert(0, job("slow", launching.doze, 2.0))
     folder = tmp_path / "launch"
-    results = launch(jobs, processes(2, retries=1), folder, lambda n, s: heard.append((n, s)), lambda n, r: ended.append(n))
+    results = launch(
+        jobs, processes(2, retries=1), folder, lambda n, s: heard.append((n, s)), lambda n, r: ended.append(n)
+    )
     _, double, share, refused, bug, once, often = results
-    assert states(results) == ["done", "done", "done", "failed", "failed", "done", "failed"] and sorted(ended) == list(range(7))
+    assert states(results) == ["done", "done", "done", "failed", "failed", "done", "failed"] and sorted(ended) == list(
+        range(7)
+    )
     assert ended.index(0) > ended.index(2), "the slow one holds up nobody"
     assert double is not None and double.value == 42
     assert share is not None and share.value == (1, "1", 1), "cores are shared out: two workers of two cores"
     assert refused is not None and (refused.line, refused.trace) == ("no images", "")
     assert bug is not None and bug.line == "ZeroDivisionError: a bug" and "in bug" in bug.trace
     assert once is not None and (once.value, once.attempts) == (1, 2)
-    assert often is not None and often.attempts == 2 and "its worker died, 2 times: its process was killed" in often.line
+    assert (
+        often is not None and often.attempts == 2 and "its worker died, 2 times: its process was killed" in often.line
+    )
     log = Path(often.line.rpartition("it printed ")[2])
     assert log.parent == folder and "about to die" in log.read_text()
     assert {p.suffix for p in folder.iterdir()} == {".log"}, "nothing else is left"
@@ -96,11 +103,16 @@ def test_killed_in_every_phase_a_run_ends_as_if_nothing_had_been(tmp_path: Path)
         config = compose(words(scene, tmp_path / phase, 60, *more))
         jobs.append(job(phase, launching.fit_and_die, {"phase": phase, "config": config.to_dict()}))
     results = launch(jobs, processes(2), tmp_path / "launch")
-    assert [(r.state, r.attempts) for r in results if r is not None] == [("done", 2)] * len(PHASES), [r and r.line for r in results]
+    assert [(r.state, r.attempts) for r in results if r is not None] == [("done", 2)] * len(PHASES), [
+        r and r.line for r in results
+    ]
     for phase in PHASES:
         for kind in ("model", "checkpoint"):
             first, second = (checkpoint.read(d / f"{kind}.safetensors", kind)[1] for d in (whole, tmp_path / phase))
-            assert first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first), (phase, kind)
+            assert first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first), (
+                phase,
+                kind,
+            )
         assert (tmp_path / phase / "report.html").exists() and not (tmp_path / phase / ".lock").exists()
 
 
@@ -124,7 +136,11 @@ def test_who_gives_no_sign_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         ({"workers": 1}, 5, (1, 2)),
         ({"threads": 2}, 5, (1, 2)),
         ({"workers": 2, "threads": 1}, 1, (2, 1)),
-        ({"workers": 3}, 5, "launcher.workers=3: more than the 2 cores of this machine; expected at most 2 threads together"),
+        (
+            {"workers": 3},
+            5,
+            "launcher.workers=3: more than the 2 cores of this machine; expected at most 2 threads together",
+        ),
         ({"workers": 2, "threads": 2}, 5, "launcher.workers=2 with launcher.threads=2: more than"),
     ],
 )

@@ -1,4 +1,5 @@
-"""The viewer in a real browser: a finished run and one that is trained, what a person does there, and what a stranger's names cannot do."""
+"""The viewer in a real browser: a finished run and one that is trained, what a person does there, and what a stranger's
+names cannot do."""
 
 from __future__ import annotations
 
@@ -60,7 +61,10 @@ class Tab:
         page.on("console", lambda message: self.faults.append(message.text) if message.type == "error" else None)
         page.on("dialog", lambda dialog: self.faults.append(f"dialog: {dialog.message}"))
         page.on(
-            "request", lambda asked: self.elsewhere.append(asked.url) if not asked.url.startswith((own, f"blob:{own}", "data:")) else None
+            "request",
+            lambda asked: (
+                self.elsewhere.append(asked.url) if not asked.url.startswith((own, f"blob:{own}", "data:")) else None
+            ),
         )
         page.goto(address)
 
@@ -99,7 +103,9 @@ class Tab:
 def open_tab(started: Any, address: str) -> Iterator[Tab]:
     page = started.new_page(viewport={"width": 800, "height": 600})
     tab = Tab(page, address)
-    tab.until(lambda: page.get_by_label("show", exact=True).count() > 0 or page.get_by_role("tab").count() > 0, "controls")
+    tab.until(
+        lambda: page.get_by_label("show", exact=True).count() > 0 or page.get_by_role("tab").count() > 0, "controls"
+    )
     yield tab
     page.close()
 
@@ -155,7 +161,9 @@ def test_a_person_looks_at_a_run(address: str, chromium: Any) -> None:
         def described() -> bool:  # the page listens to clicks a moment after the box was ticked
             page.mouse.click(int(x) + 20, int(y) + 160)
             page.wait_for_timeout(500)
-            return "semi-axes" in str(page.evaluate("[...document.querySelectorAll('textarea')].map(e => e.value).join()"))
+            return "semi-axes" in str(
+                page.evaluate("[...document.querySelectorAll('textarea')].map(e => e.value).join()")
+            )
 
         tab.until(described, "its parameters")
         assert page.evaluate("document.body.innerText").count(HOSTILE) == 1, "the run's name is text"

@@ -64,9 +64,15 @@ def test_a_stranger_gets_no_connection_and_nothing_is_sent(page: PageServer) -> 
     for headers in (
         {"Cookie": ""},
         {"Cookie": f"neuprim-{port}={token[:-1]}"},
-        {"Origin": "http://evil.example"},  # a page that the user has open elsewhere, even if the browser sent the cookie
+        {
+            "Origin": "http://evil.example"
+        },  # a page that the user has open elsewhere, even if the browser sent the cookie
         {"Origin": f"http://localhost:{port + 1}"},  # another server on this machine
-        {"Host": f"evil.example:{port}", "Origin": f"http://evil.example:{port}", "Cookie": ""},  # a name that was bent to this machine
+        {
+            "Host": f"evil.example:{port}",
+            "Origin": f"http://evil.example:{port}",
+            "Cookie": "",
+        },  # a name that was bent to this machine
     ):
         with pytest.raises(InvalidStatus, match="403"), visit(page.address, **headers):
             pass
@@ -90,7 +96,9 @@ def test_odd_requests_are_refused(page: PageServer) -> None:
     assert fetch(page.address.replace("/?", "/../../etc/passwd?"))[0] == 404
 
 
-def test_the_page_cannot_be_passed_on_through_a_server_elsewhere(page: PageServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_cannot_be_passed_on_through_a_server_elsewhere(
+    page: PageServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[str] = []
     monkeypatch.setattr("viser._viser.ViserTunnel", lambda *args: asked.append("tunnel"))
     with visit(page.address) as visitor:
@@ -150,10 +158,18 @@ def test_ports_and_hosts_that_are_not_to_be_had(page: PageServer) -> None:
             ["localhost", "LOCALHOST:80", "127.0.0.1:9", "[::1]:9"],
             ["evil.example", "localhost.evil.example:9", "10.0.0.3", "127.0.0.2"],
         ),
-        ("10.0.0.3", ["10.0.0.3:8080", "localhost:8080"], ["10.0.0.4:8080", "evil.example:8080", "10.0.0.3.evil.example"]),
+        (
+            "10.0.0.3",
+            ["10.0.0.3:8080", "localhost:8080"],
+            ["10.0.0.4:8080", "evil.example:8080", "10.0.0.3.evil.example"],
+        ),
         ("fe80::1", ["[fe80::1]:8080"], ["[fe80::2]:8080", "evil.example"]),
         ("render.lan", ["render.lan:8080", "Render.LAN"], ["lan:8080", "10.0.0.3"]),
-        ("0.0.0.0", ["10.0.0.3:8080", "[fe80::1]", "localhost", socket.gethostname()], ["evil.example:8080", "localhost."]),
+        (
+            "0.0.0.0",
+            ["10.0.0.3:8080", "[fe80::1]", "localhost", socket.gethostname()],
+            ["evil.example:8080", "localhost."],
+        ),
         ("::", ["10.0.0.3:8080", "[::1]:8"], ["evil.example:8080"]),
     ],
 )
@@ -168,7 +184,15 @@ def test_a_server_answers_to_its_own_names_alone(listens: str, good: list[str], 
 
 @pytest.mark.parametrize(
     ("host", "own"),
-    [("127.0.0.1", True), ("::1", True), ("localhost", True), ("127.8.1.2", True), ("0.0.0.0", False), ("10.0.0.3", False), ("a.b", False)],
+    [
+        ("127.0.0.1", True),
+        ("::1", True),
+        ("localhost", True),
+        ("127.8.1.2", True),
+        ("0.0.0.0", False),
+        ("10.0.0.3", False),
+        ("a.b", False),
+    ],
 )
 def test_what_counts_as_this_machine_alone(host: str, own: bool) -> None:
     assert is_loopback(host) is own

@@ -1,4 +1,5 @@
-"""Messages that no page sends, and values that a control was not made for: dropped, with one line, before anything acts on them."""
+"""Messages that no page sends, and values that a control was not made for: dropped, with one line, before anything acts
+on them."""
 
 from __future__ import annotations
 
@@ -51,13 +52,21 @@ def server() -> Iterator[PageServer]:
 
 
 def reason(message: Any, handle: Any = None) -> str | None:
-    return refusal(message if isinstance(message, bytes | str) else msgspec.msgpack.encode(message), lambda uuid: handle)
+    return refusal(
+        message if isinstance(message, bytes | str) else msgspec.msgpack.encode(message), lambda uuid: handle
+    )
 
 
 def test_what_a_page_sends_passes() -> None:
     drag = {"name": "/light", "owner": "1"}
     moved = {"type": "TransformControlsUpdateMessage", "wxyz": (1, 0, 0, 0), "position": (1, 2, 3.5), **drag}
-    for message in (CAMERA, CLICK, {**CLICK, "modifier": None}, moved, {"type": "TransformControlsDragStartMessage", **drag}):
+    for message in (
+        CAMERA,
+        CLICK,
+        {**CLICK, "modifier": None},
+        moved,
+        {"type": "TransformControlsDragStartMessage", **drag},
+    ):
         assert reason(message) is None
 
 
@@ -111,7 +120,9 @@ def test_a_control_takes_what_it_was_made_for(server: PageServer, number: int) -
     make, good, bad = CONTROLS[number]
     handle = make(server.viser.gui)
     for value in good:
-        assert reason({"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}, handle) is None, value
+        assert (
+            reason({"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}, handle) is None
+        ), value
     for value in bad:
         found = reason({"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}, handle)
         assert found is not None and found.startswith(f"{handle.label}: ") and len(found) < 200, value
@@ -138,7 +149,12 @@ def test_a_hostile_page_changes_nothing_and_is_told(visited: tuple[Page, str], t
     page, address = visited
     with visit(address) as visitor:
         visitor.stand()
-        visitor.hear(20, lambda messages: len(visitor.pictures()) > 1 and any(m.get("props", {}).get("label") == "film" for m in messages))
+        visitor.hear(
+            20,
+            lambda messages: (
+                len(visitor.pictures()) > 1 and any(m.get("props", {}).get("label") == "film" for m in messages)
+            ),
+        )
         (session,) = page.sessions.values()
         before = (session.longest, session.shows, session.settings)
 

@@ -1,4 +1,5 @@
-"""Camera paths: poses and cameras are each other's inverse, keys make a smooth way, and its file is one that ``neuprim render`` reads."""
+"""Camera paths: poses and cameras are each other's inverse, keys make a smooth way, and its file is one that ``neuprim
+render`` reads."""
 
 from __future__ import annotations
 
@@ -32,12 +33,16 @@ def keys(*xs: float, **conditions: torch.Tensor) -> list[Key]:
 def test_a_pose_is_its_camera_in_any_window() -> None:
     there = camera(1.3)
     back = Pose.of(there).camera(64, 48)
-    assert torch.allclose(back.viewmat, there.viewmat, atol=1e-12) and back.fy == pytest.approx(there.fy) and back.cx == 32
+    assert (
+        torch.allclose(back.viewmat, there.viewmat, atol=1e-12) and back.fy == pytest.approx(there.fy) and back.cx == 32
+    )
     wide = Pose.of(there).camera(128, 48)
     assert wide.fx == wide.fy == pytest.approx(there.fy) and wide.cx == 64, "the vertical field of view stays"
 
 
-@pytest.mark.parametrize(("size", "found"), [((1280, 800), (960, 600)), ((400, 800), (400, 800)), ((1, 5000), (1, 960)), ((0, 0), (1, 1))])
+@pytest.mark.parametrize(
+    ("size", "found"), [((1280, 800), (960, 600)), ((400, 800), (400, 800)), ((1, 5000), (1, 960)), ((0, 0), (1, 1))]
+)
 def test_windows_are_fitted_into_pictures(size: tuple[int, int], found: tuple[int, int]) -> None:
     assert fitted(size, 960) == found
 

@@ -71,7 +71,9 @@ def test_lower_resolution_is_sent_as_it_was_drawn(model: Primitives) -> None:
 
 def test_a_picture_of_too_many_rays_is_refused(model: Primitives) -> None:
     look = replace(look_at(), camera=look_at().camera.resized(2048, 1536))
-    with pytest.raises(ConfigError, match=r"2048 x 1536 pixels with renderer.samples=16 take more than 67,108,864 rays"):
+    with pytest.raises(
+        ConfigError, match=r"2048 x 1536 pixels with renderer.samples=16 take more than 67,108,864 rays"
+    ):
         draw_look(model, look, OperatingPoint(replace(SETTINGS, samples=16)), WHITE, RGB)
 
 
@@ -87,7 +89,9 @@ def test_levels_without_a_front_are_resolutions(model: Primitives) -> None:
     assert levels.within(0.05, 1000) is levels.full, "its own pace counts where it is known"
     levels.took(levels.all[-1], 0.03, 1000)
     levels.full.pace = 0.08 / 1000
-    assert levels.within(0.05, 1000) is levels.all[1], "a slow start of every picture does not rule out what lies between"
+    assert levels.within(0.05, 1000) is levels.all[1], (
+        "a slow start of every picture does not rule out what lies between"
+    )
 
 
 def test_levels_are_the_front_that_was_measured(model: Primitives, tmp_path: Path) -> None:
@@ -104,9 +108,13 @@ def test_levels_are_the_front_that_was_measured(model: Primitives, tmp_path: Pat
     assert [ratio for _, ratio in front.points] == [0.5, 0.2, 0.1]
     told: list[str] = []
     levels = Levels.of(model, SETTINGS, front, told.append)
-    assert [level.ratio for level in levels.all[:3]] == [1.0, 0.5, 0.2] and levels.all[1].point.settings.alpha_min == 0.05
+    assert [level.ratio for level in levels.all[:3]] == [1.0, 0.5, 0.2] and levels.all[
+        1
+    ].point.settings.alpha_min == 0.05
     assert levels.all[3].point.resolution == 0.25 and levels.all[3].point.reduced == {("density", "neurons"): 1}
-    assert len(told) == 1 and "density.neurons=7" in told[0], "a point that does not fit this model is left out and told"
+    assert len(told) == 1 and "density.neurons=7" in told[0], (
+        "a point that does not fit this model is left out and told"
+    )
     (tmp_path / "tradeoff" / "tradeoff.json").write_text("{")
     assert read_front(tmp_path, told.append) == Front() and "tradeoff.json" in told[-1]
 

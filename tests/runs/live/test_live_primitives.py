@@ -36,7 +36,11 @@ def weights(model: Primitives, look: Look, x: float, y: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("timed", [False, True])
 def test_the_primitive_under_the_mouse_is_the_one_that_contributes_most(timed: bool) -> None:
-    fields = (TimeDensity(2, "window+motion", edge=2), TimeHarmonics(1)) if timed else (CosineDensity(2, edge=2), SphericalHarmonics(1))
+    fields = (
+        (TimeDensity(2, "window+motion", edge=2), TimeHarmonics(1))
+        if timed
+        else (CosineDensity(2, edge=2), SphericalHarmonics(1))
+    )
     model = random_model(*fields, count=60, seed=2)
     look = Look(camera_at((0.3, -3.0, 1.0)), {"time": torch.tensor(0.3)} if timed else {})
     camera, found = look.camera, []
@@ -56,7 +60,11 @@ def test_ellipsoids_are_where_the_frame_has_them() -> None:
     every = ellipsoids_of(model, look, RGB, 1000)
     assert np.array_equal(every.rows, living.rows.numpy()) and 0 < len(every.rows) < 40  # type: ignore[union-attr]
     assert np.allclose(every.positions, living.geometry.means) and np.allclose(every.scales, living.geometry.scales)
-    assert np.allclose(np.linalg.norm(every.wxyz, axis=1), 1, atol=1e-6) and every.colours.dtype == np.uint8 and every.colours.std() > 5
+    assert (
+        np.allclose(np.linalg.norm(every.wxyz, axis=1), 1, atol=1e-6)
+        and every.colours.dtype == np.uint8
+        and every.colours.std() > 5
+    )
     few = ellipsoids_of(model, look, RGB, 5)
     assert len(few.rows) == 5 and set(few.rows) < set(every.rows)
     one = ellipsoid_of(model, look, int(every.rows[3]))

@@ -62,7 +62,9 @@ def test_a_run_whose_data_are_gone_is_shown_without_held_out_views(run_dir: Path
     (copy / "config.yaml").write_text(config.replace(str(run_dir.parent / "two"), str(tmp_path / "gone")))
     told: list[str] = []
     subject = open_subject(copy, told.append)
-    assert subject.dataset is None and subject.view_names() == [] and len(told) == 1 and "no held-out views: " in told[0]
+    assert (
+        subject.dataset is None and subject.view_names() == [] and len(told) == 1 and "no held-out views: " in told[0]
+    )
     start = subject.start()
     image = subject.draw(Look(start.camera.resized(96, 54), start.conditions), OperatingPoint(subject.settings)).image
     assert image.std() > 10, "the model is in the picture"
@@ -87,7 +89,9 @@ def test_a_model_on_a_card_is_drawn_and_asked_like_any(monkeypatch: pytest.Monke
 
     def asked() -> tuple[np.ndarray, np.ndarray, int | None]:
         channels = Channels(("R", "G", "B"), "srgb", None, "static")
-        subject = Subject("it", STATIC, lambda: model, channels, settings, torch.ones(3), (0.0, 0.0, 1.0), Subject.middle_of(model))
+        subject = Subject(
+            "it", STATIC, lambda: model, channels, settings, torch.ones(3), (0.0, 0.0, 1.0), Subject.middle_of(model)
+        )
         start = subject.start()
         assert start.camera.viewmat.isfinite().all()
         picture = subject.draw(look, OperatingPoint(settings)).image
@@ -98,4 +102,8 @@ def test_a_model_on_a_card_is_drawn_and_asked_like_any(monkeypatch: pytest.Monke
         model = model.to(CARD)
         assert model.device == CARD
         found = asked()
-    assert np.array_equal(found[0], expected[0]) and np.array_equal(found[1], expected[1]) and found[2] == expected[2] is not None
+    assert (
+        np.array_equal(found[0], expected[0])
+        and np.array_equal(found[1], expected[1])
+        and found[2] == expected[2] is not None
+    )

@@ -1,4 +1,5 @@
-"""A page beside a training: it pauses, steps, saves and stops it, and the model ends with the bits that it has without."""
+"""A page beside a training: it pauses, steps, saves and stops it, and the model ends with the bits that it has
+without."""
 
 from __future__ import annotations
 
@@ -98,8 +99,11 @@ def until(page: Visitor, condition: Callable[[], bool]) -> None:
     assert condition()
 
 
-def test_a_training_that_is_looked_at_ends_with_the_same_bits(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Somebody turns the model, looks at a held-out view and at ellipsoids, pauses and steps; the checkpoint is the same to the bit."""
+def test_a_training_that_is_looked_at_ends_with_the_same_bits(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody turns the model, looks at a held-out view and at ellipsoids, pauses and steps; the checkpoint is the
+    same to the bit."""
     monkeypatch.setattr(sessions, "_AGAIN", 0.0)
     monkeypatch.setattr(sessions, "_SHARE", 0.0)  # draws after every step
     alone, looked_at = (compose(words(scene, tmp_path / name, STEPS)) for name in ("alone", "looked_at"))
@@ -146,7 +150,12 @@ def test_pictures_touch_no_random_numbers(scene: Path, tmp_path: Path) -> None:
     states: list[tuple[Any, ...]] = []
 
     def now() -> tuple[Any, ...]:
-        return torch.get_rng_state().numpy().tobytes(), np.random.get_state()[1].tobytes(), random.getstate(), torch.get_num_threads()  # type: ignore[index, union-attr]
+        return (
+            torch.get_rng_state().numpy().tobytes(),
+            np.random.get_state()[1].tobytes(),
+            random.getstate(),
+            torch.get_num_threads(),
+        )  # type: ignore[index, union-attr]
 
     def look(live: LiveTraining, page: Visitor) -> None:
         until(page, lambda: len(page.pictures()) > 1)
@@ -185,7 +194,9 @@ def test_a_checkpoint_now_and_a_stop_that_can_be_resumed(scene: Path, tmp_path: 
     assert all(torch.equal(value, second[name]) for name, value in first.items())
 
 
-def test_a_picture_that_fails_ends_no_training(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
+def test_a_picture_that_fails_ends_no_training(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
+) -> None:
     def broken(*args: Any) -> None:
         raise RuntimeError("no such picture")
 

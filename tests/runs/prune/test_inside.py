@@ -109,7 +109,8 @@ def test_primitives_that_no_image_shows_go_only_where_nothing_is_known_inside() 
 
 
 def test_what_no_view_shows_is_left_alone() -> None:
-    """A primitive behind all cameras: nothing is known of it, so it is not for pruning to say that it is worth nothing."""
+    """A primitive behind all cameras: nothing is known of it, so it is not for pruning to say that it is worth
+    nothing."""
     model, dataset = known()
     params = {name: value.clone() for name, value in model.params.items()}
     params["means"][5] = torch.tensor([0.0, 0.0, 50.0])

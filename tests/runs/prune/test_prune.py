@@ -29,7 +29,8 @@ TOLERANCE = 1.0
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Forty primitives for two, and degree 3 for what is matte; all there from the start, so that none hides behind its parent, where it could go for nothing."""
+    """Forty primitives for two, and degree 3 for what is matte; all there from the start, so that none hides behind its
+    parent, where it could go for nothing."""
     folder = tmp_path_factory.mktemp("whole")
     return fit(words(tiny.write_blender(folder / "two"), folder / "run", 240, "train.population.grow_from=1"))
 
@@ -57,7 +58,9 @@ def test_less_is_left_and_training_views_lose_no_more_than_the_tolerance(made: P
 def test_the_run_of_what_is_left_is_a_run(whole: Path, left: Path, made: Pruning) -> None:
     config = RunConfig.from_yaml(left / "config.yaml")
     _, _, model, header = load_run(left)
-    assert model.count == made.after["primitives"] == config.model.primitives and numbers(model) == made.after["numbers"]
+    assert (
+        model.count == made.after["primitives"] == config.model.primitives and numbers(model) == made.after["numbers"]
+    )
     assert header["iterations"] == 240 and config.output_dir == left
     found, recorded = evaluate_run(left), json.loads((left / "metrics.json").read_text())
     assert found["psnr"] == pytest.approx(made.after["psnr"], abs=1e-4) == pytest.approx(recorded["psnr"], abs=1e-4)
@@ -65,7 +68,11 @@ def test_the_run_of_what_is_left_is_a_run(whole: Path, left: Path, made: Pruning
     assert (left / "report.html").exists() and any((left / "renders").iterdir())
     assert evaluate_run(whole)["psnr"] == pytest.approx(made.before["psnr"], abs=1e-4)
     record = json.loads((left / "pruned.json").read_text())
-    assert record["pruned_from"] == str(whole) and record["tolerance"] == TOLERANCE and record["reduced"] == list(made.words)
+    assert (
+        record["pruned_from"] == str(whole)
+        and record["tolerance"] == TOLERANCE
+        and record["reduced"] == list(made.words)
+    )
 
 
 def test_every_command_reads_it(left: Path, tmp_path: Path) -> None:
@@ -148,7 +155,9 @@ def test_inspect_says_what_is_left(left: Path, tmp_path: Path, capsys: pytest.Ca
         (["--steps", "-3"], "whole number"),
     ],
 )
-def test_words_that_mean_nothing_are_refused(whole: Path, words: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_words_that_mean_nothing_are_refused(
+    whole: Path, words: list[str], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["prune", str(whole), *words]) == 2
     assert expected in capsys.readouterr().err
 

@@ -1,4 +1,5 @@
-"""Models end no larger than their scenes: a still sequence without time, matte things without bands, soft blobs without cosines."""
+"""Models end no larger than their scenes: a still sequence without time, matte things without bands, soft blobs without
+cosines."""
 
 from __future__ import annotations
 
@@ -24,14 +25,18 @@ SIZE = 24
 
 
 class Blobs(ViewSet):
-    """Three soft blobs from all sides, as a camera with some noise sees them, and where there is time, the same at all times."""
+    """Three soft blobs from all sides, as a camera with some noise sees them, and where there is time, the same at all
+    times."""
 
     def __init__(self, count: int, begin: float, times: bool) -> None:
         self.cameras = [_camera(begin + 2.4 * i, 0.7 * math.sin(1.7 * i)) for i in range(count)]
         self.times = [torch.tensor(i * 0.37 % 1.0) for i in range(count)] if times else None
         frames = [render_lowered(_truth(), camera, RenderSettings(alpha_min=0.0, threads=1)) for camera in self.cameras]
         generator = torch.Generator().manual_seed(count)
-        self.images = [Pixels(f.rgb + (1 - f.alpha)[..., None] + 0.01 * torch.randn(f.rgb.shape, generator=generator)) for f in frames]
+        self.images = [
+            Pixels(f.rgb + (1 - f.alpha)[..., None] + 0.01 * torch.randn(f.rgb.shape, generator=generator))
+            for f in frames
+        ]
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -46,8 +51,12 @@ class Blobs(ViewSet):
 
 def _truth() -> Lowered:
     means = torch.tensor([[-0.4, 0.0, 0.0], [0.35, 0.2, 0.1], [0.1, -0.4, -0.2]])
-    geometry = Geometry(means, torch.tensor([[0.5, 0.4, 0.45]]).log().repeat(3, 1), torch.tensor([[1.0, 0.1, 0.0, 0.2]]).repeat(3, 1))
-    flat = Cosine(torch.zeros(3, 0, 3), torch.zeros(3, 0), torch.zeros(3, 0), torch.tensor([[3.0], [2.0], [4.0]]), edge=2)
+    geometry = Geometry(
+        means, torch.tensor([[0.5, 0.4, 0.45]]).log().repeat(3, 1), torch.tensor([[1.0, 0.1, 0.0, 0.2]]).repeat(3, 1)
+    )
+    flat = Cosine(
+        torch.zeros(3, 0, 3), torch.zeros(3, 0), torch.zeros(3, 0), torch.tensor([[3.0], [2.0], [4.0]]), edge=2
+    )
     return Lowered(geometry, flat, Constant(torch.tensor([[0.9, 0.2, 0.1], [0.2, 0.7, 0.3], [0.1, 0.3, 0.9]])))
 
 
@@ -67,7 +76,15 @@ def _near(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
 def dataset(times: bool) -> Dataset:
     train, test = Blobs(48, 0.0, times), Blobs(4, 0.5, times)
     extent = camera_extent([train.view(i).camera for i in range(len(train))])
-    return Dataset(name="blobs", train=train, test=test, start=_near, extent=extent, background=torch.ones(3), data_source="generated")
+    return Dataset(
+        name="blobs",
+        train=train,
+        test=test,
+        start=_near,
+        extent=extent,
+        background=torch.ones(3),
+        data_source="generated",
+    )
 
 
 def pruned(task: str, *words: str, steps: int = 2400) -> tuple[Primitives, Primitives, tuple[str, ...], Search]:
@@ -77,7 +94,9 @@ def pruned(task: str, *words: str, steps: int = 2400) -> tuple[Primitives, Primi
     config: RunConfig = compose([f"task={task}", f"scene={scene}", *common, *words], check_output=False)
     data = dataset(task == "dynamic")
     fitted = complete(start(config, dataset=data))
-    search = Search(replace(config, output_dir=config.output_dir / "none"), load_task(task), data, tolerance=0.5, steps=steps)
+    search = Search(
+        replace(config, output_dir=config.output_dir / "none"), load_task(task), data, tolerance=0.5, steps=steps
+    )
     small, less = search(fitted.model)
     assert search.judge(small) >= search.base - 0.5 - 1e-6 and search.base > 33.0
     return fitted.model, small, less, search

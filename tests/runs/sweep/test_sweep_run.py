@@ -55,7 +55,12 @@ def test_one_fails_the_others_are_compared_and_resume_makes_the_rest(
         f"neuprim: error: {out / 'seed-2'}: {out / 'seed-2' / 'model.safetensors'}: No space left on device"
     ]
     assert said.out.splitlines() == [
-        *(line for n in (1, 2, 3) for line in (f"[{n}/3] {out / f'seed-{n}'}", str(out / f"seed-{n}")) if line != str(out / "seed-2")),
+        *(
+            line
+            for n in (1, 2, 3)
+            for line in (f"[{n}/3] {out / f'seed-{n}'}", str(out / f"seed-{n}"))
+            if line != str(out / "seed-2")
+        ),
         str(out / "sweep.html"),
     ]
     rows = table(out)
@@ -64,7 +69,9 @@ def test_one_fails_the_others_are_compared_and_resume_makes_the_rest(
     ]  # fmt: skip
     metrics = json.loads((out / "seed-1" / "metrics.json").read_text())
     assert float(rows[0]["psnr"]) == metrics["psnr"] and rows[0]["model_bytes"] == str(metrics["model_bytes"])
-    assert rows[1]["psnr"] == "" and rows[1]["error"].endswith("No space left on device") and rows[0]["path"] == "seed-1"
+    assert (
+        rows[1]["psnr"] == "" and rows[1]["error"].endswith("No space left on device") and rows[0]["path"] == "seed-1"
+    )
     page = (out / "sweep.html").read_text()
     assert "<strong>seed-2 failed:</strong>" in page and "No space left on device" in page
 
@@ -73,7 +80,9 @@ def test_one_fails_the_others_are_compared_and_resume_makes_the_rest(
     assert main(["run", "-m", f"output_dir={out}", "resume=true"]) == 0, "sweep.json has the words"
     assert "[2/3]" in (said := capsys.readouterr()).out and "[1/3]" not in said.out
     assert [r["state"] for r in table(out)] == ["done"] * 3 and "failed" not in (out / "sweep.html").read_text()
-    assert before == {n: (out / f"seed-{n}" / "metrics.json").stat().st_mtime_ns for n in (1, 3)}, "what is done is kept"
+    assert before == {n: (out / f"seed-{n}" / "metrics.json").stat().st_mtime_ns for n in (1, 3)}, (
+        "what is done is kept"
+    )
 
     assert main(typed(scene, out, "resume=true", "model.primitives=9")) == 2
     assert f"{out / 'sweep.json'}: seed-1 was begun with task=static" in capsys.readouterr().err
@@ -91,7 +100,9 @@ def test_two_launchers_on_one_directory(scene: Path, tmp_path: Path, capsys: pyt
         assert [p.name for p in out.iterdir()] == [".lock"]
 
 
-def test_a_duplicated_run_is_refused_and_the_sweep_goes_on(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_duplicated_run_is_refused_and_the_sweep_goes_on(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "sweep"
     with held(out / "seed-2"):
         assert main(typed(scene, out, "train.iterations=1", "resume=true")) == 2
@@ -104,7 +115,10 @@ def test_a_duplicated_run_is_refused_and_the_sweep_goes_on(scene: Path, tmp_path
     [
         (["launcher=processes", "launcher.workers=100000"], "launcher.workers=100000: more than the"),
         (["launcher=slurm", "launcher.address=moon"], "launcher.address=moon: expected slurm or local"),
-        (["launcher=slurm", "launcher.address=local", "launcher.options.color=3"], "launcher.options: submitit refuses them"),
+        (
+            ["launcher=slurm", "launcher.address=local", "launcher.options.color=3"],
+            "launcher.options: submitit refuses them",
+        ),
     ],
 )
 def test_a_launcher_that_is_refused_leaves_nothing(
@@ -117,7 +131,9 @@ def test_a_launcher_that_is_refused_leaves_nothing(
     assert message in line and not (tmp_path / "sweep").exists()
 
 
-def test_nothing_to_sweep_and_a_damaged_record_are_said(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_to_sweep_and_a_damaged_record_are_said(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["run", "-m", f"output_dir={tmp_path}", "resume=true"]) == 2
     assert "no values to sweep; expected KEY=A,B,C, or output_dir=DIR resume=true of a sweep" in capsys.readouterr().err
     for text in ("{", "[]", '{"format": 9}', '{"format": 1, "words": [], "runs": [{"name": "../x"}]}'):

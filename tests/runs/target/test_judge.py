@@ -1,4 +1,5 @@
-"""A record of trainings, read with a target in mind: forecasts of sizes, limits, and settings that were turned since."""
+"""A record of trainings, read with a target in mind: forecasts of sizes, limits, and settings that were turned
+since."""
 
 from __future__ import annotations
 
@@ -44,7 +45,9 @@ def test_what_a_turned_setting_costs_is_taken_off_the_trials_before_it() -> None
     plain, turned = judge(Target(psnr=25), *PAIR), judge(Target(psnr=25), *PAIR, turns=turns)
     assert dict(turned.tried())[100] == pytest.approx(dict(plain.tried())[100] - 0.5)
     own = attempt(100, 200, 24.0, words={"model.sh_degree": 1})
-    assert judge(Target(psnr=25), own, turns=turns).forecasts()[100]["psnr"].value > turned.forecasts()[100]["psnr"].value
+    assert (
+        judge(Target(psnr=25), own, turns=turns).forecasts()[100]["psnr"].value > turned.forecasts()[100]["psnr"].value
+    )
     assert judge(Target(psnr=25), own).tried() == [], "made with a setting that was not turned"
 
 

@@ -78,5 +78,7 @@ def test_a_configuration_with_other_settings_says_so(tmp_path: Path) -> None:
     assert value_of(before, "model.colour.hidden") == 8, "the one before is as it was"
     assert after.model.colour.keys() == before.model.colour.keys()
     assert after.non_default["model.colour.hidden"] == (8, 4)
-    assert changed(after, {"model.colour.hidden": 8}).non_default.keys() == after.non_default.keys() - {"model.colour.hidden"}
+    assert changed(after, {"model.colour.hidden": 8}).non_default.keys() == after.non_default.keys() - {
+        "model.colour.hidden"
+    }
     assert value_of(before, "model.colour.nothing.here") is None

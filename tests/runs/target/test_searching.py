@@ -25,7 +25,9 @@ class Paced:
 
 
 def search(psnr: float, *attempts: Attempt) -> Search:
-    config = compose(["task=static", "scene=solids", "model.primitives=400", "train.iterations=800"], check_output=False)
+    config = compose(
+        ["task=static", "scene=solids", "model.primitives=400", "train.iterations=800"], check_output=False
+    )
     record = Record({"psnr": psnr, "budget": 100.0}, {}, length=200, attempts=list(attempts))
     return Search(config, Target(psnr=psnr), cast(Dataset, None), record, cast(Trying, cast(Any, Paced())))
 
@@ -45,7 +47,9 @@ def test_after_a_full_run_that_has_more_than_the_target_sizes_do_not_fall_at_onc
     found = search(25.0, *FLAT, attempt(400, 800, 25.85, "full"))
     assert found.down_to() == pytest.approx(200, abs=1) and found.wanted() >= 200
     assert search(25.0, *FLAT).down_to() == 1
-    assert search(25.0, *FLAT, attempt(400, 800, 25.85, "full"), attempt(100, 800, 24.0, "full")).down_to() == 1, "it lies between"
+    assert search(25.0, *FLAT, attempt(400, 800, 25.85, "full"), attempt(100, 800, 24.0, "full")).down_to() == 1, (
+        "it lies between"
+    )
 
 
 def test_near_the_target_is_near_in_bytes_too() -> None:

@@ -28,7 +28,9 @@ def test_one_slow_step_of_few_does_not_spoil_the_pace() -> None:
 
 
 def test_of_many_steps_the_mean_counts() -> None:
-    assert watched([2.0 * i for i in range(50)] + [1000.0 + i for i in range(50)]).pace == pytest.approx((1000 + 49) / 99)
+    assert watched([2.0 * i for i in range(50)] + [1000.0 + i for i in range(50)]).pace == pytest.approx(
+        (1000 + 49) / 99
+    )
 
 
 def test_one_step_has_no_pace() -> None:

@@ -60,13 +60,16 @@ def config(out: Path, *more: str) -> RunConfig:
         [
             "task=static", "scene=solids", "scene.size=32", "scene.train_views=16", "scene.test_views=3",
             "model.primitives=40", "model.neurons=2", "train.iterations=320", "train.population.every=20", "renderer.threads=1",
-            "train.population.grow_from=1",  # a step costs the same from the first on: what goes on is timed by the steps that are left
+            # a step costs the same from the first on: what goes on is timed by the steps that are left
+            "train.population.grow_from=1",
             f"output_dir={out}", *more,
         ]
     )  # fmt: skip
 
 
-def searched(out: Path, target: Target, *more: str, budget: float = BUDGET, clock: Clock | None = None) -> tuple[Record, Clock]:
+def searched(
+    out: Path, target: Target, *more: str, budget: float = BUDGET, clock: Clock | None = None
+) -> tuple[Record, Clock]:
     clock = clock or Clock()
     return target_run(config(out, *more), target, budget, clock.hear, clock), clock
 
@@ -146,7 +149,9 @@ def test_what_was_tried_is_recorded_and_said(met: tuple[Path, Record, Clock]) ->
     assert all(a.predicted["psnr"][1] > 0 for a in full) and record.chosen in [a.folder for a in full]
     for attempt in record.attempts[1:]:
         if attempt.purpose != "knob":
-            assert any(f"{attempt.count:,} primitives" in note and f"{attempt.steps:,} steps" in note for note in clock.notes)
+            assert any(
+                f"{attempt.count:,} primitives" in note and f"{attempt.steps:,} steps" in note for note in clock.notes
+            )
     assert read_record(out) == record
 
 
@@ -169,12 +174,19 @@ def test_another_target_keeps_the_trainings(met: tuple[Path, Record, Clock], tmp
 
 
 @posix
-def test_ctrl_c_and_resume_end_where_an_uninterrupted_search_ends(met: tuple[Path, Record, Clock], tmp_path: Path) -> None:
+def test_ctrl_c_and_resume_end_where_an_uninterrupted_search_ends(
+    met: tuple[Path, Record, Clock], tmp_path: Path
+) -> None:
     _, whole, clock = met
     out = tmp_path / "interrupted"
     for share in (0.2, 0.5):
         with pytest.raises(KeyboardInterrupt):
-            searched(out, Target(psnr=20.0), *(["resume=true"] if out.exists() else []), clock=Clock(round(share * clock.steps)))
+            searched(
+                out,
+                Target(psnr=20.0),
+                *(["resume=true"] if out.exists() else []),
+                clock=Clock(round(share * clock.steps)),
+            )
         assert read_record(out) is not None
     record, rest = searched(out, Target(psnr=20.0), "resume=true")
     assert trainings(record) == trainings(whole) and record.chosen == whole.chosen
@@ -214,7 +226,10 @@ def test_settings_that_a_target_decides_are_refused(more: list[str], message: st
 
 
 def test_a_budget_without_room_for_a_run_says_what_it_takes(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"budget=20s: a full run of 40 primitives would have \d+ steps; expected 256 or more, or \d+ s"):
+    with pytest.raises(
+        ConfigError,
+        match=r"budget=20s: a full run of 40 primitives would have \d+ steps; expected 256 or more, or \d+ s",
+    ):
         searched(tmp_path / "run", Target(psnr=20), budget=20.0)
 
 
@@ -245,7 +260,8 @@ def test_a_damaged_record_is_named(text: str, tmp_path: Path) -> None:
 
 
 def test_what_is_left_of_the_budget_prunes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Views held out are not trained on by the pruning either; what is pruned is taken only where it is smaller and still meets the target."""
+    """Views held out are not trained on by the pruning either; what is pruned is taken only where it is smaller and
+    still meets the target."""
     learned: list[int] = []
 
     class Watched(pruning.Search):

@@ -27,7 +27,9 @@ def dominated(a: Spot, b: Spot) -> bool:
 @given(SPOTS)
 def test_without_doubt_it_is_all_that_nothing_dominates(spots: list[Spot]) -> None:
     found = front(spots, same)
-    assert {(s.cost, s.quality) for s in found} == {(s.cost, s.quality) for s in spots if not any(dominated(s, other) for other in spots)}
+    assert {(s.cost, s.quality) for s in found} == {
+        (s.cost, s.quality) for s in spots if not any(dominated(s, other) for other in spots)
+    }
     assert len({(s.cost, s.quality) for s in found}) == len(found), "equal points count once"
 
 

@@ -79,7 +79,11 @@ def test_the_reference_has_the_numbers_of_eval(measured: tuple[Path, Record]) ->
     run_dir, record = measured
     metrics = evaluate_run(run_dir)
     quality = record.reference.quality
-    assert quality["psnr"] == metrics["psnr"] and quality["ssim"] == metrics["ssim"] and quality["ssim_3dgs"] == metrics["ssim_3dgs"]
+    assert (
+        quality["psnr"] == metrics["psnr"]
+        and quality["ssim"] == metrics["ssim"]
+        and quality["ssim_3dgs"] == metrics["ssim_3dgs"]
+    )
     assert record.reference.bytes == (run_dir / "model.safetensors").stat().st_size
 
 
@@ -88,12 +92,17 @@ def test_less_is_farther_from_the_exact_image(measured: tuple[Path, Record]) -> 
     _, record = measured
     assert record.facts["exact"]["float64"] is True
     ladder = [
-        point_of(record, f"renderer.alpha_min={value}").quality["psnr_exact"] for value in ("0", "0.0009765625", "0.0078125", "0.03125")
+        point_of(record, f"renderer.alpha_min={value}").quality["psnr_exact"]
+        for value in ("0", "0.0009765625", "0.0078125", "0.03125")
     ]
     assert ladder == sorted(ladder, reverse=True) and ladder[0] > 90
     sizes = [point_of(record, f"resolution={value}").quality["psnr_exact"] for value in ("0.75", "0.5", "0.25")]
     assert sizes == sorted(sizes, reverse=True)
-    assert point_of(record, "store.all=float16").bytes < point_of(record, "store.colour=float16").bytes < record.reference.bytes
+    assert (
+        point_of(record, "store.all=float16").bytes
+        < point_of(record, "store.colour=float16").bytes
+        < record.reference.bytes
+    )
 
 
 def test_where_the_oracle_takes_too_long_its_error_is_known(bare: Path) -> None:
@@ -107,7 +116,9 @@ def test_where_the_oracle_takes_too_long_its_error_is_known(bare: Path) -> None:
         Models(subject),
         "alpha_min",
         OperatingPoint(
-            read_point(["renderer.alpha_min=0", "renderer.transmittance_min=0"], subject.config.renderer, subject.model).settings
+            read_point(
+                ["renderer.alpha_min=0", "renderer.transmittance_min=0"], subject.config.renderer, subject.model
+            ).settings
         ),
         fast,
     )
@@ -177,10 +188,14 @@ def test_in_a_round_every_point_is_timed_once_a_view(bare: Path, monkeypatch: py
 
     monkeypatch.setattr(OperatingPoint, "draw", noted)
     pairs = [(point, Measured("", subject.words(point), {}, 0)) for point in points]
-    take_turns(subject.truths, Models(subject).ready, pairs, lambda m: 4, 1e18, lambda number, count: None, lambda: None)
+    take_turns(
+        subject.truths, Models(subject).ready, pairs, lambda m: 4, 1e18, lambda number, count: None, lambda: None
+    )
     assert all(len(m.ms) == 4 for _, m in pairs) and pairs[0][1].ratios == [1.0] * 4
     views = [truth.view.name for truth in subject.truths]
-    assert sorted(drawn) == sorted((i, view) for i in range(4) for view in views for _ in range(8)), "once to warm up, once to time"
+    assert sorted(drawn) == sorted((i, view) for i in range(4) for view in views for _ in range(8)), (
+        "once to warm up, once to time"
+    )
     rounds = [drawn[k : k + 8 : 2] for k in range(0, len(drawn), 8)]
     assert all({i for i, _ in one} == {0, 1, 2, 3} and len({view for _, view in one}) == 1 for one in rounds)
     assert len({tuple(i for i, _ in one) for one in rounds}) > 1, "the order changes"
@@ -189,7 +204,9 @@ def test_in_a_round_every_point_is_timed_once_a_view(bare: Path, monkeypatch: py
 def test_times_end_at_the_deadline_but_not_before_one_round(bare: Path) -> None:
     subject = load_subject(bare, (), 1)
     pairs = [(subject.reference, Measured("reference", (), {}, 0))]
-    take_turns(subject.truths, Models(subject).ready, pairs, lambda m: 1000, 0.0, lambda number, count: None, lambda: None)
+    take_turns(
+        subject.truths, Models(subject).ready, pairs, lambda m: 1000, 0.0, lambda number, count: None, lambda: None
+    )
     assert len(pairs[0][1].ms) == 1
 
 
@@ -223,7 +240,9 @@ def test_infinite_and_missing_numbers_survive() -> None:
     assert Measured.from_dict(json.loads(json.dumps(point.to_dict(), allow_nan=False))) == point
 
 
-@pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": 1, "points": 3}', '{"format": 9}', '{"format": 1, "points": [{}]}'])
+@pytest.mark.parametrize(
+    "text", ["", "{}", "[]", '{"format": 1, "points": 3}', '{"format": 9}', '{"format": 1, "points": [{}]}']
+)
 def test_a_damaged_record_is_refused(bare: Path, text: str, tmp_path: Path) -> None:
     run_dir = copied(bare, tmp_path / "run")
     path = run_dir / "tradeoff" / "tradeoff.json"
@@ -267,11 +286,19 @@ def test_what_is_measured_is_not_measured_again(bare: Path, tmp_path: Path, monk
     assert looked == [] and turns == [] and again.to_dict() == whole.to_dict()
     more = tradeoff_run(Request(run_dir, views=1, repeats=4, knobs=["alpha_min", "resolution"], budget=60.0))
     assert {words[0].partition("=")[0] for words in looked if len(words) == 1} == {"resolution"}
-    assert all(len(point.ms) >= 4 for point in more.points) and more.points[: len(whole.points)][3].ms[:2] == whole.points[3].ms
+    assert (
+        all(len(point.ms) >= 4 for point in more.points)
+        and more.points[: len(whole.points)][3].ms[:2] == whole.points[3].ms
+    )
 
     header, tensors = checkpoint.read(run_dir / "model.safetensors", "model")
     tensors["means"] = tensors["means"] + 0.01
-    checkpoint.write(run_dir / "model.safetensors", "model", tensors, {k: v for k, v in header.items() if k not in ("format", "kind")})
+    checkpoint.write(
+        run_dir / "model.safetensors",
+        "model",
+        tensors,
+        {k: v for k, v in header.items() if k not in ("format", "kind")},
+    )
     looked.clear(), said.clear()
     tradeoff_run(request, said.append)
     assert len(looked) >= 8 and any("model of before; all is measured anew" in line for line in said)
@@ -337,7 +364,9 @@ def test_the_page_stands_alone_with_the_pictures_of_both_fronts(measured: tuple[
     assert not [path for path in (run_dir / "tradeoff").iterdir() if path.name.startswith(".")]
 
 
-def test_the_command_prints_the_fronts_and_their_commands(measured: tuple[Path, Record], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_the_fronts_and_their_commands(
+    measured: tuple[Path, Record], capsys: pytest.CaptureFixture[str]
+) -> None:
     run_dir, record = measured
     assert main(["tradeoff", str(run_dir), "--views", "2", "--repeats", "3", "--budget", "2m", "--knobs", *QUICK]) == 0
     out, err = capsys.readouterr()
@@ -362,7 +391,10 @@ def test_the_command_prints_the_fronts_and_their_commands(measured: tuple[Path, 
         (["--budget", "0s"], "--budget 0s: expected a time such as 90s, 5m or 1h"),
         (["--views", "0"], "argument --views: '0': expected a positive count"),
         (["renderer.sor=entry"], "renderer.sor: no such setting; did you mean 'renderer.sort'"),
-        (["--knobs", "sort", "--", "renderer.sor=entry"], "renderer.sor: no such setting; did you mean 'renderer.sort'"),
+        (
+            ["--knobs", "sort", "--", "renderer.sor=entry"],
+            "renderer.sor: no such setting; did you mean 'renderer.sort'",
+        ),
         (["--knobs", "sort", "renderer.sor=entry"], "renderer.sor: no such setting; did you mean 'renderer.sort'"),
         (["renderer.backend=cuda"], "renderer.backend=cuda cannot run here"),
         (["--knob", "sort"], "--knob: no such argument of `neuprim tradeoff`; did you mean '--knobs'"),
@@ -393,7 +425,9 @@ def test_no_held_out_views(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     loaded = load_dataset(*load_run(bare)[:2])
     members = {name: getattr(loaded, name) for name in Dataset.__dataclass_fields__}
-    monkeypatch.setattr("neuprim.runs.tradeoff.subject.load_dataset", lambda *args, **more: Dataset(**{**members, "test": Nothing()}))
+    monkeypatch.setattr(
+        "neuprim.runs.tradeoff.subject.load_dataset", lambda *args, **more: Dataset(**{**members, "test": Nothing()})
+    )
     with pytest.raises(DataError, match="has no held-out views; expected some to measure on"):
         tradeoff_run(Request(bare))
 
@@ -408,7 +442,10 @@ def test_an_interruption_says_what_goes_on(
 
     monkeypatch.setattr(engine, "take_turns", stop)
     assert main(["tradeoff", str(run_dir), "--views", "1", "--knobs", "resolution"]) == 130
-    assert f"; {run_dir / 'tradeoff' / 'tradeoff.json'} has the points up to here; the same command goes on" in capsys.readouterr().err
+    assert (
+        f"; {run_dir / 'tradeoff' / 'tradeoff.json'} has the points up to here; the same command goes on"
+        in capsys.readouterr().err
+    )
     kept = read_record(run_dir / "tradeoff" / "tradeoff.json")
     assert kept is not None and len(kept.points) == 4
 
@@ -421,7 +458,11 @@ def test_budgets() -> None:
 
 def test_other_words_are_another_reference(bare: Path, tmp_path: Path) -> None:
     run_dir = copied(bare, tmp_path / "run")
-    record = tradeoff_run(Request(run_dir, views=1, repeats=1, knobs=["alpha_min"], words=["resolution=0.5", "renderer.alpha_min=0.03125"]))
+    record = tradeoff_run(
+        Request(
+            run_dir, views=1, repeats=1, knobs=["alpha_min"], words=["resolution=0.5", "renderer.alpha_min=0.03125"]
+        )
+    )
     assert record.reference.words == ("renderer.alpha_min=0.03125", "resolution=0.5")
     assert point_of(record, "renderer.alpha_min=0", "resolution=0.5").knob == "alpha_min"
     assert all("resolution=0.5" in point.words for point in record.points)

@@ -25,7 +25,14 @@ from tests.reports import offered
 from tests.tasks.dynamic import sequences
 from tests.tasks.dynamic.sequences import blob
 
-SMALL = ["scene.size=24", "scene.cameras=6", "scene.samples=1", "model.primitives=60", "model.neurons=2", "train.max_seconds=null"]
+SMALL = [
+    "scene.size=24",
+    "scene.cameras=6",
+    "scene.samples=1",
+    "model.primitives=60",
+    "model.neurons=2",
+    "train.max_seconds=null",
+]
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +61,9 @@ def test_a_run_learns_and_reports_every_number(finished: Path) -> None:
     m = metrics(finished)
     assert m["psnr_mask"] > m["psnr_black_image_mask"] + 4
     assert m["psnr"] > m["psnr_mask"] and m["psnr_pooled_mask"] <= m["psnr_mask"] + 1e-9
-    assert len(m["per_frame"]) == 4 and all({"psnr", "psnr_mask", "psnr_black_image"} <= f.keys() for f in m["per_frame"])
+    assert len(m["per_frame"]) == 4 and all(
+        {"psnr", "psnr_mask", "psnr_black_image"} <= f.keys() for f in m["per_frame"]
+    )
     assert m["psnr_srgb"] > 0 and m["ssim_srgb"] > 0 and m["color_space"] == "linear"
     assert m["sigma_correlation_middle"] > 0.5 and 0 < m["sigma_relative_l2_middle"] < 1
     assert m["sigma_psnr_active_middle"] > 5 and 0 < m["sigma_max_error_middle"] < 2
@@ -89,7 +98,10 @@ def test_an_animation_over_time(finished: Path, tmp_path: Path, suffix: str) -> 
     if suffix == "mp4":
         pytest.importorskip("av", reason="MP4 needs neuprim[video]")
     target = tmp_path / f"film.{suffix}"
-    assert main(["render", str(finished), "--camera", "orbit", "--time", "0:1:7", "--frames", "7", "--out", str(target)]) == 0
+    assert (
+        main(["render", str(finished), "--camera", "orbit", "--time", "0:1:7", "--frames", "7", "--out", str(target)])
+        == 0
+    )
     if suffix == "mp4":
         import av
 
@@ -133,7 +145,12 @@ def test_impossible_times(text: str) -> None:
 
 
 def test_resuming_equals_going_on(files: Path, tmp_path: Path) -> None:
-    words = ["model.density.time=phase+window+motion", "train.population.every=5", "train.population.start=0", "train.iterations=40"]
+    words = [
+        "model.density.time=phase+window+motion",
+        "train.population.every=5",
+        "train.population.start=0",
+        "train.iterations=40",
+    ]
     whole = fit(files, tmp_path / "whole", *words)
     part = tmp_path / "part"
 
@@ -162,10 +179,21 @@ def test_resuming_equals_going_on(files: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("time", ["phase", "offset", "window+phase", "none"])
 def test_every_variant_runs(files: Path, tmp_path: Path, time: str) -> None:
     folder = fit(
-        files, tmp_path / "run", "train.iterations=5", f"model.density.time={time}", "model.colour.powers=4", "model.colour.waves=4"
+        files,
+        tmp_path / "run",
+        "train.iterations=5",
+        f"model.density.time={time}",
+        "model.colour.powers=4",
+        "model.colour.waves=4",
     )
     named = time if time != "window+phase" else "phase+window"
-    assert load_run(folder)[2].density.settings() == {"neurons": 2, "edge": 2, "gain": True, "time": named, "components": ["density"]}
+    assert load_run(folder)[2].density.settings() == {
+        "neurons": 2,
+        "edge": 2,
+        "gain": True,
+        "time": named,
+        "components": ["density"],
+    }
 
 
 def test_the_papers_preset_runs(files: Path, tmp_path: Path) -> None:
@@ -177,21 +205,42 @@ def test_the_papers_preset_runs(files: Path, tmp_path: Path) -> None:
 def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(files: Path, tmp_path: Path) -> None:
     quick, equations, paper = (compose(["task=dynamic", f"preset={name}"]) for name in ("quick", "equations", "paper"))
     assert equations.model.density == paper.model.density == {"time": "phase"}
-    assert equations.model.colour == {"powers": 4, "waves": 4, "frequencies": "printed"} and equations.model.sh_degree == 3
+    assert (
+        equations.model.colour == {"powers": 4, "waves": 4, "frequencies": "printed"} and equations.model.sh_degree == 3
+    )
     assert (equations.train.voxels_every, quick.train.voxels_every) == (4, 16), "about the same share of a step's time"
     train = dataclasses.replace(equations.train, voxels_every=quick.train.voxels_every)
     assert (train, equations.renderer) == (quick.train, quick.renderer), "the budget and the rates are those of quick"
-    words = ["preset=equations", "train.iterations=20", "train.population.every=5", "train.population.start=0", "model.neurons=8"]
+    words = [
+        "preset=equations",
+        "train.iterations=20",
+        "train.population.every=5",
+        "train.population.start=0",
+        "model.neurons=8",
+    ]
     model = load_run(fit(files, tmp_path / "run", *words))[2]
-    assert model.parameters_per_primitive == 143 + 1 and bool(model.params["W_t"].any()) and bool(model.params["time_sin"].any())
-    data = dataclasses.replace(sequences.dataset(files, tmp_path), points=None)  # the form alone, without shares of components
+    assert (
+        model.parameters_per_primitive == 143 + 1
+        and bool(model.params["W_t"].any())
+        and bool(model.params["time_sin"].any())
+    )
+    data = dataclasses.replace(
+        sequences.dataset(files, tmp_path), points=None
+    )  # the form alone, without shares of components
     fields = TASK.build(vars(quick.model), data)
     numbers = 10 + sum(spec.size for field in fields for spec in field.parameters())
     assert abs(143 * equations.model.primitives - numbers * quick.model.primitives) <= 143 / 2
 
 
 def test_a_simulated_scene_says_so(tmp_path: Path) -> None:
-    words = ["task=dynamic", "scene=smoke_fire", "scene.resolution=16", "scene.timesteps=4", *SMALL, "train.iterations=5"]
+    words = [
+        "task=dynamic",
+        "scene=smoke_fire",
+        "scene.resolution=16",
+        "scene.timesteps=4",
+        *SMALL,
+        "train.iterations=5",
+    ]
     folder = run(compose([*words, f"output_dir='{tmp_path / 'run'}'"]))
     m = metrics(folder)
     assert m["data_source"] == "simulated" and "simulated" in m["dataset"]
@@ -201,7 +250,10 @@ def test_a_simulated_scene_says_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("model.density.time=windows", r"model\.density\.time: 'windows': expected none or some of phase, offset, window, motion"),
+        (
+            "model.density.time=windows",
+            r"model\.density\.time: 'windows': expected none or some of phase, offset, window, motion",
+        ),
         ("model.density.tme=phase", r"model\.density\.tme: no such setting; did you mean 'model.density.time'"),
         ("model.colour.frequencies=odd", r"model\.colour\.frequencies=odd: expected periods or printed"),
         ("model.density.divide_above=long", r"model\.density\.divide_above=long: expected a finite number"),

@@ -27,7 +27,9 @@ def moved(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor,
     return means + (velocity + acceleration * since) * since
 
 
-def compare(found: list[Tensor], wanted: list[Tensor], mine: list[Tensor], exact: list[Tensor], tolerance: float) -> None:
+def compare(
+    found: list[Tensor], wanted: list[Tensor], mine: list[Tensor], exact: list[Tensor], tolerance: float
+) -> None:
     """Values, and gradients of a random weighted sum, row by row."""
     pull = [torch.randn(x.shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64) for x in wanted]
     torch.autograd.backward(found, [p.to(x) for p, x in zip(pull, found, strict=True)])
@@ -123,8 +125,13 @@ def test_the_field_uses_them_with_every_part(parts: str) -> None:
     """The whole field in float64 against the formulas of its module's description, parameter by parameter."""
     generator = torch.Generator().manual_seed(1)
     field = TimeDensity(2, parts, edge=2, gain=True)
-    context = InitContext(torch.rand(6, 3, generator=generator), torch.full((6,), 0.3), torch.rand(6, 3, generator=generator), generator)
-    params = {s.name: (s.init(context) + 0.1 * torch.randn(6, *s.shape, generator=generator)).double() for s in field.parameters()}
+    context = InitContext(
+        torch.rand(6, 3, generator=generator), torch.full((6,), 0.3), torch.rand(6, 3, generator=generator), generator
+    )
+    params = {
+        s.name: (s.init(context) + 0.1 * torch.randn(6, *s.shape, generator=generator)).double()
+        for s in field.parameters()
+    }
     params = {name: value.requires_grad_() for name, value in params.items()}
     means = torch.rand(6, 3, generator=generator, dtype=torch.float64).requires_grad_()
     place = Geometry(means, torch.zeros(6, 3, dtype=torch.float64), torch.ones(6, 4, dtype=torch.float64))

@@ -1,4 +1,5 @@
-"""The loader of posed images with times, on a ball that goes round: what it reads, what it refuses, and where it starts."""
+"""The loader of posed images with times, on a ball that goes round: what it reads, what it refuses, and where it
+starts."""
 
 from __future__ import annotations
 
@@ -51,12 +52,15 @@ def views(scenes: Any, monocular: bool, steps: int = 12) -> list[tuple[np.ndarra
         return [(poses[c], t) for t in TIMES for c in range(4)]
     rng = np.random.default_rng(0)
     eyes = [
-        3.5 * d / np.linalg.norm(d) for d in np.abs(rng.normal(size=(steps, 3))) * rng.choice([[-1, -1, 1], [1, 1, 1], [1, -1, 1]], steps)
+        3.5 * d / np.linalg.norm(d)
+        for d in np.abs(rng.normal(size=(steps, 3))) * rng.choice([[-1, -1, 1], [1, 1, 1], [1, -1, 1]], steps)
     ]
     return [(scenes.opengl_pose(tuple(eye)), i / (steps - 1)) for i, eye in enumerate(eyes)]
 
 
-def write(folder: Path, split: str, shots: list[tuple[np.ndarray, float]], scenes: Any, exr: bool = False, scale: float = 1.0) -> None:
+def write(
+    folder: Path, split: str, shots: list[tuple[np.ndarray, float]], scenes: Any, exr: bool = False, scale: float = 1.0
+) -> None:
     """One ``transforms_SPLIT.json`` (``transforms.json`` for "") and its images."""
     frames = []
     for i, (pose, time) in enumerate(shots):
@@ -68,8 +72,13 @@ def write(folder: Path, split: str, shots: list[tuple[np.ndarray, float]], scene
             write_exr((folder / name).with_suffix(".exr"), torch.from_numpy(premultiplied))
         else:
             scenes.save((folder / name).with_suffix(".png"), image)
-        frames.append({"file_path": f"./{name}", "time": time * scale, "transform_matrix": pose.tolist(), "rotation": 0.1})
-    scenes.write_json(folder / (f"transforms_{split}.json" if split else "transforms.json"), {"camera_angle_x": ANGLE, "frames": frames})
+        frames.append(
+            {"file_path": f"./{name}", "time": time * scale, "transform_matrix": pose.tolist(), "rotation": 0.1}
+        )
+    scenes.write_json(
+        folder / (f"transforms_{split}.json" if split else "transforms.json"),
+        {"camera_angle_x": ANGLE, "frames": frames},
+    )
 
 
 @pytest.fixture
@@ -126,7 +135,9 @@ def test_the_shipped_settings_are_the_defaults(folder: Path, context: Any) -> No
     assert node.pop("_paths_") == ["path"]
     node.path = str(folder)
     settings = OmegaConf.to_container(node)
-    assert isinstance(settings, dict) and times_of(load(settings, context).train) == times_of(load({"path": folder}, context).train)
+    assert isinstance(settings, dict) and times_of(load(settings, context).train) == times_of(
+        load({"path": folder}, context).train
+    )
 
 
 def test_other_splits(folder: Path, scenes: Any, context: Any) -> None:
@@ -163,7 +174,9 @@ def test_exr_is_linear_and_premultiplied(tmp_path: Path, scenes: Any, context: A
 
 
 def test_frame_numbers_become_times(folder: Path, scenes: Any, context: Any) -> None:
-    edit(folder / "transforms_train.json", lambda frames: [f.update(time=10 + i // 4) for i, f in enumerate(frames)])  # 10..21
+    edit(
+        folder / "transforms_train.json", lambda frames: [f.update(time=10 + i // 4) for i, f in enumerate(frames)]
+    )  # 10..21
     edit(folder / "transforms_test.json", lambda frames: [f.update(time=8 + i) for i, f in enumerate(frames)])  # 8..12
     data = load({"path": folder, "time_range": "auto"}, context)
     assert times_of(data.train) == [np.float32((2 + i // 4) / 13) for i in range(48)]
@@ -172,7 +185,9 @@ def test_frame_numbers_become_times(folder: Path, scenes: Any, context: Any) -> 
         0.25,
         *(np.float32((10 + i) / 40) for i in range(1, 5)),
     ]
-    write(folder, "val", [(scenes.opengl_pose((0.0, -3.0, 1.0)), 28)], scenes)  # not in use, yet part of the scene's clock
+    write(
+        folder, "val", [(scenes.opengl_pose((0.0, -3.0, 1.0)), 28)], scenes
+    )  # not in use, yet part of the scene's clock
     assert times_of(load({"path": folder, "time_range": "auto"}, context).test)[1] == np.float32(1 / 20)
     assert times_of(load({"path": folder, "time_range": "auto", "test_split": "val"}, context).test) == [1.0]
 
@@ -194,7 +209,12 @@ def test_settings_that_make_no_sense(folder: Path, scenes: Any, context: Any) ->
     scenes.refused(load, {"path": folder, "time": "auto"}, context, "scene.time: no such setting", "scene.time_range")
     for value in ("1:0", "'0'", "a:b", "0:nan", "0:1:2", "''", "true", "0:inf"):
         given = True if value == "true" else value.strip("'")
-        scenes.refused(load, {"path": folder, "time_range": given}, context, f'scene.time_range={value}: expected auto, or "LOW:HIGH"')
+        scenes.refused(
+            load,
+            {"path": folder, "time_range": given},
+            context,
+            f'scene.time_range={value}: expected auto, or "LOW:HIGH"',
+        )
     scenes.refused(load, {"path": folder, "test_every": 1}, context, "scene.test_every=1")
 
 
@@ -210,7 +230,11 @@ def test_files_that_are_missing(folder: Path, scenes: Any, context: Any) -> None
 def test_without_a_test_split_one_file_is_offered(folder: Path, scenes: Any, context: Any) -> None:
     (folder / "transforms_test.json").unlink()
     scenes.refused(
-        load, {"path": folder}, context, "transforms_test.json: file not found", "rename transforms_train.json to transforms.json"
+        load,
+        {"path": folder},
+        context,
+        "transforms_test.json: file not found",
+        "rename transforms_train.json to transforms.json",
     )
 
 
@@ -228,7 +252,13 @@ def test_a_scene_without_times_is_static(folder: Path, scenes: Any, context: Any
     for split in ("train", "test"):
         edit(folder / f"transforms_{split}.json", lambda frames: [f.pop("time") for f in frames])
     for setting in ("0:1", "auto"):
-        scenes.refused(load, {"path": folder, "time_range": setting}, context, "transforms_train.json: no frame has a time", "task=static")
+        scenes.refused(
+            load,
+            {"path": folder, "time_range": setting},
+            context,
+            "transforms_train.json: no frame has a time",
+            "task=static",
+        )
 
 
 @pytest.mark.parametrize("setting", ["0:1", "auto"])
@@ -244,21 +274,44 @@ def test_a_scene_without_times_is_static(folder: Path, scenes: Any, context: Any
         ("absent", ["time is missing", "as other frames have one"]),
     ],
 )
-def test_times_that_are_none(folder: Path, scenes: Any, context: Any, setting: str, value: Any, words: list[str]) -> None:
-    edit(folder / "transforms_test.json", lambda frames: frames[3].pop("time") if value == "absent" else frames[3].update(time=value))
-    scenes.refused(load, {"path": folder, "time_range": setting}, context, "transforms_test.json: frames[3]", "./test/r_003", *words)
+def test_times_that_are_none(
+    folder: Path, scenes: Any, context: Any, setting: str, value: Any, words: list[str]
+) -> None:
+    edit(
+        folder / "transforms_test.json",
+        lambda frames: frames[3].pop("time") if value == "absent" else frames[3].update(time=value),
+    )
+    scenes.refused(
+        load,
+        {"path": folder, "time_range": setting},
+        context,
+        "transforms_test.json: frames[3]",
+        "./test/r_003",
+        *words,
+    )
 
 
 def test_times_out_of_range(folder: Path, scenes: Any, context: Any) -> None:
-    scenes.refused(load, {"path": folder, "time_range": "0:0.5"}, context, "transforms_train.json: frames[24]", "0 to 0.5")
+    scenes.refused(
+        load, {"path": folder, "time_range": "0:0.5"}, context, "transforms_train.json: frames[24]", "0 to 0.5"
+    )
     for value in (1.0001, -1, 30):
         edit(folder / "transforms_train.json", lambda frames, value=value: frames[5].update(time=value))  # type: ignore[misc]
-        words = ["transforms_train.json: frames[5]", f"time is {value}", "from 0 to 1", "./train/r_005", "scene.time_range", "auto"]
+        words = [
+            "transforms_train.json: frames[5]",
+            f"time is {value}",
+            "from 0 to 1",
+            "./train/r_005",
+            "scene.time_range",
+            "auto",
+        ]
         scenes.refused(load, {"path": folder}, context, *words)
         load({"path": folder, "time_range": "auto"}, context)
     for split in ("train", "test"):
         edit(folder / f"transforms_{split}.json", lambda frames: [f.update(time=3) for f in frames])
-    scenes.refused(load, {"path": folder, "time_range": "auto"}, context, "every frame has the time 3", "two different times")
+    scenes.refused(
+        load, {"path": folder, "time_range": "auto"}, context, "every frame has the time 3", "two different times"
+    )
 
 
 # ---------------------------------------------------------------- where it starts
@@ -287,7 +340,11 @@ def test_starting_points_cover_the_ball_at_all_times(folder: Path, context: Any)
     assert min(covered(points.means, 0.35 * RADIUS)) > 0.98 and beside(points.means) < 0.05
     assert torch.allclose(points.colors, torch.tensor(COLOR).float().expand(2000, 3), atol=0.02)
     times = points.conditions["time"]
-    assert times.dtype == torch.float32 and times.shape == (2000,) and sorted(set(times.tolist())) == [np.float32(t) for t in TIMES]
+    assert (
+        times.dtype == torch.float32
+        and times.shape == (2000,)
+        and sorted(set(times.tolist())) == [np.float32(t) for t in TIMES]
+    )
     where = torch.from_numpy(np.stack([middle(t) for t in times.tolist()])).float()
     assert (points.means - where).norm(dim=-1).max() < 1.7 * RADIUS, "a point lies where the ball was at its time"
 
@@ -314,7 +371,9 @@ def test_what_rests_is_covered_evenly(tmp_path: Path, scenes: Any, context: Any)
     still = [(pose, 0.4) for pose in scenes.ring(4, 3.5)]
     write(tmp_path, "train", [shot for _ in TIMES for shot in still], scenes)
     write(tmp_path, "test", still[:1], scenes)
-    edit(tmp_path / "transforms_train.json", lambda frames: [f.update(time=TIMES[i // 4]) for i, f in enumerate(frames)])
+    edit(
+        tmp_path / "transforms_train.json", lambda frames: [f.update(time=TIMES[i // 4]) for i, f in enumerate(frames)]
+    )
     points = load({"path": tmp_path}, context).initial_points(400, rng())
     gaps = torch.cdist(points.means, points.means).fill_diagonal_(9.0).min(dim=1).values
     assert gaps.quantile(0.05) > 0.3 * gaps.median() and len(set(points.conditions["time"].tolist())) == 12
@@ -346,7 +405,9 @@ def test_photographs_start_in_a_box_at_random_times(folder: Path, scenes: Any, c
     assert sorted(set(points.conditions["time"].tolist())) == [np.float32(t) for t in TIMES]
 
 
-def test_moments_without_matter_give_no_points_and_masks_that_disagree_are_named(folder: Path, scenes: Any, context: Any) -> None:
+def test_moments_without_matter_give_no_points_and_masks_that_disagree_are_named(
+    folder: Path, scenes: Any, context: Any
+) -> None:
     for i in range(8):  # the first two times show nothing yet
         scenes.save(folder / "train" / f"r_{i:03d}.png", np.zeros((SIZE, SIZE, 4)))
     points = load({"path": folder}, context).initial_points(400, rng())

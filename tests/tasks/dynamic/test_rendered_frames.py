@@ -1,4 +1,5 @@
-"""Ground truth in a place of the user's choice: the same numbers as from this machine's cache, and nothing believed that lies there."""
+"""Ground truth in a place of the user's choice: the same numbers as from this machine's cache, and nothing believed
+that lies there."""
 
 from __future__ import annotations
 
@@ -29,7 +30,9 @@ def files(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("address", ["DIR/shared", "file://DIR/shared", "memory://neuprim-truth"])
-def test_the_same_data_set_from_anywhere(files: Path, tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_data_set_from_anywhere(
+    files: Path, tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     address = address.replace("DIR", str(tmp_path))
     plain = dataset(files, tmp_path)
     dataset(files, tmp_path / "maker", cache=address)  # another machine, with a cache of its own
@@ -38,7 +41,9 @@ def test_the_same_data_set_from_anywhere(files: Path, tmp_path: Path, address: s
     assert recorded(data).folder.path.name == recorded(plain).folder.path.name, "keyed alike"
     for i in range(0, len(plain.train), 5):
         a, b = plain.train.pixels(i), data.train.pixels(i)
-        assert torch.equal(a.rgb, b.rgb) and a.alpha is not None and b.alpha is not None and torch.equal(a.alpha, b.alpha)
+        assert (
+            torch.equal(a.rgb, b.rgb) and a.alpha is not None and b.alpha is not None and torch.equal(a.alpha, b.alpha)
+        )
     clouds = [d.initial_points(50, torch.Generator().manual_seed(0)) for d in (plain, data)]
     assert torch.equal(clouds[0].means, clouds[1].means) and plain.exposure == data.exposure
     assert data.points is not None and plain.points is not None
@@ -46,7 +51,9 @@ def test_the_same_data_set_from_anywhere(files: Path, tmp_path: Path, address: s
     monkeypatch.setattr(capturing.Capture, "medium", lambda *a: pytest.fail("read again"))
     again = dataset(files, tmp_path / "third", cache=address)
     assert again.points is not None
-    assert torch.equal(again.points.draw(20, torch.Generator().manual_seed(1)).sigma, first.sigma), "voxels are kept there, too"
+    assert torch.equal(again.points.draw(20, torch.Generator().manual_seed(1)).sigma, first.sigma), (
+        "voxels are kept there, too"
+    )
     if address.startswith("memory"):
         import fsspec
 
@@ -67,14 +74,27 @@ def test_damage_and_strange_files_are_refused_by_name(files: Path, tmp_path: Pat
     frame = recording.folder.path / "frame_00002"
     image = recording.capture.image(recording.folder, recording.capture.frames[1], 0)
     image.write_bytes(image.read_bytes() + bytes(10**6))
-    with pytest.raises(DataError, match=r"cam_00\.exr: 1,0\d\d,\d\d\d bytes; expected at most .*; delete the folder .*frame_00002"):
+    with pytest.raises(
+        DataError, match=r"cam_00\.exr: 1,0\d\d,\d\d\d bytes; expected at most .*; delete the folder .*frame_00002"
+    ):
         data.train.pixels(1)
     np.savez(
-        frame / "points.npz", means=np.zeros((9, 2), np.float32), weight=1.0, brightest=np.float32(1), colors=np.zeros((9, 3), np.float32)
+        frame / "points.npz",
+        means=np.zeros((9, 2), np.float32),
+        weight=1.0,
+        brightest=np.float32(1),
+        colors=np.zeros((9, 3), np.float32),
     )
-    with pytest.raises(DataError, match=r"points\.npz: damaged \(means is float32 of shape \(9, 2\).*delete its folder"):
+    with pytest.raises(
+        DataError, match=r"points\.npz: damaged \(means is float32 of shape \(9, 2\).*delete its folder"
+    ):
         data.initial_points(50, torch.Generator().manual_seed(0))
-    good = {"index": np.array([1, 5]), "values": np.ones((2, 4), np.float32), "shape": np.array([2, 2, 2]), "scene_from_index": np.eye(4)}
+    good = {
+        "index": np.array([1, 5]),
+        "values": np.ones((2, 4), np.float32),
+        "shape": np.array([2, 2, 2]),
+        "scene_from_index": np.eye(4),
+    }
     np.savez(tmp_path / "voxels.npz", **good)
     assert len(Voxels.read(tmp_path / "voxels.npz").index) == 2
     for change in (
@@ -93,7 +113,11 @@ def test_damage_and_strange_files_are_refused_by_name(files: Path, tmp_path: Pat
 
 def test_memory_is_bounded_by_the_setting_whatever_the_length(files: Path, tmp_path: Path) -> None:
     data = dataset(files, tmp_path, memory=1, size=96, cameras=9)
-    assert isinstance(data.train, FrameViews) and isinstance(data.test, FrameViews) and isinstance(data.points, FrameVoxels)
+    assert (
+        isinstance(data.train, FrameViews)
+        and isinstance(data.test, FrameViews)
+        and isinstance(data.points, FrameVoxels)
+    )
     assert data.train.memory + data.test.memory + data.points.memory == pytest.approx(2**20)
     for views in (data.train, data.test):
         for i in range(len(views)):
@@ -101,5 +125,9 @@ def test_memory_is_bounded_by_the_setting_whatever_the_length(files: Path, tmp_p
         assert 0 < sum(kept.nbytes for kept in views._kept.values()) <= max(views.memory, 96 * 96 * 8)
     assert len(data.train._kept) < len(data.train)
     usual = dataset(files, tmp_path)
-    assert isinstance(usual.train, FrameViews) and isinstance(usual.test, FrameViews) and isinstance(usual.points, FrameVoxels)
+    assert (
+        isinstance(usual.train, FrameViews)
+        and isinstance(usual.test, FrameViews)
+        and isinstance(usual.points, FrameVoxels)
+    )
     assert [round(part.memory) / 2**20 for part in (usual.train, usual.test, usual.points)] == [768, 128, 512]

@@ -39,7 +39,9 @@ def three(time: str = "phase+window+motion") -> list[Primitives]:
     for seed in range(3):
         one = model(time, neurons=2, dtype=torch.float32)
         generator = torch.Generator().manual_seed(seed)
-        one.params["means"] = one.params["means"].detach() + 0.2 * torch.rand(one.params["means"].shape, generator=generator)
+        one.params["means"] = one.params["means"].detach() + 0.2 * torch.rand(
+            one.params["means"].shape, generator=generator
+        )
         if "window" in time:
             one.params["log_window"] = torch.full_like(one.params["log_window"], 1.0)
         models.append(one)
@@ -66,7 +68,9 @@ def test_labels_that_come_back_a_little_off_are_the_same_labels() -> None:
     assert torch.equal(shares(CHUNKS + 0.3, SEAMS, torch.tensor(0.3)), shares(CHUNKS, SEAMS, torch.tensor(0.3)))
 
 
-@pytest.mark.parametrize("wrong", [[(0.5, 0.5)], [(0.5, 0.4)], [(0.1, 0.3), (0.2, 0.4)], [(0.1,)], [("a", 0.2)], [(0.1, float("nan"))], 3])
+@pytest.mark.parametrize(
+    "wrong", [[(0.5, 0.5)], [(0.5, 0.4)], [(0.1, 0.3), (0.2, 0.4)], [(0.1,)], [("a", 0.2)], [(0.1, float("nan"))], 3]
+)
 def test_other_seams_are_refused(wrong: object) -> None:
     with pytest.raises(ValueError, match="expected pairs of"):
         checked_seams(wrong)  # type: ignore[arg-type]
@@ -85,7 +89,9 @@ def test_a_joined_field_is_the_sum_of_the_chunks_by_their_shares(time: str) -> N
         parts = [_sums(m, points, moment) for m in models]
         found = _sums(whole, points, moment)
         assert float(found.abs().max()) > 0
-        assert torch.allclose(found, sum(share * part for share, part in zip(own, parts, strict=True)), rtol=1e-5, atol=1e-5)
+        assert torch.allclose(
+            found, sum(share * part for share, part in zip(own, parts, strict=True)), rtol=1e-5, atol=1e-5
+        )
 
 
 def _sums(m: Primitives, points: Tensor, time: float) -> Tensor:
@@ -153,14 +159,18 @@ def test_children_are_of_their_parents_chunk() -> None:
 def test_a_part_of_time_can_be_taken_away() -> None:
     whole = joined(three(), [0, 1, 2], SEAMS)
     field, fewer = whole.density.reduced(whole.of(whole.density), whole.geometry, "phase", 0)
-    assert isinstance(field, TimeDensity) and field.seams == SEAMS and torch.equal(fewer["chunk"], whole.params["chunk"])
+    assert (
+        isinstance(field, TimeDensity) and field.seams == SEAMS and torch.equal(fewer["chunk"], whole.params["chunk"])
+    )
 
 
 def test_files_keep_seams_and_labels(tmp_path: Path) -> None:
     whole = joined(three(), [0, 1, 2], SEAMS)
     checkpoint.save_model(tmp_path / "model.safetensors", whole, "dynamic", {})
     again, _ = checkpoint.load_model(tmp_path / "model.safetensors", TASK)
-    assert again.density.settings() == whole.density.settings() and torch.equal(again.params["chunk"], whole.params["chunk"])
+    assert again.density.settings() == whole.density.settings() and torch.equal(
+        again.params["chunk"], whole.params["chunk"]
+    )
 
 
 def test_labels_survive_every_level_of_compression() -> None:

@@ -99,7 +99,9 @@ def test_frames_form_a_sequence(folders: dict[str, Path]) -> None:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_equal_seeds_give_equal_bits_for_any_number_of_threads(name: str, folders: dict[str, Path], tmp_path: Path, threads: None) -> None:
+def test_equal_seeds_give_equal_bits_for_any_number_of_threads(
+    name: str, folders: dict[str, Path], tmp_path: Path, threads: None
+) -> None:
     first = dense(folders[name] / f"{name}_{FEW - 1}.vdb")
     for count in (1, 3):
         torch.set_num_threads(count)
@@ -151,7 +153,12 @@ def test_progress_ends_at_one(tmp_path: Path) -> None:
 
 def test_every_setting_is_in_the_key() -> None:
     scene = SCENES["smoke_fire"]
-    keys = [cache_key(scene, 100, 64, 0), cache_key(scene, 99, 64, 0), cache_key(scene, 100, 65, 0), cache_key(scene, 100, 64, 1)]
+    keys = [
+        cache_key(scene, 100, 64, 0),
+        cache_key(scene, 99, 64, 0),
+        cache_key(scene, 100, 65, 0),
+        cache_key(scene, 100, 64, 1),
+    ]
     keys.append(cache_key(dataclasses.replace(scene, frame_time=0.5), 100, 64, 0))
     for field in dataclasses.fields(scene.solver):
         changed = dataclasses.replace(scene.solver, **{field.name: getattr(scene.solver, field.name) + 1})

@@ -12,7 +12,15 @@ from neuprim.tasks.dynamic.simulation import SCENES
 from neuprim.tasks.dynamic.simulation.advection import advect
 from neuprim.tasks.dynamic.simulation.generate import box_of
 from neuprim.tasks.dynamic.simulation.noise import Noise
-from neuprim.tasks.dynamic.simulation.projection import Box, Faces, divergence, expansion_flow, project, to_centres, to_faces
+from neuprim.tasks.dynamic.simulation.projection import (
+    Box,
+    Faces,
+    divergence,
+    expansion_flow,
+    project,
+    to_centres,
+    to_faces,
+)
 from neuprim.tasks.dynamic.simulation.scenes import Stage
 from neuprim.tasks.dynamic.simulation.solver import Forcing, SolverSettings, Source, State, advance, step
 
@@ -69,7 +77,9 @@ def test_projection_removes_gradients_and_keeps_solenoidal_flow() -> None:
     box = BOXES[0]
     pressure = torch.randn(box.shape, generator=torch.Generator().manual_seed(6))
     gradient = expansion_flow(pressure, box)  # any irrotational flow of this box is one of these
-    assert max(float(c.abs().max()) for c in project(gradient, box)) < 1e-5 * max(float(c.abs().max()) for c in gradient)
+    assert max(float(c.abs().max()) for c in project(gradient, box)) < 1e-5 * max(
+        float(c.abs().max()) for c in gradient
+    )
     flow = project(random_flow(box, 7), box)
     both = project((flow[0] + gradient[0], flow[1] + gradient[1], flow[2] + gradient[2]), box)
     for a, b in zip(flow, both, strict=True):
@@ -118,7 +128,9 @@ def test_rotation_brings_a_blob_back() -> None:
     field = start
     for _ in range(15):
         field = advect(field, wind, 1 / 60, box.cell)
-    assert centroid(field[0], box)[:2] == pytest.approx([0.0, 0.22], abs=0.25 * box.cell)  # a quarter turn, anticlockwise
+    assert centroid(field[0], box)[:2] == pytest.approx(
+        [0.0, 0.22], abs=0.25 * box.cell
+    )  # a quarter turn, anticlockwise
     for _ in range(45):
         field = advect(field, wind, 1 / 60, box.cell)
     assert centroid(field[0], box) == pytest.approx(centroid(start[0], box), abs=0.25 * box.cell)
@@ -151,7 +163,9 @@ def test_still_air_stays_still_and_keeps_its_smoke() -> None:
 def test_fuel_burns_to_heat_and_soot() -> None:
     box = BOXES[3]
     full, nothing = torch.ones(box.shape), torch.zeros(box.shape)
-    settings = SolverSettings(buoyancy=0.0, weight=0.0, confinement=0.0, cooling=0.0, dissipation=0.0, burn=2.0, heat=0.8, soot=0.5)
+    settings = SolverSettings(
+        buoyancy=0.0, weight=0.0, confinement=0.0, cooling=0.0, dissipation=0.0, burn=2.0, heat=0.8, soot=0.5
+    )
     state = State(box.still(), nothing, nothing, full)
     for _ in range(50):
         state = step(state, settings, box, Forcing(), 0.01)
@@ -190,7 +204,12 @@ def test_two_smokes_mix_by_amount() -> None:
     box = Box((16, 16, 16), 1 / 16)
     everywhere = (slice(None),) * 3
     red = Source(everywhere, torch.full(box.shape, 1e3), density=0.9, colour=(1.0, 0.0, 0.0))
-    white = Source((slice(8), slice(None), slice(None)), torch.full((8, 16, 16), math.log(2.0)), density=0.3, colour=(1.0, 1.0, 1.0))
+    white = Source(
+        (slice(8), slice(None), slice(None)),
+        torch.full((8, 16, 16), math.log(2.0)),
+        density=0.3,
+        colour=(1.0, 1.0, 1.0),
+    )
     state = step(State.empty(box, True), STILL, box, Forcing((red, white)), 1.0)
     assert state.colour is not None
     albedo = (state.colour / state.density)[:, 0, 0, 0]
@@ -212,7 +231,11 @@ def test_noise_is_a_function_of_seed_place_and_time() -> None:
     axes = Box((20, 20, 20), 1 / 20).axes()
     first = Noise(1).field(0, axes, 7.0, 3.0, 0.4)
     assert torch.equal(first, Noise(1).field(0, axes, 7.0, 3.0, 0.4))
-    for other in (Noise(2).field(0, axes, 7.0, 3.0, 0.4), Noise(1).field(1, axes, 7.0, 3.0, 0.4), Noise(1).field(0, axes, 7.0, 3.0, 0.9)):
+    for other in (
+        Noise(2).field(0, axes, 7.0, 3.0, 0.4),
+        Noise(1).field(1, axes, 7.0, 3.0, 0.4),
+        Noise(1).field(0, axes, 7.0, 3.0, 0.9),
+    ):
         assert float((first - other).abs().mean()) > 0.1
     near = Noise(1).field(0, axes, 7.0, 3.0, 0.4001)
     assert float((first - near).abs().max()) < 0.01

@@ -52,7 +52,8 @@ def test_equation_13_has_the_papers_number_of_parameters(degree: int, expected: 
 
 def test_windows_with_motion_take_as_many_as_equation_13() -> None:
     sizes = {
-        time: sum(s.size for s in TimeDensity(8, time).parameters()) for time in ("none", "phase", "offset", "window+motion", "window")
+        time: sum(s.size for s in TimeDensity(8, time).parameters())
+        for time in ("none", "phase", "offset", "window+motion", "window")
     }
     assert sizes == {"none": 41, "phase": 49, "offset": 49, "window+motion": 49, "window": 43}
 
@@ -175,7 +176,10 @@ def test_a_frame_without_a_time_is_an_error() -> None:
 
 def test_the_word_of_before_for_whole_periods_still_works() -> None:
     assert TimeHarmonics(frequencies="turns").settings() == TimeHarmonics(frequencies="periods").settings()
-    assert compose(["task=dynamic", "model.colour.frequencies=turns"], check_output=False).model.colour["frequencies"] == "turns"
+    assert (
+        compose(["task=dynamic", "model.colour.frequencies=turns"], check_output=False).model.colour["frequencies"]
+        == "turns"
+    )
 
 
 def test_colour_follows_equations_10_to_12() -> None:
@@ -225,7 +229,9 @@ def test_a_window_divides_into_halves_that_stay_on_its_path() -> None:
         assert torch.allclose(children["log_scales"][rows][long], m.params["log_scales"].detach()[long])
         assert not torch.allclose(children["log_scales"][rows][~long], m.params["log_scales"].detach()[~long])
         own = {s.name: children[s.name][rows] for s in m.density.parameters()}
-        place = m.density.move(own, Geometry(*(children[n][rows] for n in ("means", "log_scales", "quats"))), at(0.6)).means
+        place = m.density.move(
+            own, Geometry(*(children[n][rows] for n in ("means", "log_scales", "quats"))), at(0.6)
+        ).means
         whole = m.density.move({k: v.detach() for k, v in m.of(m.density).items()}, m.geometry, at(0.6)).means
         assert torch.allclose(place[long], whole[long], atol=1e-6)  # children move as their parent did
 
@@ -279,7 +285,9 @@ def test_the_task_rebuilds_its_fields_from_their_settings() -> None:
         ({"window": 0.3, "window_frames": 12}, None, 0.3),  # images with a time each
     ],
 )
-def test_a_fresh_window_is_so_many_frames_at_most(settings: dict[str, object], step: float | None, expected: float) -> None:
+def test_a_fresh_window_is_so_many_frames_at_most(
+    settings: dict[str, object], step: float | None, expected: float
+) -> None:
     spec = next(spec for spec in TimeDensity(0, "window").parameters() if spec.name == "log_window")
     made = spec.init(replace(_context(7, **settings), steps={} if step is None else {"time": step}))
     assert made.shape == (7, 1) and torch.allclose(made.exp(), torch.tensor(expected), rtol=1e-5)

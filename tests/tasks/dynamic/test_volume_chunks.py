@@ -1,4 +1,5 @@
-"""A sequence in chunks of time: how many, which frames each sees, and that all of them have the whole sequence's times, box and light."""
+"""A sequence in chunks of time: how many, which frames each sees, and that all of them have the whole sequence's times,
+box and light."""
 
 from __future__ import annotations
 
@@ -74,14 +75,20 @@ def config_of(folder: Path, *words: str) -> dict[str, Any]:
         ("auto", FEWEST - 1, 1000, 1),
     ],
 )
-def test_the_number_follows_from_frames_and_memory(asked: int | str | None, frames: int, images: int, expected: int) -> None:
+def test_the_number_follows_from_frames_and_memory(
+    asked: int | str | None, frames: int, images: int, expected: int
+) -> None:
     assert number_of_chunks(asked, frames, images, 1) == expected
 
 
 @pytest.mark.parametrize(
     ("asked", "frames", "said"),
     [
-        (5, 9, "scene.chunks=5: there are 9 frames to learn from; expected at most 4, as a chunk has at least two of its own"),
+        (
+            5,
+            9,
+            "scene.chunks=5: there are 9 frames to learn from; expected at most 4, as a chunk has at least two of its own",
+        ),
         (2, 3, "scene.chunks=2: there are 3 frames to learn from; expected null: a chunk has at least two of its own"),
         (2, 1, "scene.chunks=2: there is 1 frame to learn from; expected null: a chunk has at least two of its own"),
     ],
@@ -92,7 +99,9 @@ def test_more_than_the_frames_allow_is_refused(asked: int, frames: int, said: st
     assert str(caught.value) == said
 
 
-@pytest.mark.parametrize("word", ["scene.chunks=0", "scene.chunks=many", "scene.chunks=2.5", "scene.span=3", "scene.span=5:2"])
+@pytest.mark.parametrize(
+    "word", ["scene.chunks=0", "scene.chunks=many", "scene.chunks=2.5", "scene.span=3", "scene.span=5:2"]
+)
 def test_other_words_are_refused_in_one_line_with_their_key(word: str, folder: Path, cache: Path) -> None:
     with pytest.raises(ConfigError, match=word.partition("=")[0]) as caught:
         chunks(folder, cache, word)
@@ -111,7 +120,9 @@ def test_chunks_share_out_frames_and_see_one_more_at_each_seam(folder: Path, cac
     found = chunks(folder, cache, "scene.chunks=3")
     assert found is not None
     assert [part.settings["scene.span"] for part in found.parts] == SEEN and found.parts[0].name == "frames_02-06"
-    assert sum(part.primitives for part in found.parts) == pytest.approx(1) and sum(part.steps for part in found.parts) == pytest.approx(1)
+    assert sum(part.primitives for part in found.parts) == pytest.approx(1) and sum(
+        part.steps for part in found.parts
+    ) == pytest.approx(1)
     assert [part.steps for part in found.parts] == pytest.approx([4 / 13, 5 / 13, 4 / 13])
     shares = [part.primitives for part in found.parts]  # by the matter that they see: in one frame, four and four
     assert shares == pytest.approx([1 / 9, 4 / 9, 4 / 9], rel=0.05)
@@ -169,7 +180,14 @@ def test_a_span_has_the_whole_sequences_times_box_light_and_images(folder: Path,
 
 
 def test_files_of_a_span_are_its_frames_in_the_sequences_time(folder: Path, tmp_path: Path) -> None:
-    settings: Mapping[str, Any] = {"vdb": str(folder), "size": 24, "cameras": 6, "samples": 1, "look": "smoke_fire", "span": "5:10"}
+    settings: Mapping[str, Any] = {
+        "vdb": str(folder),
+        "size": 24,
+        "cameras": 6,
+        "samples": 1,
+        "look": "smoke_fire",
+        "span": "5:10",
+    }
     source = load_volume(settings, SceneContext(0, tmp_path / "cache"))
     assert list(source.placement.numbers) == [5, 6, 7, 8, 10]
     assert source.placement.times["time"] == pytest.approx([0.3, 0.4, 0.5, 0.6, 0.8])

@@ -30,7 +30,9 @@ SHIFT = (4.0, -2.0, 0.0)
 def ball(centre: tuple[float, float, float], radius: float, peak: float, size: int = 16) -> np.ndarray:
     """(n, n, n) values that fall from the middle to the edge of a ball, indices."""
     index = np.stack(np.meshgrid(*(np.arange(size, dtype=np.float32),) * 3, indexing="ij"), -1)
-    found: np.ndarray = peak * np.clip(1 - np.linalg.norm(index - np.array(centre, np.float32), axis=-1) / radius, 0, None)
+    found: np.ndarray = peak * np.clip(
+        1 - np.linalg.norm(index - np.array(centre, np.float32), axis=-1) / radius, 0, None
+    )
     return found.astype(np.float32)
 
 
@@ -38,7 +40,9 @@ def fire(frame: int, half: bool = True) -> list[Grid]:
     """Faint smoke, and flames of 1 that reach beyond it."""
     transform = scale_transform(0.5, SHIFT)
     smoke, flame = ball((6 + frame, 8, 9), 5, PEAK), ball((6 + frame, 8, 5), 5, 1.0)
-    return [Grid.from_dense(name, v, transform=transform, half=half) for name, v in (("density", smoke), ("flame", flame))]
+    return [
+        Grid.from_dense(name, v, transform=transform, half=half) for name, v in (("density", smoke), ("flame", flame))
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +74,9 @@ def test_extinction_is_for_the_peak_of_the_sequence(peak: float, times: float, t
 
 
 def test_what_was_chosen_is_said_once_in_one_line(files: Path, tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match=r"scene\.optics\.extinction=896 \(look: 14\), as values of grid 'density' go to about 0\.016"):
+    with pytest.warns(
+        UserWarning, match=r"scene\.optics\.extinction=896 \(look: 14\), as values of grid 'density' go to about 0\.016"
+    ):
         dataset(files, tmp_path, look="auto", frames="0:1")
 
 
@@ -102,7 +108,9 @@ def test_flames_beyond_the_density_and_on_other_voxels_absorb(other: float, tmp_
         cell = abs(np.linalg.det(medium.scene_from_index[:3, :3]))
         flames = (medium.values[..., 0] - medium.scattering).sum() * cell
         assert flames == pytest.approx(expected, rel=0.02), frame.path.name
-        corners = medium.scene_from_index[:3, :3] @ np.argwhere(medium.values[..., 0] > 1).T + medium.scene_from_index[:3, 3:]
+        corners = (
+            medium.scene_from_index[:3, :3] @ np.argwhere(medium.values[..., 0] > 1).T + medium.scene_from_index[:3, 3:]
+        )
         assert (corners.min(1) >= capture.bounds[0]).all() and (corners.max(1) <= capture.bounds[1]).all()
 
 
@@ -120,7 +128,11 @@ def test_a_component_is_every_primitives_share() -> None:
     field = TimeDensity(0, "window", gain=True, components=("density",))
     generator = torch.Generator().manual_seed(0)
     params = {s.name: torch.randn((6, *s.shape), generator=generator) * 0.3 for s in field.parameters()}
-    params |= {"means": torch.zeros(6, 3), "log_scales": torch.full((6, 3), -1.0), "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1)}
+    params |= {
+        "means": torch.zeros(6, 3),
+        "log_scales": torch.full((6, 3), -1.0),
+        "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1),
+    }
     params["b2"] = params["b2"].abs() + 1
     params["window_center"], params["log_window"] = torch.full((6, 1), 0.5), torch.zeros(6, 1)
     params["sh_dc"] = torch.zeros(6, 3)
@@ -136,7 +148,15 @@ SMALL = ["scene.size=24", "scene.cameras=6", "scene.samples=1", "model.primitive
 
 
 def words(files: Path, out: Path, *more: str) -> list[str]:
-    return ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", f"output_dir='{out}'", "renderer.threads=1", *SMALL, *more]
+    return [
+        "task=dynamic",
+        "scene=vdb",
+        f"scene.vdb='{files}'",
+        f"output_dir='{out}'",
+        "renderer.threads=1",
+        *SMALL,
+        *more,
+    ]
 
 
 def test_no_primitive_goes_beyond_the_largest_extinction(files: Path, tmp_path: Path) -> None:
@@ -153,7 +173,9 @@ def test_no_primitive_goes_beyond_the_largest_extinction(files: Path, tmp_path: 
 
 @pytest.mark.filterwarnings("ignore::neuprim.core.notices.NeuprimWarning")
 def test_exported_density_is_the_files_own(files: Path, tmp_path: Path) -> None:
-    out = run(compose(words(files, tmp_path / "run", "train.iterations=240", "train.voxels_every=2"), check_output=False))
+    out = run(
+        compose(words(files, tmp_path / "run", "train.iterations=240", "train.voxels_every=2"), check_output=False)
+    )
     report = export_run(out, "vdb", tmp_path / "frames")
     again = export_run(out, "vdb", tmp_path / "again", ["source=false", "grid=32"])
     for number in range(3):
@@ -165,7 +187,11 @@ def test_exported_density_is_the_files_own(files: Path, tmp_path: Path) -> None:
             box = grid.world_bounds()
             half = np.array(grid.voxel_size) / 2
             assert grid.range is not None and grid.range[1] <= source.range[1] * 1.001
-            assert box is not None and (box[0] >= world[0] - half - 1e-6).all() and (box[1] <= world[1] + half + 1e-6).all()
+            assert (
+                box is not None
+                and (box[0] >= world[0] - half - 1e-6).all()
+                and (box[1] <= world[1] + half + 1e-6).all()
+            )
         assert report.errors[f"frame_{number:04d}.file_relative_l2"] < 0.4
     assert any("flames absorb, too" in note for note in report.notes)
     header = open_run(out).header["world"]
@@ -174,7 +200,9 @@ def test_exported_density_is_the_files_own(files: Path, tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::neuprim.core.notices.NeuprimWarning")
 def test_a_density_that_nothing_taught_is_refused(files: Path, tmp_path: Path) -> None:
-    out = run(compose(words(files, tmp_path / "run", "train.iterations=3", "train.supervision=images"), check_output=False))
+    out = run(
+        compose(words(files, tmp_path / "run", "train.iterations=3", "train.supervision=images"), check_output=False)
+    )
     assert open_run(out).model.density.components(open_run(out).model.params) == {}
     with pytest.raises(ConfigError, match=r"flames absorb beside grid 'density'.*train\.supervision=both"):
         export_run(out, "vdb", tmp_path / "frames")

@@ -49,10 +49,22 @@ def folder(tmp_path: Path) -> Path:
         ("gradient", [], r"scene\.optics\.gradient=\[\]: expected colours"),
         ("gradient", [1, 2], r"scene\.optics\.gradient=\[1, 2\]: expected colours"),
         ("light", "sun", r"scene\.optics\.light=sun: expected settings, each as scene\.optics\.light\.KEY=VALUE"),
-        ("light", {"colour": [1, 1, 1]}, r"scene\.optics\.light\.colour: no such setting; valid: scene\.optics\.light\.direction"),
-        ("light", {"direction": [0, 0, 0]}, r"scene\.optics\.light\.direction=\[0, 0, 0\]: expected three numbers that are not all 0"),
+        (
+            "light",
+            {"colour": [1, 1, 1]},
+            r"scene\.optics\.light\.colour: no such setting; valid: scene\.optics\.light\.direction",
+        ),
+        (
+            "light",
+            {"direction": [0, 0, 0]},
+            r"scene\.optics\.light\.direction=\[0, 0, 0\]: expected three numbers that are not all 0",
+        ),
         ("light", {"direction": [0, 1]}, r"scene\.optics\.light\.direction=\[0, 1\]: expected three numbers"),
-        ("light", {"irradiance": [-1, 0, 0]}, r"scene\.optics\.light\.irradiance=\[-1, 0, 0\]: expected three numbers of at least 0"),
+        (
+            "light",
+            {"irradiance": [-1, 0, 0]},
+            r"scene\.optics\.light\.irradiance=\[-1, 0, 0\]: expected three numbers of at least 0",
+        ),
         ("flame_grid", "fire", r"scene\.optics\.flame_grid=fire: expected density, temperature, flames or color"),
         ("extinction_grids", "density", r"scene\.optics\.extinction_grids=density: expected a list"),
         ("up", "x", r"scene\.optics\.up=x: expected y or z"),
@@ -66,14 +78,23 @@ def test_wrong_optics_name_key_found_and_expected(key: str, value: Any, message:
 def test_optics_of_every_form() -> None:
     look = changed(
         named_look("smoke_fire"),
-        {"extinction": 3, "albedo": [1, 0.5, 0], "gradient": [[1, 0, 0], [0, 0, 1]], "light": {"irradiance": [1, 2, 3]}},
+        {
+            "extinction": 3,
+            "albedo": [1, 0.5, 0],
+            "gradient": [[1, 0, 0], [0, 0, 1]],
+            "light": {"irradiance": [1, 2, 3]},
+        },
     )
-    assert look.extinction == 3 and look.albedo == (1.0, 0.5, 0.0) and look.gradient == ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    assert (
+        look.extinction == 3 and look.albedo == (1.0, 0.5, 0.0) and look.gradient == ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    )
     assert look.light is not None and look.light.irradiance == (1.0, 2.0, 3.0)
     original = named_look("smoke_fire").light
     assert original is not None and look.light.direction == original.direction
     assert changed(look, {"light": None}).light is None
-    with pytest.raises(ConfigError, match=r"scene\.optics\.light\.irradiance: required and not given; expected three numbers"):
+    with pytest.raises(
+        ConfigError, match=r"scene\.optics\.light\.irradiance: required and not given; expected three numbers"
+    ):
         changed(named_look("embergen_fire"), {"light": {"direction": [0, 0, 1]}})
 
 
@@ -82,7 +103,9 @@ def test_optics_of_every_form() -> None:
 
 def test_the_box_is_that_of_the_grid_that_the_look_absorbs_by(folder: Path, tmp_path: Path) -> None:
     hot = blob(10.0, ("temperature",))[0]
-    far = Grid.from_dense("density", np.ones((8, 8, 8), np.float32), transform=scale_transform(VOXEL, (500.0, 0.0, 0.0)))
+    far = Grid.from_dense(
+        "density", np.ones((8, 8, 8), np.float32), transform=scale_transform(VOXEL, (500.0, 0.0, 0.0))
+    )
     write_vdb(folder / "ball_1.vdb", [hot, far])
     write_vdb(folder / "ball_2.vdb", [hot])  # has what absorbs, whatever else it lacks
     data = dataset(folder, tmp_path, look="embergen_fire")
@@ -96,7 +119,10 @@ def test_a_frame_without_the_grid_that_absorbs_takes_no_other(folder: Path, tmp_
     write_vdb(folder / "ball_2.vdb", blob(12.0, ("temperature",)))
     data = dataset(folder, tmp_path, look="smoke_fire")
     recording = recorded(data)
-    assert recording.capture.medium(recording.capture.frames[1]).empty and not recording.capture.medium(recording.capture.frames[0]).empty
+    assert (
+        recording.capture.medium(recording.capture.frames[1]).empty
+        and not recording.capture.medium(recording.capture.frames[0]).empty
+    )
 
 
 def test_a_look_whose_grids_are_missing(folder: Path, tmp_path: Path) -> None:
@@ -146,7 +172,9 @@ def test_a_gap_in_the_numbers_is_a_gap_in_time(folder: Path, tmp_path: Path) -> 
     assert [float(t) for t in times(dataset(folder, tmp_path, frames="2:4"))] == [0.0]
 
 
-def test_more_starting_points_than_were_kept_are_distinct(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_starting_points_than_were_kept_are_distinct(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("neuprim.tasks.dynamic.volume.capture.POINTS", 64)
     points = dataset(folder, tmp_path).initial_points(1000, torch.Generator().manual_seed(0))
     assert len(points.means) == 1000 == len(np.unique(points.means.numpy(), axis=0))
@@ -189,5 +217,7 @@ def test_a_damaged_image_says_what_to_do(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
     recording = recorded(data)
     recording.capture.image(recording.folder, recording.capture.frames[1], 0).write_bytes(b"")
-    with pytest.raises(DataError, match=r"cam_00\.exr: file is empty.*; delete the folder .*frame_00002 to render the frame again"):
+    with pytest.raises(
+        DataError, match=r"cam_00\.exr: file is empty.*; delete the folder .*frame_00002 to render the frame again"
+    ):
         data.train.pixels(1)

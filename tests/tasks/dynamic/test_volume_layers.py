@@ -16,7 +16,9 @@ CAMERA = scenes.camera(20, 16, distance=2.6)
 
 def test_beauty_is_what_is_emitted_less_what_is_absorbed() -> None:
     settings = RenderSettings(alpha_min=0.0, transmittance_min=0.0, alpha_max=0.9999)
-    frame = LayerFrame(model("window+motion", count=16, dtype=torch.float32), CAMERA, {"time": torch.tensor(0.4)}, settings)
+    frame = LayerFrame(
+        model("window+motion", count=16, dtype=torch.float32), CAMERA, {"time": torch.tensor(0.4)}, settings
+    )
     found = chords(frame.lowered, CAMERA)
     colours = frame.lowered.colour.flat
     assert colours is not None and colours.min() >= 0

@@ -40,7 +40,8 @@ def test_homogeneous_box(sigma: float) -> None:
 
 
 def test_homogeneous_box_seen_from_anywhere() -> None:
-    """Every ray that misses the rim by a voxel has the optical depth of its chord through the inner box, plus that of the rim."""
+    """Every ray that misses the rim by a voxel has the optical depth of its chord through the inner box, plus that of
+    the rim."""
     n, sigma = 24, 2.0
     medium = Medium.padded(grey(np.full((n, n, n), sigma)), box((n, n, n)))
     view = camera((1.9, -1.2, 1.4), 24)
@@ -127,7 +128,10 @@ def test_voxels_from_thick_to_solid(strength: float) -> None:
     rng = np.random.default_rng(1)
     sigma = rng.random((9, 9, 9)) * strength
     medium = Medium.padded(
-        np.concatenate([sigma[..., None], sigma[..., None] * rng.uniform(0.5, 1.0, (9, 9, 9, 3))], -1).astype(np.float32), box((9, 9, 9))
+        np.concatenate([sigma[..., None], sigma[..., None] * rng.uniform(0.5, 1.0, (9, 9, 9, 3))], -1).astype(
+            np.float32
+        ),
+        box((9, 9, 9)),
     )
     image, fine = (integrate(medium, camera((1.6, -1.5, 1.5), 64), 1, subdivisions=n) for n in (1, 8))
     assert (
@@ -144,7 +148,9 @@ def test_rotation() -> None:
     medium, view = ragged(5), camera((2.0, 1.0, 1.5), 24)
     turn = rotation(3)
     turned = Medium(medium.values, turn @ medium.scene_from_index)
-    follows = type(view)(view.viewmat @ torch.from_numpy(turn.T.copy()), view.fx, view.fy, view.cx, view.cy, view.width, view.height)
+    follows = type(view)(
+        view.viewmat @ torch.from_numpy(turn.T.copy()), view.fx, view.fy, view.cx, view.cy, view.width, view.height
+    )
     assert (integrate(medium, view) - integrate(turned, follows)).abs().max() < 2e-6
 
 
@@ -156,7 +162,9 @@ def test_anisotropic_and_sheared_voxels() -> None:
     for shape, extra in (((40, 40, 40), np.eye(4)), ((60, 30, 45), np.eye(4)), ((56, 40, 40), shear)):
         matrix = np.eye(4)
         matrix[range(3), range(3)] = np.array([1.4, 1.0, 1.0] if extra is shear else [1.0, 1.0, 1.0]) / shape
-        matrix[:3, 3] = -0.5 * np.array([1.4, 1.0, 1.0] if extra is shear else [1.0, 1.0, 1.0]) + np.diag(matrix)[:3] / 2
+        matrix[:3, 3] = (
+            -0.5 * np.array([1.4, 1.0, 1.0] if extra is shear else [1.0, 1.0, 1.0]) + np.diag(matrix)[:3] / 2
+        )
         matrix = extra @ matrix
         index = np.stack(np.meshgrid(*[np.arange(s) for s in shape], indexing="ij"), -1)
         where = index @ matrix[:3, :3].T + matrix[:3, 3]
@@ -207,7 +215,12 @@ def test_any_number_of_threads() -> None:
 def test_nothing() -> None:
     view = camera((2.0, 1.0, 1.5), 7)
     zeros = np.zeros((5, 6, 7, 4), np.float32)
-    for medium in (Medium.nothing(), Medium.padded(zeros, np.eye(4)), Medium.padded(zeros[:0], np.eye(4)), Medium(zeros[:1], np.eye(4))):
+    for medium in (
+        Medium.nothing(),
+        Medium.padded(zeros, np.eye(4)),
+        Medium.padded(zeros[:0], np.eye(4)),
+        Medium(zeros[:1], np.eye(4)),
+    ):
         assert torch.equal(integrate(medium, view), torch.zeros(7, 7, 4))
 
 

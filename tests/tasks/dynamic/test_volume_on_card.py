@@ -45,7 +45,11 @@ def test_a_sequence_is_the_processors_and_lies_in_a_folder_of_its_own(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With a light, glow and shadows; within the half floats that images are stored in."""
-    changes = {"size": 32, "samples": 2, "optics": {"light": {"direction": [0.3, -0.5, 0.8], "irradiance": [3.0, 3.0, 3.0]}}}
+    changes = {
+        "size": 32,
+        "samples": 2,
+        "optics": {"light": {"direction": [0.3, -0.5, 0.8], "irradiance": [3.0, 3.0, 3.0]}},
+    }
     own = dataset(folder, tmp_path, **changes)
     with monkeypatch.context() as patch:
         on_blocks(patch)
@@ -58,7 +62,9 @@ def test_a_sequence_is_the_processors_and_lies_in_a_folder_of_its_own(
         mine, theirs, rerun = (data.test.pixels(i) for data in (own, other, again))
         assert mine.alpha is not None and theirs.alpha is not None
         assert float(mine.alpha.max()) > 0.3
-        assert torch.allclose(mine.rgb, theirs.rgb, rtol=2e-3, atol=1e-4) and torch.allclose(mine.alpha, theirs.alpha, rtol=2e-3, atol=1e-4)
+        assert torch.allclose(mine.rgb, theirs.rgb, rtol=2e-3, atol=1e-4) and torch.allclose(
+            mine.alpha, theirs.alpha, rtol=2e-3, atol=1e-4
+        )
         assert torch.equal(theirs.rgb, rerun.rgb) and torch.equal(theirs.alpha, rerun.alpha)  # type: ignore[arg-type]
 
 
@@ -88,11 +94,17 @@ def test_extinction_on_a_lattice_is_the_processors(turned: bool, monkeypatch: py
 
 
 def test_errors_of_a_model_are_the_processors(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    capture = load_volume({"vdb": str(folder), "size": 24, "cameras": 4, "look": "smoke_fire"}, SceneContext(0, tmp_path)).capture
+    capture = load_volume(
+        {"vdb": str(folder), "size": 24, "cameras": 4, "look": "smoke_fire"}, SceneContext(0, tmp_path)
+    ).capture
     generator = torch.Generator().manual_seed(0)
     means = 0.4 * torch.rand(30, 3, generator=generator) - 0.2
     made = InitContext(
-        means, torch.full((30,), 0.15), torch.zeros(30, 3), generator, conditions={"time": torch.rand(30, generator=generator)}
+        means,
+        torch.full((30,), 0.15),
+        torch.zeros(30, 3),
+        generator,
+        conditions={"time": torch.rand(30, generator=generator)},
     )
     model = Primitives.initialise(TimeDensity(2, "window+motion"), SphericalHarmonics(0), made)
     wanted = compare_with_truth(model, capture, [0.0, 0.5, 1.0], per_third=1)

@@ -14,7 +14,18 @@ import torch
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import scale_transform, sequence, write_vdb
-from neuprim.tasks.dynamic.volume import EMBERGEN_FIRE, LOOKS, Light, Look, Medium, Normalisation, integrate, medium_of, named_look, rig
+from neuprim.tasks.dynamic.volume import (
+    EMBERGEN_FIRE,
+    LOOKS,
+    Light,
+    Look,
+    Medium,
+    Normalisation,
+    integrate,
+    medium_of,
+    named_look,
+    rig,
+)
 from neuprim.tasks.dynamic.volume.blackbody import black_body_rgb, black_body_xyz
 from neuprim.tasks.dynamic.volume.transmittance import transmittance
 from tests.core.io.vdb.vdb_bytes import real_folder
@@ -27,13 +38,16 @@ SAME = Normalisation((0.0, 0.0, 0.0), 1.0)
 
 
 @pytest.mark.parametrize(
-    ("kelvin", "x", "y"), [(1000.0, 0.6528, 0.3444), (2000.0, 0.5267, 0.4133), (2856.0, 0.4476, 0.4074), (6504.0, 0.3135, 0.3237)]
+    ("kelvin", "x", "y"),
+    [(1000.0, 0.6528, 0.3444), (2000.0, 0.5267, 0.4133), (2856.0, 0.4476, 0.4074), (6504.0, 0.3135, 0.3237)],
 )
 def test_black_body_chromaticity(kelvin: float, x: float, y: float) -> None:
     """The Planckian locus of CIE 1931; the fit of the observer costs a few thousandths, most in the deep red."""
     xyz = black_body_xyz(np.array(kelvin))
     tolerance = 0.012 if kelvin < 1500 else 0.004
-    assert xyz[0] / xyz.sum() == pytest.approx(x, abs=tolerance) and xyz[1] / xyz.sum() == pytest.approx(y, abs=tolerance)
+    assert xyz[0] / xyz.sum() == pytest.approx(x, abs=tolerance) and xyz[1] / xyz.sum() == pytest.approx(
+        y, abs=tolerance
+    )
 
 
 def test_black_body_colours() -> None:
@@ -41,7 +55,12 @@ def test_black_body_colours() -> None:
     assert orange[0] == 1.0 and 0.2 < orange[1] < 0.32 and orange[2] < 0.03
     assert white.min() > 0.93 and white.max() == 1.0
     cold = black_body_rgb(np.array([1050.0, 1600.0, 2155.0]), 2155.0)
-    assert (np.diff(cold.max(1)) > 0).all() and cold[0].max() < 1e-4 and cold[2].max() == pytest.approx(1.0) and (cold >= 0).all()
+    assert (
+        (np.diff(cold.max(1)) > 0).all()
+        and cold[0].max() < 1e-4
+        and cold[2].max() == pytest.approx(1.0)
+        and (cold >= 0).all()
+    )
     # Wien's law at the wavelength that the red channel sees: the slope of log radiance over 1 / T is -hc / λk
     steps = np.log(black_body_rgb(np.array([1500.0, 1510.0]), 2155.0)[:, 0])
     assert 1.4388e7 / ((steps[1] - steps[0]) / (1 / 1500 - 1 / 1510)) == pytest.approx(610.0, abs=25.0)
@@ -69,7 +88,9 @@ def test_transmittance_against_brute_force(seed: int) -> None:
 def _alpha(medium: Medium, start: np.ndarray, direction: np.ndarray) -> float:
     eye = torch.from_numpy(start)
     viewmat = look_at(eye, eye + torch.from_numpy(direction), torch.tensor([0.3, 0.2, 0.9]))
-    return float(march_slowly(medium, Camera(viewmat, 1.0, 1.0, 0.5, 0.5, 1, 1), near=0.0, far=2.0, steps=8000)[0, 0, 3])
+    return float(
+        march_slowly(medium, Camera(viewmat, 1.0, 1.0, 0.5, 0.5, 1, 1), near=0.0, far=2.0, steps=8000)[0, 0, 3]
+    )
 
 
 @pytest.mark.usefixtures("either_kernel")
@@ -133,7 +154,9 @@ def test_bad_voxels_count_as_zero_and_are_counted() -> None:
     flames[0, 0, 0] = np.nan
     look = Look(ambient=(0.1, 0.1, 0.1), emission=1.0)
     a = medium_of({"density": grid_of("density", dirty), "flames": grid_of("flames", flames)}, look, SAME)
-    b = medium_of({"density": grid_of("density", clean), "flames": grid_of("flames", np.zeros_like(flames))}, look, SAME)
+    b = medium_of(
+        {"density": grid_of("density", clean), "flames": grid_of("flames", np.zeros_like(flames))}, look, SAME
+    )
     assert a.non_finite == 4 and b.non_finite == 0 and np.array_equal(a.values, b.values)
 
 
@@ -160,7 +183,9 @@ def test_grids_of_other_resolutions_meet_in_the_world() -> None:
     assert np.abs(a.values - b.values)[..., 0].max() < 0.003 * a.values[..., 0].max()
     tall = Look(gradient=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), ambient=(1.0, 1.0, 1.0), color_grid="color")
     high = medium_of({"density": density}, tall, Normalisation((0.5, 0.5, 0.5), 1.0)).values[12, 12, 1:-1]
-    assert np.allclose(high[:, 3] / high[:, 0], where[0], atol=1e-5) and np.allclose(high[:, 1] / high[:, 0], 1 - where[0], atol=1e-5)
+    assert np.allclose(high[:, 3] / high[:, 0], where[0], atol=1e-5) and np.allclose(
+        high[:, 1] / high[:, 0], 1 - where[0], atol=1e-5
+    )
 
 
 def test_named_looks_differ() -> None:
@@ -169,7 +194,10 @@ def test_named_looks_differ() -> None:
     x, y, z = np.meshgrid(*[np.linspace(-1, 1, n)] * 3, indexing="ij")
     density = np.clip(1.5 - 2 * np.sqrt(x**2 + y**2 + z**2), 0, 1)
     flames = np.clip(1 - 3 * np.sqrt(x**2 + y**2 + (z + 0.6) ** 2), 0, 1)
-    grids = {k: grid_of(k, v, scale_transform(1 / n)) for k, v in (("density", density), ("flames", flames), ("temperature", flames))}
+    grids = {
+        k: grid_of(k, v, scale_transform(1 / n))
+        for k, v in (("density", density), ("flames", flames), ("temperature", flames))
+    }
     norm = Normalisation.from_bounds(np.array([[0, 0, 0], [1, 1, 1]]) - 0.5 / n)
     view, means = rig(24)[1][0], {}
     for name, look in LOOKS.items():
@@ -187,7 +215,9 @@ def test_named_looks_differ() -> None:
     close = [(a, b) for a in names for b in names if a < b and (means[a] - means[b]).abs().max() < 0.03]
     assert close == []
     turned = named_look("dust_tornado", "y")
-    assert turned.light is not None and turned.light.direction[1] == sun.light.direction[2] and turned.turned("z") == sun
+    assert (
+        turned.light is not None and turned.light.direction[1] == sun.light.direction[2] and turned.turned("z") == sun
+    )
     with pytest.raises(ConfigError, match="did you mean 'smoke_fire'"):
         named_look("smokefire")
     with pytest.raises(ConfigError, match=r"scene\.optics\.up=x: expected y or z"):
@@ -202,7 +232,9 @@ def test_named_looks_differ() -> None:
 def test_normalisation(tmp_path: Path) -> None:
     for number, low in ((1, (0, 0, 0)), (2, (10, 4, 2)), (3, (0, 0, 0))):
         array = np.zeros((2, 2, 2)) if number == 3 else np.ones((2, 2, 2))
-        grid = dataclasses.replace(grid_of("density", array), transform=scale_transform((0.5, 1.0, 2.0), (7.0, 8.0, 9.0)))
+        grid = dataclasses.replace(
+            grid_of("density", array), transform=scale_transform((0.5, 1.0, 2.0), (7.0, 8.0, 9.0))
+        )
         grid = dataclasses.replace(grid, origins=grid.origins + np.array(low, np.int32) * 8)
         write_vdb(tmp_path / f"f_{number}.vdb", [grid])
     survey = sequence(tmp_path).survey("density")
@@ -231,7 +263,11 @@ def test_extinction_is_per_scene_unit() -> None:
         grid = grid_of("density", cloud, scale_transform(size / 8, (size, 0.0, -size)))
         bounds = grid.world_bounds()
         assert bounds is not None
-        images.append(integrate(medium_of({"density": grid}, LOOKS["dust_tornado"], Normalisation.from_bounds(bounds)), rig(16)[1][0]))
+        images.append(
+            integrate(
+                medium_of({"density": grid}, LOOKS["dust_tornado"], Normalisation.from_bounds(bounds)), rig(16)[1][0]
+            )
+        )
     assert (images[0] - images[1]).abs().max() < 1e-6
 
 
@@ -244,7 +280,9 @@ def test_rig(up: str) -> None:
     assert torch.allclose(eyes.norm(dim=-1), torch.full((40,), 2.7, dtype=torch.float64))
     elevation = torch.rad2deg(torch.asin(eyes[:, axis] / 2.7))
     assert elevation.min() == pytest.approx(3.0) and elevation.max() == pytest.approx(80.0)
-    assert ((elevation[:2] > 12) & (elevation[:2] < 55)).all() and torch.rad2deg(torch.acos(eyes[0] @ eyes[1] / 2.7**2)) > 40
+    assert ((elevation[:2] > 12) & (elevation[:2] < 55)).all() and torch.rad2deg(
+        torch.acos(eyes[0] @ eyes[1] / 2.7**2)
+    ) > 40
     around = torch.rad2deg(torch.acos((eyes @ eyes.T / 2.7**2).clamp(-1, 1))).fill_diagonal_(180.0).min(1).values
     assert around.min() > 12 and around.max() < 28  # even
     for test_eye in eyes[:2]:  # within the others: they surround it
@@ -257,7 +295,9 @@ def test_rig(up: str) -> None:
         assert gaps.max() < math.radians(120)
     for view in train:
         center = view.viewmat[:3, 3] / view.viewmat[2, 3]
-        assert center[:2].abs().max() < 1e-12 and (view.viewmat[:3, :3] @ torch.eye(3, dtype=torch.float64)[axis])[1] < 0  # up is up
+        assert (
+            center[:2].abs().max() < 1e-12 and (view.viewmat[:3, :3] @ torch.eye(3, dtype=torch.float64)[axis])[1] < 0
+        )  # up is up
         assert math.degrees(2 * math.atan(0.5 * view.width / view.fx)) == pytest.approx(27.0)
     with pytest.raises(ConfigError, match="up 'x'"):
         rig(64, up="x")

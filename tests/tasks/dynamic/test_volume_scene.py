@@ -29,7 +29,10 @@ def folder(tmp_path: Path) -> Path:
     """Frames 2 (empty), 9, 10 and 11 of a ball that moves along x."""
     made = tmp_path / "files"
     made.mkdir()
-    write_vdb(made / "ball_2.vdb", [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))])
+    write_vdb(
+        made / "ball_2.vdb",
+        [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))],
+    )
     for step, number in enumerate(NUMBERS[1:]):
         write_vdb(made / f"ball_{number}.vdb", blob(8.0 + 4 * step))
     return made
@@ -39,10 +42,17 @@ def test_frames_in_numerical_order_cameras_and_times(folder: Path, tmp_path: Pat
     data = dataset(folder, tmp_path)
     assert [f.number for f in recorded(data).capture.frames] == list(NUMBERS)
     assert len(data.train) == 4 * 4 and len(data.test) == 2 * 4
-    assert [round(float(data.test.view(i).conditions["time"]), 4) for i in range(4)] == [0, 0.7778, 0.8889, 1]  # by number
+    assert [round(float(data.test.view(i).conditions["time"]), 4) for i in range(4)] == [
+        0,
+        0.7778,
+        0.8889,
+        1,
+    ]  # by number
     assert data.data_source == "real" and data.color_space == "linear"
     assert judging.clips(data)[1].views == range(4, 8)
-    trained, held_out = ({tuple(v.view(i).camera.position.tolist()) for i in range(len(v))} for v in (data.train, data.test))
+    trained, held_out = (
+        {tuple(v.view(i).camera.position.tolist()) for i in range(len(v))} for v in (data.train, data.test)
+    )
     assert len(trained) == 4 and len(held_out) == 2
     assert not trained & held_out
 
@@ -129,7 +139,9 @@ def test_every_nth_frame_may_be_left_out_of_training(folder: Path, tmp_path: Pat
     data = dataset(folder, tmp_path, train_every=2)
     assert len(data.train) == 4 * 2 and len(data.test) == 2 * 4
     assert {round(float(data.train.view(i).conditions["time"]), 3) for i in range(8)} == {0.0, 0.889}
-    assert {round(t, 3) for t in data.initial_points(50, torch.Generator().manual_seed(0)).conditions["time"].tolist()} == {0.889}
+    assert {
+        round(t, 3) for t in data.initial_points(50, torch.Generator().manual_seed(0)).conditions["time"].tolist()
+    } == {0.889}
     whole = dataset(folder, tmp_path)
     assert torch.equal(data.train.pixels(1).rgb, whole.train.pixels(2).rgb)
 
@@ -170,7 +182,10 @@ def test_the_files_extinction_on_a_lattice(folder: Path, tmp_path: Path) -> None
         ({"frames": "9-11"}, r"scene\.frames=9-11: expected all, FIRST:LAST or FIRST:LAST:STEP"),
         ({"frames": "11:9"}, r"scene\.frames=11:9: expected"),
         ({"look": "smok_fire"}, r"smok_fire.*'smoke_fire'"),
-        ({"optics": {"extinktion": 1}}, r"scene\.optics\.extinktion: no such setting; did you mean 'scene\.optics\.extinction'"),
+        (
+            {"optics": {"extinktion": 1}},
+            r"scene\.optics\.extinktion: no such setting; did you mean 'scene\.optics\.extinction'",
+        ),
         ({"optics": {"extinction": -1.0}}, r"scene\.optics\.extinction=-1\.0: expected a number of at least 0"),
         ({"optics": {"extinction": "much"}}, r"scene\.optics\.extinction=much"),
         ({"grids": {"smoke": "density"}}, r"scene\.grids\.smoke: no such setting; valid: scene\.grids\.color, "),
@@ -189,7 +204,9 @@ def test_frames_that_do_not_exist(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_grid_by_another_name(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"scene\.grids\.density=densty: no frame has such a grid; did you mean 'density'"):
+    with pytest.raises(
+        DataError, match=r"scene\.grids\.density=densty: no frame has such a grid; did you mean 'density'"
+    ):
         dataset(folder, tmp_path, grids={"density": "densty"})
     other = tmp_path / "other"
     other.mkdir()
@@ -249,7 +266,8 @@ def test_voxel_sizes_and_bounds_may_change(folder: Path, tmp_path: Path) -> None
     value = np.clip(1 - np.linalg.norm(index - np.array([24, 24, 24], np.float32), axis=-1) / 10, 0, None)
     fine = scale_transform(VOXEL / 2, (10.0, 0.0, -3.0))
     write_vdb(
-        folder / "ball_10.vdb", [Grid.from_dense(n, value * (0.2 if n == "flames" else 1), transform=fine) for n in ("density", "flames")]
+        folder / "ball_10.vdb",
+        [Grid.from_dense(n, value * (0.2 if n == "flames" else 1), transform=fine) for n in ("density", "flames")],
     )
     after = dataset(folder, tmp_path).test.pixels(2)
     assert before.alpha is not None and after.alpha is not None

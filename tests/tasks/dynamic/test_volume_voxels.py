@@ -19,7 +19,14 @@ from neuprim.tasks.dynamic.volume import voxels as module
 from neuprim.tasks.dynamic.volume.voxels import FrameVoxels, Voxels
 from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
 
-SMALL = ["scene.size=24", "scene.cameras=6", "scene.samples=1", "model.primitives=80", "model.neurons=0", "train.max_seconds=null"]
+SMALL = [
+    "scene.size=24",
+    "scene.cameras=6",
+    "scene.samples=1",
+    "model.primitives=80",
+    "model.neurons=0",
+    "train.max_seconds=null",
+]
 SOFT = ["model.density.edge=2", "model.density.gain=true"]
 
 
@@ -92,17 +99,26 @@ def test_an_empty_frame_is_learned_as_empty(files: Path, tmp_path: Path) -> None
 
 def test_a_chunk_of_a_sequence_and_frames_left_out(files: Path, tmp_path: Path) -> None:
     assert set(frames_of(supervision(files, tmp_path, frames="2:3"), 20)) == {"frame_0002", "frame_0003"}
-    assert set(frames_of(supervision(files, tmp_path, train_every=2), 300)) == {"frame_0001", "frame_0003", "frame_0005"}
+    assert set(frames_of(supervision(files, tmp_path, train_every=2), 300)) == {
+        "frame_0001",
+        "frame_0003",
+        "frame_0005",
+    }
 
 
 def test_the_generator_alone_decides(files: Path, tmp_path: Path) -> None:
     points = supervision(files, tmp_path)
-    made = [[points.draw(50, g) for _ in range(6)] for g in (torch.Generator().manual_seed(1), torch.Generator().manual_seed(1))]
+    made = [
+        [points.draw(50, g) for _ in range(6)]
+        for g in (torch.Generator().manual_seed(1), torch.Generator().manual_seed(1))
+    ]
     for a, b in zip(*made, strict=True):
         assert a.name == b.name and torch.equal(a.points, b.points) and torch.equal(a.sigma, b.sigma)
 
 
-def test_voxels_are_read_once_kept_beside_the_images_and_bounded(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxels_are_read_once_kept_beside_the_images_and_bounded(
+    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = supervision(files, tmp_path)
     read = [first.voxels(t) for t in range(5)]
     reads: list[int] = []
@@ -140,21 +156,31 @@ def test_it_learns_the_voxels_better_than_images_alone(files: Path, supervision:
     for kind in ("images", supervision):
         results[kind] = fit(compose(words(files, *budget, f"train.supervision={kind}"), check_output=False)).metrics()
     images, voxels = results["images"], results[supervision]
-    assert voxels["sigma_relative_l2_middle"] < (0.6 if supervision == "voxels" else 0.9) * images["sigma_relative_l2_middle"]
+    assert (
+        voxels["sigma_relative_l2_middle"]
+        < (0.6 if supervision == "voxels" else 0.9) * images["sigma_relative_l2_middle"]
+    )
     assert voxels["psnr_mask"] > voxels["psnr_black_image_mask"] + (2 if supervision == "voxels" else 4)
 
 
 @pytest.mark.parametrize("supervision", ["voxels", "both"])
 @pytest.mark.parametrize("strategy", ["fixed", "relocate", "gradient"])
 def test_a_run_goes_on_where_it_stopped(files: Path, supervision: str, strategy: str) -> None:
-    more = [f"train.supervision={supervision}", "train.iterations=24", "train.voxels_per_step=200", f"train.population.strategy={strategy}"]
+    more = [
+        f"train.supervision={supervision}",
+        "train.iterations=24",
+        "train.voxels_per_step=200",
+        f"train.population.strategy={strategy}",
+    ]
     more += ["train.population.every=5", "train.population.start=0", "train.population.stop=1", "train.voxels_every=3"]
     whole, half, rest = (trainer(files, *more) for _ in range(3))
     reports = list(whole.run())
     for _ in range(11):
         half.train_step()
     rest.load_state(*half.state(), "here")
-    assert [(r.loss, r.psnr, r.view, r.primitives) for r in rest.run()] == [(r.loss, r.psnr, r.view, r.primitives) for r in reports[11:]]
+    assert [(r.loss, r.psnr, r.view, r.primitives) for r in rest.run()] == [
+        (r.loss, r.psnr, r.view, r.primitives) for r in reports[11:]
+    ]
     a, b = whole.state(), rest.state()
     assert a[0].keys() == b[0].keys() and all(torch.equal(value, b[0][name]) for name, value in a[0].items())
     due = [{"voxel_sigma", "voxel_source"} <= r.parts.keys() for r in reports]
@@ -174,12 +200,25 @@ def test_the_preset_quick_learns_from_both_where_there_are_voxels(files: Path, t
     found = start(compose(words, check_output=False)).trainer
     every = found.settings.voxels_every
     assert {"voxel_sigma", "voxel_source"} <= [found.train_step().parts.keys() for _ in range(every)][-1]
-    assert found.model.density.settings() == {"neurons": 0, "edge": 2, "gain": True, "time": "window+motion", "components": ["density"]}
+    assert found.model.density.settings() == {
+        "neurons": 0,
+        "edge": 2,
+        "gain": True,
+        "time": "window+motion",
+        "components": ["density"],
+    }
     assert found.model.parameters_per_primitive == 23 + 1
 
 
 def test_auto_is_images_where_there_are_no_voxels() -> None:
-    words = ["task=static", "scene=solids", "scene.size=16", "scene.train_views=4", "scene.test_views=1", "model.primitives=10"]
+    words = [
+        "task=static",
+        "scene=solids",
+        "scene.size=16",
+        "scene.train_views=4",
+        "scene.test_views=1",
+        "model.primitives=10",
+    ]
     found = start(compose([*words, "train.supervision=auto"], check_output=False)).trainer
     assert found.settings.supervision == "images" and "voxel_sigma" not in found.train_step().parts
 
@@ -192,6 +231,15 @@ def test_colour_may_be_left_to_the_images(files: Path) -> None:
 
 
 def test_data_without_voxels_are_refused_by_name() -> None:
-    words = ["task=static", "scene=solids", "scene.size=16", "scene.train_views=4", "scene.test_views=1", "model.primitives=10"]
-    with pytest.raises(ConfigError, match=r"^train\.supervision=both: .* has no voxels to learn from; expected images$"):
+    words = [
+        "task=static",
+        "scene=solids",
+        "scene.size=16",
+        "scene.train_views=4",
+        "scene.test_views=1",
+        "model.primitives=10",
+    ]
+    with pytest.raises(
+        ConfigError, match=r"^train\.supervision=both: .* has no voxels to learn from; expected images$"
+    ):
         start(compose([*words, "train.supervision=both"], check_output=False))

@@ -1,4 +1,5 @@
-"""Media, cameras and a slow renderer for the tests of the volume renderer; nothing from the package but its data types."""
+"""Media, cameras and a slow renderer for the tests of the volume renderer; nothing from the package but its data
+types."""
 
 from __future__ import annotations
 
@@ -13,7 +14,9 @@ from neuprim.core.io.vdb import Grid
 from neuprim.tasks.dynamic.volume import Medium
 
 
-def camera(eye: tuple[float, float, float], size: int = 16, fov: float = 27.0, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Camera:
+def camera(
+    eye: tuple[float, float, float], size: int = 16, fov: float = 27.0, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+) -> Camera:
     """Looks at the origin."""
     focal = 0.5 * size / math.tan(math.radians(fov) / 2)
     viewmat = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor(up))
@@ -56,7 +59,9 @@ def sheet(seed: int, size: int = 32) -> Medium:
     gas = 10.0 * inside
     flame = np.maximum(1.0 - np.abs(where @ normal), 0.0) * inside
     color = 0.05 + flame[..., None] * np.array([1.0, 0.3, 0.03])
-    return Medium.padded(np.concatenate([gas[..., None], gas[..., None] * color], -1).astype(np.float32), box((size,) * 3))
+    return Medium.padded(
+        np.concatenate([gas[..., None], gas[..., None] * color], -1).astype(np.float32), box((size,) * 3)
+    )
 
 
 def rays(view: Camera, samples: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -70,7 +75,9 @@ def rays(view: Camera, samples: int = 1) -> tuple[np.ndarray, np.ndarray]:
     return inverse[:3, 3], local @ inverse[:3, :3].T
 
 
-def march_slowly(medium: Medium, view: Camera, samples: int = 1, near: float = 1.5, far: float = 4.0, steps: int = 8000) -> np.ndarray:
+def march_slowly(
+    medium: Medium, view: Camera, samples: int = 1, near: float = 1.5, far: float = 4.0, steps: int = 8000
+) -> np.ndarray:
     """(H, W, 4) float64: constant steps, each taken as homogeneous."""
     origin, directions = rays(view, samples)
     flat = directions.reshape(-1, 3)
@@ -80,7 +87,10 @@ def march_slowly(medium: Medium, view: Camera, samples: int = 1, near: float = 1
     for first in range(0, steps, 400):
         t = near + step * (np.arange(first, first + 400) + 0.5)
         points = (origin + flat[:, None] * t[:, None]) @ inverse[:3, :3].T + inverse[:3, 3]
-        found = [ndimage.map_coordinates(medium.values[..., c].astype(float), points.reshape(-1, 3).T, order=1) for c in range(4)]
+        found = [
+            ndimage.map_coordinates(medium.values[..., c].astype(float), points.reshape(-1, 3).T, order=1)
+            for c in range(4)
+        ]
         sigma, *source = (f.reshape(len(flat), -1) for f in found)
         depth = sigma * step
         before = np.cumsum(depth, 1) - depth

@@ -1,4 +1,5 @@
-"""Lights, images and losses at their extremes: the kernels against float64 autograd through the whole field, and training that survives."""
+"""Lights, images and losses at their extremes: the kernels against float64 autograd through the whole field, and
+training that survives."""
 
 from __future__ import annotations
 
@@ -57,7 +58,9 @@ LIGHTS: dict[str, Tensor] = {
 }
 
 
-def picture(m: Primitives, backend: str, conditions: dict[str, Tensor], keep: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+def picture(
+    m: Primitives, backend: str, conditions: dict[str, Tensor], keep: Tensor
+) -> tuple[Tensor, dict[str, Tensor]]:
     out = render(m, scenes.camera(33, 25), conditions, RenderSettings(backend=backend))
     (out.rgb * (weights((25, 33, 3), 0) * keep[..., None]).to(out.rgb.dtype)).sum().backward()
     return out.rgb.detach().double(), {k: v.grad for k, v in m.params.items() if v.grad is not None}
@@ -67,7 +70,8 @@ def picture(m: Primitives, backend: str, conditions: dict[str, Tensor], keep: Te
 @pytest.mark.parametrize("falloff", [False, True])
 @pytest.mark.parametrize("form", ["additive", "multiplicative", "H=0", "harmonics"])
 def test_kernels_equal_float64_under_any_light(form: str, falloff: bool, name: str) -> None:
-    """Image within 1e-5 of the colours' size, every parameter's gradient within 1e-3 of its row, as in the tests of RayNet alone."""
+    """Image within 1e-5 of the colours' size, every parameter's gradient within 1e-3 of its row, as in the tests of
+    RayNet alone."""
     if form == "harmonics":
         field: LightNetwork | LightHarmonics = LightHarmonics(3, 3, falloff)
     else:
@@ -79,7 +83,9 @@ def test_kernels_equal_float64_under_any_light(form: str, falloff: bool, name: s
     c = {"light": where, "light_intensity": torch.tensor([1.0, 0.6, 0.3]) * power}
     camera = scenes.camera(33, 25)
     lowered = slow.lower(camera, c)
-    values = {k: v.detach() for k, v in slow.params.items() if k in ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")}
+    values = {
+        k: v.detach() for k, v in slow.params.items() if k in ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
+    }
     if isinstance(lowered.colour, RayNet):
         values |= {k: getattr(lowered.colour, k).detach() for k in ("Wx", "bias", "Wout", "base")}
         size = float((lowered.colour.base.abs() + lowered.colour.Wout.abs().sum(-1)).detach().max())
@@ -88,7 +94,9 @@ def test_kernels_equal_float64_under_any_light(form: str, falloff: bool, name: s
         size = float(values["colors"].max())
     skip = undecided(values, camera, RenderSettings())
     assert skip.float().mean() < 0.05
-    images, grads = zip(*(picture(m, b, c, (~skip).double()) for m, b in ((fast, "cpu"), (slow, "reference"))), strict=True)
+    images, grads = zip(
+        *(picture(m, b, c, (~skip).double()) for m, b in ((fast, "cpu"), (slow, "reference"))), strict=True
+    )
     assert images[1].max() > 0.05 * min(size, 1.0) and all(bool(torch.isfinite(x).all()) for x in images)
     assert float((images[0] - images[1]).abs()[~skip].max()) < 1e-5 * max(size, 1.0)
     for key, expected in grads[1].items():
@@ -100,7 +108,10 @@ def test_kernels_equal_float64_under_any_light(form: str, falloff: bool, name: s
 @pytest.mark.parametrize("distance", [1e6, 1e12, 1e18])
 def test_lights_at_infinity_have_finite_gradients(distance: float, falloff: bool, visibility: str) -> None:
     m = model(LightNetwork(4, visibility=visibility, falloff=falloff))
-    c = {"light": distance * torch.tensor([0.6, -0.3, 0.7]), "light_intensity": torch.full((3,), distance**2 if falloff else 1.0)}
+    c = {
+        "light": distance * torch.tensor([0.6, -0.3, 0.7]),
+        "light_intensity": torch.full((3,), distance**2 if falloff else 1.0),
+    }
     out = render(m, scenes.camera(), c)
     assert bool(torch.isfinite(out.rgb).all()) and out.rgb.max() > 0.05
     out.rgb.sum().backward()
@@ -120,7 +131,12 @@ def test_a_distant_light_is_a_direction() -> None:
 
 def test_shadows_only_darken_whatever_the_light() -> None:
     shadowed, plain = (model(LightNetwork(0, visibility=v)) for v in (SHADOWED, UNSHADOWED))
-    for where in (*LIGHTS.values(), torch.zeros(3), plain.params["means"][3].detach(), plain.params["means"].detach().mean(0)):
+    for where in (
+        *LIGHTS.values(),
+        torch.zeros(3),
+        plain.params["means"][3].detach(),
+        plain.params["means"].detach().mean(0),
+    ):
         c = {"light": where, "light_intensity": torch.ones(3)}
         with torch.no_grad():
             dark, bright = (render(m, scenes.camera(33, 25), c).rgb for m in (shadowed, plain))
@@ -128,9 +144,13 @@ def test_shadows_only_darken_whatever_the_light() -> None:
 
 
 def test_directions_at_zero_and_at_infinity() -> None:
-    v = torch.tensor([[0.0, 0, 0], [1e-30, 0, 0], [1e-6, 0, 0], [3.0, 4.0, 0.0], [3e30, 4e30, 0.0], [0.0, -1e38, 0.0]]).requires_grad_()
+    v = torch.tensor(
+        [[0.0, 0, 0], [1e-30, 0, 0], [1e-6, 0, 0], [3.0, 4.0, 0.0], [3e30, 4e30, 0.0], [0.0, -1e38, 0.0]]
+    ).requires_grad_()
     found = unit(v)
-    assert torch.allclose(found, torch.tensor([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [0.6, 0.8, 0], [0.6, 0.8, 0], [0, -1, 0]]), atol=1e-6)
+    assert torch.allclose(
+        found, torch.tensor([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [0.6, 0.8, 0], [0.6, 0.8, 0], [0, -1, 0]]), atol=1e-6
+    )
     (found * torch.tensor([1.0, -2.0, 3.0])).sum().backward()
     assert v.grad is not None and bool(torch.isfinite(v.grad).all()) and float(v.grad.abs().max()) < 1e7
     w = torch.randn(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
@@ -141,7 +161,9 @@ def test_harmonics_know_the_direction_of_any_light() -> None:
     m = model(LightHarmonics(3, 3))
     with torch.no_grad():
         near, far = (
-            render(m, scenes.camera(), {"light": d * torch.tensor([0.6, -0.3, 0.7]), "light_intensity": torch.ones(3)}).rgb
+            render(
+                m, scenes.camera(), {"light": d * torch.tensor([0.6, -0.3, 0.7]), "light_intensity": torch.ones(3)}
+            ).rgb
             for d in (1e6, 1e30)
         )
     assert near.max() > 0.1 and torch.allclose(near, far, atol=2e-5)
@@ -169,7 +191,9 @@ def test_losses_of_darkness_and_of_highlights(name: str) -> None:
                 assert value == 0 and not bool(gradient.any())
             else:
                 wanted = 1.0 if float(rendered[0, 0, 0]) > float(truth[0, 0, 0]) else -1.0
-                assert bool((gradient.sign() == wanted).all()), "every pixel is pulled to the truth, from black and from a highlight too"
+                assert bool((gradient.sign() == wanted).all()), (
+                    "every pixel is pulled to the truth, from black and from a highlight too"
+                )
 
 
 @pytest.mark.parametrize("name", LOSSES)
@@ -200,7 +224,9 @@ class Lit(tiny.Views):
 
     def view(self, index: int) -> View:
         light = torch.tensor([2.0 * math.cos(index), 2.0 * math.sin(index), 3.0])
-        return View(f"v{index}", self.cameras[index], {"light": light, "light_intensity": torch.full((3,), self.intensity)})
+        return View(
+            f"v{index}", self.cameras[index], {"light": light, "light_intensity": torch.full((3,), self.intensity)}
+        )
 
 
 def fit(

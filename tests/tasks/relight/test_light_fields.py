@@ -62,7 +62,11 @@ def test_the_closed_form_is_the_network(form: str) -> None:
     l = c["light"].double() - means
     distance = l.norm(dim=1, keepdim=True)
     d, l = d / d.norm(dim=1, keepdim=True), l / distance
-    inputs = (p["net_x"] * local[:, None]).sum(-1) + (p["net_view"] * d[:, None]).sum(-1) + (p["net_light"] * l[:, None]).sum(-1)
+    inputs = (
+        (p["net_x"] * local[:, None]).sum(-1)
+        + (p["net_view"] * d[:, None]).sum(-1)
+        + (p["net_light"] * l[:, None]).sum(-1)
+    )
     hidden = torch.cos(2.5 * (inputs + p["net_phase"]))
     out = (p["net_out"] * hidden[:, None]).sum(-1)
     expected = p["c_dc"] + out if form == "additive" else p["c_dc"] * (1 + out)
@@ -92,7 +96,9 @@ def test_a_split_carries_the_colour(form: str) -> None:
 
 @pytest.mark.parametrize("where", [(0.0, 0.0, 0.0), (1e8, 0.0, 1e8), (0.3, 0.2, -50.0)])
 @pytest.mark.parametrize("visibility", ["none", "primitive", "pixel"])
-def test_lights_at_a_centre_at_infinity_and_below_the_ground(where: tuple[float, float, float], visibility: str) -> None:
+def test_lights_at_a_centre_at_infinity_and_below_the_ground(
+    where: tuple[float, float, float], visibility: str
+) -> None:
     field = LightNetwork(4, visibility=visibility)
     m = model(field, torch.float32)
     c = light(*where)
@@ -123,21 +129,28 @@ def slabs() -> tuple[Geometry, Cosine]:
     means = torch.tensor([[0.0, 0.0, 1.0], *([x, 0.0, 0.0] for x in (-1.5, -0.75, 0.0, 0.75, 1.5))])
     count = len(means)
     geometry = Geometry(means, torch.full((count, 3), math.log(0.3)), torch.tensor([[1.0, 0, 0, 0]] * count))
-    return geometry, Cosine(torch.zeros(count, 0, 3), torch.zeros(count, 0), torch.zeros(count, 0), torch.full((count, 1), 8.0))
+    return geometry, Cosine(
+        torch.zeros(count, 0, 3), torch.zeros(count, 0), torch.zeros(count, 0), torch.full((count, 1), 8.0)
+    )
 
 
 def test_what_lies_behind_something_is_in_its_shadow() -> None:
     geometry, density = slabs()
     straight = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), SETTINGS, bias=0.0875)(geometry.means)
     assert float(straight[3]) < 0.05 and bool((straight[[0, 1, 2, 4, 5]] > 0.8).all())
-    slanted = light_visibility(geometry, density, torch.tensor([4.0, 0.0, 1.0 + 4.0 * (1.0 / 0.75)]), SETTINGS, bias=0.0875)(geometry.means)
+    slanted = light_visibility(
+        geometry, density, torch.tensor([4.0, 0.0, 1.0 + 4.0 * (1.0 / 0.75)]), SETTINGS, bias=0.0875
+    )(geometry.means)
     assert float(slanted[2]) < 0.3 and float(slanted[3]) > 0.8
 
 
 @pytest.mark.parametrize("size", [1.0, 50.0])
 def test_light_fades_over_parts_of_the_scene_s_diameter(size: float) -> None:
-    """Behind a disc of the greatest opacity, 0.99, at the depths that BIAS and SOFTNESS name: all, half and none of the rest is kept."""
-    geometry = Geometry(torch.zeros(1, 3), (size * torch.tensor([[1.0, 1.0, 1e-4]])).log(), torch.tensor([[1.0, 0, 0, 0]]))
+    """Behind a disc of the greatest opacity, 0.99, at the depths that BIAS and SOFTNESS name: all, half and none of the
+    rest is kept."""
+    geometry = Geometry(
+        torch.zeros(1, 3), (size * torch.tensor([[1.0, 1.0, 1e-4]])).log(), torch.tensor([[1.0, 0, 0, 0]])
+    )
     density = Cosine(torch.zeros(1, 0, 3), torch.zeros(1, 0), torch.zeros(1, 0), torch.full((1, 1), 1e6))
     behind = torch.tensor([0.0, BIAS, BIAS + SOFTNESS, 3 * BIAS]) * 2 * size
     points = torch.stack([torch.zeros(4), torch.zeros(4), -behind], -1)
@@ -153,7 +166,8 @@ def test_shadows_carry_no_gradient_and_are_bounded() -> None:
 
 
 def covered_floor(opacity: float) -> tuple[Geometry, Cosine]:
-    """An opaque floor of 441 flat discs, and the last primitive, a disc of this opacity 1.5 above its middle, number 220."""
+    """An opaque floor of 441 flat discs, and the last primitive, a disc of this opacity 1.5 above its middle, number
+    220."""
     side = torch.linspace(-2, 2, 21)
     means = torch.cat([torch.cartesian_prod(side, side, torch.zeros(1)), torch.tensor([[0.0, 0.0, 1.5]])])
     axes = torch.cat([torch.tensor([[0.25, 0.25, 0.03]]).expand(441, 3), torch.tensor([[0.6, 0.6, 0.05]])])
@@ -207,7 +221,9 @@ def test_depth_images_are_drawn_as_the_frame_is(monkeypatch: pytest.MonkeyPatch)
 def test_distant_lights_cast_the_shadows_of_near_ones(distance: float) -> None:
     geometry, density = slabs()
     direction = torch.tensor([0.2, 0.1, 1.0])
-    near, far = (light_visibility(geometry, density, d * direction, SETTINGS)(geometry.means) for d in (100.0, distance))
+    near, far = (
+        light_visibility(geometry, density, d * direction, SETTINGS)(geometry.means) for d in (100.0, distance)
+    )
     assert float(near.min()) < 0.1 and float(near.max()) > 0.9 and torch.allclose(near, far, atol=0.05)
 
 
@@ -259,7 +275,9 @@ def test_lights_on_the_command_line() -> None:
     assert parse_intensities("2")[0].tolist() == [2, 2, 2]
 
 
-@pytest.mark.parametrize("text", ["1,2", "a,b,c", "nan,0,0", "orbit:0", "orbit:1:2:1", "orbit:1:2:3:4", "", "1e999,0,0"])
+@pytest.mark.parametrize(
+    "text", ["1,2", "a,b,c", "nan,0,0", "orbit:0", "orbit:1:2:1", "orbit:1:2:3:4", "", "1e999,0,0"]
+)
 def test_impossible_lights(text: str) -> None:
     with pytest.raises(ConfigError, match="expected x,y,z or orbit"):
         parse_lights(text)

@@ -41,7 +41,11 @@ def test_shadows_of_primitives() -> None:
     clear = alpha > 1e-3
     visibility, unshadowed = drawn["visibility"], drawn["unshadowed"]
     assert visibility is not None and unshadowed is not None
-    assert (visibility - expected)[clear].abs().max() < 1e-4 and visibility.max() <= 1 and (visibility[alpha == 0] == 0).all()
+    assert (
+        (visibility - expected)[clear].abs().max() < 1e-4
+        and visibility.max() <= 1
+        and (visibility[alpha == 0] == 0).all()
+    )
     plain = LayerFrame(model(LightNetwork(3, visibility="none"), torch.float32), CAMERA, one.conditions, EXACT)
     assert isinstance(plain.lowered.colour, RayNet)
     assert (unshadowed - plain.drawn.rgb).abs().max() < 1e-5 and (unshadowed - one.drawn.rgb).abs().max() > 0.01
@@ -59,7 +63,9 @@ def test_shadows_of_pixels_multiply() -> None:
     assert (visibility - torch.where(one.drawn.alpha > 0, expected, 0.0)).abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("colour", [LightNetwork(3, visibility="none"), LightHarmonics(2)], ids=["network", "harmonics"])
+@pytest.mark.parametrize(
+    "colour", [LightNetwork(3, visibility="none"), LightHarmonics(2)], ids=["network", "harmonics"]
+)
 def test_colours_without_shadows_have_no_such_layers(colour: LightNetwork | LightHarmonics) -> None:
     one = frame(colour)
     assert layers(one) == {"unshadowed": None, "visibility": None}

@@ -1,4 +1,5 @@
-"""The built-in scene as a data set: files, cache, classes, baselines, and the same pixels through the loader of its layout."""
+"""The built-in scene as a data set: files, cache, classes, baselines, and the same pixels through the loader of its
+layout."""
 
 from __future__ import annotations
 
@@ -78,7 +79,11 @@ def test_everything_is_inside_the_sphere_that_cameras_hold() -> None:
 def test_same_settings_same_bytes(tmp_path: Path, cache: Path) -> None:
     first, second = generate(LitSettings(**SMALL), cache), generate(LitSettings(**SMALL), tmp_path)
     assert contents(first) == contents(second)
-    assert sorted(p.name for p in (first / "train").iterdir())[:3] == ["r_0000.exr", "r_0000_classes.png", "r_0000_unshadowed.exr"]
+    assert sorted(p.name for p in (first / "train").iterdir())[:3] == [
+        "r_0000.exr",
+        "r_0000_classes.png",
+        "r_0000_unshadowed.exr",
+    ]
 
 
 def test_cache_is_reused_and_keyed_by_every_setting(cache: Path) -> None:
@@ -111,7 +116,12 @@ def test_progress_runs_from_nothing_to_all(tmp_path: Path) -> None:
     calls: list[tuple[str, float]] = []
     generate(LitSettings(**SMALL), tmp_path, lambda text, fraction: calls.append((text, fraction)))
     fractions = [fraction for _, fraction in calls]
-    assert fractions == sorted(fractions) and fractions[0] == 0.0 and fractions[-1] == 1.0 and len(fractions) == 4 + 3 + FEW_FRAMES + 1
+    assert (
+        fractions == sorted(fractions)
+        and fractions[0] == 0.0
+        and fractions[-1] == 1.0
+        and len(fractions) == 4 + 3 + FEW_FRAMES + 1
+    )
     assert all(text.startswith("lit_solids: ") for text, _ in calls)
 
 
@@ -137,7 +147,8 @@ def test_unwritable_cache_names_the_place(tmp_path: Path) -> None:
         generate(LitSettings(**SMALL), tmp_path / "file")
 
 
-# What it reads as ----------------------------------------------------------------------------------------------------------------------
+# What it reads as
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 def test_the_loader_of_the_layout_reads_the_same_pixels_and_lights(cache: Path, scene: Scene) -> None:
@@ -154,7 +165,9 @@ def test_the_loader_of_the_layout_reads_the_same_pixels_and_lights(cache: Path, 
     view = json.loads((folder / "transforms_train.json").read_text())["frames"][2]
     pose = np.array(view["transform_matrix"])
     fresh = picture(scene, pose, np.array(view["pl_pos"]), 24, 2)
-    np.testing.assert_array_equal(dataset.train.pixels(2).rgb.numpy(), fresh.rgba[..., :3].astype(np.float16).astype(np.float32))
+    np.testing.assert_array_equal(
+        dataset.train.pixels(2).rgb.numpy(), fresh.rgba[..., :3].astype(np.float16).astype(np.float32)
+    )
     assert isinstance(dataset.train, ImageViews)
     np.testing.assert_array_equal(classes(dataset.train, 2).numpy(), fresh.classes)
     np.testing.assert_allclose(pose, camera_to_world(pose[:3, 3]), atol=1e-12)
@@ -179,12 +192,16 @@ def test_the_data_set_says_what_it_is(cache: Path) -> None:
     assert clip.name == "light_round" and clip.source.view(1).name == "light_01"
     views = judging.orbit(dataset, 5)
     assert len({v.conditions["light"].numpy().tobytes() for v in views}) == 5
-    assert all(4.0 <= float(v.conditions["light"].norm()) <= 5.0 and float(v.conditions["light"][2]) > 2.0 for v in views)
+    assert all(
+        4.0 <= float(v.conditions["light"].norm()) <= 5.0 and float(v.conditions["light"][2]) > 2.0 for v in views
+    )
 
 
 def test_held_out_training_views_are_judged_too(cache: Path) -> None:
     dataset = load({**SMALL, "hold_out": 2}, SceneContext(seed=0, cache_dir=cache))
-    assert [dataset.test.view(i).name for i in range(len(dataset.test))] == ["r_0000", "r_0002"] and len(dataset.train) == 2
+    assert [dataset.test.view(i).name for i in range(len(dataset.test))] == ["r_0000", "r_0002"] and len(
+        dataset.train
+    ) == 2
     truth = dataset.test.pixels(1).rgb
     assert judging.judge(dataset, 1, truth, truth)["psnr_linear_clamped"] == np.inf
     assert set(judging.baselines(dataset)) == {"black", "no_cast_shadows"}
@@ -194,7 +211,11 @@ def test_classes_agree_with_the_images(forty: Dataset) -> None:
     brightness: dict[str, list[torch.Tensor]] = {name: [] for name in CLASSES}
     free_brightness: dict[str, list[torch.Tensor]] = {name: [] for name in CLASSES}
     for i in range(len(forty.test)):
-        shown, pixels, free = class_map(forty, i), forty.test.pixels(i), lighting_of(forty).baselines["no_cast_shadows"](i)
+        shown, pixels, free = (
+            class_map(forty, i),
+            forty.test.pixels(i),
+            lighting_of(forty).baselines["no_cast_shadows"](i),
+        )
         assert pixels.alpha is not None and torch.equal(shown == 0, pixels.alpha < 0.5)
         assert (pixels.rgb <= free + 1e-3).all()
         for value, name in enumerate(CLASSES):
@@ -217,7 +238,10 @@ def test_baselines_rank_as_they_should(forty: Dataset) -> None:
     numbers = judging.diagnose(forty, None)  # type: ignore[arg-type]  # nothing here depends on the model
     scores = {name: entry["psnr_linear_clamped"] for name, entry in numbers["baselines"].items()}
     assert set(scores) == {"black", "no_cast_shadows", "nearest_light_of_25"}
-    assert 8 < scores["black"] < scores["no_cast_shadows"] - 3 < 30 and scores["black"] < scores["nearest_light_of_25"] < 35
+    assert (
+        8 < scores["black"] < scores["no_cast_shadows"] - 3 < 30
+        and scores["black"] < scores["nearest_light_of_25"] < 35
+    )
     shares = numbers["class_percent"]
     assert sum(shares.values()) == pytest.approx(100) and set(shares) == set(CLASSES[1:])
     free = numbers["baselines"]["no_cast_shadows"]

@@ -62,8 +62,16 @@ def test_wrong_class_maps_are_refused() -> None:
 
 
 def test_means_leave_views_out_that_lack_a_number() -> None:
-    found = means([{"a": 1.0, "psnr_x": float("inf")}, {"a": 3.0}, {"mse_mask": 0.01}, {"mse_mask": 0.03, "pixels_other": 3.0}])
-    assert found == {"a": 2.0, "psnr_x": None, "psnr_x_infinite": True, "psnr_pooled_mask": pytest.approx(16.9897), "pixels_other": 3}
+    found = means(
+        [{"a": 1.0, "psnr_x": float("inf")}, {"a": 3.0}, {"mse_mask": 0.01}, {"mse_mask": 0.03, "pixels_other": 3.0}]
+    )
+    assert found == {
+        "a": 2.0,
+        "psnr_x": None,
+        "psnr_x_infinite": True,
+        "psnr_pooled_mask": pytest.approx(16.9897),
+        "pixels_other": 3,
+    }
 
 
 def test_without_flip_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,7 +102,8 @@ def test_flip_of_known_images() -> None:
     assert flip(white, white) == 0.0 and flip(black, white) > 0.9
 
 
-# Settings' files -----------------------------------------------------------------------------------------------------------------------
+# Settings' files
+# -----------------------------------------------------------------------------------------------------------------------
 
 
 def settings_of(name: str) -> dict[str, Any]:

@@ -53,7 +53,9 @@ def folder(tmp_path: Path, scenes: Any) -> Path:
         frames = []
         for i in range(count):
             write_png(root / split / f"r_{i}.png", straight(start + i))
-            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": poses[i].tolist(), "pl_pos": [1.0 + i, 2.0, 4.0]})
+            frames.append(
+                {"file_path": f"./{split}/r_{i}", "transform_matrix": poses[i].tolist(), "pl_pos": [1.0 + i, 2.0, 4.0]}
+            )
         scenes.write_json(root / f"transforms_{split}.json", {"camera_angle_x": 0.8, "frames": frames})
     return root
 
@@ -79,7 +81,8 @@ def each(change: Edit) -> Edit:
     return lambda document: [change(frame) for frame in document["frames"]]
 
 
-# What is read --------------------------------------------------------------------------------------------------------------------------
+# What is read
+# --------------------------------------------------------------------------------------------------------------------------
 
 
 def test_the_plainest_variant(folder: Path, context: SceneContext) -> None:
@@ -142,11 +145,22 @@ def test_opaque_photographs(folder: Path, context: SceneContext) -> None:
 
 
 @pytest.mark.parametrize("in_frame", [True, False])
-def test_intrinsics_come_as_principal_point_then_focal_lengths(folder: Path, context: SceneContext, scenes: Any, in_frame: bool) -> None:
+def test_intrinsics_come_as_principal_point_then_focal_lengths(
+    folder: Path, context: SceneContext, scenes: Any, in_frame: bool
+) -> None:
     order = [CX, CY, FX, FY]
-    both(folder, each(lambda f: f.update(camera_intrinsics=order)) if in_frame else lambda d: d.update(camera_intrinsics=order))
+    both(
+        folder,
+        each(lambda f: f.update(camera_intrinsics=order)) if in_frame else lambda d: d.update(camera_intrinsics=order),
+    )
     if not in_frame:
-        scenes.refused(load, {"path": str(folder)}, context, "camera_intrinsics means a focal length of 20", "camera_angle_x 14.191")
+        scenes.refused(
+            load,
+            {"path": str(folder)},
+            context,
+            "camera_intrinsics means a focal length of 20",
+            "camera_angle_x 14.191",
+        )
         both(folder, lambda d: d.pop("camera_angle_x"))
     camera = read(folder, context).train.view(0).camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (FX, FY, CX, CY)
@@ -157,7 +171,9 @@ def test_a_frames_own_field_of_view_wins_over_the_files_intrinsics(folder: Path,
     edit(folder, lambda d: d["frames"][1].update(camera_angle_x=1.0))
     train = read(folder, context).train
     assert train.view(0).camera.fx == FX and train.view(1).camera.fx == pytest.approx(6 / math.tan(0.5))
-    assert (train.view(1).camera.cx, train.view(1).camera.cy) == (6, 6), "nothing of the file's four numbers is mixed in"
+    assert (train.view(1).camera.cx, train.view(1).camera.cy) == (6, 6), (
+        "nothing of the file's four numbers is mixed in"
+    )
 
 
 def test_keys_of_other_files_count(folder: Path, context: SceneContext, scenes: Any) -> None:
@@ -174,7 +190,13 @@ def test_keys_of_other_files_count(folder: Path, context: SceneContext, scenes: 
 
 def test_images_of_another_size_than_the_intrinsics(folder: Path, context: SceneContext, scenes: Any) -> None:
     both(folder, lambda d: d.pop("camera_angle_x") and d.update(camera_intrinsics=[12.0, 12.0, 40.0, 40.0]))
-    scenes.refused(load, {"path": str(folder)}, context, "camera_intrinsics are 12, 12, the middle of an image of 24x24", "expected w, h")
+    scenes.refused(
+        load,
+        {"path": str(folder)},
+        context,
+        "camera_intrinsics are 12, 12, the middle of an image of 24x24",
+        "expected w, h",
+    )
     both(folder, lambda d: d.update(w=24, h=24))
     camera = read(folder, context).train.view(0).camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 20, 6, 6)
@@ -194,7 +216,12 @@ def test_suffix_of_the_file_may_stand_apart(folder: Path, context: SceneContext)
 def test_image_paths_of_other_machines(folder: Path, context: SceneContext, prefix: str) -> None:
     """GS³ saves optimised poses with the image's stem as file_path and the full path beside it."""
     separator = "\\" if "\\" in prefix else "/"
-    edit(folder, lambda d: [f.update(img_path=f"{prefix}{separator}r_{i}.png", file_path=f"r_{i}") for i, f in enumerate(d["frames"])])
+    edit(
+        folder,
+        lambda d: [
+            f.update(img_path=f"{prefix}{separator}r_{i}.png", file_path=f"r_{i}") for i, f in enumerate(d["frames"])
+        ],
+    )
     train = read(folder, context).train
     assert [train.file(i).name for i in range(3)] == ["r_0.png", "r_1.png", "r_2.png"] and train.view(2).name == "r_2"
 
@@ -206,7 +233,8 @@ def test_image_path_alone_and_absolute(folder: Path, context: SceneContext) -> N
 
 
 def corrections(frame: Mapping[str, Any], turn: float = 0.1) -> dict[str, Any]:
-    """R_opt and T_opt of a frame's pose turned about its own axis, as GS³ stores them: transposed rotation, then translation."""
+    """R_opt and T_opt of a frame's pose turned about its own axis, as GS³ stores them: transposed rotation, then
+    translation."""
     c2w = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
     c, s = math.cos(turn), math.sin(turn)
     view = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0.05], [0, 0, 0, 1]]) @ np.linalg.inv(c2w)
@@ -225,7 +253,9 @@ def test_corrections_replace_the_pose(folder: Path, context: SceneContext) -> No
     edit(folder, lambda d: d["frames"][0].update(R_opt=identity["R_opt"], T_opt=identity["T_opt"]))
     edit(folder, lambda d: d["frames"][0].pop("transform_matrix"))
     pose = torch.from_numpy(np.array(frames[0]["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0]))
-    torch.testing.assert_close(read(folder, context).train.view(0).camera.viewmat @ pose, torch.eye(4, dtype=torch.float64))
+    torch.testing.assert_close(
+        read(folder, context).train.view(0).camera.viewmat @ pose, torch.eye(4, dtype=torch.float64)
+    )
 
 
 def test_intensities(folder: Path, context: SceneContext) -> None:
@@ -239,7 +269,10 @@ def test_exposure(folder: Path, context: SceneContext) -> None:
     plain = read(folder, context)
     values = torch.cat([plain.train.pixels(i).rgb.flatten() for i in range(3)])
     dataset = read(folder, context, exposure="auto", falloff="inverse_square")
-    assert dataset.exposure == pytest.approx(values.quantile(0.995).item(), rel=5e-3) and lighting_of(dataset).falloff == "inverse_square"
+    assert (
+        dataset.exposure == pytest.approx(values.quantile(0.995).item(), rel=5e-3)
+        and lighting_of(dataset).falloff == "inverse_square"
+    )
     torch.testing.assert_close(dataset.test.pixels(0).rgb * dataset.exposure, plain.test.pixels(0).rgb)
     torch.testing.assert_close(dataset.test.pixels(0).alpha, plain.test.pixels(0).alpha)
 
@@ -282,7 +315,8 @@ def test_black_images_are_a_baseline(folder: Path, context: SceneContext) -> Non
     assert judging.baselines(dataset)["black"]["psnr_linear_clamped"] < 20
 
 
-# What is refused -----------------------------------------------------------------------------------------------------------------------
+# What is refused
+# -----------------------------------------------------------------------------------------------------------------------
 
 FRAME = "transforms_train.json: frames[1]"
 
@@ -294,11 +328,17 @@ FRAME = "transforms_train.json: frames[1]"
         (lambda f: f.update(pl_pos=None), (FRAME, "pl_pos is null", "3 numbers")),
         (lambda f: f.update(pl_pos=[1, 2]), (FRAME, "pl_pos is a list of 2")),
         (lambda f: f.update(pl_pos=[1, 2, "x"]), (FRAME, 'pl_pos[2] is "x"', "finite number")),
-        (lambda f: f.update(pl_intensity=[1, 2]), (FRAME, "pl_intensity is a list of 2", "3 numbers of at least 0, or one")),
+        (
+            lambda f: f.update(pl_intensity=[1, 2]),
+            (FRAME, "pl_intensity is a list of 2", "3 numbers of at least 0, or one"),
+        ),
         (lambda f: f.update(pl_intensity=-1), (FRAME, "pl_intensity is -1", "at least 0")),
         (lambda f: f.update(pl_intensity="bright"), (FRAME, "pl_intensity is", "bright")),
         (lambda f: f.pop("transform_matrix"), (FRAME, "transform_matrix is missing")),
-        (lambda f: f.update(transform_matrix=[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]), (FRAME, "singular or scaled")),
+        (
+            lambda f: f.update(transform_matrix=[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]),
+            (FRAME, "singular or scaled"),
+        ),
         (lambda f: f.update(file_ext=".npy"), (FRAME, 'file_ext is ".npy"', ".exr")),
         (lambda f: f.update(file_ext=".exr"), ("1 files not found", "./train/r_1.exr")),
         (lambda f: f.update(file_path="train/absent"), ("1 files not found", "train/absent")),
@@ -309,13 +349,21 @@ FRAME = "transforms_train.json: frames[1]"
         (lambda f: f.update(T_opt=[0, 0, 1]), (FRAME, "R_opt is missing", "beside T_opt")),
         (lambda f: f.update(R_opt=[[1, 0], [0, 1]], T_opt=[0, 0, 1]), (FRAME, "R_opt is a list of 2", "3 rows of 3")),
         (lambda f: f.update(R_opt=np.diag([1, 1, 2.0]).tolist(), T_opt=[0, 0, 1]), (FRAME, "singular or scaled")),
-        (lambda f: f.update(camera_intrinsics=[FX, FY, CX, CY]), (FRAME, "principal point outside", "[cx, cy, fx, fy]")),
+        (
+            lambda f: f.update(camera_intrinsics=[FX, FY, CX, CY]),
+            (FRAME, "principal point outside", "[cx, cy, fx, fy]"),
+        ),
         (lambda f: f.update(camera_intrinsics=[CX, CY, 0, FY]), (FRAME, "camera_intrinsics", "focal lengths above 0")),
-        (lambda f: f.update(camera_intrinsics=[[FX, 0, CX], [0, FY, CY], [0, 0, 1]]), (FRAME, "camera_intrinsics is a list of 3")),
+        (
+            lambda f: f.update(camera_intrinsics=[[FX, 0, CX], [0, FY, CY], [0, 0, 1]]),
+            (FRAME, "camera_intrinsics is a list of 3"),
+        ),
         (lambda f: f.update(camera_angle_x=4.0), (FRAME, "camera_angle_x is 4.0", "between 0 and pi")),
     ],
 )
-def test_wrong_frames_are_named(folder: Path, context: SceneContext, scenes: Any, change: Edit, words: tuple[str, ...]) -> None:
+def test_wrong_frames_are_named(
+    folder: Path, context: SceneContext, scenes: Any, change: Edit, words: tuple[str, ...]
+) -> None:
     edit(folder, lambda d: change(d["frames"][1]))
     scenes.refused(load, {"path": str(folder), "strict": True}, context, *words)
 
@@ -331,7 +379,9 @@ def test_wrong_frames_are_named(folder: Path, context: SceneContext, scenes: Any
         (lambda d: d.update(pl_intensity=[1, 1, -1]), ("pl_intensity is [1, 1, -1]",)),
     ],
 )
-def test_wrong_files_are_named(folder: Path, context: SceneContext, scenes: Any, change: Edit, words: tuple[str, ...]) -> None:
+def test_wrong_files_are_named(
+    folder: Path, context: SceneContext, scenes: Any, change: Edit, words: tuple[str, ...]
+) -> None:
     edit(folder, change)
     scenes.refused(load, {"path": str(folder)}, context, "transforms_train.json", *words)
 
@@ -356,9 +406,20 @@ def test_wrong_settings_are_named(
 
 
 def test_ignored_corrections_need_the_pose(folder: Path, context: SceneContext, scenes: Any) -> None:
-    edit(folder, lambda d: (d["frames"][1].pop("transform_matrix"), d["frames"][1].update(R_opt=np.eye(3).tolist(), T_opt=[0, 0, 1])))
+    edit(
+        folder,
+        lambda d: (
+            d["frames"][1].pop("transform_matrix"),
+            d["frames"][1].update(R_opt=np.eye(3).tolist(), T_opt=[0, 0, 1]),
+        ),
+    )
     scenes.refused(
-        load, {"path": str(folder), "ignore_corrections": True}, context, FRAME, "transform_matrix is missing", "R_opt and T_opt"
+        load,
+        {"path": str(folder), "ignore_corrections": True},
+        context,
+        FRAME,
+        "transform_matrix is missing",
+        "R_opt and T_opt",
     )
 
 

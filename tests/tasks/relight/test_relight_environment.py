@@ -1,4 +1,5 @@
-"""Light from all around a relit model: against one point light, against the light's own arithmetic, and on the command line."""
+"""Light from all around a relit model: against one point light, against the light's own arithmetic, and on the command
+line."""
 
 from __future__ import annotations
 
@@ -65,7 +66,8 @@ def some_model() -> Primitives:
 
 
 @pytest.mark.parametrize(
-    ("falloff", "exposure", "factor"), [("inverse_square", 1.0, 3.0**2), ("inverse_square", 2.5, 2.5 * 9), ("none", 1.0, 1 / math.pi)]
+    ("falloff", "exposure", "factor"),
+    [("inverse_square", 1.0, 3.0**2), ("inverse_square", 2.5, 2.5 * 9), ("none", 1.0, 1 / math.pi)],
 )
 def test_intensity_gives_the_centre_the_environments_irradiance(falloff: str, exposure: float, factor: float) -> None:
     environment = Environment(texel())
@@ -77,7 +79,8 @@ def test_intensity_gives_the_centre_the_environments_irradiance(falloff: str, ex
 
 
 def test_a_white_sky_shows_albedo() -> None:
-    """The ray caster's own shading of the built-in slab: a matt surface under uniform light of 1 is as bright as its albedo."""
+    """The ray caster's own shading of the built-in slab: a matt surface under uniform light of 1 is as bright as its
+    albedo."""
     scene = Scene([s for s in solids() if s.name == "slab"])
     told = {**facts(1e4), "center": [0.0, 0.0, 0.0]}
     lights = illuminate(Environment(torch.ones(64, 128, 3)), 600, told).conditions
@@ -155,7 +158,9 @@ def test_light_from_below_is_announced() -> None:
 
 def test_the_summary_covers_the_lights() -> None:
     g = torch.Generator().manual_seed(1)
-    lights = torch.nn.functional.normalize(torch.randn(3000, 3, generator=g), dim=1) * torch.linspace(2, 4, 3000)[:, None]
+    lights = (
+        torch.nn.functional.normalize(torch.randn(3000, 3, generator=g), dim=1) * torch.linspace(2, 4, 3000)[:, None]
+    )
     found = summary(lights, torch.zeros(3), "none", 2.0)
     kept = torch.tensor(found["directions"])
     units = torch.nn.functional.normalize(lights, dim=1)
@@ -172,7 +177,10 @@ def test_the_summary_covers_the_lights() -> None:
         ({"center": [0, 0]}, "center is a list of 2; expected 3 numbers"),
         ({"lights": {**facts()["lights"], "distance": -1.0}}, r"distance is -1\.0; expected a distance above 0"),
         ({"lights": {**facts()["lights"], "falloff": "cubic"}}, 'falloff is "cubic"; expected none or inverse_square'),
-        ({"lights": {**facts()["lights"], "directions": []}}, "directions is a list of 0; expected 1 to 256 directions"),
+        (
+            {"lights": {**facts()["lights"], "directions": []}},
+            "directions is a list of 0; expected 1 to 256 directions",
+        ),
         ({"lights": {**facts()["lights"], "directions": [[1, 2, "x"]]}}, "expected a finite number"),
         ({"lights": {**facts()["lights"], "directions": [[0, 0, 1]] * 257}}, "directions is a list of 257"),
     ],
@@ -216,7 +224,22 @@ def finished(tmp_path: Path) -> Path:
 
 def drawn(run: Path, name: str, *flags: str) -> Tensor:
     out = run.parent / f"{name}.exr"
-    assert main(["render", str(run), "--camera", str(run.parent / "one.json"), "--layers", "beauty", "--out", str(out), *flags]) == 0
+    assert (
+        main(
+            [
+                "render",
+                str(run),
+                "--camera",
+                str(run.parent / "one.json"),
+                "--layers",
+                "beauty",
+                "--out",
+                str(out),
+                *flags,
+            ]
+        )
+        == 0
+    )
     return read_image(out)
 
 
@@ -259,24 +282,43 @@ def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 def test_refusals(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = str(finished.parent / "texel.exr")
     base = [str(finished), "--camera", str(finished.parent / "one.json")]
-    assert "--light and --environment: give one of them" in refusal(capsys, *base, "--environment", file, "--light", "1,2,3")
-    assert "--environment-samples is given without --environment" in refusal(capsys, *base, "--environment-samples", "9")
-    assert "'0': expected a whole number from 1 to 4096" in refusal(capsys, *base, "--environment", file, "--environment-samples", "0")
-    assert "expected an angle in degrees" in refusal(capsys, *base, "--environment", file, "--environment-rotation", "nan")
+    assert "--light and --environment: give one of them" in refusal(
+        capsys, *base, "--environment", file, "--light", "1,2,3"
+    )
+    assert "--environment-samples is given without --environment" in refusal(
+        capsys, *base, "--environment-samples", "9"
+    )
+    assert "'0': expected a whole number from 1 to 4096" in refusal(
+        capsys, *base, "--environment", file, "--environment-samples", "0"
+    )
+    assert "expected an angle in degrees" in refusal(
+        capsys, *base, "--environment", file, "--environment-rotation", "nan"
+    )
     assert "no.exr: file not found" in refusal(capsys, *base, "--environment", "no.exr")
     assert "did you mean '--environment'" in refusal(capsys, *base, "--enviroment", file)
     negative = texel()
     negative[0, 0, 0] = -1.0
     write_exr(finished.parent / "negative.exr", negative, half=False)
-    assert "radiance -1.0 at row 0, column 0, channel 0" in refusal(capsys, *base, "--environment", str(finished.parent / "negative.exr"))
+    assert "radiance -1.0 at row 0, column 0, channel 0" in refusal(
+        capsys, *base, "--environment", str(finished.parent / "negative.exr")
+    )
 
 
 def test_what_the_model_never_saw_is_one_line(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_exr(finished.parent / "below.exr", texel(15), half=False)
-    base = ["render", str(finished), "--camera", str(finished.parent / "one.json"), "--out", str(finished.parent / "b.exr")]
+    base = [
+        "render",
+        str(finished),
+        "--camera",
+        str(finished.parent / "one.json"),
+        "--out",
+        str(finished.parent / "b.exr"),
+    ]
     assert main([*base, "--environment", str(finished.parent / "below.exr")]) == 0
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "below.exr: 100% of the environment's light comes from more than 15 degrees" in error
+    assert (
+        error.count("\n") == 1 and "below.exr: 100% of the environment's light comes from more than 15 degrees" in error
+    )
     assert main([*base, "--environment", str(finished.parent / "texel.exr")]) == 0
     assert capsys.readouterr().err == ""
 
@@ -288,7 +330,15 @@ def test_tasks_without_light_refuse(finished: Path, capsys: pytest.CaptureFixtur
     (finished / "config.yaml").write_text(config.to_yaml())
     t = scenes.tensors(3, 2)
     _, field = static.build({**vars(config.model), "options": config.options}, type("D", (), {"channels": 3})())  # type: ignore[arg-type]
-    params = {k: v for k, v in t.items() if k != "colors"} | {s.name: torch.zeros(3, *s.shape) for s in field.parameters()}
+    params = {k: v for k, v in t.items() if k != "colors"} | {
+        s.name: torch.zeros(3, *s.shape) for s in field.parameters()
+    }
     checkpoint.save_model(finished / "model.safetensors", Primitives(CosineDensity(2), field, params), "static", {})
-    words = [str(finished), "--camera", str(finished.parent / "one.json"), "--environment", str(finished.parent / "texel.exr")]
+    words = [
+        str(finished),
+        "--camera",
+        str(finished.parent / "one.json"),
+        "--environment",
+        str(finished.parent / "texel.exr"),
+    ]
     assert "task 'static' has no light that it could replace" in refusal(capsys, *words)

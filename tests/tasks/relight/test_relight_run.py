@@ -1,4 +1,5 @@
-"""A whole run of the relighting task, small: images under lights in; a report, new lights and an orbit of the light out."""
+"""A whole run of the relighting task, small: images under lights in; a report, new lights and an orbit of the light
+out."""
 
 from __future__ import annotations
 
@@ -21,7 +22,14 @@ from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.run import run
 from tests.reports import offered
 
-SCENE = ["task=relight", "scene=lit_solids", "scene.size=32", "scene.train_views=24", "scene.test_views=6", "scene.supersampling=1"]
+SCENE = [
+    "task=relight",
+    "scene=lit_solids",
+    "scene.size=32",
+    "scene.train_views=24",
+    "scene.test_views=6",
+    "scene.supersampling=1",
+]
 SMALL = ["model.primitives=150", "model.neurons=2", "model.colour.hidden=3", "train.max_seconds=null"]
 
 
@@ -48,7 +56,18 @@ def test_a_new_light_changes_the_picture(finished: Path, tmp_path: Path) -> None
 
 def test_the_light_goes_round(finished: Path, tmp_path: Path) -> None:
     target = tmp_path / "film.webp"
-    words = ["render", str(finished), "--camera", "orbit", "--frames", "1", "--light", "orbit:4:40:5", "--out", str(target)]
+    words = [
+        "render",
+        str(finished),
+        "--camera",
+        "orbit",
+        "--frames",
+        "1",
+        "--light",
+        "orbit:4:40:5",
+        "--out",
+        str(target),
+    ]
     assert main(words) == 0
     with Image.open(target) as film:
         assert getattr(film, "n_frames", 1) == 5
@@ -63,7 +82,9 @@ def test_the_report_offers_commands_that_work(finished: Path, tmp_path: Path) ->
         assert main([*words, *small]) == 0, words
 
 
-def test_a_missing_condition_is_asked_for_by_its_flag(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_condition_is_asked_for_by_its_flag(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     camera = {"w": 6, "h": 5, "camera_angle_x": 0.5, "frames": [{"name": "a", "transform_matrix": np.eye(4).tolist()}]}
     (tmp_path / "cameras.json").write_text(json.dumps(camera))
     words = ["render", str(finished), "--camera", str(tmp_path / "cameras.json"), "--light", "3,0,3"]
@@ -75,11 +96,22 @@ def test_a_missing_condition_is_asked_for_by_its_flag(finished: Path, tmp_path: 
 def test_light_from_all_around(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sky = torch.linspace(1.0, 0.0, 16)[:, None, None].expand(16, 32, 3)
     write_exr(tmp_path / "sky.exr", sky, half=False)
-    words = ["render", str(finished), "--environment", str(tmp_path / "sky.exr"), "--environment-samples", "5", "--frames", "3"]
+    words = [
+        "render",
+        str(finished),
+        "--environment",
+        str(tmp_path / "sky.exr"),
+        "--environment-samples",
+        "5",
+        "--frames",
+        "3",
+    ]
     assert main([*words, "--camera", "test", "--out", str(tmp_path / "test")]) == 0
     assert len(list((tmp_path / "test").glob("*.png"))) == 6
     assert main([*words, "--camera", "orbit", "--out", str(tmp_path / "film.webp")]) == 0
-    assert "of the environment's light comes from more than 15 degrees off every training light" in capsys.readouterr().err
+    assert (
+        "of the environment's light comes from more than 15 degrees off every training light" in capsys.readouterr().err
+    )
     with Image.open(tmp_path / "film.webp") as film:
         assert getattr(film, "n_frames", 1) == 3
         assert np.asarray(film.convert("RGB")).std() > 5
@@ -101,7 +133,10 @@ def test_layers_from_the_command_line(finished: Path, tmp_path: Path, capsys: py
     assert beauty.dtype == torch.float16 and isinstance(parts, torch.Tensor) and beauty.max() > 0
     assert (parts - beauty.float()).abs().max() < 2e-3 * beauty.max(), "as far as 16 bits go"
     for more, message in (
-        (["--layers", "shadow"], "--layers shadow: no such layer; expected some of beauty, alpha, depth, density, unshadowed, visibility"),
+        (
+            ["--layers", "shadow"],
+            "--layers shadow: no such layer; expected some of beauty, alpha, depth, density, unshadowed, visibility",
+        ),
         (["--layers", "lights"], "--layers lights: no such layer"),
         (
             [*sky, "--layers", "visibility"],
@@ -119,8 +154,14 @@ def test_layers_from_the_command_line(finished: Path, tmp_path: Path, capsys: py
     [
         (["model.colour.form=multiplicative"], {"form": "multiplicative", "hidden": 3, "visibility": "primitive"}),
         (["model.colour.form=harmonics", "model.colour.degree=3"], {"degree": 3}),
-        (["model.colour.visibility=none", "train.loss=compressed"], {"form": "additive", "hidden": 3, "visibility": "none"}),
-        (["model.colour.hidden=0", "train.loss=relative"], {"form": "additive", "hidden": 0, "visibility": "primitive"}),
+        (
+            ["model.colour.visibility=none", "train.loss=compressed"],
+            {"form": "additive", "hidden": 3, "visibility": "none"},
+        ),
+        (
+            ["model.colour.hidden=0", "train.loss=relative"],
+            {"form": "additive", "hidden": 0, "visibility": "primitive"},
+        ),
         (["preset=paper", "train.population.every=5"], {"form": "additive", "hidden": 3, "visibility": "none"}),
     ],
 )
@@ -155,5 +196,7 @@ def test_wrong_choices(word: str, message: str) -> None:
 def test_a_wrong_loss() -> None:
     with pytest.raises(ConfigError, match=r"train\.loss=l2: no such loss; did you mean 'l1'\?"):
         compose(["task=relight", "train.loss=l2"], False)
-    with pytest.raises(ConfigError, match=r"task\.options\.loss: task 'relight' has no such option; did you mean 'train\.loss'\?"):
+    with pytest.raises(
+        ConfigError, match=r"task\.options\.loss: task 'relight' has no such option; did you mean 'train\.loss'\?"
+    ):
         compose(["task=relight", "+task.options.loss=compressed"], False)

@@ -1,4 +1,5 @@
-"""Light on solids with known answers: Lambert under a point light, shadows where geometry says, highlights where the half vector is."""
+"""Light on solids with known answers: Lambert under a point light, shadows where geometry says, highlights where the
+half vector is."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ FLOOR = Solid("floor", chamfered_box([4, 4, 0.1], [0, 0, -0.05], 0.001), plain(G
 BLOCK = Solid("block", chamfered_box([0.4, 0.4, 0.2], [0, 0, 0.6], 0.0005), plain("#ffffff"), 0.0)
 
 
-def down(scene: Scene, points: list[tuple[float, float]], light: tuple[float, float, float], height: float = 0.3) -> Shaded:
+def down(
+    scene: Scene, points: list[tuple[float, float]], light: tuple[float, float, float], height: float = 0.3
+) -> Shaded:
     """What rays straight down from ``height`` see at (x, y) points."""
     origins = np.array([[x, y, height] for x, y in points])
     return shade(scene, origins, np.tile([[0.0, 0.0, -1.0]], (len(points), 1)), light, 2.0)
@@ -46,8 +49,8 @@ def test_twice_the_distance_is_a_quarter_of_the_light() -> None:
 
 
 def test_the_shadow_of_a_box_lies_where_its_edges_project() -> None:
-    """Under a light at (1, 0, 2) the upper edge of the far side projects to 1 - 1.2 * 2 / 1.3, the lower one of the near side to
-    1 - 0.8 * 2 / 1.5."""
+    """Under a light at (1, 0, 2) the upper edge of the far side projects to 1 - 1.2 * 2 / 1.3, the lower one of the
+    near side to 1 - 0.8 * 2 / 1.5."""
     seen = down(Scene([FLOOR, BLOCK]), [(x, 0.0) for x in (-0.86, -0.83, -0.4, -0.08, -0.05, 0.2)], (1.0, 0.0, 2.0))
     assert names(seen) == ["lit", "cast_shadow", "cast_shadow", "cast_shadow", "lit", "lit"]
     cast = seen.classes == CLASSES.index("cast_shadow")
@@ -89,7 +92,8 @@ def test_the_highlight_lies_where_the_normal_is_the_half_vector() -> None:
 def test_a_pixel_has_the_class_of_most_of_its_rays() -> None:
     scene = Scene([FLOOR, BLOCK])
     coarse, fine = (
-        picture(scene, camera_to_world(np.array([2.0, -3.0, 2.5])), np.array([1.0, 1.0, 4.0]), n, s) for n, s in ((16, 4), (64, 1))
+        picture(scene, camera_to_world(np.array([2.0, -3.0, 2.5])), np.array([1.0, 1.0, 4.0]), n, s)
+        for n, s in ((16, 4), (64, 1))
     )
     alpha = fine.rgba[..., 3].reshape(16, 4, 16, 4).sum((1, 3))
     np.testing.assert_array_equal(coarse.rgba[..., 3] * 16, alpha)
@@ -109,7 +113,8 @@ def test_pictures_do_not_depend_on_how_rays_are_batched(monkeypatch: pytest.Monk
         np.testing.assert_array_equal(getattr(whole, name), getattr(again, name))
 
 
-# The rig -------------------------------------------------------------------------------------------------------------------------------
+# The rig
+# -------------------------------------------------------------------------------------------------------------------------------
 
 
 def test_distances_and_angles_are_those_promised() -> None:

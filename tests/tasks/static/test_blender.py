@@ -51,7 +51,13 @@ def test_marks_are_where_cameras_say(folder: Path, scenes: Any, context: Any) ->
     assert (len(data.train), len(data.test)) == (6, 2)
     assert max(scenes.off_by(s, i) for s in (data.train, data.test) for i in range(len(s))) < 0.02
     assert [data.train.view(i).name for i in range(6)] == [f"r_{i}" for i in range(6)]
-    assert (data.name, data.channels, data.color_space, data.data_source, data.downsampling) == ("toy", 3, "srgb", "real", "none")
+    assert (data.name, data.channels, data.color_space, data.data_source, data.downsampling) == (
+        "toy",
+        3,
+        "srgb",
+        "real",
+        "none",
+    )
     assert data.background.tolist() == [1.0, 1.0, 1.0] and not data.random_background
     assert data.center.norm() < 1e-3 and data.up.tolist() == [0.0, 0.0, 1.0]
     assert 3.0 < data.extent < 4.0
@@ -82,7 +88,8 @@ def test_straight_alpha_is_premultiplied_before_it_is_averaged(folder: Path, con
 
 
 @pytest.mark.parametrize(
-    ("background", "color", "random"), [("auto", 1.0, False), ("white", 1.0, False), ("black", 0.0, False), ("random", 1.0, True)]
+    ("background", "color", "random"),
+    [("auto", 1.0, False), ("white", 1.0, False), ("black", 0.0, False), ("random", 1.0, True)],
 )
 def test_backgrounds(folder: Path, context: Any, background: str, color: float, random: bool) -> None:
     data = load({"path": folder, "background": background}, context)
@@ -118,7 +125,9 @@ def test_focal_lengths_and_principal_point_of_the_file(folder: Path, scenes: Any
             spot = scenes.blob(W, H, 40 * x + 28, 40 * y + 15)
             scenes.save(folder / f"{frame['file_path']}.png", np.stack([spot, spot, spot, np.ones_like(spot)], axis=-1))
         angle = 2 * math.atan(0.5 * W / 40)
-        document.update(camera_angle_x=angle, fl_x=40, fl_y=40, cx=28, cy=15, w=float(W), h=float(H), k1=0.0, aabb_scale=4)
+        document.update(
+            camera_angle_x=angle, fl_x=40, fl_y=40, cx=28, cy=15, w=float(W), h=float(H), k1=0.0, aabb_scale=4
+        )
         scenes.write_json(folder / f"transforms_{split}.json", document)
     data = load({"path": folder}, context)
     assert max(scenes.off_by(s, i) for s in (data.train, data.test) for i in range(len(s))) < 0.02
@@ -168,7 +177,11 @@ def test_chair(chair: Path, context: Any) -> None:
     assert data.downsampling == "50x50 from 200x200 by area"
     assert data.center.norm() < 0.01 and data.extent == pytest.approx(5.25, abs=0.01)
     pixels = data.train.pixels(0)
-    assert pixels.alpha is not None and 0.05 < pixels.alpha.mean() < 0.6 and bool((pixels.rgb <= pixels.alpha[..., None] + 0.01).all())
+    assert (
+        pixels.alpha is not None
+        and 0.05 < pixels.alpha.mean() < 0.6
+        and bool((pixels.rgb <= pixels.alpha[..., None] + 0.01).all())
+    )
 
 
 def test_starting_points_of_the_chair(chair: Path, context: Any) -> None:
@@ -311,7 +324,9 @@ def test_damaged_images_are_found_while_loading(folder: Path, scenes: Any, conte
     bad.write_bytes(data[: len(data) // 2])
     scenes.refused(load, {"path": folder, "strict": True}, context, str(bad), "truncated or corrupt")
     Image.fromarray(np.zeros((H, W), np.uint16)).save(bad)
-    scenes.refused(load, {"path": folder, "strict": True}, context, str(bad), "16-bit grey PNG", "expected 8-bit RGB or RGBA")
+    scenes.refused(
+        load, {"path": folder, "strict": True}, context, str(bad), "16-bit grey PNG", "expected 8-bit RGB or RGBA"
+    )
     with pytest.warns(NeuprimWarning, match="16-bit grey PNG.*; view r_1 is left out"):
         assert len(load({"path": folder}, context).test) == 1
 

@@ -54,11 +54,15 @@ def capture(tmp_path: Path, scenes: Any, pycolmap: Any) -> Callable[..., Path]:
         reconstruction.add_camera_with_trivial_rig(lens)
         for i, pose in enumerate(scenes.ring(count, radius=1.6)):
             view = np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
-            u, v = lens.img_from_cam((view @ np.append(scenes.mark, 1.0))[None, :3])[0] if params is None else (30.0, 25.0)
+            u, v = (
+                lens.img_from_cam((view @ np.append(scenes.mark, 1.0))[None, :3])[0] if params is None else (30.0, 25.0)
+            )
             scenes.save(path / "images" / f"{i:02d}.png", scenes.blob(W, H, u, v, sigma))
             rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(view[:3, :3]), view[:3, 3])
             # numbers run against the names, which decide the order
-            reconstruction.add_image_with_trivial_frame(pycolmap.Image(name=f"{i:02d}.png", camera_id=1, image_id=count - i), rigid)
+            reconstruction.add_image_with_trivial_frame(
+                pycolmap.Image(name=f"{i:02d}.png", camera_id=1, image_id=count - i), rigid
+            )
         for xyz, color in zip(POINTS, COLORS, strict=True) if points else ():
             reconstruction.add_point3D(xyz, pycolmap.Track(), color)
         (path / "sparse" / "0").mkdir(parents=True)
@@ -155,7 +159,9 @@ def test_text_models(capture: Any, scenes: Any, context: Any) -> None:
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
-def test_reduced_folders_scale_the_camera_to_the_actual_size(capture: Any, scenes: Any, context: Any, pycolmap: Any, model: str) -> None:
+def test_reduced_folders_scale_the_camera_to_the_actual_size(
+    capture: Any, scenes: Any, context: Any, pycolmap: Any, model: str
+) -> None:
     path = capture(model)
     lens = pycolmap.Camera(model=model, width=W, height=H, params=PARAMS[model])
     w, h = 21, 17  # a third of 64 x 50, each side rounded
@@ -166,7 +172,10 @@ def test_reduced_folders_scale_the_camera_to_the_actual_size(capture: Any, scene
     data = load({"path": path, "images": "images_3"}, context)
     assert worst(scenes, data) < 0.1 and data.downsampling == "images_3"
     assert (data.train.view(0).camera.width, data.train.view(0).camera.height) == (w, h)
-    assert load({"path": path, "images": "images_3", "downsample": 2}, context).downsampling == "images_3, then 10x8 from 21x17 by area"
+    assert (
+        load({"path": path, "images": "images_3", "downsample": 2}, context).downsampling
+        == "images_3, then 10x8 from 21x17 by area"
+    )
 
 
 def test_sizes_may_differ(capture: Any, scenes: Any, context: Any) -> None:
@@ -257,7 +266,9 @@ def test_models_with_rigs_of_two_cameras(tmp_path: Path, pycolmap: Any) -> None:
     reconstruction = pycolmap.Reconstruction()
     rig = pycolmap.Rig(rig_id=1)
     for i in (1, 2):
-        reconstruction.add_camera(pycolmap.Camera(model="PINHOLE", width=W, height=H, params=PARAMS["PINHOLE"], camera_id=i))
+        reconstruction.add_camera(
+            pycolmap.Camera(model="PINHOLE", width=W, height=H, params=PARAMS["PINHOLE"], camera_id=i)
+        )
         sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, i)
         if i == 1:
             rig.add_ref_sensor(sensor)

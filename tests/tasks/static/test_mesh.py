@@ -65,14 +65,20 @@ def pixel(camera: Camera, point: list[float]) -> tuple[int, int]:
     return int(camera.fy * p[1] / p[2] + camera.cy), int(camera.fx * p[0] / p[2] + camera.cx)
 
 
-# Colours -------------------------------------------------------------------------------------------------------------------------------
+# Colours
+# -------------------------------------------------------------------------------------------------------------------------------
 
 
 def test_a_textured_cube_shows_its_quarters_where_geometry_says(tmp_path: Path) -> None:
     """glTF's y is the scene's z, its x stays, its z comes forward as -y: the +z side is the one at y = -s."""
     dataset = read(write_glb(tmp_path / "cube.glb"), tmp_path, size=96, shading="flat", train_views=12)
     s = FARTHEST / math.sqrt(3)
-    spots = {RED: [-s / 2, -s, s / 2], GREEN: [s / 2, -s, s / 2], BLUE: [-s / 2, -s, -s / 2], YELLOW: [s / 2, -s, -s / 2]}
+    spots = {
+        RED: [-s / 2, -s, s / 2],
+        GREEN: [s / 2, -s, s / 2],
+        BLUE: [-s / 2, -s, -s / 2],
+        YELLOW: [s / 2, -s, -s / 2],
+    }
     seen = 0
     for index in range(12):
         view, pixels = dataset.train.view(index), dataset.train.pixels(index)
@@ -168,7 +174,9 @@ def test_the_texture_that_a_ply_names(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", [False, True])
 def test_an_stl_is_grey_and_says_so(tmp_path: Path, text: bool) -> None:
     mesh = trimesh.Trimesh(*cube()[:2], process=False)
-    (tmp_path / "cube.stl").write_bytes(mesh.export(file_type="stl_ascii").encode() if text else mesh.export(file_type="stl"))
+    (tmp_path / "cube.stl").write_bytes(
+        mesh.export(file_type="stl_ascii").encode() if text else mesh.export(file_type="stl")
+    )
     with pytest.warns(match="cube.stl: 12 of 12 faces have no colour; drawn grey"):
         scene = surface(tmp_path / "cube.stl")
     np.testing.assert_allclose(scene.intersect([[3.0, 0.1, 0]], [[-1.0, 0, 0]]).albedo, [GREY])
@@ -181,7 +189,9 @@ def test_base_colours_are_linear_and_multiply_texture_and_vertices(tmp_path: Pat
     primitive = document["meshes"][0]["primitives"][0]
     primitive["material"] = 0
     primitive["attributes"]["COLOR_0"] = 2
-    document["accessors"].append({"bufferView": 2, "componentType": 5123, "normalized": True, "count": 3, "type": "VEC3"})
+    document["accessors"].append(
+        {"bufferView": 2, "componentType": 5123, "normalized": True, "count": 3, "type": "VEC3"}
+    )
     document["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": 24, "byteStride": 8})
     data += np.full((3, 4), 32768, "<u2").tobytes()
     document["buffers"] = [{"uri": "triangle.bin", "byteLength": len(data)}]
@@ -192,16 +202,25 @@ def test_base_colours_are_linear_and_multiply_texture_and_vertices(tmp_path: Pat
 
 
 def test_texture_coordinates_of_the_materials_own_set_are_moved_and_wrapped(tmp_path: Path) -> None:
-    """KHR_texture_transform: half a texture to the right, from quantized coordinates; clamped along u, mirrored along v."""
+    """KHR_texture_transform: half a texture to the right, from quantized coordinates; clamped along u, mirrored along
+    v."""
     document, data = gltf()
     uv = np.array([[0, 0], [0, 0], [255, 255]], np.uint8)
     data += np.pad(uv, ((0, 0), (0, 2))).tobytes()
-    document["accessors"].append({"bufferView": 2, "componentType": 5121, "normalized": True, "count": 3, "type": "VEC2"})
+    document["accessors"].append(
+        {"bufferView": 2, "componentType": 5121, "normalized": True, "count": 3, "type": "VEC2"}
+    )
     document["bufferViews"].append({"buffer": 0, "byteOffset": 44, "byteLength": 12, "byteStride": 4})
     document["buffers"] = [{"uri": "triangle.bin", "byteLength": len(data)}]
-    document["meshes"][0]["primitives"][0] = {"attributes": {"POSITION": 0, "TEXCOORD_1": 2}, "indices": 1, "material": 0}
+    document["meshes"][0]["primitives"][0] = {
+        "attributes": {"POSITION": 0, "TEXCOORD_1": 2},
+        "indices": 1,
+        "material": 0,
+    }
     moved = {"KHR_texture_transform": {"offset": [0.5, 0.0], "scale": [2.0, 1.0]}}
-    document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1, "extensions": moved}}}]
+    document["materials"] = [
+        {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1, "extensions": moved}}}
+    ]
     document["textures"], document["images"] = [{"source": 0, "sampler": 0}], [{"uri": "the%20skin.png"}]
     document["samplers"] = [{"wrapS": 33071, "wrapT": 33648}]
     document["extensionsRequired"] = ["KHR_texture_transform", "KHR_mesh_quantization"]
@@ -210,7 +229,9 @@ def test_texture_coordinates_of_the_materials_own_set_are_moved_and_wrapped(tmp_
     (tmp_path / "t.gltf").write_text(json.dumps(document))
     (part,) = read_parts(read_gltf(Folder(tmp_path / "t.gltf")))
     assert part.material.wrap == ("clamp", "mirror") and part.uv is not None
-    np.testing.assert_allclose(part.uv[0], [[0.5, 1.0], [0.5, 1.0], [2.5, 0.0]], atol=1e-6)  # v upward: glTF's 0 is the upper edge
+    np.testing.assert_allclose(
+        part.uv[0], [[0.5, 1.0], [0.5, 1.0], [2.5, 0.0]], atol=1e-6
+    )  # v upward: glTF's 0 is the upper edge
 
 
 def test_parts_stand_where_the_graph_puts_them(tmp_path: Path) -> None:
@@ -225,35 +246,53 @@ def test_parts_stand_where_the_graph_puts_them(tmp_path: Path) -> None:
     document["scenes"] = [{"nodes": [0, 1]}]
     (tmp_path / "triangle.bin").write_bytes(data)
     (tmp_path / "t.gltf").write_text(json.dumps(document))
-    first, second = sorted(read_parts(read_gltf(Folder(tmp_path / "t.gltf"))), key=lambda part: float(part.corners.max()))
+    first, second = sorted(
+        read_parts(read_gltf(Folder(tmp_path / "t.gltf"))), key=lambda part: float(part.corners.max())
+    )
     np.testing.assert_allclose(first.corners[0], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     np.testing.assert_allclose(second.corners[0], [[20, 0, -2], [20, 2, -2], [18, 0, -2]], atol=1e-12)
 
 
-@pytest.mark.parametrize(("mode", "indices", "count"), [(4, [0, 1, 2, 0, 2, 3], 2), (5, [0, 1, 3, 2], 2), (6, [0, 1, 2, 3], 2)])
+@pytest.mark.parametrize(
+    ("mode", "indices", "count"), [(4, [0, 1, 2, 0, 2, 3], 2), (5, [0, 1, 3, 2], 2), (6, [0, 1, 2, 3], 2)]
+)
 def test_triangles_strips_and_fans(tmp_path: Path, mode: int, indices: list[int], count: int) -> None:
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32).tobytes()
     data = square + np.array(indices, "<u4").tobytes()
     document, _ = gltf(buffers=[{"uri": "triangle.bin", "byteLength": len(data)}])
-    document["bufferViews"] = [{"buffer": 0, "byteLength": 48}, {"buffer": 0, "byteOffset": 48, "byteLength": len(data) - 48}]
+    document["bufferViews"] = [
+        {"buffer": 0, "byteLength": 48},
+        {"buffer": 0, "byteOffset": 48, "byteLength": len(data) - 48},
+    ]
     document["accessors"][0]["count"] = 4
     document["accessors"][1] |= {"count": len(indices), "componentType": 5125}
     document["meshes"][0]["primitives"][0]["mode"] = mode
     (tmp_path / "triangle.bin").write_bytes(data)
     (tmp_path / "t.gltf").write_text(json.dumps(document))
     (part,) = read_parts(read_gltf(Folder(tmp_path / "t.gltf")))
-    area = np.linalg.norm(np.cross(part.corners[:, 1] - part.corners[:, 0], part.corners[:, 2] - part.corners[:, 0]), axis=1) / 2
+    area = (
+        np.linalg.norm(
+            np.cross(part.corners[:, 1] - part.corners[:, 0], part.corners[:, 2] - part.corners[:, 0]), axis=1
+        )
+        / 2
+    )
     assert len(part.corners) == count and area.sum() == pytest.approx(1.0)
 
 
-# Holes ---------------------------------------------------------------------------------------------------------------------------------
+# Holes
+# ---------------------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("mode", "alpha", "hole"), [("OPAQUE", 0, False), ("MASK", 100, True), ("MASK", 200, False), ("BLEND", 100, True)])
+@pytest.mark.parametrize(
+    ("mode", "alpha", "hole"), [("OPAQUE", 0, False), ("MASK", 100, True), ("MASK", 200, False), ("BLEND", 100, True)]
+)
 def test_where_the_texture_is_clear_there_is_a_hole(tmp_path: Path, mode: str, alpha: int, hole: bool) -> None:
-    """Seen through the red quarter of the front there is the back, mirrored: its green quarter; and the light comes through."""
+    """Seen through the red quarter of the front there is the back, mirrored: its green quarter; and the light comes
+    through."""
     more = {"alphaCutoff": 0.6} if mode == "MASK" else {}
-    scene = surface(write_glb(tmp_path / "cube.glb", (textured(quarters(alpha=alpha), alphaMode=mode, **more), np.eye(4))))
+    scene = surface(
+        write_glb(tmp_path / "cube.glb", (textured(quarters(alpha=alpha), alphaMode=mode, **more), np.eye(4)))
+    )
     s = FARTHEST / math.sqrt(3)
     at, towards = np.array([[-s / 2, -3.0, s / 2]], np.float32), np.array([[0.0, 2.0, 0.0]], np.float32)
     hits = scene.intersect(at, towards)
@@ -263,7 +302,8 @@ def test_where_the_texture_is_clear_there_is_a_hole(tmp_path: Path, mode: str, a
     assert scene.occluded(at, towards, 1.4).tolist() == [not hole] and scene.occluded(at, towards).all()
 
 
-# Textures ------------------------------------------------------------------------------------------------------------------------------
+# Textures
+# ------------------------------------------------------------------------------------------------------------------------------
 
 
 def test_texels_are_mixed_in_linear_light_about_their_middles() -> None:
@@ -273,7 +313,9 @@ def test_texels_are_mixed_in_linear_light_about_their_middles() -> None:
     found = texture.look_up(np.array([[0.25, 0.5], [0.5, 0.5], [0.75, 0.5]], np.float32), sharp)
     np.testing.assert_allclose(found[:, 0], [0, 0.5, 1], atol=1e-6)
     np.testing.assert_allclose(texture.look_up(np.array([[0.0, 0.5]], np.float32), sharp[:1])[0, 0], 0)
-    np.testing.assert_allclose(Texture(pixels).look_up(np.array([[0.0, 0.5]], np.float32), sharp[:1])[0, 0], 0.5)  # wraps around
+    np.testing.assert_allclose(
+        Texture(pixels).look_up(np.array([[0.0, 0.5]], np.float32), sharp[:1])[0, 0], 0.5
+    )  # wraps around
 
 
 @pytest.mark.parametrize(("wrap", "same"), [("repeat", 0.2), ("mirror", 0.8), ("clamp", 1.0)])
@@ -305,7 +347,8 @@ def test_images_of_every_depth_are_decoded(tmp_path: Path, mode: str) -> None:
         np.testing.assert_array_equal(pixels[0, 0], [128, 128, 128, 255])
 
 
-# Shape and place -----------------------------------------------------------------------------------------------------------------------
+# Shape and place
+# -----------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("suffix", "up", "expected"), [(".glb", "auto", "y"), (".obj", "auto", "y"), (".ply", "auto", "z"), (".stl", "auto", "z"), (".ply", "y", "y"), (".glb", "z", "z")])  # fmt: skip
@@ -338,7 +381,8 @@ def test_normals_of_the_file_are_used_and_others_follow_from_the_angles(tmp_path
         text = "".join(f"v {x} {y} {z}\n" for x, y, z in rough.vertices.tolist())
         text += "".join(f"vn {x} {y} {z}\n" for x, y, z in rough.vertices.tolist())
         text += "".join(
-            "f " + " ".join(f"{i + 1}//{i + 1}" if smooth else f"{i + 1}" for i in face) + "\n" for face in rough.faces.tolist()
+            "f " + " ".join(f"{i + 1}//{i + 1}" if smooth else f"{i + 1}" for i in face) + "\n"
+            for face in rough.faces.tolist()
         )
         (tmp_path / f"{named}.obj").write_text(text)
         scene = surface(tmp_path / f"{named}.obj", "z")
@@ -375,7 +419,8 @@ def test_faces_without_area_are_left_out_and_counted(tmp_path: Path) -> None:
     assert np.isfinite(scene._corner_normals).all() and len(scene._faces) == 12
 
 
-# The data set --------------------------------------------------------------------------------------------------------------------------
+# The data set
+# --------------------------------------------------------------------------------------------------------------------------
 
 
 def test_flat_shows_colours_and_daylight_shades_them(tmp_path: Path) -> None:
@@ -392,7 +437,11 @@ def test_white_in_the_sun_is_not_clipped(tmp_path: Path) -> None:
     white = trimesh.Trimesh(*cube()[:2], process=False)
     white.visual.vertex_colors = np.full((24, 4), 255, np.uint8)
     dataset = read(write_glb(tmp_path / "white.glb", (white, np.eye(4))), tmp_path, train_views=10)
-    tops = [pixels.rgb[pixels.alpha == 1].max() for pixels in map(dataset.train.pixels, range(10)) if pixels.alpha is not None]
+    tops = [
+        pixels.rgb[pixels.alpha == 1].max()
+        for pixels in map(dataset.train.pixels, range(10))
+        if pixels.alpha is not None
+    ]
     assert 0.9 < max(tops) < 1.0
 
 
@@ -416,7 +465,14 @@ def test_images_are_kept_by_contents_and_settings(tmp_path: Path, monkeypatch: p
         (tmp_path / "copy" / file.name).write_bytes(file.read_bytes())
     assert generate(MeshSettings(path=tmp_path / "copy" / "square.obj", **SMALL), cache) == first  # wherever it lies
     folders = {first}
-    for name, value in {"size": 40, "train_views": 3, "test_views": 1, "supersampling": 1, "up": "z", "shading": "flat"}.items():
+    for name, value in {
+        "size": 40,
+        "train_views": 3,
+        "test_views": 1,
+        "supersampling": 1,
+        "up": "z",
+        "shading": "flat",
+    }.items():
         folders.add(generate(MeshSettings(**{"path": path, **SMALL, name: value}), cache))
     quarters(alpha=255).save(tmp_path / "skin.png")
     folders.add(generate(settings, cache))
@@ -436,7 +492,9 @@ def test_an_interruption_leaves_nothing_and_progress_is_told(tmp_path: Path) -> 
     with pytest.raises(KeyboardInterrupt):
         generate(MeshSettings(path=path, **SMALL), tmp_path / "cache", stop)
     assert list((tmp_path / "cache").iterdir()) == []
-    assert said[:2] == ["mesh: reading cube.glb", "mesh: building the scene"] and said[-1].startswith("mesh: drawing 48x48 images")
+    assert said[:2] == ["mesh: reading cube.glb", "mesh: building the scene"] and said[-1].startswith(
+        "mesh: drawing 48x48 images"
+    )
 
 
 def test_the_same_model_from_three_formats_looks_alike(tmp_path: Path) -> None:
@@ -458,7 +516,13 @@ def test_the_same_model_from_three_formats_looks_alike(tmp_path: Path) -> None:
 
 def test_it_trains_end_to_end_and_the_files_units_are_kept(tmp_path: Path) -> None:
     path, out = write_glb(tmp_path / "cube.glb"), tmp_path / "out"
-    words = ["task=static", "scene=mesh", f"scene.path='{path}'", f"output_dir='{out}'", *(f"scene.{k}={v}" for k, v in SMALL.items())]
+    words = [
+        "task=static",
+        "scene=mesh",
+        f"scene.path='{path}'",
+        f"output_dir='{out}'",
+        *(f"scene.{k}={v}" for k, v in SMALL.items()),
+    ]
     run(compose([*words, "model.primitives=60", "train.iterations=200", "train.max_seconds=null"]))
     curve = [json.loads(line)["psnr"] for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert curve[-1] > curve[0] + 1
@@ -471,10 +535,14 @@ def test_it_trains_end_to_end_and_the_files_units_are_kept(tmp_path: Path) -> No
     header = read_header(out / "model.safetensors", "model")
     assert header["data"]["scene_from_file"] == metrics["scene_from_file"]
     np.testing.assert_allclose(np.linalg.norm(np.array(metrics["scene_from_file"])[:3, :3] @ [1, 1, 1]), FARTHEST)
-    assert "<strong>generated data</strong> <span>rendered from cube.glb, not photographs</span>" in (out / "report.html").read_text()
+    assert (
+        "<strong>generated data</strong> <span>rendered from cube.glb, not photographs</span>"
+        in (out / "report.html").read_text()
+    )
 
 
-# What it shares ------------------------------------------------------------------------------------------------------------------------
+# What it shares
+# ------------------------------------------------------------------------------------------------------------------------
 
 
 def test_the_yaml_has_every_setting_and_its_default(tmp_path: Path) -> None:

@@ -55,11 +55,14 @@ def notes(path: Path, **settings: Any) -> list[str]:
     return [str(warning.message) for warning in caught if issubclass(warning.category, NeuprimWarning)]
 
 
-# The file itself -----------------------------------------------------------------------------------------------------------------------
+# The file itself
+# -----------------------------------------------------------------------------------------------------------------------
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    assert "does not exist; expected a model's file (scene.path), .glb, .gltf, .obj, .ply or .stl" in refusal(tmp_path / "a.glb")
+    assert "does not exist; expected a model's file (scene.path), .glb, .gltf, .obj, .ply or .stl" in refusal(
+        tmp_path / "a.glb"
+    )
     (tmp_path / "b.obj").mkdir()
     assert "is no file" in refusal(tmp_path / "b.obj")
 
@@ -100,7 +103,8 @@ def test_a_file_that_may_not_be_read(tmp_path: Path) -> None:
     assert "cannot be read (Permission denied)" in refusal(tmp_path / "a.glb")
 
 
-# Geometry ------------------------------------------------------------------------------------------------------------------------------
+# Geometry
+# ------------------------------------------------------------------------------------------------------------------------------
 
 
 def test_a_cloud_of_points_is_no_mesh(tmp_path: Path) -> None:
@@ -114,7 +118,9 @@ def test_a_cloud_of_points_is_no_mesh(tmp_path: Path) -> None:
 def test_points_and_lines_beside_triangles_are_counted(tmp_path: Path) -> None:
     document, _ = gltf()
     primitive = document["meshes"][0]["primitives"][0]
-    path = write_gltf(tmp_path / "a.gltf", meshes=[{"primitives": [primitive, {**primitive, "mode": 0}, {**primitive, "mode": 3}]}])
+    path = write_gltf(
+        tmp_path / "a.gltf", meshes=[{"primitives": [primitive, {**primitive, "mode": 0}, {**primitive, "mode": 3}]}]
+    )
     assert f"{path}: 2 parts are points or lines; only triangles are drawn" in notes(path)
     write_gltf(path, meshes=[{"primitives": [{**primitive, "mode": 1}]}])
     assert "has no faces; expected a mesh with triangles" in refusal(path)
@@ -129,7 +135,9 @@ def test_vertices_that_are_no_numbers(tmp_path: Path, value: float) -> None:
     assert all("no colour" in note for note in notes(write_ply(tmp_path / "b.ply", unused, faces)))
 
 
-@pytest.mark.parametrize(("where", "text"), [(-1, "a face has the vertex -1 of 24"), (24, "a face has the vertex 24 of 24")])
+@pytest.mark.parametrize(
+    ("where", "text"), [(-1, "a face has the vertex -1 of 24"), (24, "a face has the vertex 24 of 24")]
+)
 def test_faces_of_vertices_that_are_not_there(tmp_path: Path, where: int, text: str) -> None:
     vertices, faces, _ = cube()
     faces[3, 1] = where
@@ -138,7 +146,9 @@ def test_faces_of_vertices_that_are_not_there(tmp_path: Path, where: int, text: 
 
 def test_nothing_but_faces_without_area(tmp_path: Path) -> None:
     line = np.array([[0, 0, 0], [1, 1, 1], [2, 2, 2]])
-    assert "1 of 1 faces have no area; expected triangles" in refusal(write_ply(tmp_path / "a.ply", line, np.array([[0, 1, 2]])))
+    assert "1 of 1 faces have no area; expected triangles" in refusal(
+        write_ply(tmp_path / "a.ply", line, np.array([[0, 1, 2]]))
+    )
     assert "the mesh is a point" in refusal(write_ply(tmp_path / "b.ply", 0 * line, np.array([[0, 1, 2]])))
 
 
@@ -150,7 +160,8 @@ def test_sizes_from_atoms_to_galaxies(tmp_path: Path) -> None:
     assert "too large for numbers" in refusal(tmp_path / "a.obj")
 
 
-# Limits --------------------------------------------------------------------------------------------------------------------------------
+# Limits
+# --------------------------------------------------------------------------------------------------------------------------------
 
 
 def test_a_header_that_says_a_billion_takes_no_memory(tmp_path: Path) -> None:
@@ -158,7 +169,9 @@ def test_a_header_that_says_a_billion_takes_no_memory(tmp_path: Path) -> None:
     head = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face {}\nproperty list uchar int vertex_indices\nend_header\n"
     (tmp_path / "a.ply").write_text(head.format("ascii", billion, 1))
     (tmp_path / "b.ply").write_text(head.format("binary_little_endian", 3, billion))
-    (tmp_path / "c.ply").write_text(head.format("binary_little_endian", 5 * 10**6, 10**6))  # within the limits, but not there
+    (tmp_path / "c.ply").write_text(
+        head.format("binary_little_endian", 5 * 10**6, 10**6)
+    )  # within the limits, but not there
     (tmp_path / "d.stl").write_bytes(bytes(80) + struct.pack("<I", billion) + bytes(500))
     document, _ = gltf()
     claims = [{**a, "count": billion} for a in document["accessors"]]
@@ -186,7 +199,10 @@ def test_a_header_that_says_a_billion_takes_no_memory(tmp_path: Path) -> None:
 
 
 def test_empty_lines_are_no_vertices(tmp_path: Path) -> None:
-    write = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n" + "\n" * 5000
+    write = (
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+        + "\n" * 5000
+    )
     (tmp_path / "a.ply").write_text(write)
     assert "0 vertices of 1 numbers; expected 1 of 3" in refusal(tmp_path / "a.ply")
 
@@ -212,7 +228,9 @@ def test_more_than_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suff
     for module in ("gltf", "obj", "scans", "parts"):
         monkeypatch.setattr(f"neuprim.tasks.static.mesh.{module}.{limit}", 11)
     found = refusal(path)
-    assert text in found or (suffix == ".stl" and "36 vertices, each use of a part counting; expected at most 11" in found)
+    assert text in found or (
+        suffix == ".stl" and "36 vertices, each use of a part counting; expected at most 11" in found
+    )
 
 
 def test_nodes_in_circles_and_nested_without_end(tmp_path: Path) -> None:
@@ -252,7 +270,8 @@ def test_textures_are_bounded_together(tmp_path: Path, monkeypatch: pytest.Monke
     assert "has 16x16 pixels; at most 300 of all textures are accepted" in refusal(path)
 
 
-# References ----------------------------------------------------------------------------------------------------------------------------
+# References
+# ----------------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -291,13 +310,17 @@ def test_textures_outside_the_folder_are_refused_by_name(secret: Path, name: str
         write_obj(path, reference)
     elif suffix == ".gltf":
         document, data = gltf(images=[{"uri": reference}], textures=[{"source": 0}])
-        document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 0, 0, 1]}}]
+        document["materials"] = [
+            {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 0, 0, 1]}}
+        ]
         document["meshes"][0]["primitives"][0]["material"] = 0
         (secret / "triangle.bin").write_bytes(data)
         path.write_text(json.dumps(document))
     else:
         write_ply(path, *cube()[:2])
-        path.write_bytes(path.read_bytes().replace(b"element vertex", f"comment TextureFile {reference}\nelement vertex".encode(), 1))
+        path.write_bytes(
+            path.read_bytes().replace(b"element vertex", f"comment TextureFile {reference}\nelement vertex".encode(), 1)
+        )
     text = refusal(path)
     assert expected in text and "scene.skip_missing=true draws without" in text
     assert repr(reference[:20])[:-1] in text
@@ -353,7 +376,9 @@ def test_colours_that_are_no_numbers(tmp_path: Path) -> None:
 def test_names_of_materials_in_other_encodings(tmp_path: Path) -> None:
     path = write_obj(tmp_path / "a.obj")
     for file in (path, path.with_suffix(".mtl")):
-        file.write_bytes(file.read_bytes().replace(b"back", "weiß".encode("latin-1")).replace(b"skin\n", "größe\n".encode("latin-1")))
+        file.write_bytes(
+            file.read_bytes().replace(b"back", "weiß".encode("latin-1")).replace(b"skin\n", "größe\n".encode("latin-1"))
+        )
     assert notes(path) == []
 
 
@@ -363,7 +388,8 @@ def test_texture_coordinates_beyond_all_measure(tmp_path: Path) -> None:
     assert notes(path) == []
 
 
-# glTF ----------------------------------------------------------------------------------------------------------------------------------
+# glTF
+# ----------------------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -371,8 +397,14 @@ def test_texture_coordinates_beyond_all_measure(tmp_path: Path) -> None:
     [
         ({"asset": {"version": "1.0"}}, "version 1.0"),
         ({"asset": {}}, "nothing called 'version'"),
-        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "needs the glTF extension KHR_draco_mesh_compression, which is not read"),
-        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "EXT_meshopt_compression, which is not read; expected a plain export"),
+        (
+            {"extensionsRequired": ["KHR_draco_mesh_compression"]},
+            "needs the glTF extension KHR_draco_mesh_compression, which is not read",
+        ),
+        (
+            {"extensionsRequired": ["EXT_meshopt_compression"]},
+            "EXT_meshopt_compression, which is not read; expected a plain export",
+        ),
         ({"bufferViews": [{"buffer": 0, "byteLength": 100}]}, "bufferViews[0] ends at byte 100 of 44"),
         ({"bufferViews": []}, "list index out of range"),
         ({"nodes": [{"mesh": -1}]}, "an index is -1"),

@@ -1,4 +1,5 @@
-"""Models of other programs: what their materials, instances, poses and extensions mean is drawn, said in a line, or refused by name."""
+"""Models of other programs: what their materials, instances, poses and extensions mean is drawn, said in a line, or
+refused by name."""
 
 from __future__ import annotations
 
@@ -61,7 +62,9 @@ class Document:
         self.data += raw + bytes(-len(raw) % 4)
         kind = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}[values.shape[1]]
         view = len(self.json["bufferViews"]) - 1
-        self.json["accessors"].append({"bufferView": view, "componentType": component, "count": len(values), "type": kind})
+        self.json["accessors"].append(
+            {"bufferView": view, "componentType": component, "count": len(values), "type": kind}
+        )
         if normalized:
             self.json["accessors"][-1]["normalized"] = True
         return len(self.json["accessors"]) - 1
@@ -95,7 +98,8 @@ def srgb(*linear: float) -> list[int]:
     return np.round(encode_srgb(np.array(linear, np.float32)) * 255).astype(int).tolist()
 
 
-# Light that is emitted -----------------------------------------------------------------------------------------------------------------
+# Light that is emitted
+# -----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("lit", [False, True])
@@ -111,7 +115,8 @@ def test_light_that_a_material_emits_is_added(tmp_path: Path, lit: bool) -> None
 
 
 def test_a_texture_of_light_has_coordinates_of_its_own(tmp_path: Path) -> None:
-    """The second set shows the lower right quarter, and is moved to the lower left one; where the factor is 0 nothing is emitted."""
+    """The second set shows the lower right quarter, and is moved to the lower left one; where the factor is 0 nothing
+    is emitted."""
     document = Document(tmp_path)
     moved = {"KHR_texture_transform": {"offset": [-0.5, 0.0]}}
     document.material |= {
@@ -149,7 +154,9 @@ def test_light_and_opacity_of_an_objs_library(tmp_path: Path) -> None:
         assert look("Ke 1 0.5 0", "d 0.3") == [255, 128, 0]
     assert look("Ke 0 0 0\nmap_Ke glow.png", "Tr 0.7") == list(RED)
     assert look("Ke 1 1 1", "d 0.7") == look("Ke 1 1 1", "Tr 0.3") == list(BLUE)
-    assert look("Ke 1 1 1", "d 1.0\nTr 1.0") == look("Ke 1 1 1", "Tr 1.0\nd 1.0") == list(BLUE)  # writers disagree about Tr
+    assert (
+        look("Ke 1 1 1", "d 1.0\nTr 1.0") == look("Ke 1 1 1", "Tr 1.0\nd 1.0") == list(BLUE)
+    )  # writers disagree about Tr
     with pytest.raises(DataError, match="material 'pane' has the opacity 'clear'; expected a number"):
         look("", "d clear")
     with pytest.raises(DataError, match=r"no face has an opacity of at least 0\.5"):
@@ -169,7 +176,9 @@ def test_light_and_opacity_of_an_objs_library(tmp_path: Path) -> None:
         ("-clamp on -o -3 -3", BLUE),
     ],
 )
-def test_textures_of_libraries_are_moved_and_in_folders_with_blanks(tmp_path: Path, options: str, colour: tuple[int, int, int]) -> None:
+def test_textures_of_libraries_are_moved_and_in_folders_with_blanks(
+    tmp_path: Path, options: str, colour: tuple[int, int, int]
+) -> None:
     (tmp_path / "tex dir").mkdir()
     quarters().save(tmp_path / "tex dir" / "my tex.png")
     (tmp_path / "my lib.mtl").write_text(f"newmtl my mat\nKd 0 0 0\nmap_Kd {options} tex dir\\my tex.png\n")
@@ -181,7 +190,8 @@ def test_textures_of_libraries_are_moved_and_in_folders_with_blanks(tmp_path: Pa
         assert shown(tmp_path / "a.obj") == list(colour)
 
 
-# Base colours --------------------------------------------------------------------------------------------------------------------------
+# Base colours
+# --------------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("metallic", [{}, {"baseColorFactor": [0, 0, 1, 1]}, None])
@@ -219,13 +229,28 @@ def test_colours_of_vertices_of_every_type(tmp_path: Path, kind: str, width: int
         ({"alphaMode": "BLEND", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}, None, True, False),
         ({"alphaMode": "BLEND", "pbrMetallicRoughness": {}}, 0.2, False, True),
         ({"alphaMode": "MASK", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.4]}}, None, False, False),
-        ({"alphaMode": "MASK", "alphaCutoff": 0.3, "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.4]}}, None, True, False),
-        ({"alphaMode": "MASK", "alphaCutoff": 0.3, "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.4]}}, 0.5, False, False),
+        (
+            {"alphaMode": "MASK", "alphaCutoff": 0.3, "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.4]}},
+            None,
+            True,
+            False,
+        ),
+        (
+            {"alphaMode": "MASK", "alphaCutoff": 0.3, "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.4]}},
+            0.5,
+            False,
+            False,
+        ),
         ({"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.1]}}, 0.1, True, False),
     ],
 )
 def test_opacity_cuts_holes_and_translucency_is_said(
-    tmp_path: Path, recwarn: pytest.WarningsRecorder, material: dict[str, Any], alpha: float | None, drawn: bool, said: bool
+    tmp_path: Path,
+    recwarn: pytest.WarningsRecorder,
+    material: dict[str, Any],
+    alpha: float | None,
+    drawn: bool,
+    said: bool,
 ) -> None:
     """Of a pane before a red square."""
     document = Document(tmp_path)
@@ -240,7 +265,8 @@ def test_opacity_cuts_holes_and_translucency_is_said(
     assert any("2 faces are translucent" in str(w.message) for w in recwarn) == said
 
 
-# Extensions ----------------------------------------------------------------------------------------------------------------------------
+# Extensions
+# ----------------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -268,7 +294,9 @@ def test_what_changes_the_picture_and_is_not_read_is_said(
     assert len(said) == bool(text) and all(text in line for line in said)
 
 
-@pytest.mark.parametrize("name", ["KHR_texture_basisu", "KHR_meshopt_compression", "KHR_materials_transmission", "VENDOR_whatever"])
+@pytest.mark.parametrize(
+    "name", ["KHR_texture_basisu", "KHR_meshopt_compression", "KHR_materials_transmission", "VENDOR_whatever"]
+)
 def test_what_a_file_requires_and_is_not_read_is_refused_by_name(tmp_path: Path, name: str) -> None:
     document = Document(tmp_path)
     document.json["extensionsRequired"] = document.json["extensionsUsed"] = [name]
@@ -289,7 +317,8 @@ def test_what_a_file_offers_beside_compression_is_read(tmp_path: Path) -> None:
         parts_of(document.write())
 
 
-# Places --------------------------------------------------------------------------------------------------------------------------------
+# Places
+# --------------------------------------------------------------------------------------------------------------------------------
 
 
 def placed(path: Path) -> list[np.ndarray]:
@@ -306,16 +335,25 @@ def test_instances_are_expanded_below_their_node(tmp_path: Path, kind: str) -> N
     turns = np.array([[0, 0, half, half], [0, 0, 0, 1]]) * most
     attributes = {
         "TRANSLATION": document.add(np.array([[10, 0, 0], [0, 20, 0]], np.float32)),
-        "ROTATION": document.add((2 * turns if kind == "<f4" else np.round(turns)).astype(kind), normalized=kind != "<f4"),
+        "ROTATION": document.add(
+            (2 * turns if kind == "<f4" else np.round(turns)).astype(kind), normalized=kind != "<f4"
+        ),
         "SCALE": document.add(np.array([[1, 3, 1], [1, 1, -2]], np.float32)),
     }
     document.json["nodes"] = [
-        {"mesh": 0, "translation": [0, 0, 5], "scale": [2, 2, 2], "extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}}},
+        {
+            "mesh": 0,
+            "translation": [0, 0, 5],
+            "scale": [2, 2, 2],
+            "extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}},
+        },
     ]
     document.json["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
     second, first = placed(document.write())
     # a corner (x, y) becomes (x, 3y), turns to (-3y, x) and moves to (10 - 3y, x), which the node doubles
-    np.testing.assert_allclose(first[0], [[20 + 6, -2, 5], [20 + 6, 2, 5], [20 - 6, 2, 5]], atol=0.05 if kind == "i1" else 1e-3)
+    np.testing.assert_allclose(
+        first[0], [[20 + 6, -2, 5], [20 + 6, 2, 5], [20 - 6, 2, 5]], atol=0.05 if kind == "i1" else 1e-3
+    )
     np.testing.assert_allclose(second[0], [[-2, 38, 5], [2, 38, 5], [2, 42, 5]], atol=1e-6)
     document.json["accessors"][attributes["SCALE"]]["count"] = 1
     with pytest.raises(DataError, match=r"instances have \[1, 2\] places"):
@@ -344,7 +382,8 @@ def test_morph_targets_have_their_default_weights(tmp_path: Path) -> None:
 
 
 def test_a_skin_is_where_its_joints_are(tmp_path: Path) -> None:
-    """Two joints: the left corners hang on one at rest, the right ones on both alike, the other 6 further up. The mesh's node counts not."""
+    """Two joints: the left corners hang on one at rest, the right ones on both alike, the other 6 further up. The
+    mesh's node counts not."""
     document = Document(tmp_path)
     bound = np.eye(4, dtype=np.float32)
     bound[3, :3] = [-7, 0, 0]  # column by column: the inverse of the joint's first place
@@ -366,7 +405,8 @@ def test_a_skin_is_where_its_joints_are(tmp_path: Path) -> None:
         parts_of(document.write())
 
 
-# STL -----------------------------------------------------------------------------------------------------------------------------------
+# STL
+# -----------------------------------------------------------------------------------------------------------------------------------
 
 
 def write_stl(path: Path, head: bytes, *attributes: int) -> Path:
@@ -380,7 +420,9 @@ def write_stl(path: Path, head: bytes, *attributes: int) -> Path:
 
 def colours_along_x(path: Path) -> list[list[float]]:
     found = [
-        (corners.mean(axis=0)[0], colour[0]) for part in parts_of(path) for corners, colour in zip(part.corners, part.colour, strict=True)
+        (corners.mean(axis=0)[0], colour[0])
+        for part in parts_of(path)
+        for corners, colour in zip(part.corners, part.colour, strict=True)
     ]
     return [np.round(encode_srgb(colour), 3).tolist() for _, colour in sorted(found, key=lambda f: f[0])]
 

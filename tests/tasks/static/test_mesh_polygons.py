@@ -35,7 +35,9 @@ PATH = Path("a.obj")
 
 def area(corners: np.ndarray) -> float:
     """Of triangles (T, 3, 3)."""
-    return float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2)
+    return float(
+        np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    )
 
 
 def own_area(polygon: np.ndarray) -> float:
@@ -45,7 +47,8 @@ def own_area(polygon: np.ndarray) -> float:
 
 @pytest.mark.parametrize("name", SIMPLE)
 def test_a_simple_polygon_is_covered_once(name: str) -> None:
-    """From either side, turned, small, large and far from the origin: what is drawn is inside, and its area is the polygon's."""
+    """From either side, turned, small, large and far from the origin: what is drawn is inside, and its area is the
+    polygon's."""
     flat = np.pad(np.array(SIMPLE[name], np.float64), ((0, 0), (0, 1)))
     turned = flat @ np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     for polygon in (flat, flat[::-1], np.roll(flat, 3, axis=0), turned, 1e-6 * flat, 1e9 * turned, turned + 1e5):
@@ -54,7 +57,10 @@ def test_a_simple_polygon_is_covered_once(name: str) -> None:
 
 
 def test_polygons_of_many_sizes_keep_their_order_and_their_corners() -> None:
-    polygons_ = [np.array(shape, np.float64) + 20 * i for i, shape in enumerate([U, [(0, 0), (1, 0), (0, 1)], SIMPLE["dart"], U, STAR])]
+    polygons_ = [
+        np.array(shape, np.float64) + 20 * i
+        for i, shape in enumerate([U, [(0, 0), (1, 0), (0, 1)], SIMPLE["dart"], U, STAR])
+    ]
     corners = np.pad(np.concatenate(polygons_), ((0, 0), (0, 1)))
     sizes = np.array([len(p) for p in polygons_])
     triangles, owner = divided(PATH, corners, sizes)
@@ -79,7 +85,9 @@ def test_what_is_bent_is_covered_and_what_has_no_area_is_left_to_be_counted() ->
 def test_polygons_that_cross_themselves_are_refused_with_a_count(monkeypatch: pytest.MonkeyPatch) -> None:
     bow, uneven = [(0, 0), (1, 1), (1, 0), (0, 1)], [(0, 0), (3, 3), (3, 0), (0, 1)]
     corners = np.pad(np.array([*U, *bow, *uneven], np.float64), ((0, 0), (0, 1)))
-    with pytest.raises(DataError, match=r"a\.obj: 2 of 3 faces cross themselves, as face 1 of 4 corners; expected simple polygons"):
+    with pytest.raises(
+        DataError, match=r"a\.obj: 2 of 3 faces cross themselves, as face 1 of 4 corners; expected simple polygons"
+    ):
         divided(PATH, corners, np.array([8, 4, 4]))
     monkeypatch.setattr(polygons, "_MOST_TESTS", 5)
     with pytest.raises(DataError, match="1 of 1 faces"):  # no file takes more than some seconds

@@ -27,7 +27,9 @@ def opencv(k1: float, k2: float, p1: float, p2: float, k3: float = 0.0, k4: floa
     def bend(x: float, y: float) -> tuple[float, float]:
         r = math.hypot(x, y)
         radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6 + k4 * r**8
-        return x * radial + 2 * p1 * x * y + p2 * (r * r + 2 * x * x), y * radial + p1 * (r * r + 2 * y * y) + 2 * p2 * x * y
+        return x * radial + 2 * p1 * x * y + p2 * (r * r + 2 * x * x), y * radial + p1 * (
+            r * r + 2 * y * y
+        ) + 2 * p2 * x * y
 
     return bend
 
@@ -93,7 +95,10 @@ def test_down_sampling(capture: Any, scenes: Any, context: Any) -> None:
     ("lens", "fields"),
     [
         (opencv(-0.2, 0.05, 0.01, -0.02), {"k1": -0.2, "k2": 0.05, "p1": 0.01, "p2": -0.02}),
-        (opencv(0.2, 0.02, 0.0, 0.0, 0.03, 0.01), {"k1": 0.2, "k2": 0.02, "k3": 0.03, "k4": 0.01, "camera_model": "OPENCV"}),
+        (
+            opencv(0.2, 0.02, 0.0, 0.0, 0.03, 0.01),
+            {"k1": 0.2, "k2": 0.02, "k3": 0.03, "k4": 0.01, "camera_model": "OPENCV"},
+        ),
         (fisheye(0.05, -0.01), {"k1": 0.05, "k2": -0.01, "camera_model": "OPENCV_FISHEYE"}),
         (fisheye(0.0, 0.0), {"is_fisheye": True}),
     ],
@@ -109,7 +114,13 @@ def test_lenses_are_undone(capture: Any, scenes: Any, context: Any, lens: Lens, 
 def test_what_the_photograph_does_not_show_is_masked(capture: Any, context: Any) -> None:
     # pincushion: the corners of the undistorted view lie outside of the photograph
     mask = load({"path": capture(opencv(0.3, 0, 0, 0), k1=0.3)}, context).train.pixels(0).mask
-    assert mask is not None and not mask[0, 0] and not mask[-1, -1] and mask[H // 2, W // 2] and 0.5 < mask.float().mean() < 1
+    assert (
+        mask is not None
+        and not mask[0, 0]
+        and not mask[-1, -1]
+        and mask[H // 2, W // 2]
+        and 0.5 < mask.float().mean() < 1
+    )
 
 
 def test_a_lens_that_folds_over_does_not_mirror_the_middle_into_the_corners(capture: Any, context: Any) -> None:
@@ -159,7 +170,12 @@ def test_masks(capture: Any, scenes: Any, context: Any, per_frame: bool) -> None
     mask[10:40, 20:51] = 1
     mask[21, 31] = 0
     Image.fromarray(mask).save(path / "mask.png")
-    edit(path, lambda d: [f.update(mask_path="mask.png") for f in d["frames"]] if per_frame else d.update(mask_path="mask.png"))
+    edit(
+        path,
+        lambda d: (
+            [f.update(mask_path="mask.png") for f in d["frames"]] if per_frame else d.update(mask_path="mask.png")
+        ),
+    )
     found = load({"path": path}, context).train.pixels(0).mask
     assert found is not None and np.array_equal(found.numpy(), mask.astype(bool))
     half = load({"path": path, "downsample": 2}, context).train.pixels(0).mask
@@ -169,8 +185,16 @@ def test_masks(capture: Any, scenes: Any, context: Any, per_frame: bool) -> None
 @pytest.mark.parametrize(
     ("lists", "train", "test"),
     [
-        ({"train_filenames": ["images/01.png", "./images/02.png"], "test_filenames": ["images/05.png"]}, ["01", "02"], ["05"]),
-        ({"test_filenames": [f"images/{i:02d}.png" for i in range(7)]}, ["07", "08", "09"], [f"{i:02d}" for i in range(7)]),
+        (
+            {"train_filenames": ["images/01.png", "./images/02.png"], "test_filenames": ["images/05.png"]},
+            ["01", "02"],
+            ["05"],
+        ),
+        (
+            {"test_filenames": [f"images/{i:02d}.png" for i in range(7)]},
+            ["07", "08", "09"],
+            [f"{i:02d}" for i in range(7)],
+        ),
         ({"train_filenames": [f"images/{i:02d}.png" for i in range(8)]}, [f"{i:02d}" for i in range(8)], ["08", "09"]),
     ],
 )
@@ -182,15 +206,23 @@ def test_split_lists(capture: Any, context: Any, lists: Any, train: list[str], t
 @pytest.mark.parametrize(
     ("lists", "train", "test"),
     [
-        ({"val_filenames": ["00", "01"], "test_filenames": ["02", "03"]}, ["04", "05", "06", "07", "08", "09"], ["02", "03"]),
+        (
+            {"val_filenames": ["00", "01"], "test_filenames": ["02", "03"]},
+            ["04", "05", "06", "07", "08", "09"],
+            ["02", "03"],
+        ),
         ({"train_filenames": ["04", "05"], "val_filenames": ["00", "01"]}, ["04", "05"], ["00", "01"]),
         ({"val_filenames": ["00", "01"]}, ["02", "03", "04", "05", "06", "07", "08", "09"], ["00", "01"]),
         ({"train_filenames": ["04"], "val_filenames": ["00"], "test_filenames": []}, ["04"], ["00"]),
         ({"train_filenames": ["04"], "val_filenames": ["04"], "test_filenames": ["05"]}, ["04"], ["05"]),
     ],
 )
-def test_views_for_validation_never_train(capture: Any, context: Any, lists: Any, train: list[str], test: list[str]) -> None:
-    data = load({"path": capture(**{key: [f"images/{name}.png" for name in named] for key, named in lists.items()})}, context)
+def test_views_for_validation_never_train(
+    capture: Any, context: Any, lists: Any, train: list[str], test: list[str]
+) -> None:
+    data = load(
+        {"path": capture(**{key: [f"images/{name}.png" for name in named] for key, named in lists.items()})}, context
+    )
     assert (names(data.train), names(data.test)) == (train, test)
 
 
@@ -258,7 +290,12 @@ def black_mask(path: Path) -> None:
 
 
 def no_pose(path: Path) -> None:
-    edit(path, lambda d: next(f for f in d["frames"] if "03" in f["file_path"])["transform_matrix"][0].__setitem__(3, math.nan))
+    edit(
+        path,
+        lambda d: next(f for f in d["frames"] if "03" in f["file_path"])["transform_matrix"][0].__setitem__(
+            3, math.nan
+        ),
+    )
 
 
 def empty_file(path: Path) -> None:
@@ -266,7 +303,9 @@ def empty_file(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [damage_image, black_mask, no_pose, empty_file])
-def test_one_bad_view_is_left_out_and_named(capture: Any, scenes: Any, context: Any, damage: Callable[[Path], None]) -> None:
+def test_one_bad_view_is_left_out_and_named(
+    capture: Any, scenes: Any, context: Any, damage: Callable[[Path], None]
+) -> None:
     path = capture()
     damage(path)
     with pytest.warns(NeuprimWarning, match=r"; view 03 is left out \(scene.strict=true refuses it\)"):
@@ -307,7 +346,10 @@ def test_ply_points(capture: Any, context: Any) -> None:
     assert points.means.tolist() == [[1, 2, 3], [4, 5, 6]], "points at one place count once"
     assert points.colors.tolist() == [[1, 0, 0], [0, 1, 0]]
     (path / "points.ply").write_text(header + "end_header\n1 2 3\n4 5 6\n7 8 9\n")
-    assert load({"path": path}, context).initial_points(2, torch.Generator().manual_seed(0)).colors.tolist() == [[0.5] * 3] * 2
+    assert (
+        load({"path": path}, context).initial_points(2, torch.Generator().manual_seed(0)).colors.tolist()
+        == [[0.5] * 3] * 2
+    )
 
 
 def test_points_of_another_format_are_not_guessed_at(capture: Any, scenes: Any, context: Any) -> None:
@@ -386,7 +428,9 @@ def test_missing_images_are_listed_or_skipped(capture: Any, scenes: Any, context
     path = capture()
     for i in (2, 7):
         (path / "images" / f"{i:02d}.png").unlink()
-    scenes.refused(load, {"path": path}, context, "2 files not found", "images/02.png", "images/07.png", "scene.skip_missing=true")
+    scenes.refused(
+        load, {"path": path}, context, "2 files not found", "images/02.png", "images/07.png", "scene.skip_missing=true"
+    )
     data = load({"path": path, "skip_missing": True}, context)
     assert sorted(names(data.train) + names(data.test)) == ["00", "01", "03", "04", "05", "06", "08", "09"]
     assert worst(scenes, data) < 0.02, "poses stay with their images"
@@ -412,7 +456,9 @@ def test_bad_masks(capture: Any, scenes: Any, context: Any) -> None:
     scenes.refused(load, {"path": path}, context, "mask.png", "not a readable PNG")
 
 
-@pytest.mark.parametrize("content", [b"", b"ply\n", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", b"rubbish"])
+@pytest.mark.parametrize(
+    "content", [b"", b"ply\n", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", b"rubbish"]
+)
 def test_bad_ply(capture: Any, scenes: Any, context: Any, content: bytes) -> None:
     path = capture(ply_file_path="points.ply")
     (path / "points.ply").write_bytes(content)

@@ -1,4 +1,5 @@
-"""The built-in room as a data set: its cameras, lens, exposures and points, and what the project's own loader makes of the files."""
+"""The built-in room as a data set: its cameras, lens, exposures and points, and what the project's own loader makes of
+the files."""
 
 from __future__ import annotations
 
@@ -66,7 +67,8 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
     return float(-10 * np.log10(((one.astype(float) - other.astype(float)) ** 2).mean() / 255**2))
 
 
-# Cameras -------------------------------------------------------------------------------------------------------------------------------
+# Cameras
+# -------------------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("train", "test"), [(80, 20), (20, 20), (2, 1), (5, 7)])
@@ -104,9 +106,10 @@ def test_test_cameras_lie_between_training_ones_and_are_the_same_for_any_number_
         assert (np.diff(found["train"]) > 0).all()
         np.testing.assert_array_equal(camera_matrices(train, 20)["test"], camera_matrices(80, 20)["test"])
     many = places(80, 20)
-    assert [int(((many["train"] > a) & (many["train"] < b)).sum()) for a, b in zip(many["test"], many["test"][1:], strict=False)] == [
-        4
-    ] * 19
+    assert [
+        int(((many["train"] > a) & (many["train"] < b)).sum())
+        for a, b in zip(many["test"], many["test"][1:], strict=False)
+    ] == [4] * 19
 
 
 def test_they_walk_around_it_twice_low_and_high() -> None:
@@ -116,7 +119,8 @@ def test_they_walk_around_it_twice_low_and_high() -> None:
     assert eyes[:10, 2].mean() < 0.8 and eyes[35:45, 2].mean() > 1.4 and np.ptp(np.linalg.norm(eyes, axis=1)) > 1.2
 
 
-# The lens ------------------------------------------------------------------------------------------------------------------------------
+# The lens
+# ------------------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("distortion", [LENS, Radial(k1=0.1, k2=-0.02, p1=-0.004, p2=0.003), Radial()])
@@ -142,11 +146,17 @@ def test_the_loaders_undistorted_image_is_what_a_pinhole_sees(tmp_path: Path) ->
     bent = np.asarray(Image.open(next(tmp_path.glob("room-*")) / "images" / "test_0000.png"))
     agreement = psnr(undistorted, pinhole)
     assert agreement > 28 and psnr(bent, pinhole) < agreement - 8
-    # what is left is the resampling's blur: a lens a little stronger or weaker fits worse, and so does one that is askew
+    # what is left is the resampling's blur: a lens a little stronger or weaker fits worse, and so does one that is
+    # askew
     for wrong in (replace(LENS, k1=-0.07), replace(LENS, k1=-0.09), replace(LENS, p1=-0.001), replace(LENS, p2=0.001)):
         other = resample(torch.from_numpy(bent.copy()).float(), source_grid(seen.camera, wrong)[0]).numpy()
         assert psnr(other, pinhole) < agreement - 0.3, wrong
-    assert (view.camera.fx, view.camera.cx, view.camera.cy, view.camera.height) == (seen.focal, 0.504 * 128, 0.495 * 96, 96)
+    assert (view.camera.fx, view.camera.cx, view.camera.cy, view.camera.height) == (
+        seen.focal,
+        0.504 * 128,
+        0.495 * 96,
+        96,
+    )
     np.testing.assert_allclose(torch.linalg.inv(view.camera.viewmat).numpy()[:3, 3], pose[:3, 3], atol=1e-9)
 
 
@@ -166,7 +176,8 @@ def test_pictures_do_not_depend_on_how_rays_are_batched(scene: Room, monkeypatch
     np.testing.assert_array_equal(picture(scene, Lens(40), pose, 2), whole)
 
 
-# The files -----------------------------------------------------------------------------------------------------------------------------
+# The files
+# -----------------------------------------------------------------------------------------------------------------------------
 
 
 def test_same_settings_same_bytes(folder: Path, tmp_path: Path) -> None:
@@ -208,12 +219,15 @@ def test_the_loader_finds_splits_points_and_what_the_data_are(dataset: Dataset, 
     np.testing.assert_allclose(start.colors.numpy() * 255, stored.columns(("red", "green", "blue")), atol=1e-3)
 
 
-# Exposures -----------------------------------------------------------------------------------------------------------------------------
+# Exposures
+# -----------------------------------------------------------------------------------------------------------------------------
 
 
 def test_exposures_are_within_bounds_and_in_training_images_only(folder: Path, tmp_path: Path) -> None:
     written = json.loads((folder / "exposures.json").read_text())
-    assert list(written) == [f"images/train_{i:04d}.png" for i in range(6)] + [f"images/test_{i:04d}.png" for i in range(3)]
+    assert list(written) == [f"images/train_{i:04d}.png" for i in range(6)] + [
+        f"images/test_{i:04d}.png" for i in range(3)
+    ]
     stops = np.log2([written[f"images/train_{i:04d}.png"] for i in range(6)])
     assert (np.abs(stops) <= 0.15).all() and len(set(stops)) == 6
     assert [written[f"images/test_{i:04d}.png"] for i in range(3)] == [1.0, 1.0, 1.0]
@@ -222,7 +236,12 @@ def test_exposures_are_within_bounds_and_in_training_images_only(folder: Path, t
         if name.startswith("images"):
             assert (plain[name] == data) == ("test_" in name), name
     many = np.log2(gains(2000, 0.3))
-    assert many.min() < -0.29 and many.max() > 0.29 and abs(many.mean()) < 0.02 and abs(many.std() - 0.3 / np.sqrt(3)) < 0.01
+    assert (
+        many.min() < -0.29
+        and many.max() > 0.29
+        and abs(many.mean()) < 0.02
+        and abs(many.std() - 0.3 / np.sqrt(3)) < 0.01
+    )
 
 
 def test_a_gain_multiplies_linear_light(scene: Room) -> None:
@@ -234,7 +253,8 @@ def test_a_gain_multiplies_linear_light(scene: Room) -> None:
     np.testing.assert_allclose(linear[1][inside] / linear[0][inside], 1.2, atol=0.04)
 
 
-# Points --------------------------------------------------------------------------------------------------------------------------------
+# Points
+# --------------------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +265,11 @@ def found(scene: Room, folder: Path) -> Found:
 
 
 def luma(folder: Path, index: int) -> np.ndarray:
-    return np.asarray(Image.open(folder / "images" / f"train_{index:04d}.png"), dtype=np.float32) @ np.array([0.2126, 0.7152, 0.0722]) / 255
+    return (
+        np.asarray(Image.open(folder / "images" / f"train_{index:04d}.png"), dtype=np.float32)
+        @ np.array([0.2126, 0.7152, 0.0722])
+        / 255
+    )
 
 
 def test_points_lie_on_surfaces_that_two_cameras_see(scene: Room, found: Found) -> None:
@@ -259,7 +283,11 @@ def test_points_lie_on_surfaces_that_two_cameras_see(scene: Room, found: Found) 
         first = scene.intersect(pose[:3, 3], ray / away[:, None])
         local = ray @ pose[:3, :3]
         before = local[:, 2] < 0
-        x, y = Lens(40).pixels(np.stack([local[:, 0], -local[:, 1]], axis=1) / -np.where(before, local[:, 2], -1.0)[:, None]).T
+        x, y = (
+            Lens(40)
+            .pixels(np.stack([local[:, 0], -local[:, 1]], axis=1) / -np.where(before, local[:, 2], -1.0)[:, None])
+            .T
+        )
         inside = before & (x >= 0) & (x <= 40) & (y >= 0) & (y <= 30)
         seen = inside & (np.abs(first.distance - away) < 2e-3 * away)
         seen_by += seen
@@ -273,7 +301,10 @@ def test_points_have_the_noise_of_a_measurement_and_a_few_are_wrong(found: Found
     depth = np.linalg.norm(found.surface - eyes, axis=1)
     moved = np.linalg.norm(found.position - found.surface, axis=1) / depth
     assert found.outlier.sum() == round(OUTLIERS * 3000) and (moved[found.outlier] > 0.09).all()
-    assert np.sqrt((moved[~found.outlier] ** 2).mean()) == pytest.approx(NOISE, rel=0.05) and moved[~found.outlier].max() < 0.03
+    assert (
+        np.sqrt((moved[~found.outlier] ** 2).mean()) == pytest.approx(NOISE, rel=0.05)
+        and moved[~found.outlier].max() < 0.03
+    )
     assert (found.position > np.subtract(LOW, 0.1)).all() and (found.position < np.add(HIGH, 0.1)).all()
 
 
@@ -303,12 +334,16 @@ def test_points_that_no_two_views_share_are_refused(scene: Room) -> None:
     outward = away.copy()
     outward[:3, [0, 2]] *= -1  # turned round by half
     with pytest.raises(
-        ConfigError, match=r"^scene\.points=50: only \d+ points found that two of 2 training views see; expected more views$"
+        ConfigError,
+        match=r"^scene\.points=50: only \d+ points found that two of 2 training views see; expected more views$",
     ):
-        found_points(scene, Lens(40), [away, outward], lambda i: np.random.default_rng(i).random((30, 40)).astype(np.float32), 50)
+        found_points(
+            scene, Lens(40), [away, outward], lambda i: np.random.default_rng(i).random((30, 40)).astype(np.float32), 50
+        )
 
 
-# The cache and the settings ------------------------------------------------------------------------------------------------------------
+# The cache and the settings
+# ------------------------------------------------------------------------------------------------------------
 
 
 def test_cache_is_reused_and_keyed_by_every_setting(folder: Path, cache: Path) -> None:

@@ -30,7 +30,8 @@ def still(count: int, width: float = 0.0) -> np.ndarray:
     return np.full(count, width, dtype=np.float32)
 
 
-# Patterns ------------------------------------------------------------------------------------------------------------------------------
+# Patterns
+# ------------------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("width", [0.01, 0.13, 0.7, 3.1])
@@ -66,17 +67,23 @@ def test_noise_is_smooth_centred_and_fades_with_the_width(dimensions: int) -> No
     strength = [noise(points, still(20000, w), 0.5, 7).std() for w in (0.0, 0.1, 0.3, 0.6, 0.8)]
     assert all(a > b for a, b in pairwise(strength)) and strength[-1] == 0
     fine = [
-        np.abs(noise(points + np.float32(0.02), still(20000, w), 0.5, 7) - noise(points, still(20000, w), 0.5, 7)).mean() for w in (0, 0.3)
+        np.abs(
+            noise(points + np.float32(0.02), still(20000, w), 0.5, 7) - noise(points, still(20000, w), 0.5, 7)
+        ).mean()
+        for w in (0, 0.3)
     ]
     assert fine[1] < 0.5 * fine[0]  # the finest goes first
 
 
 def test_mixing_keeps_its_ends() -> None:
     one, other = srgb("#102030"), srgb("#f0e0d0")
-    np.testing.assert_allclose(mix(one, other, np.array([-1, 0, 0.5, 1, 2], np.float32)), [one, one, (one + other) / 2, other, other])
+    np.testing.assert_allclose(
+        mix(one, other, np.array([-1, 0, 0.5, 1, 2], np.float32)), [one, one, (one + other) / 2, other, other]
+    )
 
 
-# Textures and bodies -------------------------------------------------------------------------------------------------------------------
+# Textures and bodies
+# -------------------------------------------------------------------------------------------------------------------
 
 
 def test_every_texture_is_a_reflectance_and_blurs_with_distance() -> None:
@@ -122,17 +129,31 @@ def test_bodies_are_closed_and_leave_the_cameras_room() -> None:
 def test_no_ray_leaves_the_room(room: Room) -> None:
     directions = np.random.default_rng(2).standard_normal((60000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    edges = np.array([[x, y, z] for x in (LOW[0], HIGH[0]) for y in (LOW[1], HIGH[1]) for z in np.linspace(LOW[2], HIGH[2], 2000)])
+    edges = np.array(
+        [[x, y, z] for x in (LOW[0], HIGH[0]) for y in (LOW[1], HIGH[1]) for z in np.linspace(LOW[2], HIGH[2], 2000)]
+    )
     corner = (edges - [0.0, 2.0, 1.0]) / np.linalg.norm(edges - [0.0, 2.0, 1.0], axis=1, keepdims=True)
     hits = room.intersect([0.0, 2.0, 1.0], np.concatenate([directions, corner]))
     assert hits.hit.all()
     assert (hits.position > np.subtract(LOW, 1e-3)).all() and (hits.position < np.add(HIGH, 1e-3)).all()
     names = {room.solids[i].name for i in hits.solid}
-    assert {"floor", "ceiling", "brick wall", "papered wall", "plastered wall", "tiled wall", "rug", "table top", "pillar"} <= names
+    assert {
+        "floor",
+        "ceiling",
+        "brick wall",
+        "papered wall",
+        "plastered wall",
+        "tiled wall",
+        "rug",
+        "table top",
+        "pillar",
+    } <= names
 
 
 def test_a_ray_takes_the_mean_over_what_it_stands_for() -> None:
-    board = Furnishing("board", chamfered_box([40, 40, 0.1], [0, 0, -0.05], 0.01), chequered("#c0c0c0", "#202020", 0, 1, 0.1, 1))
+    board = Furnishing(
+        "board", chamfered_box([40, 40, 0.1], [0, 0, -0.05], 0.01), chequered("#c0c0c0", "#202020", 0, 1, 0.1, 1)
+    )
     down = np.tile([[0.0, 0.0, -1.0]], (4000, 1))
     origins = np.column_stack([spread(4000, 2), np.full(4000, 10.0)])
     sharp, coarse = (Room([], [board], spacing).intersect(origins, down).albedo for spacing in (1e-4, 0.1))
@@ -140,7 +161,8 @@ def test_a_ray_takes_the_mean_over_what_it_stands_for() -> None:
     assert np.abs(coarse.mean() - sharp.mean()) < 0.03
 
 
-# Light ---------------------------------------------------------------------------------------------------------------------------------
+# Light
+# ---------------------------------------------------------------------------------------------------------------------------------
 
 
 def grey_floor(*more: Furnishing) -> Room:

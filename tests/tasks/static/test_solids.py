@@ -56,7 +56,8 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     return (image[:, :2] / image[:, 2:]).numpy()
 
 
-# Geometry ------------------------------------------------------------------------------------------------------------------------------
+# Geometry
+# ------------------------------------------------------------------------------------------------------------------------------
 
 
 def test_solids_are_closed_outward_and_in_the_box() -> None:
@@ -89,7 +90,8 @@ def test_rod_has_round_sides_and_hard_caps() -> None:
     assert mesh.volume == pytest.approx(np.pi * 0.01 * 2, rel=0.02)
 
 
-# Rays ----------------------------------------------------------------------------------------------------------------------------------
+# Rays
+# ----------------------------------------------------------------------------------------------------------------------------------
 
 
 def test_rays_meet_a_ball_where_the_equation_says() -> None:
@@ -157,7 +159,8 @@ def test_surface_points_lie_on_surfaces_and_repeat(scene: Scene) -> None:
     assert np.abs(sphere.mean(0)).max() < 0.04
 
 
-# Light ---------------------------------------------------------------------------------------------------------------------------------
+# Light
+# ---------------------------------------------------------------------------------------------------------------------------------
 
 
 def test_shadow_takes_the_sun_away() -> None:
@@ -169,14 +172,18 @@ def test_shadow_takes_the_sun_away() -> None:
     assert hit.all()
     grey = srgb("#808080")
     np.testing.assert_allclose(rgb[0], grey * DAYLIGHT.sky, rtol=1e-5)
-    np.testing.assert_allclose(rgb[1], grey * (np.array(DAYLIGHT.sky) + np.array(DAYLIGHT.sun) * lamp[2] / np.pi), rtol=1e-5)
+    np.testing.assert_allclose(
+        rgb[1], grey * (np.array(DAYLIGHT.sky) + np.array(DAYLIGHT.sun) * lamp[2] / np.pi), rtol=1e-5
+    )
 
 
 def test_gloss_makes_colour_depend_on_the_eye() -> None:
     point = np.array([0.2, -0.3, 0.5]) / np.linalg.norm([0.2, -0.3, 0.5]) * 0.4
     eyes = np.array([[0.5, -0.8, 3.0], [0.3, 2.0, 3.0]])
     rays = (point - eyes) / np.linalg.norm(point - eyes, axis=1, keepdims=True)
-    matt, polished = (radiance(Scene([Solid("ball", ball([0, 0, 0], 0.4), plain("#2040c0"), g)]), eyes, rays)[0] for g in (0.0, 1.0))
+    matt, polished = (
+        radiance(Scene([Solid("ball", ball([0, 0, 0], 0.4), plain("#2040c0"), g)]), eyes, rays)[0] for g in (0.0, 1.0)
+    )
     np.testing.assert_allclose(matt[0], matt[1], atol=0.02)
     assert np.abs(polished[0] - polished[1]).max() > 0.05
 
@@ -187,7 +194,8 @@ def test_srgb_decoding_and_encoding_are_inverse() -> None:
     np.testing.assert_array_equal(np.round(encode_srgb(np.stack([srgb(c) for c in codes])) * 255), stored)
 
 
-# The data set --------------------------------------------------------------------------------------------------------------------------
+# The data set
+# --------------------------------------------------------------------------------------------------------------------------
 
 
 def test_same_settings_same_bytes(tmp_path: Path, cache: Path) -> None:
@@ -266,7 +274,8 @@ def test_dataset_is_marked_generated(cache: Path) -> None:
     assert dataset.center.abs().max() < 0.05 and dataset.up.tolist() == [0.0, 0.0, 1.0]
 
 
-# The cache -----------------------------------------------------------------------------------------------------------------------------
+# The cache
+# -----------------------------------------------------------------------------------------------------------------------------
 
 
 def test_cache_is_reused_and_keyed_by_every_setting(cache: Path) -> None:
@@ -322,7 +331,8 @@ def test_unknown_setting_suggests_the_nearest(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("size", 0), ("size", 7.5), ("size", "big"), ("train_views", True), ("test_views", 0), ("size", None)]
+    ("name", "value"),
+    [("size", 0), ("size", 7.5), ("size", "big"), ("train_views", True), ("test_views", 0), ("size", None)],
 )
 def test_impossible_values_are_refused(name: str, value: object, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=rf"scene\.{name}=.*: expected a whole number from [18] to "):

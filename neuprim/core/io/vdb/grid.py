@@ -49,8 +49,11 @@ class Tiles:
         return len(self.sizes)
 
 
-def scale_transform(voxel_size: float | Sequence[float] = 1.0, translation: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """(4, 4) index to world: voxels of an edge (one, or one per axis), the centre of voxel 0 at ``translation``; world units."""
+def scale_transform(
+    voxel_size: float | Sequence[float] = 1.0, translation: Sequence[float] = (0.0, 0.0, 0.0)
+) -> np.ndarray:
+    """(4, 4) index to world: voxels of an edge (one, or one per axis), the centre of voxel 0 at ``translation``; world
+    units."""
     matrix = np.eye(4)
     matrix[range(3), range(3)] = voxel_size
     matrix[:3, 3] = translation
@@ -61,8 +64,9 @@ def scale_transform(voxel_size: float | Sequence[float] = 1.0, translation: Sequ
 class Grid:
     """A float or vec3s grid.
 
-    A voxel with index (i, j, k) has its *centre* at ``transform @ (i, j, k, 1)``. Voxels of no leaf and no tile have the
-    background value and are not active. NaN and infinite values are kept as they are stored and counted in :attr:`non_finite`.
+    A voxel with index (i, j, k) has its *centre* at ``transform @ (i, j, k, 1)``. Voxels of no leaf and no tile have
+    the background value and are not active. NaN and infinite values are kept as they are stored and counted in
+    :attr:`non_finite`.
 
     Attributes:
         name: as in the file.
@@ -152,7 +156,9 @@ class Grid:
     @cached_property
     def active_voxels(self) -> int:
         """How many voxels are active, those of active tiles included."""
-        inside = sum(size**3 * int(np.count_nonzero(self.tiles.sizes[self.tiles.active] == size)) for size in TILE_SIZES)
+        inside = sum(
+            size**3 * int(np.count_nonzero(self.tiles.sizes[self.tiles.active] == size)) for size in TILE_SIZES
+        )
         return int(np.count_nonzero(self.masks)) + inside
 
     @cached_property
@@ -175,7 +181,8 @@ class Grid:
         return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
     def world_bounds(self) -> np.ndarray | None:
-        """(2, 3) float64: the box, in world units and axes, around all active voxels with their extent; None if there is none."""
+        """(2, 3) float64: the box, in world units and axes, around all active voxels with their extent; None if there
+        is none."""
         if self.bounds is None:
             return None
         corners = np.stack(np.meshgrid(*np.array(self.bounds, float).T - 0.5, indexing="ij"), -1).reshape(-1, 3)
@@ -209,7 +216,9 @@ class Grid:
         """Memory that the box of active voxels takes as one float32 array."""
         return 0 if self.bounds is None else _volume(self.bounds) * 4 * self.channels
 
-    def to_dense(self, bounds: Bounds | None = None, max_bytes: int = DENSE_LIMIT, non_finite: float | None = None) -> np.ndarray:
+    def to_dense(
+        self, bounds: Bounds | None = None, max_bytes: int = DENSE_LIMIT, non_finite: float | None = None
+    ) -> np.ndarray:
         """(X, Y, Z) or (X, Y, Z, 3) float32: every voxel of a box, active or not.
 
         Args:

@@ -48,8 +48,8 @@ class GridHeader:
         flags: compression bits.
         metadata: the grid's own; values of types not known here are bytes.
         map: name of the transform's class.
-        transform: (4, 4) float64, index to world, acting on column vectors; None if the map is of a class not known here.
-        parent: the grid whose tree this one shares; empty for nearly all.
+        transform: (4, 4) float64, index to world, acting on column vectors; None if the map is of a class not known
+        here. parent: the grid whose tree this one shares; empty for nearly all.
         tree_at, block, end: byte offsets of the tree, of its leaf buffers, and of the first byte after the grid.
     """
 
@@ -93,7 +93,9 @@ class GridHeader:
         if "ptdataidx" in self.type or "ptidx" in self.type:
             return f"holds points ({self.type}), which have no density; rasterise them to a fog volume first"
         if not self.channels:
-            return f"has values of type {self.type}; Tree_float_5_4_3 and Tree_vec3s_5_4_3 (also as half floats) are read"
+            return (
+                f"has values of type {self.type}; Tree_float_5_4_3 and Tree_vec3s_5_4_3 (also as half floats) are read"
+            )
         if self.transform is None:
             return f"has a transform of class {self.map}; known: {', '.join(_DOUBLES)}"
         return None
@@ -141,7 +143,9 @@ def read_header(path: Path) -> FileHeader:
 def parse_header(cursor: Cursor) -> FileHeader:
     """:func:`read_header` for an open file whose cursor is at the start."""
     if cursor.end < 8 or cursor.unpack("q", "the magic number") != (MAGIC,):
-        raise cursor.fail(f"starts with {cursor.data[:8].hex(' ')}; expected {MAGIC.to_bytes(8, 'little').hex(' ')} (an OpenVDB file)")
+        raise cursor.fail(
+            f"starts with {cursor.data[:8].hex(' ')}; expected {MAGIC.to_bytes(8, 'little').hex(' ')} (an OpenVDB file)"
+        )
     (version,) = cursor.unpack("I", "the file version")
     if not VERSIONS[0] <= version <= VERSIONS[1]:
         raise cursor.fail(f"OpenVDB file version {version}; expected {VERSIONS[0]} to {VERSIONS[1]}")
@@ -157,7 +161,9 @@ def parse_header(cursor: Cursor) -> FileHeader:
         cursor.at = grids[-1].end
     names = [grid.name for grid in grids]
     if len(set(names)) != len(names):
-        raise cursor.fail(f"two grids have the name {next(n for n in names if names.count(n) > 1)!r}; expected unique names")
+        raise cursor.fail(
+            f"two grids have the name {next(n for n in names if names.count(n) > 1)!r}; expected unique names"
+        )
     return FileHeader(cursor.path, version, (major, minor), metadata, tuple(grids))
 
 
@@ -176,13 +182,17 @@ def _grid(cursor: Cursor, what: str) -> GridHeader:
     inner = Cursor(cursor.path, cursor.data, start, end)
     (flags,) = inner.unpack("I", f"compression of {what}")
     if flags & ~(ZIP | MASK | BLOSC):
-        raise inner.fail(f"{what} has compression bits {flags:#x}; expected a sum of 1 (zip), 2 (active values) and 4 (blosc)")
+        raise inner.fail(
+            f"{what} has compression bits {flags:#x}; expected a sum of 1 (zip), 2 (active values) and 4 (blosc)"
+        )
     metadata = _metadata(inner, f"metadata of {what}")
     mapping, transform = _transform(inner, what)
     half = kind.endswith(_HALF)
     parent, _, suffix = parent.partition("\x1e")
     parent += f"[{suffix}]" if suffix else ""
-    return GridHeader(name, kind.removesuffix(_HALF), half, flags, metadata, mapping, transform, parent, inner.at, block, end)
+    return GridHeader(
+        name, kind.removesuffix(_HALF), half, flags, metadata, mapping, transform, parent, inner.at, block, end
+    )
 
 
 def _metadata(cursor: Cursor, what: str) -> dict[str, Any]:
@@ -198,7 +208,9 @@ def _metadata(cursor: Cursor, what: str) -> dict[str, Any]:
         elif layout is None:
             found[name] = raw
         elif size != struct.calcsize("<" + layout):
-            raise cursor.fail(f"{name!r} in {what} has {size} bytes; expected {struct.calcsize('<' + layout)} for a {kind}")
+            raise cursor.fail(
+                f"{name!r} in {what} has {size} bytes; expected {struct.calcsize('<' + layout)} for a {kind}"
+            )
         else:
             values = struct.unpack("<" + layout, raw)
             found[name] = values if len(values) > 1 else values[0]

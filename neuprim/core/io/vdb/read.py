@@ -34,7 +34,9 @@ def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets:
         return _read(cursor, file, file.grid(name), max_bytes, level_sets)
 
 
-def read_grids(path: Path, names: Sequence[str] | None = None, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False) -> Iterator[Grid]:
+def read_grids(
+    path: Path, names: Sequence[str] | None = None, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False
+) -> Iterator[Grid]:
     """Several grids of a file, one at a time; the file's header is read once.
 
     Args:
@@ -61,7 +63,9 @@ def _read(cursor: Cursor, file: FileHeader, header: GridHeader, max_bytes: int, 
     if header.parent:  # an instance: own transform and metadata, another grid's tree
         source = file.grid(header.parent)
         if source.parent or source.type != header.type:
-            raise cursor.fail(f"{what} shares the tree of {header.parent!r}, which has none of its own or one of another type")
+            raise cursor.fail(
+                f"{what} shares the tree of {header.parent!r}, which has none of its own or one of another type"
+            )
     inner = Cursor(cursor.path, cursor.data, source.tree_at, source.end)
     tree = TreeReader(inner, source.block, source.flags, source.half, source.channels, what, max_bytes)
     return Grid(

@@ -69,7 +69,8 @@ class Survey:
 
     @property
     def voxel_sizes(self) -> tuple[tuple[float, float, float], ...]:
-        """The different voxel sizes, in order of appearance; more than one where the simulation changed its resolution."""
+        """The different voxel sizes, in order of appearance; more than one where the simulation changed its
+        resolution."""
         return tuple(dict.fromkeys(f.voxel_size for f in self.frames if f.voxel_size is not None))
 
     @property
@@ -162,10 +163,14 @@ def sequence(folder: Path, prefix: str | None = None) -> Sequence:
     folder = Path(folder)
     try:
         if not folder.is_dir():
-            raise DataError(f"{folder}: {'is a file' if folder.exists() else 'no such folder'}; expected a folder with .vdb files")
+            raise DataError(
+                f"{folder}: {'is a file' if folder.exists() else 'no such folder'}; expected a folder with .vdb files"
+            )
         paths = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".vdb" and p.is_file())
     except OSError as error:  # no permission, a name that is too long
-        raise DataError(f"{folder}: cannot be read ({error.strerror or error}); expected a folder with .vdb files") from error
+        raise DataError(
+            f"{folder}: cannot be read ({error.strerror or error}); expected a folder with .vdb files"
+        ) from error
     found: dict[str, list[VdbFrame]] = {}
     odd: list[str] = []
     for path in paths:

@@ -105,7 +105,9 @@ def blosc_module() -> Any:
     try:
         import blosc
     except ImportError as error:
-        raise BackendUnavailable(f"Blosc-compressed OpenVDB files need the package blosc ({error}): pip install blosc") from None
+        raise BackendUnavailable(
+            f"Blosc-compressed OpenVDB files need the package blosc ({error}): pip install blosc"
+        ) from None
     blosc.set_nthreads(1)
     return blosc
 
@@ -147,5 +149,7 @@ def _unzip(chunk: bytes, size: int) -> bytes:
     except zlib.error as error:
         raise ValueError(f"a damaged zip chunk ({error})") from None
     if len(values) != size:
-        raise ValueError(f"a zip chunk of {'more than ' * (len(values) > size)}{min(len(values), size)} bytes; expected {size}")
+        raise ValueError(
+            f"a zip chunk of {'more than ' * (len(values) > size)}{min(len(values), size)} bytes; expected {size}"
+        )
     return values

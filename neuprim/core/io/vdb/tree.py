@@ -1,8 +1,11 @@
-"""Decoding a grid's tree: root, upper nodes (32³ slots of 128³ voxels), lower nodes (16³ slots of 8³), leaves (8³ voxels).
+"""Decoding a grid's tree: root, upper nodes (32³ slots of 128³ voxels), lower nodes (16³ slots of 8³), leaves (8³
+voxels).
 
-The layout is that of OpenVDB's ``RootNode``, ``InternalNode``, ``LeafNode`` and ``io/Compression.h`` for file versions 222–224.
-First comes the topology, depth first, in which a leaf is 64 bytes of mask; then all leaf buffers in the same order. Memory stays
-within about 150 times the bytes of the file, as every node and leaf must be paid for with bytes that are there.
+The layout is that of OpenVDB's ``RootNode``, ``InternalNode``, ``LeafNode`` and ``io/Compression.h`` for file versions
+222–224.
+First comes the topology, depth first, in which a leaf is 64 bytes of mask; then all leaf buffers in the same order.
+Memory stays within about 150 times the bytes of the file, as every node and leaf must be paid for with bytes that are
+there.
 """
 
 from __future__ import annotations
@@ -21,8 +24,8 @@ __all__ = ["ALL_VALUES", "UPPER", "LOWER", "Slots", "TreeReader"]
 ALL_VALUES = 6
 """The code of a node that stores every value, active or not. Codes of nodes that store active values alone:
 
-0: inactive values are the background; 1: minus the background; 2: one value, given; 3: a mask chooses background or its negative;
-4: a mask chooses background or one value, given; 5: a mask chooses between two values, given.
+0: inactive values are the background; 1: minus the background; 2: one value, given; 3: a mask chooses background or its
+negative; 4: a mask chooses background or one value, given; 5: a mask chooses between two values, given.
 """
 
 _CHUNK = 1024
@@ -68,7 +71,9 @@ class TreeReader:
         BackendUnavailable: Blosc chunks, but no package ``blosc``.
     """
 
-    def __init__(self, cursor: Cursor, block: int, flags: int, half: bool, channels: int, what: str, max_bytes: int) -> None:
+    def __init__(
+        self, cursor: Cursor, block: int, flags: int, half: bool, channels: int, what: str, max_bytes: int
+    ) -> None:
         self._buffers = Cursor(cursor.path, cursor.data, block, cursor.end)
         self._cursor = Cursor(cursor.path, cursor.data, cursor.at, block)
         self._flags, self._half, self._what = flags, half, what
@@ -88,13 +93,17 @@ class TreeReader:
         count = len(self.origins)
         size = count * _LEAF * (self._full_size + 1)
         if size > self._left:
-            raise cursor.fail(f"{what} has {count} leaves, which take {size} bytes in memory; at most {self._left} are allowed")
+            raise cursor.fail(
+                f"{what} has {count} leaves, which take {size} bytes in memory; at most {self._left} are allowed"
+            )
         self.values: np.ndarray = np.empty((count, _LEAF, *self._shape), np.float32)
         self.masks: np.ndarray = np.empty((count, _LEAF), bool)
         for first in range(0, count, _CHUNK):
             self._leaves(first, min(first + _CHUNK, count))
         if self._buffers.at != self._buffers.end:
-            raise cursor.fail(f"{what}: leaf buffers end at byte {self._buffers.at}; the header says {self._buffers.end}")
+            raise cursor.fail(
+                f"{what}: leaf buffers end at byte {self._buffers.at}; the header says {self._buffers.end}"
+            )
         self.values = self.values.reshape(count, 8, 8, 8, *self._shape)
         self.masks = self.masks.reshape(count, 8, 8, 8)
 
@@ -122,14 +131,18 @@ class TreeReader:
 
     def _root_entry(self, seen: set[tuple[int, ...]], origin: tuple[int, ...]) -> None:
         if origin in seen or any(v % TILE_SIZES[2] for v in origin):
-            raise self._cursor.fail(f"{self._what} has a root entry at {origin}; expected multiples of {TILE_SIZES[2]}, each once")
+            raise self._cursor.fail(
+                f"{self._what} has a root entry at {origin}; expected multiples of {TILE_SIZES[2]}, each once"
+            )
         seen.add(origin)
 
     def _upper(self, origin: np.ndarray) -> None:
         for child in UPPER.offsets[self._node(origin, UPPER)]:
             lower = origin + child
             leaves = LOWER.offsets[self._node(lower, LOWER)]
-            self._cursor.skip(64 * len(leaves), f"masks of {len(leaves)} leaves of {self._what}")  # repeated with the buffers
+            self._cursor.skip(
+                64 * len(leaves), f"masks of {len(leaves)} leaves of {self._what}"
+            )  # repeated with the buffers
             self._leaf_origins.append(lower + leaves)
 
     def _node(self, origin: np.ndarray, slots: Slots) -> np.ndarray:
@@ -149,7 +162,9 @@ class TreeReader:
         if kept.any():
             self._left -= int(np.count_nonzero(kept)) * (17 + self._full_size)
             if self._left < 0:
-                raise self._cursor.fail(f"{self._what} has tiles that take more bytes in memory than the {self._limit} allowed")
+                raise self._cursor.fail(
+                    f"{self._what} has tiles that take more bytes in memory than the {self._limit} allowed"
+                )
             self._tiles.append((origins[kept], size, values[kept], active[kept]))
 
     def _collect_tiles(self, channels: int) -> Tiles:
@@ -157,7 +172,12 @@ class TreeReader:
             return Tiles.none(channels)
         origins, sizes, values, active = zip(*self._tiles, strict=True)
         repeated = np.repeat(np.array(sizes, np.int32), [len(a) for a in active])
-        return Tiles(np.concatenate(origins).astype(np.int32), repeated, np.concatenate(values).astype(np.float32), np.concatenate(active))
+        return Tiles(
+            np.concatenate(origins).astype(np.int32),
+            repeated,
+            np.concatenate(values).astype(np.float32),
+            np.concatenate(active),
+        )
 
     # ---------------------------------------------------------------- values of one node
 
@@ -241,8 +261,11 @@ class TreeReader:
             values[stored] = found
         self.masks[first:last] = active
 
-    def _leaf_bytes(self, first: int, last: int) -> tuple[bytes, list[tuple[int, Any, Any, bytes | None]], list[int], bytes]:
-        """Masks, leaves with inactive values besides the background, leaves that store all values, and all stored values."""
+    def _leaf_bytes(
+        self, first: int, last: int
+    ) -> tuple[bytes, list[tuple[int, Any, Any, bytes | None]], list[int], bytes]:
+        """Masks, leaves with inactive values besides the background, leaves that store all values, and all stored
+        values."""
         cursor, what = self._buffers, f"a leaf of {self._what}"
         data, unpack, size_at = cursor.data, self._unpack, struct.Struct("<q").unpack_from
         unit, masked, packed, nothing = self._stored_size, self._flags & MASK, self._packed, self._half

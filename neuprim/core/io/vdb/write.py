@@ -1,4 +1,5 @@
-"""Writing OpenVDB files of version 224, in the layout that :mod:`neuprim.core.io.vdb.tree` reads and OpenVDB itself writes."""
+"""Writing OpenVDB files of version 224, in the layout that :mod:`neuprim.core.io.vdb.tree` reads and OpenVDB itself
+writes."""
 
 from __future__ import annotations
 
@@ -26,11 +27,21 @@ COMPRESSIONS = {"none": MASK, "zip": ZIP | MASK, "blosc": BLOSC | MASK}
 _VERSION = 224
 _LIBRARY = (10, 0)
 _EMPTY_BOX = ((2**31 - 1,) * 3, (-(2**31),) * 3)
-_OURS = ("class", "name", "file_bbox_min", "file_bbox_max", "file_voxel_count", "file_compression", "is_saved_as_half_float")
+_OURS = (
+    "class",
+    "name",
+    "file_bbox_min",
+    "file_bbox_max",
+    "file_voxel_count",
+    "file_compression",
+    "is_saved_as_half_float",
+)
 _STALE = ("file_mem_bytes", "file_delayed_load")
 
 
-def write_vdb(path: Path, grids: Sequence[Grid], *, compression: str = "blosc", metadata: Mapping[str, Any] | None = None) -> None:
+def write_vdb(
+    path: Path, grids: Sequence[Grid], *, compression: str = "blosc", metadata: Mapping[str, Any] | None = None
+) -> None:
     """Writes grids to a file, whole or not at all.
 
     Args:
@@ -40,7 +51,8 @@ def write_vdb(path: Path, grids: Sequence[Grid], *, compression: str = "blosc", 
         metadata: of the file: str, bool, int, float, or three ints or floats each.
 
     Raises:
-        DataError: names that repeat, leaves or tiles that overlap or are out of place, values that no half float holds, a
+        DataError: names that repeat, leaves or tiles that overlap or are out of place, values that no half float holds,
+        a
             transform that is no invertible affine map, or metadata of another type.
         BackendUnavailable: Blosc is asked for, and the package ``blosc`` is missing.
     """
@@ -60,7 +72,12 @@ def write_vdb(path: Path, grids: Sequence[Grid], *, compression: str = "blosc", 
             writer = _TreeWriter(grid, flags, where)
             kind = ("Tree_vec3s_5_4_3" if grid.channels == 3 else "Tree_float_5_4_3") + "_HalfFloat" * grid.half
             start = file.tell() + len(_text(grid.name) + _text(kind) + _text("")) + 24
-            tree = struct.pack("<I", flags) + _grid_metadata(grid, flags, where) + _transform(grid.transform, where) + writer.topology
+            tree = (
+                struct.pack("<I", flags)
+                + _grid_metadata(grid, flags, where)
+                + _transform(grid.transform, where)
+                + writer.topology
+            )
             file.write(_text(grid.name) + _text(kind) + _text(""))
             file.write(struct.pack("<3q", start, start + len(tree), start + len(tree) + len(writer.buffers)))
             file.write(tree)
@@ -80,7 +97,9 @@ def _metadata(values: Mapping[str, Any], where: str) -> bytes:
     for name, value in values.items():
         kind, raw = _metadatum(value)
         if not kind:
-            raise DataError(f"{where}: metadata {name!r} is {value!r}; expected text, bool, int (64 bits), float, or three ints or floats")
+            raise DataError(
+                f"{where}: metadata {name!r} is {value!r}; expected text, bool, int (64 bits), float, or three ints or floats"
+            )
         parts.append(_text(name) + _text(kind) + struct.pack("<I", len(raw)) + raw)
     return b"".join(parts)
 
@@ -106,7 +125,9 @@ def _metadatum(value: Any) -> tuple[str, bytes]:
 
 
 def _grid_metadata(grid: Grid, flags: int, where: str) -> bytes:
-    kept = {k: v for k, v in grid.metadata.items() if k not in (*_OURS, *_STALE) and _metadatum(v)[0]}  # foreign types are bytes
+    kept = {
+        k: v for k, v in grid.metadata.items() if k not in (*_OURS, *_STALE) and _metadatum(v)[0]
+    }  # foreign types are bytes
     low, high = grid.bounds or ((0, 0, 0), (0, 0, 0))
     box = (low, tuple(v - 1 for v in high)) if grid.bounds else _EMPTY_BOX  # OpenVDB's boxes include their upper corner
     ours = (grid.kind, grid.name, *box, grid.active_voxels, compression_label(flags), bool(grid.half))
@@ -116,7 +137,12 @@ def _grid_metadata(grid: Grid, flags: int, where: str) -> bytes:
 def _transform(matrix: np.ndarray, where: str) -> bytes:
     """The simplest of OpenVDB's maps that is this transform."""
     matrix = np.asarray(matrix, np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or (matrix[3] != (0, 0, 0, 1)).any() or np.linalg.det(matrix) == 0:
+    if (
+        matrix.shape != (4, 4)
+        or not np.isfinite(matrix).all()
+        or (matrix[3] != (0, 0, 0, 1)).any()
+        or np.linalg.det(matrix) == 0
+    ):
         raise DataError(f"{where}: transform {matrix.tolist()}; expected an invertible affine (4, 4) matrix")
     scale, translation = np.diag(matrix)[:3], matrix[:3, 3]
     if (matrix[:3, :3] != np.diag(scale)).any():
@@ -149,26 +175,42 @@ class _TreeWriter:
 
     def _check(self) -> None:
         grid, tiles = self._grid, self._grid.tiles
-        if not np.isin(tiles.sizes, TILE_SIZES).all() or (grid.origins % 8).any() or (tiles.origins % tiles.sizes[:, None]).any():
-            raise DataError(f"{self._where}: leaves and tiles must start at multiples of their size (8, 128 or 4096 voxels)")
-        places = np.concatenate([np.c_[grid.origins, np.full(len(grid.origins), 8)], np.c_[tiles.origins, tiles.sizes]]).astype(np.int64)
+        if (
+            not np.isin(tiles.sizes, TILE_SIZES).all()
+            or (grid.origins % 8).any()
+            or (tiles.origins % tiles.sizes[:, None]).any()
+        ):
+            raise DataError(
+                f"{self._where}: leaves and tiles must start at multiples of their size (8, 128 or 4096 voxels)"
+            )
+        places = np.concatenate(
+            [np.c_[grid.origins, np.full(len(grid.origins), 8)], np.c_[tiles.origins, tiles.sizes]]
+        ).astype(np.int64)
         for size in TILE_SIZES:
             here = [tuple(p) for p in (places[places[:, 3] == size, :3] // size).tolist()]
             smaller = {tuple(p) for p in (places[places[:, 3] < size, :3] // size).tolist()}
             if len(set(here)) != len(here) or not smaller.isdisjoint(here):
-                raise DataError(f"{self._where}: leaves or tiles overlap in blocks of {size} voxels; expected each voxel once")
+                raise DataError(
+                    f"{self._where}: leaves or tiles overlap in blocks of {size} voxels; expected each voxel once"
+                )
         if grid.half:
             for values in (grid.values, tiles.values):
                 largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
                 if largest >= 65520:  # what rounds to infinity
-                    raise DataError(f"{self._where}: a value of magnitude {largest:g} does not fit a half float (65504 at most)")
+                    raise DataError(
+                        f"{self._where}: a value of magnitude {largest:g} does not fit a half float (65504 at most)"
+                    )
 
     def _root(self) -> bytes:
         grid = self._grid
         root = np.flatnonzero(grid.tiles.sizes == TILE_SIZES[2])
         small = np.flatnonzero(grid.tiles.sizes < TILE_SIZES[2])
         nodes = _grouped(TILE_SIZES[2], self._origins, self._tile_origins[small])
-        parts = [struct.pack("<i", 1), grid.background.astype("<f4").tobytes(), struct.pack("<II", len(root), len(nodes))]
+        parts = [
+            struct.pack("<i", 1),
+            grid.background.astype("<f4").tobytes(),
+            struct.pack("<II", len(root), len(nodes)),
+        ]
         for i in root:
             tile = struct.pack("<3i", *self._tile_origins[i].tolist()) + grid.tiles.values[i].astype("<f4").tobytes()
             parts.append(tile + struct.pack("<?", bool(grid.tiles.active[i])))
@@ -193,7 +235,9 @@ class _TreeWriter:
                 parts.append(mask)
                 self._buffers.append(mask + self._values(self._grid.values[leaf], self._grid.masks[leaf]))
 
-    def _node(self, parts: list[bytes], children: np.ndarray, origin: tuple[int, int, int], tiles: np.ndarray, slots: Slots) -> None:
+    def _node(
+        self, parts: list[bytes], children: np.ndarray, origin: tuple[int, int, int], tiles: np.ndarray, slots: Slots
+    ) -> None:
         """Appends an internal node: masks of children and of active tiles, and the tiles' values."""
         grid = self._grid
         has_child, active = np.zeros(slots.count, bool), np.zeros(slots.count, bool)
@@ -222,13 +266,21 @@ class _TreeWriter:
         return bytes([code]) + extra + self._pack(stored.astype("<f2" if grid.half else "<f4").tobytes())
 
 
-def _grouped(size: int, leaves: np.ndarray, tiles: np.ndarray) -> list[tuple[tuple[int, int, int], tuple[np.ndarray, np.ndarray]]]:
-    """The blocks of ``size`` voxels that hold leaves or tiles, with the indices of both in each, in order of their corners."""
+def _grouped(
+    size: int, leaves: np.ndarray, tiles: np.ndarray
+) -> list[tuple[tuple[int, int, int], tuple[np.ndarray, np.ndarray]]]:
+    """The blocks of ``size`` voxels that hold leaves or tiles, with the indices of both in each, in order of their
+    corners."""
     corners, inverse = np.unique(np.concatenate([leaves, tiles]) // size * size, axis=0, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
-    parts = np.split(order, np.cumsum(np.bincount(inverse.ravel(), minlength=len(corners)))[:-1]) if len(corners) else []
+    parts = (
+        np.split(order, np.cumsum(np.bincount(inverse.ravel(), minlength=len(corners)))[:-1]) if len(corners) else []
+    )
     count = len(leaves)
-    return [((x, y, z), (part[part < count], part[part >= count] - count)) for (x, y, z), part in zip(corners.tolist(), parts, strict=True)]
+    return [
+        ((x, y, z), (part[part < count], part[part >= count] - count))
+        for (x, y, z), part in zip(corners.tolist(), parts, strict=True)
+    ]
 
 
 def _slot(corners: np.ndarray, origin: tuple[int, int, int], slots: Slots) -> np.ndarray:

@@ -98,22 +98,27 @@ def _check(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
 
 
 def fewer_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
-    """The tensors with the bands above ``degree`` gone from the one called ``name``, (N, bands but the first, C); it goes with the last of them.
+    """The tensors with the bands above ``degree`` gone from the one called ``name``, (N, bands but the first, C); it
+    goes with the last of them.
 
-    What is left is the closest there is, as bands are orthogonal: no other coefficients are nearer on average over all directions.
+    What is left is the closest there is, as bands are orthogonal: no other coefficients are nearer on average over all
+    directions.
     """
     kept = {key: value for key, value in params.items() if key != name}
     return {**kept, name: params[name][:, : coefficient_count(degree) - 1].contiguous()} if degree else kept
 
 
 _DARKEST = 1e-3
-"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays black."""
+"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays
+black."""
 
 
 def coefficients(degree: int, channels: int, name: str) -> tuple[Piece, ...]:
     """Every number by itself of coefficients (N, (degree + 1)^2 - 1, C) in the parameter ``name``, told of by bands."""
     return tuple(
-        Piece(f"coefficient {band} {order - band:+d}, channel {c}", {name: (band * band - 1 + order, c)}, f"band {band}")
+        Piece(
+            f"coefficient {band} {order - band:+d}, channel {c}", {name: (band * band - 1 + order, c)}, f"band {band}"
+        )
         for band in range(1, degree + 1)
         for order in range(2 * band + 1)
         for c in range(channels)
@@ -122,7 +127,9 @@ def coefficients(degree: int, channels: int, name: str) -> tuple[Piece, ...]:
 
 def bands(degree: int, name: str) -> tuple[Piece, ...]:
     """The bands above the zeroth: pieces, in earlier files."""
-    return tuple(Piece(f"band {band}", {name: (slice(band * band - 1, (band + 1) ** 2 - 1),)}) for band in range(1, degree + 1))
+    return tuple(
+        Piece(f"band {band}", {name: (slice(band * band - 1, (band + 1) ** 2 - 1),)}) for band in range(1, degree + 1)
+    )
 
 
 def initial_dc(color: Tensor) -> Tensor:

@@ -1,4 +1,5 @@
-"""Factors of the real spherical harmonics up to degree 3, with the signs of 3D Gaussian splatting; numba freezes them into its kernels."""
+"""Factors of the real spherical harmonics up to degree 3, with the signs of 3D Gaussian splatting; numba freezes them
+into its kernels."""
 
 from __future__ import annotations
 

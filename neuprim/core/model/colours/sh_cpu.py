@@ -24,10 +24,20 @@ def _basis(x, y, z, degree, Y):  # type: ignore[no-untyped-def]
     Y[0], Y[1], Y[2] = -C1 * y, C1 * z, -C1 * x
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        Y[3], Y[4], Y[5], Y[6], Y[7] = C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * zz - xx - yy), C2[3] * x * z, C2[4] * (xx - yy)
+        Y[3], Y[4], Y[5], Y[6], Y[7] = (
+            C2[0] * x * y,
+            C2[1] * y * z,
+            C2[2] * (2 * zz - xx - yy),
+            C2[3] * x * z,
+            C2[4] * (xx - yy),
+        )
         if degree >= 3:
             Y[8], Y[9] = C3[0] * y * (3 * xx - yy), C3[1] * x * y * z
-            Y[10], Y[11], Y[12] = C3[2] * y * (4 * zz - xx - yy), C3[3] * z * (2 * zz - 3 * xx - 3 * yy), C3[4] * x * (4 * zz - xx - yy)
+            Y[10], Y[11], Y[12] = (
+                C3[2] * y * (4 * zz - xx - yy),
+                C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+                C3[4] * x * (4 * zz - xx - yy),
+            )
             Y[13], Y[14] = C3[5] * z * (xx - yy), C3[6] * x * (xx - 3 * yy)
 
 
@@ -44,8 +54,24 @@ def _basis_gradient(x, y, z, degree, g, out):  # type: ignore[no-untyped-def]
             xx, yy, zz = x * x, y * y, z * z
             a, b, c, d = C3[0] * g[8], C3[1] * g[9], C3[2] * g[10], C3[3] * g[11]
             e, f, h = C3[4] * g[12], C3[5] * g[13], C3[6] * g[14]
-            gx += 6 * a * x * y + b * y * z - 2 * c * x * y - 6 * d * x * z + e * (4 * zz - 3 * xx - yy) + 2 * f * x * z + 3 * h * (xx - yy)
-            gy += 3 * a * (xx - yy) + b * x * z + c * (4 * zz - xx - 3 * yy) - 6 * d * y * z - 2 * e * x * y - 2 * f * y * z - 6 * h * x * y
+            gx += (
+                6 * a * x * y
+                + b * y * z
+                - 2 * c * x * y
+                - 6 * d * x * z
+                + e * (4 * zz - 3 * xx - yy)
+                + 2 * f * x * z
+                + 3 * h * (xx - yy)
+            )
+            gy += (
+                3 * a * (xx - yy)
+                + b * x * z
+                + c * (4 * zz - xx - 3 * yy)
+                - 6 * d * y * z
+                - 2 * e * x * y
+                - 2 * f * y * z
+                - 6 * h * x * y
+            )
             gz += b * x * y + 8 * c * y * z + d * (6 * zz - 3 * xx - 3 * yy) + 8 * e * x * z + f * (xx - yy)
     out[0], out[1], out[2] = gx, gy, gz
 
@@ -85,7 +111,11 @@ def _colors_backward(start, stop, means, rest, origin, degree, color, grad, g_me
                 gY[k] += g * rest[i, k, c]
         _basis_gradient(x, y, z, degree, gY, gd)
         radial = gd[0] * x + gd[1] * y + gd[2] * z
-        g_means[i, 0], g_means[i, 1], g_means[i, 2] = (gd[0] - radial * x) * n, (gd[1] - radial * y) * n, (gd[2] - radial * z) * n
+        g_means[i, 0], g_means[i, 1], g_means[i, 2] = (
+            (gd[0] - radial * x) * n,
+            (gd[1] - radial * y) * n,
+            (gd[2] - radial * z) * n,
+        )
 
 
 class _Colors(torch.autograd.Function):
@@ -95,7 +125,16 @@ class _Colors(torch.autograd.Function):
         ctx.origin, ctx.degree = origin.detach().double().numpy(), degree
         color = np.empty(dc.shape, np.float32)
         parallel_for(
-            _colors, len(color), _CHUNK, 0, ctx.arrays[0], dc.detach().contiguous().numpy(), ctx.arrays[1], ctx.origin, degree, color
+            _colors,
+            len(color),
+            _CHUNK,
+            0,
+            ctx.arrays[0],
+            dc.detach().contiguous().numpy(),
+            ctx.arrays[1],
+            ctx.origin,
+            degree,
+            color,
         )
         ctx.color = color
         return torch.from_numpy(color)
@@ -111,7 +150,8 @@ class _Colors(torch.autograd.Function):
 
 
 def fused_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
-    """max(0, SH(direction origin -> mean) + 0.5) of float32 CPU tensors: means (N, 3), dc (N, C), rest (N, bands, C) -> (N, C).
+    """max(0, SH(direction origin -> mean) + 0.5) of float32 CPU tensors: means (N, 3), dc (N, C), rest (N, bands, C) ->
+    (N, C).
 
     ``origin`` (3,) is the camera centre; gradients flow to all four. ``degree`` 1..3 selects how many bands count.
     """

@@ -58,7 +58,9 @@ def _functions(degree: int) -> tuple[Any, Any]:
         if wp.static(degree >= 2):
             p, q, r, s, t = a0 * g[3], a1 * g[4], a2 * g[5], a3 * g[6], a4 * g[7]
             out += wp.vec3d(
-                p * y - two * r * x + s * z + two * t * x, p * x + q * z - two * r * y - two * t * y, q * y + four * r * z + s * x
+                p * y - two * r * x + s * z + two * t * x,
+                p * x + q * z - two * r * y - two * t * y,
+                q * y + four * r * z + s * x,
             )
         if wp.static(degree >= 3):
             xx, yy, zz = x * x, y * y, z * z
@@ -156,7 +158,8 @@ class _Colors(torch.autograd.Function):
 
 
 def fused_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
-    """max(0, SH(direction origin -> mean) + 0.5) of float32 tensors: means (N, 3), dc (N, C), rest (N, bands, C) -> (N, C).
+    """max(0, SH(direction origin -> mean) + 0.5) of float32 tensors: means (N, 3), dc (N, C), rest (N, bands, C) -> (N,
+    C).
 
     ``origin`` (3,) is the camera centre; gradients flow to all four. ``degree`` 1..3 selects how many bands count.
     """

@@ -1,6 +1,8 @@
-"""The density of a neural primitive: one hidden layer of K cosines (the paper's; method: "Density"), with an edge and a gain.
+"""The density of a neural primitive: one hidden layer of K cosines (the paper's; method: "Density"), with an edge and a
+gain.
 
-    sigma(x) = g (1 - |y|^2)^p f(x~)/m inside the ellipsoid |y| < 1,   f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2,   g = exp(log_gain)
+    sigma(x) = g (1 - |y|^2)^p f(x~)/m inside the ellipsoid |y| < 1,   f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k))
+    + b2,   g = exp(log_gain)
 
 p = 0 without gain is the paper's primitive; p = 2 with K = 0 is close to a Gaussian, with a support that ends.
 """
@@ -25,14 +27,23 @@ from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.scripts import script_beside
 from neuprim.core.model.tensors import number_fault
 
-__all__ = ["DENSITY_OPTIONS", "DENSITY_TRADE", "OMEGA0", "CosineDensity", "amplified", "cosine_density", "split_cosine", "split_scale"]
+__all__ = [
+    "DENSITY_OPTIONS",
+    "DENSITY_TRADE",
+    "OMEGA0",
+    "CosineDensity",
+    "amplified",
+    "cosine_density",
+    "split_cosine",
+    "split_scale",
+]
 
 OMEGA0 = 30.0
 """SIREN boost: multiplies the whole phase."""
 
 GAIN_LIMIT = 20.0
-"""Bound of |log_gain|: beyond, a gain counts as exp(20) or exp(-20), and its gradient is zero. No scene needs densities so far apart, and
-products with the other weights stay far from the ends of float32."""
+"""Bound of |log_gain|: beyond, a gain counts as exp(20) or exp(-20), and its gradient is zero. No scene needs densities
+so far apart, and products with the other weights stay far from the ends of float32."""
 
 
 DENSITY_OPTIONS: dict[str, Any] = {"edge": EDGES, "gain": bool, "omega0": Annotated[float, Range(above=0)]}
@@ -75,7 +86,10 @@ class CosineDensity(DensityField):
 
     def settings(self) -> dict[str, Any]:
         usual = {"omega0": OMEGA0, "edge": 0, "gain": False}
-        return {"neurons": self.neurons, **{name: getattr(self, name) for name, value in usual.items() if getattr(self, name) != value}}
+        return {
+            "neurons": self.neurons,
+            **{name: getattr(self, name) for name, value in usual.items() if getattr(self, name) != value},
+        }
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
@@ -116,8 +130,12 @@ class CosineDensity(DensityField):
     def reductions(self) -> dict[str, tuple[int, ...]]:
         return {"neurons": smaller_counts(self.neurons)} if self.neurons else {}
 
-    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[CosineDensity, dict[str, Tensor]]:
-        return CosineDensity(value, self.omega0, self.edge, self.gain), fewer_neurons(params, geometry, value, self.omega0)
+    def reduced(
+        self, params: Params, geometry: Geometry, name: str, value: int
+    ) -> tuple[CosineDensity, dict[str, Tensor]]:
+        return CosineDensity(value, self.omega0, self.edge, self.gain), fewer_neurons(
+            params, geometry, value, self.omega0
+        )
 
     def pieces(self) -> tuple[Piece, ...]:
         """Neurons."""
@@ -135,7 +153,8 @@ class CosineDensity(DensityField):
 
 
 def amplified(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple[Tensor, Tensor]:
-    """(w2, b2) (N, K) and (N, 1) times the gain exp(log_gain), (N, 1) or (N,), so that no renderer needs to know of it."""
+    """(w2, b2) (N, K) and (N, 1) times the gain exp(log_gain), (N, 1) or (N,), so that no renderer needs to know of
+    it."""
     if log_gain is None:
         return w2, b2
     from neuprim.core.model.densities.gain_cpu import fused_gain  # numba, loaded when first needed
@@ -166,7 +185,9 @@ def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) ->
     sigma = ((form.w2[prim] * phase.cos()).sum(-1) + form.b2[prim].reshape(-1)) / m
     if form.edge == 0:
         return sigma
-    whitened = (geometry.rotations[prim].transpose(1, 2) @ local[:, :, None])[..., 0] * (m[:, None] / geometry.scales[prim])
+    whitened = (geometry.rotations[prim].transpose(1, 2) @ local[:, :, None])[..., 0] * (
+        m[:, None] / geometry.scales[prim]
+    )
     return sigma * fade(whitened.square().sum(-1), form.edge)
 
 
@@ -178,14 +199,17 @@ def split_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:
     return 0.5 * r * (old.log_scales.double().sum(-1) - new.log_scales.double().sum(-1)).exp()
 
 
-def split_cosine(params: Params, old: Geometry, new: Geometry, omega0: float = OMEGA0, edge: int = 0) -> dict[str, Tensor]:
+def split_cosine(
+    params: Params, old: Geometry, new: Geometry, omega0: float = OMEGA0, edge: int = 0
+) -> dict[str, Tensor]:
     """Children that continue their parents' f: W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = c (w2, b2), r = m'/m.
 
-    With a hard edge c = r, and sigma goes on unchanged inside the children. A soft edge fades within a child where its parent's does not:
-    c = r V/2V' then, V = s_1 s_2 s_3, for which both children have as much of the weight (1 - |y|^2)^p together as their parent.
+    With a hard edge c = r, and sigma goes on unchanged inside the children. A soft edge fades within a child where its
+    parent's does not: c = r V/2V' then, V = s_1 s_2 s_3, for which both children have as much of the weight (1 -
+    |y|^2)^p together as their parent.
 
-    ``omega0`` and ``edge`` are those of the form which ``params`` lower to. Computed in float64, so that the field changes by no more than
-    the final rounding; other tensors pass through.
+    ``omega0`` and ``edge`` are those of the form which ``params`` lower to. Computed in float64, so that the field
+    changes by no more than the final rounding; other tensors pass through.
     """
     r, c = split_scale(old, new), split_scale(old, new, edge)
     shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]

@@ -2,10 +2,12 @@
 
 Over an ellipsoid with semi-axes s and orientation R, x~ = R diag(s/m) y with y in the unit ball, a neuron's cosine has
 
-    mean of cos(phi + r.y) = cos(phi) b(|r|),   b(r) = 3 (sin r - r cos r)/r^3,   phi = omega0 b1,   r = omega0 diag(s/m) R^T W1
+    mean of cos(phi + r.y) = cos(phi) b(|r|),   b(r) = 3 (sin r - r cos r)/r^3,   phi = omega0 b1,   r = omega0
+    diag(s/m) R^T W1
 
-and its variance follows from the mean of cos^2 = (1 + cos 2(.))/2. Where phases advance in time, phi + xi a for xi in 0..1, b gets the
-factor sinc(a/2) and phi the middle of the sequence, phi + a/2. Means are those of a hard edge; a soft one weighs the middle more.
+and its variance follows from the mean of cos^2 = (1 + cos 2(.))/2. Where phases advance in time, phi + xi a for xi in
+0..1, b gets the factor sinc(a/2) and phi the middle of the sequence, phi + a/2. Means are those of a hard edge; a soft
+one weighs the middle more.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ def smaller_counts(neurons: int) -> tuple[int, ...]:
 
 
 def fewer_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) -> dict[str, Tensor]:
-    """The tensors with ``keep`` neurons for each primitive, those whose part of the density varies most; others pass through.
+    """The tensors with ``keep`` neurons for each primitive, those whose part of the density varies most; others pass
+    through.
 
     Args:
         params: W1 (N, K, 3), b1 (N, K), w2 (N, K), b2 (N, 1), and W_t (N, K) where phases advance in time.

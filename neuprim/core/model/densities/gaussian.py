@@ -1,6 +1,7 @@
 """A true Gaussian density: the baseline of every comparison, and a density that no fast kernel knows.
 
-With y = diag(1/s) R^T (x - mu) the whitened point and c the number of standard deviations at the support's edge |y| = 1,
+With y = diag(1/s) R^T (x - mu) the whitened point and c the number of standard deviations at the support's edge |y| =
+1,
 
     sigma(x) = kappa/m exp(-c^2 |y|^2 / 2)   inside the ellipsoid, 0 outside,   m = max(s)
 
@@ -23,7 +24,8 @@ from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 __all__ = ["GaussianDensity", "bell_integral"]
 
 _SHORT = 0.2
-"""Intervals with w (1 + |u|) below this are integrated by their Taylor series: differences of erfc lose a digit per decade of w."""
+"""Intervals with w (1 + |u|) below this are integrated by their Taylor series: differences of erfc lose a digit per
+decade of w."""
 _TERMS = 8  # of that series; the first one left out is below 1e-17 of the sum
 _START = 0.02, 0.98  # bounds of the opacities that starting points may ask for
 _FAINTEST = 1e-30  # a density scaled by zero keeps a finite logarithm
@@ -32,8 +34,9 @@ _FAINTEST = 1e-30  # a density scaled by zero keeps a finite logarithm
 class GaussianDensity(DensityField):
     """sigma = kappa/m exp(-c^2 |y|^2 / 2); one parameter, log kappa, so 11 with the geometry.
 
-    The division by m makes kappa, like the cosine field's f, free of the scene's unit. ``init.mode`` of the model settings:
-    "opaque" (default) starts every primitive at central opacity ``init.alpha``, "paper" at 0.1, as 3D Gaussian splatting does.
+    The division by m makes kappa, like the cosine field's f, free of the scene's unit. ``init.mode`` of the model
+    settings: "opaque" (default) starts every primitive at central opacity ``init.alpha``, "paper" at 0.1, as 3D
+    Gaussian splatting does.
 
     Args:
         deviations: c, standard deviations from the centre to the edge of the support, 0.5 to 10.
@@ -58,7 +61,9 @@ class GaussianDensity(DensityField):
 
     def _initial(self, ctx: InitContext) -> Tensor:
         alpha = 0.1 if ctx.choice("mode", "opaque", "paper") == "paper" else ctx.number("alpha", 0.8, 0, 1)
-        central = math.sqrt(2 * math.pi) / self.deviations * math.erf(self.deviations / math.sqrt(2))  # a sphere's depth at kappa = 1
+        central = (
+            math.sqrt(2 * math.pi) / self.deviations * math.erf(self.deviations / math.sqrt(2))
+        )  # a sphere's depth at kappa = 1
         if ctx.alphas is None:
             return torch.full((ctx.count, 1), math.log(-math.log1p(-alpha) / central))
         depth = -torch.log1p(-ctx.alphas.double().clamp(*_START))
@@ -71,8 +76,8 @@ class GaussianDensity(DensityField):
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Opaque:
         """The line integral over a chord [t0, t1] in closed form, in float64; differentiable in every argument.
 
-        With p = (t0 + t1)/2 the chord's middle, y its whitened point, v = diag(1/s) R^T d, a = v.v and u = y.v/a the ray's way
-        from its closest approach x = y - u v to that middle,
+        With p = (t0 + t1)/2 the chord's middle, y its whitened point, v = diag(1/s) R^T d, a = v.v and u = y.v/a the
+        ray's way from its closest approach x = y - u v to that middle,
 
             I = kappa/m sqrt(2/a)/c exp(-c^2 x.x / 2) B(c sqrt(a/2) u, c sqrt(a/2) (t1 - t0)/2)
 
@@ -91,25 +96,36 @@ class GaussianDensity(DensityField):
             u = (y * v).sum(-1) / a
             x = y - u[:, None] * v
             rate = c * (a / 2).sqrt()
-            return peak[prim] / rate * (-0.5 * c * c * (x * x).sum(-1)).exp() * bell_integral(rate * u, rate * (t1 - t0) / 2)
+            return (
+                peak[prim]
+                / rate
+                * (-0.5 * c * c * (x * x).sum(-1)).exp()
+                * bell_integral(rate * u, rate * (t1 - t0) / 2)
+            )
 
         return Opaque(line_integral)
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
-        y = (geometry.rotations[prim].transpose(1, 2) @ (x - geometry.means[prim])[:, :, None])[..., 0] / geometry.scales[prim]
+        y = (geometry.rotations[prim].transpose(1, 2) @ (x - geometry.means[prim])[:, :, None])[
+            ..., 0
+        ] / geometry.scales[prim]
         peak = (params["log_amplitude"][:, 0] - geometry.log_length_scale).exp()
         return peak[prim] * (-0.5 * self.deviations**2 * (y * y).sum(-1)).exp()
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Each child gets half its parent's mass, the integral of sigma over space: kappa'/m' prod s' = (1/2) kappa/m prod s.
+        """Each child gets half its parent's mass, the integral of sigma over space: kappa'/m' prod s' = (1/2) kappa/m
+        prod s.
 
-        No Gaussian continues another inside a smaller support, so unlike the cosine field's this split changes the image. What it
-        keeps is the mass of the pair, and two children left in place are exactly their parent.
+        No Gaussian continues another inside a smaller support, so unlike the cosine field's this split changes the
+        image. What it keeps is the mass of the pair, and two children left in place are exactly their parent.
         """
         grown = (new.log_scales.double() - old.log_scales.double()).sum(-1)
         longer = new.log_length_scale.double() - old.log_length_scale.double()
         change = longer - grown - math.log(2.0)
-        return {**params, "log_amplitude": (params["log_amplitude"].double() + change[:, None]).to(params["log_amplitude"])}
+        return {
+            **params,
+            "log_amplitude": (params["log_amplitude"].double() + change[:, None]).to(params["log_amplitude"]),
+        }
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         """See the base class; kappa is positive, so a factor below 1e-30 counts as 1e-30.
@@ -141,7 +157,8 @@ def bell_integral(u: Tensor, w: Tensor) -> Tensor:
 
 
 def _series(u: Tensor, w: Tensor) -> Tensor:
-    """The Taylor series of :func:`bell_integral` about the middle; scaled polynomials P_n = w^n H_n(u)/n! keep every term small."""
+    """The Taylor series of :func:`bell_integral` about the middle; scaled polynomials P_n = w^n H_n(u)/n! keep every
+    term small."""
     low, high = torch.ones_like(u), 2 * u * w  # P_0, P_1;  P_(n+1) = 2 (u w P_n - w^2 P_(n-1)) / (n + 1)
     total = low
     for n in range(1, 2 * _TERMS - 1, 2):

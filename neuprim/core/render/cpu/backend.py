@@ -67,7 +67,8 @@ class _Prepared:
     chunk: int = field(init=False)
 
     def __post_init__(self) -> None:
-        """Fixes the unit of work for both passes: half a row of tiles, or more where threads are few, as every unit costs a call."""
+        """Fixes the unit of work for both passes: half a row of tiles, or more where threads are few, as every unit
+        costs a call."""
         threads = threads_of(self.settings.threads)
         least = 2 if threads > 1 else _TILES_ALONE
         self.chunk = max(least, -(-self.camera.width // L.TILE) // 2, self.tiles // (_UNITS_PER_THREAD * threads))
@@ -148,7 +149,9 @@ def _prepare(
     stats.extra["float64"] = len(which)
     lists = bin_primitives(rows, spans, boxes, depth, status, camera.width, camera.height, settings.threads, images)
     stats.pairs = lists.pairs
-    limits = np.array([settings.alpha_min, settings.alpha_max, settings.transmittance_min, settings.depth_floor], np.float32)
+    limits = np.array(
+        [settings.alpha_min, settings.alpha_max, settings.transmittance_min, settings.depth_floor], np.float32
+    )
     return _Prepared(
         camera,
         settings,
@@ -188,7 +191,9 @@ def _non_finite(tensors: dict[str, Array], row: int) -> NonFiniteError:
     if not tensors["quats"][row].any():
         return NonFiniteError(f"quats of primitive {row} is zero; expected a non-zero quaternion")
     scale = tensors["log_scales"][row].tolist()
-    return NonFiniteError(f"log_scales of primitive {row} is {scale}: the semi-axes or weights leave the range of float32")
+    return NonFiniteError(
+        f"log_scales of primitive {row} is {scale}: the semi-axes or weights leave the range of float32"
+    )
 
 
 class _Rasterize(torch.autograd.Function):
@@ -202,7 +207,16 @@ class _Rasterize(torch.autograd.Function):
         kernels = zip((*_NAMES, *painted[:-1]), (means, log_scales, quats, W1, b1, w2, b2, *net), strict=True)
         tensors = _alike({n: _array(v) for n, v in kernels}) | {painted[-1]: _array(colors)}
         _check_colours(tensors, painted)
-        frame = _prepare(tensors, camera, viewmat.detach().double().numpy(), omega0, edge, _array(background.float()), settings, stats)
+        frame = _prepare(
+            tensors,
+            camera,
+            viewmat.detach().double().numpy(),
+            omega0,
+            edge,
+            _array(background.float()),
+            settings,
+            stats,
+        )
         h, w, C = camera.height, camera.width, colors.shape[1]
         rgb, T = np.empty((h, w, C), np.float32), np.empty((h, w), np.float32)
         z, last = np.zeros((h, w) if settings.depth else (1, 1), np.float32), np.empty((h, w), np.int32)
@@ -217,7 +231,9 @@ class _Rasterize(torch.autograd.Function):
             lanes = parallel_for(composite_tiles_by_entry, frame.tiles, frame.chunk, settings.threads, *pixels, *form)
         else:
             kept = Kept.of(frame.lists.pairs if differentiable else 0)
-            drawn = parallel_for(composite_tiles, frame.tiles, frame.chunk, settings.threads, *pixels, kept.live, kept.found, *form)
+            drawn = parallel_for(
+                composite_tiles, frame.tiles, frame.chunk, settings.threads, *pixels, kept.live, kept.found, *form
+            )
             lanes, kept.depths = [n for n, _ in drawn], [depths for _, depths in drawn]
         stats.extra["forward_lanes"] = sum(lanes)
         ctx.frame, ctx.tensors, ctx.palette, ctx.last, ctx.T, ctx.kept = frame, tensors, palette, last, T, kept
@@ -241,7 +257,9 @@ class _Rasterize(torch.autograd.Function):
         gT = np.ascontiguousarray((g_T + g_rgb @ torch.from_numpy(frame.background)).numpy(), np.float32)
         gz = np.ascontiguousarray(g_z.numpy(), np.float32)
         watched = frame.stats.watched
-        error = np.zeros((h, w), np.float32) if watched is None else np.ascontiguousarray(_array(watched.error), np.float32)
+        error = (
+            np.zeros((h, w), np.float32) if watched is None else np.ascontiguousarray(_array(watched.error), np.float32)
+        )
         width = L.gradient_width(frame.neurons, C, frame.net.hidden if frame.net else 0)
         pair_rows = np.empty((frame.lists.pairs, width), np.float32)
         pixels = (
@@ -304,26 +322,36 @@ class _Rasterize(torch.autograd.Function):
 
 
 def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
-    """Render a :class:`Cosine` density with :class:`Constant` or :class:`RayNet` colours; see ``neuprim.core.render.render``."""
+    """Render a :class:`Cosine` density with :class:`Constant` or :class:`RayNet` colours; see
+    ``neuprim.core.render.render``."""
     density, colour = lowered.density, lowered.colour
-    assert isinstance(density, Cosine) and isinstance(colour, Constant | RayNet), "the caller chooses a backend that knows the forms"
+    assert isinstance(density, Cosine) and isinstance(colour, Constant | RayNet), (
+        "the caller chooses a backend that knows the forms"
+    )
     g = lowered.geometry
     stats = RenderStats("cpu", g.count)
-    palette, net = (colour.base, (colour.Wx, colour.bias, colour.Wout)) if isinstance(colour, RayNet) else (colour.rgb, ())
+    palette, net = (
+        (colour.base, (colour.Wx, colour.bias, colour.Wout)) if isinstance(colour, RayNet) else (colour.rgb, ())
+    )
     if background is None:
         background = torch.zeros(palette.shape[1])
     tensors = (
         g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), palette, camera.viewmat, background,
     )  # fmt: skip
-    rgb, T, zsum = applied(_Rasterize, *tensors, camera, density.omega0, density.edge, settings, stats, asked(*tensors, *net), *net)
+    rgb, T, zsum = applied(
+        _Rasterize, *tensors, camera, density.omega0, density.edge, settings, stats, asked(*tensors, *net), *net
+    )
     dtype = g.means.dtype
     alpha = 1 - T
     depth = mean_depth(zsum, alpha).to(dtype) if settings.depth else None
     return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)
 
 
-def render_parts(lowered: Lowered, parts: Tensor, count: int, camera: Camera, settings: RenderSettings) -> tuple[Tensor, Tensor]:
-    """Opacity and depth of parts of the primitives, each as if it were alone, prepared as one frame; see :func:`neuprim.core.render.parts.render_parts`."""
+def render_parts(
+    lowered: Lowered, parts: Tensor, count: int, camera: Camera, settings: RenderSettings
+) -> tuple[Tensor, Tensor]:
+    """Opacity and depth of parts of the primitives, each as if it were alone, prepared as one frame; see
+    :func:`neuprim.core.render.parts.render_parts`."""
     g, density = lowered.geometry, lowered.density
     assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
     values = (g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1))

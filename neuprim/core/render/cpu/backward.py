@@ -1,8 +1,8 @@
 """Tile-wise compositing, backward: back to front, transmittance recovered by T/(1 - alpha).
 
-The optical depths of the lanes are the forward pass's (:mod:`~neuprim.core.render.cpu.kept`), so that what reaches a lane is known before its
-neurons are evaluated. Each (tile, primitive) pair writes one gradient row; the rows of a primitive are then added in a fixed order, so the
-result is bit-identical for any number of threads.
+The optical depths of the lanes are the forward pass's (:mod:`~neuprim.core.render.cpu.kept`), so that what reaches a
+lane is known before its neurons are evaluated. Each (tile, primitive) pair writes one gradient row; the rows of a
+primitive are then added in a fixed order, so the result is bit-identical for any number of threads.
 """
 
 from __future__ import annotations
@@ -13,7 +13,13 @@ from neuprim.core.compute.kernels import exact_kernel, inline, kernel
 from neuprim.core.compute.views import copy16, keep16, lent, returned
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
-from neuprim.core.render.cpu.gradients import AT_ONCE, chord_gradient, gradients_at_once, lanes_with_slopes, neuron_gradients
+from neuprim.core.render.cpu.gradients import (
+    AT_ONCE,
+    chord_gradient,
+    gradients_at_once,
+    lanes_with_slopes,
+    neuron_gradients,
+)
 from neuprim.core.render.cpu.ray_colours import (
     ray_colour_gradient,
     ray_colour_gradient_row,
@@ -43,7 +49,8 @@ def optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
 
 @inline
 def opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
-    """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) of every lane from its DEPTH, with exactly the forward pass's clamp and cut."""
+    """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) of every lane from its DEPTH, with exactly the forward
+    pass's clamp and cut."""
     for k in range(n):
         norm, depth = S[L.NORM_L + k], S[L.DEPTH + k]
         raw = one_minus_exp(depth)
@@ -82,7 +89,8 @@ def _uncomposite_row(st, lanes, cg, w, a, b, rank):  # type: ignore[no-untyped-d
 
 @inline
 def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, c0, c1, c2):  # type: ignore[no-untyped-def]
-    """:func:`_uncomposite_row` and the tallies of three channels in one pass; ``sums`` are 16 wide and reduced once per pair."""
+    """:func:`_uncomposite_row` and the tallies of three channels in one pass; ``sums`` are 16 wide and reduced once per
+    pair."""
     a, b = f(a), f(b)
     for k in range(L.TILE):
         step, alpha = _STEPS[k], S[index(at + k + L.ALPHA)]
@@ -121,7 +129,8 @@ def _tally(st, w, sums):  # type: ignore[no-untyped-def]
 
 @inline
 def _lanes_that_count(S, n, with_depths):  # type: ignore[no-untyped-def]
-    """Move the lanes with a gradient together, and zeros behind them; returns their number. ``with_depths``: DEPTH and NORM_L, too.
+    """Move the lanes with a gradient together, and zeros behind them; returns their number. ``with_depths``: DEPTH and
+    NORM_L, too.
 
     Many have none: rays below the cut, and those of pixels that are opaque before they get here.
     """
@@ -154,10 +163,17 @@ def backward_tiles(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Gradient rows of every pair of tiles ``start:stop``. ``g_transmittance`` already holds the background's share.
 
-    ``depths``, ``live``, ``found``: what the forward pass kept of these tiles (:mod:`~neuprim.core.render.cpu.kept`). ``net``: as for
-    :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
+    ``depths``, ``live``, ``found``: what the forward pass kept of these tiles (:mod:`~neuprim.core.render.cpu.kept`).
+    ``net``: as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
     """
-    depths, rows, wide, slots, spans, kinds = lent(depths), lent(rows), lent(wide), lent(slots), lent(spans), lent(kinds)
+    depths, rows, wide, slots, spans, kinds = (
+        lent(depths),
+        lent(rows),
+        lent(wide),
+        lent(slots),
+        lent(spans),
+        lent(kinds),
+    )
     boxes, starts, ids, colors, pair_rows = lent(boxes), lent(starts), lent(ids), lent(colors), lent(pair_rows)
     live, found = lent(live), lent(found)
     height, width = norms.shape
@@ -169,8 +185,17 @@ def backward_tiles(  # type: ignore[no-untyped-def]
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
         waves = aligned(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
-    lanes, wide_lanes, slopes = aligned(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64), aligned(neurons * L.NEURON_SCRATCH)
-    pixels, weights, rays, totals = aligned((6 + C) * L.PIXELS + 2 * L.TILE), aligned(L.TILE), aligned(L.TILE), aligned((2 + C) * L.TILE)
+    lanes, wide_lanes, slopes = (
+        aligned(scratch + 1024),
+        np.zeros(FLOAT64_SCRATCH, np.float64),
+        aligned(neurons * L.NEURON_SCRATCH),
+    )
+    pixels, weights, rays, totals = (
+        aligned((6 + C) * L.PIXELS + 2 * L.TILE),
+        aligned(L.TILE),
+        aligned(L.TILE),
+        aligned((2 + C) * L.TILE),
+    )
     ends, begins, lives = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32), aligned(L.TILE)
     S, D, V = lent(lanes), lent(wide_lanes), lent(slopes).reshape((neurons, L.NEURON_SCRATCH))
     state, w, cg, sums = lent(pixels), lent(weights), lent(rays), lent(totals)
@@ -228,7 +253,9 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             later = slots[i] < 0 and net is None and not with_depth
             if not later:
                 evaluated += n16
-                lanes_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, neurons, floor, edge)
+                lanes_with_slopes(
+                    S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, neurons, floor, edge
+                )
             opacity(S, n16, amin, amax)
             for k in range(n, n16):
                 S[L.GRAD + k] = f(0)
@@ -247,7 +274,9 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                     at = offset[y] - a
                     if C == 3 and not with_depth:
                         if net is None:
-                            _uncomposite_rgb_row(state, S, y * L.TILE, at, sums, a, b, rank, colors[i, 0], colors[i, 1], colors[i, 2])
+                            _uncomposite_rgb_row(
+                                state, S, y * L.TILE, at, sums, a, b, rank, colors[i, 0], colors[i, 1], colors[i, 2]
+                            )
                         else:
                             uncomposite_rgb_ray_colours(state, S, y * L.TILE, at, sums, a, b, rank)
                         continue

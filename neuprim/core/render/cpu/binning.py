@@ -54,10 +54,11 @@ def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
 
 @exact_kernel
 def _reached(start, stop, rows, spans, boxes, status, across, first):  # type: ignore[no-untyped-def]
-    """Tiles that the silhouettes of primitives ``start:stop`` reach, row by row (exact for ellipses, up to a 1e-3 pixel margin).
+    """Tiles that the silhouettes of primitives ``start:stop`` reach, row by row (exact for ellipses, up to a 1e-3 pixel
+    margin).
 
-    Returns them; ``first[i + 1]`` is how many primitive i has. In the order of the primitives, not of their depths: what they read lies
-    side by side.
+    Returns them; ``first[i + 1]`` is how many primitive i has. In the order of the primitives, not of their depths:
+    what they read lies side by side.
     """
     tiles, n = np.empty(4096, np.int32), 0
     for i in range(start, stop):
@@ -67,7 +68,11 @@ def _reached(start, stop, rows, spans, boxes, status, across, first):  # type: i
             lo, hi = box[0] // L.TILE, (box[2] - 1) // L.TILE + 1
             hx, hy, skew = np.float64(spans[i, L.HX]), np.float64(spans[i, L.HY]), np.float64(spans[i, L.SKEW])
             ellipse = spans[i, L.HY] < L.UNBOUNDED
-            over, base, middle = 1.0 / hy, 0.5 - np.float64(rows[i, L.UY]) - spans[i, L.YC], spans[i, L.XC] + np.float64(rows[i, L.UX])
+            over, base, middle = (
+                1.0 / hy,
+                0.5 - np.float64(rows[i, L.UY]) - spans[i, L.YC],
+                spans[i, L.XC] + np.float64(rows[i, L.UX]),
+            )
             peak = skew * hy * hy / np.sqrt(hx * hx + skew * skew * hy * hy)  # where the ellipse is furthest right
             for ty in range(box[1] // L.TILE, (box[3] - 1) // L.TILE + 1):
                 if ellipse:
@@ -112,11 +117,20 @@ def _scatter(order, first, tiles, starts, ids, slots):  # type: ignore[no-untype
 
 
 def bin_primitives(
-    rows: Any, spans: Any, boxes: Any, depth: Any, status: Any, width: int, height: int, threads: int, images: tuple[Any, int] | None = None
+    rows: Any,
+    spans: Any,
+    boxes: Any,
+    depth: Any,
+    status: Any,
+    width: int,
+    height: int,
+    threads: int,
+    images: tuple[Any, int] | None = None,
 ) -> TileLists:
     """Tile lists of one frame; every argument as :func:`~neuprim.core.render.cpu.prepare.prepare` filled it.
 
-    With ``images``, (N,) numbers and how many there are, each primitive is in one of several images, whose tiles follow each other.
+    With ``images``, (N,) numbers and how many there are, each primitive is in one of several images, whose tiles follow
+    each other.
     """
     count = depth.shape[0]
     across, down = -(-width // L.TILE), -(-height // L.TILE)

@@ -29,7 +29,8 @@ def ray(p):  # type: ignore[no-untyped-def]
 
 @text
 def chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
-    """The chord of one pixel of the tile: (du, dv, slide, e, closest point, D, 1/(e.e), tm, h, uncut, mid, half), as in the layout.
+    """The chord of one pixel of the tile: (du, dv, slide, e, closest point, D, 1/(e.e), tm, h, uncut, mid, half), as in
+    the layout.
 
     fx0, fy0: the tile corner's pixel centre from the anchor; row: from :func:`ray`. ``half`` is 0 where the ray misses.
     """
@@ -39,7 +40,11 @@ def chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
     slide = du * tu + dv * tv
     gx, gy, gz = du * x0 + dv * y0, du * x1 + dv * y1, du * x2 + dv * y2
     ex, ey, ez = e0 + gx, e1 + gy, e2 + gz
-    mx, my, mz = a0 + du * u0 + dv * v0 + slide * gx, a1 + du * u1 + dv * v1 + slide * gy, a2 + du * u2 + dv * v2 + slide * gz
+    mx, my, mz = (
+        a0 + du * u0 + dv * v0 + slide * gx,
+        a1 + du * u1 + dv * v1 + slide * gy,
+        a2 + du * u2 + dv * v2 + slide * gz,
+    )
     ia = f(1) / (ex * ex + ey * ey + ez * ez)
     tm = -(mx * ex + my * ey + mz * ez) * ia
     px, py, pz = mx + tm * ex, my + tm * ey, mz + tm * ez
@@ -77,9 +82,11 @@ def weight(D, edge):  # type: ignore[no-untyped-def]
 def through_chord(  # type: ignore[no-untyped-def]
     g_half, g_mid, g_tm, gD, gA, half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, dh, qx, qy, qz, vx, vy, vz,
 ):  # fmt: skip
-    """From dL/d(half, MID) and dL/d(chord middle) = q, dL/d(half e) = v to dL/d(the ray's origin m) and dL/d(its direction e).
+    """From dL/d(half, MID) and dL/d(chord middle) = q, dL/d(half e) = v to dL/d(the ray's origin m) and dL/d(its
+    direction e).
 
-    g_tm, gD, gA: what reaches the closest approach, D = 1 - |p|^2 and a = e.e on other ways than through the chord's ends.
+    g_tm, gD, gA: what reaches the closest approach, D = 1 - |p|^2 and a = e.e on other ways than through the chord's
+    ends.
     """
     gex, gey, gez = vx * half + mid * qx, vy * half + mid * qy, vz * half + mid * qz
     gt1 = (g_mid + g_half) * f(0.5)

@@ -1,8 +1,8 @@
 """The per-primitive stage of a :class:`~neuprim.core.model.forms.RayNet`, in float64, and its hand-written backward.
 
-The network sees the chord's middle, x~_m = local (axes q) with q the middle in whitened space, which the density's pixel stage leaves
-in the lanes anyway. So its first layer goes to whitened axes and turns once per primitive, exactly as the density's neurons do, and
-nothing here depends on the camera. The pixel stage is in ``ray_colours``.
+The network sees the chord's middle, x~_m = local (axes q) with q the middle in whitened space, which the density's
+pixel stage leaves in the lanes anyway. So its first layer goes to whitened axes and turns once per primitive, exactly
+as the density's neurons do, and nothing here depends on the camera. The pixel stage is in ``ray_colours``.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ Array = np.ndarray[Any, Any]
 
 
 class Net(NamedTuple):
-    """The networks of one frame, as the pixel kernels take them; ``None`` in its place compiles a kernel for constant colours.
+    """The networks of one frame, as the pixel kernels take them; ``None`` in its place compiles a kernel for constant
+    colours.
 
     Attributes:
-        rows: (N, width) float32: per unit its first layer (WX, WY, WZ, PHASE: whitened axes, turns), then C output weights.
-        wide: the same in float64 of the primitives that are drawn so, by slot.
+        rows: (N, width) float32: per unit its first layer (WX, WY, WZ, PHASE: whitened axes, turns), then C output
+        weights. wide: the same in float64 of the primitives that are drawn so, by slot.
         hidden: units per primitive, padded to a whole number of pairs by units without output.
     """
 
@@ -40,7 +41,8 @@ class Net(NamedTuple):
 
 @exact_kernel
 def prepare_net(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast):  # type: ignore[no-untyped-def]
-    """Rows ``out[n]`` (float32 or float64) of primitives ``which[n]``; ``fast[n]`` where a unit turns too fast for float32 pixels."""
+    """Rows ``out[n]`` (float32 or float64) of primitives ``which[n]``; ``fast[n]`` where a unit turns too fast for
+    float32 pixels."""
     H, C = Wx.shape[1], Wout.shape[1]
     local, axes = np.empty((3, 3)), np.empty(3)
     for n in range(start, stop):
@@ -55,7 +57,11 @@ def prepare_net(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast
         for j in range(H):
             o, square = (L.NET_OUT + C) * j, 0.0
             for a in range(3):
-                w = _TURNS * axes[a] * (Wx[i, j, 0] * local[0, a] + Wx[i, j, 1] * local[1, a] + Wx[i, j, 2] * local[2, a])
+                w = (
+                    _TURNS
+                    * axes[a]
+                    * (Wx[i, j, 0] * local[0, a] + Wx[i, j, 1] * local[1, a] + Wx[i, j, 2] * local[2, a])
+                )
                 row[o + L.WX + a] = w
                 square += w * w
             phase = _TURNS * np.float64(bias[i, j])
@@ -91,10 +97,11 @@ def net_rows(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tup
 def net_backward(  # type: ignore[no-untyped-def]
     start, stop, log_scales, quats, Wx, rows, grads, first, touched, g_log_scales, g_quats, g_Wx, g_bias, g_Wout,
 ):  # fmt: skip
-    """Chain rule from gradient rows (the networks' columns begin at ``first``) to parameters, for primitives ``start:stop``.
+    """Chain rule from gradient rows (the networks' columns begin at ``first``) to parameters, for primitives
+    ``start:stop``.
 
-    Adds to ``g_log_scales`` and ``g_quats``: the first layer on whitened axes depends on the ellipsoid's axes. What flows through the
-    chord's middle is already in the density's columns.
+    Adds to ``g_log_scales`` and ``g_quats``: the first layer on whitened axes depends on the ellipsoid's axes. What
+    flows through the chord's middle is already in the density's columns.
     """
     H, C = Wx.shape[1], g_Wout.shape[1]
     local, gL, axes, gl, q, gq = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(4), np.empty(4)

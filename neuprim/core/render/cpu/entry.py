@@ -1,10 +1,11 @@
 """Tile-wise compositing in the order in which each ray enters its chords (``sort = "entry"``), forward and backward.
 
-The default kernels walk a tile's primitives in one order, that of their centres. Here every pixel has its own. A first pass
-over the tile's primitives lists the hits: the pixel, the camera-z at which its ray enters, the opacity. Each pixel's hits are
-then sorted and composited front to back. The backward pass lists and composites again, walks back to front, which leaves
-dL/d(2 FIELD HALF) with every hit, and in a second pass over the primitives turns these into the same gradient rows, one per
-(tile, primitive), as the default kernel writes. Nothing can stop early before the lists are complete, so hidden primitives cost.
+The default kernels walk a tile's primitives in one order, that of their centres. Here every pixel has its own. A first
+pass over the tile's primitives lists the hits: the pixel, the camera-z at which its ray enters, the opacity. Each
+pixel's hits are then sorted and composited front to back. The backward pass lists and composites again, walks back to
+front, which leaves dL/d(2 FIELD HALF) with every hit, and in a second pass over the primitives turns these into the
+same gradient rows, one per (tile, primitive), as the default kernel writes. Nothing can stop early before the lists are
+complete, so hidden primitives cost.
 
 Entries that agree in float32 keep the order of the centres, and so do all chords that the near plane cuts.
 """
@@ -28,8 +29,11 @@ __all__ = ["backward_tiles_by_entry", "composite_tiles_by_entry"]
 
 f = np.float32
 
-# One row per hit of the tile, because hits are read in another order than they are written. The backward pass fills the last three.
-H_ENTRY, H_ALPHA, H_SLOPE, H_DEPTH, H_OPTICAL, H_WEIGHT, H_BEFORE, H_GRAD = range(8)  # H_DEPTH: camera-z of the chord's middle
+# One row per hit of the tile, because hits are read in another order than they are written. The backward pass fills the
+# last three.
+H_ENTRY, H_ALPHA, H_SLOPE, H_DEPTH, H_OPTICAL, H_WEIGHT, H_BEFORE, H_GRAD = range(
+    8
+)  # H_DEPTH: camera-z of the chord's middle
 H_FLOATS = 8
 H_PIXEL, H_LANE, H_PAIR = 0, 1, 2  # pixel of the tile, lane of the pair, pair of the tile
 H_INTS = 4
@@ -38,7 +42,8 @@ _CUT = f(-1e30)  # entry of every chord that the near plane cuts: in front of al
 
 @inline
 def _lanes_of(S, state, offset, bounds, rows_live, span, box, p, tx, ty):  # type: ignore[no-untyped-def]
-    """Compact the pixels of one pair into lanes; returns (lanes, first row, row after the last, and the tile's corner from the anchor)."""
+    """Compact the pixels of one pair into lanes; returns (lanes, first row, row after the last, and the tile's corner
+    from the anchor)."""
     y0, y1 = max(box[1] - ty, 0), min(box[3] - ty, L.TILE)
     x0, x1 = max(box[0] - tx, 0), min(box[2] - tx, L.TILE)
     fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
@@ -89,7 +94,9 @@ def _list_hits(  # type: ignore[no-untyped-def]
             continue
         n16 = ((n + 15) // 16) * 16
         evaluated += n16
-        field_values(S, D, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, False, True, edge)
+        field_values(
+            S, D, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, False, True, edge
+        )
         optical_depths(S, n16, edge)
         opacity(S, n16, amin, amax)
         if net is not None:
@@ -117,8 +124,8 @@ def _list_hits(  # type: ignore[no-untyped-def]
 def _sort_hits(count, hits, marks, begin, listing):  # type: ignore[no-untyped-def]
     """``listing[begin[j] : begin[j + 1]]`` are the hits of pixel j, front to back.
 
-    A counting sort by pixel, which keeps the order of the centres, then an insertion sort by entry: centres are nearly in the
-    right order, so few hits move far. Equal entries do not move.
+    A counting sort by pixel, which keeps the order of the centres, then an insertion sort by entry: centres are nearly
+    in the right order, so few hits move far. Equal entries do not move.
     """
     begin[:] = 0
     for s in range(count):
@@ -148,7 +155,8 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, background, limits, with_depth, neurons,
     rgb, transmittance, zsum, last, net, edge,
 ):  # fmt: skip
-    """As :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``last`` receives how many hits each pixel composited."""
+    """As :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``last`` receives how many hits each pixel
+    composited."""
     height, width = norms.shape
     across = (width + L.TILE - 1) // L.TILE
     C = colors.shape[1]
@@ -172,7 +180,11 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
         _load_tile(state, rows_live, norms, tx, ty)
         room = _room(first, end, ids, boxes, tx, ty)
         if room > listing.shape[0]:
-            hits, marks, listing = np.empty((room, H_FLOATS), np.float32), np.empty((room, H_INTS), np.int32), np.empty(room, np.int32)
+            hits, marks, listing = (
+                np.empty((room, H_FLOATS), np.float32),
+                np.empty((room, H_INTS), np.int32),
+                np.empty(room, np.int32),
+            )
             if net is not None:
                 hues = np.empty((room, C), np.float32)
         if end - first >= starts_of.shape[0]:
@@ -213,7 +225,8 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, limits, with_depth, neurons,
     transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows, net, edge,
 ):  # fmt: skip
-    """As :func:`~neuprim.core.render.cpu.backward.backward_tiles`. Composites anew, so ``transmittance`` and ``last`` are not read."""
+    """As :func:`~neuprim.core.render.cpu.backward.backward_tiles`. Composites anew, so ``transmittance`` and ``last``
+    are not read."""
     height, width = norms.shape
     across = (width + L.TILE - 1) // L.TILE
     C = colors.shape[1]
@@ -239,7 +252,11 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
         _load_tile(state, rows_live, norms, tx, ty)
         room = _room(first, end, ids, boxes, tx, ty)
         if room > listing.shape[0]:
-            hits, marks, listing = np.empty((room, H_FLOATS), np.float32), np.empty((room, H_INTS), np.int32), np.empty(room, np.int32)
+            hits, marks, listing = (
+                np.empty((room, H_FLOATS), np.float32),
+                np.empty((room, H_INTS), np.int32),
+                np.empty(room, np.int32),
+            )
             if net is not None:
                 hues = np.empty((room, C), np.float32)
         if end - first >= starts_of.shape[0]:
@@ -295,7 +312,9 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
             n, y0, y1, fx0, fy0 = _lanes_of(S, state, offset, bounds, rows_live, spans[i], boxes[i], p, tx, ty)
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            lanes_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, neurons, floor, edge)
+            lanes_with_slopes(
+                S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, neurons, floor, edge
+            )
             for k in range(n16):
                 S[L.GRAD + k], S[L.GMID + k], S[L.DEPTH + k] = f(0), f(0), f(0)
             if net is not None:
@@ -309,7 +328,9 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
                 if net is not None:
                     for c in range(C):
                         if S[L.RAY_COLOUR + c * L.LANES + k] >= f(0):
-                            S[L.RAY_COLOUR + (C + c) * L.LANES + k] = hits[s, H_WEIGHT] * g_rgb[ty + j // L.TILE, tx + j % L.TILE, c]
+                            S[L.RAY_COLOUR + (C + c) * L.LANES + k] = (
+                                hits[s, H_WEIGHT] * g_rgb[ty + j // L.TILE, tx + j % L.TILE, c]
+                            )
                 if with_depth:
                     S[L.GMID + k] = hits[s, H_WEIGHT] * g_z[ty + j // L.TILE, tx + j % L.TILE] * p[L.UNIT]
             neuron_gradients(S, V, n16, p, kinds[i], neurons, edge, slots[i] >= 0, out)

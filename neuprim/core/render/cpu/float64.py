@@ -1,7 +1,8 @@
-"""The float64 pixel stage, for the few primitives that float32 cannot follow: needles and discs near the camera, fast neurons.
+"""The float64 pixel stage, for the few primitives that float32 cannot follow: needles and discs near the camera, fast
+neurons.
 
-Same interface as the float32 building blocks: what they leave in the lanes is rounded to float32 at the end, so compositing and
-the gradient sums are shared.
+Same interface as the float32 building blocks: what they leave in the lanes is rounded to float32 at the end, so
+compositing and the gradient sums are shared.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ __all__ = [
 ]  # fmt: skip
 
 f = np.float32
-# float64 lanes: chord middle and half chord vector in whitened space, then 1 - |y|^2 at the closest approach, how far the middle is from it
+# float64 lanes: chord middle and half chord vector in whitened space, then 1 - |y|^2 at the closest approach, how far
+# the middle is from it
 # and the half chord (units of m along e), and e.e
 _Q, _V = (L.lane(0), L.lane(1), L.lane(2)), (L.lane(3), L.lane(4), L.lane(5))
 _Q0, _Q1, _Q2 = _Q
@@ -28,13 +30,18 @@ FLOAT64_SCRATCH = L.lane(10)
 
 @inline
 def chords_float64(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, backward):  # type: ignore[no-untyped-def]
-    """As :func:`~neuprim.core.render.cpu.tiles.chords` from a float64 row ``p``, for the pixels of ``bounds``; lanes n: are padding."""
+    """As :func:`~neuprim.core.render.cpu.tiles.chords` from a float64 row ``p``, for the pixels of ``bounds``; lanes n:
+    are padding."""
     at = 0
     for y in range(y0, y1):
         dv = ty + y + 0.5 - p[L.UY]
         for x in range(bounds[y], bounds[y + L.TILE]):
             du = tx + x + 0.5 - p[L.UX]
-            gx, gy, gz = du * p[L.EX] + dv * p[L.EY], du * p[L.EX + 1] + dv * p[L.EY + 1], du * p[L.EX + 2] + dv * p[L.EY + 2]
+            gx, gy, gz = (
+                du * p[L.EX] + dv * p[L.EY],
+                du * p[L.EX + 1] + dv * p[L.EY + 1],
+                du * p[L.EX + 2] + dv * p[L.EY + 2],
+            )
             ex, ey, ez = p[L.E0] + gx, p[L.E0 + 1] + gy, p[L.E0 + 2] + gz
             mx, my, mz = p[L.XA] + p[L.TC] * gx, p[L.XA + 1] + p[L.TC] * gy, p[L.XA + 2] + p[L.TC] * gz
             ia = 1.0 / (ex * ex + ey * ey + ez * ez)

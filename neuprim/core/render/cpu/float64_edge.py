@@ -1,12 +1,14 @@
 """Neurons of the float64 path with any edge; soft ones along whole chords and along those that the near plane cuts.
 
-Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the closest approach, a = e.e and shift from there to the
-chord's middle. Its p-th power is a polynomial q, and the mean of q cos(phase + z u) follows from the moments
+Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the closest approach, a = e.e and shift from
+there to the chord's middle. Its p-th power is a polynomial q, and the mean of q cos(phase + z u) follows from the
+moments
 
-    C_n = 1/2 integral of u^n cos(z u) du (n even),   S_n = 1/2 integral of u^n sin(z u) du (n odd),   dC_n/dz = -S_(n+1), dS_n/dz = C_(n+1)
+    C_n = 1/2 integral of u^n cos(z u) du (n even),   S_n = 1/2 integral of u^n sin(z u) du (n odd),   dC_n/dz =
+    -S_(n+1), dS_n/dz = C_(n+1)
 
-which are sums of spherical Bessel functions j_0 to j_5 (:mod:`neuprim.core.model.edge`). FADE is the mean of q, FIELD the mean of the density
-weighted by q over that of q, so that gradients of weights read alike for every edge.
+which are sums of spherical Bessel functions j_0 to j_5 (:mod:`neuprim.core.model.edge`). FADE is the mean of q, FIELD
+the mean of the density weighted by q over that of q, so that gradients of weights read alike for every edge.
 """
 
 from __future__ import annotations
@@ -15,7 +17,15 @@ import numpy as np
 
 from neuprim.core.compute.kernels import by_length, inline
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.float64 import HALF64, INNER, SHIFT, SQUARE, hard_neurons_float64, hard_slopes_float64, reduced_float64
+from neuprim.core.render.cpu.float64 import (
+    HALF64,
+    INNER,
+    SHIFT,
+    SQUARE,
+    hard_neurons_float64,
+    hard_slopes_float64,
+    reduced_float64,
+)
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns
 
 __all__ = ["neurons_float64", "slopes_float64"]

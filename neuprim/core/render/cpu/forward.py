@@ -19,12 +19,15 @@ __all__ = ["composite_tiles"]
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(L.TILE).astype(np.float32)
-_LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count costs a reduction per row
+_LIVE_EVERY = (
+    4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count costs a reduction per row
+)
 
 
 @inline
 def _opacity(S, n, amin, amax, edge, keep, depths, at):  # type: ignore[no-untyped-def]
-    """ALPHA of every lane: 0 below alpha_min and where the integral is not positive, at most alpha_max; its depth to ``depths[at + k]``."""
+    """ALPHA of every lane: 0 below alpha_min and where the integral is not positive, at most alpha_max; its depth to
+    ``depths[at + k]``."""
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
         if len(edge) > 0:
@@ -85,12 +88,15 @@ def composite_tiles(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, background, limits, with_depth, neurons,
     rgb, transmittance, zsum, last, live, found, net, edge,
 ):  # fmt: skip
-    """Draw tiles ``start:stop``; returns the number of evaluated lanes, and their optical depths if ``live`` and ``found`` have room for them.
+    """Draw tiles ``start:stop``; returns the number of evaluated lanes, and their optical depths if ``live`` and
+    ``found`` have room for them.
 
     limits = (alpha_min, alpha_max, transmittance_min, depth_floor), all float32. ``norms`` (H, W) is the length of the
-    pixel's ray direction whose camera-z is 1. Where ``slots[i]`` is not -1, primitive i is drawn in float64 from that row of
-    ``wide``. ``last`` receives the rank + 1 of each pixel's last contributor. ``net`` is None where ``colors`` is all there is to a
-    colour, which leaves no trace of it in the compiled kernel, or the :class:`~neuprim.core.render.cpu.colour_net.Net` on that base.
+    pixel's ray direction whose camera-z is 1. Where ``slots[i]`` is not -1, primitive i is drawn in float64 from that
+    row of
+    ``wide``. ``last`` receives the rank + 1 of each pixel's last contributor. ``net`` is None where ``colors`` is all
+    there is to a colour, which leaves no trace of it in the compiled kernel, or the
+    :class:`~neuprim.core.render.cpu.colour_net.Net` on that base.
     """
     rows, wide, slots, spans, kinds, boxes = lent(rows), lent(wide), lent(slots), lent(spans), lent(kinds), lent(boxes)
     starts, ids, colors, live, found = lent(starts), lent(ids), lent(colors), lent(live), lent(found)
@@ -145,7 +151,26 @@ def composite_tiles(  # type: ignore[no-untyped-def]
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
                 field_values(
-                    S, D, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_depth, False, edge
+                    S,
+                    D,
+                    n16,
+                    bounds,
+                    y0,
+                    y1,
+                    tx,
+                    ty,
+                    fx0,
+                    fy0,
+                    i,
+                    rows,
+                    wide,
+                    slots,
+                    kinds,
+                    neurons,
+                    floor,
+                    with_depth,
+                    False,
+                    edge,
                 )
                 _opacity(S, n16, amin, amax, edge, keep, depths, evaluated)
                 evaluated += n16
@@ -155,11 +180,23 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                 for y in range(y0, y1):
                     a, b = bounds[y], bounds[y + L.TILE]
                     if b > a:
-                        at = offset[y] - a  # the row's lanes start at offset[y], its pixels at a: shift so that both run with k
+                        at = (
+                            offset[y] - a
+                        )  # the row's lanes start at offset[y], its pixels at a: shift so that both run with k
                         if C == 3 and not with_depth:
                             if net is None:
                                 _composite_rgb_row(
-                                    state, S, y * L.TILE, L.ALPHA + at, a, b, tmin, rank, colors[i, 0], colors[i, 1], colors[i, 2]
+                                    state,
+                                    S,
+                                    y * L.TILE,
+                                    L.ALPHA + at,
+                                    a,
+                                    b,
+                                    tmin,
+                                    rank,
+                                    colors[i, 0],
+                                    colors[i, 1],
+                                    colors[i, 2],
                                 )
                             else:
                                 composite_rgb_ray_colours(state, S, y * L.TILE, at, a, b, tmin, rank)
@@ -195,7 +232,9 @@ def composite_tiles(  # type: ignore[no-untyped-def]
             for c in range(C):
                 behind = background[c]
                 for x in range(wide_row):
-                    rgb[Y, index(tx + x), index(c)] = state[index(j + x + L.COLOR + c * L.PIXELS)] + state[index(j + x + L.T_)] * behind
+                    rgb[Y, index(tx + x), index(c)] = (
+                        state[index(j + x + L.COLOR + c * L.PIXELS)] + state[index(j + x + L.T_)] * behind
+                    )
             if with_depth:
                 for x in range(wide_row):
                     zsum[Y, index(tx + x)] = state[index(j + x + L.ZSUM)]

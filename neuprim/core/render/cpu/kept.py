@@ -1,7 +1,8 @@
 """What a forward pass keeps for its backward pass: the optical depth of every lane that it evaluated, 4 bytes each.
 
-With them the backward pass composites before it has evaluated a single neuron. Its lanes have to be the forward pass's own, which depend on
-the rows that were alive: 2 bytes per pair say which, and 4 where the pair's lanes begin among those of its chunk of tiles.
+With them the backward pass composites before it has evaluated a single neuron. Its lanes have to be the forward pass's
+own, which depend on the rows that were alive: 2 bytes per pair say which, and 4 where the pair's lanes begin among
+those of its chunk of tiles.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ class Kept:
     """Of one frame.
 
     Attributes:
-        live: (pairs,) bit y is set where row y of the tile was alive when the pair was drawn; no pairs where nothing is kept.
-        found: (pairs,) first lane of each pair in the depths of its chunk.
+        live: (pairs,) bit y is set where row y of the tile was alive when the pair was drawn; no pairs where nothing is
+        kept. found: (pairs,) first lane of each pair in the depths of its chunk.
         depths: per chunk of tiles (lanes,) optical depth of each evaluated lane.
     """
 
@@ -48,7 +49,8 @@ def alive(rows_live):  # type: ignore[no-untyped-def]
 
 @inline
 def room(floats):  # type: ignore[no-untyped-def]
-    """Floats that begin a cache line; as :func:`~neuprim.core.render.cpu.tiles.aligned`, but not zero: memory is taken where it is written."""
+    """Floats that begin a cache line; as :func:`~neuprim.core.render.cpu.tiles.aligned`, but not zero: memory is taken
+    where it is written."""
     block = np.empty(floats + 16, np.float32)
     shift = -(np.int64(block.ctypes.data) // 4) % 16
     return block[shift : shift + floats]

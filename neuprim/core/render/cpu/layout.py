@@ -11,7 +11,8 @@ __all__ = ["gradient_width", "lane", "net_row_width", "row_width"]
 # ---- one primitive, as a pixel kernel sees it (method: "float64 preparation, float32 pixels").
 # The ray of pixel offset (du, dv) from the anchor pixel (UX, UY) is, in whitened space with t in units of m,
 #   x(t) = (XA + TC G) + t e,  G = du EX + dv EY,  e = E0 + G.
-# Its origin is slid along the ray by s = du TU + dv TV, to where x is nearly orthogonal to e. The closest approach is then a
+# Its origin is slid along the ray by s = du TU + dv TV, to where x is nearly orthogonal to e. The closest approach is
+# then a
 # small correction, and float32 loses nothing to thin axes:
 #   x(t + s) = (XA + du XU + dv XV + s G) + t e,  XU = TC EX + TU E0,  XV = TC EY + TV E0.
 E0, EX, EY, XA, XU, XV = 0, 3, 6, 9, 12, 15
@@ -28,7 +29,8 @@ PER_NEURON = 5
 # ---- one primitive's colour network: per unit WX, WY, WZ, PHASE as above, then C output weights
 NET_OUT = 4
 
-# How fast a pair of neurons may turn over a half chord, in turns; neurons are stored by rising rate, so that pairs are alike.
+# How fast a pair of neurons may turn over a half chord, in turns; neurons are stored by rising rate, so that pairs are
+# alike.
 SLOW, MEDIUM, FAST = 0, 1, 2
 SLOW_TURNS, MEDIUM_TURNS = 0.4999, 1.4999
 
@@ -62,7 +64,8 @@ def net_row_width(hidden: int, channels: int) -> int:
 
 
 def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
-    """Floats per gradient row for K padded neurons, C colours and H padded units of a colour network, a multiple of 16."""
+    """Floats per gradient row for K padded neurons, C colours and H padded units of a colour network, a multiple of
+    16."""
     return _padded(G_NEURONS + PER_NEURON * neurons + channels + (NET_OUT + channels) * hidden)
 
 
@@ -84,7 +87,9 @@ DH = lane(16)  # dh/dD with the floor on D
 UNCUT = lane(17)  # 1 where the near plane does not cut the chord
 NORM_L = lane(18)  # length of the ray direction whose camera-z is 1
 ALPHA = lane(19)  # opacity after clamp and cut
-FADE = lane(20)  # soft edges: mean of (1 - |y|^2)^p over the chord; an optical depth is 2 FIELD HALF FADE, FADE = 1 without
+FADE = lane(
+    20
+)  # soft edges: mean of (1 - |y|^2)^p over the chord; an optical depth is 2 FIELD HALF FADE, FADE = 1 without
 OVER = lane(21)  # 1/(1 - alpha)
 SLOPE = lane(22)  # d alpha / d(2 FIELD HALF FADE), 0 where clamped or cut
 GRAD = lane(23)  # dL/d(2 FIELD HALF FADE)

@@ -1,4 +1,5 @@
-"""A pair's field: the mean density over every lane's chord, which either order of compositing evaluates once a pair's pixels are gathered."""
+"""A pair's field: the mean density over every lane's chord, which either order of compositing evaluates once a pair's
+pixels are gathered."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ f = np.float32
 
 
 def _values(profiles):  # type: ignore[no-untyped-def]
-    """FIELD += w2 cos(phase at the middle) B_p(rate x half chord) of two neurons, with the profiles of their range of rates."""
+    """FIELD += w2 cos(phase at the middle) B_p(rate x half chord) of two neurons, with the profiles of their range of
+    rates."""
 
     @inline
     def add(S, n, p, o, edge):  # type: ignore[no-untyped-def]
@@ -45,8 +47,11 @@ _values_slow, _values_medium, _values_fast = _values(profiles_slow), _values(pro
 
 
 @inline
-def field_values(S, D, n, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_mid, backward, edge):  # type: ignore[no-untyped-def]
-    """Chords and FIELD of ``n`` lanes of primitive ``i``, in float64 where float32 is too coarse; see :func:`~tiles.chords`."""
+def field_values(
+    S, D, n, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_mid, backward, edge
+):  # type: ignore[no-untyped-def]
+    """Chords and FIELD of ``n`` lanes of primitive ``i``, in float64 where float32 is too coarse; see
+    :func:`~tiles.chords`."""
     if slots[i] >= 0:
         chords_float64(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, with_mid, backward)
         neurons_float64(edge, S, D, n, wide[slots[i]], neurons)

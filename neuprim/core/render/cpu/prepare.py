@@ -81,9 +81,11 @@ def _frame(mean, log_scale, quat, R, t, cam, near, local, B, axes, c, anchor):  
 
 @strict
 def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, waves, rate, order, row):  # type: ignore[no-untyped-def]
-    """Fill the float64 kernel row of primitive ``i`` and ``order[i]``; returns (m, whether all is finite, largest number).
+    """Fill the float64 kernel row of primitive ``i`` and ``order[i]``; returns (m, whether all is finite, largest
+    number).
 
-    ``work`` (10, 3): scratch, of which rows 0..2 return B, 3 the axes s/m, 4 the centre in camera axes. ``waves`` (K, 4): scratch.
+    ``work`` (10, 3): scratch, of which rows 0..2 return B, 3 the axes s/m, 4 the centre in camera axes. ``waves`` (K,
+    4): scratch.
     ``rate`` (K,) returns the neurons' rates, rising.
     """
     K = W1.shape[1]
@@ -109,15 +111,24 @@ def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turn
     biggest = max(biggest, tc, abs(row[L.NEAR]), m, abs(row[L.OFFSET]))
     total += tc + row[L.NEAR] + m + row[L.OFFSET]
     for k in range(K):
-        waves[k, 0] = turns * axes[0] * (W1[i, k, 0] * local[0, 0] + W1[i, k, 1] * local[1, 0] + W1[i, k, 2] * local[2, 0])
-        waves[k, 1] = turns * axes[1] * (W1[i, k, 0] * local[0, 1] + W1[i, k, 1] * local[1, 1] + W1[i, k, 2] * local[2, 1])
-        waves[k, 2] = turns * axes[2] * (W1[i, k, 0] * local[0, 2] + W1[i, k, 1] * local[1, 2] + W1[i, k, 2] * local[2, 2])
+        waves[k, 0] = (
+            turns * axes[0] * (W1[i, k, 0] * local[0, 0] + W1[i, k, 1] * local[1, 0] + W1[i, k, 2] * local[2, 0])
+        )
+        waves[k, 1] = (
+            turns * axes[1] * (W1[i, k, 0] * local[0, 1] + W1[i, k, 1] * local[1, 1] + W1[i, k, 2] * local[2, 1])
+        )
+        waves[k, 2] = (
+            turns * axes[2] * (W1[i, k, 0] * local[0, 2] + W1[i, k, 1] * local[1, 2] + W1[i, k, 2] * local[2, 2])
+        )
         speed = np.sqrt(waves[k, 0] * waves[k, 0] + waves[k, 1] * waves[k, 1] + waves[k, 2] * waves[k, 2])
         waves[k, 3] = speed
         biggest = max(biggest, speed, abs(np.float64(w2[i, k])))
         total += speed + turns * np.float64(b1[i, k]) + w2[i, k]
     for k in range(K):
-        at, speed = np.int64(0), waves[k, 3]  # counting the slower ones sorts without a branch; neurons as fast keep their order
+        at, speed = (
+            np.int64(0),
+            waves[k, 3],
+        )  # counting the slower ones sorts without a branch; neurons as fast keep their order
         for j in range(K):
             at += np.int64((waves[j, 3] < speed) | ((waves[j, 3] == speed) & (j < k)))
         o, phase = L.NEURONS + L.PER_NEURON * at, turns * np.float64(b1[i, k])
@@ -129,7 +140,8 @@ def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turn
 
 @strict
 def _are_finite(i, means, log_scales, quats, W1, b1, most):  # type: ignore[no-untyped-def]
-    """Whether the numbers of a primitive that is not drawn are finite, ``most`` for its amplitudes, and its quaternion a rotation."""
+    """Whether the numbers of a primitive that is not drawn are finite, ``most`` for its amplitudes, and its quaternion
+    a rotation."""
     total, square = most, np.float64(0.0)
     for a in range(3):
         total += np.float64(means[i, a]) + np.float64(log_scales[i, a])
@@ -142,13 +154,17 @@ def _are_finite(i, means, log_scales, quats, W1, b1, most):  # type: ignore[no-u
 
 @strict
 def _extent(c, m, B, axes, cam, axis, s22, square):  # type: ignore[no-untyped-def]
-    """Where the silhouette of the ellipsoid that is ``square`` ** 0.5 times as large begins and ends along an axis of the screen, in pixels.
+    """Where the silhouette of the ellipsoid that is ``square`` ** 0.5 times as large begins and ends along an axis of
+    the screen, in pixels.
 
-    In units of m: tangents (k +- sqrt(D))/(z^2 - S_zz), see projection.screen_boxes; ``s22``: S_zz of the whole ellipsoid.
+    In units of m: tangents (k +- sqrt(D))/(z^2 - S_zz), see projection.screen_boxes; ``s22``: S_zz of the whole
+    ellipsoid.
     """
     z, ci, szz = c[2] / m, c[axis] / m, square * s22
     sii = square * ((B[axis, 0] * axes[0]) ** 2 + (B[axis, 1] * axes[1]) ** 2 + (B[axis, 2] * axes[2]) ** 2)
-    siz = square * (B[axis, 0] * B[2, 0] * axes[0] ** 2 + B[axis, 1] * B[2, 1] * axes[1] ** 2 + B[axis, 2] * B[2, 2] * axes[2] ** 2)
+    siz = square * (
+        B[axis, 0] * B[2, 0] * axes[0] ** 2 + B[axis, 1] * B[2, 1] * axes[1] ** 2 + B[axis, 2] * B[2, 2] * axes[2] ** 2
+    )
     D = z * z * sii - 2 * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
     root, mid, den = np.sqrt(max(D, 0.0)), ci * z - siz, z * z - szz
     return cam[axis] * (mid - root) / den + cam[2 + axis], cam[axis] * (mid + root) / den + cam[2 + axis]
@@ -156,10 +172,11 @@ def _extent(c, m, B, axes, cam, axis, s22, square):  # type: ignore[no-untyped-d
 
 @strict
 def _longest(c, m, reach, row, cam, e0, ex, ey):  # type: ignore[no-untyped-def]
-    """A bound of the half chords of all rays that meet the ellipsoid, in units of its longest semi-axis; at most that, 1.
+    """A bound of the half chords of all rays that meet the ellipsoid, in units of its longest semi-axis; at most that,
+    1.
 
-    A ray's direction is e on whitened axes, and m / |e| its half chord through the centre. No point of the ellipsoid is farther than m from the
-    centre, which bounds how far a ray's slopes are from the centre's.
+    A ray's direction is e on whitened axes, and m / |e| its half chord through the centre. No point of the ellipsoid is
+    farther than m from the centre, which bounds how far a ray's slopes are from the centre's.
     """
     if row[L.TC] == 0.0:  # the anchor is not the centre
         return 1.0
@@ -176,7 +193,26 @@ def prepare_wide(start, stop, which, means, log_scales, quats, W1, b1, w2, b2, R
     work, waves, rate = np.empty((10, 3)), np.empty((W1.shape[1], 4)), np.empty(W1.shape[1])
     for n in range(start, stop):
         wide[n, :] = 0.0
-        _wide_row(which[n], means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, waves, rate, order, wide[n])
+        _wide_row(
+            which[n],
+            means,
+            log_scales,
+            quats,
+            W1,
+            b1,
+            w2,
+            b2,
+            R,
+            t,
+            cam,
+            near,
+            turns,
+            work,
+            waves,
+            rate,
+            order,
+            wide[n],
+        )
 
 
 @exact_kernel
@@ -186,15 +222,25 @@ def prepare(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Fill kernel rows, silhouette spans, pixel boxes, view depths and status of primitives ``start:stop``.
 
-    cam = (fx, fy, cx, cy); size = (width, height); turns = omega0 / 2 pi. Neurons are stored by rising rate: ``order[i, k]`` is the
-    model's index of row neuron k, ``kinds[i, m]`` the range of rates (SLOW, MEDIUM, FAST) of row neurons 2m and 2m + 1.
-    ``in_float64[i]`` says that float32 is not enough for the primitive's pixels (see :func:`prepare_wide`). ``least``: the optical depth below
-    which nothing is drawn; silhouettes are those of the rays that can reach it (:mod:`~neuprim.core.render.cpu.seen`), and of a primitive that cannot
-    anywhere nothing is filled but its status, an empty box and a depth of 0.
+    cam = (fx, fy, cx, cy); size = (width, height); turns = omega0 / 2 pi. Neurons are stored by rising rate: ``order[i,
+    k]`` is the model's index of row neuron k, ``kinds[i, m]`` the range of rates (SLOW, MEDIUM, FAST) of row neurons 2m
+    and 2m + 1.
+    ``in_float64[i]`` says that float32 is not enough for the primitive's pixels (see :func:`prepare_wide`). ``least``:
+    the optical depth below which nothing is drawn; silhouettes are those of the rays that can reach it
+    (:mod:`~neuprim.core.render.cpu.seen`), and of a primitive that cannot anywhere nothing is filled but its status, an
+    empty box and a depth of 0.
     """
     K = W1.shape[1]
     work, waves, rate, row = np.empty((10, 3)), np.empty((K, 4)), np.empty(K), np.zeros(rows.shape[1])
-    B, axes, c, e0, ex, ey, xa = work[0:3], work[3], work[4], row[L.E0 : L.EX], row[L.EX : L.EY], row[L.EY : L.XA], row[L.XA : L.XU]
+    B, axes, c, e0, ex, ey, xa = (
+        work[0:3],
+        work[3],
+        work[4],
+        row[L.E0 : L.EX],
+        row[L.EX : L.EY],
+        row[L.EY : L.XA],
+        row[L.XA : L.XU],
+    )
     k0, ka, kb, tmp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(start, stop):
         most = np.float64(b2[i])
@@ -205,7 +251,9 @@ def prepare(  # type: ignore[no-untyped-def]
             in_float64[i], depth[i] = False, 0.0
             status[i] = CULLED if _are_finite(i, means, log_scales, quats, W1, b1, most) else NON_FINITE
             continue
-        m, finite, biggest = _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, waves, rate, order, row)
+        m, finite, biggest = _wide_row(
+            i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, waves, rate, order, row
+        )
         for n in range(kinds.shape[1]):
             fastest = rate[min(2 * n + 1, K - 1)]
             kinds[i, n] = L.SLOW if fastest < L.SLOW_TURNS else (L.MEDIUM if fastest < L.MEDIUM_TURNS else L.FAST)
@@ -224,7 +272,9 @@ def prepare(  # type: ignore[no-untyped-def]
         status[i] = CULLED
         szz = m * m * ((B[2, 0] * axes[0]) ** 2 + (B[2, 1] * axes[1]) ** 2 + (B[2, 2] * axes[2]) ** 2)
         reach = np.sqrt(szz)
-        in_float64[i] |= edge > 0 and c[2] - reach < near + CUT * reach  # only there are integrals of cut chords with a soft edge
+        in_float64[i] |= (
+            edge > 0 and c[2] - reach < near + CUT * reach
+        )  # only there are integrals of cut chords with a soft edge
         if c[2] + reach <= near:
             continue
         if biggest > FLOAT32_MAX:
@@ -239,10 +289,14 @@ def prepare(  # type: ignore[no-untyped-def]
             square = seen_square(most, _longest(c, m, reach, row, cam, e0, ex, ey), edge, least)
             if square == 0.0:
                 continue
-            (x0, x1), (y0, y1) = _extent(c, m, B, axes, cam, 0, s22, square), _extent(c, m, B, axes, cam, 1, s22, square)
+            (x0, x1), (y0, y1) = (
+                _extent(c, m, B, axes, cam, 0, s22, square),
+                _extent(c, m, B, axes, cam, 1, s22, square),
+            )
             x0, x1 = max(0.0, np.ceil(x0 - 0.5)), min(float(size[0]), np.floor(x1 - 0.5) + 1)
             y0, y1 = max(0.0, np.ceil(y0 - 0.5)), min(float(size[1]), np.floor(y1 - 0.5) + 1)
-            # |r e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width from (HX, HY)
+            # |r e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width from
+            # (HX, HY)
             _cross(xa, e0, k0)
             _cross(xa, ex, ka)
             _cross(ex, e0, tmp)
@@ -252,8 +306,16 @@ def prepare(  # type: ignore[no-untyped-def]
             _cross(ey, e0, tmp)
             for j in range(3):
                 kb[j] += tc * tmp[j]
-            q0, q1, q2 = square * _dot(e0, e0) - _dot(k0, k0), square * _dot(e0, ex) - _dot(k0, ka), square * _dot(e0, ey) - _dot(k0, kb)
-            q3, q4, q5 = square * _dot(ex, ex) - _dot(ka, ka), square * _dot(ex, ey) - _dot(ka, kb), square * _dot(ey, ey) - _dot(kb, kb)
+            q0, q1, q2 = (
+                square * _dot(e0, e0) - _dot(k0, k0),
+                square * _dot(e0, ex) - _dot(k0, ka),
+                square * _dot(e0, ey) - _dot(k0, kb),
+            )
+            q3, q4, q5 = (
+                square * _dot(ex, ex) - _dot(ka, ka),
+                square * _dot(ex, ey) - _dot(ka, kb),
+                square * _dot(ey, ey) - _dot(kb, kb),
+            )
             d0, d1, d2 = q1 * q1 - q3 * q0, q1 * q4 - q3 * q2, q4 * q4 - q3 * q5
             if q3 < 0.0 and d2 < 0.0:
                 yc = -d1 / d2
@@ -265,10 +327,13 @@ def prepare(  # type: ignore[no-untyped-def]
                     tall = min(abs(yc) + span[L.HY], max(abs(0.5 - row[L.UY]), abs(size[1] - 0.5 - row[L.UY])))
                     broad = abs(span[L.XC]) + abs(span[L.SKEW]) * (abs(yc) + span[L.HY]) + span[L.HX]
                     broad = min(broad, max(abs(0.5 - row[L.UX]), abs(size[0] - 0.5 - row[L.UX])))
-                    # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle
+                    # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted
+                    # needle
                     # each is many radii of its thin axis, and they cancel
                     slide = abs(row[L.TU]) * broad + abs(row[L.TV]) * tall
-                    in_float64[i] |= slide * (np.sqrt(_dot(ex, ex)) * broad + np.sqrt(_dot(ey, ey)) * tall) > FLOAT64_RADII
+                    in_float64[i] |= (
+                        slide * (np.sqrt(_dot(ex, ex)) * broad + np.sqrt(_dot(ey, ey)) * tall) > FLOAT64_RADII
+                    )
                     for a in range(3):
                         in_float64[i] |= abs(row[L.XU + a]) * broad + abs(row[L.XV + a]) * tall > FLOAT64_RADII
         if in_float64[i]:  # the float64 rows do not slide
@@ -287,11 +352,18 @@ def prepare_backward(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Chain rule from gradient rows to parameters, for primitives ``start:stop``.
 
-    With ``want_view`` it also fills ``g_view`` (N, 3, 4), each primitive's part of dL/d(R | t); rows that are not ``touched`` stay as they
-    are.
+    With ``want_view`` it also fills ``g_view`` (N, 3, 4), each primitive's part of dL/d(R | t); rows that are not
+    ``touched`` stay as they are.
     """
     K = W1.shape[1]
-    local, B, A, gA, gB, gL = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    local, B, A, gA, gB, gL = (
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+    )
     axes, c, anchor, ref, w = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     gc, gl, gq, q = np.empty(3), np.empty(3), np.empty(4), np.empty(4)
     fx, fy, cx, cy = cam[0], cam[1], cam[2], cam[3]

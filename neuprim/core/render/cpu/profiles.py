@@ -1,8 +1,10 @@
-"""B_p of soft edges in float32: what sinc is for a hard one (:mod:`neuprim.core.model.edge`). Coefficients: benchmarks/fit_polynomials.py.
+"""B_p of soft edges in float32: what sinc is for a hard one (:mod:`neuprim.core.model.edge`). Coefficients:
+benchmarks/fit_polynomials.py.
 
-Rates v are in turns over half a chord, as for :mod:`~neuprim.core.render.cpu.trigonometry`: B_p(2 pi v). Beyond half a turn, or one and a
-half, the recursions B_1 = 3 (B_0 - cos z)/z^2 and B_2 = 15 (B_1 - B_0)/z^2 take over, and dB_1/dz = -3 (B_1 - B_0)/z, dB_2/dz = -5 (B_2 - B_1)/z.
-float32 Horner errors: B 1.3e-7 and 9e-8 up to half a turn, 4.8e-7 and 3.2e-7 up to 1.5; derivatives 4.4e-7 and 2.6e-7, 5.8e-7 and 4.1e-7.
+Rates v are in turns over half a chord, as for :mod:`~neuprim.core.render.cpu.trigonometry`: B_p(2 pi v). Beyond half a
+turn, or one and a half, the recursions B_1 = 3 (B_0 - cos z)/z^2 and B_2 = 15 (B_1 - B_0)/z^2 take over, and dB_1/dz =
+-3 (B_1 - B_0)/z, dB_2/dz = -5 (B_2 - B_1)/z. float32 Horner errors: B 1.3e-7 and 9e-8 up to half a turn, 4.8e-7 and
+3.2e-7 up to 1.5; derivatives 4.4e-7 and 2.6e-7, 5.8e-7 and 4.1e-7.
 """
 
 from __future__ import annotations
@@ -15,11 +17,19 @@ import numpy as np
 from neuprim.core.compute.kernels import by_length, inline
 from neuprim.core.render.cpu import trigonometry as T
 
-__all__ = ["EDGE_TYPES", "profiles_fast", "profiles_medium", "profiles_slow", "slopes_fast", "slopes_medium", "slopes_slow"]
+__all__ = [
+    "EDGE_TYPES",
+    "profiles_fast",
+    "profiles_medium",
+    "profiles_slow",
+    "slopes_fast",
+    "slopes_medium",
+    "slopes_slow",
+]
 
 EDGE_TYPES: tuple[tuple[int, ...], ...] = ((), (0,), (0, 0))
-"""The exponents p = 0, 1, 2 as kernels take them: as many zeros. A tuple's length belongs to its type, so that numba compiles a kernel
-for each p that is drawn, and none that is not."""
+"""The exponents p = 0, 1, 2 as kernels take them: as many zeros. A tuple's length belongs to its type, so that numba
+compiles a kernel for each p that is drawn, and none that is not."""
 
 f = np.float32
 _TO_UNIT = f(2 / 1.5**2)  # v^2 on [0, 1.5^2] to [-1, 1]

@@ -1,8 +1,9 @@
-"""Colours per lane, for :class:`~neuprim.core.model.forms.RayNet`: the pixel stage of ``colour_net``, forward and backward.
+"""Colours per lane, for :class:`~neuprim.core.model.forms.RayNet`: the pixel stage of ``colour_net``, forward and
+backward.
 
-Every function works on the lanes of one (tile, primitive) pair, after the density's chord stage. RAY_COLOUR holds the colours before
-max(0, .), so that forward and backward clamp alike. Three channels have fused loops over constant offsets; other counts, and
-primitives drawn in float64, go unit by unit through ``V``.
+Every function works on the lanes of one (tile, primitive) pair, after the density's chord stage. RAY_COLOUR holds the
+colours before max(0, .), so that forward and backward clamp alike. Three channels have fused loops over constant
+offsets; other counts, and primitives drawn in float64, go unit by unit through ``V``.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ __all__ = [
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(L.TILE).astype(np.float32)
-_RGB_GRADIENT = L.RAY_COLOUR + 3 * L.LANES  # dL/d RAY_COLOUR of three channels; in general it follows the C arrays of RAY_COLOUR
+_RGB_GRADIENT = (
+    L.RAY_COLOUR + 3 * L.LANES
+)  # dL/d RAY_COLOUR of three channels; in general it follows the C arrays of RAY_COLOUR
 
 
 # ---------------------------------------------------------------- the network
@@ -139,7 +142,8 @@ def _mix(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
 
 @inline
 def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-untyped-def]
-    """RAY_COLOUR of ``n`` lanes of primitive ``i``; with ``slopes`` also what :func:`ray_colour_gradient` needs, in ``V``."""
+    """RAY_COLOUR of ``n`` lanes of primitive ``i``; with ``slopes`` also what :func:`ray_colour_gradient` needs, in
+    ``V``."""
     C, p = base.shape[0], net.rows[i]
     for c in range(C):
         colour = S[L.RAY_COLOUR + c * L.LANES :]
@@ -165,8 +169,22 @@ def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-unt
 @inline
 def _rgb_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
     """Gradients of two units, three channels, and their share of dL/dQ."""
-    ax, ay, az, a0, a1, a2 = p[o + L.WX], p[o + L.WY], p[o + L.WZ], p[o + L.NET_OUT], p[o + L.NET_OUT + 1], p[o + L.NET_OUT + 2]
-    bx, by, bz, b0, b1, b2 = p[o2 + L.WX], p[o2 + L.WY], p[o2 + L.WZ], p[o2 + L.NET_OUT], p[o2 + L.NET_OUT + 1], p[o2 + L.NET_OUT + 2]
+    ax, ay, az, a0, a1, a2 = (
+        p[o + L.WX],
+        p[o + L.WY],
+        p[o + L.WZ],
+        p[o + L.NET_OUT],
+        p[o + L.NET_OUT + 1],
+        p[o + L.NET_OUT + 2],
+    )
+    bx, by, bz, b0, b1, b2 = (
+        p[o2 + L.WX],
+        p[o2 + L.WY],
+        p[o2 + L.WZ],
+        p[o2 + L.NET_OUT],
+        p[o2 + L.NET_OUT + 1],
+        p[o2 + L.NET_OUT + 2],
+    )
     s0, s1, s2, s3, s4, s5, s6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
     r0, r1, r2, r3, r4, r5, r6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
     for k in range(n):
@@ -244,7 +262,8 @@ def ray_colour_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-un
             _unit_gradient(S, V[j], n, p, (L.NET_OUT + C) * j, C, row)
 
 
-# ---------------------------------------------------------------- compositing one pixel row; ``at`` is the lane of the row's pixel 0
+# ---------------------------------------------------------------- compositing one pixel row; ``at`` is the lane of the
+# row's pixel 0
 
 
 @inline
@@ -260,7 +279,9 @@ def composite_rgb_ray_colours(state, S, base, at, a, b, tmin, rank):  # type: ig
         state[index(base + k + L.LAST)] = rank if alpha > f(0) else state[index(base + k + L.LAST)]
         state[index(base + k + L.COLOR)] += weight * max(S[index(at + k + L.RAY_COLOUR)], f(0))
         state[index(base + k + L.COLOR + L.PIXELS)] += weight * max(S[index(at + k + L.RAY_COLOUR + L.LANES)], f(0))
-        state[index(base + k + L.COLOR + 2 * L.PIXELS)] += weight * max(S[index(at + k + L.RAY_COLOUR + 2 * L.LANES)], f(0))
+        state[index(base + k + L.COLOR + 2 * L.PIXELS)] += weight * max(
+            S[index(at + k + L.RAY_COLOUR + 2 * L.LANES)], f(0)
+        )
 
 
 @inline
@@ -306,7 +327,9 @@ def uncomposite_rgb_ray_colours(state, S, base, at, sums, a, b, rank):  # type: 
         h2 = weight * g2 if c2 >= f(0) else f(0)
         S[index(at + k + _RGB_GRADIENT)] = h0 if inside else S[index(at + k + _RGB_GRADIENT)]
         S[index(at + k + _RGB_GRADIENT + L.LANES)] = h1 if inside else S[index(at + k + _RGB_GRADIENT + L.LANES)]
-        S[index(at + k + _RGB_GRADIENT + 2 * L.LANES)] = h2 if inside else S[index(at + k + _RGB_GRADIENT + 2 * L.LANES)]
+        S[index(at + k + _RGB_GRADIENT + 2 * L.LANES)] = (
+            h2 if inside else S[index(at + k + _RGB_GRADIENT + 2 * L.LANES)]
+        )
 
 
 @inline

@@ -29,7 +29,8 @@ _MARGIN, _ROUNDING = f(2e-3), f(4e-7)  # pixels, and per pixel of the ellipse; a
 
 @inline
 def aligned(floats):  # type: ignore[no-untyped-def]
-    """Zeros that begin a cache line: numba aligns to 32 bytes, and a vector of 64 that lies across two lines costs twice."""
+    """Zeros that begin a cache line: numba aligns to 32 bytes, and a vector of 64 that lies across two lines costs
+    twice."""
     room = np.zeros(floats + 16, np.float32)
     shift = -(np.int64(room.ctypes.data) // 4) % 16
     return room[shift : shift + floats]
@@ -40,7 +41,9 @@ def _prefetch(context, address):  # type: ignore[no-untyped-def]
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
-        function = builder.module.declare_intrinsic("llvm.prefetch", (byte,), ir.FunctionType(ir.VoidType(), [byte, i32, i32, i32]))
+        function = builder.module.declare_intrinsic(
+            "llvm.prefetch", (byte,), ir.FunctionType(ir.VoidType(), [byte, i32, i32, i32])
+        )
         builder.call(function, [builder.inttoptr(arguments[0], byte), i32(0), i32(3), i32(1)])  # to read, to stay, data
         return context.get_dummy_value()
 
@@ -52,7 +55,8 @@ _ask: Any = intrinsic(_prefetch)
 
 @inline
 def fetch_ahead(i, rows, spans, boxes):  # type: ignore[no-untyped-def]
-    """Ask memory for what the pair after this one, of primitive ``i``, reads first: tiles meet primitives in no order that it could guess."""
+    """Ask memory for what the pair after this one, of primitive ``i``, reads first: tiles meet primitives in no order
+    that it could guess."""
     row = rows.ctypes.data + i * rows.strides[0]
     for at in range(0, rows.strides[0], 64):
         _ask(row + at)
@@ -69,7 +73,8 @@ def lanes_ahead(depths, first, stop):  # type: ignore[no-untyped-def]
 
 @inline
 def row_spans(span, fx0, fy0, y0, y1, x0, x1, rows_live, bounds):  # type: ignore[no-untyped-def]
-    """Pixels [bounds[y], bounds[y + 16]) of each live tile row inside the silhouette, equal in the others and outside rows y0:y1.
+    """Pixels [bounds[y], bounds[y + 16]) of each live tile row inside the silhouette, equal in the others and outside
+    rows y0:y1.
 
     fx0, fy0: the tile corner's pixel centre from the anchor. All 16 rows at once: one vector.
     """
@@ -95,8 +100,8 @@ def row_spans(span, fx0, fy0, y0, y1, x0, x1, rows_live, bounds):  # type: ignor
 def compact(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
     """Gather pixels and their ray norms into lanes; ``offset[y]`` is where row y starts. Returns the lane count.
 
-    Every row copies a whole vector, without a branch that would be guessed wrong every other time; the next row, or the final padding,
-    overwrites what stands over, so tail lanes always hold numbers of pixels of the tile.
+    Every row copies a whole vector, without a branch that would be guessed wrong every other time; the next row, or the
+    final padding, overwrites what stands over, so tail lanes always hold numbers of pixels of the tile.
     """
     n = 0
     for y in range(y0, y1):

@@ -1,4 +1,5 @@
-"""Trigonometry: cos and sinc of a phase in turns, and the exponential, as polynomials (coefficients: benchmarks/fit_polynomials.py).
+"""Trigonometry: cos and sinc of a phase in turns, and the exponential, as polynomials (coefficients:
+benchmarks/fit_polynomials.py).
 
 With W1 and b1 divided by 2 pi beforehand, reducing a phase to |r| <= 1/2 turn is ``r = u - rint(u)``, which is exact.
 float32 Horner errors: cos 4.3e-7, sinc 2.6e-7, dsinc/dz 9.3e-7; up to 1.5 turns sinc 4.4e-7, dsinc/dv 1.9e-6.
@@ -31,13 +32,37 @@ TAU = f(2 * np.pi)
 
 _C = tuple(
     f(c)
-    for c in (1.0, -19.73920440673828, 64.93911743164062, -85.45016479492188, 60.16783142089844, -25.968313217163086, 6.529610633850098)
+    for c in (
+        1.0,
+        -19.73920440673828,
+        64.93911743164062,
+        -85.45016479492188,
+        60.16783142089844,
+        -25.968313217163086,
+        6.529610633850098,
+    )
 )
 _S = tuple(
-    f(c) for c in (0.9999999403953552, -6.579718589782715, 12.987038612365723, -12.193624496459961, 6.580165386199951, -1.9852460622787476)
+    f(c)
+    for c in (
+        0.9999999403953552,
+        -6.579718589782715,
+        12.987038612365723,
+        -12.193624496459961,
+        6.580165386199951,
+        -1.9852460622787476,
+    )
 )
 _D = tuple(
-    f(c) for c in (-6.579736232757568, 25.975732803344727, -36.623226165771484, 26.756011962890625, -11.860190391540527, 3.093101978302002)
+    f(c)
+    for c in (
+        -6.579736232757568,
+        25.975732803344727,
+        -36.623226165771484,
+        26.756011962890625,
+        -11.860190391540527,
+        3.093101978302002,
+    )
 )
 _M = tuple(
     f(c)
@@ -125,7 +150,8 @@ def slopes_medium(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def reduced(v, w):  # type: ignore[no-untyped-def]
-    """v and w reduced to half a turn, whether they were within, and their reciprocals (1 where within) from one division."""
+    """v and w reduced to half a turn, whether they were within, and their reciprocals (1 where within) from one
+    division."""
     k, j = np.rint(v), np.rint(w)
     a, b = k == f(0), j == f(0)
     sv, sw = f(1) if a else v, f(1) if b else w

@@ -1,4 +1,5 @@
-"""The CUDA backend as one differentiable operation: lowered tensors in, image out, all on the tensors' device and the caller's stream."""
+"""The CUDA backend as one differentiable operation: lowered tensors in, image out, all on the tensors' device and the
+caller's stream."""
 
 from __future__ import annotations
 
@@ -48,7 +49,9 @@ def _blame(tensors: dict[str, Tensor], row: int) -> NonFiniteError:
     if not bool(tensors["quats"][row].any()):
         return NonFiniteError(f"quats of primitive {row} is zero; expected a non-zero quaternion")
     scale = tensors["log_scales"][row].tolist()
-    return NonFiniteError(f"log_scales of primitive {row} is {scale}: the semi-axes or weights leave the range of float32")
+    return NonFiniteError(
+        f"log_scales of primitive {row} is {scale}: the semi-axes or weights leave the range of float32"
+    )
 
 
 class _Rasterize(torch.autograd.Function):
@@ -85,7 +88,15 @@ class _Rasterize(torch.autograd.Function):
         drawn = forward(frame, form, net, behind, settings, differentiable)
         h, w = camera.height, camera.width
         stats.extra["hits"] = drawn.hits.shape[0]
-        ctx.frame, ctx.form, ctx.net, ctx.drawn, ctx.settings, ctx.stats, ctx.background = frame, form, net, drawn, settings, stats, behind
+        ctx.frame, ctx.form, ctx.net, ctx.drawn, ctx.settings, ctx.stats, ctx.background = (
+            frame,
+            form,
+            net,
+            drawn,
+            settings,
+            stats,
+            behind,
+        )
         ctx.net_dtypes = [x.dtype for x in network]
         ctx.dtypes = [x.dtype for x in (means, log_scales, quats, W1, b1, w2, b2, colors)]
         ctx.view_dtype, ctx.view_device, ctx.background_dtype, ctx.background_device = (
@@ -100,16 +111,26 @@ class _Rasterize(torch.autograd.Function):
         frame, form, settings, stats = ctx.frame, ctx.form, ctx.settings, ctx.stats
         drawn: Composited | None = ctx.drawn
         if drawn is None:
-            raise RuntimeError("the cuda backend's backward pass uses up what the forward pass kept: it runs once per frame")
+            raise RuntimeError(
+                "the cuda backend's backward pass uses up what the forward pass kept: it runs once per frame"
+            )
         ctx.drawn = None
         device, pixels = frame.device, drawn.transmittance.shape[0]
-        rgb = torch.zeros(pixels, form.channels, device=device) if g_rgb is None else g_rgb.reshape(pixels, -1).float().contiguous()
+        rgb = (
+            torch.zeros(pixels, form.channels, device=device)
+            if g_rgb is None
+            else g_rgb.reshape(pixels, -1).float().contiguous()
+        )
         T = rgb @ ctx.background
         if g_T is not None:
             T = T + g_T.reshape(-1).float()
         z = g_z.reshape(-1).float().contiguous() if settings.depth and g_z is not None else None
         watched = stats.watched
-        error = torch.zeros(pixels, device=device) if watched is None else watched.error.to(device, torch.float32).reshape(-1).contiguous()
+        error = (
+            torch.zeros(pixels, device=device)
+            if watched is None
+            else watched.error.to(device, torch.float32).reshape(-1).contiguous()
+        )
         net: Net | None = ctx.net
         grads, net_grads = backward(frame, form, net, drawn, settings, rgb, T.contiguous(), z, error)
         base = L.G_NEURONS + L.PER_NEURON * form.neurons
@@ -140,30 +161,46 @@ class _Rasterize(torch.autograd.Function):
 
 
 def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
-    """Render a :class:`Cosine` density with :class:`Constant` or :class:`RayNet` colours; see ``neuprim.core.render.render``."""
+    """Render a :class:`Cosine` density with :class:`Constant` or :class:`RayNet` colours; see
+    ``neuprim.core.render.render``."""
     density, colour = lowered.density, lowered.colour
-    assert isinstance(density, Cosine) and isinstance(colour, Constant | RayNet), "the caller chooses a backend that knows the forms"
+    assert isinstance(density, Cosine) and isinstance(colour, Constant | RayNet), (
+        "the caller chooses a backend that knows the forms"
+    )
     g = lowered.geometry
     stats = RenderStats("cuda", g.count)
-    palette, net = (colour.base, (colour.Wx, colour.bias, colour.Wout)) if isinstance(colour, RayNet) else (colour.rgb, ())
+    palette, net = (
+        (colour.base, (colour.Wx, colour.bias, colour.Wout)) if isinstance(colour, RayNet) else (colour.rgb, ())
+    )
     if background is None:
         background = torch.zeros(palette.shape[1], device=g.means.device)
     tensors = (
         g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), palette, camera.viewmat, background,
     )  # fmt: skip
     differentiable = torch.is_grad_enabled() and any(x.requires_grad for x in (*tensors, *net))
-    rgb, T, zsum = _Rasterize.apply(*tensors, camera, density.omega0, density.edge, settings, stats, differentiable, *net)
+    rgb, T, zsum = _Rasterize.apply(
+        *tensors, camera, density.omega0, density.edge, settings, stats, differentiable, *net
+    )
     dtype = g.means.dtype
     alpha = 1 - T
     depth = mean_depth(zsum, alpha).to(dtype) if settings.depth else None
     return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)
 
 
-def render_parts(lowered: Lowered, parts: Tensor, count: int, camera: Camera, settings: RenderSettings) -> tuple[Tensor, Tensor]:
-    """Opacity and depth of parts of the primitives, each as if it were alone, in one frame; see :func:`neuprim.core.render.parts.render_parts`."""
+def render_parts(
+    lowered: Lowered, parts: Tensor, count: int, camera: Camera, settings: RenderSettings
+) -> tuple[Tensor, Tensor]:
+    """Opacity and depth of parts of the primitives, each as if it were alone, in one frame; see
+    :func:`neuprim.core.render.parts.render_parts`."""
     g, density = lowered.geometry, lowered.density
     assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
-    tensors = dict(zip(NAMES, (g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1)), strict=True))
+    tensors = dict(
+        zip(
+            NAMES,
+            (g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1)),
+            strict=True,
+        )
+    )
     tensors = {name: value.detach() for name, value in tensors.items()}
     blank = torch.zeros(g.count, 1, device=g.means.device)
     form, turns = Form(density.W1.shape[1], density.edge, 1, -1), density.omega0 / (2 * math.pi)
@@ -171,7 +208,16 @@ def render_parts(lowered: Lowered, parts: Tensor, count: int, camera: Camera, se
     try:
         images = (parts.int().contiguous(), count)
         frame = prepared(
-            tensors, blank, camera, camera.viewmat, own.near_plane, turns, density.edge, depth_that_counts(own.alpha_min), None, images
+            tensors,
+            blank,
+            camera,
+            camera.viewmat,
+            own.near_plane,
+            turns,
+            density.edge,
+            depth_that_counts(own.alpha_min),
+            None,
+            images,
         )
     except NotFinite as error:
         raise _blame(tensors, error.row) from None

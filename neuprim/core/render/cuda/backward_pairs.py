@@ -1,10 +1,13 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Backward, second pass: a warp a (tile, primitive) pair over its hits: chord and neurons again, sums in registers, one row for the pair.
+"""Backward, second pass: a warp a (tile, primitive) pair over its hits: chord and neurons again, sums in registers, one
+row for the pair.
 
-The rows of a primitive are then added in the order of its pairs: no sum depends on which block came first, and reruns are the same bits.
+The rows of a primitive are then added in the order of its pairs: no sum depends on which block came first, and reruns
+are the same bits.
 
-With 8 neurons the sums alone are 59 registers of a lane's 128. So over the neurons nothing is kept that a few operations give again: of the
-chord its middle, depth and closest point; of the tile both corners but in one number; of the pair its spans, which are in shared memory.
+With 8 neurons the sums alone are 59 registers of a lane's 128. So over the neurons nothing is kept that a few
+operations give again: of the chord its middle, depth and closest point; of the tile both corners but in one number; of
+the pair its spans, which are in shared memory.
 """
 
 from __future__ import annotations
@@ -26,7 +29,8 @@ __all__ = ["pairs_kernel", "pixel_of_slot", "sum_pairs"]
 
 @wp.func
 def pixel_of_slot(spans: Any, n: int, s: int):
-    """(x, y) in the tile of pixel ``s`` of pair ``n``, a row of ``spans``: the last row of pixels that starts at or before it."""
+    """(x, y) in the tile of pixel ``s`` of pair ``n``, a row of ``spans``: the last row of pixels that starts at or
+    before it."""
     y = int(0)
     for b in range(4):
         if int(spans[n, y + (8 >> b)]) >> 8 <= s:
@@ -48,7 +52,8 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
     mean = float(NORMS[P])
     by_rate = -TAU * TAU / (2.0 * P + 3.0)  # B' = -z B_(p+1)/(2p + 3), and z = 2 pi v
 
-    # 128 registers: 16 warps a multiprocessor instead of 12. With 5 to 8 neurons; fewer need no cap, and with more they would spill
+    # 128 registers: 16 warps a multiprocessor instead of 12. With 5 to 8 neurons; fewer need no cap, and with more they
+    # would spill
     bounds = (L.WARP, 16) if 4 < K <= 8 else None
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False, launch_bounds=bounds)

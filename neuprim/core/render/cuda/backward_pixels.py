@@ -1,5 +1,6 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Backward, first pass: a thread a pixel walks its hits back to front and leaves dL/dI and the weight in each slot. No neurons, no sums."""
+"""Backward, first pass: a thread a pixel walks its hits back to front and leaves dL/dI and the weight in each slot. No
+neurons, no sums."""
 
 from __future__ import annotations
 
@@ -40,8 +41,8 @@ def pixels_kernel(form: Form, depth: bool) -> Any:
         hues: wp.array2d(dtype=wp.float32),
         hits: wp.array(dtype=wp.vec2),
     ):
-        """``g_transmittance`` already holds the background's share. With b what lies behind a hit, sum of w (dL/dw) and the rest of the light:
-        dL/dI = (1 - alpha) T dL/dw - b, and 0 where the opacity was clamped."""
+        """``g_transmittance`` already holds the background's share. With b what lies behind a hit, sum of w (dL/dw) and
+        the rest of the light: dL/dI = (1 - alpha) T dL/dw - b, and 0 where the opacity was clamped."""
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
         at = pixel(lane)

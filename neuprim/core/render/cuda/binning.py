@@ -1,8 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Tile lists on the device: which primitives reach which 16 x 16 tile, front to back; the twin of :mod:`neuprim.core.render.cpu.binning`.
+"""Tile lists on the device: which primitives reach which 16 x 16 tile, front to back; the twin of
+:mod:`neuprim.core.render.cpu.binning`.
 
-Everything is counted before it is written, and sorted by integers, so that a rerun gives the same bits. The host waits once, for how many
-pairs there are.
+Everything is counted before it is written, and sorted by integers, so that a rerun gives the same bits. The host waits
+once, for how many pairs there are.
 """
 
 import functools
@@ -70,12 +71,16 @@ def count(counts: Tensor, bad: Tensor) -> Counted:
     Raises:
         BackendUnavailable: too many pairs for int32.
     """
-    ends = torch.stack([torch.cumsum(row, 0, dtype=torch.int64) for row in counts])  # along one row torch's scan is ten times faster
+    ends = torch.stack(
+        [torch.cumsum(row, 0, dtype=torch.int64) for row in counts]
+    )  # along one row torch's scan is ten times faster
     if counts.shape[1] == 0:
         return Counted(0, 0, -1, ends)
     pairs, delicate, first_bad = torch.cat((ends[:, -1], bad.long())).tolist()
     if pairs >= _MOST:
-        raise BackendUnavailable(f"primitives reach {pairs} tiles in all; the cuda backend counts to {_MOST - 1}: render a smaller image")
+        raise BackendUnavailable(
+            f"primitives reach {pairs} tiles in all; the cuda backend counts to {_MOST - 1}: render a smaller image"
+        )
     return Counted(pairs, delicate, first_bad if first_bad < counts.shape[1] else -1, ends)
 
 
@@ -139,7 +144,8 @@ def bin_primitives(
     rows: Tensor, spans: Tensor, boxes: Tensor, depth: Tensor, counts: Tensor, counted: Counted, width: int, height: int,
     images: tuple[Tensor, int] | None = None,
 ) -> tuple[TileLists, Tensor, Tensor]:  # fmt: skip
-    """Tile lists of one frame, ``slots`` and ``which``; every argument as ``prepare`` and :func:`count` filled it, no primitive bad.
+    """Tile lists of one frame, ``slots`` and ``which``; every argument as ``prepare`` and :func:`count` filled it, no
+    primitive bad.
 
     ``images``: of each primitive, (N,) int32, and how many there are.
     """

@@ -1,9 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Compositing in the order in which each ray enters its chords (``sort = "entry"``), forward and backward.
 
-Every hit is listed first, with a key of pixel and entry (:mod:`~neuprim.core.render.cuda.forward`), the list is sorted, and a thread a pixel walks
-its part. Entries that agree in float32 keep the order of the centres, and so do all chords that the near plane cuts: slots lie in that order, and
-the sort is stable. Nothing can stop early before the list is complete, so hidden primitives cost. What follows, over pairs, is the same.
+Every hit is listed first, with a key of pixel and entry (:mod:`~neuprim.core.render.cuda.forward`), the list is sorted,
+and a thread a pixel walks its part. Entries that agree in float32 keep the order of the centres, and so do all chords
+that the near plane cuts: slots lie in that order, and the sort is stable. Nothing can stop early before the list is
+complete, so hidden primitives cost. What follows, over pairs, is the same.
 """
 
 import functools
@@ -31,7 +32,8 @@ def _begin(keys: wp.array(dtype=wp.int64), count: int, pixel: int):
 
 @functools.cache
 def composite_kernel(form: Form, depth: bool) -> Any:
-    """A thread a pixel, front to back; slots keep (alpha, transmittance before), alpha 0 behind the last that counts."""
+    """A thread a pixel, front to back; slots keep (alpha, transmittance before), alpha 0 behind the last that
+    counts."""
     C, H = form.channels, form.hidden
     colours = L.colours(form.neurons)
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
@@ -78,7 +80,8 @@ def composite_kernel(form: Form, depth: bool) -> Any:
 
 @functools.cache
 def uncomposite_kernel(form: Form, depth: bool) -> Any:
-    """Back to front: (alpha, T) of every hit becomes (dL/dI, weight), see :mod:`~neuprim.core.render.cuda.backward_pixels`."""
+    """Back to front: (alpha, T) of every hit becomes (dL/dI, weight), see
+    :mod:`~neuprim.core.render.cuda.backward_pixels`."""
     C, H = form.channels, form.hidden
     colours = L.colours(form.neurons)
 

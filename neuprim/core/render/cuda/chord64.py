@@ -1,9 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """One pixel's chord and the mean density along it in float64, for the few primitives that float32 cannot follow.
 
-Needles and discs near the camera, fast neurons, and every soft edge that the near plane may cut. The formulas are the CPU's
-(:mod:`neuprim.core.render.cpu.float64_edge`): (1 - |y|^2)^p is a polynomial q of u in [-1, 1], and the mean of q(u) cos(phase + z u) follows
-from moments C_n (even n) and S_n (odd n) of cos and sin, sums of spherical Bessel functions j_0 to j_5. A hard edge is q = 1.
+Needles and discs near the camera, fast neurons, and every soft edge that the near plane may cut. The formulas are the
+CPU's (:mod:`neuprim.core.render.cpu.float64_edge`): (1 - |y|^2)^p is a polynomial q of u in [-1, 1], and the mean of
+q(u) cos(phase + z u) follows from moments C_n (even n) and S_n (odd n) of cos and sin, sums of spherical Bessel
+functions j_0 to j_5. A hard edge is q = 1.
 """
 
 from __future__ import annotations
@@ -221,7 +222,8 @@ def through64(
     c: Chord64, tc: wp.float64, depth_floor: float, g_half: wp.float64, g_mid: wp.float64, g_tm: wp.float64, gD: wp.float64, gA: wp.float64,
     gq: wp.vec3d, gv: wp.vec3d,
 ):  # fmt: skip
-    """As :func:`~neuprim.core.render.cuda.chord.through`, with dh/dD from the floor on D; g_tm, gD, gA: on other ways than the chord's ends."""
+    """As :func:`~neuprim.core.render.cuda.chord.through`, with dh/dD from the floor on D; g_tm, gD, gA: on other ways
+    than the chord's ends."""
     half = wp.float64(0.5)
     two = wp.float64(2.0)
     gt1 = half * (g_mid + g_half)

@@ -1,5 +1,6 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Opacities in float64 of the primitives that float32 cannot follow, and where rays enter them, left in their pixels' slots beforehand."""
+"""Opacities in float64 of the primitives that float32 cannot follow, and where rays enter them, left in their pixels'
+slots beforehand."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """The backward pass over pairs for primitives in float64: :mod:`~neuprim.core.render.cuda.backward_pairs` for the few.
 
-A hard edge has the gradient of its ends. A soft one has none there, the density being zero, and its weight depends on D, on a = e.e and on the
-closest approach, where the near plane may cut the chord; see :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
+A hard edge has the gradient of its ends. A soft one has none there, the density being zero, and its weight depends on
+D, on a = e.e and on the closest approach, where the near plane may cut the chord; see
+:func:`neuprim.core.render.cpu.gradients.chord_gradient`.
 """
 
 from __future__ import annotations

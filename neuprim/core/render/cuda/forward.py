@@ -1,9 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Compositing, forward: a block a tile, a thread a pixel.
 
-Rows of primitives come to shared memory in batches; a tile ends when no pixel sees light through it any more. What the backward pass needs
-goes to the pixels' slots (:mod:`~neuprim.core.render.cuda.spans`): (alpha, transmittance before) of every hit. Pairs of primitives that float32
-cannot follow have their opacities there beforehand (:mod:`~neuprim.core.render.cuda.delicate`).
+Rows of primitives come to shared memory in batches; a tile ends when no pixel sees light through it any more. What the
+backward pass needs goes to the pixels' slots (:mod:`~neuprim.core.render.cuda.spans`): (alpha, transmittance before) of
+every hit. Pairs of primitives that float32 cannot follow have their opacities there beforehand
+(:mod:`~neuprim.core.render.cuda.delicate`).
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ BATCH = 16
 def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, several: bool = False) -> Any:
     """Of a form; ``keep``: fill the slots, and take delicate primitives from there; ``depth``: also the sum of w z.
 
-    ``listing``: composite nothing, but list every hit for :mod:`~neuprim.core.render.cuda.by_entry`, with its sorting key and its pair.
+    ``listing``: composite nothing, but list every hit for :mod:`~neuprim.core.render.cuda.by_entry`, with its sorting
+    key and its pair.
     ``several``: images of one size, one after the other.
     """
     assert (keep or not listing) and not (listing and several)
@@ -81,8 +83,8 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
         keys: wp.array(dtype=wp.int64),
         owners: wp.array(dtype=wp.int32),
     ):
-        """limits = (alpha_min, alpha_max, transmittance_min, -); ``net``, ``hues``: of colour networks; ``reached[tile]``: the pairs before it
-        were composited."""
+        """limits = (alpha_min, alpha_max, transmittance_min, -); ``net``, ``hues``: of colour networks;
+        ``reached[tile]``: the pairs before it were composited."""
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
         at = pixel(lane)

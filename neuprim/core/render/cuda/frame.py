@@ -20,7 +20,8 @@ from neuprim.core.render.cuda.prepare import prepare_kernel, wide_kernel
 __all__ = ["NAMES", "Frame", "NotFinite", "Projection", "as_arrays", "prepared"]
 
 NAMES = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
-"""Parameters of the per-primitive stage, in the order in which its kernels and :mod:`prepare_backward` take and return them."""
+"""Parameters of the per-primitive stage, in the order in which its kernels and :mod:`prepare_backward` take and return
+them."""
 
 
 class NotFinite(ValueError):
@@ -64,8 +65,8 @@ class Frame:
         neurons: K.
         channels: C of the palette.
         rows: (N, columns(K, C), 4) float32.
-        wide: (M, wide_width(K)) float64, rows of the delicate primitives, columns of :mod:`neuprim.core.render.cpu.layout`.
-        slots: (N,) int32, row in ``wide``, or -1.
+        wide: (M, wide_width(K)) float64, rows of the delicate primitives, columns of
+        :mod:`neuprim.core.render.cpu.layout`. slots: (N,) int32, row in ``wide``, or -1.
         which: (M,) int32, primitive of each row of ``wide``, rising.
         spans: (N, 8) float32, silhouettes.
         boxes: (N, 4) int32, pixel boxes x0, y0, x1, y1.
@@ -130,7 +131,8 @@ def prepared(
     """Everything that the pixel kernels read of one view; the host waits for the device once.
 
     Args:
-        tensors: those of :data:`NAMES`, all on one device: means (N, 3), log_scales (N, 3), quats (N, 4), W1 (N, K, 3), b1 (N, K), w2 (N, K),
+        tensors: those of :data:`NAMES`, all on one device: means (N, 3), log_scales (N, 3), quats (N, 4), W1 (N, K, 3),
+        b1 (N, K), w2 (N, K),
             b2 (N,).
         palette: (N, C) colours.
         camera: focal lengths, centre and size in pixels.
@@ -149,7 +151,9 @@ def prepared(
     parameters = _alike([tensors[name] for name in NAMES])
     device, (N, K, _), C = parameters[0].device, parameters[3].shape, palette.shape[1]
     double = parameters[0].dtype == torch.float64
-    matrix = view.detach().to(device, torch.float64, non_blocking=device.type == "cuda").reshape(16).contiguous()  # a plain copy would wait
+    matrix = (
+        view.detach().to(device, torch.float64, non_blocking=device.type == "cuda").reshape(16).contiguous()
+    )  # a plain copy would wait
     projection = Projection(matrix, camera, near, turns, edge)
 
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -171,7 +175,9 @@ def prepared(
     counted = count(counts, bad)
     if counted.bad >= 0:
         raise NotFinite(counted.bad)
-    lists, slots, which = bin_primitives(rows, spans, boxes, depth, counts, counted, camera.width, camera.height, images)
+    lists, slots, which = bin_primitives(
+        rows, spans, boxes, depth, counts, counted, camera.width, camera.height, images
+    )
     wide = empty(counted.delicate, L.wide_width(K), dtype=torch.float64)
     launch(
         wide_kernel(double), counted.delicate,

@@ -1,7 +1,8 @@
 """Names for the columns of the kernels' arrays on the device.
 
-A primitive's row is a whole number of float4, so that one load of 16 bytes brings a vector and a scalar. The numbers are those of
-:mod:`neuprim.core.render.cpu.layout`, which says what they mean; only their places differ. Gradient rows are the CPU's, column for column.
+A primitive's row is a whole number of float4, so that one load of 16 bytes brings a vector and a scalar. The numbers
+are those of :mod:`neuprim.core.render.cpu.layout`, which says what they mean; only their places differ. Gradient rows
+are the CPU's, column for column.
 """
 
 from __future__ import annotations
@@ -25,11 +26,12 @@ __all__ = [
 ]  # fmt: skip
 
 E0, EX, EY, XA, XU, XV, REST, NEURONS = 0, 1, 2, 3, 4, 5, 6, 7
-"""float4 columns: a vector each, and beside it a scalar, see :data:`SCALARS`; REST holds four scalars, then come the neurons."""
+"""float4 columns: a vector each, and beside it a scalar, see :data:`SCALARS`; REST holds four scalars, then come the
+neurons."""
 
 SCALARS = {E0: "UX", EX: "UY", EY: "NEAR", XA: "OFFSET", XU: "TU", XV: "TV"}
-"""The fourth number of each column. Those of REST are TC, UNIT, ANCHOR_Z and whether float32 is too coarse (0 or 1); of a neuron
-(WX, WY, WZ, PHASE)."""
+"""The fourth number of each column. Those of REST are TC, UNIT, ANCHOR_Z and whether float32 is too coarse (0 or 1); of
+a neuron (WX, WY, WZ, PHASE)."""
 
 AMPLITUDE = 4
 """Place of the amplitude among the five numbers of a neuron in a gradient row."""

@@ -1,8 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Numbers of arrays in one instruction each, for the loops over hits.
 
-An index of Warp's may be negative and its strides are read from the launch, in 64 bits: nine instructions for a row's span, of which two are
-needed. Here indices are whole numbers from zero, and arrays are contiguous, as :func:`neuprim.core.compute.warp.array` asserts.
+An index of Warp's may be negative and its strides are read from the launch, in 64 bits: nine instructions for a row's
+span, of which two are needed. Here indices are whole numbers from zero, and arrays are contiguous, as
+:func:`neuprim.core.compute.warp.array` asserts.
 """
 
 # annotations are values here: Warp reads them

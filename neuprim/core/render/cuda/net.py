@@ -1,8 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Colour networks per primitive (:class:`~neuprim.core.model.forms.RayNet`), in float64: the twin of :mod:`neuprim.core.render.cpu.colour_net`.
+"""Colour networks per primitive (:class:`~neuprim.core.model.forms.RayNet`), in float64: the twin of
+:mod:`neuprim.core.render.cpu.colour_net`.
 
-The network sees the chord's middle, which the density's pixel stage has anyway in whitened space: its first layer goes there, in turns, once per
-primitive, as the density's neurons do, and nothing here depends on the camera.
+The network sees the chord's middle, which the density's pixel stage has anyway in whitened space: its first layer goes
+there, in turns, once per primitive, as the density's neurons do, and nothing here depends on the camera.
 """
 
 import functools
@@ -97,7 +98,8 @@ def _kernels(double: bool) -> tuple[Any, Any, Any]:
         g_log_scales: wp.array(dtype=wp.vec3), g_quats: wp.array(dtype=wp.vec4), g_Wx: wp.array2d(dtype=wp.vec3),
         g_bias: wp.array2d(dtype=wp.float32), g_Wout: wp.array3d(dtype=wp.float32),
     ):  # fmt: skip
-        """Thread i. ``weights``: rows whose column G_WEIGHT says whether the primitive was seen. Adds to ``g_log_scales`` and ``g_quats``."""
+        """Thread i. ``weights``: rows whose column G_WEIGHT says whether the primitive was seen. Adds to
+        ``g_log_scales`` and ``g_quats``."""
         i = wp.tid()
         seen = weights[i, wp.static(L.G_WEIGHT)] > f(0.0)
         logs, quat = wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
@@ -175,12 +177,20 @@ def wide_net(net: Net, which: Tensor, log_scales: Tensor, quats: Tensor) -> None
 
 
 def net_backward(
-    net: Net, log_scales: Tensor, quats: Tensor, weights: Tensor, grads: Tensor, first: int, g_log_scales: Tensor, g_quats: Tensor
+    net: Net,
+    log_scales: Tensor,
+    quats: Tensor,
+    weights: Tensor,
+    grads: Tensor,
+    first: int,
+    g_log_scales: Tensor,
+    g_quats: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradients of Wx, bias and Wout in float32; adds to those of log_scales and quats.
 
     Args:
-        weights: (N, .) gradient rows of the density's pass; grads: (N, .) those of the networks' pass, units from column ``first``.
+        weights: (N, .) gradient rows of the density's pass; grads: (N, .) those of the networks' pass, units from
+        column ``first``.
     """
     double = net.Wx.dtype == torch.float64
     _, vec3, vec4 = _types(double)

@@ -34,12 +34,14 @@ class Composited:
 
     Attributes:
         rgb: (H W, C); transmittance: (H W,); zsum: (H W,) sum of w z, one number device no depth is wanted.
-        spans: (pairs, 16) int16, offsets: (pairs + 1,) int32: the pixels that each pair covers (:mod:`~neuprim.core.render.cuda.spans`).
-        hits: (slots, 2) opacity and transmittance before it, if they were kept; depths: (slots,) camera-z, if wanted, too;
+        spans: (pairs, 16) int16, offsets: (pairs + 1,) int32: the pixels that each pair covers
+        (:mod:`~neuprim.core.render.cuda.spans`). hits: (slots, 2) opacity and transmittance before it, if they were
+        kept; depths: (slots,) camera-z, if wanted, too;
             hues: (slots, C) colours before max(0, .), of colour networks.
         reached: (tiles,) int32, the pairs before it were composited.
         delicate: (D,) int32, the pairs that are drawn in float64, rising.
-        order: (slots,) int64 slots by pixel and entry, begins: (H W + 1,) int32 and owners: (slots,) int32, the pair of each; where hits were
+        order: (slots,) int64 slots by pixel and entry, begins: (H W + 1,) int32 and owners: (slots,) int32, the pair of
+        each; where hits were
             sorted by entry.
     """
 
@@ -75,9 +77,16 @@ def _limits(s: RenderSettings) -> object:
 
 
 def forward(
-    frame: Frame, form: Form, net: Net | None, background: Tensor, settings: RenderSettings, differentiable: bool, images: int = 1
+    frame: Frame,
+    form: Form,
+    net: Net | None,
+    background: Tensor,
+    settings: RenderSettings,
+    differentiable: bool,
+    images: int = 1,
 ) -> Composited:
-    """Draw; of several ``images``, whose pixels come one after the other, without gradients and sorted by centres. The host waits for the device once device slots are kept, for how many there are.
+    """Draw; of several ``images``, whose pixels come one after the other, without gradients and sorted by centres. The
+    host waits for the device once device slots are kept, for how many there are.
 
     Raises:
         BackendUnavailable: the frame's hits are more than int32 counts.
@@ -177,7 +186,8 @@ def backward(
     """(N, gradient_width) gradient rows, and (N, net_width) of colour networks; the slots' contents are used up.
 
     Args:
-        g_rgb: (H W, C); g_T: (H W,), with the background's share; g_z: (H W,) or None; error: (H W,). float32, contiguous.
+        g_rgb: (H W, C); g_T: (H W,), with the background's share; g_z: (H W,) or None; error: (H W,). float32,
+        contiguous.
     """
     lists, device = frame.lists, frame.device
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1

@@ -1,7 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Where a primitive lies before the camera, in float64: what the per-primitive kernels and their backward pass share.
 
-The twin of ``_frame`` and of the geometry in ``_wide_row`` of :mod:`neuprim.core.render.cpu.prepare`, which say what the numbers are.
+The twin of ``_frame`` and of the geometry in ``_wide_row`` of :mod:`neuprim.core.render.cpu.prepare`, which say what
+the numbers are.
 """
 
 from neuprim.core.compute.warp import OPTIONS, wp
@@ -10,10 +11,12 @@ from neuprim.core.render.cpu.limits import ANCHOR_RADII
 __all__ = ["EXACT", "PER_BLOCK", "Placed", "Ray", "View", "place", "rounded", "view_of", "whiten"]
 
 EXACT = {**OPTIONS, "fuse_fp": False}
-"""Options of the per-primitive kernels: every product is rounded, so that two kernels that count the same tiles, and the CPU, agree."""
+"""Options of the per-primitive kernels: every product is rounded, so that two kernels that count the same tiles, and
+the CPU, agree."""
 
 PER_BLOCK = 64
-"""Primitives of a block: float64 takes 163 registers, and a few more small blocks lie on a processor than large ones."""
+"""Primitives of a block: float64 takes 163 registers, and a few more small blocks lie on a processor than large
+ones."""
 
 d = wp.float64
 _ANCHOR_RADII = wp.constant(d(ANCHOR_RADII))
@@ -32,7 +35,8 @@ class View:
 
 @wp.struct
 class Placed:
-    """Orientation in camera axes, rotation, axes s/m, centre in camera axes, anchor (depth, pixel x, pixel y), m and 1/|q|."""
+    """Orientation in camera axes, rotation, axes s/m, centre in camera axes, anchor (depth, pixel x, pixel y), m and
+    1/|q|."""
 
     B: wp.mat33d
     local: wp.mat33d
@@ -45,7 +49,8 @@ class Placed:
 
 @wp.struct
 class Ray:
-    """A = m S^-1 B^T, and rays in whitened space: x(t) = (xa + du xu + dv xv + s G) + t (e0 + G), G = du ex + dv ey, s = du tu + dv tv."""
+    """A = m S^-1 B^T, and rays in whitened space: x(t) = (xa + du xu + dv xv + s G) + t (e0 + G), G = du ex + dv ey, s
+    = du tu + dv tv."""
 
     A: wp.mat33d
     ref: wp.vec3d
@@ -80,7 +85,8 @@ def view_of(matrix: wp.array(dtype=wp.float64), intrinsics: wp.vec4d, near: wp.f
 
 @wp.func
 def place(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
-    """The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number."""
+    """The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same
+    number."""
     one, two = d(1.0), d(2.0)
     p = Placed()
     n = one / wp.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
@@ -98,10 +104,14 @@ def place(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
     c = v.R * mean + v.t
     p.centre = c
     p.B = v.R * p.local
-    p.anchor = wp.vec3d(d(0.0), rounded(v.centre[0]), rounded(v.centre[1]))  # near or behind the camera, or nothing is seen of it
+    p.anchor = wp.vec3d(
+        d(0.0), rounded(v.centre[0]), rounded(v.centre[1])
+    )  # near or behind the camera, or nothing is seen of it
     if c[2] > _ANCHOR_RADII * m and c[2] + m > v.near:
         p.anchor = wp.vec3d(
-            m * rounded(c[2] / m), rounded(v.focal[0] * c[0] / c[2] + v.centre[0]), rounded(v.focal[1] * c[1] / c[2] + v.centre[1])
+            m * rounded(c[2] / m),
+            rounded(v.focal[0] * c[0] / c[2] + v.centre[0]),
+            rounded(v.focal[1] * c[1] / c[2] + v.centre[1]),
         )
     return p
 

@@ -1,7 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The per-primitive stage on the device, one thread a primitive, float64 inside: the twin of :mod:`neuprim.core.render.cpu.prepare`.
+"""The per-primitive stage on the device, one thread a primitive, float64 inside: the twin of
+:mod:`neuprim.core.render.cpu.prepare`.
 
-Three differences of form: rows are float4 with the colours in them, neurons stay in the model's order, and TU and TV are 0 where a caller's
+Three differences of form: rows are float4 with the colours in them, neurons stay in the model's order, and TU and TV
+are 0 where a caller's
 ``forced`` asks for float64, not only where this stage does. It also counts each primitive's tiles, see
 :mod:`neuprim.core.render.cuda.binning`.
 """
@@ -32,7 +34,11 @@ from neuprim.core.render.cuda.silhouette import ellipse, tile_range
 __all__ = ["prepare_kernel", "wide_kernel"]
 
 d, f = wp.float64, wp.float32
-_VISIBLE, _CULLED, _NON_FINITE = wp.constant(wp.uint8(VISIBLE)), wp.constant(wp.uint8(CULLED)), wp.constant(wp.uint8(NON_FINITE))
+_VISIBLE, _CULLED, _NON_FINITE = (
+    wp.constant(wp.uint8(VISIBLE)),
+    wp.constant(wp.uint8(CULLED)),
+    wp.constant(wp.uint8(NON_FINITE)),
+)
 _FLOAT32_MAX, _CUT = wp.constant(d(FLOAT32_MAX)), wp.constant(d(CUT))
 _RADII, _TURNS = wp.constant(d(FLOAT64_RADII)), wp.constant(d(FLOAT64_TURNS))
 _ANCHOR, _PIXELS = wp.constant(d(FLOAT64_ANCHOR**2)), wp.constant(d(FLOAT64_PIXELS))
@@ -73,17 +79,21 @@ def _spread(p: Placed, i: int, j: int):
 
 @wp.func
 def _extent(p: Placed, v: View, axis: int, s22: wp.float64, square: wp.float64):
-    """Where the silhouette of the ellipsoid that is ``square`` ** 0.5 times as large begins and ends on the screen along one axis, in pixels."""
+    """Where the silhouette of the ellipsoid that is ``square`` ** 0.5 times as large begins and ends on the screen
+    along one axis, in pixels."""
     z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
     sii, siz = square * _spread(p, axis, axis), square * _spread(p, axis, 2)
     D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
     root, mid, den = wp.sqrt(wp.max(D, d(0.0))), ci * z - siz, z * z - szz
-    return wp.vec2d(v.focal[axis] * (mid - root) / den + v.centre[axis], v.focal[axis] * (mid + root) / den + v.centre[axis])
+    return wp.vec2d(
+        v.focal[axis] * (mid - root) / den + v.centre[axis], v.focal[axis] * (mid + root) / den + v.centre[axis]
+    )
 
 
 @wp.struct
 class Outline:
-    """A silhouette's row spans, see :mod:`neuprim.core.render.cpu.layout`; whether it is an ellipse, and float32 too coarse for it."""
+    """A silhouette's row spans, see :mod:`neuprim.core.render.cpu.layout`; whether it is an ellipse, and float32 too
+    coarse for it."""
 
     skew: wp.float64
     xc: wp.float64
@@ -95,7 +105,8 @@ class Outline:
 
 @wp.func
 def _outline(p: Placed, r: Ray, width: int, height: int, square: wp.float64):
-    """|r e|^2 - |x x e|^2 > 0, r^2 = ``square``, is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width from (HX, HY)."""
+    """|r e|^2 - |x x e|^2 > 0, r^2 = ``square``, is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half
+    width from (HX, HY)."""
     o = Outline()
     o.hx = _UNBOUNDED
     o.hy = _UNBOUNDED
@@ -120,7 +131,8 @@ def _outline(p: Placed, r: Ray, width: int, height: int, square: wp.float64):
             tall = wp.min(wp.abs(yc) + o.hy, wp.max(wp.abs(half - uy), wp.abs(d(height) - half - uy)))
             broad = wp.abs(o.xc) + wp.abs(o.skew) * (wp.abs(yc) + o.hy) + o.hx
             broad = wp.min(broad, wp.max(wp.abs(half - ux), wp.abs(d(width) - half - ux)))
-            # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle each is many radii
+            # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle
+            # each is many radii
             # of its thin axis, and they cancel
             slide = wp.abs(r.tu) * broad + wp.abs(r.tv) * tall
             if slide * (wp.sqrt(wp.dot(r.ex, r.ex)) * broad + wp.sqrt(wp.dot(r.ey, r.ey)) * tall) > _RADII:
@@ -141,11 +153,13 @@ def _wave(w: wp.vec3d, p: Placed, turns: wp.float64):
 
 @functools.cache
 def prepare_kernel(double: bool) -> Any:
-    """Fills rows, spans, boxes, depth, status and counts of every primitive from float32 or float64 parameters; dim (N,).
+    """Fills rows, spans, boxes, depth, status and counts of every primitive from float32 or float64 parameters; dim
+    (N,).
 
-    ``counts`` (2, N): tiles reached, and 1 where float32 is too coarse and something is seen. ``bad`` (1,): the first primitive that is not
-    finite, its colours included; otherwise left as it is. ``least``: the optical depth below which nothing is drawn; of a primitive that reaches
-    it nowhere nothing is filled but its status, counts, an empty box and a depth of 0.
+    ``counts`` (2, N): tiles reached, and 1 where float32 is too coarse and something is seen. ``bad`` (1,): the first
+    primitive that is not finite, its colours included; otherwise left as it is. ``least``: the optical depth below
+    which nothing is drawn; of a primitive that reaches it nowhere nothing is filled but its status, counts, an empty
+    box and a depth of 0.
     """
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
@@ -185,7 +199,9 @@ def prepare_kernel(double: bool) -> Any:
         r = whiten(p, v)
         m, z, ux, uy = p.m, p.centre[2], p.anchor[1], p.anchor[2]
         offset = d(b2[i])
-        biggest = wp.max(wp.max(_largest(r.xa), _largest(r.e0)), wp.max(wp.max(r.tc, wp.abs(r.near)), wp.max(m, wp.abs(offset))))
+        biggest = wp.max(
+            wp.max(_largest(r.xa), _largest(r.e0)), wp.max(wp.max(r.tc, wp.abs(r.near)), wp.max(m, wp.abs(offset)))
+        )
         total = r.tc + r.near + m + offset
         for a in range(3):
             total += r.e0[a] + r.ex[a] + r.ey[a] + r.xa[a]
@@ -218,7 +234,12 @@ def prepare_kernel(double: bool) -> Any:
         if r.tc == d(0.0):
             ratio = _RATIO_NEAR
         # a centre far from the anchor, in the thinnest axis, among them
-        if fastest > _TURNS or wp.max(wp.abs(ux), wp.abs(uy)) > _PIXELS or wp.dot(r.xa, r.xa) > _ANCHOR or thinnest * ratio < d(1.0):
+        if (
+            fastest > _TURNS
+            or wp.max(wp.abs(ux), wp.abs(uy)) > _PIXELS
+            or wp.dot(r.xa, r.xa) > _ANCHOR
+            or thinnest * ratio < d(1.0)
+        ):
             delicate = 1
         if forced:
             if forced[i]:
@@ -233,7 +254,9 @@ def prepare_kernel(double: bool) -> Any:
         if not wp.isfinite(total):
             state = int(_NON_FINITE)
         elif z + reach > near:
-            if biggest > _FLOAT32_MAX:  # so small against its distance that no pixel centre can hit it, or a scale or weight beyond float32
+            if (
+                biggest > _FLOAT32_MAX
+            ):  # so small against its distance that no pixel centre can hit it, or a scale or weight beyond float32
                 if m > d(1.0):
                     state = int(_NON_FINITE)
             else:

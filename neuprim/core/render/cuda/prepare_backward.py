@@ -1,5 +1,6 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The chain rule from gradient rows to parameters, one thread a primitive, float64 inside: the twin of the CPU's ``prepare_backward``."""
+"""The chain rule from gradient rows to parameters, one thread a primitive, float64 inside: the twin of the CPU's
+``prepare_backward``."""
 
 import functools
 from typing import Any
@@ -31,9 +32,15 @@ def quaternion_gradient(q: wp.vec4d, n: wp.float64, g: wp.mat33d):
     two = d(2.0)
     w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
     gw = two * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
-    gx = two * (w * (g[2, 1] - g[1, 2]) + y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) - two * x * (g[1, 1] + g[2, 2]))
-    gy = two * (w * (g[0, 2] - g[2, 0]) + x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) - two * y * (g[0, 0] + g[2, 2]))
-    gz = two * (w * (g[1, 0] - g[0, 1]) + x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) - two * z * (g[0, 0] + g[1, 1]))
+    gx = two * (
+        w * (g[2, 1] - g[1, 2]) + y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) - two * x * (g[1, 1] + g[2, 2])
+    )
+    gy = two * (
+        w * (g[0, 2] - g[2, 0]) + x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) - two * y * (g[0, 0] + g[2, 2])
+    )
+    gz = two * (
+        w * (g[1, 0] - g[0, 1]) + x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) - two * z * (g[0, 0] + g[1, 1])
+    )
     along = gw * w + gx * x + gy * y + gz * z
     return wp.vec4d((gw - along * w) * n, (gx - along * x) * n, (gy - along * y) * n, (gz - along * z) * n)
 

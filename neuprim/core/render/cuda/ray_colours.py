@@ -1,8 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Colour networks at pixels: the backward pass over pairs of what they add, and both passes in float64 for delicate primitives.
+"""Colour networks at pixels: the backward pass over pairs of what they add, and both passes in float64 for delicate
+primitives.
 
-A slot's hue is the colour before max(0, .), which the forward pass leaves there. A network's share of the gradient of a ray comes through the
-chord's middle alone; it is linear, so that it is added to the density's row by row.
+A slot's hue is the colour before max(0, .), which the forward pass leaves there. A network's share of the gradient of a
+ray comes through the chord's middle alone; it is linear, so that it is added to the density's row by row.
 """
 
 import functools
@@ -21,7 +22,8 @@ from neuprim.core.render.cuda.together import row_sums, row_type
 __all__ = ["FIRST_COLOUR", "delicate_hues_kernel", "delicate_net_kernel", "net_pairs_kernel", "net_width"]
 
 FIRST_COLOUR = L.G_NEURONS
-"""Column of a network's gradient row where the C bases begin, then (WX, WY, WZ, PHASE, C weights) of each unit; the ray's come first."""
+"""Column of a network's gradient row where the C bases begin, then (WX, WY, WZ, PHASE, C weights) of each unit; the
+ray's come first."""
 
 d = wp.float64
 _TWO_PI = wp.constant(wp.float64(TAU))
@@ -121,7 +123,8 @@ def delicate_hues_kernel(channels: int) -> Any:
         tiles: wp.array(dtype=wp.int32), spans: wp.array2d(dtype=wp.uint16), offsets: wp.array(dtype=wp.int32), size: wp.vec2i,
         hues: wp.array2d(dtype=wp.float32),
     ):  # fmt: skip
-        """``mixes``: the networks' float32 rows, for their output weights; ``rows``: the primitives', with the bases from column ``first``."""
+        """``mixes``: the networks' float32 rows, for their output weights; ``rows``: the primitives', with the bases
+        from column ``first``."""
         member, lane = wp.tid()
         n = pairs[member]
         i = ids[n]
@@ -198,7 +201,9 @@ def delicate_net_kernel(form: Form) -> Any:
                         total[to + 3] += float(gu)
                         gq += gu * axes
                     zero = d(0.0)
-                    moved = through64(c, wide[r, W.TC], depth_floor, zero, wp.dot(gq, c.e), zero, zero, zero, gq, wp.vec3d())
+                    moved = through64(
+                        c, wide[r, W.TC], depth_floor, zero, wp.dot(gq, c.e), zero, zero, zero, gq, wp.vec3d()
+                    )
                     for k in range(3):
                         total[k] += float(moved.e[k])
                         total[3 + k] += float(c.du * moved.G[k])

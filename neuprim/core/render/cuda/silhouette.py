@@ -1,5 +1,6 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Which tiles a primitive's silhouette reaches, row by row: exact for ellipses, up to a margin of 1e-3 pixels; the twin of ``_reached``."""
+"""Which tiles a primitive's silhouette reaches, row by row: exact for ellipses, up to a margin of 1e-3 pixels; the twin
+of ``_reached``."""
 
 from neuprim.core.compute.warp import wp
 from neuprim.core.render.cpu.layout import UNBOUNDED
@@ -43,7 +44,8 @@ def ellipse(span: wp.vec4, hy: wp.float32, ux: wp.float32, uy: wp.float32, box: 
 
 @wp.func
 def tile_range(e: Ellipse, ty: int):
-    """First tile and one past the last that the silhouette reaches in row ``ty`` of tiles; nothing, where they are equal."""
+    """First tile and one past the last that the silhouette reaches in row ``ty`` of tiles; nothing, where they are
+    equal."""
     lo, hi = e.box[0] // _TILE, (e.box[2] - 1) // _TILE + 1
     if e.bounded > 0:
         d0 = wp.max(d(wp.max(ty * _TILE, e.box[1])) + e.base, -e.hy)

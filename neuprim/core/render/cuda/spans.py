@@ -1,8 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Which pixels of a tile a primitive's silhouette covers: a span in each of its 16 rows.
 
-Each pixel inside has a slot of its own, in the order of pairs, rows and pixels, where the forward pass leaves what the backward pass needs: a
-fifth of the memory of whole tiles, and lists without gaps for the pass over pairs.
+Each pixel inside has a slot of its own, in the order of pairs, rows and pixels, where the forward pass leaves what the
+backward pass needs: a fifth of the memory of whole tiles, and lists without gaps for the pass over pairs.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """What the threads of a block do together, on the device and, in the same words, on Warp's CPU blocks.
 
-Every thread of the block has to call them. On the CPU a static buffer takes the place of the hardware: its threads take turns between two
+Every thread of the block has to call them. On the CPU a static buffer takes the place of the hardware: its threads take
+turns between two
 ``WP_TILE_SYNC``.
 """
 
@@ -38,10 +39,11 @@ def any_thread(yes: int) -> int:
 def _halving(width: int) -> str:
     """Every step keeps half of the values and adds those of a lane's partner: 31 shuffles per 32 values instead of 160.
 
-    A card tells a thread its lane again, so that no register has to keep it; positions are 64 bits, as rows of all pairs may be billions.
+    A card tells a thread its lane again, so that no register has to keep it; positions are 64 bits, as rows of all
+    pairs may be billions.
 
-    Lane l ends with values l m to l m + m - 1, m = width/32. Loops run over constants alone: over two counters they would not be unrolled,
-    and the values would go to memory.
+    Lane l ends with values l m to l m + m - 1, m = width/32. Loops run over constants alone: over two counters they
+    would not be unrolled, and the values would go to memory.
     """
     steps = ""
     for bit in (16, 8, 4, 2, 1):
@@ -83,8 +85,8 @@ def row_type(width: int) -> Any:
 
 @functools.cache
 def row_sums(width: int) -> Callable[..., Any]:
-    """A function (x, lane, out, pair) that writes the sums of ``width`` values over a warp's lanes, a block, to the row of a pair; a multiple
-    of 32.
+    """A function (x, lane, out, pair) that writes the sums of ``width`` values over a warp's lanes, a block, to the row
+    of a pair; a multiple of 32.
     """
     row = row_type(width)
 

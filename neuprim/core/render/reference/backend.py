@@ -26,7 +26,8 @@ _BLOCK = 32  # pixels on a side; bounds memory, changes nothing
 
 
 class _FlooredSqrt(torch.autograd.Function):
-    """sqrt(D) whose derivative uses max(D, floor): gradients grow as D^-1/2 at a silhouette, and float32 cannot follow."""
+    """sqrt(D) whose derivative uses max(D, floor): gradients grow as D^-1/2 at a silhouette, and float32 cannot
+    follow."""
 
     @staticmethod
     def forward(ctx: Any, D: Tensor, floor: float) -> Tensor:
@@ -67,7 +68,8 @@ class _Prepared:
         view = camera.viewmat.double()
         self.rotation = view[:3, :3]
         self.origin = -self.rotation.T @ view[:3, 3]
-        # one layout: the order of a product's sums, and the last bits of gradients, would follow that of its factors on some processors
+        # one layout: the order of a product's sums, and the last bits of gradients, would follow that of its factors on
+        # some processors
         means, log_scales, quats = (x.double().contiguous() for x in (g.means, g.log_scales, g.quats))
         first = log_scales.detach().argmax(dim=-1, keepdim=True)
         log_m = log_scales.gather(-1, first)
@@ -81,7 +83,8 @@ class _Prepared:
 
 
 def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
-    """Render a lowered model; see :func:`neuprim.core.render.render` for shapes. Computes in float64, returns the model's dtype."""
+    """Render a lowered model; see :func:`neuprim.core.render.render` for shapes. Computes in float64, returns the
+    model's dtype."""
     frame = _Prepared(lowered, camera)
     count = lowered.geometry.count
     seen = frame_rays(camera, lowered.geometry, frame.center, settings.near_plane)
@@ -98,7 +101,11 @@ def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, setti
             out = _trace(lowered, frame, rays, touched, pixels, channels, settings, stats)
             line.append(out.reshape(h, w, channels + 2))
         rows_of_blocks.append(torch.cat(line, 1))
-    image = torch.cat(rows_of_blocks, 0) if rows_of_blocks else torch.zeros(camera.height, camera.width, channels + 2, dtype=torch.float64)
+    image = (
+        torch.cat(rows_of_blocks, 0)
+        if rows_of_blocks
+        else torch.zeros(camera.height, camera.width, channels + 2, dtype=torch.float64)
+    )
     dtype = lowered.geometry.means.dtype
     rgb, transmittance, z = image[..., :channels], image[..., channels], image[..., channels + 1]
     if background is not None:
@@ -141,7 +148,9 @@ def _trace(
     a = (v * v).sum(-1)
     tm = -(p * v).sum(-1) / a
     x = p + tm[:, None] * v
-    floor = settings.depth_floor if lowered.density.edge == 0 else 0.0  # a soft edge has finite gradients at the silhouette by itself
+    floor = (
+        settings.depth_floor if lowered.density.edge == 0 else 0.0
+    )  # a soft edge has finite gradients at the silhouette by itself
     h = _FlooredSqrt.apply(1 - (x * x).sum(-1), floor) / a.sqrt()
     m = frame.m[prim]
     t_near = rays.near[j] / m
@@ -151,7 +160,9 @@ def _trace(
     xm = p + mid[:, None] * v  # whitened chord middle
 
     world_d = dj @ frame.rotation
-    local = (frame.local[prim] @ (frame.axes[prim] * xm)[:, :, None])[..., 0]  # (x - mu)/m of the chord middle, scene axes
+    local = (frame.local[prim] @ (frame.axes[prim] * xm)[:, :, None])[
+        ..., 0
+    ]  # (x - mu)/m of the chord middle, scene axes
     pairs = Pairs(prim, world_d, local, half, frame.origin, t0, t1, mid, m, xm, v)
     optical_depth = lowered.optical_depth(pairs)
 
@@ -162,7 +173,9 @@ def _trace(
 
     # Front to back: composite, then stop once T < T_min. Rows are already sorted by depth of the centre.
     dense = torch.zeros(len(rows), P, dtype=torch.float64).index_put((i, j), alpha)
-    if settings.sort == "entry":  # every ray by the depth of its entries; those that the near plane cuts are equal, and first
+    if (
+        settings.sort == "entry"
+    ):  # every ray by the depth of its entries; those that the near plane cuts are equal, and first
         with torch.no_grad():
             entry = torch.where(tm - h > t_near, (tm - h) * m * rays.depth[j], torch.zeros_like(h))
             keys = torch.full_like(dense, torch.inf).index_put((i, j), entry)
@@ -186,5 +199,9 @@ def _trace(
     else:
         c = lowered.seen(pairs)
         rgb = torch.zeros(P, channels, dtype=torch.float64).index_add(0, j, weights[i, j][:, None] * c)
-    z = torch.zeros(P, dtype=torch.float64).index_add(0, j, weights[i, j] * mid * m * rays.depth[j]) if settings.depth else T[-1] * 0
+    z = (
+        torch.zeros(P, dtype=torch.float64).index_add(0, j, weights[i, j] * mid * m * rays.depth[j])
+        if settings.depth
+        else T[-1] * 0
+    )
     return torch.cat([rgb, T[-1][:, None], z[:, None]], -1)

@@ -15,8 +15,10 @@ def screen_boxes(geometry: Geometry, camera: Camera, near: float) -> Tensor:
     """(N, 4) pixel-coordinate bounds (x0, y0, x1, y1) of each ellipsoid's projection, float64.
 
     For the plane through the camera spanned by an image axis i and the optical axis, the tangents to the ellipsoid are
-    x_i/z = (k +- sqrt(D))/(z^2 - S_zz) with k = c_i z - S_iz and D = z^2 S_ii - 2 c_i z S_iz + c_i^2 S_zz - (S_ii S_zz - S_iz^2),
-    S = B diag(s^2) B^T the ellipsoid's shape in camera axes and c its centre. D is written without the cancelling c_i^2 z^2.
+    x_i/z = (k +- sqrt(D))/(z^2 - S_zz) with k = c_i z - S_iz and D = z^2 S_ii - 2 c_i z S_iz + c_i^2 S_zz - (S_ii S_zz
+    - S_iz^2),
+    S = B diag(s^2) B^T the ellipsoid's shape in camera axes and c its centre. D is written without the cancelling c_i^2
+    z^2.
     An ellipsoid that the near plane cuts bounds to the whole screen, one behind it to nothing (x1 < x0).
     """
     view = camera.viewmat.detach().double()

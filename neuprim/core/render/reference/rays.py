@@ -1,4 +1,5 @@
-"""What the reference backend asks of a camera: rays, their near limits, their measure of depth, an order, a rough cull."""
+"""What the reference backend asks of a camera: rays, their near limits, their measure of depth, an order, a rough
+cull."""
 
 from __future__ import annotations
 

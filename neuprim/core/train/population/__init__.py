@@ -6,7 +6,14 @@ from neuprim.core.train.population.fixed import Fixed
 from neuprim.core.train.population.gradient import Gradient
 from neuprim.core.train.population.interface import Change, Plan, Population
 from neuprim.core.train.population.relocate import Relocate
-from neuprim.core.train.population.splitting import SPLIT_GAUSSIAN, SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT, children_of, split
+from neuprim.core.train.population.splitting import (
+    SPLIT_GAUSSIAN,
+    SPLIT_LONG,
+    SPLIT_OTHERS,
+    SPLIT_SHIFT,
+    children_of,
+    split,
+)
 from neuprim.core.train.population.table import TABLE, check_name, make_population, names
 
 __all__ = [

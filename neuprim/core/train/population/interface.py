@@ -27,7 +27,8 @@ class Change:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to become of a population, in numbers of its primitives alone: whoever has a primitive's row can carry out its part.
+    """What is to become of a population, in numbers of its primitives alone: whoever has a primitive's row can carry
+    out its part.
 
     Attributes:
         parents: (P,) rows that split in two; the first child takes its parent's row.
@@ -61,7 +62,8 @@ class Population(ABC):
     """Watches every step and now and then proposes a :class:`Change`.
 
     Attributes:
-        plans: whether it decides by :meth:`plan`, from sums over views of each primitive's tally, so that several processes that have a part of
+        plans: whether it decides by :meth:`plan`, from sums over views of each primitive's tally, so that several
+        processes that have a part of
             the primitives each can decide together.
         count: primitives of the whole model where this one watches a part of it; None where it watches all.
     """

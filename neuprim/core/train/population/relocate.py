@@ -16,19 +16,22 @@ from neuprim.core.train.settings import PopulationSettings
 __all__ = ["Relocate"]
 
 _GROWTH = 0.25
-"""Share of the primitives that is born at once: a split costs quality that training has to win back. It is more where the count would else not be reached."""
+"""Share of the primitives that is born at once: a split costs quality that training has to win back. It is more where
+the count would else not be reached."""
 
 _PARTS = 3
 """Of the time between ``start`` and ``stop``, at least, between which primitives are born while some are missing."""
 
 
 class Relocate(Population):
-    """Primitives with the least total weight move to where weight x error is largest, and as many are born there as are still missing.
+    """Primitives with the least total weight move to where weight x error is largest, and as many are born there as are
+    still missing.
 
-    The busiest primitive splits in two by the exact rule, one child in its own row and one in the idle row. A split costs more than it
-    brings once the idle ones are used up (children cover each other and not all of their parent): ``idle`` says who may move. Where there are
-    fewer primitives than ``grow_to``, further ones split without an idle row, a quarter of all at a time, or as many as the interventions that are
-    left need to reach it; budgets that are over before that have their interventions sooner.
+    The busiest primitive splits in two by the exact rule, one child in its own row and one in the idle row. A split
+    costs more than it brings once the idle ones are used up (children cover each other and not all of their parent):
+    ``idle`` says who may move. Where there are fewer primitives than ``grow_to``, further ones split without an idle
+    row, a quarter of all at a time, or as many as the interventions that are left need to reach it; budgets that are
+    over before that have their interventions sooner.
     """
 
     plans = True
@@ -43,7 +46,11 @@ class Relocate(Population):
     def due(self, step: int, progress: float) -> bool:
         s = self.settings
         share = (s.stop - s.start) / _PARTS
-        if self.weight is not None and (self.count or len(self.weight)) < (s.grow_to or 0) and 0 < share * step < s.every * progress:
+        if (
+            self.weight is not None
+            and (self.count or len(self.weight)) < (s.grow_to or 0)
+            and 0 < share * step < s.every * progress
+        ):
             # a budget so short that ``every`` would leave it without its primitives, or with all of them born at once
             part = int((progress - s.start) // share)
             due, self._part = self._part < min(part, _PARTS - 1), max(part, self._part)
@@ -51,7 +58,9 @@ class Relocate(Population):
             return due
         due = super().due(step, progress)
         if due:
-            further = (self.settings.stop - progress) / progress * step / self.settings.every if progress > 0 else math.inf
+            further = (
+                (self.settings.stop - progress) / progress * step / self.settings.every if progress > 0 else math.inf
+            )
             # the schedule ends before ``stop``, so that an intervention just then does not happen
             self._left = math.inf if math.isinf(further) else max(math.ceil(further - 1e-6) - 1, 0)
         return due
@@ -77,7 +86,9 @@ class Relocate(Population):
         count = len(weight)
         budget = int(self.settings.fraction * count)
         missing = max((self.settings.grow_to or 0) - count, 0)
-        due = math.ceil(count * ((1 + missing / count) ** (1 / (self._left + 1)) - 1) - 1e-9)  # by the same factor each time that is left
+        due = math.ceil(
+            count * ((1 + missing / count) ** (1 / (self._left + 1)) - 1) - 1e-9
+        )  # by the same factor each time that is left
         births = min(missing, max(int(_GROWTH * count), due, 1))
         busiest = torch.argsort(error, descending=True, stable=True)
         busy = torch.zeros(count, dtype=torch.bool, device=weight.device)
@@ -91,7 +102,9 @@ class Relocate(Population):
         moved = torch.zeros_like(busy)
         moved[idle] = True
         busiest = busiest[~moved[busiest]]
-        births = max(min(births, int((error[busiest] > 0).sum()) - moves), 0)  # what no view showed has nothing to split for
+        births = max(
+            min(births, int((error[busiest] > 0).sum()) - moves), 0
+        )  # what no view showed has nothing to split for
         busiest = busiest[: moves + births]
         if len(busiest) == 0:
             return None

@@ -15,18 +15,21 @@ __all__ = ["SPLIT_GAUSSIAN", "SPLIT_LONG", "SPLIT_OTHERS", "SPLIT_SHIFT", "carri
 SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS = 0.5, 0.6, 0.9
 """A child's centre and semi-axes over its parent's: shift along the longest axis, that axis, the other two.
 
-As exact children carry their parent's sigma only inside themselves, what they leave uncovered vanishes and what both cover counts twice.
-These cover 78 % of the parent and overlap in 2 %, with 2 x 0.6 x 0.9^2 = 0.97 of its volume. Found by training: relocation with them beat a
-fixed set of primitives on the chair of the NeRF-synthetic set, and five other shapes tried on smoke and fire trained no better.
+As exact children carry their parent's sigma only inside themselves, what they leave uncovered vanishes and what both
+cover counts twice.
+These cover 78 % of the parent and overlap in 2 %, with 2 x 0.6 x 0.9^2 = 0.97 of its volume. Found by training:
+relocation with them beat a fixed set of primitives on the chair of the NeRF-synthetic set, and five other shapes tried
+on smoke and fire trained no better.
 """
 
 SPLIT_GAUSSIAN = 1 / 1.6
-"""All semi-axes of a child over its parent's, in the rule of 3D Gaussian splatting (Kerbl et al. 2023: 0.8 times the number of children)
-that the authors of the method keep; such children cover 45 % of their parent."""
+"""All semi-axes of a child over its parent's, in the rule of 3D Gaussian splatting (Kerbl et al. 2023: 0.8 times the
+number of children) that the authors of the method keep; such children cover 45 % of their parent."""
 
 
 def children_of(model: Primitives, parents: Tensor) -> dict[str, Tensor]:
-    """Two children per parent in the shape of a :class:`~neuprim.core.train.population.interface.Plan`, as :func:`split` returns them."""
+    """Two children per parent in the shape of a :class:`~neuprim.core.train.population.interface.Plan`, as
+    :func:`split` returns them."""
     return split(model, parents, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)
 
 
@@ -37,12 +40,16 @@ def carried_out(plan: Plan, model: Primitives) -> Change:
     params = {}
     for name, value in model.params.items():
         value = value.detach()
-        params[name] = torch.cat([value, value[plan.parents[len(plan.parents) - plan.births :]]]) if plan.births else value.clone()
+        params[name] = (
+            torch.cat([value, value[plan.parents[len(plan.parents) - plan.births :]]]) if plan.births else value.clone()
+        )
         params[name][target] = children[name]
     return Change(params, plan.origin, plan.fresh, plan.text)
 
 
-def split(model: Primitives, parents: Tensor, shift: float, long_factor: float, other_factor: float) -> dict[str, Tensor]:
+def split(
+    model: Primitives, parents: Tensor, shift: float, long_factor: float, other_factor: float
+) -> dict[str, Tensor]:
     """Two children per parent, all first ones then all second ones, each carrying its parent's fields unchanged.
 
     Children sit at +-shift x the longest semi-axis from the parent's centre; that axis shrinks by ``long_factor``,
@@ -63,7 +70,9 @@ def split(model: Primitives, parents: Tensor, shift: float, long_factor: float, 
     after = Geometry(before.means + sign * shift * reach * direction, before.log_scales + shrink.log(), before.quats)
     own, own_colour = ({k: old[k] for k in model.of(field)} for field in (model.density, model.colour))
     density = check_tensors(model.density.on_split(own, before, after), own, method(model.density, "on_split"))
-    colour = check_tensors(model.colour.on_split(own_colour, before, after), own_colour, method(model.colour, "on_split"))
+    colour = check_tensors(
+        model.colour.on_split(own_colour, before, after), own_colour, method(model.colour, "on_split")
+    )
     children = {**old, "means": after.means, "log_scales": after.log_scales, **density, **colour}
     first = slice(len(parents))
     divided = model.density.divide({k: v[first] for k, v in own.items()}, before[first])

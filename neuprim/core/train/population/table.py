@@ -1,4 +1,5 @@
-"""The one table of population strategies. A new one is a file of this package and a row here; the settings are checked against it."""
+"""The one table of population strategies. A new one is a file of this package and a row here; the settings are checked
+against it."""
 
 from __future__ import annotations
 

@@ -69,7 +69,8 @@ class StepViews:
         self._tallies: list[Tally] = []
 
     def drawn(self, looks: Callable[[], Sequence[Look]]) -> Primitives:
-        """What this rank draws next, when ``looks`` says what each of them does, by rank; gradients are to end in its parameters."""
+        """What this rank draws next, when ``looks`` says what each of them does, by rank; gradients are to end in its
+        parameters."""
         return self.model
 
     def add(self, seen: Seen, tally: Tally) -> None:
@@ -98,8 +99,8 @@ class Alone:
         return self.rank == 0
 
     def last(self, asked: Callable[[], bool]) -> Callable[[], bool]:
-        """``asked`` says whether this process was asked to stop; what is returned, whether the step just done is the last one as any rank was,
-        which is the same on all of them."""
+        """``asked`` says whether this process was asked to stop; what is returned, whether the step just done is the
+        last one as any rank was, which is the same on all of them."""
         return asked
 
     @property
@@ -112,7 +113,8 @@ class Alone:
         return model.count
 
     def own_of(self, count: int) -> tuple[int, int]:
-        """First row that this rank keeps of a whole model of ``count`` primitives from now on, and the one after the last.
+        """First row that this rank keeps of a whole model of ``count`` primitives from now on, and the one after the
+        last.
 
         Raises:
             ConfigError: there are too few for all.
@@ -120,7 +122,8 @@ class Alone:
         return 0, count
 
     def collected(self, value: Tensor) -> Iterator[Tensor]:
-        """On the first rank an (N, ...) tensor of the whole model, in pieces from first to last; called on all, with their rows of it."""
+        """On the first rank an (N, ...) tensor of the whole model, in pieces from first to last; called on all, with
+        their rows of it."""
         yield value
 
     def cut(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -131,7 +134,9 @@ class Alone:
         """As :meth:`last`, for whether a checkpoint is due; the first rank's word counts."""
         return asked
 
-    def judged(self, model: Primitives, views: Sequence[View], judge: Callable[[int, Primitives], float]) -> list[float]:
+    def judged(
+        self, model: Primitives, views: Sequence[View], judge: Callable[[int, Primitives], float]
+    ) -> list[float]:
         """What ``judge`` says of each view, by its place and the primitives that it shows; the same on all ranks."""
         return [judge(place, model) for place in range(len(views))]
 
@@ -140,7 +145,8 @@ class Alone:
         return population.intervene(model, extent)
 
     def step(self, model: Primitives, views: int, elapsed: float, start: float) -> StepViews:
-        """What collects a step, of so many ``views`` of each rank, that began at ``start`` (seconds of ``time.perf_counter``) after ``elapsed`` seconds of training."""
+        """What collects a step, of so many ``views`` of each rank, that began at ``start`` (seconds of
+        ``time.perf_counter``) after ``elapsed`` seconds of training."""
         return StepViews(model)
 
     def spent(self, elapsed: float, start: float) -> float:

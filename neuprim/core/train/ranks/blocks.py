@@ -20,7 +20,8 @@ __all__ = ["Blocks", "regrouped"]
 
 @dataclass(frozen=True)
 class Blocks:
-    """``count`` rows in ``size`` blocks that follow each other and differ by one row at most, so that blocks one after the other are the model."""
+    """``count`` rows in ``size`` blocks that follow each other and differ by one row at most, so that blocks one after
+    the other are the model."""
 
     count: int
     size: int
@@ -31,7 +32,8 @@ class Blocks:
 
 
 def regrouped(group: Group, plan: Plan, before: Blocks, after: Blocks, model: Primitives, optimizer: RowAdam) -> Change:
-    """Carry out this rank's part of a plan: it gets the rows that its new block descends from, and splits those that are children.
+    """Carry out this rank's part of a plan: it gets the rows that its new block descends from, and splits those that
+    are children.
 
     ``optimizer`` has the moments of these rows afterwards; the change's ``origin`` leaves them where they are.
     """
@@ -45,7 +47,11 @@ def regrouped(group: Group, plan: Plan, before: Blocks, after: Blocks, model: Pr
     bounds = torch.tensor([before.of(rank)[1] for rank in range(before.size)], device=own.device)
     owner = torch.bucketize(own, bounds, right=True)
     place = torch.argsort(owner, stable=True)  # where what comes from each rank, by rank, is to be
-    rows, give, take = torch.cat(asked), [len(part) for part in asked], torch.bincount(owner, minlength=before.size).tolist()
+    rows, give, take = (
+        torch.cat(asked),
+        [len(part) for part in asked],
+        torch.bincount(owner, minlength=before.size).tolist(),
+    )
 
     def moved(value: Tensor) -> Tensor:
         found = value.new_empty((stop - first, *value.shape[1:]))

@@ -1,7 +1,8 @@
 """Gradients and statistics of a model as one flat buffer, and their sums over views, in the order of the views.
 
-Floating-point sums depend on their order. A ring or a tree would add the views of a step in an order of its own; here every rank owns a slice of the
-buffer, gets that slice of every view, adds it up view by view as one process does, and hands the sum to the others. It sends as many bytes as a ring.
+Floating-point sums depend on their order. A ring or a tree would add the views of a step in an order of its own; here
+every rank owns a slice of the buffer, gets that slice of every view, adds it up view by view as one process does, and
+hands the sum to the others. It sends as many bytes as a ring.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ Swap = Callable[[Tensor, Tensor], None]
 """((R, n) rows, one for each rank; (R, n) for what comes, one from each), of one dtype and device."""
 
 _ALIGNED = 16
-"""Numbers that every tensor's place is a multiple of: 64 bytes, what vectors of the processor and of a card take at once."""
+"""Numbers that every tensor's place is a multiple of: 64 bytes, what vectors of the processor and of a card take at
+once."""
 
 
 def _padded(numbers: int) -> int:
@@ -35,7 +37,8 @@ class Bucket:
         letter: bytes that go with the sums from each rank to each, a multiple of 4.
 
     Attributes:
-        width: numbers of a slice; :meth:`add` sends ``ranks - 1`` slices, and so does :meth:`spread`, with as many letters.
+        width: numbers of a slice; :meth:`add` sends ``ranks - 1`` slices, and so does :meth:`spread`, with as many
+        letters.
     """
 
     def __init__(self, params: Mapping[str, Tensor], ranks: int, letter: int) -> None:
@@ -44,7 +47,11 @@ class Bucket:
         count = like.shape[0]
         self._places: dict[str, tuple[int, int]] = {}
         at = 0
-        for name, numbers in (*((name, value.numel()) for name, value in params.items()), (_WEIGHT, count), (_ERROR, count)):
+        for name, numbers in (
+            *((name, value.numel()) for name, value in params.items()),
+            (_WEIGHT, count),
+            (_ERROR, count),
+        ):
             self._places[name] = at, numbers
             at += _padded(numbers)
         self.width, self.letter = _padded(-(-at // ranks)), letter
@@ -66,7 +73,8 @@ class Bucket:
         return self._flat.reshape(-1)[start : start + numbers]
 
     def take(self, params: Mapping[str, Tensor], tally: Tally) -> list[bool]:
-        """Fill it with a view's gradients, which the parameters lose, and its tally; of each parameter, whether there was a gradient."""
+        """Fill it with a view's gradients, which the parameters lose, and its tally; of each parameter, whether there
+        was a gradient."""
         there = []
         for name, value in params.items():
             part, grad = self._part(name), value.grad
@@ -92,7 +100,8 @@ class Bucket:
                 self._begun = True
 
     def spread(self, swap: Swap, letter: bytes) -> list[bytes]:
-        """Bring the slices together, and to every rank a letter of every rank, which are returned; the next :meth:`add` begins a new sum."""
+        """Bring the slices together, and to every rank a letter of every rank, which are returned; the next :meth:`add`
+        begins a new sum."""
         assert self._begun and len(letter) == self.letter
         self._begun = False
         self._sums[:, : self.width] = self._sum
@@ -102,7 +111,8 @@ class Bucket:
         return [part.numpy().tobytes() for part in self._all[:, self.width :].cpu()]
 
     def give(self, params: Mapping[str, Tensor], there: Sequence[bool]) -> Tally:
-        """Hand the sums out: gradients to the parameters that have one, and the tally that is returned; good until the next :meth:`take`."""
+        """Hand the sums out: gradients to the parameters that have one, and the tally that is returned; good until the
+        next :meth:`take`."""
         for (name, value), has in zip(params.items(), there, strict=True):
             if has:
                 value.grad = self._part(name).view(value.shape)
@@ -110,8 +120,8 @@ class Bucket:
 
 
 class Pair(Bucket):
-    """The buffer of two ranks that look at one view each. A sum of two has no order, so both send all and add it up themselves: as many bytes as by slices, and
-    one exchange less to wait for.
+    """The buffer of two ranks that look at one view each. A sum of two has no order, so both send all and add it up
+    themselves: as many bytes as by slices, and one exchange less to wait for.
 
     Args:
         rank: this one, 0 or 1.

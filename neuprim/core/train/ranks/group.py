@@ -1,7 +1,8 @@
 """Several ranks that train one model: what they tell each other in a step, and what happens when one of them is gone.
 
-Every rank draws all random numbers of a step, looks at its own views, and adds up the gradients of all of them in their order
-(:mod:`~neuprim.core.train.ranks.bucket`). From there all ranks compute alike, population and learning rates included, so nothing else is sent.
+Every rank draws all random numbers of a step, looks at its own views, and adds up the gradients of all of them in their
+order (:mod:`~neuprim.core.train.ranks.bucket`). From there all ranks compute alike, population and learning rates
+included, so nothing else is sent.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ class Group(Alone):
 
     Args:
         place: which.
-        wire: the way to the others: ``swap``, ``store``, ``hosted`` and ``close`` of :class:`~neuprim.core.train.ranks.wire.Wire`.
+        wire: the way to the others: ``swap``, ``store``, ``hosted`` and ``close`` of
+        :class:`~neuprim.core.train.ranks.wire.Wire`.
 
     Attributes:
         sent: bytes that this rank sent.
@@ -80,7 +82,9 @@ class Group(Alone):
         """The buffer for the model as it is now, and for letters about so many views."""
         if self._bucket is None or not self._bucket.fits(model.params, views * _LETTER):
             pair = self.size == 2 and views == 1
-            self._bucket = Pair(model.params, self.rank, _LETTER) if pair else Bucket(model.params, self.size, views * _LETTER)
+            self._bucket = (
+                Pair(model.params, self.rank, _LETTER) if pair else Bucket(model.params, self.size, views * _LETTER)
+            )
         return self._bucket
 
     def time(self, elapsed: float, start: float) -> float:
@@ -124,7 +128,8 @@ class Group(Alone):
         return self.tell_by(self._all_get, letter, _LETTER)
 
     def tell_by(self, post: Callable[[bytes], list[bytes]], letter: dict[str, Any], room: int) -> list[dict[str, Any]]:
-        """The same by another way, which brings ``room`` bytes of each rank to each; what is longer follows by the usual one."""
+        """The same by another way, which brings ``room`` bytes of each rank to each; what is longer follows by the
+        usual one."""
         text = json.dumps(letter).encode()
         whole = len(text).to_bytes(_HEAD, "little") + text
         first = post(whole[:room].ljust(room, b"\0"))
@@ -146,7 +151,9 @@ class Group(Alone):
         for rank, letter in enumerate(letters):
             for name, value in letters[0].items():
                 if letter.get(name) != value:
-                    raise RankError(f"rank {rank} has other {name} than rank 0: {letter.get(name)!r}, not {value!r}; {what}")
+                    raise RankError(
+                        f"rank {rank} has other {name} than rank 0: {letter.get(name)!r}, not {value!r}; {what}"
+                    )
 
     @contextmanager
     def in_turn(self) -> Iterator[None]:
@@ -172,7 +179,8 @@ class Group(Alone):
     # ------------------------------------------------------------ faults
 
     def fail(self, line: str, of_ranks: bool = False) -> str | None:
-        """Leave a word for the others that the training ends and why; returns the line that the user must be told, None if another rank was first.
+        """Leave a word for the others that the training ends and why; returns the line that the user must be told, None
+        if another rank was first.
 
         Args:
             of_ranks: the line names ranks itself.
@@ -203,7 +211,9 @@ class Group(Alone):
     def close(self, failed: bool = False) -> None:
         """Leave the others."""
         if failed and self.wire.hosted and self.first:
-            time.sleep(1.5 * pulse.SILENCE)  # the others look into the store for the cause, and it goes with this process
+            time.sleep(
+                1.5 * pulse.SILENCE
+            )  # the others look into the store for the cause, and it goes with this process
         self.pulse.stop()
         self.wire.close()
 
@@ -243,5 +253,9 @@ class _GroupViews(StepViews):
                     f"rank {rank} does not compute as rank 0 does: its positions differ; expected processors or cards of one kind"
                 )
         group.heard(letters)
-        self.seen = [Seen(**seen) for views in zip(*(other["seen"] for other in letters), strict=True) for seen in views]
-        return bucket.give(self.model.params, [any(has) for has in zip(*(other["there"] for other in letters), strict=True)])
+        self.seen = [
+            Seen(**seen) for views in zip(*(other["seen"] for other in letters), strict=True) for seen in views
+        ]
+        return bucket.give(
+            self.model.params, [any(has) for has in zip(*(other["there"] for other in letters), strict=True)]
+        )

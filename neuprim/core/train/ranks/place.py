@@ -49,7 +49,9 @@ def place_of(environment: Mapping[str, str] = os.environ) -> Place | None:
     there = [name for name in ALL if environment.get(name, "") != ""]
     missing = [name for name in ALL if name not in there]
     if missing:
-        raise ConfigError(f"environment: {', '.join(there)} without {', '.join(missing)}; expected all that torchrun sets, or none")
+        raise ConfigError(
+            f"environment: {', '.join(there)} without {', '.join(missing)}; expected all that torchrun sets, or none"
+        )
     values = {}
     for name in NUMBERS:
         text = environment[name]

@@ -1,7 +1,7 @@
 """Which ranks live: each counts in the shared store, and one that stands still is gone.
 
-A broken connection says that *some* rank is gone, and that may be one that left because of another. So whoever finds one broken looks who failed and
-said so, and else whose count stands still.
+A broken connection says that *some* rank is gone, and that may be one that left because of another. So whoever finds
+one broken looks who failed and said so, and else whose count stands still.
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ BEAT = 0.25
 """Seconds between two counts."""
 
 SILENCE = 4.0
-"""Seconds without a count after which a rank is gone, where one surely is: a busy processor delays a thread, but not for so long."""
+"""Seconds without a count after which a rank is gone, where one surely is: a busy processor delays a thread, but not
+for so long."""
 
 LONG_SILENCE = 60.0
-"""The same where there is no other sign of it: compiled code that does not let go of Python may hold up a thread for a while."""
+"""The same where there is no other sign of it: compiled code that does not let go of Python may hold up a thread for a
+while."""
 
 
 class Pulse:
@@ -46,7 +48,8 @@ class Pulse:
                 return
 
     def gone(self, store: Any, silence: float) -> list[int]:
-        """Ranks whose count stands still for that many seconds; those that never counted among them. ``store`` is the caller's own.
+        """Ranks whose count stands still for that many seconds; those that never counted among them. ``store`` is the
+        caller's own.
 
         Raises:
             RuntimeError: the store is gone.

@@ -10,7 +10,8 @@ __all__ = ["refuse_parts"]
 
 
 def refuse_parts(settings: TrainSettings, ranks: int) -> None:
-    """Refuse ``train.shard`` of one process, and where a step or an intervention needs more of the model than a rank has.
+    """Refuse ``train.shard`` of one process, and where a step or an intervention needs more of the model than a rank
+    has.
 
     Raises:
         ConfigError: names the setting that does.

@@ -1,8 +1,9 @@
 """One model in parts: every rank holds a block of the primitives, with their gradients, moments and statistics.
 
-Each rank still looks at views of its own. Before a view is drawn, every rank finds which of *its* primitives the view can show, and sends their
-parameters to the rank that draws it. That rank lowers, draws and goes back as with any model, and sends the rows' gradients and statistics back, which
-their owners add up in the order of the views. Primitives that were not sent have a gradient of zero in one process, too, so that the sums are the same bits.
+Each rank still looks at views of its own. Before a view is drawn, every rank finds which of *its* primitives the view
+can show, and sends their parameters to the rank that draws it. That rank lowers, draws and goes back as with any model,
+and sends the rows' gradients and statistics back, which their owners add up in the order of the views. Primitives that
+were not sent have a gradient of zero in one process, too, so that the sums are the same bits.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ class _Sent:
     """What went to each rank before its view was drawn.
 
     Attributes:
-        rows: (M,) of this rank's primitives, those for the first rank first. give: how many for each; take: how many came from each.
+        rows: (M,) of this rank's primitives, those for the first rank first. give: how many for each; take: how many
+        came from each.
     """
 
     rows: Tensor
@@ -97,7 +99,8 @@ class Shards(Alone):
         return _ShardViews(self, model, elapsed, start)
 
     def gather(self, model: Primitives, looks: Sequence[Look | None]) -> tuple[Primitives, _Sent]:
-        """The primitives that this rank's look needs, in the order of the whole model, and what was sent for all ranks' looks, one each."""
+        """The primitives that this rank's look needs, in the order of the whole model, and what was sent for all ranks'
+        looks, one each."""
         device = model.device
         with torch.no_grad():
             none = torch.zeros(0, dtype=torch.int64, device=device)
@@ -105,7 +108,10 @@ class Shards(Alone):
         give = [len(rows) for rows in each]
         sent = _Sent(torch.cat(each), give, self._lengths(give))
         params = {}
-        for name, value in model.params.items():  # one at a time: what comes is the tensor that is drawn, without another copy
+        for (
+            name,
+            value,
+        ) in model.params.items():  # one at a time: what comes is the tensor that is drawn, without another copy
             found = value.new_empty((sum(sent.take), *value.shape[1:]))
             self.group.exchange(value.detach()[sent.rows], found, give, sent.take)
             params[name] = found.requires_grad_()
@@ -135,7 +141,9 @@ class Shards(Alone):
         self.group.swap(own, found)
         return [int(n) for n in found[:, 0]]
 
-    def judged(self, model: Primitives, views: Sequence[View], judge: Callable[[int, Primitives], float]) -> list[float]:
+    def judged(
+        self, model: Primitives, views: Sequence[View], judge: Callable[[int, Primitives], float]
+    ) -> list[float]:
         own: dict[str, float] = {}
         for start in range(0, len(views), self.size):
             looks = [Look(views[i]) if i < len(views) else None for i in range(start, start + self.size)]
@@ -143,14 +151,18 @@ class Shards(Alone):
             if looks[self.rank] is not None:
                 with torch.no_grad():
                     own[str(start + self.rank)] = judge(start + self.rank, drawn)
-        every = {place: value for letter in self.group.tell({"judged": own}) for place, value in letter["judged"].items()}
+        every = {
+            place: value for letter in self.group.tell({"judged": own}) for place, value in letter["judged"].items()
+        }
         return [every[str(i)] for i in range(len(views))]
 
     # ------------------------------------------------------------ who has what
 
     def own_of(self, count: int) -> tuple[int, int]:
         if count < self.size:
-            raise ConfigError(f"train.shard=true: {count} primitives for {self.size} ranks; expected one for each at least")
+            raise ConfigError(
+                f"train.shard=true: {count} primitives for {self.size} ranks; expected one for each at least"
+            )
         self.blocks = Blocks(count, self.size)
         return self.blocks.of(self.rank)
 
@@ -160,7 +172,8 @@ class Shards(Alone):
         return {name: value.detach()[mine].clone() for name, value in tensors.items()}
 
     def collected(self, value: Tensor) -> Iterator[Tensor]:
-        """On the first rank, (N, ...) of the whole model piece by piece, of which it never holds more than one beside its own; nothing on the others."""
+        """On the first rank, (N, ...) of the whole model piece by piece, of which it never holds more than one beside
+        its own; nothing on the others."""
         at_once = max(_PIECE // max(value[:1].numel(), 1), 1)
         for rank in range(self.size):
             start, stop = self.blocks.of(rank)
@@ -182,7 +195,8 @@ class Shards(Alone):
                     yield found
 
     def intervene(self, population: Population, model: Primitives, optimizer: RowAdam, extent: float) -> Change | None:
-        """All ranks decide the same on everybody's statistics; rows move to whose block they are in then, with their moments."""
+        """All ranks decide the same on everybody's statistics; rows move to whose block they are in then, with their
+        moments."""
         found = population.take()
         if found is None:
             return None
@@ -253,7 +267,9 @@ class _ShardViews(StepViews):
         letters = group.tell(letter)
         group.heard(letters)
         self._shards._save = bool(letters[0]["save"])
-        self.seen = [Seen(**seen) for views in zip(*(other["seen"] for other in letters), strict=True) for seen in views]
+        self.seen = [
+            Seen(**seen) for views in zip(*(other["seen"] for other in letters), strict=True) for seen in views
+        ]
         there = {name for other in letters for name in other["there"]}
         for name, value in self.model.params.items():
             value.grad = self._sums[name] if name in there else None

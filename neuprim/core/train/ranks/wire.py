@@ -38,7 +38,11 @@ class Wire:
             attempt = environment.get("TORCHELASTIC_RESTART_COUNT", "0")
             self.store = dist.PrefixStore(f"neuprim/{attempt}", store)
             dist.init_process_group(
-                backend, store=dist.PrefixStore("group", self.store), rank=place.rank, world_size=place.size, timeout=PATIENCE
+                backend,
+                store=dist.PrefixStore("group", self.store),
+                rank=place.rank,
+                world_size=place.size,
+                timeout=PATIENCE,
             )
         except (RuntimeError, ValueError, OSError) as error:
             raise ConfigError(
@@ -57,7 +61,8 @@ class Wire:
             raise _broken(error) from error
 
     def exchange(self, rows: Tensor, found: Tensor, give: list[int], take: list[int]) -> None:
-        """Send ``give[r]`` of the rows (sum of give, ...) to rank r, in their order, and find ``take[r]`` from each, by rank.
+        """Send ``give[r]`` of the rows (sum of give, ...) to rank r, in their order, and find ``take[r]`` from each, by
+        rank.
 
         Raises:
             RankError: a rank is gone; without its name.

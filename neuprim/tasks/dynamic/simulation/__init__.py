@@ -1,7 +1,7 @@
 """Built-in fluid simulations, for those who have no OpenVDB export at hand.
 
-``scenes`` says what happens, ``solver`` how gas moves (``projection``: incompressibility, ``advection``: transport, ``noise``:
-turbulence in sources), ``generate`` writes a sequence of OpenVDB files.
+``scenes`` says what happens, ``solver`` how gas moves (``projection``: incompressibility, ``advection``: transport,
+``noise``: turbulence in sources), ``generate`` writes a sequence of OpenVDB files.
 """
 
 from neuprim.tasks.dynamic.simulation.generate import simulate

@@ -26,8 +26,9 @@ NOTHING = 1e-4
 class Stencil(NamedTuple):
     """Where N points read: rows of a table (X * Y * Z, C) that holds all channels of a cell in one row.
 
-    A point is a weighted sum of eight rows, for which torch has a fast kernel under the name ``embedding_bag``: several times faster
-    than ``grid_sample`` in three dimensions, and with the same result for any number of threads, since each sum is one thread's.
+    A point is a weighted sum of eight rows, for which torch has a fast kernel under the name ``embedding_bag``: several
+    times faster than ``grid_sample`` in three dimensions, and with the same result for any number of threads, since
+    each sum is one thread's.
 
     Attributes:
         rows: (N, 8) int32, the cells around each point; the first is the lowest corner.
@@ -43,7 +44,8 @@ class Stencil(NamedTuple):
 
 
 def stencil(points: list[Tensor], shape: tuple[int, int, int]) -> Stencil:
-    """Of points given as three tensors (N,) in cells, the first centre at 0; those outside are moved to the nearest centre."""
+    """Of points given as three tensors (N,) in cells, the first centre at 0; those outside are moved to the nearest
+    centre."""
     lower, parts = [], []
     for along, count in zip(points, shape, strict=True):
         inside = along.clamp(0, count - 1)
@@ -56,17 +58,21 @@ def stencil(points: list[Tensor], shape: tuple[int, int, int]) -> Stencil:
     x, y, z = parts
     weights = torch.empty(len(x), 8)
     both = x * y
-    for pair, edge in enumerate((1 - x - y + both, y - both, x - both, both)):  # (0, 0), (0, 1), (1, 0), (1, 1) along x and y
+    for pair, edge in enumerate(
+        (1 - x - y + both, y - both, x - both, both)
+    ):  # (0, 0), (0, 1), (1, 0), (1, 1) along x and y
         upper = torch.mul(edge, z, out=weights[:, 2 * pair + 1])
         torch.sub(edge, upper, out=weights[:, 2 * pair])
     return Stencil(base[:, None] + torch.tensor(_corners(shape), dtype=torch.int32), weights)
 
 
 def advect(fields: Tensor, velocity: Tensor, time: float, cell: float, blurred: int = 0) -> Tensor:
-    """(C, X, Y, Z) fields, carried for ``time`` seconds by a velocity (3, X, Y, Z) in world units per second at the centres.
+    """(C, X, Y, Z) fields, carried for ``time`` seconds by a velocity (3, X, Y, Z) in world units per second at the
+    centres.
 
-    Traces back with the midpoint rule, then corrects the interpolation's blur (MacCormack; Selle, Fedkiw, Kim, Liu and Rossignac
-    2008, "An unconditionally stable MacCormack method"): carry forward, carry back, add half the difference to what it started as,
+    Traces back with the midpoint rule, then corrects the interpolation's blur (MacCormack; Selle, Fedkiw, Kim, Liu and
+    Rossignac 2008, "An unconditionally stable MacCormack method"): carry forward, carry back, add half the difference
+    to what it started as,
 
         q1 = A(q),   q2 = A^-1(q1),   q' = q1 + (q - q2) / 2,
 
@@ -79,7 +85,11 @@ def advect(fields: Tensor, velocity: Tensor, time: float, cell: float, blurred: 
     table, winds = _table(fields), _table(velocity)
     sharp = table[:, blurred:].contiguous()
     scale, cells = time / cell, _indices(shape)
-    carried, behind, place = torch.empty_like(table), torch.empty_like(winds), torch.empty(len(table), dtype=torch.int32)
+    carried, behind, place = (
+        torch.empty_like(table),
+        torch.empty_like(winds),
+        torch.empty(len(table), dtype=torch.int32),
+    )
 
     def carry(rows: slice) -> None:
         here = [axis[rows] for axis in cells]
@@ -112,8 +122,9 @@ def _table(fields: Tensor) -> Tensor:
 def _on_all_cores(work: Callable[[Job], None], jobs: Iterable[Job]) -> None:
     """Calls that write to different places, in threads of our own.
 
-    torch's threads wait for each other in a busy loop after every operation, which on a machine with other things to do takes many
-    times longer than the work; these meet once. The jobs are the same for any number of threads, and so is the result.
+    torch's threads wait for each other in a busy loop after every operation, which on a machine with other things to do
+    takes many times longer than the work; these meet once. The jobs are the same for any number of threads, and so is
+    the result.
     """
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
         list(pool.map(work, jobs))

@@ -7,7 +7,8 @@
     flames         fuel that is burning (scenes with fire)
     color          albedo of the smoke, vec3s, not multiplied by density (scenes with colours)
 
-Values are about 0 to 1. Voxels are cubes; the box is one world unit wide and deep, centred at x = y = 0, its ground at z = 0, z up.
+Values are about 0 to 1. Voxels are cubes; the box is one world unit wide and deep, centred at x = y = 0, its ground at
+z = 0, z up.
 """
 
 from __future__ import annotations
@@ -59,8 +60,8 @@ def simulate(
 ) -> Path:
     """Run a scene unless a complete sequence is there; returns its folder ``cache_dir/sim-NAME-KEY``.
 
-    Equal arguments give equal grids on one machine, whatever the number of threads. The folder appears under its name only when
-    complete, so an interrupted run leaves nothing that could be taken for a sequence.
+    Equal arguments give equal grids on one machine, whatever the number of threads. The folder appears under its name
+    only when complete, so an interrupted run leaves nothing that could be taken for a sequence.
 
     Args:
         name: one of :data:`~neuprim.tasks.dynamic.simulation.scenes.SCENES`.
@@ -74,7 +75,9 @@ def simulate(
         DataError: the cache directory cannot be written.
     """
     scene = _scene(name)
-    count: int = converted(scene.timesteps if frames is None else frames, Annotated[int, Range(*TIMESTEPS)], "scene.timesteps")
+    count: int = converted(
+        scene.timesteps if frames is None else frames, Annotated[int, Range(*TIMESTEPS)], "scene.timesteps"
+    )
     resolution = converted(resolution, Resolution, "scene.resolution")
     seed = converted(seed, Annotated[int, Range(0, 2**63 - 1)], "seed")
     final = Path(cache_dir) / f"sim-{name}-{cache_key(scene, count, resolution, seed)}"

@@ -16,10 +16,11 @@ PERIOD = 16
 
 
 class Noise:
-    """Value noise (random numbers on a lattice, smoothly interpolated) with mean 0 and about unit variance at the nodes.
+    """Value noise (random numbers on a lattice, smoothly interpolated) with mean 0 and about unit variance at the
+    nodes.
 
-    A pure function of seed, channel, place and time, so that it is the same however a frame is divided into steps, and at any
-    resolution the same pattern.
+    A pure function of seed, channel, place and time, so that it is the same however a frame is divided into steps, and
+    at any resolution the same pattern.
     """
 
     def __init__(self, seed: int) -> None:
@@ -30,7 +31,9 @@ class Noise:
         numbers = np.random.default_rng([self._seed, channel, key]).standard_normal((PERIOD,) * 3)
         return torch.from_numpy(numbers.astype(np.float32))
 
-    def field(self, channel: int, axes: tuple[Tensor, Tensor, Tensor], cells: float, tempo: float, time: float) -> Tensor:
+    def field(
+        self, channel: int, axes: tuple[Tensor, Tensor, Tensor], cells: float, tempo: float, time: float
+    ) -> Tensor:
         """(X, Y, Z) values.
 
         Args:
@@ -44,20 +47,38 @@ class Noise:
         angle = (phase - key) * math.pi / 2
         lattice = math.cos(angle) * self._lattice(channel, key) + math.sin(angle) * self._lattice(channel, key + 1)
         x, y, z = (_weights(axis.reshape(-1) * cells) for axis in axes)
-        return torch.matmul(x, torch.matmul(y, torch.matmul(lattice, z.T)).reshape(PERIOD, -1)).reshape(len(x), len(y), len(z))
+        return torch.matmul(x, torch.matmul(y, torch.matmul(lattice, z.T)).reshape(PERIOD, -1)).reshape(
+            len(x), len(y), len(z)
+        )
 
     def fractal(
-        self, channel: int, axes: tuple[Tensor, Tensor, Tensor], cells: float, tempo: float, time: float, octaves: int = 3
+        self,
+        channel: int,
+        axes: tuple[Tensor, Tensor, Tensor],
+        cells: float,
+        tempo: float,
+        time: float,
+        octaves: int = 3,
     ) -> Tensor:
         """Octaves of :meth:`field`, each twice as fine, half as strong and faster by half."""
-        parts = [self.field(channel + 101 * k, axes, cells * 2**k, tempo * 1.5**k, time) * 0.5**k for k in range(octaves)]
+        parts = [
+            self.field(channel + 101 * k, axes, cells * 2**k, tempo * 1.5**k, time) * 0.5**k for k in range(octaves)
+        ]
         return torch.stack(parts).sum(0)
 
     def vector(
-        self, channel: int, axes: tuple[Tensor, Tensor, Tensor], cells: float, tempo: float, time: float, octaves: int = 2
+        self,
+        channel: int,
+        axes: tuple[Tensor, Tensor, Tensor],
+        cells: float,
+        tempo: float,
+        time: float,
+        octaves: int = 2,
     ) -> Tensor:
         """(3, X, Y, Z): three independent :meth:`fractal` fields."""
-        return torch.stack([self.fractal(channel + 1009 * (k + 1), axes, cells, tempo, time, octaves) for k in range(3)])
+        return torch.stack(
+            [self.fractal(channel + 1009 * (k + 1), axes, cells, tempo, time, octaves) for k in range(3)]
+        )
 
 
 def _weights(places: Tensor) -> Tensor:

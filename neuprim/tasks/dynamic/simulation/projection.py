@@ -1,10 +1,11 @@
 """The box of a simulation, its staggered grid, and the pressure projection that is exact for it.
 
-Marker-and-cell layout (Harlow and Welch 1965): scalars at the cells' centres, each velocity component at the centres of the faces that
-it crosses. Divergence and gradient are differences over one cell, and their product, the 7-point Laplacian, is a sum of one
-tridiagonal matrix per axis. Diagonalising these three small matrices solves Poisson's equation directly (Lynch, Rice and Thomas 1964,
-"Direct solution of partial difference equations by tensor product methods"): no iteration, no tolerance, and any mix of solid and
-open ends, where a cosine transform would need another variant for each.
+Marker-and-cell layout (Harlow and Welch 1965): scalars at the cells' centres, each velocity component at the centres of
+the faces that it crosses. Divergence and gradient are differences over one cell, and their product, the 7-point
+Laplacian, is a sum of one tridiagonal matrix per axis. Diagonalising these three small matrices solves Poisson's
+equation directly (Lynch, Rice and Thomas 1964, "Direct solution of partial difference equations by tensor product
+methods"): no iteration, no tolerance, and any mix of solid and open ends, where a cosine transform would need another
+variant for each.
 """
 
 from __future__ import annotations
@@ -18,15 +19,16 @@ from torch import Tensor
 __all__ = ["Box", "Faces", "divergence", "expansion_flow", "project", "to_centres", "to_faces"]
 
 Faces = tuple[Tensor, Tensor, Tensor]
-"""Velocity in world units per second: x component (X+1, Y, Z), y component (X, Y+1, Z), z component (X, Y, Z+1); float32."""
+"""Velocity in world units per second: x component (X+1, Y, Z), y component (X, Y+1, Z), z component (X, Y, Z+1);
+float32."""
 
 
 @dataclass(frozen=True)
 class Box:
     """X x Y x Z cubic cells over a solid ground; z is up.
 
-    The box is centred at x = y = 0 and stands on z = 0. At an open end the pressure beyond is zero, and air goes in and out; through a
-    solid one nothing flows.
+    The box is centred at x = y = 0 and stands on z = 0. At an open end the pressure beyond is zero, and air goes in and
+    out; through a solid one nothing flows.
 
     Attributes:
         shape: cells per axis.
@@ -45,7 +47,8 @@ class Box:
         return (self.open_sides,) * 2, (self.open_sides,) * 2, (False, self.open_top)
 
     def axes(self) -> tuple[Tensor, Tensor, Tensor]:
-        """World coordinates of the cells' centres: (X, 1, 1), (1, Y, 1) and (1, 1, Z), float32; they broadcast against fields."""
+        """World coordinates of the cells' centres: (X, 1, 1), (1, Y, 1) and (1, 1, Z), float32; they broadcast against
+        fields."""
         x, y, z = (torch.arange(n, dtype=torch.float32) + 0.5 for n in self.shape)
         x, y = x - self.shape[0] / 2, y - self.shape[1] / 2
         return (x * self.cell).reshape(-1, 1, 1), (y * self.cell).reshape(1, -1, 1), (z * self.cell).reshape(1, 1, -1)
@@ -57,11 +60,14 @@ class Box:
 
     @cached_property
     def _modes(self) -> tuple[tuple[Tensor, ...], Tensor]:
-        """Eigenvectors (n, n) of each axis' second difference, in columns, and (X, Y, Z) one over the Laplacian's eigenvalues."""
+        """Eigenvectors (n, n) of each axis' second difference, in columns, and (X, Y, Z) one over the Laplacian's
+        eigenvalues."""
         vectors, total = [], torch.zeros(self.shape, dtype=torch.float64)
         for axis, (count, (low, high)) in enumerate(zip(self.shape, self.ends, strict=True)):
             second = torch.diag(torch.full((count,), -2.0, dtype=torch.float64))
-            second += torch.diag(torch.ones(count - 1, dtype=torch.float64), 1) + torch.diag(torch.ones(count - 1, dtype=torch.float64), -1)
+            second += torch.diag(torch.ones(count - 1, dtype=torch.float64), 1) + torch.diag(
+                torch.ones(count - 1, dtype=torch.float64), -1
+            )
             second[0, 0] += not low  # beyond a solid end the pressure repeats, so that its gradient there is zero
             second[-1, -1] += not high
             values, columns = torch.linalg.eigh(second)
@@ -89,7 +95,8 @@ def divergence(velocity: Faces, box: Box) -> Tensor:
 
 
 def project(velocity: Faces, box: Box) -> Faces:
-    """The divergence-free part of a flow: ``u - grad p`` with ``laplace p = div u``, and nothing through solid ends (Stam 1999)."""
+    """The divergence-free part of a flow: ``u - grad p`` with ``laplace p = div u``, and nothing through solid ends
+    (Stam 1999)."""
     velocity = _closed(velocity, box)
     return _less_gradient(velocity, box.solve(divergence(velocity, box)), box)
 
@@ -114,7 +121,9 @@ def to_faces(centred: Tensor) -> Faces:
     for axis, field in enumerate(centred):
         first, last = field.narrow(axis, 0, 1), field.narrow(axis, -1, 1)
         count = field.shape[axis] - 1
-        parts.append(torch.cat([first, (field.narrow(axis, 0, count) + field.narrow(axis, 1, count)).mul_(0.5), last], axis))
+        parts.append(
+            torch.cat([first, (field.narrow(axis, 0, count) + field.narrow(axis, 1, count)).mul_(0.5), last], axis)
+        )
     return parts[0], parts[1], parts[2]
 
 

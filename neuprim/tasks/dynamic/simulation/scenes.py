@@ -36,7 +36,9 @@ class Stage:
         inside = torch.minimum(torch.minimum(half_x - x.abs(), half_y - y.abs()) / 0.14, (top - z) / 0.25)
         self.fade = 80.0 * (1 - inside).clamp_min(0) ** 2
 
-    def region(self, low: tuple[float, float, float], high: tuple[float, float, float]) -> tuple[tuple[slice, slice, slice], Axes]:
+    def region(
+        self, low: tuple[float, float, float], high: tuple[float, float, float]
+    ) -> tuple[tuple[slice, slice, slice], Axes]:
         """The cells whose centres lie in a box of the world (one at least per axis), and their coordinates."""
         slices, axes = [], []
         for axis, (a, b) in enumerate(zip(low, high, strict=True)):
@@ -104,7 +106,16 @@ SMOKE_FIRE = Scene(
     1 / 25,
     ("density", "temperature", "flames"),
     SolverSettings(
-        buoyancy=4.0, weight=0.2, confinement=0.5, cooling=0.7, dissipation=0.35, burn=1.9, heat=0.7, soot=0.8, expansion=1.5, drag=0.1
+        buoyancy=4.0,
+        weight=0.2,
+        confinement=0.5,
+        cooling=0.7,
+        dissipation=0.35,
+        burn=1.9,
+        heat=0.7,
+        soot=0.8,
+        expansion=1.5,
+        drag=0.1,
     ),
     _smoke_fire,
 )
@@ -132,7 +143,9 @@ def _colorful_smoke(stage: Stage, time: float) -> Forcing:
         push[0] += speed * (-inward * math.cos(angle) - around * math.sin(angle))
         push[1] += speed * (-inward * math.sin(angle) + around * math.cos(angle))
         push[2] += speed * 0.9
-        sources.append(Source(where, rate, density=0.25 + 0.75 * strength, temperature=0.35, colour=albedo, velocity=push))
+        sources.append(
+            Source(where, rate, density=0.25 + 0.75 * strength, temperature=0.35, colour=albedo, velocity=push)
+        )
     gusts = 1.2 * stage.noise.vector(200, stage.axes, 6.0, 2.0, time)
     return Forcing(sources, gusts, fade=stage.fade)
 
@@ -223,7 +236,9 @@ def _dust_tornado(stage: Stage, time: float) -> Forcing:
     arms = torch.cos(2 * torch.atan2(dy, dx) + 9.0 * z - 14.0 * time + 2.0 * noise.field(9, stage.axes, 4.0, 2.0, time))
     updraft = 1.35 * inside * (1 + 0.55 * arms) - 0.12
     outward = updraft * widening * r / core * inside - 0.6 * torch.exp(-z / 0.08) * (1 - inside)
-    push = torch.stack([(dx * outward - dy * turn) / r, (dy * outward + dx * turn) / r, updraft * (1 - torch.exp(-z / 0.03))])
+    push = torch.stack(
+        [(dx * outward - dy * turn) / r, (dy * outward + dx * turn) / r, updraft * (1 - torch.exp(-z / 0.03))]
+    )
     whole = (slice(None), slice(None), slice(None))
     whirl = Source(whole, 4.5 * torch.exp(-r2 / (3.0 * core) ** 2), velocity=push)
 

@@ -1,7 +1,8 @@
 """A smoke-and-fire solver: incompressible air on a staggered grid that carries smoke, heat, fuel and colour.
 
-One step is advection, reaction, forces, projection (Stam 1999, "Stable fluids"; Fedkiw, Stam and Jensen 2001, "Visual simulation of
-smoke"). Lengths are world units, times seconds; density, temperature and fuel have no unit and are about 0 to 1.
+One step is advection, reaction, forces, projection (Stam 1999, "Stable fluids"; Fedkiw, Stam and Jensen 2001, "Visual
+simulation of smoke"). Lengths are world units, times seconds; density, temperature and fuel have no unit and are about
+0 to 1.
 """
 
 from __future__ import annotations
@@ -70,9 +71,9 @@ class State:
 
     Attributes:
         velocity: at the faces, free of divergence.
-        density, temperature, fuel: (X, Y, Z) float32. Fuel is the reaction coordinate: 1 as it leaves the source, 0 when burnt.
-        colour: (3, X, Y, Z) albedo times density, so that where two smokes mix, each counts by its amount; None without colours.
-        time: seconds since the start.
+        density, temperature, fuel: (X, Y, Z) float32. Fuel is the reaction coordinate: 1 as it leaves the source, 0
+        when burnt. colour: (3, X, Y, Z) albedo times density, so that where two smokes mix, each counts by its amount;
+        None without colours. time: seconds since the start.
     """
 
     velocity: Faces
@@ -116,8 +117,8 @@ class Forcing:
 
     Attributes:
         sources: applied in order.
-        gusts: (3, X, Y, Z) acceleration of what is not clear air, or None; full where density, temperature and fuel add up to 1/2.
-        expansion: (X, Y, Z) volume made per volume and second, or None.
+        gusts: (3, X, Y, Z) acceleration of what is not clear air, or None; full where density, temperature and fuel add
+        up to 1/2. expansion: (X, Y, Z) volume made per volume and second, or None.
         fade: (X, Y, Z) per second: how fast smoke, heat and fuel vanish; above 0 near open ends only. None is nowhere.
     """
 
@@ -137,7 +138,8 @@ def advance(state: State, settings: SolverSettings, box: Box, forcing: Forcing, 
 
 
 def step(state: State, settings: SolverSettings, box: Box, forcing: Forcing, time: float) -> State:
-    """The gas ``time`` seconds later; its velocity is free of divergence, to rounding, under :func:`projection.divergence`."""
+    """The gas ``time`` seconds later; its velocity is free of divergence, to rounding, under
+    :func:`projection.divergence`."""
     before = to_centres(state.velocity)
     wind = before
     making = _expansion(state, settings, forcing, time)
@@ -165,13 +167,20 @@ def step(state: State, settings: SolverSettings, box: Box, forcing: Forcing, tim
     if forcing.fade is not None:
         keep = torch.exp(-time * forcing.fade)
         colour = None if state.colour is None else state.colour * keep
-        state = replace(state, density=state.density * keep, temperature=state.temperature * keep, fuel=state.fuel * keep, colour=colour)
+        state = replace(
+            state,
+            density=state.density * keep,
+            temperature=state.temperature * keep,
+            fuel=state.fuel * keep,
+            colour=colour,
+        )
     return replace(state, velocity=project(_changed(state.velocity, before, after, settings.smoothing), box))
 
 
 def _changed(velocity: Faces, before: Tensor, after: Tensor, smoothing: float) -> Faces:
-    """Face velocities from what happened at the centres: they take the *change*, since the mean of means would blur all motion at
-    every step. The little smoothing removes what the centres cannot see: motion that alternates from face to face."""
+    """Face velocities from what happened at the centres: they take the *change*, since the mean of means would blur all
+    motion at every step. The little smoothing removes what the centres cannot see: motion that alternates from face to
+    face."""
     change, mean = to_faces(after - before), to_faces(before)
     parts = [old + more + smoothing * (m - old) for old, more, m in zip(velocity, change, mean, strict=True)]
     return parts[0], parts[1], parts[2]
@@ -184,8 +193,11 @@ def _expansion(state: State, settings: SolverSettings, forcing: Forcing, time: f
     return burnt if forcing.expansion is None else burnt + forcing.expansion
 
 
-def _react(density: Tensor, temperature: Tensor, fuel: Tensor, settings: SolverSettings, time: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Fuel burns at a constant rate (Nguyen, Fedkiw and Jensen 2002), which gives flames a sharp end; then the gas cools."""
+def _react(
+    density: Tensor, temperature: Tensor, fuel: Tensor, settings: SolverSettings, time: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Fuel burns at a constant rate (Nguyen, Fedkiw and Jensen 2002), which gives flames a sharp end; then the gas
+    cools."""
     burnt = fuel.clamp_max(settings.burn * time)
     density = density + (2 * settings.soot) * burnt * (1 - fuel).clamp_min(0)
     temperature = temperature + settings.heat * burnt
@@ -195,8 +207,9 @@ def _react(density: Tensor, temperature: Tensor, fuel: Tensor, settings: SolverS
 
 
 def _forces(velocity: Tensor, density: Tensor, temperature: Tensor, settings: SolverSettings, box: Box) -> Tensor:
-    """(3, X, Y, Z) acceleration: buoyancy, weight, and vorticity confinement ``e h (N x w)`` with w = curl u and N = grad |w| / |grad |w||
-    (Fedkiw, Stam and Jensen 2001), which gives small eddies back what interpolation takes from them."""
+    """(3, X, Y, Z) acceleration: buoyancy, weight, and vorticity confinement ``e h (N x w)`` with w = curl u and N =
+    grad |w| / |grad |w|| (Fedkiw, Stam and Jensen 2001), which gives small eddies back what interpolation takes from
+    them."""
     if settings.confinement:
         w = _curl(velocity, box.cell)
         size = (w * w).sum(0).sqrt()
@@ -242,11 +255,15 @@ def _emit(state: State, velocity: Tensor, source: Source, time: float) -> tuple[
     if source.density is not None:
         density = towards(density, source.density)
         if colour is not None and source.colour is not None:
-            colour = torch.stack([towards(c, albedo * source.density) for c, albedo in zip(colour, source.colour, strict=True)])
+            colour = torch.stack(
+                [towards(c, albedo * source.density) for c, albedo in zip(colour, source.colour, strict=True)]
+            )
     if source.temperature is not None:
         temperature = towards(temperature, source.temperature)
     if source.fuel is not None:
         fuel = towards(fuel, source.fuel)
     if source.velocity is not None:
-        velocity = torch.stack([towards(component, value) for component, value in zip(velocity, source.velocity, strict=True)])
+        velocity = torch.stack(
+            [towards(component, value) for component, value in zip(velocity, source.velocity, strict=True)]
+        )
     return replace(state, density=density, temperature=temperature, fuel=fuel, colour=colour), velocity

@@ -7,4 +7,15 @@ from neuprim.tasks.dynamic.volume.normalise import Normalisation
 from neuprim.tasks.dynamic.volume.optics import Light, Look, medium_of
 from neuprim.tasks.dynamic.volume.rig import rig
 
-__all__ = ["EMBERGEN_FIRE", "LOOKS", "Light", "Look", "Medium", "Normalisation", "integrate", "medium_of", "named_look", "rig"]
+__all__ = [
+    "EMBERGEN_FIRE",
+    "LOOKS",
+    "Light",
+    "Look",
+    "Medium",
+    "Normalisation",
+    "integrate",
+    "medium_of",
+    "named_look",
+    "rig",
+]

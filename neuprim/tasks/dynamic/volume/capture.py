@@ -71,7 +71,8 @@ class Capture:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """The extinction grid's meaning where flames add to its extinction, so that its own part is kept apart; else none."""
+        """The extinction grid's meaning where flames add to its extinction, so that its own part is kept apart; else
+        none."""
         return (self.reader.extinction,) if self.look.mixes(self.reader.names) else ()
 
     @property
@@ -85,24 +86,39 @@ class Capture:
         return (frame.number - first) / max(last - first, 1)
 
     def within(self, first: int, last: int) -> Capture:
-        """The frames with these numbers and between them; their times stay, and the folder of the images is that of all frames."""
+        """The frames with these numbers and between them; their times stay, and the folder of the images is that of all
+        frames."""
         return replace(self, frames=[frame for frame in self.frames if first <= frame.number <= last], ends=self.clock)
 
     def key(self) -> str:
         """A short hash of all of it; files count by name, size and time of change."""
         stats = [(f.number, str(f.path), f.path.stat().st_size, f.path.stat().st_mtime_ns) for f in self.frames]
         cameras = [(c.viewmat.tolist(), c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in self.cameras]
-        parts = [RENDERER_VERSION, stats, asdict(self.look), dict(self.reader.names), cameras, self.samples, self.normalisation.to_json()]
+        parts = [
+            RENDERER_VERSION,
+            stats,
+            asdict(self.look),
+            dict(self.reader.names),
+            cameras,
+            self.samples,
+            self.normalisation.to_json(),
+        ]
         parts += [self.device.type] * hardware.computes(self.device)
         return hashlib.sha256(json.dumps(parts, default=_plain).encode()).hexdigest()[:16]
 
     def medium(self, frame: VdbFrame) -> Medium:
-        """What a frame's file holds, as extinction and radiance; nothing where it lacks the grids that absorb in the others."""
+        """What a frame's file holds, as extinction and radiance; nothing where it lacks the grids that absorb in the
+        others."""
         grids = self.reader.read(frame.path)
         if self.reader.extinction not in grids and not (self.components and self.look.flame_grid in grids):
             return Medium.nothing()
         try:
-            return medium_of(grids, replace(self.look, extinction_grids=(self.reader.extinction,)), self.normalisation, where=self.device)
+            return medium_of(
+                grids,
+                replace(self.look, extinction_grids=(self.reader.extinction,)),
+                self.normalisation,
+                where=self.device,
+            )
         except DataError as error:
             raise DataError(f"{frame.path}: {error}") from error
 
@@ -116,8 +132,8 @@ class Capture:
         return store.fetch(f"{self.name(frame)}/cam_{camera:02d}.exr", pixels * 4 * 4 + 2**16)
 
     def points(self, store: Store, frame: VdbFrame) -> Path:
-        """File of a frame's points: means (M, 3) scene units, colors (M, 3) linear radiance, weight (), the frame's total extinction, and
-        largest (), its largest."""
+        """File of a frame's points: means (M, 3) scene units, colors (M, 3) linear radiance, weight (), the frame's
+        total extinction, and largest (), its largest."""
         return store.fetch(f"{self.name(frame)}/{LAST}", _POINTS_BYTES)
 
     def describe(self) -> dict[str, Any]:
@@ -153,7 +169,9 @@ class Capture:
             brightest = max(brightest, peak)
             images.write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
         largest = medium.values[..., 0].max(initial=0.0)
-        np.savez(folder / LAST, brightest=np.float32(brightest), largest=np.float32(largest), **_points(medium, frame.number))
+        np.savez(
+            folder / LAST, brightest=np.float32(brightest), largest=np.float32(largest), **_points(medium, frame.number)
+        )
 
 
 def _points(medium: Medium, seed: int) -> dict[str, Any]:

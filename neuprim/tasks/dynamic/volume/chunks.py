@@ -1,7 +1,10 @@
-"""A long sequence in chunks of time: which frames each sees, what share of the work it gets, and how their models become one.
+"""A long sequence in chunks of time: which frames each sees, what share of the work it gets, and how their models
+become one.
 
-Chunks share out the frames that are learned from, in order and evenly. Each also sees a few frames beyond its ends, so that across a seam two
-chunks know the same frames, and over these one hands over to the other (:mod:`neuprim.tasks.dynamic.seams`). Times, box, cameras and exposure are those of the whole sequence, so that nothing has to be converted.
+Chunks share out the frames that are learned from, in order and evenly. Each also sees a few frames beyond its ends, so
+that across a seam two chunks know the same frames, and over these one hands over to the other
+(:mod:`neuprim.tasks.dynamic.seams`). Times, box, cameras and exposure are those of the whole sequence, so that nothing
+has to be converted.
 """
 
 from __future__ import annotations
@@ -27,19 +30,20 @@ FRAMES = 100
 """Frames of a chunk, at most, where their number is left to us."""
 
 FEWEST = 25
-"""Frames of a chunk, at least, where their number is left to us: primitives live for a good part of a sequence, and a seam ends their lives."""
+"""Frames of a chunk, at least, where their number is left to us: primitives live for a good part of a sequence, and a
+seam ends their lives."""
 
 _IN_TIME = {"window_center": 1, "velocity": -1, "acceleration": -2, "W_t": -1}
 """Parameters that are measured in the sequence's time, and the power of time in them."""
 
 _BEYOND, _MOST_BEYOND = 8, 3
-"""A chunk sees beyond its ends one frame for so many of its own, one at least and so many at most: a hand-over of one step in time is sudden
-where little moves, and frames that two chunks learn cost both."""
+"""A chunk sees beyond its ends one frame for so many of its own, one at least and so many at most: a hand-over of one
+step in time is sudden where little moves, and frames that two chunks learn cost both."""
 
 
 def number_of_chunks(asked: int | str | None, frames: int, images: int, memory: float) -> int:
-    """How many: what was asked for; ``auto``: so many that none has more than :data:`FRAMES` frames and the images of each stay in memory, but
-    not so many that one has fewer than :data:`FEWEST`.
+    """How many: what was asked for; ``auto``: so many that none has more than :data:`FRAMES` frames and the images of
+    each stay in memory, but not so many that one has fewer than :data:`FEWEST`.
 
     Args:
         frames: that are learned from.
@@ -54,7 +58,9 @@ def number_of_chunks(asked: int | str | None, frames: int, images: int, memory: 
     count = int(asked or 1)
     if count > 1 and 2 * count > frames:
         most = (
-            f"at most {frames // 2}, as a chunk has at least two of its own" if frames >= 4 else "null: a chunk has at least two of its own"
+            f"at most {frames // 2}, as a chunk has at least two of its own"
+            if frames >= 4
+            else "null: a chunk has at least two of its own"
         )
         raise ConfigError(
             f"scene.chunks={count}: there {'is 1 frame' if frames == 1 else f'are {frames} frames'} to learn from; expected {most}"
@@ -62,24 +68,30 @@ def number_of_chunks(asked: int | str | None, frames: int, images: int, memory: 
     return count
 
 
-def planned(capture: Capture, every: int, count: int, weight: Callable[[VdbFrame], float], config: Mapping[str, Any]) -> Chunks | None:
+def planned(
+    capture: Capture, every: int, count: int, weight: Callable[[VdbFrame], float], config: Mapping[str, Any]
+) -> Chunks | None:
     """The chunks of a sequence; None where no frame holds anything.
 
     Args:
         capture: of the whole sequence.
         every: every n-th frame is learned from.
         count: of chunks, two or more; each has at least two of the frames.
-        weight: of a frame, its total extinction: chunks share out the primitives by it, as the starting points of one run are.
-        config: of the run, in the layout of the command line's keys.
+        weight: of a frame, its total extinction: chunks share out the primitives by it, as the starting points of one
+        run are. config: of the run, in the layout of the command line's keys.
     """
     frames = capture.frames[::every]
     begins = [number * len(frames) // count for number in range(count + 1)]
-    times = [float(torch.tensor(capture.time(frame))) for frame in frames]  # as views have them, so that no share is nearly 0 or 1
+    times = [
+        float(torch.tensor(capture.time(frame))) for frame in frames
+    ]  # as views have them, so that no share is nearly 0 or 1
     beyond = min(max(len(frames) // count // _BEYOND, 1), _MOST_BEYOND)
     seams = tuple((times[begin - beyond], times[begin + beyond - 1]) for begin in begins[1:-1])
     seen = [frames[max(begin - beyond, 0) : end + beyond] for begin, end in itertools.pairwise(begins)]
     weights = [sum(map(weight, own)) for own in seen]
-    lit = [number for number in range(count) if weights[number] > 0]  # in a chunk without any matter there is nothing to fit
+    lit = [
+        number for number in range(count) if weights[number] > 0
+    ]  # in a chunk without any matter there is nothing to fit
     if not lit:
         return None
     steps = sum(len(seen[number]) for number in lit)
@@ -97,12 +109,15 @@ def planned(capture: Capture, every: int, count: int, weight: Callable[[VdbFrame
 
 
 def _in_time(capture: Capture, own: Sequence[VdbFrame], config: Mapping[str, Any]) -> dict[str, Any]:
-    """What a chunk's training has other than that of one run, as time goes faster in it: rates of what is measured in the sequence's time are those
-    of a sequence that is as long as the chunk, and windows start no longer than the chunk."""
+    """What a chunk's training has other than that of one run, as time goes faster in it: rates of what is measured in
+    the sequence's time are those of a sequence that is as long as the chunk, and windows start no longer than the
+    chunk."""
     length = capture.time(own[-1]) - capture.time(own[0])
     density = TimeDensity(config["model"]["neurons"], **config["model"]["density"])
     rates = {spec.name: config["train"]["rates"].get(spec.name, spec.lr) for spec in density.parameters()}
-    found: dict[str, Any] = {f"train.rates.{name}": rates[name] * length**power for name, power in _IN_TIME.items() if name in rates}
+    found: dict[str, Any] = {
+        f"train.rates.{name}": rates[name] * length**power for name, power in _IN_TIME.items() if name in rates
+    }
     window = config["model"]["init"].get("window")
     if isinstance(window, int | float) and window > length:
         found["model.init.window"] = length
@@ -110,7 +125,8 @@ def _in_time(capture: Capture, own: Sequence[VdbFrame], config: Mapping[str, Any
 
 
 def joined(models: Sequence[Primitives], numbers: Sequence[int], seams: Seams) -> Primitives:
-    """One model of the models of a sequence's chunks: at every time their extinctions and sources, weighted by their shares.
+    """One model of the models of a sequence's chunks: at every time their extinctions and sources, weighted by their
+    shares.
 
     Args:
         models: all of one form, in the whole sequence's time.
@@ -127,9 +143,13 @@ def joined(models: Sequence[Primitives], numbers: Sequence[int], seams: Seams) -
                 f"a chunk's density is {type(model.density).__name__} {model.density.settings()}; expected a TimeDensity without seams"
             )
         if any(getattr(model, kind).settings() != getattr(first, kind).settings() for kind in ("density", "colour")):
-            raise ConfigError(f"chunks have models of different forms: {first.density.settings()} and {model.density.settings()}")
+            raise ConfigError(
+                f"chunks have models of different forms: {first.density.settings()} and {model.density.settings()}"
+            )
     density = TimeDensity(**{**first.density.settings(), "seams": seams})
     params = {name: torch.cat([model.params[name].detach().cpu() for model in models]) for name in first.params}
-    params["chunk"] = torch.cat([torch.full((model.count, 1), float(number)) for number, model in zip(numbers, models, strict=True)])
+    params["chunk"] = torch.cat(
+        [torch.full((model.count, 1), float(number)) for number, model in zip(numbers, models, strict=True)]
+    )
     made = Primitives(density, first.colour, params)
     return Primitives(density, first.colour, {spec.name: params[spec.name] for spec in made.specs})

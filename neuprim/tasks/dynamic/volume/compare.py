@@ -22,9 +22,10 @@ THIRDS = ("early", "middle", "late")
 def compare_with_truth(model: Primitives, capture: Capture, times: list[float], per_third: int = 3) -> dict[str, Any]:
     """Errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
 
-    ``sigma_frames`` has every compared frame, see :meth:`~neuprim.core.volumes.errors.Comparison.numbers`; the thirds are means over
-    ``per_third`` of them, evenly spaced. Frames without any extinction are left out. Where flames add to the extinction of a grid, the same
-    numbers are there of that grid's part, against its own values: ``density_frames``, ...
+    ``sigma_frames`` has every compared frame, see :meth:`~neuprim.core.volumes.errors.Comparison.numbers`; the thirds
+    are means over
+    ``per_third`` of them, evenly spaced. Frames without any extinction are left out. Where flames add to the extinction
+    of a grid, the same numbers are there of that grid's part, against its own values: ``density_frames``, ...
     """
     found: dict[str, Any] = {}
     for component in (None, *model.density.components(model.params)):
@@ -32,12 +33,16 @@ def compare_with_truth(model: Primitives, capture: Capture, times: list[float], 
     return found
 
 
-def _compared(model: Primitives, capture: Capture, times: list[float], per_third: int, component: str | None) -> dict[str, Any]:
+def _compared(
+    model: Primitives, capture: Capture, times: list[float], per_third: int, component: str | None
+) -> dict[str, Any]:
     count, truth = len(capture.frames), VolumeTruth(capture)
     chosen = sorted({int((i + 0.5) * count / (3 * per_third)) for i in range(3 * per_third)})
     entries: list[dict[str, Any]] = []
     for t in chosen:
-        numbers = frame_errors(model, {"time": torch.tensor(times[t])}, truth, t, where=capture.device, component=component)
+        numbers = frame_errors(
+            model, {"time": torch.tensor(times[t])}, truth, t, where=capture.device, component=component
+        )
         if numbers is not None:
             entries.append({"frame": capture.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **numbers})
     what = component or "sigma"

@@ -27,7 +27,8 @@ from neuprim.tasks.dynamic.volume.voxels import FrameVoxels
 __all__ = ["MEMORY", "TRAINING", "FrameViews", "Recording", "stored_points", "volume_dataset"]
 
 MEMORY = 11 * 2**27
-"""Bytes of decoded images and voxels that are kept, 1408 MiB; beyond them those not used for longest are read again when needed."""
+"""Bytes of decoded images and voxels that are kept, 1408 MiB; beyond them those not used for longest are read again
+when needed."""
 
 TRAINING, _TEST, _VOXELS = 6 / 11, 1 / 11, 4 / 11
 """Shares of the training images, of the test images, which are gone through in order, and of the voxels."""
@@ -42,9 +43,21 @@ class FrameViews(ViewSet):
     """
 
     def __init__(
-        self, capture: Capture, folder: Store, cameras: Sequence[int], exposure: float, every: int = 1, memory: float = MEMORY
+        self,
+        capture: Capture,
+        folder: Store,
+        cameras: Sequence[int],
+        exposure: float,
+        every: int = 1,
+        memory: float = MEMORY,
     ) -> None:
-        self.capture, self.folder, self.cameras, self.exposure, self.memory = capture, folder, list(cameras), exposure, memory
+        self.capture, self.folder, self.cameras, self.exposure, self.memory = (
+            capture,
+            folder,
+            list(cameras),
+            exposure,
+            memory,
+        )
         self._kept: OrderedDict[int, Tensor] = OrderedDict()
         self.frames = capture.frames[::every]
         self.times = [torch.tensor(capture.time(frame)) for frame in self.frames]
@@ -55,7 +68,11 @@ class FrameViews(ViewSet):
     def view(self, index: int) -> View:
         c, t = divmod(index, len(self.times))
         frame = self.frames[t]
-        return View(f"cam_{self.cameras[c]:02d}_frame_{frame.number:04d}", self.capture.cameras[self.cameras[c]], {"time": self.times[t]})
+        return View(
+            f"cam_{self.cameras[c]:02d}_frame_{frame.number:04d}",
+            self.capture.cameras[self.cameras[c]],
+            {"time": self.times[t]},
+        )
 
     def pixels(self, index: int) -> Pixels:
         rgba = self._decoded(index).float()
@@ -108,9 +125,12 @@ class Recording:
     _tracks: dict[int, Tensor] = field(default_factory=dict, repr=False)
 
     def points(self, views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
-        """Points where some frame absorbs, as many of a frame as it has of the sequence's extinction, with the frame's time."""
+        """Points where some frame absorbs, as many of a frame as it has of the sequence's extinction, with the frame's
+        time."""
         total = np.array(self.weights)
-        total[[t for t in range(len(total)) if t % self.every]] = 0.0  # nothing is known of frames that are not learned from
+        total[[t for t in range(len(total)) if t % self.every]] = (
+            0.0  # nothing is known of frames that are not learned from
+        )
         if not total.sum() > 0:
             raise DataError(
                 f"{self.name}: no frame to learn from absorbs light; expected extinction in one (scene.frames, scene.train_every)"
@@ -127,7 +147,9 @@ class Recording:
             place = points[rows]
             if wanted > len(points):  # points used again stand beside themselves, or they would start with no size
                 apart = torch.from_numpy(cKDTree(stored["means"]).query(stored["means"], k=2)[0][:, 1]).float()
-                place[len(points) :] += (apart[rows, None] * (torch.rand((wanted, 3), generator=generator) - 0.5))[len(points) :]
+                place[len(points) :] += (apart[rows, None] * (torch.rand((wanted, 3), generator=generator) - 0.5))[
+                    len(points) :
+                ]
             means.append(place)
             colors.append(torch.from_numpy(stored["colors"])[rows] / self.exposure)
             times.append(torch.full((wanted,), float(self.test.times[t])))
@@ -136,12 +158,15 @@ class Recording:
         return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)}, steps=steps)
 
     def track(self, index: int) -> Tensor:
-        """(H, W) bool, the pixels that show matter in some frame of a test view's camera; kept, as all frames of a camera share it."""
+        """(H, W) bool, the pixels that show matter in some frame of a test view's camera; kept, as all frames of a
+        camera share it."""
         frames = len(self.capture.frames)
         camera = index // frames
         if camera not in self._tracks:
             alphas = (self.test.pixels(i).alpha for i in range(camera * frames, (camera + 1) * frames))
-            union = torch.zeros(self.test.view(index).camera.height, self.test.view(index).camera.width, dtype=torch.bool)
+            union = torch.zeros(
+                self.test.view(index).camera.height, self.test.view(index).camera.width, dtype=torch.bool
+            )
             for alpha in alphas:
                 assert alpha is not None
                 union |= alpha > _MATTER
@@ -160,13 +185,14 @@ def volume_dataset(
     span: tuple[int, int] | None = None,
     memory: float = MEMORY,
 ) -> Dataset:
-    """A volume sequence seen by cameras; colours are linear radiance over the exposure, the brightest value any camera sees.
+    """A volume sequence seen by cameras; colours are linear radiance over the exposure, the brightest value any camera
+    sees.
 
     Args:
         folder: of the images that the capture took.
         held_out: indices of the cameras of the test split.
-        span: numbers of the first and the last frame that are learned from and judged; the exposure is that of all. None: all.
-        memory: bytes of decoded images and voxels that are kept.
+        span: numbers of the first and the last frame that are learned from and judged; the exposure is that of all.
+        None: all. memory: bytes of decoded images and voxels that are kept.
 
     Raises:
         DataError: every frame is black, or a file is damaged.
@@ -174,7 +200,9 @@ def volume_dataset(
     stored = [stored_points(capture.points(folder, frame), "brightest", "largest") for frame in capture.frames]
     exposure = max(float(frame["brightest"]) for frame in stored)
     if not exposure > 0:
-        raise DataError(f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)")
+        raise DataError(
+            f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)"
+        )
     if span is not None:
         capture = capture.within(*span)
     learned = [c for c in range(len(capture.cameras)) if c not in held_out]

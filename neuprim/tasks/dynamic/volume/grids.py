@@ -22,7 +22,8 @@ USUAL = {
 
 @dataclass(frozen=True)
 class GridReader:
-    """Meaning ("density", "temperature", "flames", "color") -> name in the files, and the meaning of the grid that absorbs."""
+    """Meaning ("density", "temperature", "flames", "color") -> name in the files, and the meaning of the grid that
+    absorbs."""
 
     names: Mapping[str, str]
     extinction: str = "density"
@@ -53,7 +54,8 @@ def find_grids(frames: Sequence[VdbFrame], given: Mapping[str, str]) -> GridRead
     """The grids that some frame has: those the user named, then those with a usual name.
 
     Raises:
-        DataError: a named grid is in no file or cannot be read (level sets, points), or no file has anything that absorbs.
+        DataError: a named grid is in no file or cannot be read (level sets, points), or no file has anything that
+        absorbs.
     """
     kinds: dict[str, str | None] = {}  # name -> why it cannot be used
     for frame in frames:
@@ -67,7 +69,9 @@ def find_grids(frames: Sequence[VdbFrame], given: Mapping[str, str]) -> GridRead
         if meaning in given:
             name = given[meaning]
             if name not in kinds:
-                raise DataError(f"{folder}: scene.grids.{meaning}={name}: no frame has such a grid{nearest(name, kinds)}")
+                raise DataError(
+                    f"{folder}: scene.grids.{meaning}={name}: no frame has such a grid{nearest(name, kinds)}"
+                )
             if kinds[name]:
                 raise DataError(f"{folder}: scene.grids.{meaning}={name}: the grid {kinds[name]}")
             names[meaning] = name
@@ -76,5 +80,7 @@ def find_grids(frames: Sequence[VdbFrame], given: Mapping[str, str]) -> GridRead
             names |= {meaning: found[0]} if found else {}
     if not {"density", "temperature"} & names.keys():
         listed = ", ".join(f"{name} ({why or 'readable'})" for name, why in sorted(kinds.items())) or "none"
-        raise DataError(f"{folder}: no grid of density or temperature; found: {listed}. Name one: scene.grids.density=NAME")
+        raise DataError(
+            f"{folder}: no grid of density or temperature; found: {listed}. Name one: scene.grids.density=NAME"
+        )
     return GridReader(names)

@@ -23,8 +23,8 @@ EMBERGEN_FIRE = Look(
 )
 """EmberGen's free fire, which has no density: hot gas absorbs, flames glow, and a grey of 0.05 shows the rest.
 
-The strength of the glow beside the grey decides how dark the images are beside their brightest pixel, and so what a black image
-scores: ``benchmarks/dynamic_quality.py`` prints it beside every number.
+The strength of the glow beside the grey decides how dark the images are beside their brightest pixel, and so what a
+black image scores: ``benchmarks/dynamic_quality.py`` prints it beside every number.
 """
 
 SMOKE_FIRE = Look(

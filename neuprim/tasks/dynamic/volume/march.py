@@ -19,13 +19,20 @@ _ROWS = 4
 
 
 def integrate(
-    medium: Medium, camera: Camera, samples: int = 2, subdivisions: int = 1, threads: int = 0, where: torch.device = device.HOST
+    medium: Medium,
+    camera: Camera,
+    samples: int = 2,
+    subdivisions: int = 1,
+    threads: int = 0,
+    where: torch.device = device.HOST,
 ) -> Tensor:
-    """(H, W, 4) float32 linear premultiplied RGBA of what a pinhole camera in scene units sees, behind nothing; on the processor.
+    """(H, W, 4) float32 linear premultiplied RGBA of what a pinhole camera in scene units sees, behind nothing; on the
+    processor.
 
-    L = ∫ T σ c ds and alpha = 1 - T from the camera on, per ray and averaged over a pixel. Each cell between voxel centres is
-    integrated by itself with two Gauss points per sub-interval: alpha is exact but for rounding, radiance of fourth order; see
-    :mod:`~neuprim.tasks.dynamic.volume.traverse`. A ray ends where T < 1e-4. The result does not depend on ``threads``.
+    L = ∫ T σ c ds and alpha = 1 - T from the camera on, per ray and averaged over a pixel. Each cell between voxel
+    centres is integrated by itself with two Gauss points per sub-interval: alpha is exact but for rounding, radiance of
+    fourth order; see :mod:`~neuprim.tasks.dynamic.volume.traverse`. A ray ends where T < 1e-4. The result does not
+    depend on ``threads``.
 
     Args:
         samples: rays per pixel side, on a regular grid.
@@ -45,7 +52,9 @@ def integrate(
 
         values, skips = medium.on(where)
         place, lenses = (device.from_host(torch.from_numpy(np.ascontiguousarray(x)), where) for x in (pose, lens))
-        return traverse_warp.radiances(values, skips, place, lenses, camera.width, camera.height, samples, subdivisions).cpu()
+        return traverse_warp.radiances(
+            values, skips, place, lenses, camera.width, camera.height, samples, subdivisions
+        ).cpu()
     image = np.zeros((camera.height, camera.width, 4), np.float32)
     parallel_for(
         radiances,

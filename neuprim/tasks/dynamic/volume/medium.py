@@ -26,12 +26,14 @@ class Medium:
     The radiance along a ray is L = ∫ T(s) σ(s) c(s) ds with T(s) = exp(-∫₀ˢ σ), and alpha = 1 - T at its end.
 
     Attributes:
-        values: (X, Y, Z, 4) float32, C-contiguous: σ, σ·c_R, σ·c_G, σ·c_B at voxel centres. σ is extinction in 1/scene unit,
-            c the source radiance in linear RGB. The outermost layer of voxels is zero, so that the field is continuous where
-            it ends; :meth:`padded` adds that layer. No voxels at all is an empty medium.
+        values: (X, Y, Z, 4) float32, C-contiguous: σ, σ·c_R, σ·c_G, σ·c_B at voxel centres. σ is extinction in 1/scene
+        unit,
+            c the source radiance in linear RGB. The outermost layer of voxels is zero, so that the field is continuous
+            where it ends; :meth:`padded` adds that layer. No voxels at all is an empty medium.
         scene_from_index: (4, 4) float64, affine and invertible: the centre of voxel (i, j, k) is at it @ (i, j, k, 1).
         non_finite: how many voxels of the source were NaN or infinite and count as 0.
-        scattering: (X, Y, Z) float32, the part of σ that the extinction grid makes, where flames add to it; None where all of it is that part.
+        scattering: (X, Y, Z) float32, the part of σ that the extinction grid makes, where flames add to it; None where
+        all of it is that part.
     """
 
     values: np.ndarray
@@ -43,9 +45,13 @@ class Medium:
     def __post_init__(self) -> None:
         v, m = self.values, self.scene_from_index
         if v.ndim != 4 or v.shape[3] != 4 or v.dtype != np.float32 or not v.flags.c_contiguous:
-            raise DataError(f"medium: values are {v.dtype} of shape {v.shape}; expected contiguous float32 (X, Y, Z, 4)")
+            raise DataError(
+                f"medium: values are {v.dtype} of shape {v.shape}; expected contiguous float32 (X, Y, Z, 4)"
+            )
         if m.shape != (4, 4) or m.dtype != np.float64 or not np.isfinite(m).all() or (m[3] != (0, 0, 0, 1)).any():
-            raise DataError(f"medium: scene_from_index is {m.dtype} of shape {m.shape}; expected a finite affine float64 (4, 4)")
+            raise DataError(
+                f"medium: scene_from_index is {m.dtype} of shape {m.shape}; expected a finite affine float64 (4, 4)"
+            )
         if self.empty:
             return
         edges = np.linalg.norm(m[:3, :3], axis=0)
@@ -57,8 +63,11 @@ class Medium:
             raise DataError("medium: the outermost voxels are not zero; Medium.padded adds a layer that is")
 
     @staticmethod
-    def padded(values: np.ndarray, scene_from_index: np.ndarray, non_finite: int = 0, scattering: np.ndarray | None = None) -> Medium:
-        """The medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels; ``scene_from_index`` is of ``values``."""
+    def padded(
+        values: np.ndarray, scene_from_index: np.ndarray, non_finite: int = 0, scattering: np.ndarray | None = None
+    ) -> Medium:
+        """The medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels; ``scene_from_index`` is of
+        ``values``."""
         shift = np.eye(4)
         shift[:3, 3] = -1.0
         around = np.zeros((*(n + 2 for n in values.shape[:3]), 4), np.float32)
@@ -95,7 +104,8 @@ class Medium:
 
     @cached_property
     def skips(self) -> np.ndarray:
-        """(X-1, Y-1, Z-1) uint8: chessboard distance in cells to the nearest one that holds anything; 0 for those, 255 if far or none.
+        """(X-1, Y-1, Z-1) uint8: chessboard distance in cells to the nearest one that holds anything; 0 for those, 255
+        if far or none.
 
         A ray in a cell of distance d may leave the cube of 2d-1 cells around it at once.
         """

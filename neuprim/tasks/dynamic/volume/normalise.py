@@ -29,7 +29,9 @@ class Normalisation:
 
     def __post_init__(self) -> None:
         if len(self.center) != 3 or not all(math.isfinite(c) for c in self.center) or not 0.0 < self.scale < math.inf:
-            raise DataError(f"normalisation: center {self.center}, scale {self.scale}; expected three finite numbers and one > 0")
+            raise DataError(
+                f"normalisation: center {self.center}, scale {self.scale}; expected three finite numbers and one > 0"
+            )
 
     @staticmethod
     def from_bounds(bounds: np.ndarray) -> Normalisation:
@@ -37,7 +39,9 @@ class Normalisation:
         low, high = np.asarray(bounds, np.float64)
         longest = float((high - low).max())
         if not np.isfinite(high - low).all() or longest <= 0.0 or (high < low).any():
-            raise DataError(f"normalisation: box from {low.tolist()} to {high.tolist()}; expected a finite one with a volume")
+            raise DataError(
+                f"normalisation: box from {low.tolist()} to {high.tolist()}; expected a finite one with a volume"
+            )
         x, y, z = ((low + high) / 2).tolist()
         return Normalisation((x, y, z), 1.0 / longest)
 
@@ -84,4 +88,6 @@ class Normalisation:
             x, y, z = (float(c) for c in record["center"])
             return Normalisation((x, y, z), float(record["scale"]))
         except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{where}: {dict(record)!r} ({error!r}); expected 'center' (three numbers) and 'scale'") from None
+            raise DataError(
+                f"{where}: {dict(record)!r} ({error!r}); expected 'center' (three numbers) and 'scale'"
+            ) from None

@@ -25,11 +25,16 @@ from neuprim.tasks.dynamic.volume.transmittance import transmittance
 __all__ = ["FOLLOWING", "Light", "Look", "medium_of"]
 
 NotNegative = Annotated[float, Range(at_least=0)]
-RGB = Annotated[tuple[NotNegative, NotNegative, NotNegative], Accepts(lambda colour: True, "three numbers of at least 0, as [1, 0.5, 0]")]
+RGB = Annotated[
+    tuple[NotNegative, NotNegative, NotNegative],
+    Accepts(lambda colour: True, "three numbers of at least 0, as [1, 0.5, 0]"),
+]
 Coordinate = Annotated[float, Unbounded("any direction, of any length")]
 Level = Annotated[float, Unbounded("values of a grid, in whatever unit its files have")]
 Kelvin = Annotated[float, Range(above=0, at_most=1e5)]
-Direction = Annotated[tuple[Coordinate, Coordinate, Coordinate], Accepts(any, "three numbers that are not all 0, as [0, 0, 1]")]
+Direction = Annotated[
+    tuple[Coordinate, Coordinate, Coordinate], Accepts(any, "three numbers that are not all 0, as [0, 0, 1]")
+]
 
 
 def _absorbing(names: tuple[str, ...]) -> bool:
@@ -70,10 +75,10 @@ class Look:
         σ   = σ_s + σ_f
         σ c = σ_s · albedo · (ambient + T_light · irradiance / 4π) + σ · emission · B(K(f))
 
-    B is the radiance of a black body relative to the hottest of the look, whose largest channel is 1; K maps ``flame_range``
-    linearly to ``kelvin`` and clamps. T_light is the transmittance to the light: single scattering, isotropic phase function
-    1/4π, with shadows. Extinctions are per scene unit, and a scene unit is the longest side of the sequence's box; radiances
-    are linear sRGB in one arbitrary unit. Negative, NaN and infinite voxels count as 0.
+    B is the radiance of a black body relative to the hottest of the look, whose largest channel is 1; K maps
+    ``flame_range`` linearly to ``kelvin`` and clamps. T_light is the transmittance to the light: single scattering,
+    isotropic phase function 1/4π, with shadows. Extinctions are per scene unit, and a scene unit is the longest side of
+    the sequence's box; radiances are linear sRGB in one arbitrary unit. Negative, NaN and infinite voxels count as 0.
 
     Attributes:
         extinction_grids: names in order of preference; the first that a file has is d.
@@ -102,15 +107,21 @@ class Look:
     ambient: RGB = (0.0, 0.0, 0.0)
     light: Light | None = None
     flame_grid: Meaning = "flames"
-    flame_range: Annotated[tuple[Level, Level], Accepts(lambda ends: ends[0] < ends[1], "two rising numbers, as [0, 1]")] = (0.0, 1.0)
-    kelvin: Annotated[tuple[Kelvin, Kelvin], Accepts(lambda k: k[0] <= k[1], "two rising numbers within 0..1e5, as [1000, 2000]")] = (
+    flame_range: Annotated[
+        tuple[Level, Level], Accepts(lambda ends: ends[0] < ends[1], "two rising numbers, as [0, 1]")
+    ] = (0.0, 1.0)
+    kelvin: Annotated[
+        tuple[Kelvin, Kelvin], Accepts(lambda k: k[0] <= k[1], "two rising numbers within 0..1e5, as [1000, 2000]")
+    ] = (
         1000.0,
         2000.0,
     )
     emission: NotNegative = 0.0
     flame_extinction: NotNegative = 0.0
     color_grid: Meaning | None = None
-    gradient: Annotated[tuple[RGB, ...], Accepts(bool, "colours from bottom to top, as [[1, 0, 0], [0, 0, 1]]")] | None = None
+    gradient: (
+        Annotated[tuple[RGB, ...], Accepts(bool, "colours from bottom to top, as [[1, 0, 0], [0, 0, 1]]")] | None
+    ) = None
     up: Axis = "z"
 
     def __post_init__(self) -> None:
@@ -134,12 +145,18 @@ class Look:
 
 
 def medium_of(
-    grids: Mapping[str, Grid], look: Look, normalisation: Normalisation, threads: int = 0, where: torch.device = device.HOST
+    grids: Mapping[str, Grid],
+    look: Look,
+    normalisation: Normalisation,
+    threads: int = 0,
+    where: torch.device = device.HOST,
 ) -> Medium:
     """The medium of one frame on the voxels of its extinction grid.
 
-    Other grids are sampled at those voxels' centres: as they are where their transform is the same, trilinearly where not.
-    Where flames absorb, the medium reaches to all of them. An empty frame gives an empty medium. :attr:`Medium.non_finite` counts the NaN and infinite voxels of all grids that were used.
+    Other grids are sampled at those voxels' centres: as they are where their transform is the same, trilinearly where
+    not.
+    Where flames absorb, the medium reaches to all of them. An empty frame gives an empty medium.
+    :attr:`Medium.non_finite` counts the NaN and infinite voxels of all grids that were used.
 
     Args:
         grids: by name; those that the look does not name are ignored.
@@ -171,8 +188,12 @@ def medium_of(
     scene_from_index[:3, 3] += scene_from_index[:3, :3] @ np.array(box[0], np.float64)
     arriving: np.ndarray = np.array(look.ambient, np.float32)
     if look.light is not None:
-        lit = transmittance(Medium.padded(values, scene_from_index), look.light.direction, threads, where)[1:-1, 1:-1, 1:-1]
-        arriving = arriving + lit[..., None] * (np.array(look.light.irradiance, np.float32) / np.float32(4.0 * math.pi)).astype(np.float32)
+        lit = transmittance(Medium.padded(values, scene_from_index), look.light.direction, threads, where)[
+            1:-1, 1:-1, 1:-1
+        ]
+        arriving = arriving + lit[..., None] * (
+            np.array(look.light.irradiance, np.float32) / np.float32(4.0 * math.pi)
+        ).astype(np.float32)
     albedo, more = _albedo(grids, look, base.transform, box, scene_from_index)
     values[..., 1:] = sigma_s[..., None] * (albedo * arriving)
     if flame is not None and look.emission > 0.0:
@@ -188,7 +209,10 @@ def _bounds_in(grid: Grid, transform: np.ndarray) -> Bounds | None:
     corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)
     chain = np.linalg.inv(transform) @ grid.transform
     index = corners @ chain[:3, :3].T + chain[:3, 3]
-    low, high = np.ceil(index.min(0) - 1e-6).astype(int).tolist(), (np.floor(index.max(0) + 1e-6).astype(int) + 1).tolist()
+    low, high = (
+        np.ceil(index.min(0) - 1e-6).astype(int).tolist(),
+        (np.floor(index.max(0) + 1e-6).astype(int) + 1).tolist(),
+    )
     return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 
@@ -200,7 +224,8 @@ def _union(a: Bounds | None, b: Bounds | None) -> Bounds | None:
 
 
 def _aligned(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two index-to-world maps have the same voxels, to a millionth of one; the offset from the world's origin may be large."""
+    """Whether two index-to-world maps have the same voxels, to a millionth of one; the offset from the world's origin
+    may be large."""
     return np.allclose(a[:3, :3], b[:3, :3], rtol=0, atol=1e-9 * float(np.abs(b[:3, :3]).max())) and np.allclose(
         np.linalg.inv(b) @ a[:, 3], [0, 0, 0, 1], rtol=0, atol=1e-6
     )
@@ -253,7 +278,9 @@ def _albedo(
     indices = np.meshgrid(*(np.arange(n) for n in sizes), indexing="ij", sparse=True)
     height = sum(scene_from_index[axis, a] * indices[a] for a in range(3)) + scene_from_index[axis, 3] + 0.5
     stops = np.linspace(0.0, 1.0, len(look.gradient))
-    return albedo * np.stack([np.interp(height, stops, [s[c] for s in look.gradient]) for c in range(3)], -1).astype(np.float32), 0
+    return albedo * np.stack([np.interp(height, stops, [s[c] for s in look.gradient]) for c in range(3)], -1).astype(
+        np.float32
+    ), 0
 
 
 def _glow(flame: np.ndarray, look: Look) -> np.ndarray:

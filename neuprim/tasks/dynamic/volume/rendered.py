@@ -24,8 +24,8 @@ _SCENE = "scene.json"
 class RenderedFrames(GroundTruth):
     """Ground truth of a volume sequence: every frame from every camera.
 
-    A frame's files get their name together when all are written, so that an interrupted run goes on with the frames that are missing, and of
-    two runs that render one frame the slower one finds that it is there.
+    A frame's files get their name together when all are written, so that an interrupted run goes on with the frames
+    that are missing, and of two runs that render one frame the slower one finds that it is there.
 
     Args:
         store: where ground truth is kept; the images lie in ``volumes/KEY`` of it.
@@ -73,7 +73,9 @@ class RenderedFrames(GroundTruth):
         """Render a frame, and keep it unless it is there by then."""
 
         def attempt() -> None:
-            self.store.publish(self.frames[frame], lambda folder: self.capture.render(self.capture.frames[frame], folder), LAST)
+            self.store.publish(
+                self.frames[frame], lambda folder: self.capture.render(self.capture.frames[frame], folder), LAST
+            )
 
         with _told(self.store):
             self.store.patiently(attempt, tell)
@@ -110,4 +112,6 @@ def _told(store: Store) -> Iterator[None]:
         if not isinstance(cause, OSError) or (isinstance(error, DataError) and str(store.path) not in str(error)):
             raise
         why = cause.strerror or cause
-        raise DataError(f"cannot write the rendered images to {store.address}: {why}; frames that are there are kept") from error
+        raise DataError(
+            f"cannot write the rendered images to {store.address}: {why}; frames that are there are kept"
+        ) from error

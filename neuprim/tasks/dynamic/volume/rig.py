@@ -15,7 +15,8 @@ AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 """Up directions by name."""
 
 _TEST = (0.4, 0.75)
-"""Where the test cameras stand in the sequence, which goes from the rim to the pole: neighbours on all sides, 90 degrees apart."""
+"""Where the test cameras stand in the sequence, which goes from the rim to the pole: neighbours on all sides, 90
+degrees apart."""
 
 
 def rig(
@@ -40,7 +41,13 @@ def rig(
     low, high = (math.sin(math.radians(e)) for e in elevations)
     if up not in AXES:
         raise ConfigError(f"up {up!r}; expected 'y' or 'z'")
-    if size < 1 or cameras < 4 or distance <= 0.0 or not 0.0 < field_of_view < 180.0 or not -90 <= elevations[0] < elevations[1] <= 90:
+    if (
+        size < 1
+        or cameras < 4
+        or distance <= 0.0
+        or not 0.0 < field_of_view < 180.0
+        or not -90 <= elevations[0] < elevations[1] <= 90
+    ):
         raise ConfigError(
             f"size {size}, cameras {cameras}, distance {distance}, field_of_view {field_of_view}, elevations {elevations}; "
             "expected positive sizes, at least 4 cameras, an angle below 180 and rising elevations"

@@ -51,10 +51,14 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     span = _span(asked, capture)
     rendered = _rendered(asked, capture, context).take(context.progress)
     up = torch.tensor(AXES[asked.up], dtype=torch.float64)
-    return volume_dataset(name, source, capture, rendered, held_out, up, asked.train_every, span, asked.memory * 2.0**20)
+    return volume_dataset(
+        name, source, capture, rendered, held_out, up, asked.train_every, span, asked.memory * 2.0**20
+    )
 
 
-def load_truth(settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None) -> RenderedFrames:
+def load_truth(
+    settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
+) -> RenderedFrames:
     """The same scene's images as work to be done; raises as :func:`load`.
 
     Args:
@@ -65,7 +69,9 @@ def load_truth(settings: Mapping[str, Any], context: SceneContext, known: Mappin
 
 
 def _rendered(asked: VolumeSettings, capture: Capture, context: SceneContext) -> RenderedFrames:
-    store = LocalStore(context.cache_dir) if asked.cache is None else store_at(asked.cache, context.cache_dir / "copies")
+    store = (
+        LocalStore(context.cache_dir) if asked.cache is None else store_at(asked.cache, context.cache_dir / "copies")
+    )
     return RenderedFrames(capture, store)
 
 
@@ -77,7 +83,8 @@ def load_volume(settings: Mapping[str, Any], context: SceneContext) -> CaptureSo
 
 
 def load_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
-    """The chunks that ``scene.chunks`` asks for, with the ground truth of all frames rendered, as their exposure is one; None for one run.
+    """The chunks that ``scene.chunks`` asks for, with the ground truth of all frames rendered, as their exposure is
+    one; None for one run.
 
     Raises:
         ConfigError: more chunks than the frames allow. And as :func:`load`.
@@ -85,7 +92,9 @@ def load_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | No
     settings = {name: value for name, value in config["scene"].items() if name != "name"}
     asked, _, _, capture, held_out = _prepare(settings, context)
     learned, camera = len(capture.frames[:: asked.train_every]), capture.cameras[0]
-    images = learned * (len(capture.cameras) - len(held_out)) * camera.width * camera.height * 4 * 2  # RGBA, half floats
+    images = (
+        learned * (len(capture.cameras) - len(held_out)) * camera.width * camera.height * 4 * 2
+    )  # RGBA, half floats
     count = number_of_chunks(asked.chunks, learned, images, asked.memory * 2.0**20 * TRAINING)
     if count == 1:
         return None
@@ -100,7 +109,8 @@ def load_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | No
 def _prepare(
     settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
 ) -> tuple[VolumeSettings, str, DataSource, Capture, range]:
-    """All that is known before anything is rendered: settings, name, origin, what to render, and the cameras held out."""
+    """All that is known before anything is rendered: settings, name, origin, what to render, and the cameras held
+    out."""
     asked = checked(VolumeSettings, settings, "scene")
     _look(asked, AUTO[0])  # a typing error shows before anything is simulated
     folder, name, source = _files(asked, context)
@@ -115,17 +125,22 @@ def _prepare(
             reader = dataclasses.replace(reader, names={m: n for m, n in reader.names.items() if m != "flames"})
         if source == "real":
             look = dataclasses.replace(
-                look, **{key: v for key, v in _following(look, reader.extinction, survey).items() if key not in asked.optics}
+                look,
+                **{key: v for key, v in _following(look, reader.extinction, survey).items() if key not in asked.optics},
             )
         normalisation, measured = Normalisation.from_bounds(survey.box), survey.extents
         bounds = normalisation.to_scene(survey.box)
     else:
         low, high = known["look"]["flame_range"]
-        look = dataclasses.replace(look, **{**{key: known["look"][key] for key in FOLLOWING}, "flame_range": (low, high)})
+        look = dataclasses.replace(
+            look, **{**{key: known["look"][key] for key in FOLLOWING}, "flame_range": (low, high)}
+        )
         reader = dataclasses.replace(reader, names=known["grids"])
         normalisation, bounds = Normalisation.from_json(known["normalisation"]), np.array(known["bounds"])
     train, test = rig(asked.size, asked.cameras, up=asked.up, field_of_view=asked.field_of_view)
-    capture = Capture(frames, reader, look, [*train, *test], asked.samples, normalisation, bounds, context.device, measured=measured)
+    capture = Capture(
+        frames, reader, look, [*train, *test], asked.samples, normalisation, bounds, context.device, measured=measured
+    )
     return asked, name, source, capture, range(len(train), len(train) + len(test))
 
 
@@ -159,7 +174,9 @@ def _files(asked: VolumeSettings, context: SceneContext) -> tuple[Path, str, Dat
     if asked.vdb is not None:
         return asked.vdb, asked.vdb.name, "real"
     assert asked.simulation is not None, "settings were checked"
-    folder = simulate(asked.simulation, asked.timesteps, asked.resolution, context.seed, context.cache_dir, context.progress)
+    folder = simulate(
+        asked.simulation, asked.timesteps, asked.resolution, context.seed, context.cache_dir, context.progress
+    )
     return folder, f"{asked.simulation} (simulated)", "simulated"
 
 
@@ -200,7 +217,8 @@ class _Survey:
 
 
 class _Histogram:
-    """How often positive values occur, to about 1 % of their size, so that a quantile of a whole sequence takes little memory."""
+    """How often positive values occur, to about 1 % of their size, so that a quantile of a whole sequence takes little
+    memory."""
 
     def __init__(self) -> None:
         self.counts = np.zeros(1 << 15, np.int64)
@@ -218,7 +236,8 @@ class _Histogram:
 
 
 def _survey(frames: list[VdbFrame], reader: GridReader, look: Look, progress: Progress) -> _Survey:
-    """Looks through all frames. What absorbs is matter: the extinction grid, and flames where the look gives them an extinction.
+    """Looks through all frames. What absorbs is matter: the extinction grid, and flames where the look gives them an
+    extinction.
 
     Raises:
         DataError: no frame has any active voxel.
@@ -244,7 +263,9 @@ def _survey(frames: list[VdbFrame], reader: GridReader, look: Look, progress: Pr
     box = Extent.around(matter).box
     if box is None:
         where = os.path.commonpath([f.path for f in frames])
-        raise DataError(f"{where}: no frame has an active voxel of {reader.names[reader.extinction]!r}; expected matter in at least one")
+        raise DataError(
+            f"{where}: no frame has an active voxel of {reader.names[reader.extinction]!r}; expected matter in at least one"
+        )
     return _Survey(box, extents, hottest, {meaning: found.quantile(_TYPICAL) for meaning, found in values.items()})
 
 
@@ -253,10 +274,15 @@ _TYPICAL = 0.999
 
 
 def _following(look: Look, absorbing: str, survey: _Survey) -> dict[str, Any]:
-    """The settings of a look that follow the files: its extinctions are for grids that peak at about 1, and are divided by their peak.
+    """The settings of a look that follow the files: its extinctions are for grids that peak at about 1, and are divided
+    by their peak.
 
     The divisor is rounded to a power of two, so that a few frames more or less change nothing.
     """
     grids = {"extinction": absorbing, "flame_extinction": "flames"}
-    scaled = {key: getattr(look, key) * 2.0 ** -round(math.log2(survey.typical[m])) for key, m in grids.items() if survey.typical[m] > 0}
+    scaled = {
+        key: getattr(look, key) * 2.0 ** -round(math.log2(survey.typical[m]))
+        for key, m in grids.items()
+        if survey.typical[m] > 0
+    }
     return {**scaled, **({"flame_range": (0.0, survey.hottest)} if survey.hottest > 0 else {})}

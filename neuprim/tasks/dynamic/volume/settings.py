@@ -32,7 +32,9 @@ def _span(frames: str) -> range | None:
 
 
 Span = Annotated[str, Accepts(lambda v: v.count(":") == 1 and _span(v) is not None, "FIRST:LAST, as 0:19")]
-Frames = Annotated[str, Accepts(lambda v: v == "all" or _span(v) is not None, "all, FIRST:LAST or FIRST:LAST:STEP, as 0:100:2")]
+Frames = Annotated[
+    str, Accepts(lambda v: v == "all" or _span(v) is not None, "all, FIRST:LAST or FIRST:LAST:STEP, as 0:100:2")
+]
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,8 @@ class VolumeSettings:
         resolution: voxels across the simulation's box.
         timesteps: of the simulation; None: as many as the scene has.
         frames: "all", "FIRST:LAST" or "FIRST:LAST:STEP" by number, LAST included.
-        span: "FIRST:LAST" by number, the frames to learn from and to be judged by; times, box, exposure and images stay those of all ``frames``.
+        span: "FIRST:LAST" by number, the frames to learn from and to be judged by; times, box, exposure and images stay
+        those of all ``frames``.
             None: all.
         chunks: in how many chunks of time the sequence is fitted, each a run of its own; "auto": see
             :func:`~neuprim.tasks.dynamic.volume.chunks.number_of_chunks`; None or 1: in one.
@@ -58,7 +61,8 @@ class VolumeSettings:
         train_every: learn from every n-th frame only; the test views keep all.
         up: "y" or "z", the upward axis of the files.
         cache: folder or URL where the ground truth is kept; None: the cache of this machine's user.
-        memory: MiB of decoded images and voxels that stay in memory, however long the sequence is; beyond them they are read again when needed.
+        memory: MiB of decoded images and voxels that stay in memory, however long the sequence is; beyond them they are
+        read again when needed.
     """
 
     vdb: Annotated[Path, text("a folder of .vdb files")] | None = None

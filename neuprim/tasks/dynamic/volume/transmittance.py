@@ -16,10 +16,13 @@ from neuprim.tasks.dynamic.volume.traverse import depths
 __all__ = ["transmittance"]
 
 
-def transmittance(medium: Medium, direction: Sequence[float], threads: int = 0, where: torch.device = device.HOST) -> np.ndarray:
+def transmittance(
+    medium: Medium, direction: Sequence[float], threads: int = 0, where: torch.device = device.HOST
+) -> np.ndarray:
     """(X, Y, Z) float32 exp(-∫ σ ds) from each voxel centre towards a directional light.
 
-    Every voxel has its own ray, walked cell by cell, so the optical depth is that of the trilinear field but for rounding.
+    Every voxel has its own ray, walked cell by cell, so the optical depth is that of the trilinear field but for
+    rounding.
     Voxels without extinction get 1 without a ray: nothing there scatters.
 
     Args:

@@ -1,9 +1,10 @@
 """The two kernels that walk rays through the cells between voxel centres, and the steps they share.
 
-A cell is the cube between eight voxel centres. Along a straight line through it a trilinear field is a cubic polynomial, which
-two Gauss points integrate exactly: the optical depth of a ray has no discretisation error at all. For the radiance, the points'
-sources are weighted by the transmittance up to each, and the weights scaled so that a constant source is integrated exactly: fourth
-order in the step. Steps of an optical depth above 0.5 are made shorter where the ray is, so thick smoke needs no setting.
+A cell is the cube between eight voxel centres. Along a straight line through it a trilinear field is a cubic
+polynomial, which two Gauss points integrate exactly: the optical depth of a ray has no discretisation error at all. For
+the radiance, the points' sources are weighted by the transmittance up to each, and the weights scaled so that a
+constant source is integrated exactly: fourth order in the step. Steps of an optical depth above 0.5 are made shorter
+where the ray is, so thick smoke needs no setting.
 """
 
 from __future__ import annotations
@@ -111,7 +112,8 @@ def _gains(a, b):  # type: ignore[no-untyped-def]
         q, last = _fading(b)
         return p, rest * q, rest * last
     mean, rest = _fading(depth)
-    # depths up to the points if extinction is linear between and beyond them; the first may come out as a trifle below zero
+    # depths up to the points if extinction is linear between and beyond them; the first may come out as a trifle below
+    # zero
     p, q = _transmittance(_HALF * a - _LESS * b), _transmittance(_MORE * a + _HALF * b)
     whole = a * p + b * q
     scale = mean * depth / whole if whole > _TINY else _ONE
@@ -125,10 +127,12 @@ _FREE = ("nsz", "contract", "reassoc")
 def _generator(context, flat, o, dy, dx, x1, y1, z1, x2, y2, z2):  # type: ignore[no-untyped-def]
     """Trilinear values of the four channels at two points of one cell, eight numbers: one vector of four per corner.
 
-    Written in LLVM's vectors because its optimiser does not find them in scalar code; without them an image takes 1.4 times as long.
+    Written in LLVM's vectors because its optimiser does not find them in scalar code; without them an image takes 1.4
+    times as long.
 
     Args:
-        flat: float32 array of the interleaved voxels. o, dy, dx: uint64, offsets of the cell's lowest corner and between neighbours
+        flat: float32 array of the interleaved voxels. o, dy, dx: uint64, offsets of the cell's lowest corner and
+        between neighbours
             in y and x; those in z are 4 apart. x1 … z2: float32 fractions within the cell.
     """
     signature = types.UniTuple(types.float32, 8)(flat, o, dy, dx, *(types.float32,) * 6)
@@ -221,9 +225,17 @@ def radiances(start, stop, values, skips, pose, lens, width, samples, parts, ima
                         begin = t
                         while begin < out and through > _OPAQUE:
                             s = begin + part * _GAUSS
-                            x1, y1, z1 = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j), np.float32(oz + s * rz - k)
+                            x1, y1, z1 = (
+                                np.float32(ox + s * rx - i),
+                                np.float32(oy + s * ry - j),
+                                np.float32(oz + s * rz - k),
+                            )
                             s = begin + part * (1.0 - _GAUSS)
-                            x2, y2, z2 = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j), np.float32(oz + s * rz - k)
+                            x2, y2, z2 = (
+                                np.float32(ox + s * rx - i),
+                                np.float32(oy + s * ry - j),
+                                np.float32(oz + s * rz - k),
+                            )
                             s1, r1, g1, b1, s2, r2, g2, b2 = _two_points(flat, o, dy, dx, x1, y1, z1, x2, y2, z2)
                             half = np.float32(0.5 * part)
                             s1 *= half
@@ -295,7 +307,11 @@ def depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignore[no-un
                     if skip == 0 and out > t:
                         for point in range(2):
                             s = t + (out - t) * (_GAUSS if point == 0 else 1.0 - _GAUSS)
-                            x, y, z = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j), np.float32(oz + s * rz - k)
+                            x, y, z = (
+                                np.float32(ox + s * rx - i),
+                                np.float32(oy + s * ry - j),
+                                np.float32(oz + s * rz - k),
+                            )
                             depth += 0.5 * (out - t) * _between(sigma, i, j, k, x, y, z)
                     i = _next(ox, rx, i, reach, out, tx == out)
                     j = _next(oy, ry, j, reach, out, ty == out)

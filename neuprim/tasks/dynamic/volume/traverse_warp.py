@@ -1,6 +1,7 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Rays through the cells between voxel centres on a card, a thread a pixel or a voxel: the twin of
-:mod:`~neuprim.tasks.dynamic.volume.traverse`, step by step. Places along a ray are float64, what is gathered float32, as there.
+:mod:`~neuprim.tasks.dynamic.volume.traverse`, step by step. Places along a ray are float64, what is gathered float32,
+as there.
 Warp is imported with this module."""
 
 from __future__ import annotations
@@ -87,7 +88,8 @@ def _fading(depth: float):
 
 @wp.func
 def _gains(a: float, b: float):
-    """How much of the sources of two Gauss points leaves a step, and its transmittance; a, b: optical depth that each point stands for."""
+    """How much of the sources of two Gauss points leaves a step, and its transmittance; a, b: optical depth that each
+    point stands for."""
     depth = a + b
     if depth > 0.5:
         one = _fading(a)
@@ -158,9 +160,17 @@ def _radiances() -> Any:
                         begin = d(t)
                         while begin < out and through > _OPAQUE:
                             s = begin + part * d(_LOW)
-                            x1, y1, z1 = f(origin[0] + s * rx - d(i)), f(origin[1] + s * ry - d(j)), f(origin[2] + s * rz - d(k))
+                            x1, y1, z1 = (
+                                f(origin[0] + s * rx - d(i)),
+                                f(origin[1] + s * ry - d(j)),
+                                f(origin[2] + s * rz - d(k)),
+                            )
                             s = begin + part * d(_HIGH)
-                            x2, y2, z2 = f(origin[0] + s * rx - d(i)), f(origin[1] + s * ry - d(j)), f(origin[2] + s * rz - d(k))
+                            x2, y2, z2 = (
+                                f(origin[0] + s * rx - d(i)),
+                                f(origin[1] + s * ry - d(j)),
+                                f(origin[2] + s * rz - d(k)),
+                            )
                             one = _between(values, i, j, k, x1, y1, z1)
                             two = _between(values, i, j, k, x2, y2, z2)
                             half = f(d(0.5) * part)
@@ -274,7 +284,9 @@ def depths(sigma: Tensor, skips: Tensor, way: Tensor) -> Tensor:
         way: (3,) float64, the direction, indices per scene unit.
     """
     result = torch.zeros_like(sigma)
-    launch(_depths(), sigma.shape, (array(sigma, f), array(skips, wp.uint8), array(way, d), array(result, f)), sigma.device)
+    launch(
+        _depths(), sigma.shape, (array(sigma, f), array(skips, wp.uint8), array(way, d), array(result, f)), sigma.device
+    )
     return result
 
 

@@ -22,7 +22,11 @@ __all__ = ["VolumeTruth", "extinction_on"]
 
 
 def extinction_on(
-    medium: Medium, scene_from_index: Tensor, shape: tuple[int, int, int], where: torch.device = device.HOST, part: bool = False
+    medium: Medium,
+    scene_from_index: Tensor,
+    shape: tuple[int, int, int],
+    where: torch.device = device.HOST,
+    part: bool = False,
 ) -> np.ndarray:
     """(X, Y, Z) float32 extinction of the files at a lattice's points, trilinear; ``where``: the device that computes.
 
@@ -47,8 +51,9 @@ def extinction_on(
 class VolumeTruth(DensityTruth):
     """Frames of ``path``, or the scene's own; grids, look, placement and times are those of the scene.
 
-    A frame's time follows from its number: the scene's first is 0 and its last 1. Frames of a folder outside these are left out; a
-    single file outside them has no time. Models are compared with a frame on its own voxels, all that lie in the sequence's box.
+    A frame's time follows from its number: the scene's first is 0 and its last 1. Frames of a folder outside these are
+    left out; a single file outside them has no time. Models are compared with a frame on its own voxels, all that lie
+    in the sequence's box.
 
     Raises:
         DataError: no file, or no frame within the scene's times.
@@ -87,8 +92,12 @@ class VolumeTruth(DensityTruth):
         ends = np.stack(np.meshgrid(*np.stack([np.ones(3), inside], -1), indexing="ij"), -1).reshape(-1, 3)
         corners = ends @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
         low, high = self.bounds.numpy()
-        return voxels_within(np.stack([np.minimum(corners.min(0), low), np.maximum(corners.max(0), high)]), medium.scene_from_index)
+        return voxels_within(
+            np.stack([np.minimum(corners.min(0), low), np.maximum(corners.max(0), high)]), medium.scene_from_index
+        )
 
-    def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None) -> Tensor:
+    def grid(
+        self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
+    ) -> Tensor:
         found = extinction_on(self.medium(frame), scene_from_index, shape, self.capture.device, component is not None)
         return torch.from_numpy(found)

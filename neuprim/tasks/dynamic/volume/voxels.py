@@ -53,8 +53,8 @@ class Voxels:
 
     Attributes:
         index: (V,) int64 ascending, flat indices (i Y + j) Z + k of a grid of ``shape``.
-        values: (V, C) float32, sigma, sigma times radiance, and where flames add to sigma the part of it that the extinction grid makes.
-        shape: of the grid; scene_from_index: (4, 4) float64.
+        values: (V, C) float32, sigma, sigma times radiance, and where flames add to sigma the part of it that the
+        extinction grid makes. shape: of the grid; scene_from_index: (4, 4) float64.
     """
 
     index: np.ndarray
@@ -74,7 +74,8 @@ class Voxels:
 
     @cached_property
     def sizes(self) -> tuple[float, float, float]:
-        """Root mean squares of sigma, of sigma times radiance, and of the extinction grid's part, over the voxels; 0 without any."""
+        """Root mean squares of sigma, of sigma times radiance, and of the extinction grid's part, over the voxels; 0
+        without any."""
         if not len(self.index):
             return 0.0, 0.0, 0.0
         squares = np.square(self.values, dtype=np.float64).mean(0)
@@ -87,7 +88,13 @@ class Voxels:
     def write(self, path: Path) -> None:
         """As a file of arrays. Raises OSError."""
         with open(path, "wb") as file:
-            np.savez(file, index=self.index, values=self.values, shape=np.array(self.shape), scene_from_index=self.scene_from_index)
+            np.savez(
+                file,
+                index=self.index,
+                values=self.values,
+                shape=np.array(self.shape),
+                scene_from_index=self.scene_from_index,
+            )
 
     @staticmethod
     def read(path: Path) -> Voxels:
@@ -126,12 +133,13 @@ class Voxels:
 class FrameVoxels(PointSupervision):
     """Points on the voxels' centres of one frame after another.
 
-    A frame is drawn as often as it has a share of the sequence's extinction, and one draw in ten takes any. 70 % of the points are voxels
-    with matter, 20 % lie up to six voxels beside one, and 10 % anywhere in a box a little larger than the sequence's.
+    A frame is drawn as often as it has a share of the sequence's extinction, and one draw in ten takes any. 70 % of the
+    points are voxels with matter, 20 % lie up to six voxels beside one, and 10 % anywhere in a box a little larger than
+    the sequence's.
 
     Args:
-        folder: of the capture's images; a frame's voxels are kept beside them once they were read, as the light in them may take long.
-        frames, times, weights: those to learn from, and each one's extinction.
+        folder: of the capture's images; a frame's voxels are kept beside them once they were read, as the light in them
+        may take long. frames, times, weights: those to learn from, and each one's extinction.
         exposure: what radiance is divided by.
         memory: bytes of voxels that are kept; beyond them those of the oldest frame are read again when needed.
     """
@@ -160,7 +168,11 @@ class FrameVoxels(PointSupervision):
             near, far = 0, count
         low, high = self.capture.bounds
         margin = _MARGIN * float((high - low).max())
-        places = low - margin + torch.rand((far, 3), generator=generator, dtype=torch.float64).numpy() * (high - low + 2 * margin)
+        places = (
+            low
+            - margin
+            + torch.rand((far, 3), generator=generator, dtype=torch.float64).numpy() * (high - low + 2 * margin)
+        )
         back = np.linalg.inv(voxels.scene_from_index)
         cells = np.rint(places @ back[:3, :3].T + back[:3, 3]).astype(np.int64)
         known = np.zeros((0, voxels.values.shape[1]), np.float32)

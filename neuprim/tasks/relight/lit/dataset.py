@@ -1,4 +1,5 @@
-"""The built-in scene as a data set: what :mod:`.generate` wrote, and what only a generated scene can tell of its pixels."""
+"""The built-in scene as a data set: what :mod:`.generate` wrote, and what only a generated scene can tell of its
+pixels."""
 
 from __future__ import annotations
 
@@ -40,7 +41,9 @@ class LitSolidsSettings(LitSettings):
         hold_out: n: every n-th training view is the test split, for tuning; 0 for the split that is drawn.
     """
 
-    background: Annotated[str, Accepts(_BLACK_OR_RANDOM.__contains__, "black or random: nothing but the light shines here")] = "black"
+    background: Annotated[
+        str, Accepts(_BLACK_OR_RANDOM.__contains__, "black or random: nothing but the light shines here")
+    ] = "black"
     hold_out: HoldOut = 0
 
 
@@ -68,8 +71,8 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
 
 def _known(dataset: Dataset, folder: Path) -> Lighting:
-    """Classes of pixels, parts of the test split, and the baselines: perfect shading without cast shadows, and the nearest of 25 training
-    lights at the same camera. The film is one new camera under a light that goes round."""
+    """Classes of pixels, parts of the test split, and the baselines: perfect shading without cast shadows, and the
+    nearest of 25 training lights at the same camera. The film is one new camera under a light that goes round."""
     test = dataset.test
     assert isinstance(test, ImageViews)  # as posed_images makes them
     baselines = {"no_cast_shadows": partial(companion, test, "unshadowed.exr")}
@@ -96,8 +99,8 @@ def classes(views: ImageViews, index: int) -> Tensor:
 
 
 def companion(views: ImageViews, ending: str, index: int) -> Tensor:
-    """(H, W, 3) the image beside that of a view, linear light over the exposure: "unshadowed.exr", as if nothing cast a shadow, or
-    "nearest.exr", under the nearest of the first 25 training lights."""
+    """(H, W, 3) the image beside that of a view, linear light over the exposure: "unshadowed.exr", as if nothing cast a
+    shadow, or "nearest.exr", under the nearest of the first 25 training lights."""
     camera = views.view(index).camera
     return read_image(_beside(views.file(index), ending), (camera.width, camera.height))[..., :3].float()
 

@@ -1,13 +1,14 @@
 """The scene ``lit_solids`` as a data set on disk, in the layout of GS³ that any loader of it reads.
 
-    transforms_train.json, transforms_test.json, transforms_circle.json      camera_angle_x, poses with OpenGL axes, pl_pos, pl_intensity
-    train/r_0000.exr                 RGBA, linear radiance over the exposure, premultiplied, half floats
-    train/r_0000_unshadowed.exr      the same as if nothing cast a shadow (attached shadows stay)
+    transforms_train.json, transforms_test.json, transforms_circle.json      camera_angle_x, poses with OpenGL axes,
+    pl_pos, pl_intensity train/r_0000.exr                 RGBA, linear radiance over the exposure, premultiplied, half
+    floats train/r_0000_unshadowed.exr      the same as if nothing cast a shadow (attached shadows stay)
     train/r_0000_classes.png         8-bit grey, index into CLASSES of :mod:`neuprim.tasks.relight.measure`
     test/new_light_03_nearest.exr    test views only: the camera's view under the nearest of 25 training lights
 
-A pixel is background where fewer than half of its rays hit anything; else it has the class of more than half of those that hit, and is
-"lit" where there is none such. The light's intensity is :data:`INTENSITY` in every image, so images fade with the square of its distance.
+A pixel is background where fewer than half of its rays hit anything; else it has the class of more than half of those
+that hit, and is "lit" where there is none such. The light's intensity is :data:`INTENSITY` in every image, so images
+fade with the square of its distance.
 
 Scene, cameras and lights are fixed: equal settings give equal files whatever the seed.
 """
@@ -42,7 +43,8 @@ GENERATOR_VERSION = 1
 """Part of the cache's key: to be raised with every change to solids, rig, shading or file layout."""
 
 INTENSITY = 69.2
-"""Radiant intensity of the lights over the exposure: it makes 1 the 99.5th percentile of the training images at the default settings."""
+"""Radiant intensity of the lights over the exposure: it makes 1 the 99.5th percentile of the training images at the
+default settings."""
 
 FIELD_OF_VIEW = 2 * float(np.arcsin(RADIUS / DISTANCE[0]))
 """Radians; holds the whole scene from the nearest camera."""
@@ -103,7 +105,11 @@ def generate(settings: LitSettings, cache_dir: Path, progress: Progress = lambda
         Image.fromarray(taken.classes).save(classes)
         for path in nearest_light:
             assert view.near_light is not None
-            write_exr(path, torch.from_numpy(picture(scene, pose, view.near_light, settings.size, settings.supersampling).rgba), half=True)
+            write_exr(
+                path,
+                torch.from_numpy(picture(scene, pose, view.near_light, settings.size, settings.supersampling).rgba),
+                half=True,
+            )
 
     return ImageSet(
         name="lit_solids",
@@ -118,13 +124,20 @@ def generate(settings: LitSettings, cache_dir: Path, progress: Progress = lambda
     ).generate(cache_dir, progress)
 
 
-def picture(scene: Scene, pose: NDArray[np.float64], light: NDArray[np.float64], size: int, supersampling: int) -> Picture:
-    """The view of a camera at ``pose`` (camera to world, OpenGL axes) under a light at ``light`` (3,) of :data:`INTENSITY`."""
+def picture(
+    scene: Scene, pose: NDArray[np.float64], light: NDArray[np.float64], size: int, supersampling: int
+) -> Picture:
+    """The view of a camera at ``pose`` (camera to world, OpenGL axes) under a light at ``light`` (3,) of
+    :data:`INTENSITY`."""
     parts = []
     for directions in bands(pose, FIELD_OF_VIEW, size, supersampling):
         seen = shade(scene, pose[:3, 3], directions, light, INTENSITY)
         kinds = seen.classes[:, None] == np.arange(len(CLASSES), dtype=np.uint8)
-        parts.append(pixel_means(np.concatenate([seen.rgb, seen.unshadowed, kinds], axis=1, dtype=np.float32), size, supersampling))
+        parts.append(
+            pixel_means(
+                np.concatenate([seen.rgb, seen.unshadowed, kinds], axis=1, dtype=np.float32), size, supersampling
+            )
+        )
     mean = np.concatenate(parts)
     shares = mean[..., 6:]
     alpha = shares[..., 1:].sum(axis=-1, keepdims=True)

@@ -1,8 +1,8 @@
 """Where the cameras and lights of the built-in scene are: fixed lists, whatever the seed.
 
-Cameras look at the origin from 4 to 5 units, at most 75 degrees from the zenith; lights are as far away, at most 60 degrees
-from it. Directions are spread evenly over their part of the sphere, distances evenly over their range. A training image has
-a camera and a light of its own. The test split has three parts of equal size:
+Cameras look at the origin from 4 to 5 units, at most 75 degrees from the zenith; lights are as far away, at most 60
+degrees from it. Directions are spread evenly over their part of the sphere, distances evenly over their range. A
+training image has a camera and a light of its own. The test split has three parts of equal size:
 
     new_view_03    a camera never seen, the light of a training image
     new_light_03   the camera of a training image, a light never seen
@@ -65,11 +65,16 @@ def splits(train_views: int, test_views: int) -> dict[str, list[LitView]]:
             seen = first + i * (train_views - first) // max(counts[part], 1)
             camera = cameras[seen] if name == "new_light" else new_cameras[fresh]
             light = lights[seen] if name == "new_view" else new_lights[fresh]
-            test.append(LitView(f"{name}_{i:0{max(2, len(str(test_views)) - 1)}d}", camera, light, _nearest(known, light)))
+            test.append(
+                LitView(f"{name}_{i:0{max(2, len(str(test_views)) - 1)}d}", camera, light, _nearest(known, light))
+            )
     middle = sum(DISTANCE) / 2
     eye = middle * direction(math.cos(math.radians(58.0)), -1.1)
     turns = [2 * math.pi * i / CIRCLE_FRAMES for i in range(CIRCLE_FRAMES)]
-    circle = [LitView(f"light_{i:02d}", eye, middle * direction(math.cos(math.radians(45.0)), turn)) for i, turn in enumerate(turns)]
+    circle = [
+        LitView(f"light_{i:02d}", eye, middle * direction(math.cos(math.radians(45.0)), turn))
+        for i, turn in enumerate(turns)
+    ]
     return {"train": train, "test": test, "circle": circle}
 
 

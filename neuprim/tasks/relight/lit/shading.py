@@ -5,7 +5,8 @@ Radiance = (albedo / pi + highlight) cosine intensity / distance^2 where nothing
 
 * attached shadow: the surface, or its shading normal, faces away from the light;
 * cast shadow: it faces the light, but something lies between;
-* highlight: neither, and the highlight is brighter than the diffuse part and than half of a white surface that faces the light
+* highlight: neither, and the highlight is brighter than the diffuse part and than half of a white surface that faces
+  the light
   from the rig's mean distance (:data:`BRIGHT`);
 * lit: all else that is hit.
 """

@@ -1,9 +1,11 @@
 """NeRF-synthetic ("Blender") scenes: ``transforms_SPLIT.json`` with a field of view, OpenGL poses and RGBA images.
 
-Frames are read by :mod:`neuprim.core.data.transforms`, so that focal lengths, principal points, lenses and masks count, too (BlenderNeRF).
+Frames are read by :mod:`neuprim.core.data.transforms`, so that focal lengths, principal points, lenses and masks count,
+too (BlenderNeRF).
 
 Settings beside the common ones: ``train_split`` and ``test_split`` (names in the files' names, default train and test);
-``hold_out`` (default 0; n > 1 makes every n-th training view the test split and leaves the real one unread, for tuning).
+``hold_out`` (default 0; n > 1 makes every n-th training view the test split and leaves the real one unread, for
+tuning).
 """
 
 from __future__ import annotations
@@ -57,9 +59,13 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         for frame in frames:
             info, first = frame.info, frames[0].info
             if (info.width, info.height) != (first.width, first.height):
-                found = f"image is {info.width}x{info.height}; expected {first.width}x{first.height} as {frames[0].path}"
+                found = (
+                    f"image is {info.width}x{info.height}; expected {first.width}x{first.height} as {frames[0].path}"
+                )
                 raise DataError(f"{frame.path}: {found}{turned(info)}")
         return frames
 
     train, test = read_splits(folder, asked.train_split, asked.test_split, asked.hold_out, read)
-    return posed_images(str(folder), folder.resolve().name, train, test, asked, context, up=torch.tensor([0.0, 0.0, 1.0]))
+    return posed_images(
+        str(folder), folder.resolve().name, train, test, asked, context, up=torch.tensor([0.0, 0.0, 1.0])
+    )

@@ -1,12 +1,12 @@
 """COLMAP reconstructions: a model below ``sparse`` and an image folder; needs the extra ``neuprim[colmap]``.
 
 Sizes may differ from image to image. Distorted models are undistorted to a pinhole of the same focal lengths; what a
-photograph does not show is masked out, as is what an image in ``masks/`` blackens. Reduced copies (``images_4``) scale the cameras
-to the files' actual sizes. A line says how many images of the folder have no pose.
+photograph does not show is masked out, as is what an image in ``masks/`` blackens. Reduced copies (``images_4``) scale
+the cameras to the files' actual sizes. A line says how many images of the folder have no pose.
 
-Settings beside the common ones: ``images`` (folder, default "images"), ``model`` (default "auto": of the models in ``sparse`` the one
-with the most posed images), ``test_every`` (default 8: every 8th image by name, from the first, is a test view) and ``skip_missing``
-(default false).
+Settings beside the common ones: ``images`` (folder, default "images"), ``model`` (default "auto": of the models in
+``sparse`` the one with the most posed images), ``test_every`` (default 8: every 8th image by name, from the first, is a
+test view) and ``skip_missing`` (default false).
 """
 
 from __future__ import annotations
@@ -27,7 +27,15 @@ from neuprim.core.cameras.pinhole import check_viewmat
 from neuprim.core.checked import checked, text
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.bad_views import BadViews
-from neuprim.core.data.common import IMAGE_SUFFIXES, every_nth, find_image, missing_files, posed_images, turned, unique_names
+from neuprim.core.data.common import (
+    IMAGE_SUFFIXES,
+    every_nth,
+    find_image,
+    missing_files,
+    posed_images,
+    turned,
+    unique_names,
+)
 from neuprim.core.data.distortion import Distortion
 from neuprim.core.data.masks import masks_beside
 from neuprim.core.data.settings import EveryNth, FolderSettings, data_folder
@@ -45,8 +53,8 @@ class ColmapSettings(FolderSettings):
     """What the user may set.
 
     Attributes:
-        images, model: folders of the images and of the reconstruction; "auto" for the model in ``sparse`` with the most posed images.
-        test_every: every n-th image is held out.
+        images, model: folders of the images and of the reconstruction; "auto" for the model in ``sparse`` with the most
+        posed images. test_every: every n-th image is held out.
         skip_missing: leave out images that are missing; otherwise they are an error.
     """
 
@@ -78,7 +86,9 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     train, test = every_nth(frames, asked.test_every)
     prefix = "" if asked.images == "images" else asked.images
     points = _read_points(reconstruction, model)
-    return posed_images(str(model), folder.resolve().name, train, test, asked, context, points=points, prefix=prefix, home=folder)
+    return posed_images(
+        str(model), folder.resolve().name, train, test, asked, context, points=points, prefix=prefix, home=folder
+    )
 
 
 def _read_frames(model: Path, folder: Path, reconstruction: Any, asked: ColmapSettings) -> list[ImageFrame]:
@@ -91,13 +101,17 @@ def _read_frames(model: Path, folder: Path, reconstruction: Any, asked: ColmapSe
     files = [place / i.name if (place / i.name).is_file() else find_image(place, i.name) for i in posed]
     absent = [i.name for i, file in zip(posed, files, strict=True) if file is None]
     if absent and (not asked.skip_missing or len(absent) == len(posed)):
-        raise missing_files(str(place), absent, "" if asked.skip_missing else "; scene.skip_missing=true leaves such images out")
+        raise missing_files(
+            str(place), absent, "" if asked.skip_missing else "; scene.skip_missing=true leaves such images out"
+        )
     present = [(i, file) for i, file in zip(posed, files, strict=True) if file is not None]
     _tell_unposed(place, {file for _, file in present}, model)
     masks = masks_beside(folder, [file for _, file in present], place)
     frames: list[ImageFrame] = []
     bad = BadViews(str(model), asked.strict)
-    for (image, file), mask, name in zip(present, masks, unique_names([i.name for i, _ in present], str(model)), strict=True):
+    for (image, file), mask, name in zip(
+        present, masks, unique_names([i.name for i, _ in present], str(model)), strict=True
+    ):
         where = f"{model}: camera {image.camera_id} of image {image.name}"
         read = bad.read(name, _info_and_pose, image, file, where)
         if read is None:
@@ -114,9 +128,15 @@ def _read_frames(model: Path, folder: Path, reconstruction: Any, asked: ColmapSe
 def _tell_unposed(place: Path, posed: set[Path], model: Path) -> None:
     """Say how many images of the folder the model has no pose of."""
     suffixes = {suffix.lower() for suffix in IMAGE_SUFFIXES}
-    others = [p for p in place.rglob("*") if p.suffix.lower() in suffixes and p not in posed and not p.name.startswith("dynamic_mask_")]
+    others = [
+        p
+        for p in place.rglob("*")
+        if p.suffix.lower() in suffixes and p not in posed and not p.name.startswith("dynamic_mask_")
+    ]
     if others:
-        warn_once(f"{place}: {len(others)} of {len(posed) + len(others)} images have no pose in {model}, e.g. {min(others).name}; left out")
+        warn_once(
+            f"{place}: {len(others)} of {len(posed) + len(others)} images have no pose in {model}, e.g. {min(others).name}; left out"
+        )
 
 
 def _info_and_pose(image: Any, file: Path, where: str) -> tuple[ImageInfo, Tensor]:
@@ -128,9 +148,13 @@ def _info_and_pose(image: Any, file: Path, where: str) -> tuple[ImageInfo, Tenso
 def _camera(where: str, image: Any, viewmat: Tensor, file: Path, info: ImageInfo) -> Camera:
     lens = image.camera
     if lens.width <= 0 or lens.height <= 0 or not np.isfinite(lens.params).all():
-        raise DataError(f"{where}: size {lens.width}x{lens.height}, parameters {lens.params}; expected a positive size, finite numbers")
+        raise DataError(
+            f"{where}: size {lens.width}x{lens.height}, parameters {lens.params}; expected a positive size, finite numbers"
+        )
     if not same_shape((lens.width, lens.height), (info.width, info.height)):
-        found = f"image is {info.width}x{info.height}; expected {lens.width}x{lens.height} ({where}) or a reduction of it"
+        found = (
+            f"image is {info.width}x{info.height}; expected {lens.width}x{lens.height} ({where}) or a reduction of it"
+        )
         raise DataError(f"{file}: {found}{turned(info)}")
     fx, fy, cx, cy = pinhole_of(lens, where)
     return Camera(viewmat, fx, fy, cx, cy, int(lens.width), int(lens.height)).resized(info.width, info.height)
@@ -152,7 +176,9 @@ class _Lens(Distortion):
         return _Lens(lens.model_name, int(lens.width), int(lens.height), tuple(map(float, lens.params)), scale)
 
     def project(self, points: np.ndarray, camera: Camera) -> np.ndarray:
-        lens = pycolmap_package().Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+        lens = pycolmap_package().Camera(
+            model=self.model, width=self.width, height=self.height, params=list(self.params)
+        )
         rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
         return np.asarray(lens.img_from_cam(rays), dtype=np.float64) * self.scale
 
@@ -166,5 +192,7 @@ def _read_points(reconstruction: Any, model: Path) -> PointCloud | None:
     colors = np.array([p.color for p in points], dtype=np.float64) / 255.0
     keep = np.isfinite(means).all(axis=1)
     if not keep.all():
-        raise DataError(f"{model}: points3D: {int((~keep).sum())} of {len(points)} points are not finite; expected finite coordinates")
+        raise DataError(
+            f"{model}: points3D: {int((~keep).sum())} of {len(points)} points are not finite; expected finite coordinates"
+        )
     return PointCloud(torch.from_numpy(means), torch.from_numpy(colors).float())

@@ -1,10 +1,12 @@
-"""nerfstudio and instant-ngp captures: one ``transforms.json`` with intrinsics, lens distortion, OpenGL poses and masks.
+"""nerfstudio and instant-ngp captures: one ``transforms.json`` with intrinsics, lens distortion, OpenGL poses and
+masks.
 
-Frames are read by :mod:`neuprim.core.data.transforms`. Images are undistorted; what a photograph does not show is masked
-out, as is what ``mask_path`` blackens, or an image in ``masks/`` where no frame names one.
+Frames are read by :mod:`neuprim.core.data.transforms`. Images are undistorted; what a photograph does not show is
+masked out, as is what ``mask_path`` blackens, or an image in ``masks/`` where no frame names one.
 
 Settings beside the common ones: ``skip_missing`` (default false: absent images are an error that lists them) and
-``test_every`` (default 8: every 8th frame by name is a test view where the file has no ``train_filenames``, ``val_filenames`` or
+``test_every`` (default 8: every 8th frame by name is a test view where the file has no ``train_filenames``,
+``val_filenames`` or
 ``test_filenames``).
 """
 
@@ -45,7 +47,8 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
     Raises:
         ConfigError: unknown or impossible settings.
-        DataError: missing or damaged files, wrong or missing fields, impossible cameras, an unknown camera model, empty splits.
+        DataError: missing or damaged files, wrong or missing fields, impossible cameras, an unknown camera model, empty
+        splits.
     """
     asked = checked(NerfstudioSettings, settings, "scene")
     folder = data_folder(asked.path)

@@ -1,4 +1,5 @@
-"""The numbers of a glTF document: buffers, views and accessors, bounded by the bytes that are there, whatever they claim."""
+"""The numbers of a glTF document: buffers, views and accessors, bounded by the bytes that are there, whatever they
+claim."""
 
 from __future__ import annotations
 
@@ -37,7 +38,9 @@ class Accessors:
         elif binary is not None and index == 0:
             data = binary
         elif entry.get("extensions"):
-            raise DataError(f"{self.path}: needs the glTF extension {next(iter(entry['extensions']))[:60]}, which is not read; {PLAIN}")
+            raise DataError(
+                f"{self.path}: needs the glTF extension {next(iter(entry['extensions']))[:60]}, which is not read; {PLAIN}"
+            )
         else:
             raise ValueError(f"buffers[{index}] has no uri")
         if len(data) < entry["byteLength"]:
@@ -47,7 +50,11 @@ class Accessors:
     def view(self, index: int) -> tuple[bytes, int]:
         """Bytes and stride (0: packed) of a buffer view."""
         view = self.document["bufferViews"][index_of(index)]
-        data, start, size = self.buffers[index_of(view["buffer"])], count_of(view.get("byteOffset", 0)), count_of(view["byteLength"])
+        data, start, size = (
+            self.buffers[index_of(view["buffer"])],
+            count_of(view.get("byteOffset", 0)),
+            count_of(view["byteLength"]),
+        )
         if start + size > len(data):
             raise ValueError(f"bufferViews[{index}] ends at byte {start + size} of {len(data)}")
         return data[start : start + size], count_of(view.get("byteStride", 0))

@@ -1,6 +1,7 @@
 """A model's file and the files that it names, read under limits and from its own folder alone.
 
-What a file refers to is read here, before any parser sees it: trimesh gets bytes, and has no way to the disk or the network.
+What a file refers to is read here, before any parser sees it: trimesh gets bytes, and has no way to the disk or the
+network.
 """
 
 from __future__ import annotations
@@ -65,8 +66,8 @@ class Material:
     """How a part of the surface is coloured.
 
     Attributes:
-        colour: (3,) linear RGB that the texture and the vertices' colours are multiplied with; None: the file says none.
-        texture: name of the image among :attr:`Model.images`.
+        colour: (3,) linear RGB that the texture and the vertices' colours are multiplied with; None: the file says
+        none. texture: name of the image among :attr:`Model.images`.
         wrap: what happens to texture coordinates beyond 0..1 along u and v: "repeat", "clamp" or "mirror".
         transform: (2, 3) of texture coordinates whose v runs down; None leaves them.
         opacity: what the alpha of the texture and of the vertices is multiplied with.
@@ -146,10 +147,14 @@ def model_file(path: Path) -> Path:
     except (OSError, RuntimeError) as error:
         raise DataError(f"{path}: {error}; expected a model's file (scene.path)") from None
     if not usable:
-        raise DataError(f"{file}: {'is no file' if there else 'does not exist'}; expected a model's file (scene.path), {_listed()}")
+        raise DataError(
+            f"{file}: {'is no file' if there else 'does not exist'}; expected a model's file (scene.path), {_listed()}"
+        )
     if file.suffix.lower() not in SUFFIXES:
         found = f"ends in {file.suffix!r}" if file.suffix else "has no suffix"
-        raise DataError(f"{file}: {found}; expected {_listed()}" + (nearest(file.suffix, SUFFIXES) if file.suffix else ""))
+        raise DataError(
+            f"{file}: {found}; expected {_listed()}" + (nearest(file.suffix, SUFFIXES) if file.suffix else "")
+        )
     return file
 
 
@@ -158,7 +163,8 @@ def _listed() -> str:
 
 
 class Folder:
-    """Reads a model's file and the files beside and below it, as long as the budget lasts, and digests all that it reads.
+    """Reads a model's file and the files beside and below it, as long as the budget lasts, and digests all that it
+    reads.
 
     Args:
         file: the model.
@@ -193,7 +199,8 @@ class Folder:
         return found
 
     def optional(self, references: Sequence[str], what: str) -> bytes | None:
-        """The bytes of the first of several spellings of a name that is there; None, with a warning, where ``skip_missing`` allows that.
+        """The bytes of the first of several spellings of a name that is there; None, with a warning, where
+        ``skip_missing`` allows that.
 
         Raises:
             DataError: as :meth:`required`.
@@ -238,7 +245,9 @@ class Folder:
                 raise ValueError("no base64")
             return base64.b64decode(unquote(body), validate=True)
         except (ValueError, binascii.Error) as error:
-            raise DataError(f"{self.file}: embedded {what} is damaged ({error}); expected data:...;base64,...") from None
+            raise DataError(
+                f"{self.file}: embedded {what} is damaged ({error}); expected data:...;base64,..."
+            ) from None
 
     def _read(self, path: Path, name: str) -> bytes:
         try:
@@ -246,7 +255,9 @@ class Folder:
                 size = os.fstat(file.fileno()).st_size
                 if size > self._budget:
                     more = "" if path == self.file else f" with what it names, up to {path.name},"
-                    raise DataError(f"{self.file}: the model{more} is larger than {MAX_BYTES >> 20} MiB; expected a smaller one")
+                    raise DataError(
+                        f"{self.file}: the model{more} is larger than {MAX_BYTES >> 20} MiB; expected a smaller one"
+                    )
                 data = file.read(size)
         except OSError as error:
             raise DataError(f"{path}: cannot be read ({error.strerror or error})") from None
@@ -276,7 +287,9 @@ def check_vertices(path: Path, places: NDArray[np.float64], faces: NDArray[np.in
         return
     low, high = int(faces.min()), int(faces.max())
     if low < 0 or high >= len(places):
-        raise DataError(f"{path}: a face has the vertex {high if low >= 0 else low} of {len(places)}; expected one that is there")
+        raise DataError(
+            f"{path}: a face has the vertex {high if low >= 0 else low} of {len(places)}; expected one that is there"
+        )
     bad = np.flatnonzero(~np.isfinite(places).all(axis=1) & np.isin(np.arange(len(places)), faces))
     if len(bad):
         raise DataError(f"{path}: vertex {bad[0]} is at {places[bad[0]].tolist()}; expected finite numbers")

@@ -1,6 +1,8 @@
-"""The scene ``mesh`` as a data set on disk: the layout, the cameras and the light of the built-in solids, with a model in their place.
+"""The scene ``mesh`` as a data set on disk: the layout, the cameras and the light of the built-in solids, with a model
+in their place.
 
-The transforms files also say which file was drawn (``rendered_from``) and where its points are in the scene (``scene_from_file``).
+The transforms files also say which file was drawn (``rendered_from``) and where its points are in the scene
+(``scene_from_file``).
 """
 
 from __future__ import annotations
@@ -64,7 +66,8 @@ class MeshSettings(SolidsSettings):
         path: the model, .glb, .gltf, .obj, .ply or .stl.
         up: the axis of the file that points up; "auto" is y for glTF and OBJ, z for PLY and STL.
         shading: "daylight", a sun with shadows and a soft sky; "flat", the colours themselves, unlit.
-        skip_missing: whether textures and material files that are missing or refused are left out; they are an error otherwise.
+        skip_missing: whether textures and material files that are missing or refused are left out; they are an error
+        otherwise.
     """
 
     path: Annotated[Path, text("the model's file")] = field(kw_only=True)
@@ -74,11 +77,13 @@ class MeshSettings(SolidsSettings):
 
 
 def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """The data set of ``scene=mesh``, drawn on first use of the file's contents and read from ``context.cache_dir`` afterwards.
+    """The data set of ``scene=mesh``, drawn on first use of the file's contents and read from ``context.cache_dir``
+    afterwards.
 
     Raises:
         ConfigError: unknown setting or impossible value.
-        DataError: the model is missing, damaged, too large or refers to files outside its folder; the cache cannot be written.
+        DataError: the model is missing, damaged, too large or refers to files outside its folder; the cache cannot be
+        written.
     """
     asked = checked(MeshSettings, settings, "scene")
     folder = generate(asked, context.cache_dir, context.progress)
@@ -114,7 +119,9 @@ def generate(settings: MeshSettings, cache_dir: Path, progress: Progress = lambd
     return image_set("mesh", key, settings, build, seen, facts).generate(cache_dir, progress)
 
 
-def _colours(scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _colours(
+    scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """What N rays see without any light: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits."""
     hits = scene.intersect(origins, directions)
     image = np.zeros(directions.shape, dtype=np.float32)

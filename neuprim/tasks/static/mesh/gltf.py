@@ -1,10 +1,13 @@
-"""glTF 2 (.gltf, .glb): what a document says, checked and written anew with nothing in it but surfaces, for trimesh to read.
+"""glTF 2 (.gltf, .glb): what a document says, checked and written anew with nothing in it but surfaces, for trimesh to
+read.
 
-Accessors are unpacked, quantized ones too. Materials and images are not passed on, so no decoder runs before its turn. Morph targets have
-their default weights, and skins the pose of their joints' nodes; animations, lights and cameras are left out.
+Accessors are unpacked, quantized ones too. Materials and images are not passed on, so no decoder runs before its turn.
+Morph targets have their default weights, and skins the pose of their joints' nodes; animations, lights and cameras are
+left out.
 
-Extensions: those in ``_READ`` are honoured, those in ``_HARMLESS`` change nothing that is drawn, and beside those of ``_COMPRESSION`` a file
-may hold what is read, or is refused. Any other is named in one line, and refused where the file requires it.
+Extensions: those in ``_READ`` are honoured, those in ``_HARMLESS`` change nothing that is drawn, and beside those of
+``_COMPRESSION`` a file may hold what is read, or is refused. Any other is named in one line, and refused where the file
+requires it.
 """
 
 from __future__ import annotations
@@ -86,7 +89,16 @@ def read_gltf(folder: Folder) -> Model:
         if not isinstance(document, dict):
             raise ValueError(f"top level is a {type(document).__name__}, no object")
         return _Document(folder, document, binary).model()
-    except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError, struct.error) as error:
+    except (
+        AttributeError,
+        IndexError,
+        KeyError,
+        OverflowError,
+        RecursionError,
+        TypeError,
+        ValueError,
+        struct.error,
+    ) as error:
         said = f"nothing called {error}" if isinstance(error, KeyError) else str(error)
         raise DataError(f"{path}: damaged glTF ({' '.join(said.split())[:160]}); expected glTF 2") from None
 
@@ -99,7 +111,9 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
     if version != 2:
         raise ValueError(f"version {version}")
     if length > len(data) or kind != _JSON or 20 + size > len(data):
-        raise ValueError(f"{len(data)} bytes are there, {max(length, 20 + size)} announced" if kind == _JSON else "no JSON chunk")
+        raise ValueError(
+            f"{len(data)} bytes are there, {max(length, 20 + size)} announced" if kind == _JSON else "no JSON chunk"
+        )
     text, place = data[20 : 20 + size], 20 + size
     while place + 8 <= length:
         size, kind = struct.unpack_from("<2I", data, place)
@@ -122,8 +136,15 @@ class _Document:
         required, used = set(document.get("extensionsRequired", [])), set(document.get("extensionsUsed", []))
         unread = sorted(required - _READ - _HARMLESS)
         if unread:
-            raise DataError(f"{self.path}: needs the glTF extension {unread[0][:60]}, which is not read; {PLAIN}, not compressed")
-        ignored = sorted(used.union(*(m.get("extensions", {}) for m in document.get("materials", []))) - _READ - _HARMLESS - _COMPRESSION)
+            raise DataError(
+                f"{self.path}: needs the glTF extension {unread[0][:60]}, which is not read; {PLAIN}, not compressed"
+            )
+        ignored = sorted(
+            used.union(*(m.get("extensions", {}) for m in document.get("materials", [])))
+            - _READ
+            - _HARMLESS
+            - _COMPRESSION
+        )
         if ignored:
             shown = ", ".join(ignored[:6]) + ", ..." * (len(ignored) > 6)
             warn_once(f"{self.path}: uses the glTF extension{'s' * (len(ignored) > 1)} {shown[:300]}; drawn without")
@@ -173,7 +194,9 @@ class _Document:
 
     # ------------------------------------------------------------ surfaces
 
-    def _mesh(self, mesh: Mapping[str, Any], weights: Sequence[float], pose: NDArray | None = None) -> list[dict[str, Any]]:
+    def _mesh(
+        self, mesh: Mapping[str, Any], weights: Sequence[float], pose: NDArray | None = None
+    ) -> list[dict[str, Any]]:
         """The primitives of a mesh.
 
         Args:
@@ -197,10 +220,16 @@ class _Document:
             check_counts(self.folder, {"parts": (self.primitives, MAX_PARTS)})
         return found
 
-    def _primitive(self, primitive: Mapping[str, Any], mode: int, weights: Sequence[float], pose: NDArray | None) -> dict[str, Any]:
+    def _primitive(
+        self, primitive: Mapping[str, Any], mode: int, weights: Sequence[float], pose: NDArray | None
+    ) -> dict[str, Any]:
         attributes: Mapping[str, int] = primitive["attributes"]
         positions = self.data.array(attributes["POSITION"], ["VEC3"])
-        flat = self.data.array(primitive["indices"], ["SCALAR"])[:, 0] if "indices" in primitive else np.arange(len(positions))
+        flat = (
+            self.data.array(primitive["indices"], ["SCALAR"])[:, 0]
+            if "indices" in primitive
+            else np.arange(len(positions))
+        )
         self.vertices, self.corners = self.vertices + len(positions), self.corners + len(flat)
         check_counts(self.folder, {"vertices": (self.vertices, MAX_VERTICES), "faces": (self.corners // 3, MAX_FACES)})
         if flat.dtype.kind == "f" or (len(flat) and flat.max() >= len(positions)):
@@ -228,9 +257,16 @@ class _Document:
             if attribute == "NORMAL":
                 values = self._posed(primitive, "NORMAL", values, weights, pose)
             kept[attribute] = self._kept(values, kinds[values.shape[1] == 4])
-        return {"attributes": kept, "indices": self._kept(flat[:, None], "SCALAR"), "mode": mode, "material": self.order[name]}
+        return {
+            "attributes": kept,
+            "indices": self._kept(flat[:, None], "SCALAR"),
+            "mode": mode,
+            "material": self.order[name],
+        }
 
-    def _posed(self, primitive: Mapping[str, Any], name: str, values: NDArray, weights: Sequence[float], pose: NDArray | None) -> NDArray:
+    def _posed(
+        self, primitive: Mapping[str, Any], name: str, values: NDArray, weights: Sequence[float], pose: NDArray | None
+    ) -> NDArray:
         """(N, 3) positions or normals with morph targets added, and where the joints of the vertices are."""
         for weight, target in zip(weights, primitive.get("targets", []), strict=False):
             if weight and name in target:
@@ -239,7 +275,9 @@ class _Document:
             return values
         attributes, count = primitive["attributes"], len(values)
         pairs = [i for i in range(_MOST_JOINTS // 4) if f"JOINTS_{i}" in attributes]
-        joints = np.concatenate([self._per_vertex(attributes[f"JOINTS_{i}"], ["VEC4"], count) for i in pairs], axis=1).astype(np.int64)
+        joints = np.concatenate(
+            [self._per_vertex(attributes[f"JOINTS_{i}"], ["VEC4"], count) for i in pairs], axis=1
+        ).astype(np.int64)
         shares = np.concatenate([self._per_vertex(attributes[f"WEIGHTS_{i}"], ["VEC4"], count) for i in pairs], axis=1)
         moved, total = np.zeros((count, 3)), np.maximum(shares.sum(axis=1, keepdims=True), 1e-9)
         whole = np.concatenate([values, np.full((count, 1), name == "POSITION")], axis=1)  # normals do not move
@@ -262,7 +300,9 @@ class _Document:
             return 0
         material = self.document["materials"][int(name)]
         texture = {**_base(material), "emissiveTexture": material.get("emissiveTexture", {})}.get(key, {})
-        return count_of(texture.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", texture.get("texCoord", 0)))
+        return count_of(
+            texture.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", texture.get("texCoord", 0))
+        )
 
     def _nodes(self) -> tuple[list[dict[str, Any]], list[int]]:
         """Nodes with nothing but places and meshes, and the roots of the scene that is shown."""
@@ -284,7 +324,9 @@ class _Document:
             level, depth = [child for node in level for child in below[node]], depth + 1
         nodes = []
         for i, node in enumerate(given):
-            plain: dict[str, Any] = {k: [finite(x) for x in node[k]] for k in ("matrix", "translation", "rotation", "scale") if k in node}
+            plain: dict[str, Any] = {
+                k: [finite(x) for x in node[k]] for k in ("matrix", "translation", "rotation", "scale") if k in node
+            }
             if [len(plain[k]) for k in plain] != [{"matrix": 16, "rotation": 4}.get(k, 3) for k in plain]:
                 raise ValueError(f"nodes[{i}] has a transform of another length")
             plain |= {"name": f"node {i}", "children": below[i]}
@@ -330,12 +372,18 @@ class _Document:
             raise ValueError(f"instances have {sorted(lengths) or 'no'} places")
         return [{name: values[k].tolist() for name, values in found.items()} for k in range(lengths.pop())]
 
-    def _pose(self, skin: Mapping[str, Any], nodes: Sequence[Mapping[str, Any]], parents: Mapping[int, int]) -> NDArray[np.float64]:
+    def _pose(
+        self, skin: Mapping[str, Any], nodes: Sequence[Mapping[str, Any]], parents: Mapping[int, int]
+    ) -> NDArray[np.float64]:
         """(J, 4, 4) from the place where a vertex was bound to each joint to where the joint is."""
         joints = [index_of(joint) for joint in skin["joints"]]
         inverse = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
         if "inverseBindMatrices" in skin:
-            inverse = self.data.array(skin["inverseBindMatrices"], ["MAT4"]).reshape(-1, 4, 4).transpose(0, 2, 1)[: len(joints)]
+            inverse = (
+                self.data.array(skin["inverseBindMatrices"], ["MAT4"])
+                .reshape(-1, 4, 4)
+                .transpose(0, 2, 1)[: len(joints)]
+            )
         return np.stack([_world(joint, nodes, parents) for joint in joints]) @ inverse
 
     # ------------------------------------------------------------ colours
@@ -364,7 +412,9 @@ class _Document:
             found = ", ".join(texture.get("extensions", {})) or "no image"
             raise DataError(f"{self.path}: a texture has {found[:60]}, which is not read; expected PNG, JPEG or WebP")
         name = self._image(index_of(source))
-        sampler: Mapping[str, int] = self.document["samplers"][index_of(texture["sampler"])] if "sampler" in texture else {}
+        sampler: Mapping[str, int] = (
+            self.document["samplers"][index_of(texture["sampler"])] if "sampler" in texture else {}
+        )
         wrap = _WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat")
         moved = place.get("extensions", {}).get("KHR_texture_transform")
         return Material(colour, name, wrap, None if moved is None else _moved(moved))
@@ -374,7 +424,11 @@ class _Document:
         name = f"image {index}"
         if name not in self.images:
             image = self.document["images"][index]
-            data = self.folder.optional([file_name(image["uri"])], "texture") if "uri" in image else self.data.view(image["bufferView"])[0]
+            data = (
+                self.folder.optional([file_name(image["uri"])], "texture")
+                if "uri" in image
+                else self.data.view(image["bufferView"])[0]
+            )
             if data is None:
                 return None
             self.images[name] = data
@@ -382,7 +436,8 @@ class _Document:
 
 
 def _base(material: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Base colour and its texture, of either of the two ways to say it; where a material has both, the extension wins."""
+    """Base colour and its texture, of either of the two ways to say it; where a material has both, the extension
+    wins."""
     glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
     if glossy is None:
         return material.get("pbrMetallicRoughness", {})
@@ -396,7 +451,9 @@ def _world(node: int, nodes: Sequence[Mapping[str, Any]], parents: Mapping[int, 
     for _ in range(_MAX_DEPTH):
         place, own = nodes[node], np.eye(4)
         x, y, z, w = place.get("rotation", (0.0, 0.0, 0.0, 1.0))
-        own[:3, :3] = trimesh.transformations.quaternion_matrix([w, x, y, z])[:3, :3] * place.get("scale", (1.0, 1.0, 1.0))
+        own[:3, :3] = trimesh.transformations.quaternion_matrix([w, x, y, z])[:3, :3] * place.get(
+            "scale", (1.0, 1.0, 1.0)
+        )
         own[:3, 3] = place.get("translation", (0.0, 0.0, 0.0))
         found = np.reshape(place.get("matrix", np.eye(4)), (4, 4)).T @ own @ found
         if node not in parents:

@@ -1,7 +1,8 @@
 """Wavefront OBJ with its material libraries (.mtl).
 
-Of a library, colours (``Kd``), emitted light (``Ke``), their textures and opacity (``d``, else 1 - ``Tr``) are read; colours and textures
-are taken for sRGB, and a texture stands in the place of the colour, as many exporters write a colour of 0 beside it.
+Of a library, colours (``Kd``), emitted light (``Ke``), their textures and opacity (``d``, else 1 - ``Tr``) are read;
+colours and textures are taken for sRGB, and a texture stands in the place of the colour, as many exporters write a
+colour of 0 beside it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,17 @@ from numpy.typing import NDArray
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import srgb_to_linear
 from neuprim.core.notices import warn_once
-from neuprim.tasks.static.mesh.files import MAX_FACES, MAX_PARTS, MAX_VERTICES, Faces, Folder, Material, Model, check_counts, check_vertices
+from neuprim.tasks.static.mesh.files import (
+    MAX_FACES,
+    MAX_PARTS,
+    MAX_VERTICES,
+    Faces,
+    Folder,
+    Material,
+    Model,
+    check_counts,
+    check_vertices,
+)
 from neuprim.tasks.static.mesh.polygons import divided
 
 __all__ = ["obj_faces", "read_obj"]
@@ -30,7 +41,8 @@ _WORDS = {"-blendu", "-blendv", "-bm", "-boost", "-cc", "-clamp", "-imfchan", "-
 """Options that are followed by one word."""
 
 _WIDTHS = {"v": (3, 8), "vt": (1, 3), "vn": (3, 3)}
-"""Numbers of a vertex (x y z, then a colour or a weight), its texture coordinates and its normal: fewest and most that are read."""
+"""Numbers of a vertex (x y z, then a colour or a weight), its texture coordinates and its normal: fewest and most that
+are read."""
 
 _NONE = -1
 """The index of texture coordinates or a normal that a corner does without."""
@@ -42,13 +54,17 @@ def read_obj(folder: Folder) -> Model:
     Raises:
         DataError: too large, or with references that lead nowhere.
     """
-    data = folder.own().decode("utf-8", "replace").encode()  # names of materials are compared with the library's, decoded alike
+    data = (
+        folder.own().decode("utf-8", "replace").encode()
+    )  # names of materials are compared with the library's, decoded alike
     found = {"vertices": (data.count(b"\nv "), MAX_VERTICES), "faces": (data.count(b"\nf "), MAX_FACES)}
     check_counts(folder, {**found, "changes of material": (data.count(b"usemtl "), MAX_PARTS)})
     materials: dict[str, Material] = {}
     images: dict[str, bytes] = {}
     wanted = [line.decode("utf-8", "replace") for line in re.findall(rb"(?m)^\s*mtllib[ \t]+(.+?)\s*$", data)]
-    libraries = [name.strip() for line in wanted for name in re.findall(r"(?i).+?\.mtl(?=\s|$)", line) or [line]]  # names may hold blanks
+    libraries = [
+        name.strip() for line in wanted for name in re.findall(r"(?i).+?\.mtl(?=\s|$)", line) or [line]
+    ]  # names may hold blanks
     for library in dict.fromkeys(libraries):
         text = folder.optional([library, PurePosixPath(library.replace("\\", "/")).name], "material file")
         if text is not None:
@@ -101,7 +117,9 @@ def obj_faces(model: Model) -> tuple[list[Faces], int]:
     check_vertices(model.path, v[:, :3], used[:, 0])
     for column, table, what in ((1, vt, "texture coordinates"), (2, vn, "normal")):
         if len(used) and used[:, column].max() >= len(table):
-            raise DataError(f"{model.path}: a face has the {what} {used[:, column].max() + 1} of {len(table)}; expected one that is there")
+            raise DataError(
+                f"{model.path}: a face has the {what} {used[:, column].max() + 1} of {len(table)}; expected one that is there"
+            )
     corners = v[used[:, 0], :3]
     faces, polygon = divided(model.path, corners, np.frombuffer(sizes, np.int64) if sizes else np.zeros(0, np.int64))
     owner = np.frombuffer(owners, np.int64)[polygon] if owners else polygon
@@ -112,7 +130,9 @@ def obj_faces(model: Model) -> tuple[list[Faces], int]:
         if len(mine):
             normals = _looked_up(vn, mine[..., 2], 0.0) if len(vn) else None
             uv = _looked_up(vt[:, :2], mine[..., 1], np.nan) if (mine[..., 1] != _NONE).any() else None
-            found.append(Faces(v[mine[..., 0], :3], name, normals, None if colours is None else colours[mine[..., 0]], uv, uv))
+            found.append(
+                Faces(v[mine[..., 0], :3], name, normals, None if colours is None else colours[mine[..., 0]], uv, uv)
+            )
     return found, len(v)
 
 
@@ -165,7 +185,9 @@ def _library(text: str, folder: Folder, images: dict[str, bytes]) -> dict[str, M
         elif key in ("map_kd", "map_ke"):
             image = _texture(words, rest, folder, images)
             if image is not None and key == "map_kd":
-                found[name] = replace(old, texture=image.texture, wrap=image.wrap, transform=image.transform, cutoff=0.5, blend=True)
+                found[name] = replace(
+                    old, texture=image.texture, wrap=image.wrap, transform=image.transform, cutoff=0.5, blend=True
+                )
             elif image is not None:
                 found[name] = replace(old, glow=replace(image, colour=glow.colour))
         elif key == "d" or (key == "tr" and name not in told):
@@ -173,7 +195,9 @@ def _library(text: str, folder: Folder, images: dict[str, bytes]) -> dict[str, M
             told |= {name} if key == "d" else set()
             found[name] = replace(old, opacity=value if key == "d" else 1 - value, cutoff=0.5, blend=True)
         elif key == "map_d" and _file_name(words, rest)[0] != old.texture:
-            warn_once(f"{folder.file}: map_d of material {name[:40]!r} is not read; drawn as opaque as d and the alpha of map_Kd say")
+            warn_once(
+                f"{folder.file}: map_d of material {name[:40]!r} is not read; drawn as opaque as d and the alpha of map_Kd say"
+            )
     return {name: _textured(material) for name, material in found.items()}
 
 
@@ -230,7 +254,9 @@ def _number(word: str) -> bool:
 
 def _number_of(word: str, folder: Folder, name: str) -> float:
     if not _number(word):
-        raise DataError(f"{folder.file}: material {name[:40]!r} has the opacity {word[:20]!r}; expected a number from 0 to 1")
+        raise DataError(
+            f"{folder.file}: material {name[:40]!r} has the opacity {word[:20]!r}; expected a number from 0 to 1"
+        )
     return min(max(float(word), 0.0), 1.0)
 
 
@@ -240,6 +266,8 @@ def _colour(words: list[str], folder: Folder, name: str) -> tuple[float, float, 
         if not values.isfinite().all():
             raise ValueError
     except ValueError:
-        raise DataError(f"{folder.file}: material {name[:40]!r} has the colour {' '.join(words)[:40]!r}; expected three numbers") from None
+        raise DataError(
+            f"{folder.file}: material {name[:40]!r} has the colour {' '.join(words)[:40]!r}; expected three numbers"
+        ) from None
     r, g, b = srgb_to_linear(values.clamp(0, 1)).tolist()
     return r, g, b

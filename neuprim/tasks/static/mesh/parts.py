@@ -1,4 +1,5 @@
-"""A model's surfaces: every part in its place, with the colours of each corner of each face, whatever read its geometry."""
+"""A model's surfaces: every part in its place, with the colours of each corner of each face, whatever read its
+geometry."""
 
 from __future__ import annotations
 
@@ -82,7 +83,8 @@ def read_parts(model: Model) -> list[Part]:
     """All triangles of a model.
 
     Raises:
-        DataError: geometry that cannot be read, no triangles, too many, vertices that are no finite numbers, or faces without them.
+        DataError: geometry that cannot be read, no triangles, too many, vertices that are no finite numbers, or faces
+        without them.
     """
     readers = {"obj": obj_faces, "ply": ply_faces, "stl": stl_faces}
     faces, vertices = readers.get(model.kind, _trimesh_faces)(model)
@@ -102,26 +104,38 @@ def _trimesh_faces(model: Model) -> tuple[list[Faces], int]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             data, parts = io.BytesIO(model.data), _Parts(model.parts)
-            scene: Any = trimesh.load(data, file_type=model.kind, resolver=parts, force="scene", process=False, validate=False)
+            scene: Any = trimesh.load(
+                data, file_type=model.kind, resolver=parts, force="scene", process=False, validate=False
+            )
     except MemoryError:
         raise
     except Exception as error:  # trimesh's readers raise whatever their arrays do
         said = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
-        raise DataError(f"{model.path}: cannot be read as {model.kind[:4].upper()} ({said}); expected a complete file") from None
+        raise DataError(
+            f"{model.path}: cannot be read as {model.kind[:4].upper()} ({said}); expected a complete file"
+        ) from None
     finally:
         trimesh.util.log.setLevel(level)
     placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
     used = [(np.asarray(matrix, np.float64), scene.geometry[name]) for matrix, name in placed]
     meshes = [(matrix, mesh) for matrix, mesh in used if isinstance(mesh, trimesh.Trimesh)]
-    _check_counts(model, sum(len(mesh.faces) for _, mesh in meshes), sum(len(mesh.vertices) for _, mesh in used), len(meshes))
-    return [_placed(model, matrix, mesh) for matrix, mesh in meshes if len(mesh.faces)], sum(len(mesh.vertices) for _, mesh in used)
+    _check_counts(
+        model, sum(len(mesh.faces) for _, mesh in meshes), sum(len(mesh.vertices) for _, mesh in used), len(meshes)
+    )
+    return [_placed(model, matrix, mesh) for matrix, mesh in meshes if len(mesh.faces)], sum(
+        len(mesh.vertices) for _, mesh in used
+    )
 
 
 def _check_counts(model: Model, faces: int, vertices: int, parts: int) -> None:
     if not faces:
         found = f"{vertices} points and no faces" if vertices else "no faces"
         raise DataError(f"{model.path}: has {found}; expected a mesh with triangles")
-    for what, count, most in (("faces", faces, MAX_FACES), ("vertices", vertices, MAX_VERTICES), ("parts", parts, MAX_PARTS)):
+    for what, count, most in (
+        ("faces", faces, MAX_FACES),
+        ("vertices", vertices, MAX_VERTICES),
+        ("parts", parts, MAX_PARTS),
+    ):
         if count > most:
             raise DataError(f"{model.path}: {count} {what}, each use of a part counting; expected at most {most}")
 
@@ -129,7 +143,9 @@ def _check_counts(model: Model, faces: int, vertices: int, parts: int) -> None:
 def _placed(model: Model, matrix: NDArray[np.float64], mesh: trimesh.Trimesh) -> Faces:
     vertices, faces = mesh.vertices.view(np.ndarray), mesh.faces.view(np.ndarray)
     if vertices.shape[1] != 3 or faces.shape[1] != 3:
-        raise DataError(f"{model.path}: vertices of {vertices.shape[1]} numbers, faces of {faces.shape[1]}; expected 3 of each")
+        raise DataError(
+            f"{model.path}: vertices of {vertices.shape[1]} numbers, faces of {faces.shape[1]}; expected 3 of each"
+        )
     normals = None
     with np.errstate(all="ignore"):
         moved = vertices @ matrix[:3, :3].T + matrix[:3, 3]
@@ -140,8 +156,12 @@ def _placed(model: Model, matrix: NDArray[np.float64], mesh: trimesh.Trimesh) ->
     name = getattr(getattr(mesh.visual, "material", None), "name", None)
     uv, colour = getattr(mesh.visual, "uv", None), getattr(mesh.visual, "vertex_attributes", {}).get("color")
     glow_uv = mesh.vertex_attributes.get(GLOW_UV)
-    glow_uv = None if glow_uv is None else np.array([0, 1]) - np.array([-1, 1]) * glow_uv  # v upward, as trimesh turns the other
-    uv, colour, glow_uv = (None if value is None else np.asarray(value, np.float32)[faces] for value in (uv, colour, glow_uv))
+    glow_uv = (
+        None if glow_uv is None else np.array([0, 1]) - np.array([-1, 1]) * glow_uv
+    )  # v upward, as trimesh turns the other
+    uv, colour, glow_uv = (
+        None if value is None else np.asarray(value, np.float32)[faces] for value in (uv, colour, glow_uv)
+    )
     normals = None if normals is None else normals[faces]
     return Faces(moved[faces], name if isinstance(name, str) else "", normals, colour, uv, glow_uv)
 
@@ -169,12 +189,16 @@ def _part(model: Model, faces: Faces) -> Part:
     return Part(faces.corners, faces.normals, colour, uv, material, bare, alpha, glow)
 
 
-def _coordinates(model: Model, uv: NDArray[np.floating] | None, material: Material, faces: int) -> NDArray[np.float32] | None:
+def _coordinates(
+    model: Model, uv: NDArray[np.floating] | None, material: Material, faces: int
+) -> NDArray[np.float32] | None:
     """(F, 3, 2) places of the corners in the material's texture; None without one."""
     if material.texture is None:
         return None
     if uv is None:
-        warn_once(f"{model.path}: texture {material.texture[:80]!r} has no coordinates on a part of {faces} faces; drawn without it")
+        warn_once(
+            f"{model.path}: texture {material.texture[:80]!r} has no coordinates on a part of {faces} faces; drawn without it"
+        )
         return None
     with np.errstate(all="ignore"):
         moved = _moved(np.asarray(uv, np.float32), material)

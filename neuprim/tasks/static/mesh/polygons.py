@@ -1,8 +1,8 @@
 """Polygons of any number of corners as triangles that cover the same surface.
 
-A division of a polygon into triangles that all turn as the polygon does covers every point as often as the polygon winds around it: once,
-where it does not cross itself, whether it is convex, concave or touches itself. So fans are tried first, then ears are cut off, and what
-cannot be divided that way crosses itself and is refused.
+A division of a polygon into triangles that all turn as the polygon does covers every point as often as the polygon
+winds around it: once, where it does not cross itself, whether it is convex, concave or touches itself. So fans are
+tried first, then ears are cut off, and what cannot be divided that way crosses itself and is refused.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ _FLAT = 1e-10
 """Twice an area, over the square of the polygon's size, that counts as none."""
 
 
-def divided(path: Path, corners: NDArray[np.float64], sizes: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def divided(
+    path: Path, corners: NDArray[np.float64], sizes: NDArray[np.integer]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Triangles of polygons: (T, 3) rows of ``corners``, and (T,) which polygon each is of, ascending.
 
     Args:
@@ -63,7 +65,9 @@ def divided(path: Path, corners: NDArray[np.float64], sizes: NDArray[np.integer]
             areas = _areas(points[left], normal[left], fan)
             line = np.linalg.norm(_crosses(points[left], fan), axis=2).max(axis=1) <= _FLAT if start == 0 else np.False_
             good = ((areas >= -_FLAT).all(axis=1) & (length[left, 0] > _FLAT)) | line
-            shown = good[:, None] & ((areas > _FLAT) | np.reshape(line, (-1, 1)))  # triangles without area are no faces of the file
+            shown = good[:, None] & (
+                (areas > _FLAT) | np.reshape(line, (-1, 1))
+            )  # triangles without area are no faces of the file
             found.append(index[left][:, fan][shown])
             owners.append(np.repeat(rows[left], shown.sum(axis=1)))
             left = left[~good]
@@ -110,10 +114,11 @@ def _flattened(points: NDArray, normal: NDArray) -> NDArray[np.float64]:
 
 
 def _ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | None, int]:
-    """Triangles cut off a polygon one after the other (Meisters 1975), None where that ends too soon; and how many tests are left.
+    """Triangles cut off a polygon one after the other (Meisters 1975), None where that ends too soon; and how many
+    tests are left.
 
-    An ear is a corner that turns left and whose triangle holds no other corner. Corners in the same place as one of its own do not count,
-    nor, where there is no other ear, those on its edges: polygons may touch themselves.
+    An ear is a corner that turns left and whose triangle holds no other corner. Corners in the same place as one of its
+    own do not count, nor, where there is no other ear, those on its edges: polygons may touch themselves.
     """
     left, found = list(range(len(points))), []
     place, strict, failed = 0, True, 0

@@ -1,4 +1,5 @@
-"""PLY, with its vertices' or faces' colours or a texture, and STL, which may have colours: what headers claim is held against their bytes."""
+"""PLY, with its vertices' or faces' colours or a texture, and STL, which may have colours: what headers claim is held
+against their bytes."""
 
 from __future__ import annotations
 
@@ -11,7 +12,17 @@ from numpy.typing import NDArray
 from neuprim.core.errors import DataError
 from neuprim.core.io.ply import PlyElement, read_elements
 from neuprim.core.notices import warn_once
-from neuprim.tasks.static.mesh.files import MAX_FACES, MAX_PARTS, MAX_VERTICES, Faces, Folder, Material, Model, check_counts, check_vertices
+from neuprim.tasks.static.mesh.files import (
+    MAX_FACES,
+    MAX_PARTS,
+    MAX_VERTICES,
+    Faces,
+    Folder,
+    Material,
+    Model,
+    check_counts,
+    check_vertices,
+)
 from neuprim.tasks.static.mesh.polygons import divided
 
 __all__ = ["ply_faces", "read_ply", "read_stl", "stl_faces"]
@@ -31,11 +42,17 @@ def read_ply(folder: Folder) -> Model:
     data = folder.own()
     end = data.find(b"end_header", 0, _HEADER)
     if not data.startswith(b"ply") or end < 0:
-        found = f"starts with {data[:12]!r}" if not data.startswith(b"ply") else f"has no end_header in its first {_HEADER} bytes"
+        found = (
+            f"starts with {data[:12]!r}"
+            if not data.startswith(b"ply")
+            else f"has no end_header in its first {_HEADER} bytes"
+        )
         raise DataError(f"{folder.file}: {found}; expected a PLY file")
     header = data[:end].decode("utf-8", "replace")
     counts = {name: int(count) for name, count in re.findall(r"(?m)^element[ \t]+(\S+)[ \t]+(\d{1,18})\s*$", header)}
-    check_counts(folder, {"vertices": (counts.get("vertex", 0), MAX_VERTICES), "faces": (counts.get("face", 0), MAX_FACES)})
+    check_counts(
+        folder, {"vertices": (counts.get("vertex", 0), MAX_VERTICES), "faces": (counts.get("face", 0), MAX_FACES)}
+    )
     materials: dict[str, Material] = {}
     images: dict[str, bytes] = {}
     texture = re.search(r"(?mi)^comment[ \t]+TextureFile[ \t]+(.+?)\s*$", header)
@@ -64,7 +81,9 @@ def ply_faces(model: Model) -> tuple[list[Faces], int]:
     if face is None or corners is None:
         strips = elements["tristrips"].lists if "tristrips" in elements else {}
         if strips or lists:
-            raise DataError(f"{model.path}: faces are {', '.join([*strips, *lists])[:60]}; expected a list vertex_indices of every face")
+            raise DataError(
+                f"{model.path}: faces are {', '.join([*strips, *lists])[:60]}; expected a list vertex_indices of every face"
+            )
         return [], count
     index = corners.values.astype(np.int64)
     xyz = vertices.columns(("x", "y", "z"))
@@ -111,7 +130,9 @@ def read_stl(folder: Folder) -> Model:
     text = len(data) != 84 + 50 * count or len(data) < 84
     if text:
         if data[:5].lower() != b"solid" or b"facet" not in data[:_HEADER]:
-            raise DataError(f"{folder.file}: {count} faces announced; expected {84 + 50 * count} bytes for them, found {len(data)}")
+            raise DataError(
+                f"{folder.file}: {count} faces announced; expected {84 + 50 * count} bytes for them, found {len(data)}"
+            )
         check_counts(folder, {"solids": (data.lower().count(b"endsolid"), MAX_PARTS)})
         count = data.lower().count(b"endfacet")
     check_counts(folder, {"faces": (count, MAX_FACES)})
@@ -121,8 +142,8 @@ def read_stl(folder: Folder) -> Model:
 def stl_faces(model: Model) -> tuple[list[Faces], int]:
     """All triangles of a binary file, and the number of their corners.
 
-    The two bytes after each may be its colour: with bit 15 set red, green and blue from bit 10 down; in files whose header says COLOR=
-    (Materialise Magics) red, green and blue from bit 0 up where bit 15 is clear, else the header's.
+    The two bytes after each may be its colour: with bit 15 set red, green and blue from bit 10 down; in files whose
+    header says COLOR= (Materialise Magics) red, green and blue from bit 0 up where bit 15 is clear, else the header's.
     """
     rows = np.frombuffer(model.data, _STL, offset=84)
     bits = rows["attribute"].astype(np.int64)

@@ -1,4 +1,5 @@
-"""A model as rays meet it: in the box of the scenes, drawn alike from both sides, with its textures and the holes in them."""
+"""A model as rays meet it: in the box of the scenes, drawn alike from both sides, with its textures and the holes in
+them."""
 
 from __future__ import annotations
 
@@ -77,10 +78,14 @@ class Surface(Scene):
         DataError: a model without size, or a texture that cannot be decoded.
     """
 
-    def __init__(self, model: Model, parts: Sequence[Part], upward: Up, spacing: float, engine: Engine = "auto") -> None:
+    def __init__(
+        self, model: Model, parts: Sequence[Part], upward: Up, spacing: float, engine: Engine = "auto"
+    ) -> None:
         matrix = scene_from_file(parts, upward)
         if matrix is None:
-            raise DataError(f"{model.path}: the mesh is a point, or too large for numbers; expected a size from 1e-150 to 1e150")
+            raise DataError(
+                f"{model.path}: the mesh is a point, or too large for numbers; expected a size from 1e-150 to 1e150"
+            )
         self.scene_from_file = matrix
         points = np.concatenate([(part.corners @ matrix[:3, :3].T + matrix[:3, 3]).reshape(-1, 3) for part in parts])
         first, same = trimesh.grouping.unique_rows(points, digits=_DIGITS)
@@ -96,7 +101,9 @@ class Surface(Scene):
             warn_once(f"{found}; left out")
         faint = np.concatenate([_faint(part) for part in parts])
         if not (kept & ~faint).any():
-            raise DataError(f"{model.path}: no face has an opacity of at least 0.5; expected a model that is not all clear (alpha, d, Tr)")
+            raise DataError(
+                f"{model.path}: no face has an opacity of at least 0.5; expected a model that is not all clear (alpha, d, Tr)"
+            )
         kept &= ~faint
         mesh = _mesh(points, faces[kept])
         normals = _smooth(_file_normals(parts, matrix[:3, :3])[kept], across[kept], mesh)
@@ -107,7 +114,10 @@ class Surface(Scene):
         _say_translucent(model, parts, pool)
         glows = [p.glow or replace(p, colour=np.zeros_like(p.colour), uv=None, alpha=None) for p in parts]
         self._glow = _Layer(model, glows, kept, area, pool) if any(p.glow for p in parts) else None
-        cutoffs = [np.nan if p.material.cutoff is None or (p.uv is None and p.alpha is None) else p.material.cutoff for p in parts]
+        cutoffs = [
+            np.nan if p.material.cutoff is None or (p.uv is None and p.alpha is None) else p.material.cutoff
+            for p in parts
+        ]
         self._cutoff = np.repeat(np.array(cutoffs, np.float32), [len(part.colour) for part in parts])[kept]
         self._holes = bool((self._cutoff > 0).any())
 
@@ -165,7 +175,9 @@ class _Layer:
         pool: textures that are decoded already, by image and wrapping; those of the parts are added.
     """
 
-    def __init__(self, model: Model, parts: Sequence[Part], kept: NDArray[np.bool_], area: NDArray[np.float64], pool: _Pool) -> None:
+    def __init__(
+        self, model: Model, parts: Sequence[Part], kept: NDArray[np.bool_], area: NDArray[np.float64], pool: _Pool
+    ) -> None:
         owner = np.full(len(parts), -1, dtype=np.intp)
         for i, part in enumerate(parts):
             name, wrap = part.material.texture, part.material.wrap
@@ -179,9 +191,13 @@ class _Layer:
         self._texture = np.repeat(owner, [len(part.colour) for part in parts])[kept]
         self._colour = np.ones((len(kept), 3, 4), np.float32)
         self._colour[..., :3] = np.concatenate([part.colour for part in parts])
-        self._colour[..., 3] = np.concatenate([np.ones(part.colour.shape[:2]) if part.alpha is None else part.alpha for part in parts])
+        self._colour[..., 3] = np.concatenate(
+            [np.ones(part.colour.shape[:2]) if part.alpha is None else part.alpha for part in parts]
+        )
         self._colour = self._colour[kept]
-        self._uv = np.concatenate([np.zeros((len(p.colour), 3, 2), np.float32) if p.uv is None else p.uv for p in parts])[kept]
+        self._uv = np.concatenate(
+            [np.zeros((len(p.colour), 3, 2), np.float32) if p.uv is None else p.uv for p in parts]
+        )[kept]
         # texels per scene unit: the square root of the area in the texture over that in space, of every face
         sides = self._uv[:, 1:] - self._uv[:, :1]
         inside = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
@@ -209,7 +225,11 @@ def _faint(part: Part) -> NDArray[np.bool_]:
 
 def _say_translucent(model: Model, parts: Sequence[Part], pool: _Pool) -> None:
     """One line for what should show what is behind it: nothing is translucent here."""
-    soft = {key for key, texture in pool.items() if ((texture.levels[0][..., 3] > 0) & (texture.levels[0][..., 3] < 255)).any()}
+    soft = {
+        key
+        for key, texture in pool.items()
+        if ((texture.levels[0][..., 3] > 0) & (texture.levels[0][..., 3] < 255)).any()
+    }
     count = 0
     for part in parts:
         if part.material.blend and part.uv is not None and (part.material.texture, part.material.wrap) in soft:
@@ -217,7 +237,9 @@ def _say_translucent(model: Model, parts: Sequence[Part], pool: _Pool) -> None:
         elif part.material.blend and part.alpha is not None:
             count += int(((part.alpha > 0) & (part.alpha < 1)).any(axis=1).sum())
     if count:
-        warn_once(f"{model.path}: {count} faces are translucent; drawn opaque where their opacity is at least 0.5, left out elsewhere")
+        warn_once(
+            f"{model.path}: {count} faces are translucent; drawn opaque where their opacity is at least 0.5, left out elsewhere"
+        )
 
 
 def _mesh(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
@@ -232,11 +254,14 @@ def _mesh(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trim
 
 def _file_normals(parts: Sequence[Part], turn: NDArray[np.float64]) -> NDArray[np.float64]:
     """(F, 3, 3) normals of the file on the scene's axes, of any length; zero where it has none."""
-    return np.concatenate([np.zeros_like(part.corners) if part.normals is None else part.normals @ turn.T for part in parts])
+    return np.concatenate(
+        [np.zeros_like(part.corners) if part.normals is None else part.normals @ turn.T for part in parts]
+    )
 
 
 def _smooth(given: NDArray[np.float64], across: NDArray[np.float64], mesh: trimesh.Trimesh) -> NDArray[np.float64]:
-    """(F, 3, 3) unit normals: the file's, turned to the side of their face; else those that the angles between faces suggest."""
+    """(F, 3, 3) unit normals: the file's, turned to the side of their face; else those that the angles between faces
+    suggest."""
     with np.errstate(all="ignore"):
         length = np.linalg.norm(given, axis=2, keepdims=True)
         unit = given / length

@@ -1,4 +1,5 @@
-"""Textures as surfaces show them: decoded to linear light, filtered bilinearly, from a smaller copy where a pixel covers many texels."""
+"""Textures as surfaces show them: decoded to linear light, filtered bilinearly, from a smaller copy where a pixel
+covers many texels."""
 
 from __future__ import annotations
 
@@ -119,10 +120,16 @@ def decode(path: Path, name: str, data: bytes, left: int = MAX_TEXELS) -> NDArra
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
                 size = image.width * image.height
                 if size > min(MAX_PIXELS, left):
-                    most = f"{MAX_PIXELS} are accepted" if size > MAX_PIXELS else f"{MAX_TEXELS} of all textures are accepted"
+                    most = (
+                        f"{MAX_PIXELS} are accepted"
+                        if size > MAX_PIXELS
+                        else f"{MAX_TEXELS} of all textures are accepted"
+                    )
                     raise DataError(f"{where} has {image.width}x{image.height} pixels; at most {most}")
                 deep = image.mode.startswith("I")  # 16 bits of grey, which Pillow would cut off at 255
-                plain = Image.fromarray((np.asarray(image, np.int64) >> 8).clip(0, 255).astype(np.uint8)) if deep else image
+                plain = (
+                    Image.fromarray((np.asarray(image, np.int64) >> 8).clip(0, 255).astype(np.uint8)) if deep else image
+                )
                 return np.array(plain.convert("RGBA"))
     except (DataError, MemoryError):
         raise
@@ -130,4 +137,6 @@ def decode(path: Path, name: str, data: bytes, left: int = MAX_TEXELS) -> NDArra
         raise DataError(f"{where} claims more than {MAX_PIXELS} pixels; expected fewer") from None
     except Exception as error:  # Pillow's decoders raise OSError, SyntaxError, ValueError, struct.error, ...
         said = " ".join(str(error).split())[:120]
-        raise DataError(f"{where} cannot be decoded ({said}); expected {', '.join(FORMATS[:-1])} or {FORMATS[-1]}") from None
+        raise DataError(
+            f"{where} cannot be decoded ({said}); expected {', '.join(FORMATS[:-1])} or {FORMATS[-1]}"
+        ) from None

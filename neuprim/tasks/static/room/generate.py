@@ -1,7 +1,7 @@
 """The scene ``room`` as a data set on disk, in the layout of nerfstudio that any loader of it reads.
 
-    transforms.json                   intrinsics and distortion, camera-to-world matrices with OpenGL axes, which images are for testing
-    images/train_0000.png ...         RGB, sRGB, as the lens bends them
+    transforms.json                   intrinsics and distortion, camera-to-world matrices with OpenGL axes, which images
+    are for testing images/train_0000.png ...         RGB, sRGB, as the lens bends them
     images/test_0000.png ...
     points.ply                        points with colours, as a reconstruction finds them
     exposures.json                    what the linear light of every image is multiplied by; 1 for test images
@@ -105,7 +105,12 @@ def generate(settings: RoomSettings, cache_dir: Path, progress: Progress = lambd
     shots = _shots(settings)
     files = ["transforms.json", "points.ply", "exposures.json", *(f"images/{name}" for name, _, _ in shots)]
     what = "scene room: cannot write the generated images"
-    return cached_folder(Path(cache_dir) / f"room-{settings.key()}", files, lambda folder: _write(folder, settings, shots, progress), what)
+    return cached_folder(
+        Path(cache_dir) / f"room-{settings.key()}",
+        files,
+        lambda folder: _write(folder, settings, shots, progress),
+        what,
+    )
 
 
 def lens(settings: RoomSettings) -> Lens:
@@ -119,13 +124,19 @@ def room(settings: RoomSettings) -> Room:
 
 
 def gains(count: int, stops: float) -> NDArray[np.float64]:
-    """(count,) what training images are multiplied by, their logarithms even between minus and plus ``stops`` to the base of 2."""
+    """(count,) what training images are multiplied by, their logarithms even between minus and plus ``stops`` to the
+    base of 2."""
     return 2.0 ** (stops * (2 * np.random.default_rng(_EXPOSURE_SEED).random(count) - 1))
 
 
-def picture(scene: Room, seen: Lens, pose: NDArray[np.float64], supersampling: int, gain: float = 1.0) -> NDArray[np.uint8]:
+def picture(
+    scene: Room, seen: Lens, pose: NDArray[np.float64], supersampling: int, gain: float = 1.0
+) -> NDArray[np.uint8]:
     """(H, W, 3) sRGB, of linear light that is averaged over the rays of each pixel and multiplied by ``gain``."""
-    parts = [pixel_means(radiance(scene, pose[:3, 3], d), seen.width, supersampling) for d in bands(seen, pose, supersampling)]
+    parts = [
+        pixel_means(radiance(scene, pose[:3, 3], d), seen.width, supersampling)
+        for d in bands(seen, pose, supersampling)
+    ]
     return np.round(encode_srgb(np.concatenate(parts) * np.float32(gain)) * 255).astype(np.uint8)
 
 
@@ -133,7 +144,11 @@ def _shots(settings: RoomSettings) -> list[_Shot]:
     """All images, those to train on first."""
     poses = camera_matrices(settings.train_views, settings.test_views)
     factor = {"train": gains(settings.train_views, settings.exposure).tolist(), "test": [1.0] * settings.test_views}
-    return [(f"{split}_{i:04d}.png", pose, factor[split][i]) for split in ("train", "test") for i, pose in enumerate(poses[split])]
+    return [
+        (f"{split}_{i:04d}.png", pose, factor[split][i])
+        for split in ("train", "test")
+        for i, pose in enumerate(poses[split])
+    ]
 
 
 def _write(folder: Path, settings: RoomSettings, shots: list[_Shot], progress: Progress) -> None:
@@ -177,12 +192,17 @@ def _layout(seen: Lens, shots: list[_Shot]) -> dict[str, Any]:
         "ply_file_path": "points.ply",
         "train_filenames": [name for name in names if "/train_" in name],
         "test_filenames": [name for name in names if "/test_" in name],
-        "frames": [{"file_path": name, "transform_matrix": pose.tolist()} for name, (_, pose, _) in zip(names, shots, strict=True)],
+        "frames": [
+            {"file_path": name, "transform_matrix": pose.tolist()}
+            for name, (_, pose, _) in zip(names, shots, strict=True)
+        ],
     }
 
 
 def _write_points(path: Path, points: Found) -> None:
-    rows = np.empty(len(points.position), dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
+    rows = np.empty(
+        len(points.position), dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
+    )
     for axis, name in enumerate("xyz"):
         rows[name] = points.position[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):

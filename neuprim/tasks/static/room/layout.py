@@ -1,7 +1,8 @@
-"""The room around the solids: a box of 12 x 12 x 5 with the subject's table in its middle, and large things along its walls.
+"""The room around the solids: a box of 12 x 12 x 5 with the subject's table in its middle, and large things along its
+walls.
 
-Walls, floor and ceiling are slabs that overlap at the edges, so that no ray leaves. Nothing stands within :data:`FREE` of the middle's
-vertical but the table, the rug below and the lamp above: that is where the cameras are.
+Walls, floor and ceiling are slabs that overlap at the edges, so that no ray leaves. Nothing stands within :data:`FREE`
+of the middle's vertical but the table, the rug below and the lamp above: that is where the cameras are.
 """
 
 from __future__ import annotations
@@ -65,10 +66,20 @@ class Furnishing:
 
 def furnishings() -> list[Furnishing]:
     """All of the room but the solids, the same at every call."""
-    return [*_shell(), *_table(), *_lamp(), *_by_the_bricks(), *_by_the_plaster(), *_by_the_wallpaper(), *_by_the_tiles()]
+    return [
+        *_shell(),
+        *_table(),
+        *_lamp(),
+        *_by_the_bricks(),
+        *_by_the_plaster(),
+        *_by_the_wallpaper(),
+        *_by_the_tiles(),
+    ]
 
 
-def _between(low: tuple[float, float, float], high: tuple[float, float, float], chamfer: float = 0.02) -> trimesh.Trimesh:
+def _between(
+    low: tuple[float, float, float], high: tuple[float, float, float], chamfer: float = 0.02
+) -> trimesh.Trimesh:
     """A box with these opposite corners."""
     return chamfered_box(np.subtract(high, low), np.add(low, high) / 2, chamfer)
 
@@ -96,9 +107,14 @@ def _shell() -> list[Furnishing]:
         Furnishing("ceiling", _slab((*below, z1), (*above, z1 + t)), speckled("#ece6da", 23, 0.08, 1.0)),
         Furnishing("brick wall", _slab((x1, y0 - t, z0 - t), (x1 + t, y1 + t, z1 + t)), bricks(1, 2, 31)),
         Furnishing("papered wall", _slab((x0 - t, y0 - t, z0 - t), (x0, y1 + t, z1 + t)), wallpaper(1, 2, 41)),
-        Furnishing("plastered wall", _slab((x0 - t, y1, z0 - t), (x1 + t, y1 + t, z1 + t)), plaster(0, 2, 51, z0 + 1.5)),
         Furnishing(
-            "tiled wall", _slab((x0 - t, y0 - t, z0 - t), (x1 + t, y0, z1 + t)), chequered("#d9cfba", "#3f7f86", 0, 2, 0.5, 61), 0.3
+            "plastered wall", _slab((x0 - t, y1, z0 - t), (x1 + t, y1 + t, z1 + t)), plaster(0, 2, 51, z0 + 1.5)
+        ),
+        Furnishing(
+            "tiled wall",
+            _slab((x0 - t, y0 - t, z0 - t), (x1 + t, y0, z1 + t)),
+            chequered("#d9cfba", "#3f7f86", 0, 2, 0.5, 61),
+            0.3,
         ),
         Furnishing("skirting", merged(skirting), speckled("#e8e2d6", 71, 0.05)),
         Furnishing("beams", merged(beams), planks("#4a2f1b", "#6e4a2c", 0, 1, 73, width=0.14)),
@@ -112,7 +128,12 @@ def _table() -> list[Furnishing]:
     disc = [(0, _TABLE - 0.04), (0.03, _TABLE), (0.06, _TABLE), (0.09, _TABLE - 0.03)]
     carpet = [(0, 2.5), (0.015, 2.5), (0.02, 2.49)]
     return [
-        Furnishing("table top", lathe([0, 0, top - 0.09], [0, 0, 1], disc), planks("#5b3a24", "#a9764a", 1, 0, 81, width=0.21), 0.35),
+        Furnishing(
+            "table top",
+            lathe([0, 0, top - 0.09], [0, 0, 1], disc),
+            planks("#5b3a24", "#a9764a", 1, 0, 81, width=0.21),
+            0.35,
+        ),
         Furnishing("table leg", lathe([0, 0, foot], [0, 0, 1], leg), speckled("#54351f", 83, 0.3, 0.12), 0.3),
         Furnishing("rug", lathe([0, 0, foot], [0, 0, 1], carpet), rug(2.5, 85)),
     ]
@@ -128,8 +149,11 @@ def _lamp() -> list[Furnishing]:
     ]
 
 
-def _frame(x: float, y: float, low: float, high: float, half: float, along: int, width: float, depth: float) -> trimesh.Trimesh:
-    """Four bars around the opening of half width ``half`` between two heights, on the wall through (x, y) that runs along an axis."""
+def _frame(
+    x: float, y: float, low: float, high: float, half: float, along: int, width: float, depth: float
+) -> trimesh.Trimesh:
+    """Four bars around the opening of half width ``half`` between two heights, on the wall through (x, y) that runs
+    along an axis."""
     middle = np.array([x, y, (low + high) / 2])
     side = np.eye(3)[along]
     thick = np.full(3, depth)
@@ -146,13 +170,30 @@ def _frame(x: float, y: float, low: float, high: float, half: float, along: int,
 def _by_the_bricks() -> list[Furnishing]:
     """The wall at x = 6: a window with four panes, and crates below."""
     x, low, high = HIGH[0], 0.2, 2.4
-    bars = [_between((x - 0.1, -0.05, low), (x, 0.05, high), 0.01), _between((x - 0.1, -1.4, 1.25), (x, 1.4, 1.35), 0.01)]
-    crate = [((5.0, 3.6, -1.6), (5.9, 4.9, -0.7)), ((5.1, 3.8, -0.7), (5.8, 4.7, 0.0)), ((5.2, -4.4, -1.6), (5.9, -3.2, -0.9))]
+    bars = [
+        _between((x - 0.1, -0.05, low), (x, 0.05, high), 0.01),
+        _between((x - 0.1, -1.4, 1.25), (x, 1.4, 1.35), 0.01),
+    ]
+    crate = [
+        ((5.0, 3.6, -1.6), (5.9, 4.9, -0.7)),
+        ((5.1, 3.8, -0.7), (5.8, 4.7, 0.0)),
+        ((5.2, -4.4, -1.6), (5.9, -3.2, -0.9)),
+    ]
     return [
-        Furnishing("pane", _between((x - 0.02, -1.4, low), (x + 0.05, 1.4, high), 0.005), sky(101, low, high), glow=0.95),
-        Furnishing("window", merged([_frame(x, 0, low, high, 1.4, 1, 0.14, 0.2), *bars]), speckled("#f2efe8", 103, 0.05), 0.3),
-        Furnishing("sill", _between((x - 0.3, -1.65, low - 0.24), (x, 1.65, low - 0.14)), speckled("#f2efe8", 105, 0.05), 0.3),
-        Furnishing("crates", merged([_between(*c, 0.03) for c in crate]), planks("#7c5a34", "#cfa46a", 1, 2, 107, width=0.22, length=1.3)),
+        Furnishing(
+            "pane", _between((x - 0.02, -1.4, low), (x + 0.05, 1.4, high), 0.005), sky(101, low, high), glow=0.95
+        ),
+        Furnishing(
+            "window", merged([_frame(x, 0, low, high, 1.4, 1, 0.14, 0.2), *bars]), speckled("#f2efe8", 103, 0.05), 0.3
+        ),
+        Furnishing(
+            "sill", _between((x - 0.3, -1.65, low - 0.24), (x, 1.65, low - 0.14)), speckled("#f2efe8", 105, 0.05), 0.3
+        ),
+        Furnishing(
+            "crates",
+            merged([_between(*c, 0.03) for c in crate]),
+            planks("#7c5a34", "#cfa46a", 1, 2, 107, width=0.22, length=1.3),
+        ),
     ]
 
 
@@ -161,7 +202,8 @@ def _by_the_plaster() -> list[Furnishing]:
     y0, y1, left, right, bottom, shelf = 5.3, 6.0, -4.6, -1.6, -1.6, 0.62
     boards = [_between((left, y0, bottom + shelf * i), (right, y1, bottom + shelf * i + 0.06), 0.005) for i in range(6)]
     boards += [
-        _between((x, y0, bottom), (x + 0.08, y1, bottom + shelf * 5 + 0.06), 0.005) for x in (left - 0.08, (left + right) / 2, right)
+        _between((x, y0, bottom), (x + 0.08, y1, bottom + shelf * 5 + 0.06), 0.005)
+        for x in (left - 0.08, (left + right) / 2, right)
     ]
     rows = [
         _between((left, y0 + 0.12, bottom + shelf * i + 0.05), (right - gap, y1, bottom + shelf * i + height), 0.005)
@@ -178,30 +220,44 @@ def _by_the_plaster() -> list[Furnishing]:
 def _by_the_wallpaper() -> list[Furnishing]:
     """The wall at x = -6: a long bench, two pictures above it, and a pillar in the corner."""
     column = [(0.0, 0.62), (0.2, 0.62), (0.3, 0.45), (4.7, 0.42), (4.8, 0.6), (5.0, 0.6)]
-    seat = [_between((-5.95, -2.6, -1.35), (-5.15, 1.4, -1.1), 0.05), _between((-5.95, -2.6, -1.1), (-5.75, 1.4, -0.3), 0.05)]
+    seat = [
+        _between((-5.95, -2.6, -1.35), (-5.15, 1.4, -1.1), 0.05),
+        _between((-5.95, -2.6, -1.1), (-5.75, 1.4, -0.3), 0.05),
+    ]
     seat += [_between((-5.9, y, -1.6), (-5.2, y + 0.25, -1.35)) for y in (-2.5, 1.05)]
     return [
         Furnishing("bench", merged(seat), chequered("#b5533c", "#d98f4e", 1, 2, 0.2, 121)),
         Furnishing("small picture", _between((-6.0, -2.4, 0.3), (-5.94, -0.8, 1.5), 0.005), painting(1, 2, 123)),
         Furnishing("small frame", _frame(-6.0, -1.6, 0.3, 1.5, 0.8, 1, 0.1, 0.2), speckled("#26221e", 125, 0.1), 0.4),
         Furnishing("tall picture", _between((-6.0, 0.3, 0.1), (-5.94, 1.4, 2.0), 0.005), painting(1, 2, 127)),
-        Furnishing("tall frame", _frame(-6.0, 0.85, 0.1, 2.0, 0.55, 1, 0.1, 0.2), speckled("#8a5a2b", 129, 0.15, 0.2), 0.4),
+        Furnishing(
+            "tall frame", _frame(-6.0, 0.85, 0.1, 2.0, 0.55, 1, 0.1, 0.2), speckled("#8a5a2b", 129, 0.15, 0.2), 0.4
+        ),
         Furnishing("pillar", lathe([-5.0, 5.0, -1.6], [0, 0, 1], column), marble(131), 0.4),
     ]
 
 
 def _by_the_tiles() -> list[Furnishing]:
     """The wall at y = -6: a cupboard, a door and a big pot."""
-    panels = [_between((x, -5.27, z), (x + 0.62, -5.22, z + 0.95), 0.02) for x in (-4.3, -3.55, -2.8) for z in (-1.4, -0.3)]
+    panels = [
+        _between((x, -5.27, z), (x + 0.62, -5.22, z + 0.95), 0.02) for x in (-4.3, -3.55, -2.8) for z in (-1.4, -0.3)
+    ]
     pot = [(0.0, 0.3), (0.2, 0.42), (0.5, 0.48), (0.75, 0.4), (0.85, 0.45), (0.9, 0.45)]
     door = [
         _between((1.3, -6.0, -1.6), (2.9, -5.92, 1.5)),
         *(_between((x, -5.93, z), (x + 0.55, -5.88, z + 1.1)) for x in (1.45, 2.2) for z in (-1.4, 0.1)),
     ]
     return [
-        Furnishing("cupboard", _between((-4.5, -6.0, -1.6), (-2.0, -5.25, 0.8), 0.03), speckled("#496a81", 141, 0.15, 0.3), 0.2),
+        Furnishing(
+            "cupboard", _between((-4.5, -6.0, -1.6), (-2.0, -5.25, 0.8), 0.03), speckled("#496a81", 141, 0.15, 0.3), 0.2
+        ),
         Furnishing("panels", merged(panels), speckled("#6f93a8", 143, 0.15, 0.3), 0.2),
-        Furnishing("pot", lathe([-0.2, -5.4, -1.6], [0, 0, 1], pot), bricks(0, 2, 145, width=0.2, height=0.15, mortar=0.02), 0.3),
+        Furnishing(
+            "pot",
+            lathe([-0.2, -5.4, -1.6], [0, 0, 1], pot),
+            bricks(0, 2, 145, width=0.2, height=0.15, mortar=0.02),
+            0.3,
+        ),
         Furnishing("bush", ball([-0.2, -5.4, -0.2], 0.62), speckled("#3f7d3a", 147, 0.7, 0.25)),
         Furnishing("door", merged(door), planks("#6e2f24", "#8f4a35", 2, 0, 149, width=0.4), 0.3),
         Furnishing("door frame", _frame(2.1, -6.0, -1.8, 1.5, 0.8, 0, 0.12, 0.24), speckled("#efe9dc", 151, 0.05), 0.2),

@@ -1,4 +1,5 @@
-"""The camera that takes the photographs: 4:3, a wide angle, and a lens that bends; rays of its pixels, and back from points to pixels."""
+"""The camera that takes the photographs: 4:3, a wide angle, and a lens that bends; rays of its pixels, and back from
+points to pixels."""
 
 from __future__ import annotations
 
@@ -46,18 +47,21 @@ class Lens:
 
     @property
     def camera(self) -> Camera:
-        """The pinhole of the undistorted image, in the camera's own frame; the principal point is a little off the middle."""
+        """The pinhole of the undistorted image, in the camera's own frame; the principal point is a little off the
+        middle."""
         centre = 0.504 * self.width, 0.495 * self.height
         return Camera(torch.eye(4, dtype=torch.float64), self.focal, self.focal, *centre, self.width, self.height)
 
     def pixels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(M, 2) photographed pixels of (M, 2) undistorted directions (x/z, y/z), OpenCV axes; pixel centres at +0.5."""
+        """(M, 2) photographed pixels of (M, 2) undistorted directions (x/z, y/z), OpenCV axes; pixel centres at
+        +0.5."""
         return self.distortion.project(points, self.camera)
 
     def directions(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """(M, 2) undistorted directions (x/z, y/z) of (M, 2) photographed pixels; the inverse of :meth:`pixels`.
 
-        The lens moves nothing by more than a fraction of its distance to the middle, so taking the excess away again and again converges.
+        The lens moves nothing by more than a fraction of its distance to the middle, so taking the excess away again
+        and again converges.
         """
         camera = self.camera
         bent = (pixels - [camera.cx, camera.cy]) / self.focal

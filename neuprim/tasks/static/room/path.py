@@ -1,4 +1,5 @@
-"""Where the photographs are taken from: a hand-held walk of two rounds about the subject, the first low, the second high."""
+"""Where the photographs are taken from: a hand-held walk of two rounds about the subject, the first low, the second
+high."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ def places(train: int, test: int) -> dict[str, NDArray[np.float64]]:
 
 
 def camera_matrices(train: int, test: int) -> dict[str, list[NDArray[np.float64]]]:
-    """Camera-to-world matrices (4, 4), OpenGL axes, of both splits. Those of the test split depend on their own number alone."""
+    """Camera-to-world matrices (4, 4), OpenGL axes, of both splits. Those of the test split depend on their own number
+    alone."""
     return {split: _walk(t, _SEEDS[split]) for split, t in places(train, test).items()}
 
 

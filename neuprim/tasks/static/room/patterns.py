@@ -1,6 +1,8 @@
-"""Patterns evaluated where a ray hits, averaged over the width that the ray stands for, so that distant detail blurs and does not flicker.
+"""Patterns evaluated where a ray hits, averaged over the width that the ray stands for, so that distant detail blurs
+and does not flicker.
 
-Everything is a function of position; nothing is stored, nothing is random but by the hash of a cell's whole coordinates.
+Everything is a function of position; nothing is stored, nothing is random but by the hash of a cell's whole
+coordinates.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ _PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
 
 
 def stripes(x: Array, period: float, part: float, width: Array) -> Array:
-    """(M,) share of the intervals of ``width`` (M,) about ``x`` (M,) that the first ``part`` (0..1) of every ``period`` covers."""
+    """(M,) share of the intervals of ``width`` (M,) about ``x`` (M,) that the first ``part`` (0..1) of every ``period``
+    covers."""
     half = np.maximum(width / np.float32(period), np.float32(1e-4)) / 2
     t = x / np.float32(period)
     return ((_filled(t + half, part) - _filled(t - half, part)) / (2 * half)).astype(np.float32, copy=False)
@@ -31,11 +34,14 @@ def _filled(t: Array, part: float) -> NDArray[np.float64]:
 
 def checks(x: Array, y: Array, cell: float, width: Array) -> Array:
     """(M,) share of the light squares of a chequerboard of edge ``cell``."""
-    return (0.5 + 2 * (stripes(x, 2 * cell, 0.5, width) - 0.5) * (stripes(y, 2 * cell, 0.5, width) - 0.5)).astype(np.float32)
+    return (0.5 + 2 * (stripes(x, 2 * cell, 0.5, width) - 0.5) * (stripes(y, 2 * cell, 0.5, width) - 0.5)).astype(
+        np.float32
+    )
 
 
 def noise(points: Array, width: Array, cell: float, seed: int, octaves: int = 4, fall: float = 0.55) -> Array:
-    """(M,) smooth noise about -1..1 of mean 0 at ``points`` (M, D): lattices of edge ``cell``, ``cell``/2, ..., each ``fall`` times weaker.
+    """(M,) smooth noise about -1..1 of mean 0 at ``points`` (M, D): lattices of edge ``cell``, ``cell``/2, ..., each
+    ``fall`` times weaker.
 
     An octave is left out where its cells are smaller than about ``width`` (M,), having averaged out.
     """
@@ -73,7 +79,8 @@ def mix(one: Array, other: Array, share: Array) -> Array:
 
 
 def _lattice(points: Array, seed: int) -> Array:
-    """(M,) values of -1..1 at whole coordinates, blended in between by the quintic whose first and second derivatives vanish there."""
+    """(M,) values of -1..1 at whole coordinates, blended in between by the quintic whose first and second derivatives
+    vanish there."""
     base = np.floor(points)
     t = points - base
     t = t * t * t * (t * (t * 6 - 15) + 10)

@@ -1,4 +1,5 @@
-"""What a reconstruction from the photographs would know of the surfaces: points where there is something to recognise, a few of them wrong."""
+"""What a reconstruction from the photographs would know of the surfaces: points where there is something to recognise,
+a few of them wrong."""
 
 from __future__ import annotations
 
@@ -82,7 +83,9 @@ def found_points(
     finder = np.concatenate([by for _, by in batches])
     random = np.random.default_rng([_SEED, _ROUNDS])
     chosen = np.sort(random.permutation(have)[:count])
-    return _measured(room, np.stack([p[:3, 3] for p in poses])[finder[chosen]], directions[chosen], finder[chosen], random)
+    return _measured(
+        room, np.stack([p[:3, 3] for p in poses])[finder[chosen]], directions[chosen], finder[chosen], random
+    )
 
 
 def _chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -103,7 +106,8 @@ def _drawn(chances: NDArray[np.float64], width: int, numbers: NDArray[np.float64
 def _seen_by_another(
     room: Room, lens: Lens, poses: Sequence[NDArray[np.float64]], camera: int, directions: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """(M,) whether what ``camera`` sees in these directions (M, 3) lies open to one of the other cameras, within its picture."""
+    """(M,) whether what ``camera`` sees in these directions (M, 3) lies open to one of the other cameras, within its
+    picture."""
     hits = room.intersect(poses[camera][:3, 3], directions)
     starts = hits.lifted()
     seen = np.zeros(len(starts), dtype=np.bool_)
@@ -124,7 +128,11 @@ def _seen_by_another(
 
 
 def _measured(
-    room: Room, origins: NDArray[np.float64], directions: NDArray[np.float64], camera: NDArray[np.intp], random: np.random.Generator
+    room: Room,
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    camera: NDArray[np.intp],
+    random: np.random.Generator,
 ) -> Found:
     """The points that these rays (N, 3) meet, with the errors of a measurement."""
     hits = room.intersect(origins, directions)

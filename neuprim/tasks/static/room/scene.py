@@ -32,7 +32,9 @@ class Room(Scene):
         subject: how many of the first bodies are solids.
     """
 
-    def __init__(self, solids: Sequence[Solid], around: Sequence[Furnishing], spacing: float, engine: Engine = "auto") -> None:
+    def __init__(
+        self, solids: Sequence[Solid], around: Sequence[Furnishing], spacing: float, engine: Engine = "auto"
+    ) -> None:
         super().__init__([*solids, *(Solid(f.name, f.mesh, plain("#000000"), f.gloss) for f in around)], engine)
         self.subject = len(solids)
         self.glow = np.array([0.0] * len(solids) + [f.glow for f in around], dtype=np.float32)
@@ -43,7 +45,8 @@ class Room(Scene):
         """As of any scene, for directions of unit length."""
         hits = super().intersect(origins, directions)
         towards = np.asarray(directions, dtype=np.float32)[hits.hit]
-        # A pixel covers an ellipse of the surface; its area decides, so grazing views blur across rather than flicker along.
+        # A pixel covers an ellipse of the surface; its area decides, so grazing views blur across rather than flicker
+        # along.
         root: NDArray[np.float32] = np.sqrt(np.maximum(np.abs(dot(hits.face, towards)), np.float32(_GRAZING)))
         width = hits.distance * self._spacing / root
         albedo = hits.albedo.copy()

@@ -1,4 +1,5 @@
-"""Light in the room: one lamp that hangs from the ceiling and casts hard shadows, and what walls and floor give back. Linear RGB throughout."""
+"""Light in the room: one lamp that hangs from the ceiling and casts hard shadows, and what walls and floor give back.
+Linear RGB throughout."""
 
 from __future__ import annotations
 
@@ -21,8 +22,8 @@ class Lamplight:
 
     Attributes:
         position: (3,) the lamp, a point for shading.
-        power: (3,) linear RGB irradiance of a surface that faces the lamp at distance 1; it falls with the distance squared.
-        above, below: (3,) linear RGB radiance from straight above and straight below, blended in between.
+        power: (3,) linear RGB irradiance of a surface that faces the lamp at distance 1; it falls with the distance
+        squared. above, below: (3,) linear RGB radiance from straight above and straight below, blended in between.
     """
 
     position: Colour = LAMP
@@ -34,7 +35,9 @@ class Lamplight:
 LAMPLIGHT = Lamplight()
 
 
-def radiance(room: Room, origins: ArrayLike, directions: ArrayLike, light: Lamplight = LAMPLIGHT) -> NDArray[np.float32]:
+def radiance(
+    room: Room, origins: ArrayLike, directions: ArrayLike, light: Lamplight = LAMPLIGHT
+) -> NDArray[np.float32]:
     """What N rays see: (N, 3) linear RGB; zero where nothing is hit, which inside of the room does not happen.
 
     Args:
@@ -47,7 +50,9 @@ def radiance(room: Room, origins: ArrayLike, directions: ArrayLike, light: Lampl
     to_lamp = np.array(light.position, dtype=np.float32) - hits.position
     away = np.sqrt(dot(to_lamp, to_lamp))
     to_lamp /= away[:, None]
-    lit = unshadowed(room, hits, to_lamp, np.maximum(away - np.float32(1.2 * BULB), 0))  # the bulb itself is no obstacle
+    lit = unshadowed(
+        room, hits, to_lamp, np.maximum(away - np.float32(1.2 * BULB), 0)
+    )  # the bulb itself is no obstacle
     rgb = reflected(hits, to_eye, to_lamp) * (np.array(light.power, dtype=np.float32) * (lit / away**2)[:, None])
     add_surroundings(rgb, hits, to_eye, light.above, light.below)
     glow = room.glow[hits.solid][:, None]

@@ -10,7 +10,20 @@ from numpy.typing import NDArray
 from neuprim.scenes.shapes import srgb
 from neuprim.tasks.static.room.patterns import cells, checks, mix, noise, stripes
 
-__all__ = ["Texture", "bricks", "books", "chequered", "marble", "painting", "planks", "plaster", "rug", "sky", "speckled", "wallpaper"]
+__all__ = [
+    "Texture",
+    "bricks",
+    "books",
+    "chequered",
+    "marble",
+    "painting",
+    "planks",
+    "plaster",
+    "rug",
+    "sky",
+    "speckled",
+    "wallpaper",
+]
 
 Array = NDArray[np.float32]
 
@@ -24,7 +37,9 @@ def speckled(code: str, seed: int, strength: float = 0.12, cell: float = 0.5) ->
     return lambda p, w: np.clip(colour * (1 + np.float32(strength) * noise(p, w, cell, seed))[:, None], 0, 1)
 
 
-def planks(dark: str, light: str, along: int, across: int, seed: int, width: float = 0.3, length: float = 2.2) -> Texture:
+def planks(
+    dark: str, light: str, along: int, across: int, seed: int, width: float = 0.3, length: float = 2.2
+) -> Texture:
     """Boards along one axis beside each other along another, each of its own tone, with a grain and narrow gaps."""
     one, other = srgb(dark), srgb(light)
 
@@ -35,7 +50,9 @@ def planks(dark: str, light: str, along: int, across: int, seed: int, width: flo
         grain = noise(np.stack([x / 9, p[:, across]], axis=1), w, 0.12, seed + 1, octaves=3, fall=0.7)
         knots = noise(np.stack([x / 3, p[:, across]], axis=1), w, 0.5, seed + 7, octaves=2)
         tone = 0.15 + 0.6 * cells(board, seed + 2) + 0.22 * grain + 0.15 * knots
-        gap = np.maximum(stripes(p[:, across] + 0.007, width, 0.014 / width, w), stripes(x + 0.007, length, 0.014 / length, w))
+        gap = np.maximum(
+            stripes(p[:, across] + 0.007, width, 0.014 / width, w), stripes(x + 0.007, length, 0.014 / length, w)
+        )
         return mix(one, other, tone) * (1 - np.float32(0.75) * gap)[:, None]
 
     return texture
@@ -50,7 +67,12 @@ def bricks(u: int, v: int, seed: int, width: float = 0.62, height: float = 0.22,
         x = p[:, u] + np.float32(width / 2) * (row % 2)
         brick = np.stack([np.floor(x / width), row], axis=1).astype(np.int64)
         flat = p[:, [u, v]]
-        tone = 0.1 + 0.8 * cells(brick, seed) + 0.2 * noise(flat, w, 0.12, seed + 1, octaves=3) + 0.15 * noise(flat, w, 2.5, seed + 2, 2)
+        tone = (
+            0.1
+            + 0.8 * cells(brick, seed)
+            + 0.2 * noise(flat, w, 0.12, seed + 1, octaves=3)
+            + 0.15 * noise(flat, w, 2.5, seed + 2, 2)
+        )
         joint = 1 - stripes(x, width, 1 - mortar / width, w) * stripes(p[:, v], height, 1 - mortar / height, w)
         return mix(mix(dark, light, tone), grout, joint)
 
@@ -99,7 +121,9 @@ def plaster(u: int, v: int, seed: int, panel: float) -> Texture:
         flat = p[:, [u, v]]
         rough = mix(light, dark, 0.45 + 0.5 * noise(flat, w, 1.6, seed, octaves=7, fall=0.72))
         boards = mix(board, seam, stripes(p[:, u], 0.32, 0.12, w))
-        boards = boards * (1 + 0.1 * noise(flat * np.array([1, 0.2], np.float32), w, 0.12, seed + 9, octaves=2))[:, None]
+        boards = (
+            boards * (1 + 0.1 * noise(flat * np.array([1, 0.2], np.float32), w, 0.12, seed + 9, octaves=2))[:, None]
+        )
         rail: Array = np.clip((0.06 - np.abs(p[:, v] - panel)) / np.maximum(w, 0.005) + 0.5, 0, 1)
         below: Array = np.clip((panel - p[:, v]) / np.maximum(w, 0.005) + 0.5, 0, 1)
         return np.clip(mix(mix(rough, boards, below), srgb("#efe9dc"), rail), 0, 1)
@@ -125,7 +149,9 @@ def painting(u: int, v: int, seed: int) -> Texture:
 
 def books(u: int, v: int, seed: int, thickness: float = 0.11, shelf: float = 0.5) -> Texture:
     """Spines side by side: each of its own colour, with a band, and a dark line to the next."""
-    colours = np.stack([srgb(c) for c in ("#8c2f39", "#1d3557", "#e0b04c", "#3a5a40", "#d8d0c0", "#5e3a78", "#c8553d", "#247ba0")])
+    colours = np.stack(
+        [srgb(c) for c in ("#8c2f39", "#1d3557", "#e0b04c", "#3a5a40", "#d8d0c0", "#5e3a78", "#c8553d", "#247ba0")]
+    )
 
     def texture(p: Array, w: Array) -> Array:
         index = np.stack([np.floor(p[:, u] / thickness), np.floor(p[:, v] / shelf)], axis=1).astype(np.int64)

@@ -29,7 +29,17 @@ from neuprim.scenes.settings import ImageSize, Supersampling, settings_key
 from neuprim.scenes.shapes import build
 from neuprim.tasks.static.solids.shading import encode_srgb, radiance
 
-__all__ = ["FIELD_OF_VIEW", "GENERATOR_VERSION", "Seen", "SolidsSettings", "camera_matrices", "generate", "image_set", "load", "picture"]
+__all__ = [
+    "FIELD_OF_VIEW",
+    "GENERATOR_VERSION",
+    "Seen",
+    "SolidsSettings",
+    "camera_matrices",
+    "generate",
+    "image_set",
+    "load",
+    "picture",
+]
 
 Seen = Callable[[Any, NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float32], NDArray[np.bool_]]]
 """(scene, origins, directions) -> what :func:`~neuprim.tasks.static.solids.shading.radiance` returns."""
@@ -100,7 +110,8 @@ def image_set(
     seen: Seen = radiance,
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {},
 ) -> ImageSet[_View]:
-    """Whatever ``build`` makes, seen by the cameras of the solids; arguments as of :class:`~neuprim.scenes.image_set.ImageSet`."""
+    """Whatever ``build`` makes, seen by the cameras of the solids; arguments as of
+    :class:`~neuprim.scenes.image_set.ImageSet`."""
     counts = {"train": settings.train_views, "test": settings.test_views}
 
     def draw(scene: Scene, view: _View, paths: Sequence[Path]) -> None:
@@ -111,10 +122,16 @@ def image_set(
         name=name,
         key=key,
         size=settings.size,
-        splits={split: [_View(f"r_{i}", eye) for i, eye in enumerate(_eyes(split, count))] for split, count in counts.items()},
+        splits={
+            split: [_View(f"r_{i}", eye) for i, eye in enumerate(_eyes(split, count))]
+            for split, count in counts.items()
+        },
         lens={"camera_angle_x": FIELD_OF_VIEW},
         build=build,
-        frame=lambda split, view: {"file_path": f"./{split}/{view.name}", "transform_matrix": camera_to_world(view.eye).tolist()},
+        frame=lambda split, view: {
+            "file_path": f"./{split}/{view.name}",
+            "transform_matrix": camera_to_world(view.eye).tolist(),
+        },
         files=lambda view: [f"{view.name}.png"],
         draw=draw,
         facts=facts,
@@ -124,8 +141,8 @@ def image_set(
 def camera_matrices(split: str, count: int) -> list[NDArray[np.float64]]:
     """``count`` camera-to-world matrices (4, 4), OpenGL axes, looking at the origin from distance 4.
 
-    "train" is a Fibonacci lattice of equal area from 9 degrees below the horizon to 78 above; "test" is another, turning the other way
-    from 3 to 64 degrees, so that its views fall between the first's.
+    "train" is a Fibonacci lattice of equal area from 9 degrees below the horizon to 78 above; "test" is another,
+    turning the other way from 3 to 64 degrees, so that its views fall between the first's.
     """
     return [camera_to_world(eye) for eye in _eyes(split, count)]
 
@@ -136,8 +153,11 @@ def _eyes(split: str, count: int) -> list[NDArray[np.float64]]:
     return [DISTANCE * direction(low + (high - low) * (i + 0.5) / count, phase + i * turn) for i in range(count)]
 
 
-def picture(scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int, seen: Seen = radiance) -> NDArray[np.uint8]:
-    """(size, size, 4) RGBA in sRGB with straight alpha, as Blender stores it: rays are averaged premultiplied and linear, then encoded."""
+def picture(
+    scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int, seen: Seen = radiance
+) -> NDArray[np.uint8]:
+    """(size, size, 4) RGBA in sRGB with straight alpha, as Blender stores it: rays are averaged premultiplied and
+    linear, then encoded."""
     bands_of_rays = bands(pose, FIELD_OF_VIEW, size, supersampling)
     mean = np.concatenate([pixel_means(_rgba(scene, pose, d, seen), size, supersampling) for d in bands_of_rays])
     alpha = mean[..., 3:]

@@ -1,4 +1,5 @@
-"""Light on the solids: one hard-shadowed sun, a soft sky and a mild gloss that moves with the eye. Linear RGB throughout."""
+"""Light on the solids: one hard-shadowed sun, a soft sky and a mild gloss that moves with the eye. Linear RGB
+throughout."""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ class Daylight:
 DAYLIGHT = Daylight()
 
 
-def radiance(scene: Scene, origins: ArrayLike, directions: ArrayLike, light: Daylight = DAYLIGHT) -> tuple[Array, NDArray[np.bool_]]:
+def radiance(
+    scene: Scene, origins: ArrayLike, directions: ArrayLike, light: Daylight = DAYLIGHT
+) -> tuple[Array, NDArray[np.bool_]]:
     """What N rays see: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits.
 
     Args:
@@ -67,13 +70,14 @@ def unshadowed(scene: Scene, hits: Hits, to_light: Array, away: ArrayLike) -> ND
 def encode_srgb(linear: Array) -> Array:
     """Display values 0..1 of linear ones, clipped (IEC 61966-2-1)."""
     x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, np.float32(0.0031308)) ** np.float32(1 / 2.4) - 0.055).astype(
-        np.float32
-    )
+    return np.where(
+        x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, np.float32(0.0031308)) ** np.float32(1 / 2.4) - 0.055
+    ).astype(np.float32)
 
 
 def add_surroundings(rgb: Array, hits: Hits, to_eye: Array, sky: Colour, ground: Colour) -> None:
-    """Add to ``rgb`` (M, 3) what soft light from all around, ``sky`` above and ``ground`` below, makes the surfaces send to the eye.
+    """Add to ``rgb`` (M, 3) what soft light from all around, ``sky`` above and ``ground`` below, makes the surfaces
+    send to the eye.
 
     Args:
         to_eye: (M, 3) unit vectors away from the surface.

@@ -1,7 +1,7 @@
 """OpenVDB itself, in another Python of this machine that has its module.
 
-Looked for in ``$NEUPRIM_OPENVDB_PYTHON``, else in ``/usr/bin/python3`` (Debian's package is python3-openvdb). The other Python
-runs :mod:`tests.core.io.vdb.openvdb_side`; numbers travel in .npz files.
+Looked for in ``$NEUPRIM_OPENVDB_PYTHON``, else in ``/usr/bin/python3`` (Debian's package is python3-openvdb). The other
+Python runs :mod:`tests.core.io.vdb.openvdb_side`; numbers travel in .npz files.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ def reason(python: str) -> str | None:
     """Why a Python cannot serve, or None."""
     hint = f"set {VARIABLE} to a Python with the module openvdb or pyopenvdb"
     try:
-        done = subprocess.run([python, str(SCRIPT), "check"], capture_output=True, text=True, timeout=120, env=environment())
+        done = subprocess.run(
+            [python, str(SCRIPT), "check"], capture_output=True, text=True, timeout=120, env=environment()
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"needs OpenVDB's Python module and numpy: {python} does not run ({type(error).__name__}); {hint}"
     if done.returncode:
@@ -56,7 +58,9 @@ def other_python() -> str:
 
 
 def ask(python: str, *words: object) -> None:
-    done = subprocess.run([python, str(SCRIPT), *map(str, words)], capture_output=True, text=True, timeout=600, env=environment())
+    done = subprocess.run(
+        [python, str(SCRIPT), *map(str, words)], capture_output=True, text=True, timeout=600, env=environment()
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -95,7 +99,9 @@ def agrees(grid: Grid, kind: str, mapping: str, found: dict[str, np.ndarray], ab
     np.testing.assert_array_equal(np.concatenate([grid.tiles.values] * 2).astype(np.float64), found["probed"])
     np.testing.assert_array_equal(np.concatenate([grid.tiles.active] * 2), found["on"])
     np.testing.assert_array_equal(grid.background.astype(np.float64), found["background"])
-    np.testing.assert_allclose(POINTS @ grid.transform[:3, :3].T + grid.transform[:3, 3], found["world"], rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(
+        POINTS @ grid.transform[:3, :3].T + grid.transform[:3, 3], found["world"], rtol=1e-14, atol=1e-14
+    )
     np.testing.assert_allclose(grid.voxel_size, found["voxel_size"], rtol=1e-14)
     assert (about["name"], about["class"], about["half"]) == (grid.name, grid.kind, grid.half)
     assert about["map"] == mapping and kind.startswith(f"Tree_{about['type']}_")

@@ -1,4 +1,5 @@
-"""What OpenVDB's own Python module makes of files; a script for another Python, which has that module and not this package.
+"""What OpenVDB's own Python module makes of files; a script for another Python, which has that module and not this
+package.
 
     openvdb_side.py check                        prints the module's name and the library's version, or fails
     openvdb_side.py read FILE QUERY.npz OUT.npz  describes all grids of FILE; QUERY holds where to look, see `describe`
@@ -24,7 +25,9 @@ def plain(value):
 
 
 def known(metadata):
-    return {key: plain(value) for key, value in metadata.items() if isinstance(value, (str, bool, int, float, list, tuple))}
+    return {
+        key: plain(value) for key, value in metadata.items() if isinstance(value, (str, bool, int, float, list, tuple))
+    }
 
 
 def describe(grid, leaves, probes, points):
@@ -58,7 +61,9 @@ def describe(grid, leaves, probes, points):
         "blocks": blocks,
         "probed": np.array(probed, np.float64).reshape((-1, *channels)),
         "on": np.array([accessor.isValueOn(tuple(p)) for p in probes.tolist()], bool),
-        "world": np.array([tuple(transform.indexToWorld(tuple(p))) for p in points.tolist()], np.float64).reshape(-1, 3),
+        "world": np.array([tuple(transform.indexToWorld(tuple(p))) for p in points.tolist()], np.float64).reshape(
+            -1, 3
+        ),
         "voxel_size": np.array(tuple(transform.voxelSize()), np.float64),
         "background": np.array(tuple(grid.background) if vector else grid.background, np.float64),
     }

@@ -97,7 +97,12 @@ TREES: list[tuple[bytes, bytes, int, tuple[str, ...]]] = [
     (struct.pack("<ifII", 1, 0, 0, 2**32 - 1), b"", 2, ("root child 1 of 4294967295",)),
     (struct.pack("<ifII", 7, 0, 0, 0), b"", 2, ("7 buffers",)),
     (struct.pack("<ifII3i", 1, 0, 0, 1, 5, 0, 0), b"", 2, ("(5, 0, 0)", "multiples of 4096")),
-    (struct.pack("<ifII3ifB", 1, 0, 1, 1, 0, 0, 0, 1, 1) + struct.pack("<3i", 0, 0, 0), b"", 2, ("(0, 0, 0)", "each once")),
+    (
+        struct.pack("<ifII3ifB", 1, 0, 1, 1, 0, 0, 0, 1, 1) + struct.pack("<3i", 0, 0, 0),
+        b"",
+        2,
+        ("(0, 0, 0)", "each once"),
+    ),
     (struct.pack("<ifII3i", 1, 0, 0, 1, 0, 0, 0) + b"\xff" * 4096 + bytes(4097), b"", 2, ("truncated",)),
     (*one_leaf(FULL, b"\0" + bytes(2048), bytes(4), b"\x07"), 2, ("value code 7", "0 to 6")),
     (*one_leaf(FULL, b"\x09" + bytes(2048), bytes(4)), 2, ("value code 9", "a leaf")),
@@ -132,7 +137,14 @@ def test_many_leaves_in_few_bytes_are_refused_before_they_take_memory(tmp_path: 
     """A node of 4096 leaves needs 64 bytes for each; with a small limit, nothing of 2 KB each is allocated."""
     upper = np.zeros(32768, bool)
     upper[0] = True
-    tree = struct.pack("<ifII3i", 1, 0, 0, 1, 0, 0, 0) + bits(upper) + bytes(4097) + b"\xff" * 512 + bytes(513) + bytes(4096 * 64)
+    tree = (
+        struct.pack("<ifII3i", 1, 0, 0, 1, 0, 0, 0)
+        + bits(upper)
+        + bytes(4097)
+        + b"\xff" * 512
+        + bytes(513)
+        + bytes(4096 * 64)
+    )
     path = one_grid(tmp_path / "a.vdb", tree, bytes(4096 * 65))
     tracemalloc.start()
     try:
@@ -147,9 +159,18 @@ def test_many_tiles_in_few_bytes_count_too(tmp_path: Path) -> None:
     """One node may hold 32,768 tiles, equal ones in few bytes; in memory they take 21 bytes each."""
     values = struct.pack("<32768f", *range(32768))
     chunk = zlib.compress(values)
-    tree = struct.pack("<ifII3i", 1, 0, 0, 1, 0, 0, 0) + bytes(4096) + b"\xff" * 4096 + b"\0" + struct.pack("<q", len(chunk)) + chunk
+    tree = (
+        struct.pack("<ifII3i", 1, 0, 0, 1, 0, 0, 0)
+        + bytes(4096)
+        + b"\xff" * 4096
+        + b"\0"
+        + struct.pack("<q", len(chunk))
+        + chunk
+    )
     path = one_grid(tmp_path / "a.vdb", tree, b"", flags=3)
-    refused(lambda: read_grid(path, "density", max_bytes=32768 * 21 - 1), "a.vdb", "'density'", "tiles", str(32768 * 21 - 1))
+    refused(
+        lambda: read_grid(path, "density", max_bytes=32768 * 21 - 1), "a.vdb", "'density'", "tiles", str(32768 * 21 - 1)
+    )
     grid = read_grid(path, "density", max_bytes=32768 * 21)
     assert len(grid.tiles) == 32768 and grid.active_voxels == 4096**3 and grid.range == (0.0, 32767.0)
 

@@ -1,4 +1,5 @@
-"""Against OpenVDB itself, where some Python on this machine has its module: it reads what we write, and we read what it writes."""
+"""Against OpenVDB itself, where some Python on this machine has its module: it reads what we write, and we read what it
+writes."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ def test_a_python_without_the_module_is_a_reason_to_skip(tmp_path: Path, monkeyp
     chosen.cache_clear()
     try:
         with pytest.raises(
-            pytest.skip.Exception, match=r"python-without has not both \(ModuleNotFoundError: No module named 'pyopenvdb'\)"
+            pytest.skip.Exception,
+            match=r"python-without has not both \(ModuleNotFoundError: No module named 'pyopenvdb'\)",
         ):
             other_python()
     finally:
@@ -45,7 +47,15 @@ def ours() -> list[Grid]:
     inactive = random_grid(rng, name="inactive")
     inactive.values[0][~inactive.masks[0]] = 7.0  # one value that is not the background
     inactive.values[1] = rng.normal(size=(8, 8, 8))  # many
-    metadata = {"note": "é", "frame": 7, "big": 2**40, "step": 0.5, "flag": True, "corner": (1, -2, 3), "offset": (0.5, 1.0, -2.0)}
+    metadata = {
+        "note": "é",
+        "frame": 7,
+        "big": 2**40,
+        "step": 0.5,
+        "flag": True,
+        "corner": (1, -2, 3),
+        "offset": (0.5, 1.0, -2.0),
+    }
     background = Grid("background", np.eye(4), np.float32(0.25), np.zeros((1, 3), np.int32), np.full((1, 8, 8, 8), 2.0, np.float32),
                       np.ones((1, 8, 8, 8), bool), Tiles.none())  # fmt: skip
     return [
@@ -69,7 +79,12 @@ def ours() -> list[Grid]:
 def test_openvdb_reads_what_we_write(tmp_path: Path, compression: str) -> None:
     python = other_python()
     path, grids = tmp_path / "ours.vdb", ours()
-    write_vdb(path, grids, compression=compression, metadata={"creator": "neuprim", "frame": 7, "corner": (1, 2, 3), "step": 0.5})
+    write_vdb(
+        path,
+        grids,
+        compression=compression,
+        metadata={"creator": "neuprim", "frame": 7, "corner": (1, 2, 3), "step": 0.5},
+    )
     read = compare(python, path, tmp_path)
     assert [g.name for g in read] == [g.name for g in grids]
 

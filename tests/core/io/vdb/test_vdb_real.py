@@ -44,7 +44,8 @@ def test_all_counts_and_boxes(folder: str) -> None:
 
 
 def test_the_writer_makes_the_same_bytes_as_openvdb(tmp_path: Path) -> None:
-    """The tree up to the leaf buffers, byte by byte; the buffers hold chunks that another Blosc version packs differently."""
+    """The tree up to the leaf buffers, byte by byte; the buffers hold chunks that another Blosc version packs
+    differently."""
     source = real_folder("vdb_samples") / "dragon.vdb"
     grid = read_grid(source, "density")
     copy = tmp_path / "copy.vdb"
@@ -74,11 +75,18 @@ def test_the_fire(tmp_path: Path) -> None:
     fire = sequence(real_folder("embergen_fire_a"))
     assert [f.number for f in fire.frames] == list(range(41)) and fire.gaps == ()
     first, second = fire.read(0, "flames"), fire.read(1, "flames")
-    assert first is not None and first.bounds is None and first.metadata["file_bbox_min"] > first.metadata["file_bbox_max"]
+    assert (
+        first is not None and first.bounds is None and first.metadata["file_bbox_min"] > first.metadata["file_bbox_max"]
+    )
     assert second is not None and second.half and second.active_voxels == 7405
     assert second.to_dense().shape == (45, 45, 30) and np.count_nonzero(second.to_dense()) == 7405
     assert fire.read(1, "density") is None
 
 
 def test_level_sets_are_refused() -> None:
-    refused(lambda: read_grid(real_folder("vdb_samples") / "sphere.vdb", "ls_sphere"), "sphere.vdb", "'ls_sphere'", "level set")
+    refused(
+        lambda: read_grid(real_folder("vdb_samples") / "sphere.vdb", "ls_sphere"),
+        "sphere.vdb",
+        "'ls_sphere'",
+        "level set",
+    )

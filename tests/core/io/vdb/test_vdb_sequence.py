@@ -85,8 +85,12 @@ def test_info_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert [Path(f["path"]).name for f in report["files"]] == ["a_2.vdb", "a_3.vdb", "a_10.vdb"]
     assert report["notes"] == ["3 frames, 2 to 10; missing: 4–9"]
     first, second, last = (f["grids"][0] for f in report["files"])
-    assert first["voxel_size"] == [0.5] * 3 and first["bounds"] == [[0, 0, 0], [4, 4, 4]] and first["active_voxels"] == 64
-    assert first["range"] == [1.0, 1.0] and first["dense_bytes"] == 256 and first["compression"] == "blosc + active values"
+    assert (
+        first["voxel_size"] == [0.5] * 3 and first["bounds"] == [[0, 0, 0], [4, 4, 4]] and first["active_voxels"] == 64
+    )
+    assert (
+        first["range"] == [1.0, 1.0] and first["dense_bytes"] == 256 and first["compression"] == "blosc + active values"
+    )
     assert second["non_finite"] == 8 and second["range"] is None
     assert last["bounds"] is None and last["active_voxels"] == 0
 
@@ -103,7 +107,12 @@ def test_info_shows_what_is_not_read_and_why(tmp_path: Path, capsys: pytest.Capt
 
 def test_info_refuses_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.vdb").write_bytes(b"no volume at all")
-    for words in (["vdb", "info", str(tmp_path / "a.vdb")], ["vdb", "info", str(tmp_path / "b.vdb")], ["vdb", "show", "x"], ["vdb"]):
+    for words in (
+        ["vdb", "info", str(tmp_path / "a.vdb")],
+        ["vdb", "info", str(tmp_path / "b.vdb")],
+        ["vdb", "show", "x"],
+        ["vdb"],
+    ):
         assert main(words) == 2
         streams = capsys.readouterr()
         assert streams.out == "" and streams.err.count("\n") == 1 and streams.err.startswith("neuprim: error:")

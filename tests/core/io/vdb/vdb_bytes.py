@@ -22,7 +22,9 @@ def text(value: str) -> bytes:
 
 
 def metadata(values: Mapping[str, tuple[str, bytes]]) -> bytes:
-    return struct.pack("<I", len(values)) + b"".join(text(k) + text(t) + struct.pack("<I", len(v)) + v for k, (t, v) in values.items())
+    return struct.pack("<I", len(values)) + b"".join(
+        text(k) + text(t) + struct.pack("<I", len(v)) + v for k, (t, v) in values.items()
+    )
 
 
 def bits(flags: np.ndarray) -> bytes:
@@ -52,7 +54,11 @@ def grid_bytes(
     kept: Mapping[str, tuple[str, bytes]] | None = None,
 ) -> bytes:
     """A grid whose descriptor starts at byte ``at``."""
-    mapping = text("UniformScaleMap") + struct.pack("<15d", *[0.5] * 6, *[2.0] * 3, *[4.0] * 3, *[1.0] * 3) if mapping is None else mapping
+    mapping = (
+        text("UniformScaleMap") + struct.pack("<15d", *[0.5] * 6, *[2.0] * 3, *[4.0] * 3, *[1.0] * 3)
+        if mapping is None
+        else mapping
+    )
     head = text(name) + text(kind) + text(parent)
     body = struct.pack("<I", flags) + metadata(kept or {}) + mapping
     start = at + len(head) + 24
@@ -71,8 +77,11 @@ def one_grid(path: Path, tree: bytes, buffers: bytes, version: int = 224, **opti
     return path
 
 
-def random_grid(rng: np.random.Generator, *, half: bool = False, channels: int = 1, tiles: bool = True, name: str = "density") -> Grid:
-    """Scattered leaves on both sides of the origin, partly active, and tiles of all three sizes, one of each inactive."""
+def random_grid(
+    rng: np.random.Generator, *, half: bool = False, channels: int = 1, tiles: bool = True, name: str = "density"
+) -> Grid:
+    """Scattered leaves on both sides of the origin, partly active, and tiles of all three sizes, one of each
+    inactive."""
     corners = np.unique(rng.integers(-40, 40, (30, 3)), axis=0) * 8
     shape = (len(corners), 8, 8, 8, *([3] if channels == 3 else []))
     masks = rng.random(shape[:4]) < rng.random((len(corners), 1, 1, 1))
@@ -89,7 +98,17 @@ def random_grid(rng: np.random.Generator, *, half: bool = False, channels: int =
         flat = Tiles(np.array(origins, np.int32), np.array(sizes, np.int32), numbers, active)
     background = np.zeros((3,) if channels == 3 else (), np.float32)
     transform = scale_transform(0.5, (1.0, 2.0, 3.0))
-    return Grid(name, transform, background, corners.astype(np.int32), values, masks, flat, half=half, metadata={"creator": "test"})
+    return Grid(
+        name,
+        transform,
+        background,
+        corners.astype(np.int32),
+        values,
+        masks,
+        flat,
+        half=half,
+        metadata={"creator": "test"},
+    )
 
 
 def sorted_tiles(tiles: Tiles) -> list[tuple[Any, ...]]:
@@ -115,7 +134,11 @@ def small_files(folder: Path) -> list[Path]:
     paths = []
     for compression in ("none", "zip", "blosc"):
         paths.append(folder / f"{compression}.vdb")
-        grids = [random_grid(rng, name="a"), random_grid(rng, half=True, name="b"), random_grid(rng, channels=3, name="c")]
+        grids = [
+            random_grid(rng, name="a"),
+            random_grid(rng, half=True, name="b"),
+            random_grid(rng, channels=3, name="c"),
+        ]
         write_vdb(paths[-1], grids, compression=compression)
     return paths
 

@@ -1,4 +1,5 @@
-"""The tile lists of a frame: every pixel that a ray through it meets is in a tile that lists the primitive, front to back."""
+"""The tile lists of a frame: every pixel that a ray through it meets is in a tile that lists the primitive, front to
+back."""
 
 from __future__ import annotations
 

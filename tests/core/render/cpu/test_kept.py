@@ -1,4 +1,5 @@
-"""The backward pass takes the forward pass's optical depths: they are there, they are of the same lanes, and nothing else is kept."""
+"""The backward pass takes the forward pass's optical depths: they are there, they are of the same lanes, and nothing
+else is kept."""
 
 from __future__ import annotations
 
@@ -65,7 +66,8 @@ def test_gradients_where_rows_die_early(neurons: int, monkeypatch: pytest.Monkey
     kept, _ = kept_of(t, monkeypatch)
     monkeypatch.undo()
     assert ((kept.live != 0) & (kept.live != 2**layout.TILE - 1)).any(), "no row dies"
-    # behind walls that let a fiftieth through, float32 is a little coarser than elsewhere: as much before depths were kept (4e-5 and 1.2e-3)
+    # behind walls that let a fiftieth through, float32 is a little coarser than elsewhere: as much before depths were
+    # kept (4e-5 and 1.2e-3)
     fast, _ = assert_same_frame(t, scenes.camera(), SETTINGS, image_bound=1e-4, grad_bound=2e-3)
     extra = fast.output.stats.extra
     assert extra["backward_lanes"] < 0.9 * extra["forward_lanes"], "lanes of opaque pixels get no gradient"
@@ -97,7 +99,9 @@ def test_a_second_backward_pass_finds_the_same(neurons: int) -> None:
 
 @pytest.mark.parametrize("neurons", [0, 2, 8])
 def test_depths_are_found_for_any_number_of_threads(neurons: int) -> None:
-    grads = [draw("cpu", wall(neurons), scenes.camera(), RenderSettings(backend="cpu", threads=n)).grads for n in (1, 2, 3)]
+    grads = [
+        draw("cpu", wall(neurons), scenes.camera(), RenderSettings(backend="cpu", threads=n)).grads for n in (1, 2, 3)
+    ]
     assert all(torch.equal(grads[0][k], g[k]) for g in grads[1:] for k in g)
 
 
@@ -118,8 +122,11 @@ def test_sixteen_floats_are_read_before_they_are_written() -> None:
 
 
 @pytest.mark.parametrize("compresses", [True, False])
-def test_those_of_sixteen_floats_that_count_are_moved_together(compresses: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the instruction and one by one, in place, and whatever the flags: not numbers count, and zeros of either sign do not."""
+def test_those_of_sixteen_floats_that_count_are_moved_together(
+    compresses: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the instruction and one by one, in place, and whatever the flags: not numbers count, and zeros of either sign
+    do not."""
     if compresses and not views._COMPRESSES:
         pytest.skip("this version of LLVM is not asked for the instruction")
     monkeypatch.setattr(views, "_COMPRESSES", compresses)
@@ -132,7 +139,9 @@ def test_those_of_sixteen_floats_that_count_are_moved_together(compresses: bool,
     for chance in (0.0, 0.1, 0.5, 0.9, 1.0):
         for at in (0, 3, 16):
             array = g.normal(size=64).astype(np.float32)
-            array[32:48] = np.where(g.random(16) < chance, g.choice([1e-40, -2.0, np.nan, np.inf], 16), g.choice([0.0, -0.0], 16))
+            array[32:48] = np.where(
+                g.random(16) < chance, g.choice([1e-40, -2.0, np.nan, np.inf], 16), g.choice([0.0, -0.0], 16)
+            )
             chosen = array[16:32][array[32:48] != 0]
             expected = array.copy()
             expected[at : at + 16] = [*chosen, *[0.0] * (16 - len(chosen))]

@@ -45,8 +45,11 @@ def half_chords(t: dict[str, Tensor], camera: Camera) -> Tensor:
     return 1.0 / (whitened.norm(dim=-1) * scales.amax(-1))
 
 
-def barely_seen(camera: Camera, edge: int, neurons: int, seed: int, alpha_min: float, spread: float) -> dict[str, Tensor]:
-    """Needles, discs and balls whose deepest rays have 1.03 to 4 times the optical depth of ``alpha_min``, so that some or few of them count."""
+def barely_seen(
+    camera: Camera, edge: int, neurons: int, seed: int, alpha_min: float, spread: float
+) -> dict[str, Tensor]:
+    """Needles, discs and balls whose deepest rays have 1.03 to 4 times the optical depth of ``alpha_min``, so that some
+    or few of them count."""
     t = scenes.tensors(40, neurons, seed=seed, dtype=torch.float64)
     g = torch.Generator().manual_seed(seed)
     t["log_scales"] += spread * (torch.rand(40, 3, generator=g, dtype=torch.float64) - 0.7)
@@ -72,7 +75,9 @@ def barely_seen(camera: Camera, edge: int, neurons: int, seed: int, alpha_min: f
         ({"distance": 2.0}, 2, ALPHA_MIN, 3.0, "entry"),
     ],
 )
-def test_rays_that_count_are_drawn(edge: int, view: dict[str, float], neurons: int, alpha_min: float, spread: float, sort: str) -> None:
+def test_rays_that_count_are_drawn(
+    edge: int, view: dict[str, float], neurons: int, alpha_min: float, spread: float, sort: str
+) -> None:
     camera = scenes.camera(96, 72, **view)  # type: ignore[arg-type]
     settings = RenderSettings(backend="cpu", alpha_min=alpha_min, sort=sort)
     for seed in range(3):
@@ -101,10 +106,15 @@ def test_what_cannot_be_seen_costs_nothing(edge: int) -> None:
 def test_discs_that_are_thin_along_every_ray_cost_nothing(edge: int) -> None:
     """Seen from the front their chords are a fiftieth of their radius; from the side the same discs can be seen."""
     t = scenes.tensors(9, 0)
-    t["means"], t["log_scales"] = 0.3 * t["means"], torch.tensor([-2.0, -2.0, -2.0 - math.log(50.0)]).expand(9, 3).contiguous()
+    t["means"], t["log_scales"] = (
+        0.3 * t["means"],
+        torch.tensor([-2.0, -2.0, -2.0 - math.log(50.0)]).expand(9, 3).contiguous(),
+    )
     t["b2"] = torch.full_like(t["b2"], 10.0 * depth_that_counts(ALPHA_MIN) / NORMS[edge])
     camera, pairs = scenes.camera(1280, 960), {}
-    axes = camera.viewmat[:3, :3].T  # of the camera, as columns: the disc's are these, or its normal is the first of them
+    axes = camera.viewmat[
+        :3, :3
+    ].T  # of the camera, as columns: the disc's are these, or its normal is the first of them
     for name, order in (("front", [0, 1, 2]), ("side", [1, 2, 0])):
         t["quats"] = Quaternion.from_matrix(axes[None, :, order]).data.float().expand(9, 4).contiguous()
         with scenes.soft(edge):

@@ -1,4 +1,5 @@
-"""Frames of the cuda backend for tests of its kernels: a scene's image, gradients and sums, and the kernels' launches on the way."""
+"""Frames of the cuda backend for tests of its kernels: a scene's image, gradients and sums, and the kernels' launches
+on the way."""
 
 from __future__ import annotations
 
@@ -26,11 +27,13 @@ SCENES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "colour networks": ({"neurons": 2, "hidden": 3}, {"distance": 0.5, "fov": 80.0, "near": 0.05}, {}),
     "entry": ({"neurons": 2, "edge": 1}, {"distance": 0.5, "fov": 60.0}, {"sort": "entry", "depth": True}),
 }
-"""Model, view and settings: pairs in float32 and float64, tiles that end early, sizes that are no multiples of a tile."""
+"""Model, view and settings: pairs in float32 and float64, tiles that end early, sizes that are no multiples of a
+tile."""
 
 
 def everything(name: str, count: int = 300) -> dict[str, Tensor]:
-    """All that a frame gives: images, gradients of every tensor, the view and the background, and the sums over what was watched."""
+    """All that a frame gives: images, gradients of every tensor, the view and the background, and the sums over what
+    was watched."""
     model, view, knobs = (dict(part) for part in SCENES[name])
     edge = model.pop("edge", 0)
     knobs |= {key: view.pop(key) for key in ("near",) if key in view}
@@ -38,7 +41,11 @@ def everything(name: str, count: int = 300) -> dict[str, Tensor]:
     camera = scenes.camera(**{"width": 64, "height": 64, **view})
     with scenes.soft(edge):
         frame = draw("cuda", t, camera, replace(RenderSettings(), **by("cuda"), **knobs))
-    images = {"rgb": frame.output.rgb, "alpha": frame.output.alpha, **({"depth": frame.output.depth} if "depth" in knobs else {})}
+    images = {
+        "rgb": frame.output.rgb,
+        "alpha": frame.output.alpha,
+        **({"depth": frame.output.depth} if "depth" in knobs else {}),
+    }
     sums = {"weight": frame.tally.weight, "error": frame.tally.error_weight}
     return {**{k: v.detach() for k, v in images.items() if v is not None}, **frame.grads, **sums}
 
@@ -74,7 +81,9 @@ class Args:
         return values
 
 
-def intercept(monkeypatch: pytest.MonkeyPatch, wrapped: Callable[[Launch, Any, Any, Sequence[Any], torch.device, int], None]) -> None:
+def intercept(
+    monkeypatch: pytest.MonkeyPatch, wrapped: Callable[[Launch, Any, Any, Sequence[Any], torch.device, int], None]
+) -> None:
     """Have every launch of the pixel kernels go through ``wrapped(launch, kernel, dim, inputs, device, block)``."""
     genuine = passes.launch
 

@@ -1,4 +1,5 @@
-"""No bit of a frame depends on which block comes first, how many rows are read at a time, or what was in memory before."""
+"""No bit of a frame depends on which block comes first, how many rows are read at a time, or what was in memory
+before."""
 
 from __future__ import annotations
 
@@ -25,11 +26,15 @@ def plain() -> dict[str, dict[str, Tensor]]:
 @pytest.mark.parametrize("name", SCENES)
 def test_a_rerun_gives_the_same_bits(name: str, plain: dict[str, dict[str, Tensor]]) -> None:
     assert_same_bits(plain[name], everything(name))
-    assert plain[name]["alpha"].max() > 0.5 and plain[name]["means"].abs().max() > 0 and plain[name]["weight"].max() > 0.5
+    assert (
+        plain[name]["alpha"].max() > 0.5 and plain[name]["means"].abs().max() > 0 and plain[name]["weight"].max() > 0.5
+    )
 
 
 @pytest.mark.parametrize("rows", [1, 7, 64])
-def test_rows_are_read_in_batches_of_any_size(rows: int, plain: dict[str, dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_are_read_in_batches_of_any_size(
+    rows: int, plain: dict[str, dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A tile's end is looked for after each batch: pairs behind it are composited or not, and change nothing."""
     name = "center, depth"
     monkeypatch.setattr(forward, "BATCH", rows)
@@ -50,7 +55,9 @@ def _only(reached: Tensor, tile: int) -> Tensor:
     return torch.where(torch.arange(len(reached)) == tile, reached, 0).int()
 
 
-def _tile_by_tile(launch: Launch, kernel: Any, dim: Any, inputs: Sequence[Any], device: torch.device, block: int) -> None:
+def _tile_by_tile(
+    launch: Launch, kernel: Any, dim: Any, inputs: Sequence[Any], device: torch.device, block: int
+) -> None:
     """Tiles one at a time, the last first: what a launch leaves of the others is thrown away."""
     args = Args(kernel, inputs)
     if "starts" in args:
@@ -66,7 +73,11 @@ def _tile_by_tile(launch: Launch, kernel: Any, dim: Any, inputs: Sequence[Any], 
             else:
                 copies = {}
                 launch(
-                    kernel, dim, args.with_tensors(starts=_alone(starts, tile), reached=_only(args.tensor("reached"), tile)), device, block
+                    kernel,
+                    dim,
+                    args.with_tensors(starts=_alone(starts, tile), reached=_only(args.tensor("reached"), tile)),
+                    device,
+                    block,
                 )
             for name, copy in copies.items():
                 own = torch.arange(len(copy)) == tile if name == "reached" else tile_of == tile
@@ -84,7 +95,9 @@ def _tile_by_tile(launch: Launch, kernel: Any, dim: Any, inputs: Sequence[Any], 
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_tiles_may_come_in_any_order(name: str, plain: dict[str, dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiles_may_come_in_any_order(
+    name: str, plain: dict[str, dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each as if it were alone, the last first."""
     met = []
 
@@ -97,9 +110,14 @@ def test_tiles_may_come_in_any_order(name: str, plain: dict[str, dict[str, Tenso
     assert {"forward_kernel", "pairs_kernel"} <= set(met)
 
 
-@pytest.mark.parametrize(("threads", "name"), [(32, "center, depth"), *((96, name) for name in SCENES), (512, "colour networks")])
-def test_blocks_may_be_of_any_size(threads: int, name: str, plain: dict[str, dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a block is a number of threads; it is a tile, or a warp, in kernels that work together, and these have one size."""
+@pytest.mark.parametrize(
+    ("threads", "name"), [(32, "center, depth"), *((96, name) for name in SCENES), (512, "colour networks")]
+)
+def test_blocks_may_be_of_any_size(
+    threads: int, name: str, plain: dict[str, dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a block is a number of threads; it is a tile, or a warp, in kernels that work together, and these have one
+    size."""
     changed, together = set(), set()
 
     def through(kernel: Any, dim: Any, inputs: Sequence[Any], device: torch.device, block: int = warp.BLOCK) -> None:
@@ -116,7 +134,9 @@ def test_blocks_may_be_of_any_size(threads: int, name: str, plain: dict[str, dic
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_what_is_read_was_written(name: str, plain: dict[str, dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_read_was_written(
+    name: str, plain: dict[str, dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Memory that kernels fill is full of NaN, and of whole numbers far off, before them."""
     genuine, filled = torch.empty, []
 
@@ -140,7 +160,8 @@ def test_what_is_read_was_written(name: str, plain: dict[str, dict[str, Tensor]]
 
 
 def test_the_scenes_have_pairs_of_every_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In float64 and not, with tiles that end early and those that do not, and with fewer and more pairs than a batch."""
+    """In float64 and not, with tiles that end early and those that do not, and with fewer and more pairs than a
+    batch."""
     found: dict[str, list[tuple[int, int, int, int, int]]] = {}
     genuine = backend.forward
 

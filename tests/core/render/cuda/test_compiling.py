@@ -1,4 +1,5 @@
-"""The kernels compile for a card where there is none: what only a card compiles, such as stores of 16 bytes, is checked on every machine."""
+"""The kernels compile for a card where there is none: what only a card compiles, such as stores of 16 bytes, is checked
+on every machine."""
 
 from __future__ import annotations
 
@@ -19,9 +20,12 @@ from neuprim.core.render.cuda import binning, prepare, prepare_backward
 
 BENCHMARKS = Path(__file__).parents[4] / "benchmarks"
 ARCHS = (80, 89, 90)
-needs_sm_90 = pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="this build of Warp does not compile for sm_90")
+needs_sm_90 = pytest.mark.skipif(
+    90 not in wp.get_cuda_supported_archs(), reason="this build of Warp does not compile for sm_90"
+)
 needs_all = pytest.mark.skipif(
-    not set(ARCHS) <= set(wp.get_cuda_supported_archs()), reason="this build of Warp does not compile for sm_80, sm_89 and sm_90"
+    not set(ARCHS) <= set(wp.get_cuda_supported_archs()),
+    reason="this build of Warp does not compile for sm_80, sm_89 and sm_90",
 )
 KERNELS = {
     "prepare": prepare.prepare_kernel(False),
@@ -60,15 +64,32 @@ def record(script: ModuleType) -> dict[str, Any]:
 
 
 def checked(forms: tuple[str, ...], archs: tuple[int, ...], record: dict[str, Any], *kernels: str) -> None:
-    """In a process of its own, as kernels are compiled for blocks of their own sizes. Record what is meant: gpu_kernels.py --record."""
+    """In a process of its own, as kernels are compiled for blocks of their own sizes. Record what is meant:
+    gpu_kernels.py --record."""
     if record["warp"] != wp.__version__:
         pytest.skip(f"recorded with Warp {record['warp']}, whose compiler is another one than that of {wp.__version__}")
-    words = [sys.executable, str(BENCHMARKS / "gpu_kernels.py"), "--check", "--archs", *map(str, archs), "--forms", *forms]
+    words = [
+        sys.executable,
+        str(BENCHMARKS / "gpu_kernels.py"),
+        "--check",
+        "--archs",
+        *map(str, archs),
+        "--forms",
+        *forms,
+    ]
     words += ["--kernels", *kernels] if kernels else []
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    own = [r for r in record["kernels"] if r["arch"] in archs and r["form"] in forms and (not kernels or r["kernel"] in kernels)]
-    assert sum(line.startswith(tuple(f"| {form} |" for form in forms)) for line in done.stdout.splitlines()) == len(own) > 5
+    own = [
+        r
+        for r in record["kernels"]
+        if r["arch"] in archs and r["form"] in forms and (not kernels or r["kernel"] in kernels)
+    ]
+    assert (
+        sum(line.startswith(tuple(f"| {form} |" for form in forms)) for line in done.stdout.splitlines())
+        == len(own)
+        > 5
+    )
 
 
 @needs_sm_90

@@ -1,4 +1,5 @@
-"""How often the processor would wait for a card in a frame: whatever makes a number of Python's, or a shape, of a tensor."""
+"""How often the processor would wait for a card in a frame: whatever makes a number of Python's, or a shape, of a
+tensor."""
 
 from __future__ import annotations
 

@@ -53,7 +53,10 @@ def test_a_missing_disassembler_is_one_line(
     monkeypatch.setattr(sys, "argv", ["gpu_hits.py"])
     monkeypatch.setattr(script, "find_nvdisasm", lambda: None)
     assert script.main() == 1
-    assert capsys.readouterr().err == "nvdisasm is missing: pip install nvidia-cuda-nvdisasm, or name one with --nvdisasm\n"
+    assert (
+        capsys.readouterr().err
+        == "nvdisasm is missing: pip install nvidia-cuda-nvdisasm, or name one with --nvdisasm\n"
+    )
 
 
 def test_lanes_are_those_of_a_frame(script: ModuleType) -> None:
@@ -62,16 +65,22 @@ def test_lanes_are_those_of_a_frame(script: ModuleType) -> None:
     assert 0 < seen.hits <= seen.slots and seen.hits <= 32 * seen.steps and seen.hits <= 32 * seen.patches
     assert seen.patches <= 8 * seen.pairs and seen.steps >= seen.slots / 32 * 0.5
     share, ms = script.predicted("forward", {"instructions": 100}, seen)
-    assert share == pytest.approx(seen.hits / (32 * seen.patches)) and ms == pytest.approx(1e3 * 3200 * seen.patches / script.RATE)
+    assert share == pytest.approx(seen.hits / (32 * seen.patches)) and ms == pytest.approx(
+        1e3 * 3200 * seen.patches / script.RATE
+    )
 
 
 def test_the_page_has_what_was_recorded(script: ModuleType) -> None:
-    """And a hit costs no more than it was planned to: the study's, and forward what pairs in float64 and faint chords add."""
+    """And a hit costs no more than it was planned to: the study's, and forward what pairs in float64 and faint chords
+    add."""
     record = json.loads(script.RESULTS.read_text(encoding="utf-8"))
     page = script.PAGE.read_text(encoding="utf-8")
     assert f"<!-- gpu-hits -->\n{script.document(record)}\n<!-- /gpu-hits -->" in page
     paper = {row["kernel"]: row for row in record["rows"] if row["neurons"] == 8}
-    assert paper["pairs"]["instructions"] <= script.STUDY["pairs"] and paper["forward"]["instructions"] <= 1.05 * script.STUDY["forward"]
+    assert (
+        paper["pairs"]["instructions"] <= script.STUDY["pairs"]
+        and paper["forward"]["instructions"] <= 1.05 * script.STUDY["forward"]
+    )
     scene = record["scene"]
     assert (8 * scene["slots"] + 36 * scene["pairs"]) / scene["hits"] < 14.0  # bytes a hit; whole tiles would take 50
     for row in record["rows"]:

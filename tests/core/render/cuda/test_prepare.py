@@ -1,4 +1,5 @@
-"""The per-primitive stage in Warp makes what numba makes, and so does its chain rule; on Warp's CPU blocks, and on a card where there is one."""
+"""The per-primitive stage in Warp makes what numba makes, and so does its chain rule; on Warp's CPU blocks, and on a
+card where there is one."""
 
 from __future__ import annotations
 
@@ -77,7 +78,8 @@ def test_delicate_primitives_are_numbas(name: str, device: str) -> None:
     assert (numpy(frame.rows)[numba.visible, L.REST, 3] == (slots >= 0)[numba.visible]).all()
     wide = numpy(frame.wide)
     assert wide.shape == (len(numba.which), L.wide_width(frame.neurons))
-    # what float64 leaves of differences: of points at the anchor's depth, of the steps between them, of directions nearly orthogonal
+    # what float64 leaves of differences: of points at the anchor's depth, of the steps between them, of directions
+    # nearly orthogonal
     tc, e0, step = numba.wide[:, P.TC], norm(numba.wide[:, P.E0 : P.EX]), norm(numba.wide[:, P.EX : P.XA])
     cancels = {P.XA: tc * e0, P.XU: tc * step, P.XV: tc * step, P.TU: tc * step / e0, P.TV: tc * step / e0}
     for column in PLACES:
@@ -117,7 +119,8 @@ def test_forced_primitives_are_drawn_in_float64(device: str) -> None:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     ("name", "value"),
-    [(n, math.nan) for n in (*NAMES, "colors")] + [("log_scales", 95.0), ("w2", -math.inf), ("b2", -math.inf), ("quats", 0.0)],
+    [(n, math.nan) for n in (*NAMES, "colors")]
+    + [("log_scales", 95.0), ("w2", -math.inf), ("b2", -math.inf), ("quats", 0.0)],
 )
 def test_the_first_primitive_that_is_not_finite_is_named(name: str, value: float, device: str) -> None:
     case = CASES["K=8"]
@@ -135,7 +138,11 @@ def test_small_discs_beyond_float32_are_not_seen(device: str) -> None:
     t = case.tensors()
     t["log_scales"][::2] = torch.tensor([-129.5, -40.0, -40.0])
     numba, frame = numba_frame(case, t), frame_of(case, t, device)
-    assert (numpy(frame.status) == numba.status).all() and (numba.status[::2] == CULLED).all() and not numpy(frame.boxes)[::2].any()
+    assert (
+        (numpy(frame.status) == numba.status).all()
+        and (numba.status[::2] == CULLED).all()
+        and not numpy(frame.boxes)[::2].any()
+    )
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -152,9 +159,13 @@ def test_gradients_are_numbas(name: str, device: str) -> None:
     for parameter, own, theirs in zip(NAMES, found, expected, strict=True):
         assert own.dtype == torch.float32 and own.shape == theirs.shape
         a, b = numpy(own).reshape(len(seen), -1).astype(np.float64), theirs.reshape(len(seen), -1).astype(np.float64)
-        if parameter == "log_scales":  # numba takes its frequencies from the float32 row, and the longest axis is a sum that cancels
+        if (
+            parameter == "log_scales"
+        ):  # numba takes its frequencies from the float32 row, and the longest axis is a sum that cancels
             W = numba.neurons(numba.rows, np.arange(len(seen)))[:, :, :3]
-            gw = grads.numpy()[:, L.G_NEURONS : L.G_NEURONS + L.PER_NEURON * frame.neurons].reshape(len(seen), frame.neurons, L.PER_NEURON)
+            gw = grads.numpy()[:, L.G_NEURONS : L.G_NEURONS + L.PER_NEURON * frame.neurons].reshape(
+                len(seen), frame.neurons, L.PER_NEURON
+            )
             scale = np.abs(b).max(1) + np.abs(W * gw[:, :, :3]).sum((1, 2))
         else:
             scale = np.abs(b).max(1, initial=0)
@@ -189,7 +200,9 @@ def test_a_rerun_gives_the_same_bits(device: str) -> None:
     for name in ("starts", "ids", "tile_of", "first", "slots_of"):
         assert torch.equal(getattr(one.lists, name), getattr(two.lists, name)), name
     grads = torch.rand(case.count, L.gradient_width(8, 3), device=device)
-    assert all(torch.equal(a, b) for a, b in zip(prepare_backward(one, grads)[0], prepare_backward(two, grads)[0], strict=True))
+    assert all(
+        torch.equal(a, b) for a, b in zip(prepare_backward(one, grads)[0], prepare_backward(two, grads)[0], strict=True)
+    )
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -1,4 +1,5 @@
-"""The race against gsplat keeps to gsplat's documented interface: a stand-in with its signatures draws by the reference backend."""
+"""The race against gsplat keeps to gsplat's documented interface: a stand-in with its signatures draws by the reference
+backend."""
 
 from __future__ import annotations
 
@@ -35,8 +36,15 @@ def rasterization(
     """As gsplat documents it; what it would refuse, this refuses."""
     count = len(means)
     assert means.shape == scales.shape == (count, 3) and quats.shape == (count, 4) and opacities.shape == (count,)
-    assert viewmats.shape == (1, 4, 4) and Ks.shape == (1, 3, 3) and (backgrounds is None or backgrounds.shape == (1, 3))
-    assert sh_degree is not None and colors.shape[0] == count and colors.shape[2] == 3 and (sh_degree + 1) ** 2 <= colors.shape[1]
+    assert (
+        viewmats.shape == (1, 4, 4) and Ks.shape == (1, 3, 3) and (backgrounds is None or backgrounds.shape == (1, 3))
+    )
+    assert (
+        sh_degree is not None
+        and colors.shape[0] == count
+        and colors.shape[2] == 3
+        and (sh_degree + 1) ** 2 <= colors.shape[1]
+    )
     assert bool((scales > 0).all()) and bool(((opacities > 0) & (opacities < 1)).all())
     assert {x.dtype for x in (means, quats, scales, opacities, colors, viewmats, Ks)} == {torch.float32}
     K = Ks[0].tolist()
@@ -46,7 +54,9 @@ def rasterization(
     amplitude = -torch.log1p(-opacities)[:, None]
     rgb = sh.colors(means, colors[:, 0], colors[:, 1:], camera.position, sh_degree)
     lowered = Lowered(geometry, density.lower({"log_amplitude": amplitude.log()}, geometry, {}), Constant(rgb))
-    output = render_lowered(lowered, camera, RenderSettings(backend="reference"), None if backgrounds is None else backgrounds[0])
+    output = render_lowered(
+        lowered, camera, RenderSettings(backend="reference"), None if backgrounds is None else backgrounds[0]
+    )
     return output.rgb[None], output.alpha[None, ..., None], {"width": width, "height": height}
 
 
@@ -70,7 +80,9 @@ class MCMCStrategy:
     def initialize_state(self) -> dict[str, Any]:
         return {"binoms": torch.zeros(51, 51)}
 
-    def step_post_backward(self, params: Any, optimizers: Any, state: dict[str, Any], step: int, info: dict[str, Any], lr: float) -> None:
+    def step_post_backward(
+        self, params: Any, optimizers: Any, state: dict[str, Any], step: int, info: dict[str, Any], lr: float
+    ) -> None:
         assert "binoms" in state and info["width"] == tiny.SIZE and len(params["means"]) <= self.cap_max
         self.told.append((step, lr))
 
@@ -95,7 +107,12 @@ def test_gaussians_learn_what_neuprim_learns(race: ModuleType) -> None:
     params = race.gaussians(data, 12, torch.device("cpu"))
     before, _ = race.judged(gsplat, params, data.test, data.background)
     found = race.lap(gsplat, data, 12, STEPS, torch.device("cpu"))
-    assert (found.count, found.bytes) == (12, 12 * 59 * 4) and found.psnr > before + 0.1 and found.step_ms > 0 and found.frame_ms > 0
+    assert (
+        (found.count, found.bytes) == (12, 12 * 59 * 4)
+        and found.psnr > before + 0.1
+        and found.step_ms > 0
+        and found.frame_ms > 0
+    )
     assert [step for step, _ in made[0].told] == list(range(STEPS)) and made[0].cap_max == 12
     rates = [lr for _, lr in made[0].told]
     assert rates == sorted(rates, reverse=True) and rates[0] == pytest.approx(1.6e-4 * data.extent)
@@ -111,7 +128,9 @@ def test_only_documented_arguments_are_named(race: ModuleType) -> None:
         return rasterization(**kwargs)
 
     data = tiny.two_primitives()
-    race.judged(SimpleNamespace(rasterization=seen), race.gaussians(data, 5, torch.device("cpu")), data.test, data.background)
+    race.judged(
+        SimpleNamespace(rasterization=seen), race.gaussians(data, 5, torch.device("cpu")), data.test, data.background
+    )
     assert called.keys() <= inspect.signature(rasterization).parameters.keys() and called["sh_degree"] == race.DEGREE
 
 

@@ -28,7 +28,9 @@ def test_lists_are_numbas(name: str, device: str) -> None:
     assert (numpy(own.first) == theirs.first).all()
     assert (numpy(own.slots_of) == theirs.slots).all()
     assert (numpy(own.tile_of) == np.repeat(np.arange(len(theirs.starts) - 1), np.diff(theirs.starts))).all()
-    assert {x.dtype for x in (own.starts, own.ids, own.tile_of, own.first, own.slots_of, frame.slots, frame.which)} == {torch.int32}
+    assert {x.dtype for x in (own.starts, own.ids, own.tile_of, own.first, own.slots_of, frame.slots, frame.which)} == {
+        torch.int32
+    }
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -1,4 +1,5 @@
-"""Every task trains through the kernels on Warp's CPU blocks as it does through the cpu backend, and says that this is slow."""
+"""Every task trains through the kernels on Warp's CPU blocks as it does through the cpu backend, and says that this is
+slow."""
 
 from __future__ import annotations
 
@@ -27,18 +28,38 @@ SMALL = [
     "model.primitives=80", "model.neurons=2", "train.max_seconds=null", "train.iterations=12", "train.population.every=5",
     "train.population.start=0.0",
 ]  # fmt: skip
-LIT = ["task=relight", "scene=lit_solids", "scene.size=24", "scene.train_views=6", "scene.test_views=2", "scene.supersampling=1"]
+LIT = [
+    "task=relight",
+    "scene=lit_solids",
+    "scene.size=24",
+    "scene.train_views=6",
+    "scene.test_views=2",
+    "scene.supersampling=1",
+]
 
 
 def configured(task: str, folder: Path) -> list[str]:
     if task == "static":
-        return words(tiny.write_blender(folder / "two"), folder / "run", 12, "train.population.every=5", "train.population.start=0.0")
+        return words(
+            tiny.write_blender(folder / "two"),
+            folder / "run",
+            12,
+            "train.population.every=5",
+            "train.population.start=0.0",
+        )
     if task == "relight":
         return [*LIT, *SMALL, "model.colour.hidden=3", f"output_dir='{folder / 'run'}'"]
     (folder / "ball").mkdir()
     for number in range(1, 4):
         write_vdb(folder / "ball" / f"ball_{number}.vdb", blob(6.0 + 3 * number))
-    own = ["task=dynamic", "scene=vdb", f"scene.vdb='{folder / 'ball'}'", "scene.look=smoke_fire", "scene.size=24", "scene.cameras=4"]
+    own = [
+        "task=dynamic",
+        "scene=vdb",
+        f"scene.vdb='{folder / 'ball'}'",
+        "scene.look=smoke_fire",
+        "scene.size=24",
+        "scene.cameras=4",
+    ]
     return [*own, *SMALL, "scene.samples=1", f"output_dir='{folder / 'run'}'"]
 
 
@@ -59,7 +80,8 @@ def test_first_gradients_are_the_cpu_backends(task: str, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("task", ["static", "dynamic", "relight"])
 def test_a_run_is_the_cpu_backends(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From data to report. Adam's first steps are as long where a gradient is nothing but rounding, so that runs drift apart a little."""
+    """From data to report. Adam's first steps are as long where a gradient is nothing but rounding, so that runs drift
+    apart a little."""
     monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
     monkeypatch.setattr(notices, "_said", set())
     numbers: list[dict[str, Any]] = []
@@ -79,7 +101,9 @@ def test_a_run_is_the_cpu_backends(task: str, tmp_path: Path, monkeypatch: pytes
     assert other["psnr"] == pytest.approx(one["psnr"], abs=0.2) and other["psnr"] > 5
 
 
-def test_the_warning_is_said_of_this_backend_alone(monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder) -> None:
+def test_the_warning_is_said_of_this_backend_alone(
+    monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
     monkeypatch.setattr(notices, "_said", set())
     low, camera = scenes.lowered(scenes.tensors(3)), scenes.camera(8, 8)
     for backend in ("cpu", "reference", "auto"):
@@ -88,4 +112,7 @@ def test_the_warning_is_said_of_this_backend_alone(monkeypatch: pytest.MonkeyPat
     for _ in range(2):
         render_lowered(low, camera, RenderSettings(backend="cuda", device="cpu"))
     (said,) = [w for w in recwarn if issubclass(w.category, notices.NeuprimWarning)]
-    assert str(said.message) == "renderer.backend=cuda is slow on the cpu, where only its tests draw; renderer.backend=cpu is made for it"
+    assert (
+        str(said.message)
+        == "renderer.backend=cuda is slow on the cpu, where only its tests draw; renderer.backend=cpu is made for it"
+    )

@@ -85,7 +85,9 @@ def test_gradients_of_parts_of_the_output() -> None:
         grads = []
         for backend in ("cuda", "cpu"):
             leaves = {k: v.requires_grad_() for k, v in scenes.tensors(20).items()}
-            out = render_lowered(scenes.lowered(leaves), scenes.camera(24, 20), RenderSettings(**by(backend), depth=True))
+            out = render_lowered(
+                scenes.lowered(leaves), scenes.camera(24, 20), RenderSettings(**by(backend), depth=True)
+            )
             ((getattr(out, part) * (out.alpha.detach() > 0.1)).sum()).backward()
             grads.append(leaves["means"].grad)
         assert bool(grads[1].any()) and (grads[0] - grads[1]).norm() <= 1e-4 * grads[1].norm(), part

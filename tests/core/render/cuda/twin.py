@@ -1,4 +1,5 @@
-"""One frame's arrays from the numba backend, in the cuda backend's form, and the scenes on which the two are compared."""
+"""One frame's arrays from the numba backend, in the cuda backend's form, and the scenes on which the two are
+compared."""
 
 from __future__ import annotations
 
@@ -56,7 +57,8 @@ class Case:
 
 
 def widen(t: dict[str, Tensor]) -> None:
-    """Needles, discs, specks and giants, before, around and behind the camera, some with fast neurons, some smaller than float32 can tell."""
+    """Needles, discs, specks and giants, before, around and behind the camera, some with fast neurons, some smaller
+    than float32 can tell."""
     g = torch.Generator().manual_seed(3)
     count = len(t["means"])
     t["means"] *= 5.0
@@ -78,7 +80,9 @@ CASES = {
     "wild": Case(8, wild=True, count=2000, view={"distance": 2.0, "fov": 70.0}),
     "wild, no neurons, soft edge": Case(0, edge=2, wild=True, count=2000, near=0.3),
     "wild, principal point far off": Case(2, wild=True, count=2000, view={"shift": (-30000.0, 40.0), "fov": 0.5}),
-    "wild, principal point off": Case(2, edge=1, wild=True, count=2000, dtype=torch.float64, view={"shift": (60.0, -90.0)}),
+    "wild, principal point off": Case(
+        2, edge=1, wild=True, count=2000, dtype=torch.float64, view={"shift": (60.0, -90.0)}
+    ),
     "one pixel": Case(2, view={"width": 1, "height": 1, "fov": 5.0}),
 }
 

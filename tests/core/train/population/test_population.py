@@ -66,7 +66,12 @@ def points_inside(params: dict[str, Tensor], rows: Tensor, each: int = 8) -> tup
 
 
 def relocate(  # type: ignore[no-untyped-def]
-    m: Primitives, weight: Tensor, error: Tensor, fraction: float = 0.25, idle: float | None = None, grow_to: int | None = None
+    m: Primitives,
+    weight: Tensor,
+    error: Tensor,
+    fraction: float = 0.25,
+    idle: float | None = None,
+    grow_to: int | None = None,
 ):
     population = Relocate(PopulationSettings(fraction=fraction, idle=idle, grow_to=grow_to))
     population.observe(m, stats(weight, error))
@@ -77,7 +82,9 @@ def relocate(  # type: ignore[no-untyped-def]
     ("factors", "covered", "twice", "volume"),
     [((SPLIT_LONG, SPLIT_OTHERS), 0.78, 0.02, 0.97), ((SPLIT_GAUSSIAN, SPLIT_GAUSSIAN), 0.45, 0.01, 0.49)],
 )
-def test_children_cover_what_is_said_of_them(factors: tuple[float, float], covered: float, twice: float, volume: float) -> None:
+def test_children_cover_what_is_said_of_them(
+    factors: tuple[float, float], covered: float, twice: float, volume: float
+) -> None:
     """Shares of the parent's volume: in a child, in both, and of the children's own volumes together."""
     m = model(4)
     children = split(m, torch.arange(4), SPLIT_SHIFT, *factors)
@@ -141,7 +148,9 @@ def test_relocation_can_be_left_to_the_idle() -> None:
     assert sorted(change.origin[[2, 6]].tolist()) == [18, 19] and change.origin[9] == 9
     assert relocate(m, weight, error, 0.05, 0.05).text == "moved 1", "the share still bounds it"
     assert relocate(m, torch.ones(COUNT), error, 0.25, 0.05) is None, "all are at work"
-    assert relocate(m, torch.zeros(COUNT), error, 0.25, 0.05) is None, "a stretch of views without anything says nothing of anyone"
+    assert relocate(m, torch.zeros(COUNT), error, 0.25, 0.05) is None, (
+        "a stretch of views without anything says nothing of anyone"
+    )
 
 
 def test_relocation_grows_to_what_was_asked_for_where_the_error_is() -> None:
@@ -157,10 +166,14 @@ def test_relocation_grows_to_what_was_asked_for_where_the_error_is() -> None:
     assert torch.allclose(sigma(change.params, 4, rows, x), before, rtol=1e-10, atol=1e-10)
     others = [i for i in range(COUNT) if i not in (2, 6, 15, 16, 17, 18, 19)]
     assert all(torch.equal(v[others], m.params[k][others]) for k, v in change.params.items())
-    assert relocate(m, torch.ones(COUNT), error, 0.1, 0.05, grow_to=1000).text == f"grew by {COUNT // 4}", "a quarter at a time"
+    assert relocate(m, torch.ones(COUNT), error, 0.1, 0.05, grow_to=1000).text == f"grew by {COUNT // 4}", (
+        "a quarter at a time"
+    )
     assert relocate(m, torch.ones(COUNT), error, 0.1, 0.05, grow_to=COUNT) is None, "nobody is missing"
     error[:-2] = 0.0
-    assert relocate(m, torch.ones(COUNT), error, 0.1, 0.05, grow_to=1000).text == "grew by 2", "nothing is known of the others"
+    assert relocate(m, torch.ones(COUNT), error, 0.1, 0.05, grow_to=1000).text == "grew by 2", (
+        "nothing is known of the others"
+    )
 
 
 @pytest.mark.parametrize("grow_from", [0.5, 0.2])
@@ -181,7 +194,9 @@ def test_relocation_reaches_its_count_however_few_interventions_there_are(grow_f
 
 
 @pytest.mark.parametrize(("steps", "most"), [(5, 2), (40, 2), (500, 2)])
-def test_relocation_reaches_its_count_in_budgets_that_are_over_before_the_first_intervention(steps: int, most: int) -> None:
+def test_relocation_reaches_its_count_in_budgets_that_are_over_before_the_first_intervention(
+    steps: int, most: int
+) -> None:
     m, target = model(), 2 * COUNT
     population, counts, when = Relocate(PopulationSettings(start=0.02, stop=0.35, every=200, grow_to=target)), [], []
     for step in range(1, steps + 1):
@@ -220,7 +235,14 @@ def test_relocation_sums_over_views_and_starts_anew() -> None:
 
 def settings(**changes: object) -> PopulationSettings:
     return PopulationSettings(
-        **{"strategy": "gradient", "grow_threshold": 1.0, "prune_threshold": 0.1, "clone_scale": 0.1, "prune_scale": 2.0, **changes}  # type: ignore[arg-type]
+        **{
+            "strategy": "gradient",
+            "grow_threshold": 1.0,
+            "prune_threshold": 0.1,
+            "clone_scale": 0.1,
+            "prune_scale": 2.0,
+            **changes,
+        }  # type: ignore[arg-type]
     )
 
 
@@ -305,7 +327,9 @@ def test_the_mean_is_over_views_that_saw_the_primitive() -> None:
     one[0] = 1.0
     give_grads(m, torch.full((COUNT,), 1.5))
     population.observe(m, stats(torch.ones(COUNT)))
-    give_grads(m, torch.full((COUNT,), 0.7))  # the norm of primitive 0 falls to 1.1; the others were not seen and keep 1.5
+    give_grads(
+        m, torch.full((COUNT,), 0.7)
+    )  # the norm of primitive 0 falls to 1.1; the others were not seen and keep 1.5
     population.observe(m, stats(one))
     state = population.state()
     assert torch.allclose(state["total"] / state["seen"], torch.tensor([1.1] + [1.5] * 19))
@@ -399,14 +423,42 @@ def dividing(change: Any) -> dict[str, Any]:
     [
         (splits, changed("on_split", b2=lambda v: v[:, 0]), r"on_split: b2 has shape \(10,\); expected \(10, 1\)"),
         (splits, changed("on_split", b1=lambda v: v[:3]), r"on_split: b1 has shape \(3, 4\); expected \(10, 4\)"),
-        (splits, changed("on_split", w2=lambda v: v.float()), r"on_split: w2 has dtype torch\.float32; expected torch\.float64"),
+        (
+            splits,
+            changed("on_split", w2=lambda v: v.float()),
+            r"on_split: w2 has dtype torch\.float32; expected torch\.float64",
+        ),
         (splits, changed("on_split", w2=lambda v: v.tolist()), r"on_split: w2 has type list; expected a torch tensor"),
-        (splits, {"on_split": lambda self, p, old, new: {**p, "amplitude": p["w2"]}}, r"on_split returned tensors \['W1', 'amplitude'"),
-        (splits, {"on_split": lambda self, p, old, new: {"W1": p["W1"]}}, r"on_split returned tensors \['W1'\]; expected \['W1', 'b1'"),
-        (splits, {"on_split": lambda self, p, old, new: None}, r"on_split returned type NoneType; expected a dict of tensors"),
-        (clones, changed("scale_density", w2=lambda v: v.T), r"scale_density: w2 has shape \(4, 20\); expected \(20, 4\)"),
-        (clones, {"scale_density": lambda self, p, f: p["w2"] * f[:, None]}, r"scale_density returned type Tensor; expected a dict"),
-        (splits, dividing(lambda mask, halves, place: (mask.float(), halves, place)), r"divide returned a mask of torch\.float32 \(5,\)"),
+        (
+            splits,
+            {"on_split": lambda self, p, old, new: {**p, "amplitude": p["w2"]}},
+            r"on_split returned tensors \['W1', 'amplitude'",
+        ),
+        (
+            splits,
+            {"on_split": lambda self, p, old, new: {"W1": p["W1"]}},
+            r"on_split returned tensors \['W1'\]; expected \['W1', 'b1'",
+        ),
+        (
+            splits,
+            {"on_split": lambda self, p, old, new: None},
+            r"on_split returned type NoneType; expected a dict of tensors",
+        ),
+        (
+            clones,
+            changed("scale_density", w2=lambda v: v.T),
+            r"scale_density: w2 has shape \(4, 20\); expected \(20, 4\)",
+        ),
+        (
+            clones,
+            {"scale_density": lambda self, p, f: p["w2"] * f[:, None]},
+            r"scale_density returned type Tensor; expected a dict",
+        ),
+        (
+            splits,
+            dividing(lambda mask, halves, place: (mask.float(), halves, place)),
+            r"divide returned a mask of torch\.float32 \(5,\)",
+        ),
         (
             splits,
             dividing(lambda mask, halves, place: (mask[:2], halves, place)),
@@ -417,9 +469,21 @@ def dividing(change: Any) -> dict[str, Any]:
             dividing(lambda mask, halves, place: (mask, {k: v[:5] for k, v in halves.items()}, place)),
             r"divide: W1 has shape \(5, 4, 3\)",
         ),
-        (splits, dividing(lambda mask, halves, place: (mask, halves, place[:5])), r"divide: means has shape \(5, 3\); expected \(10, 3\)"),
-        (splits, dividing(lambda mask, halves, place: (mask, halves)), r"divide returned type tuple; expected \(mask, tensors, Geometry\)"),
-        (splits, dividing(lambda mask, halves, place: (mask, halves, None)), r"divide returned a geometry of type NoneType"),
+        (
+            splits,
+            dividing(lambda mask, halves, place: (mask, halves, place[:5])),
+            r"divide: means has shape \(5, 3\); expected \(10, 3\)",
+        ),
+        (
+            splits,
+            dividing(lambda mask, halves, place: (mask, halves)),
+            r"divide returned type tuple; expected \(mask, tensors, Geometry\)",
+        ),
+        (
+            splits,
+            dividing(lambda mask, halves, place: (mask, halves, None)),
+            r"divide returned a geometry of type NoneType",
+        ),
     ],
 )
 def test_what_a_method_returns_is_checked_by_name(act: Any, methods: dict[str, Any], message: str) -> None:
@@ -437,6 +501,10 @@ def test_a_right_division_is_taken() -> None:
 
 def test_a_colour_s_split_is_checked_too() -> None:
     m = model()
-    m.colour = type("Paint", (SphericalHarmonics,), {"on_split": lambda self, p, old, new: {"sh_dc": p["sh_dc"][:, :2]}})(0)
-    with pytest.raises(FormError, match=r"^colour field Paint: on_split: sh_dc has shape \(10, 2\); expected \(10, 3\)"):
+    m.colour = type(
+        "Paint", (SphericalHarmonics,), {"on_split": lambda self, p, old, new: {"sh_dc": p["sh_dc"][:, :2]}}
+    )(0)
+    with pytest.raises(
+        FormError, match=r"^colour field Paint: on_split: sh_dc has shape \(10, 2\); expected \(10, 3\)"
+    ):
         splits(m)

@@ -1,4 +1,5 @@
-"""The table of population strategies: one that stands there and nowhere else is chosen, run, recorded and resumed like the others."""
+"""The table of population strategies: one that stands there and nowhere else is chosen, run, recorded and resumed like
+the others."""
 
 from __future__ import annotations
 
@@ -59,9 +60,13 @@ def test_a_strategy_of_the_table_is_all_that_a_run_needs(third: type[Decimate], 
 
 
 def test_a_wrong_name_is_told_the_table(third: type[Decimate], tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"^train\.population\.strategy='decimat': expected fixed, relocate, gradient or decimate$"):
+    with pytest.raises(
+        ConfigError, match=r"^train\.population\.strategy='decimat': expected fixed, relocate, gradient or decimate$"
+    ):
         compose(words(tmp_path, "decimat"))
-    with pytest.raises(ConfigError, match=r"^train\.population\.strategy='grow': expected fixed, relocate, gradient or decimate$"):
+    with pytest.raises(
+        ConfigError, match=r"^train\.population\.strategy='grow': expected fixed, relocate, gradient or decimate$"
+    ):
         make_population(PopulationSettings(strategy="grow"))
 
 
@@ -69,13 +74,20 @@ def test_the_built_in_ones(tmp_path: Path) -> None:
     assert population.names() == ("fixed", "relocate", "gradient")
     for name in population.names():
         assert type(make_population(PopulationSettings(strategy=name))) is population.TABLE[name]
-    with pytest.raises(ConfigError, match=r"^train\.population\.strategy='none': expected fixed, relocate or gradient$"):
+    with pytest.raises(
+        ConfigError, match=r"^train\.population\.strategy='none': expected fixed, relocate or gradient$"
+    ):
         compose(words(tmp_path, "none"))
 
 
-def test_a_file_that_asks_for_another_is_refused(third: type[Decimate], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_asks_for_another_is_refused(
+    third: type[Decimate], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "config.yaml").write_text(compose(words(tmp_path, "decimate")).to_yaml())
     assert RunConfig.from_yaml(tmp_path / "config.yaml").train.population.strategy == "decimate"
     monkeypatch.delitem(population.TABLE, "decimate")
-    with pytest.raises(ConfigError, match=r"config\.yaml: train\.population\.strategy='decimate': expected fixed, relocate or gradient$"):
+    with pytest.raises(
+        ConfigError,
+        match=r"config\.yaml: train\.population\.strategy='decimate': expected fixed, relocate or gradient$",
+    ):
         RunConfig.from_yaml(tmp_path / "config.yaml")

@@ -83,7 +83,9 @@ def test_what_one_rank_finds_wrong_all_are_told(scene: Dataset) -> None:
     assert told[0].told and str(own[0]) in str(told[0])
 
 
-def test_a_gradient_of_the_sum_that_is_not_finite_is_all_ranks_error(scene: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gradient_of_the_sum_that_is_not_finite_is_all_ranks_error(
+    scene: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def work(group: Group) -> None:
         trainer = make(scene, group)
         look = trainer._go_back
@@ -99,7 +101,9 @@ def test_a_gradient_of_the_sum_that_is_not_finite_is_all_ranks_error(scene: Data
             pass
 
     found = together(2, work)
-    assert all(isinstance(error, NonFiniteError) and "gradient of means of primitive 4" in str(error) for error in found), found
+    assert all(
+        isinstance(error, NonFiniteError) and "gradient of means of primitive 4" in str(error) for error in found
+    ), found
 
 
 def test_a_rank_that_computes_otherwise_is_found_at_the_next_step(scene: Dataset) -> None:
@@ -110,7 +114,11 @@ def test_a_rank_that_computes_otherwise_is_found_at_the_next_step(scene: Dataset
                 trainer.model.params["means"].detach()[0, 0] += 1e-7
 
     for error in together(2, work):
-        assert isinstance(error, RankError) and "rank 1 does not compute as rank 0 does" in str(error) and "in step 4" in str(error)
+        assert (
+            isinstance(error, RankError)
+            and "rank 1 does not compute as rank 0 does" in str(error)
+            and "in step 4" in str(error)
+        )
 
 
 @pytest.mark.parametrize(

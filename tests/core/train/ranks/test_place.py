@@ -7,7 +7,14 @@ import pytest
 from neuprim.core.errors import ConfigError
 from neuprim.core.train.ranks.place import Place, place_of
 
-WHOLE = {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "host", "MASTER_PORT": "29500"}
+WHOLE = {
+    "RANK": "3",
+    "WORLD_SIZE": "4",
+    "LOCAL_RANK": "1",
+    "LOCAL_WORLD_SIZE": "2",
+    "MASTER_ADDR": "host",
+    "MASTER_PORT": "29500",
+}
 
 
 def test_a_place() -> None:

@@ -1,4 +1,5 @@
-"""Ranks that have a part of the primitives each train the whole model, bit for bit, and hold no more than their part of it."""
+"""Ranks that have a part of the primitives each train the whole model, bit for bit, and hold no more than their part of
+it."""
 
 from __future__ import annotations
 
@@ -131,7 +132,8 @@ def test_what_is_judged_is_drawn_with_everybodys_primitives(scene: Dataset) -> N
 def test_a_file_is_written_in_pieces_and_goes_on_with_any_number_of_ranks(
     scene: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Six views a step: by three ranks with a part each, by one process, by two ranks with a part each; and by one process throughout."""
+    """Six views a step: by three ranks with a part each, by one process, by two ranks with a part each; and by one
+    process throughout."""
     monkeypatch.setattr("neuprim.core.train.ranks.shards._PIECE", 16)
 
     def make(views: int) -> Trainer:
@@ -173,7 +175,9 @@ def test_at_the_end_the_whole_model_takes_the_place_of_a_part(scene: Dataset) ->
         return trainer
 
     for trainer in done(together(2, work)):
-        assert trainer.ranks is ALONE and trainer.count == trainer.model.count == 12 and len(trainer.optimizer.age) == 12
+        assert (
+            trainer.ranks is ALONE and trainer.count == trainer.model.count == 12 and len(trainer.optimizer.age) == 12
+        )
 
 
 def test_a_rank_that_dies_is_named(scene: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,7 +210,9 @@ def test_what_cannot_be_in_parts_is_refused(changes: dict[str, Any], ranks: int,
 
 def test_fewer_primitives_than_ranks_are_refused(scene: Dataset) -> None:
     for error in together(13, lambda group: share(tiny.trainer(scene), group)):
-        assert isinstance(error, ConfigError) and "12 primitives for 13 ranks; expected one for each at least" in str(error)
+        assert isinstance(error, ConfigError) and "12 primitives for 13 ranks; expected one for each at least" in str(
+            error
+        )
 
 
 @pytest.mark.parametrize(("count", "size"), [(7, 3), (12, 5), (4, 4), (1_000_003, 64)])

@@ -1,4 +1,5 @@
-"""Every task by two ranks, from its own preset, is what one process trains with two views a step; also where each has half of the primitives."""
+"""Every task by two ranks, from its own preset, is what one process trains with two views a step; also where each has
+half of the primitives."""
 
 from __future__ import annotations
 
@@ -17,7 +18,14 @@ from tests.shards import different, share, whole_of
 TASKS = {
     "static": ["scene=solids", "scene.size=24", "scene.train_views=8", "scene.test_views=2", "model.primitives=60"],
     "dynamic": [
-        *("scene=smoke_fire", "scene.size=24", "scene.resolution=16", "scene.timesteps=3", "scene.cameras=5", "model.primitives=60"),
+        *(
+            "scene=smoke_fire",
+            "scene.size=24",
+            "scene.resolution=16",
+            "scene.timesteps=3",
+            "scene.cameras=5",
+            "model.primitives=60",
+        ),
         *("train.supervision=both", "train.voxels_every=2", "train.voxels_per_step=200"),
     ],
     "relight": ["scene=lit_solids", "scene.size=24", "model.primitives=40"],

@@ -21,7 +21,13 @@ from tests.ranks import done, together
 STEPS = 30
 STRATEGIES: dict[str, dict[str, Any]] = {
     "relocate": {"strategy": "relocate", "fraction": 0.2, "grow_to": 16},
-    "gradient": {"strategy": "gradient", "grow_threshold": 1e-4, "prune_threshold": 1e-9, "clone_scale": 0.05, "max_primitives": 20},
+    "gradient": {
+        "strategy": "gradient",
+        "grow_threshold": 1e-4,
+        "prune_threshold": 1e-9,
+        "clone_scale": 0.05,
+        "max_primitives": 20,
+    },
 }
 
 
@@ -51,7 +57,8 @@ def same(a: Trainer, b: Trainer) -> None:
 
 
 def trained(size: int, make: Callable[[int], Trainer], views: int = 1) -> None:
-    """One process with all views a step, and ``size`` ranks with ``views`` each, end alike; and say alike what they did."""
+    """One process with all views a step, and ``size`` ranks with ``views`` each, end alike; and say alike what they
+    did."""
     alone = make(views * size)
     expected = list(alone.run())
     assert [r.change for r in expected if r.change], "the population must have changed, or the test says nothing of it"
@@ -73,13 +80,23 @@ def trained(size: int, make: Callable[[int], Trainer], views: int = 1) -> None:
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_ranks_are_one_process_with_as_many_views(size: int, views: int, strategy: str, scene: Dataset) -> None:
     more = {"warmup_steps": 5, "anisotropy_weight": 1e-3, "anisotropy_from": 10, "cooldown": 0.3}
-    trained(size, lambda looks: tiny.trainer(scene, STEPS, population=STRATEGIES[strategy], views_per_step=looks, **more), views)
+    trained(
+        size,
+        lambda looks: tiny.trainer(scene, STEPS, population=STRATEGIES[strategy], views_per_step=looks, **more),
+        views,
+    )
 
 
 def test_exposures_of_photographs_are_shared() -> None:
     dataset = photographs()
     # more views a step than there are: one is seen twice in a step
-    trained(4, lambda looks: tiny.trainer(dataset, STEPS, population=STRATEGIES["relocate"], views_per_step=looks, exposure_rate=0.02), 2)
+    trained(
+        4,
+        lambda looks: tiny.trainer(
+            dataset, STEPS, population=STRATEGIES["relocate"], views_per_step=looks, exposure_rate=0.02
+        ),
+        2,
+    )
 
 
 def test_a_budget_of_seconds_is_the_first_ranks(scene: Dataset) -> None:
@@ -137,6 +154,9 @@ def test_one_rank_that_is_asked_to_stop_stops_all_after_the_same_step(scene: Dat
 def test_voxels_alone_have_no_views_to_share(scene: Dataset) -> None:
     trainer = tiny.trainer(scene)
     trainer.settings = replace(trainer.settings, supervision="voxels")
-    with pytest.raises(ConfigError, match=r"train\.supervision=voxels: there are no views that 2 ranks could share; expected one process"):
+    with pytest.raises(
+        ConfigError,
+        match=r"train\.supervision=voxels: there are no views that 2 ranks could share; expected one process",
+    ):
         trainer.join(type("Two", (), {"size": 2})())
     trainer.join(ALONE)

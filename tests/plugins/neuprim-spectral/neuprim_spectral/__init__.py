@@ -36,7 +36,9 @@ TASK = TaskSpec(
     config_package="neuprim_spectral.conf",
     scenes=(
         SceneSpec("ball", "a ball of three belts, made on the spot", lambda settings, context: ball(**settings)),
-        SceneSpec("files", "EXR or .npy images of five bands, and cameras.json", lambda settings, context: files(**settings)),
+        SceneSpec(
+            "files", "EXR or .npy images of five bands, and cameras.json", lambda settings, context: files(**settings)
+        ),
     ),
     build=_build,
     loss=lambda settings: spectral_loss(settings["options"]["angle"]),

@@ -25,4 +25,6 @@ def parse_shift(text):
         raise ConfigError(f"--wavelength-shift {text}: expected a number from 0 to 1") from None
 
 
-SHIFT = ConditionSpec("wavelength_shift", (), "fraction of the distance of two bands", (0.0, 1.0), parse_shift, strict=True)
+SHIFT = ConditionSpec(
+    "wavelength_shift", (), "fraction of the distance of two bands", (0.0, 1.0), parse_shift, strict=True
+)

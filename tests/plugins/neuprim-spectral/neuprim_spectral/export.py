@@ -12,18 +12,24 @@ from neuprim_spectral.fields import spectrum
 def write(job):
     model = job.run.model
     if job.run.task.name != "spectral":
-        raise ConfigError(f"--format spectra: {job.run.directory} is a run of task {job.run.task.name!r}; expected 'spectral'")
+        raise ConfigError(
+            f"--format spectra: {job.run.directory} is a run of task {job.run.task.name!r}; expected 'spectral'"
+        )
     (conditions,) = job.frames()
     digits, most = job.count("digits", 0, 12), job.count("most", 1, 10**9)
     with torch.no_grad():
         geometry, _ = model.lower_density(conditions)
-        rows = torch.cat([geometry.means, spectrum(model.of(model.colour)["logit"], conditions["wavelength_shift"])], 1)[:most].tolist()
+        rows = torch.cat(
+            [geometry.means, spectrum(model.of(model.colour)["logit"], conditions["wavelength_shift"])], 1
+        )[:most].tolist()
     names = ("x", "y", "z", *BANDS)
     values = [[round(x, digits) for x in row] for row in rows]
     if job.out.suffix == ".json":
         write_json(job.out, [dict(zip(names, row, strict=True)) for row in values])
     else:
-        write_text(job.out, "\n".join([",".join(names), *(",".join(f"{x:.{digits}f}" for x in row) for row in values)]) + "\n")
+        write_text(
+            job.out, "\n".join([",".join(names), *(",".join(f"{x:.{digits}f}" for x in row) for row in values)]) + "\n"
+        )
     notes = (f"{len(values)} of {model.count} primitives; centres in scene units, linear light; no density",)
     return ExportReport((job.out,), lossless=False, notes=notes)
 

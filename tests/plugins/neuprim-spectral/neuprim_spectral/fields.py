@@ -31,13 +31,24 @@ class TwoScales(DensityField):
         return dict(self.units)
 
     def parameters(self):
-        specs = [ParameterSpec("offset", (1,), 1e-2, lambda c: torch.full((c.count, 1), -math.log1p(-c.number("alpha", 0.8, 0, 1)) / 2))]
+        specs = [
+            ParameterSpec(
+                "offset", (1,), 1e-2, lambda c: torch.full((c.count, 1), -math.log1p(-c.number("alpha", 0.8, 0, 1)) / 2)
+            )
+        ]
         for part, omega0 in _PARTS.items():
             K = self.units[part]
             bound = 4.0 / omega0
             specs += [
-                ParameterSpec(f"{part}_W1", (K, 3), 3e-2 / omega0, lambda c, K=K, bound=bound: c.uniform(K, 3, bound=bound)),
-                ParameterSpec(f"{part}_b1", (K,), 3e-2 / omega0, lambda c, K=K, omega0=omega0: c.uniform(K, bound=math.pi / omega0)),
+                ParameterSpec(
+                    f"{part}_W1", (K, 3), 3e-2 / omega0, lambda c, K=K, bound=bound: c.uniform(K, 3, bound=bound)
+                ),
+                ParameterSpec(
+                    f"{part}_b1",
+                    (K,),
+                    3e-2 / omega0,
+                    lambda c, K=K, omega0=omega0: c.uniform(K, bound=math.pi / omega0),
+                ),
                 ParameterSpec(f"{part}_w2", (K,), 1e-2, lambda c, K=K: c.uniform(K, bound=0.1)),
             ]
         return specs
@@ -45,7 +56,9 @@ class TwoScales(DensityField):
     def lower(self, params, geometry, conditions):
         coarse, fine = (
             Cosine(params[f"{part}_W1"], params[f"{part}_b1"], params[f"{part}_w2"], offset, omega0=omega0)
-            for (part, omega0), offset in zip(_PARTS.items(), (params["offset"], torch.zeros_like(params["offset"])), strict=True)
+            for (part, omega0), offset in zip(
+                _PARTS.items(), (params["offset"], torch.zeros_like(params["offset"])), strict=True
+            )
         )
         return coarse + fine
 
@@ -66,13 +79,15 @@ class TwoScales(DensityField):
 
 
 def spectrum(logit, shift):
-    """(N, C) linear colours of a primitive with logits (N, C + 1), each read ``shift`` (a number) of the way to the next one."""
+    """(N, C) linear colours of a primitive with logits (N, C + 1), each read ``shift`` (a number) of the way to the
+    next one."""
     values = logit.sigmoid()
     return torch.lerp(values[:, :-1], values[:, 1:], shift.to(values))
 
 
 class ShiftedSpectrum(ColourField):
-    """One spectrum per primitive, the same from all sides; a shift reads each band nearer to the next, the last nearer to one beyond."""
+    """One spectrum per primitive, the same from all sides; a shift reads each band nearer to the next, the last nearer
+    to one beyond."""
 
     def __init__(self, channels=5):
         self.channels = channels

@@ -1,6 +1,7 @@
 """Images of five bands from a folder: OpenEXR or .npy files, a mask each where there is one, and cameras.json.
 
-cameras.json is a transforms.json whose frames also say "file_path", "wavelength_shift" and perhaps "mask_path"; every eighth frame is held out.
+cameras.json is a transforms.json whose frames also say "file_path", "wavelength_shift" and perhaps "mask_path"; every
+eighth frame is held out.
 """
 
 import json
@@ -58,7 +59,9 @@ def _frames(folder):
     where = folder / "cameras.json"
     cameras = read_cameras(where)
     frames = []
-    for index, (record, (name, camera)) in enumerate(zip(json.loads(where.read_text())["frames"], cameras, strict=True)):
+    for index, (record, (name, camera)) in enumerate(
+        zip(json.loads(where.read_text())["frames"], cameras, strict=True)
+    ):
         shift = record.get("wavelength_shift")
         if not isinstance(shift, int | float) or not 0 <= shift <= 1:
             raise DataError(f"{where}: frame {index}: wavelength_shift is {shift!r}; expected a number from 0 to 1")

@@ -1,4 +1,5 @@
-"""Absolute differences and the angle between spectra, of the pixels that count; views that are shifted more count less."""
+"""Absolute differences and the angle between spectra, of the pixels that count; views that are shifted more count
+less."""
 
 
 def spectral_loss(weight):

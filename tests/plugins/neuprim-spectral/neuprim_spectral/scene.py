@@ -1,4 +1,5 @@
-"""A ball of three belts that reflect different wavelengths, ray-cast on the spot, with the bands shifted from view to view."""
+"""A ball of three belts that reflect different wavelengths, ray-cast on the spot, with the bands shifted from view to
+view."""
 
 import torch
 

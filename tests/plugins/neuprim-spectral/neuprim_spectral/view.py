@@ -14,7 +14,9 @@ def bands(frame):
     if "logit" not in model.params or "wavelength_shift" not in frame.conditions:
         raise ConfigError("--show bands: the model has no spectra, or --wavelength-shift is missing")
     with torch.no_grad():
-        best = spectrum(model.params["logit"], frame.conditions["wavelength_shift"]).argmax(1)[torch.as_tensor(frame.alive)]
+        best = spectrum(model.params["logit"], frame.conditions["wavelength_shift"]).argmax(1)[
+            torch.as_tensor(frame.alive)
+        ]
     scale = Scale(0, len(BANDS) - 1, "viridis", "strongest band")
     return [Points(frame.geometry.means.detach().numpy(), values=best.numpy(), scale=scale)]
 

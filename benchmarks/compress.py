@@ -23,7 +23,7 @@ from shared.tables import Table, spread
 
 from neuprim.config import RunConfig
 from neuprim.core.checkpoint import load_model, save_compressed
-from neuprim.core.compressed import LEVELS, bit_table
+from neuprim.core.compression import LEVELS, bit_table
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.measure import quality

@@ -146,7 +146,7 @@ def measure(rounds: int, group: Any) -> dict[str, Any]:
     from shared.synthetic import random_trainer
 
     from neuprim.core.render.frustum import in_sight
-    from neuprim.core.train.ranks.shards import Shards
+    from neuprim.core.train.distributed.shards import Shards
     from neuprim.runs.fit import one_torch_thread
 
     with group.in_turn():  # kernels are compiled once
@@ -219,9 +219,9 @@ def measure(rounds: int, group: Any) -> dict[str, Any]:
 
 def worker(rounds: int, out: Path) -> None:
     """What each process of the torchrun does."""
-    from neuprim.core.train.ranks.group import Group
-    from neuprim.core.train.ranks.place import place_of
-    from neuprim.core.train.ranks.wire import Wire
+    from neuprim.core.train.distributed.group import Group
+    from neuprim.core.train.distributed.place import place_of
+    from neuprim.core.train.distributed.wire import Wire
 
     place = place_of()
     assert place is not None and place.size == 2

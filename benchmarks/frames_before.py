@@ -33,8 +33,8 @@ CHILD = """
 import hashlib, json, statistics, sys, time
 from pathlib import Path
 from neuprim.runs.fit import one_torch_thread
-from neuprim.runs.tradeoff.measure import Models
-from neuprim.runs.tradeoff.subject import load_subject
+from neuprim.search.tradeoff.measure import Models
+from neuprim.search.tradeoff.subject import load_subject
 
 with one_torch_thread():
     subject = load_subject(Path(sys.argv[1]), ["renderer.threads=1"], 5)

@@ -23,8 +23,8 @@ from shared.tables import ROOT, Table, between_markers
 
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.io.files import write_json
-from neuprim.runs.design.run import DesignRequest, design_run
-from neuprim.runs.tradeoff.run import seconds_of
+from neuprim.search.design.run import DesignRequest, design_run
+from neuprim.search.tradeoff.run import seconds_of
 
 VIEWS = 25
 """Held-out views, evenly spread: as many as the chair has."""

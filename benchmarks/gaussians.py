@@ -42,8 +42,8 @@ from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.plugins.export.appearance import Harmonics
-from neuprim.plugins.export.gaussians import SIZES, Gaussians, draw_gaussians, fit_gaussians
+from neuprim.export.appearance import Harmonics
+from neuprim.export.gaussians import SIZES, Gaussians, draw_gaussians, fit_gaussians
 from neuprim.runs.export import export_run
 from neuprim.runs.run import run
 from neuprim.tasks.static.fields import SphericalHarmonics

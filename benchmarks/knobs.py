@@ -26,13 +26,13 @@ from shared.tables import ROOT, Table, between_markers
 
 from neuprim.config import compose
 from neuprim.core.compute.machine import cpu_name
-from neuprim.runs.design.record import Model
-from neuprim.runs.design.run import DesignRequest, design_run
-from neuprim.runs.design.variants import CENTRE
 from neuprim.runs.run import run
-from neuprim.runs.tradeoff.knobs import COMBINED
-from neuprim.runs.tradeoff.record import Measured
-from neuprim.runs.tradeoff.run import Request, seconds_of, tradeoff_run
+from neuprim.search.design.record import Model
+from neuprim.search.design.run import DesignRequest, design_run
+from neuprim.search.design.variants import CENTRE
+from neuprim.search.tradeoff.knobs import COMBINED
+from neuprim.search.tradeoff.record import Measured
+from neuprim.search.tradeoff.run import Request, seconds_of, tradeoff_run
 
 RESULTS = Path(__file__).parent / "results" / "knobs.json"
 NAMES = {"chair": "chair, 200×200", "smoke_fire": "`smoke_fire`, 64×64", "lit_solids": "`lit_solids`, 128×128"}

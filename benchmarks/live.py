@@ -29,8 +29,8 @@ from neuprim.config.viewer import ViewerSettings
 from neuprim.core.train.trainer import StepReport
 from neuprim.runs.events import Events, Step, silent
 from neuprim.runs.fit import Fitted, one_torch_thread, start, steps
-from neuprim.runs.live.training import LiveTraining
 from neuprim.runs.training import Between, alone, make_ready
+from neuprim.viewer.training import LiveTraining
 
 _IDLE = 5.0  # seconds
 _CALLS = 20_000

@@ -118,9 +118,9 @@ def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, An
 
 def worker(scenes: list[str], rounds: int, seconds: float, out: Path) -> None:
     """What each process of the torchrun does."""
-    from neuprim.core.train.ranks.group import Group
-    from neuprim.core.train.ranks.place import place_of
-    from neuprim.core.train.ranks.wire import Wire
+    from neuprim.core.train.distributed.group import Group
+    from neuprim.core.train.distributed.place import place_of
+    from neuprim.core.train.distributed.wire import Wire
 
     place = place_of()
     assert place is not None and place.size == 2

@@ -45,7 +45,7 @@ def measure(way: str, inside: bool, primitives: int, size: int, group: Any) -> d
     import torch
     from shared.synthetic import random_trainer
 
-    from neuprim.core.train.ranks.shards import Shards
+    from neuprim.core.train.distributed.shards import Shards
 
     torch.set_num_threads(1)
     random_trainer(100, size, 10).train_step()  # what it needs at all: code and kernels
@@ -80,9 +80,9 @@ def measure(way: str, inside: bool, primitives: int, size: int, group: Any) -> d
 
 
 def worker(way: str, inside: bool, primitives: int, size: int, out: Path) -> None:
-    from neuprim.core.train.ranks.group import Group
-    from neuprim.core.train.ranks.place import place_of
-    from neuprim.core.train.ranks.wire import Wire
+    from neuprim.core.train.distributed.group import Group
+    from neuprim.core.train.distributed.place import place_of
+    from neuprim.core.train.distributed.wire import Wire
 
     place = place_of()
     group = None if place is None else Group(place, Wire(place, os.environ))

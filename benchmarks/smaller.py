@@ -41,13 +41,13 @@ from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.train.sensitivity import sensitivity
-from neuprim.runs.compress import compress_run
 from neuprim.runs.finetune import fine_tuner
 from neuprim.runs.measure import quality
 from neuprim.runs.open import load_dataset, load_run, read_metrics
-from neuprim.runs.prune.judge import Judge
-from neuprim.runs.prune.run import Request, prune_run
 from neuprim.runs.run import run
+from neuprim.search.compress import compress_run
+from neuprim.search.prune.judge import Judge
+from neuprim.search.prune.run import Request, prune_run
 
 RESULTS = Path(__file__).parent / "results" / "smaller.json"
 RUNS = ROOT / "outputs" / "smaller"

@@ -34,15 +34,15 @@ from shared.tables import ROOT, Table, between_markers
 from neuprim.config import compose, task_of
 from neuprim.config.target import Target
 from neuprim.core.checkpoint import load_model, save_compressed
-from neuprim.core.compressed import USUAL_LEVEL, bit_table
+from neuprim.core.compression import USUAL_LEVEL, bit_table
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.io.files import write_json
 from neuprim.runs.events import Event, Note
 from neuprim.runs.open import load_dataset
-from neuprim.runs.target import target_run
-from neuprim.runs.target.run import hold_out
-from neuprim.runs.target.trying import VIEWS
-from neuprim.runs.trials import Trial, run_trial
+from neuprim.search.target import target_run
+from neuprim.search.target.run import hold_out
+from neuprim.search.target.trying import VIEWS
+from neuprim.search.trials import Trial, run_trial
 
 RESULTS = Path(__file__).parent / "results" / "target.json"
 

@@ -32,7 +32,7 @@ import torch
 from shared.tables import ROOT, Table, between_markers, spread
 
 from neuprim.config import compose
-from neuprim.core.compressed import order as curve
+from neuprim.core.compression import order as curve
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.fit import Fitted, compile_kernels, complete, start

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from neuprim.core.compressed import BitTable, Schemes, file_order, folded, schemes
+from neuprim.core.compression import BitTable, Schemes, file_order, folded, schemes
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import ColourField, DensityField, pieces_by_name

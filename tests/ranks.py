@@ -13,8 +13,8 @@ import torch.distributed as dist
 from torch import Tensor
 
 from neuprim.core.errors import RankError
-from neuprim.core.train.ranks.group import Group
-from neuprim.core.train.ranks.place import Place
+from neuprim.core.train.distributed.group import Group
+from neuprim.core.train.distributed.place import Place
 
 T = TypeVar("T")
 

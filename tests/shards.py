@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from neuprim.core.train.ranks.group import Group
-from neuprim.core.train.ranks.shards import Shards
+from neuprim.core.train.distributed.group import Group
+from neuprim.core.train.distributed.shards import Shards
 from neuprim.core.train.restoring import by_row
 from neuprim.core.train.trainer import Trainer
 

@@ -222,7 +222,7 @@ def _run(args: argparse.Namespace) -> int:
     from neuprim.config.overrides import Typed, without_place
     from neuprim.config.target import target_words
     from neuprim.config.viewer import viewer_words
-    from neuprim.core.train.ranks.place import place_of
+    from neuprim.core.train.distributed.place import place_of
     from neuprim.runs.chunks.asked import asked, refuse_chunks
 
     place = place_of()
@@ -354,7 +354,7 @@ def _import(args: argparse.Namespace) -> int:
 def _inspect(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
     from neuprim.cli.progress import print_notes
-    from neuprim.plugins.inspect import ViewOptions, corners
+    from neuprim.inspect import ViewOptions, corners
     from neuprim.runs.inspect import Request, inspect_run
 
     names = [name.strip() for name in args.show.split(",") if name.strip()]

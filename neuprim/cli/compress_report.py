@@ -7,7 +7,7 @@ from pathlib import Path
 
 from neuprim.cli.console import plain_console
 from neuprim.cli.progress import LineProgress
-from neuprim.runs.compress import Compression, compress_run
+from neuprim.search.compress import Compression, compress_run
 
 __all__ = ["compress", "print_compression"]
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from neuprim.cli import arguments
 
 if TYPE_CHECKING:
-    from neuprim.runs.prune.run import Pruning
+    from neuprim.search.prune.run import Pruning
 
 __all__ = ["for_prune", "prune"]
 
@@ -38,7 +38,7 @@ def prune(args: argparse.Namespace) -> int:
     """Prunes, writes a run directory and prints what became of the model."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
-    from neuprim.runs.prune.run import Request, prune_run
+    from neuprim.search.prune.run import Request, prune_run
 
     request = Request(args.run_dir, args.tolerance, args.seconds, args.steps, args.out, args.force)
     with DrawProgress(plain_console(stderr=True)) as progress:

@@ -17,8 +17,8 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, RankError, one_
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
-    from neuprim.core.train.ranks.group import Group
-    from neuprim.core.train.ranks.place import Place
+    from neuprim.core.train.distributed.group import Group
+    from neuprim.core.train.distributed.place import Place
 
 __all__ = ["run_as_rank"]
 
@@ -33,8 +33,8 @@ def run_as_rank(place: Place, words: list[str], more: bool) -> int:
         more: whether anything but one run is asked for.
     """
     from neuprim.core.compute.threads import machine_cores, sharing
-    from neuprim.core.train.ranks.group import Group
-    from neuprim.core.train.ranks.wire import Wire
+    from neuprim.core.train.distributed.group import Group
+    from neuprim.core.train.distributed.wire import Wire
 
     group = Group(place, Wire(place, os.environ))
     failed = True

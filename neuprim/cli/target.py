@@ -14,9 +14,9 @@ from neuprim.config.launcher import LauncherSettings
 from neuprim.config.overrides import Typed
 from neuprim.config.target import Target
 from neuprim.runs.events import Event, Note, Step
-from neuprim.runs.target import Record, target_run
-from neuprim.runs.target.record import FILE
-from neuprim.runs.target.words import promised
+from neuprim.search.target import Record, target_run
+from neuprim.search.target.record import FILE
+from neuprim.search.target.words import promised
 
 __all__ = ["fit_target", "print_record"]
 

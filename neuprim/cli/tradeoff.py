@@ -13,7 +13,7 @@ from neuprim.core.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from neuprim.runs.tradeoff.record import Measured, Record
+    from neuprim.search.tradeoff.record import Measured, Record
 
 __all__ = ["FORMS", "for_tradeoff", "of_words", "tradeoff"]
 
@@ -57,8 +57,8 @@ def tradeoff(args: argparse.Namespace) -> int:
     """Measures, writes RUN_DIR/tradeoff and prints the fronts."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
-    from neuprim.runs.tradeoff.record import command
-    from neuprim.runs.tradeoff.run import FOLDER, Request, seconds_of, tradeoff_run
+    from neuprim.search.tradeoff.record import command
+    from neuprim.search.tradeoff.run import FOLDER, Request, seconds_of, tradeoff_run
 
     words = [*args.words, *(word for word in args.knobs if "=" in word)]  # after --knobs they look like names
     knobs = [word for word in args.knobs if "=" not in word]

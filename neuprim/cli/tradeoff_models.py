@@ -11,7 +11,7 @@ from neuprim.core.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from neuprim.runs.design.record import Model
+    from neuprim.search.design.record import Model
 
 __all__ = ["tradeoff_models"]
 
@@ -24,9 +24,9 @@ def tradeoff_models(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.config.launcher import launcher_words
     from neuprim.config.overrides import parse
-    from neuprim.runs.design.record import Model, command
-    from neuprim.runs.design.run import DesignRequest, design_run
-    from neuprim.runs.tradeoff.run import seconds_of
+    from neuprim.search.design.record import Model, command
+    from neuprim.search.design.run import DesignRequest, design_run
+    from neuprim.search.tradeoff.run import seconds_of
 
     words = [
         args.run_dir,

@@ -33,7 +33,7 @@ def view(args: argparse.Namespace) -> int:
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import LineProgress
     from neuprim.config.viewer import ViewerSettings
-    from neuprim.runs.live.view import view_run
+    from neuprim.viewer.view import view_run
 
     settings = ViewerSettings(port=args.port) if args.host is None else ViewerSettings(args.host, args.port)
     _warn_of_others(settings)
@@ -58,8 +58,8 @@ def view(args: argparse.Namespace) -> int:
 def run_viewed(config: RunConfig, events: RunProgress, settings: ViewerSettings) -> Path:
     """``neuprim run`` with a page beside the training; raises as :func:`neuprim.runs.run.run`."""
     from neuprim.runs.events import Note
-    from neuprim.runs.live.training import LiveTraining
     from neuprim.runs.run import run
+    from neuprim.viewer.training import LiveTraining
 
     _warn_of_others(settings)
     with LiveTraining(settings, config, lambda address: events(Note(f"the viewer is at {address}")), events) as live:
@@ -69,7 +69,7 @@ def run_viewed(config: RunConfig, events: RunProgress, settings: ViewerSettings)
 def _warn_of_others(settings: ViewerSettings) -> None:
     """A page that others can reach is worth a word."""
     from neuprim.config.viewer import LOOPBACK
-    from neuprim.runs.live.server import is_loopback
+    from neuprim.viewer.server import is_loopback
 
     if is_loopback(settings.host):
         return

@@ -17,7 +17,7 @@ from neuprim.config.record import RunConfig
 from neuprim.core.checked import shown
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.notices import warn_once
-from neuprim.core.train.ranks.place import place_of
+from neuprim.core.train.distributed.place import place_of
 from neuprim.plugins.mechanism import Group, UnknownPlugin
 from neuprim.plugins.names import qualified, split
 from neuprim.plugins.provenance import Maker, missing

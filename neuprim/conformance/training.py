@@ -13,7 +13,7 @@ from torch import Tensor
 from neuprim.conformance.subject import ConformanceError, Subject
 from neuprim.core import checkpoint
 from neuprim.core.channels import channels_of
-from neuprim.core.compressed import LEVELS, folded
+from neuprim.core.compression import LEVELS, folded
 from neuprim.core.data import Dataset
 from neuprim.core.data import check as data_check
 from neuprim.core.errors import CheckpointError

@@ -1,7 +1,7 @@
 """Models and checkpoints on disk: safetensors with one JSON header. Nothing in a file is ever executed.
 
 A *model* holds what rendering needs and nothing else; a *checkpoint* holds the exact training state. A model may also
-be a compressed file (:mod:`neuprim.core.compressed`), which its first bytes tell; whatever reads models here reads
+be a compressed file (:mod:`neuprim.core.compression`), which its first bytes tell; whatever reads models here reads
 both.
 """
 
@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from neuprim.core import compressed
+from neuprim.core import compression
 from neuprim.core.errors import CheckpointError, cut, nearest
 from neuprim.core.io.files import atomic_path
 from neuprim.core.io.pieces import Kind, write_pieces
@@ -71,8 +71,8 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
     Raises:
         CheckpointError: missing, truncated, foreign or of another format version.
     """
-    if compressed.is_compressed(path):
-        return _checked(path, compressed.read_head(path), kind)
+    if compression.is_compressed(path):
+        return _checked(path, compression.read_head(path), kind)
     try:
         with safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}
@@ -149,8 +149,8 @@ def read(
     Raises:
         CheckpointError: see :func:`read_header`.
     """
-    if compressed.is_compressed(path):
-        header, tensors, _ = compressed.read_compressed(path)
+    if compression.is_compressed(path):
+        header, tensors, _ = compression.read_compressed(path)
         return _checked(path, header, kind), tensors
     header = read_header(path, kind)
     try:
@@ -185,9 +185,9 @@ def save_compressed(
     model: Primitives,
     task: str,
     extra: Mapping[str, Any],
-    bits: compressed.BitTable | compressed.Schemes,
+    bits: compression.BitTable | compression.Schemes,
     config: str | None = None,
-) -> dict[str, compressed.Stored]:
+) -> dict[str, compression.Stored]:
     """As :func:`save_model`, in few bits; returns what the file has of every parameter.
 
     Args:
@@ -197,17 +197,17 @@ def save_compressed(
     Raises:
         CheckpointError: numbers that cannot be stored, or the file could not be written; names it and the reason.
     """
-    if isinstance(bits, compressed.BitTable):
-        model = compressed.folded(model)
-        made = compressed.schemes(model, bits)
+    if isinstance(bits, compression.BitTable):
+        model = compression.folded(model)
+        made = compression.schemes(model, bits)
     else:
         made = bits
-    sections = compressed.encode(model, made)
+    sections = compression.encode(model, made)
     if config is not None:
-        sections.insert(0, compressed.Section(compressed.CONFIG, compressed.TEXT, (), planes=(config.encode(),)))
+        sections.insert(0, compression.Section(compression.CONFIG, compression.TEXT, (), planes=(config.encode(),)))
     header = {"format": FORMAT, "kind": "model", **model_header(model, task, extra)}
-    sizes = compressed.write_compressed(path, header, model.count, sections)
-    return {name: compressed.Stored(compressed.bits_in_words(scheme), sizes[name]) for name, scheme in made.items()}
+    sizes = compression.write_compressed(path, header, model.count, sections)
+    return {name: compression.Stored(compression.bits_in_words(scheme), sizes[name]) for name, scheme in made.items()}
 
 
 def stored_config(path: Path) -> str | None:
@@ -216,7 +216,7 @@ def stored_config(path: Path) -> str | None:
     Raises:
         CheckpointError: see :func:`read_header`.
     """
-    return compressed.read_compressed(path)[2]
+    return compression.read_compressed(path)[2]
 
 
 def model_header(model: Primitives, task: str, extra: Mapping[str, Any]) -> dict[str, Any]:

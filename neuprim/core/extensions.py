@@ -198,8 +198,8 @@ class Inspector:
     """A way of showing a density in ``neuprim inspect --show NAME``; group ``neuprim.inspectors``.
 
     Attributes:
-        layers: a :class:`~neuprim.plugins.inspect.field.FieldFrame` -> a list of layers of
-        :mod:`neuprim.plugins.inspect.layers`, which
+        layers: a :class:`~neuprim.inspect.field.FieldFrame` -> a list of layers of
+        :mod:`neuprim.inspect.layers`, which
             a window, a picture, a film and a page draw; called once per frame and panel.
         shows: "sigma" for the extinction on the frame's grid, asked a second time with the ground truth where there is
         one; "model"

@@ -13,7 +13,7 @@ import torch
 
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
-from neuprim.core.compressed import is_compressed
+from neuprim.core.compression import is_compressed
 from neuprim.core.conditions import flag, named, read_conditions, split_words
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel

@@ -20,8 +20,8 @@ from neuprim.core.model.less import fewer_fields
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.core.task import Loss, TaskSpec
+from neuprim.core.train.distributed.refusals import refuse_parts
 from neuprim.core.train.initial import initial_model
-from neuprim.core.train.ranks.refusals import refuse_parts
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.core.uses import build_settings, loss_settings

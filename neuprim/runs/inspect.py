@@ -21,15 +21,15 @@ from neuprim.core.render.backends import computing_device
 from neuprim.core.volumes.errors import frame_errors
 from neuprim.core.volumes.grid import POINTS_LIMIT, density_grid, lattice
 from neuprim.core.volumes.truth import DensityTruth
+from neuprim.inspect.against import open_truth, pair, write_volume
+from neuprim.inspect.field import FieldFrame, ViewOptions
+from neuprim.inspect.frames import box_of, condition_frames, in_words, round_up
+from neuprim.inspect.headless import has_display, prepare_headless, require_pyvista
+from neuprim.inspect.layer_checks import fault
+from neuprim.inspect.layers import Layer
+from neuprim.inspect.page import write_page
+from neuprim.inspect.window import Window, panels_of
 from neuprim.plugins.blame import reported
-from neuprim.plugins.inspect.against import open_truth, pair, write_volume
-from neuprim.plugins.inspect.field import FieldFrame, ViewOptions
-from neuprim.plugins.inspect.frames import box_of, condition_frames, in_words, round_up
-from neuprim.plugins.inspect.headless import has_display, prepare_headless, require_pyvista
-from neuprim.plugins.inspect.layer_checks import fault
-from neuprim.plugins.inspect.layers import Layer
-from neuprim.plugins.inspect.page import write_page
-from neuprim.plugins.inspect.window import Window, panels_of
 from neuprim.plugins.registry import INSPECTORS, PluginError, load_inspector
 from neuprim.runs.events import Events, Note, silent
 from neuprim.runs.kept import PRUNED, kept_pieces, kept_words

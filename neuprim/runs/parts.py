@@ -17,8 +17,8 @@ from neuprim.config import RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.errors import CheckpointError
 from neuprim.core.io.pieces import Kind, in_order
-from neuprim.core.train.ranks import Alone
-from neuprim.core.train.ranks.refusals import refuse_parts
+from neuprim.core.train.distributed import Alone
+from neuprim.core.train.distributed.refusals import refuse_parts
 from neuprim.core.train.restoring import by_row, by_row_name
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import Fitted
@@ -35,7 +35,7 @@ def in_parts(config: RunConfig, ranks: Alone) -> Alone:
     if not config.train.shard:
         return ranks
     refuse_parts(config.train, ranks.size)
-    from neuprim.core.train.ranks.shards import shards_of
+    from neuprim.core.train.distributed.shards import shards_of
 
     near = config.renderer.near
     return shards_of(ranks, 0.0 if near == "auto" else near)  # decided later, and with less culled images are the same

@@ -8,7 +8,7 @@ from pathlib import Path
 from neuprim.config import RunConfig, suspects_of
 from neuprim.config.launcher import LauncherSettings
 from neuprim.core.metrics.words import in_words
-from neuprim.core.train.ranks import ALONE, Alone
+from neuprim.core.train.distributed import ALONE, Alone
 from neuprim.runs.chunks.asked import asked, refuse_chunks
 from neuprim.runs.chunks.train import train_in_chunks
 from neuprim.runs.events import Events, Finishing, Note, silent

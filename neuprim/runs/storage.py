@@ -1,6 +1,6 @@
 """How a model's numbers may be stored, and what comes back of them: the one table of formats. A new one is a row here.
 
-A model file of neuprim holds float32, unless it was compressed (:mod:`neuprim.core.compressed`). What it would be
+A model file of neuprim holds float32, unless it was compressed (:mod:`neuprim.core.compression`). What it would be
 otherwise is tried in memory: values are rounded to what the format brings back, and its bytes are counted.
 """
 
@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.checkpoint import read_header
-from neuprim.core.compressed import is_compressed
-from neuprim.core.compressed.columns import fit_columns
+from neuprim.core.compression import is_compressed
+from neuprim.core.compression.columns import fit_columns
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.model.primitives import Primitives

@@ -21,7 +21,7 @@ from neuprim.core.io.files import write_text
 from neuprim.core.model.edge import EDGES
 from neuprim.core.notices import warn_once
 from neuprim.core.render.backends import choose, compiled_ahead
-from neuprim.core.train.ranks import ALONE, Alone
+from neuprim.core.train.distributed import ALONE, Alone
 from neuprim.core.train.restoring import part
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.blame import Suspects
@@ -119,7 +119,7 @@ def make_ready(trainer: Trainer, events: Events = silent) -> None:
 
 
 def _begun(trainer: Trainer) -> dict[str, Any]:
-    from neuprim.core.train.ranks.beginning import beginning
+    from neuprim.core.train.distributed.beginning import beginning
 
     return beginning(trainer)
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from neuprim.core.compressed import bit_table, file_order, folded, schemes
-from neuprim.core.compressed.rotations import Rotations
-from neuprim.core.compressed.sections import COLUMNS, ROTATIONS, pack
+from neuprim.core.compression import bit_table, file_order, folded, schemes
+from neuprim.core.compression.rotations import Rotations
+from neuprim.core.compression.sections import COLUMNS, ROTATIONS, pack
 from neuprim.core.model.primitives import Primitives
 
 __all__ = ["PackedModel", "pack_model"]

@@ -14,9 +14,9 @@ from neuprim.cli.ranks import _choose_card, _composed, run_as_rank
 from neuprim.config import compose
 from neuprim.core.compute import threads
 from neuprim.core.errors import BackendUnavailable, ConfigError, RankError
-from neuprim.core.train.ranks import wire
-from neuprim.core.train.ranks.group import Group
-from neuprim.core.train.ranks.place import Place
+from neuprim.core.train.distributed import wire
+from neuprim.core.train.distributed.group import Group
+from neuprim.core.train.distributed.place import Place
 from tests.ranks import Threads, done, together
 
 WORDS = ["task=static", "scene=solids"]

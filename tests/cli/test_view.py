@@ -68,7 +68,7 @@ def test_an_address_that_others_reach_is_warned_of(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("viser", reason="the package viser is not installed")
-    monkeypatch.setattr("neuprim.runs.live.view.view_run", lambda *args: None)
+    monkeypatch.setattr("neuprim.viewer.view.view_run", lambda *args: None)
     assert main(["view", str(run_dir), "--host", "0.0.0.0"]) == 0
     error = capsys.readouterr().err
     assert "reached from other machines, without encryption" in error and "ssh -L 8080:127.0.0.1:8080" in error

@@ -331,7 +331,7 @@ def _run(folder: Path) -> None:
 
 def _compressed(folder: Path) -> None:
     from neuprim.core import checkpoint
-    from neuprim.core.compressed import LEVELS
+    from neuprim.core.compression import LEVELS
     from tests.compressing import example, without_pieces
 
     for name, model in (("whole", example("static", 20)[1]), ("pruned", without_pieces(example("static", 20)[1]))):
@@ -364,12 +364,12 @@ def _records(folder: Path) -> None:
     from neuprim.runs.chunks.record import Row as Chunk
     from neuprim.runs.launch.status import Status, write_status
     from neuprim.runs.sweep.record import Row, SweepRecord
-    from neuprim.runs.target.record import Record as TargetRecord
-    from neuprim.runs.target.record import Turn
-    from neuprim.runs.tradeoff.knobs import LeftOut
-    from neuprim.runs.tradeoff.record import Measured, Record
-    from neuprim.runs.trials import Outcome
-    from tests.runs.target_records import attempt
+    from neuprim.search.target.record import Record as TargetRecord
+    from neuprim.search.target.record import Turn
+    from neuprim.search.tradeoff.knobs import LeftOut
+    from neuprim.search.tradeoff.record import Measured, Record
+    from neuprim.search.trials import Outcome
+    from tests.search.target_records import attempt
 
     _run(folder)
     view = {"name": "a", "psnr": 20.0, "ssim": 0.9}
@@ -404,15 +404,16 @@ def _records(folder: Path) -> None:
 
 def _read_records(folder: Path) -> None:
     from neuprim.core.train.settings import TrainSettings
-    from neuprim.runs import curve, trials
+    from neuprim.runs import curve
     from neuprim.runs.chunks.record import read_record as read_chunks
     from neuprim.runs.launch.status import read_status
-    from neuprim.runs.live.levels import read_front
     from neuprim.runs.sweep.record import read_sweep
     from neuprim.runs.sweep.rows import sweep_rows, write_csv
-    from neuprim.runs.target.record import read_record as read_target
-    from neuprim.runs.tradeoff.record import read_record
-    from neuprim.runs.tradeoff.record import write_csv as write_points
+    from neuprim.search import trials
+    from neuprim.search.target.record import read_record as read_target
+    from neuprim.search.tradeoff.record import read_record
+    from neuprim.search.tradeoff.record import write_csv as write_points
+    from neuprim.viewer.levels import read_front
 
     _read_run(folder)
     curve.read_curve(folder / "run/metrics.jsonl", TrainSettings())

@@ -36,7 +36,7 @@ PLUGIN = Exporter(api=1, name="centres", summary="centres as JSON", write=write)
 
 INSPECTOR = """
 from neuprim.core.extensions import Inspector
-from neuprim.plugins.inspect.layers import Points
+from neuprim.inspect.layers import Points
 
 PLUGIN = Inspector(api=1, name="crumbs", summary="points", layers=lambda frame: [Points(frame.box)])
 """

@@ -21,10 +21,10 @@ from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.initial import initial_model
 from neuprim.core.train.settings import ModelSettings
-from neuprim.plugins.export import appearance
-from neuprim.plugins.export.appearance import Harmonics, harmonics_of
-from neuprim.plugins.export.gaussian_ply import LAYOUT
-from neuprim.plugins.export.gaussians import SIZES, Gaussians, draw_gaussians, fit_gaussians
+from neuprim.export import appearance
+from neuprim.export.appearance import Harmonics, harmonics_of
+from neuprim.export.gaussian_ply import LAYOUT
+from neuprim.export.gaussians import SIZES, Gaussians, draw_gaussians, fit_gaussians
 from neuprim.plugins.registry import load_task
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run

@@ -12,8 +12,8 @@ import torch
 
 from neuprim.core.compute import device
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.plugins.export import appearance, mesh
-from neuprim.plugins.export.mesh import best_level
+from neuprim.export import appearance, mesh
+from neuprim.export.mesh import best_level
 from neuprim.runs.export import export_run
 from tests.plugins import marked
 

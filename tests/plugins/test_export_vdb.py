@@ -16,7 +16,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import Grid, read_grid
 from neuprim.core.volumes.errors import NUMBERS
 from neuprim.core.volumes.grid import density_grid
-from neuprim.plugins.export import vdb as exporter
+from neuprim.export import vdb as exporter
 from neuprim.runs.export import export_run
 from neuprim.runs.inspect import Request, inspect_run
 from neuprim.runs.open import open_run

@@ -18,12 +18,12 @@ from neuprim.core.extensions import Inspector
 from neuprim.core.io.vdb import read_grid
 from neuprim.core.volumes.errors import NUMBERS
 from neuprim.core.volumes.grid import density_at, density_grid, lattice
-from neuprim.plugins.inspect import ViewOptions, headless, views
-from neuprim.plugins.inspect.field import FieldFrame
-from neuprim.plugins.inspect.frames import box_of, condition_frames, corners, in_words, round_up
-from neuprim.plugins.inspect.layers import Scale
-from neuprim.plugins.inspect.packing import encoded
-from neuprim.plugins.inspect.shapes import ellipsoids
+from neuprim.inspect import ViewOptions, headless, views
+from neuprim.inspect.field import FieldFrame
+from neuprim.inspect.frames import box_of, condition_frames, corners, in_words, round_up
+from neuprim.inspect.layers import Scale
+from neuprim.inspect.packing import encoded
+from neuprim.inspect.shapes import ellipsoids
 from neuprim.plugins.registry import load_task
 from neuprim.runs import inspect as inspecting
 from neuprim.runs.events import Event, Note

@@ -17,14 +17,14 @@ from neuprim.cli import main
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
-from neuprim.plugins.inspect import window
-from neuprim.plugins.inspect.field import FieldFrame, ViewOptions
-from neuprim.plugins.inspect.headless import prepare_headless
-from neuprim.plugins.inspect.layer_checks import fault
-from neuprim.plugins.inspect.layers import Ellipsoids, Isosurfaces, Lines, Mesh, Points, Scale, Slices, Text, Volume
-from neuprim.plugins.inspect.packing import ELLIPSOIDS_LIMIT, Packed
-from neuprim.plugins.inspect.shapes import cut_ball, level_lines
-from neuprim.plugins.inspect.views import PRIMITIVE
+from neuprim.inspect import window
+from neuprim.inspect.field import FieldFrame, ViewOptions
+from neuprim.inspect.headless import prepare_headless
+from neuprim.inspect.layer_checks import fault
+from neuprim.inspect.layers import Ellipsoids, Isosurfaces, Lines, Mesh, Points, Scale, Slices, Text, Volume
+from neuprim.inspect.packing import ELLIPSOIDS_LIMIT, Packed
+from neuprim.inspect.shapes import cut_ball, level_lines
+from neuprim.inspect.views import PRIMITIVE
 from neuprim.runs.inspect import Request, inspect_run
 from tests.plugins import marked, runs
 from tests.plugins.fakes import install, site
@@ -35,7 +35,7 @@ __all__ = ["site"]
 SOURCE = """
 import numpy as np
 from neuprim.core.extensions import Inspector
-from neuprim.plugins.inspect.layers import *
+from neuprim.inspect.layers import *
 
 GREEN = np.array([0.0, 1.0, 0.0])
 
@@ -200,7 +200,7 @@ def forget(site: Path) -> None:
 GRID, ORIGIN, SCALE = np.zeros((4, 5, 6), np.float32), np.zeros(3), Scale(0.0, 1.0)
 POINTS, FACES = np.zeros((4, 3)), np.array([[0, 1, 2]])
 WRONG: list[tuple[Any, str]] = [
-    (None, "returned None; expected a list of layers of neuprim.plugins.inspect.layers: Volume, "),
+    (None, "returned None; expected a list of layers of neuprim.inspect.layers: Volume, "),
     (Text("x"), "returned a Text; expected a list of layers"),
     ([np.zeros(3)], "returned a ndarray as layer 0; expected one of"),
     ([Text("x"), Text(3)], "layer 1, a Text, whose text is an int; expected text"),  # type: ignore[arg-type]
@@ -259,7 +259,7 @@ def test_what_cannot_be_drawn_is_named(found: Any, text: str) -> None:
 @pytest.mark.parametrize(
     ("found", "text"),
     [
-        ("None", "returned None; expected a list of layers of neuprim.plugins.inspect.layers"),
+        ("None", "returned None; expected a list of layers of neuprim.inspect.layers"),
         (
             "[Mesh(frame.box, np.array([[0, 1, 7]]))]",
             "returned layer 0, a Mesh, whose faces has rows 0 to 7 of vertices; there are 2",

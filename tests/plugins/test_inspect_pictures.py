@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from neuprim.core.errors import BackendUnavailable
-from neuprim.plugins.inspect import window
-from neuprim.plugins.inspect.headless import prepare_headless
+from neuprim.inspect import window
+from neuprim.inspect.headless import prepare_headless
 from neuprim.runs.inspect import Request, inspect_run
 from tests.plugins import runs
 

@@ -203,7 +203,7 @@ def test_a_page_keeps_anothers_view_apart_from_its_own(
 ) -> None:
     _, name, source = TAKEN["inspector"]
     other = source.replace("lambda frame: []", "lambda frame: [Text('of another')]")
-    files = {"my_views/__init__.py": f"from neuprim.plugins.inspect.layers import Text\n{other}"}
+    files = {"my_views/__init__.py": f"from neuprim.inspect.layers import Text\n{other}"}
     install(site, "my-views", {name: "my_views:PLUGIN"}, files, group=INSPECTORS.entry_points)
     run, page = str(write_run(tmp_path / "run", static_model(), ["task=static", "scene=solids"])), tmp_path / "x.html"
     assert main(["inspect", run, "--show", "volume,my-views:slices", "--grid", "8", "--out", str(page)]) == 0

@@ -27,7 +27,7 @@ from neuprim.core.errors import CheckpointError, ConfigError, DataError, Neuprim
 from neuprim.core.io import images
 from neuprim.core.model.colours import sh
 from neuprim.core.render import render
-from neuprim.plugins.export import appearance, mesh
+from neuprim.export import appearance, mesh
 from neuprim.plugins.registry import load_task
 from neuprim.runs.draw import FORMATS, render_run
 from neuprim.runs.export import export_run, import_run
@@ -217,7 +217,7 @@ def test_whole_models_keep_every_channel(trained: Path, tmp_path: Path) -> None:
 def test_gaussians_of_five_channels_are_refused_before_any_is_fitted(
     trained: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuprim.plugins.export.gaussian_ply.harmonics_of", lambda *a: pytest.fail("too late"))
+    monkeypatch.setattr("neuprim.export.gaussian_ply.harmonics_of", lambda *a: pytest.fail("too late"))
     with pytest.raises(
         ConfigError, match=r"5 channels, 450nm, .*; this format has red, green and blue; --format ply and npz hold all"
     ):

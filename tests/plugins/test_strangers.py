@@ -13,9 +13,9 @@ from PIL import Image
 from neuprim.cli import main
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import read_grid
+from neuprim.export import npz
 from neuprim.plugins import crashes
 from neuprim.plugins.blame import origin_of
-from neuprim.plugins.export import npz
 from neuprim.plugins.registry import EXPORTERS, PluginError
 from neuprim.runs.export import export_run, import_run
 from neuprim.runs.inspect import Request, inspect_run
@@ -415,7 +415,7 @@ def test_a_crash_of_an_inspector(
         and "strange_inspector.py" in path.read_text()
         and not (tmp_path / "a.html").exists()
     )
-    monkeypatch.setattr("neuprim.plugins.inspect.views.Slices", None)
+    monkeypatch.setattr("neuprim.inspect.views.Slices", None)
     with pytest.raises(TypeError, match="not callable"):  # neuprim's own
         inspect_run(Request(run_dir, ["slices"], grid=8, out=tmp_path / "a.html"))
 
@@ -431,7 +431,7 @@ def test_the_package_of_a_name_that_two_have(site: Path) -> None:
 def test_an_inspector_of_strangers_still_draws(site: Path, run_dir: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyvista", exc_type=ImportError)
     from neuprim.core.errors import BackendUnavailable
-    from neuprim.plugins.inspect.headless import prepare_headless
+    from neuprim.inspect.headless import prepare_headless
 
     try:
         prepare_headless()

@@ -16,19 +16,19 @@ import trimesh
 from neuprim.core import checkpoint
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.world import World
-from neuprim.core.compressed import LEVELS
+from neuprim.core.compression import LEVELS
 from neuprim.core.data.points_file import read_points
 from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.io.ply import read_ply
 from neuprim.core.io.vdb import read_grid
-from neuprim.plugins.export.appearance import Harmonics, sphere
+from neuprim.export.appearance import Harmonics, sphere
 from neuprim.runs.draw import render_run
 from neuprim.runs.export import export_run, import_run
 from neuprim.runs.inspect import Request, inspect_run
-from neuprim.runs.live.path import CameraPath, Key, condition_texts
-from neuprim.runs.live.poses import Pose
 from neuprim.runs.open import open_run, read_metrics
 from neuprim.tasks.relight import TASK as RELIGHT
+from neuprim.viewer.path import CameraPath, Key, condition_texts
+from neuprim.viewer.poses import Pose
 from tests.core import tiny
 from tests.plugins import marked
 from tests.short_runs import fit, words

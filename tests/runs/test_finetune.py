@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuprim.core.compressed import Schemes, bit_table, folded, rounded, schemes
-from neuprim.core.compressed.columns import Columns
+from neuprim.core.compression import Schemes, bit_table, folded, rounded, schemes
+from neuprim.core.compression.columns import Columns
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
-from neuprim.runs.few_bits import Rounding, train_for, train_within
 from neuprim.runs.finetune import COOL, LEAST_START, LONG, START, fine_tuner, steps_in
 from neuprim.runs.open import load_dataset, load_run
-from neuprim.runs.prune.judge import Judge
+from neuprim.search.few_bits import Rounding, train_for, train_within
+from neuprim.search.prune.judge import Judge
 from tests.core import tiny
 from tests.short_runs import fit, words
 

@@ -25,7 +25,7 @@ from neuprim.runs.events import Event, Note, Preparing
 from neuprim.runs.ground_truth import before_runs, make_truth, shares, truth_of
 from neuprim.runs.launch.status import Status
 from neuprim.tasks.dynamic.volume import capture
-from tests.runs import truth_jobs
+from tests.search import truth_jobs
 from tests.systems import posix
 from tests.tasks.dynamic.sequences import blob
 

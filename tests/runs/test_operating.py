@@ -23,7 +23,7 @@ from neuprim.runs.measure import draw, evaluate_run
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.operating import HEADS, OperatingPoint, read_point
 from neuprim.runs.storage import stored_bytes
-from tests.runs.tradeoff_runs import tiny_run
+from tests.search.tradeoff_runs import tiny_run
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from neuprim.core.render.output import Tally
-from neuprim.core.train.ranks import Seen
+from neuprim.core.train.distributed import Seen
 
 __all__ = ["ImageStep", "StepReport", "of_views"]
 

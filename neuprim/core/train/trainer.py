@@ -30,13 +30,13 @@ from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.ahead import Ahead
 from neuprim.core.train.angle import AngularSize
 from neuprim.core.train.coarse import reduced, reduction
+from neuprim.core.train.distributed import ALONE, Alone, Look, Seen
+from neuprim.core.train.distributed.refusals import refuse_parts
 from neuprim.core.train.exposure import Exposures
 from neuprim.core.train.losses import scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.points import PointStep, point_step
 from neuprim.core.train.population import Change, make_population
-from neuprim.core.train.ranks import ALONE, Alone, Look, Seen
-from neuprim.core.train.ranks.refusals import refuse_parts
 from neuprim.core.train.restoring import by_row, names_of, part, restored
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.step import ImageStep, StepReport, of_views

@@ -1,5 +1,4 @@
-"""Colour that changes in time: the zero-order spherical-harmonics coefficient is a function of it (equations 10 to
-12)."""
+"""Colour that changes in time: the zero-order spherical-harmonics coefficient depends on it (equations 10 to 12)."""
 
 from __future__ import annotations
 

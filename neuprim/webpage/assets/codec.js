@@ -1,4 +1,4 @@
-// The model's numbers out of the page: byte planes, gzipped, in base64. What codes stand for: neuprim/core/compressed.
+// The model's numbers out of the page: byte planes, gzipped, in base64. What codes stand for: neuprim/core/compression.
 async function numbersOf(text, parts, count) {
   if (typeof DecompressionStream === "undefined") throw new Error("this browser is too old to unpack the model (no DecompressionStream)");
   const packed = Uint8Array.from(atob(text), letter => letter.charCodeAt(0));

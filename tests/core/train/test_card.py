@@ -18,9 +18,9 @@ from neuprim.core.compute import device
 from neuprim.core.data import Dataset, Pixels
 from neuprim.core.errors import DataError, NonFiniteError
 from neuprim.core.io.vdb import write_vdb
-from neuprim.core.train.ranks.group import Group
-from neuprim.core.train.ranks.place import Place
-from neuprim.core.train.ranks.shards import Shards
+from neuprim.core.train.distributed.group import Group
+from neuprim.core.train.distributed.place import Place
+from neuprim.core.train.distributed.shards import Shards
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import Fitted, start
 from neuprim.runs.measure import evaluate_run

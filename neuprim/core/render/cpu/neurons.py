@@ -47,9 +47,9 @@ _values_slow, _values_medium, _values_fast = _values(profiles_slow), _values(pro
 
 
 @inline
-def field_values(
+def field_values(  # type: ignore[no-untyped-def]
     S, D, n, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_mid, backward, edge
-):  # type: ignore[no-untyped-def]
+):
     """Chords and FIELD of ``n`` lanes of primitive ``i``, in float64 where float32 is too coarse; see
     :func:`~tiles.chords`."""
     if slots[i] >= 0:

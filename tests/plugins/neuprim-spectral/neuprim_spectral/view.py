@@ -4,7 +4,7 @@ import torch
 
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Inspector
-from neuprim.plugins.inspect.layers import Points, Scale
+from neuprim.inspect.layers import Points, Scale
 from neuprim_spectral.bands import BANDS
 from neuprim_spectral.fields import spectrum
 

@@ -1,0 +1,317 @@
+"""``mesh``: the surface where the density passes a level, with vertex colours, as .glb, .ply or .obj; lossy.
+
+The density is sampled on a lattice of ``grid`` voxels along the longest side, blurred by ``smooth`` voxels (primitives
+end in a step, which would leave stairs), and contoured by VTK's flying edges (Schroeder et al. 2015). The default level
+is the one whose silhouettes along the three axes agree best with where the model is more than half opaque: for each
+axis, a column of voxels is opaque if its optical depth passes ln 2, and shows matter if its densest voxel passes the
+level. Pieces with less than ``keep`` of the largest piece's area are left out.
+
+A vertex has the mean colour of the primitives around it, weighted by their density there, seen from outside along its
+normal.
+Coordinates are those of the run's data; a .glb is turned from z up to glTF's y up (but data that are y up already:
+``up=y``, or where the model was fitted to such a mesh), as its readers turn it back, and has what moves it far from the
+origin in its node, as its vertices are float32. A .ply has ``double x y z`` there. Colours are sRGB in .ply and .obj
+and linear in .glb, as glTF wants them; they are what the
+task's display shows, or red, green and blue, or grey. Other channels are refused.
+
+The error is the intersection over union of silhouettes against where the model's alpha passes one half, over views of
+an orbit.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from neuprim.core.cameras.world import World
+from neuprim.core.errors import BackendUnavailable, ConfigError
+from neuprim.core.extensions import Exporter, ExportJob, ExportReport
+from neuprim.core.io import images
+from neuprim.core.io.files import atomic_path
+from neuprim.core.model.fields import Conditions
+from neuprim.core.render import render
+from neuprim.core.render.backends import computing_device
+from neuprim.core.task import API_VERSION
+from neuprim.core.volumes.grid import density_grid
+from neuprim.export.appearance import Harmonics, comparison_views, harmonics_of, rgb_of
+from neuprim.export.common import model_box
+
+__all__ = ["EXPORTER", "best_level"]
+
+OPTIONS = {
+    "grid": (192, "voxels along the longest side, 8 to 1024"),
+    "level": (
+        None,
+        "extinction of the surface, 1/scene unit (default: the silhouettes that agree best with the opaque parts)",
+    ),
+    "smooth": (1.0, "standard deviation of the blur before contouring, voxels, 0 to 4"),
+    "keep": (0.01, "least area of a piece, as a part of the largest one's"),
+    "up": (
+        "auto",
+        "upward axis of the data, z or y; only .glb files are turned by it (auto: that of a mesh that was fitted, else z)",
+    ),
+}
+_SUFFIXES = (".glb", ".ply", ".obj")
+_CHUNK = 2_000_000
+_MOST_VOXELS = 2**29
+_TO_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Scene (z up) to glTF (y up): x, z, -y."""
+
+
+def _write(job: ExportJob) -> ExportReport:
+    path = job.out
+    (conditions,) = job.frames()
+    channels = job.run.channels
+    rgb = (
+        None
+        if channels.own is not None
+        else rgb_of(job.run, f", and task {job.run.task.name!r} has no display that makes these")
+    )
+    contour = _contour()
+    smooth, keep, up = (
+        job.number("smooth", 0, 4) or 0.0,
+        job.number("keep", 0, 1) or 0.0,
+        job.choice("up", "auto", "z", "y"),
+    )
+    turn = job.run.world.rotation
+    if up == "auto":
+        up = (
+            "y" if turn is not None and float(turn[2, 1]) > 0.5 else "z"
+        )  # of the world's axes, the one that is the scene's z
+    seen = harmonics_of(job.run, conditions)
+    job.progress("sampling the density", 0.0)
+    sigma, scene_from_index = _sample(job, conditions, job.count("grid", 8, 1024) or 192)
+    step = float(scene_from_index[0, 0])
+    given = job.number("level", 1e-9, 1e9)
+    level = best_level(sigma, step) if given is None else given
+    notes = [f"surface at an extinction of {level:.4g} per scene unit" + ", chosen by silhouettes" * (given is None)]
+    field = ndimage.gaussian_filter(sigma, smooth) if smooth else sigma
+    job.progress("contouring", 0.3)
+    points, faces = contour(field, level)
+    if not len(faces):
+        raise ConfigError(
+            f"level={level:.4g}: no surface; the densest of the sampled points has {float(field.max()):.4g} per scene unit"
+        )
+    import trimesh
+
+    mesh = trimesh.Trimesh(points @ scene_from_index[:3, :3].T + scene_from_index[:3, 3], faces, process=False)
+    mesh, dropped = _larger_pieces(mesh, keep)
+    if mesh.volume < 0:
+        mesh.invert()
+    job.progress("colouring", 0.5)
+    colours = torch.from_numpy(
+        _colours(job, conditions, seen, np.array(mesh.vertices), np.array(mesh.vertex_normals))
+    ).float()
+    colours = channels.display_rows(colours) if rgb is None else colours[:, list(rgb)]
+    iou = _silhouettes(job, conditions, mesh)
+    _save(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up, job.run.world)
+    notes.append(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles; {dropped} small pieces left out")
+    notes.append(
+        "colours: of the primitives around each vertex, weighted by density, seen along the normal from outside"
+    )
+    if channels.shown:
+        notes.append(f"colours: {channels.shown}")
+    if path.suffix.lower() == ".glb" and up == "z":
+        notes.append("turned from z up to glTF's y up; Blender and others turn it back")
+    return ExportReport((path,), False, {"silhouette_iou": iou}, tuple(notes))
+
+
+# ---------------------------------------------------------------- surface
+
+
+def _contour() -> Any:
+    """(values (X, Y, Z), level) -> points (V, 3) in indices, triangles (F, 3)."""
+    try:
+        import pyvista
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"--format mesh needs the package pyvista ({error}): pip install 'neuprim[mesh]'"
+        ) from error
+
+    def contour(values: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
+        image = pyvista.ImageData(dimensions=values.shape)
+        image.point_data["sigma"] = values.ravel(order="F")
+        surface = image.contour([level], scalars="sigma", method="flying_edges")
+        if not surface.n_cells:
+            return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+        return np.asarray(surface.points, np.float64), np.asarray(surface.faces).reshape(-1, 4)[:, 1:].astype(np.int64)
+
+    return contour
+
+
+def _sample(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Extinction on a lattice with an empty border, and (4, 4) scene_from_index."""
+    low, high = (v.numpy() for v in model_box(job, [conditions]))
+    step = float((high - low).max()) / count
+    shape = tuple(math.ceil(n) + 7 for n in (high - low) / step)
+    if math.prod(shape) > _MOST_VOXELS:
+        raise ConfigError(f"grid={count}: {math.prod(shape)} voxels; expected at most {_MOST_VOXELS}")
+    matrix = np.diag([step, step, step, 1.0])
+    matrix[:3, 3] = low - 3 * step
+    size, settings = (shape[0], shape[1], shape[2]), job.run.settings
+    sigma = density_grid(
+        job.run.model, conditions, torch.from_numpy(matrix), size, settings.threads, computing_device(settings)
+    )
+    return sigma.numpy(), matrix
+
+
+def best_level(sigma: np.ndarray, step: float) -> float:
+    """The level at which "the column's densest voxel passes it" agrees in most columns with "the column is more than
+    half opaque".
+
+    Columns along all three axes count. Where nothing is half opaque, half of the largest optical depth stands for ln 2.
+
+    Args:
+        sigma: (X, Y, Z) extinction, 1/scene unit; step: edge of a voxel, scene units.
+    """
+    depths = np.concatenate([(sigma.sum(a, dtype=np.float64) * step).ravel() for a in range(3)])
+    peaks = np.concatenate([sigma.max(a).ravel() for a in range(3)]).astype(np.float64)
+    opaque = depths > min(math.log(2), 0.5 * float(depths.max()))
+    order = np.argsort(peaks)
+    # with the level just below the i-th peak, columns i.. show matter: wrong are opaque ones before i and clear ones
+    # from i on
+    missed = np.concatenate([[0], np.cumsum(opaque[order])])
+    false = np.concatenate([np.cumsum(~opaque[order][::-1])[::-1], [0]])
+    i = int(np.argmin((missed + false)[:-1]))
+    below = float(peaks[order[i - 1]]) if i else 0.0
+    return max((below + float(peaks[order[i]])) / 2, 1e-9)
+
+
+def _larger_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
+    """The mesh without pieces of less than ``keep`` of the largest one's area, and how many these were."""
+    import trimesh
+
+    if keep <= 0:
+        return mesh, 0
+    labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
+    areas = np.bincount(labels, weights=mesh.area_faces)
+    large = areas >= keep * areas.max()
+    kept = mesh.submesh([np.flatnonzero(large[labels])], append=True, repair=False)
+    return kept, int((~large).sum())
+
+
+# ---------------------------------------------------------------- colour
+
+
+def _colours(
+    job: ExportJob, conditions: Conditions, colours: Harmonics, points: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """(V, C) of the primitives around each point, weighted by density; of the nearest one where none reaches."""
+    with torch.no_grad():
+        living = job.run.model.living(conditions)
+        moved = living.geometry
+        whiten = moved.rotations.double().transpose(1, 2) / moved.scales.double()[:, :, None]
+        total, weight = (
+            torch.zeros(len(points), colours.dc.shape[1], dtype=torch.float64),
+            torch.zeros(len(points), dtype=torch.float64),
+        )
+        tree = cKDTree(points)
+        around = tree.query_ball_point(moved.means.double().numpy(), moved.scales.double().amax(1).numpy())
+        counts = np.array([len(a) for a in around])
+        for part in np.split(np.arange(len(counts)), np.flatnonzero(np.diff(np.cumsum(counts) // _CHUNK)) + 1):
+            prim = torch.from_numpy(np.repeat(part, counts[part]))
+            vertex = torch.from_numpy(np.concatenate([np.asarray(around[i], np.int64) for i in part]))
+            x = torch.from_numpy(points)[vertex]
+            y = (whiten[prim] @ (x - moved.means.double()[prim])[:, :, None])[..., 0]
+            inside = y.square().sum(-1) < 1
+            prim, vertex, x = prim[inside], vertex[inside], x[inside]
+            rho = living.sigma(prim, x.float()).double().clamp_min(0)
+            seen = colours.towards(prim, -torch.from_numpy(normals)[vertex])
+            total.index_add_(0, vertex, rho[:, None] * seen)
+            weight.index_add_(0, vertex, rho)
+        bare = (weight <= 0).nonzero()[:, 0]
+        if len(bare):  # the blur puts a vertex a little outside
+            nearest = torch.from_numpy(cKDTree(moved.means.double().numpy()).query(points[bare.numpy()])[1])
+            total[bare] = colours.towards(nearest, -torch.from_numpy(normals)[bare])
+            weight[bare] = 1.0
+    result: np.ndarray = (total / weight[:, None]).numpy()
+    return result
+
+
+def _save(mesh: Any, colours: Tensor, space: str, path: Path, up: str, world: World) -> None:
+    import trimesh
+
+    suffix, values = path.suffix.lower(), colours.clamp(0, 1)
+    if suffix == ".glb" and space != "linear":
+        values = images.srgb_to_linear(values)
+    elif suffix != ".glb" and space == "linear":
+        values = images.linear_to_srgb(values)
+    opaque = np.concatenate([values.numpy(), np.ones((len(values), 1), np.float32)], 1)
+    written = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals, process=False)
+    written.visual = trimesh.visual.ColorVisuals(written, vertex_colors=np.round(opaque * 255).astype(np.uint8))
+    matrix = world.world_from_scene.numpy()
+    linear, offset = np.eye(4), matrix[:3, 3]
+    linear[:3, :3] = matrix[:3, :3]
+    if suffix == ".glb" and up == "z":
+        linear, offset = _TO_GLTF @ linear, _TO_GLTF[:3, :3] @ offset
+    if (linear != np.eye(4)).any():
+        written.apply_transform(linear)
+    data: Any = _far(written, suffix, offset) if offset.any() else written.export(file_type=suffix[1:])
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+
+
+def _far(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
+    """The file's content with its vertices moved by ``offset`` (3,) float64, which none of them is rounded by."""
+    import trimesh
+
+    if suffix == ".glb":
+        scene = trimesh.Scene()
+        scene.add_geometry(mesh, transform=trimesh.transformations.translation_matrix(offset))
+        return scene.export(file_type="glb")
+    points = np.asarray(mesh.vertices, np.float64) + offset
+    if suffix == ".obj":
+        mesh.vertices = points
+        return mesh.export(file_type="obj")
+    head, body = mesh.export(file_type="ply").split(b"end_header\n", 1)
+    rest = f"V{4 * head.count(b'property float n') + head.count(b'property uchar')}"
+    rows = np.frombuffer(body, [("place", "<f4", 3), ("rest", rest)], len(points))
+    wide = np.empty(len(points), [("place", "<f8", 3), ("rest", rest)])
+    wide["place"], wide["rest"] = points, rows["rest"]
+    return head.replace(
+        b"property float x\nproperty float y\nproperty float z",
+        b"property double x\nproperty double y\nproperty double z",
+    ) + (b"end_header\n" + wide.tobytes() + body[rows.nbytes :])
+
+
+# ---------------------------------------------------------------- error
+
+
+def _silhouettes(job: ExportJob, conditions: Conditions, mesh: Any) -> float:
+    """Intersection over union of the mesh's and the model's half-opaque silhouettes, pooled over views of an orbit."""
+    views, _ = comparison_views(job, "orbit", conditions)
+    both = either = 0
+    for i, view in enumerate(views):
+        job.progress("comparing silhouettes", i / len(views))
+        camera = view.camera
+        with torch.no_grad():
+            alpha = render(job.run.model, camera, conditions, job.run.settings).alpha.numpy()
+        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+        rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1).reshape(-1, 3)
+        rays = rays @ camera.viewmat[:3, :3].double().numpy()
+        origin: Tensor = camera.position.double()
+        hit = mesh.ray.intersects_any(
+            np.broadcast_to(origin.numpy(), rays.shape), rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        )
+        solid = alpha.reshape(-1) > 0.5
+        both, either = both + int((hit & solid).sum()), either + int((hit | solid).sum())
+    return both / either if either else 0.0
+
+
+EXPORTER = Exporter(
+    API_VERSION,
+    "mesh",
+    "an isosurface of the density with vertex colours: .glb, .ply or .obj; lossy",
+    _write,
+    OPTIONS,
+    conditions=True,
+    default="mesh.glb",
+    suffixes=_SUFFIXES,
+)

@@ -1,0 +1,381 @@
+"""``vdb``: the density as an OpenVDB fog volume, one file per frame for models that change in time; lossy (sampled).
+
+Grid ``density`` is the sum over primitives of their density clamped at 0, at the voxels' centres; what is below
+``threshold`` is not stored (background 0, inactive). Where flames add to the extinction of the source's grid, only that
+grid's part is written: what absorbs because it burns is no density. A model that was fitted to .vdb files is written on
+the voxels and in the units of these files, frame by frame, so that both overlay each other, with no value above the
+source frame's largest and nothing outside its active voxels; else in the coordinates of the run's data on cubic voxels
+whose lattice has a corner of its index space in the scene's origin, one lattice for all frames. Axes are those of the
+data; nothing is turned.
+
+Units (metadata ``neuprim_units``): ``source``: sigma divided by the extinction per unit of the file's grid, as the
+scene's look has it; ``world``: extinction per world unit of the file, what a volume shader multiplies with a length;
+``scene``: extinction per scene unit, sigma itself. Where nothing is known of a world, that is the scene.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from neuprim.core.errors import ConfigError, NeuprimError
+from neuprim.core.extensions import Exporter, ExportJob, ExportReport
+from neuprim.core.io.vdb import Grid, Tiles, read_grid, scale_transform, write_vdb
+from neuprim.core.model.fields import Conditions
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.backends import computing_device
+from neuprim.core.task import API_VERSION
+from neuprim.core.volumes.errors import Comparison, blocks, frame_errors
+from neuprim.core.volumes.grid import density_grid
+from neuprim.core.volumes.source import Extent, Placement, VolumeSource
+from neuprim.export.common import model_box
+
+__all__ = ["EXPORTER", "sampled_grid"]
+
+OPTIONS = {
+    "grid": (None, "voxels along the longest side, 8 to 2048 (default: the source's own voxels, else 128)"),
+    "voxel_size": (None, "edge of a voxel in world units, instead of grid"),
+    "units": ("auto", "source, world or scene; auto: source where the model was fitted to .vdb files, else world"),
+    "threshold": (None, "values below it are not stored (default: an optical depth of 0.001 along the box)"),
+    "half": (False, "16-bit floats"),
+    "name": ("density", "of the grid"),
+    "source": (
+        True,
+        "whether to look for the files that the model was fitted to: their voxels, and errors against them",
+    ),
+}
+_SLAB_BYTES = 64 * 2**20
+_MOST_VOXELS = 2**34
+
+
+@dataclass(frozen=True)
+class _GridFrame:
+    """``number`` is of its file name; ``source`` its index in the scene's files, None where it has none."""
+
+    number: int
+    conditions: Conditions
+    source: int | None = None
+
+
+def _write(job: ExportJob) -> ExportReport:
+    source, placement, notes = _origin(job, job.flag("source"))
+    frames = _frames(job, placement)
+    paths = _paths(job, frames)
+    units = job.choice("units", "auto", "source", "world", "scene")
+    if units == "auto":
+        units = "source" if placement else "world"
+    if units == "source" and placement is None:
+        raise ConfigError("units=source: the model's header names no .vdb files; expected world or scene")
+    scene_from_world = job.run.world.scene_from_world.numpy() if placement is None else placement.scene_from_world
+    per_world = abs(np.linalg.det(scene_from_world[:3, :3])) ** (1 / 3)
+    factor = {"source": 1 / placement.sigma_per_unit if placement else 1.0, "world": per_world, "scene": 1.0}[units]
+    box = np.stack([v.numpy() for v in model_box(job, [f.conditions for f in frames])])
+    threshold = job.number("threshold", 0.0, 1e9)
+    threshold = 1e-3 / float((box[1] - box[0]).max()) * factor if threshold is None else threshold
+    name = str(job.options["name"])
+    own = job.number("grid") is None and job.number("voxel_size") is None and source is not None
+    fallback = _transform(
+        job, box, scene_from_world, np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy()
+    )
+    model = _component(job, placement)
+    cut = _Cut(0, 0)
+    metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
+    errors: dict[str, float] = {}
+    for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
+        job.progress("writing frames", i / len(frames))
+        transform = source.transform(frame.source) if own and source is not None and frame.source is not None else None
+        transform = fallback if transform is None else transform
+        grid = sampled_grid(job, model, frame.conditions, transform, scene_from_world, name, factor, threshold)
+        if placement is not None and placement.extents:
+            grid, more_cut = _within(grid, _extent(placement, frame), placement.sigma_per_unit * factor)
+            cut = _Cut(*(a + b for a, b in zip(cut, more_cut, strict=True)))
+        more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
+        grid = replace(grid, half=job.flag("half"), metadata={**metadata, **more})
+        write_vdb(path, [grid])
+        if source is not None and frame.source is not None:
+            errors |= _errors(job, source, frame, path, scene_from_world, factor)
+    what = placement.grid if placement else ""
+    said = {
+        "source": f"in the units of the source's grid {what!r}",
+        "world": "extinction per world unit",
+        "scene": "extinction per scene unit",
+    }
+    notes.append(
+        f"grid {name!r} is {said[units]}: extinction per scene unit = value x {1 / factor:g}; clamped at 0 per primitive"
+    )
+    if placement is not None and not placement.exact:
+        notes.append(f"flames absorb, too: written is the part of the extinction that comes from {what!r} alone")
+    if cut != _Cut(0, 0):
+        notes.append(
+            f"{cut.above} voxels were above the source's largest value and are set to it; {cut.outside} outside its bounds are left out"
+        )
+    where = (
+        "the source's own voxels and world"
+        if own
+        else "cubic voxels in " + ("the source's world" if placement else "the coordinates of the run's data")
+    )
+    notes.append(f"on {where}; values below {threshold:.3g} are left out")
+    if errors:
+        notes.append(
+            f"errors: the model's extinction from {what!r} against the files' own values of that grid, on all their voxels, as in metrics.json; "
+            "file_*: what was written against them; "
+            "psnr_active over voxels with matter, max_error as a share of the frame's largest sigma: a proxy with a measured error, no bound"
+        )
+    return ExportReport(tuple(paths), False, errors, tuple(notes))
+
+
+class _Cut(NamedTuple):
+    """How many voxels were above the source's largest value, and outside its bounds."""
+
+    above: int
+    outside: int
+
+
+def _component(job: ExportJob, placement: Placement | None) -> Primitives:
+    """The model, or its part that comes from the source's grid where other grids absorb, too.
+
+    Raises:
+        ConfigError: the model does not know that part.
+    """
+    model = job.run.model
+    if placement is None or placement.exact:
+        return model
+    if placement.component not in model.density.components(model.params):
+        raise ConfigError(
+            f"{job.run.directory}: flames absorb beside grid {placement.grid!r}, and the model has learned no share of it in its extinction, so "
+            "its density is not known; train again with voxels (train.supervision=both, scene.optics.extinction above 0)"
+        )
+    return model.component(placement.component)
+
+
+def _extent(placement: Placement, frame: _GridFrame) -> Extent:
+    """That of the source's frame, or of all of them for a time between."""
+    return Extent.around(placement.extents) if frame.source is None else placement.extents[frame.source]
+
+
+def _within(grid: Grid, extent: Extent, per_unit: float) -> tuple[Grid, _Cut]:
+    """The grid with no value above the extent's largest and none outside its box; and how many voxels that changed.
+
+    Args:
+        per_unit: what a source value of 1 is in the grid.
+    """
+    if not len(grid.origins):
+        return grid, _Cut(0, 0)
+    offsets = np.stack(np.meshgrid(*(np.arange(8),) * 3, indexing="ij"), -1)
+    centres = (grid.origins[:, None, None, None] + offsets) @ grid.transform[:3, :3].T + grid.transform[:3, 3]
+    inside = (
+        np.zeros(grid.masks.shape, bool)
+        if extent.box is None
+        else ((centres >= extent.box[0]) & (centres <= extent.box[1])).all(-1)
+    )
+    kept, largest = grid.masks & inside, np.float32(extent.largest * per_unit)
+    above = kept & (grid.values > largest)
+    values = np.where(kept, np.minimum(grid.values, largest), np.float32(0))
+    some = kept.any((1, 2, 3))
+    cut = _Cut(int(above.sum()), int((grid.masks & ~inside).sum()))
+    return replace(grid, origins=grid.origins[some], values=values[some], masks=kept[some]), cut
+
+
+# ---------------------------------------------------------------- which frames, and where
+
+
+def _origin(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placement | None, list[str]]:
+    """The scene's files, how the model lies in their world, and what to tell the user about it."""
+    notes: list[str] = []
+    source = None
+    if wanted:
+        try:
+            source = job.run.volume()
+        except NeuprimError as error:
+            notes.append(f"the source's files cannot be read, so neither their voxels nor errors against them: {error}")
+    record = job.run.header.get("world")
+    kept = None
+    if isinstance(record, dict) and "grid" in record:
+        kept = Placement.from_json(record, str(job.run.directory / "model.safetensors"))
+    if source is not None and kept is not None and not kept.same(source.placement):
+        notes.append(
+            "the source's files are not those that the model was fitted to, so neither their voxels nor errors against them"
+        )
+        source = None
+    return source, kept if source is None else source.placement, notes
+
+
+def _frames(job: ExportJob, placement: Placement | None) -> list[_GridFrame]:
+    """Those the user names, else those of the run; a model without conditions has one."""
+    if not job.run.task.conditions:
+        return [_GridFrame(0, {})]
+    if job.conditions or placement is None:
+        frames = [_GridFrame(i, c) for i, c in enumerate(job.frames(several=True))]
+        return [_GridFrame(f.number, f.conditions, _same(f.conditions, placement)) for f in frames]
+    return [_GridFrame(n, _conditions(placement, i), i) for i, n in enumerate(placement.numbers)]
+
+
+def _conditions(placement: Placement, frame: int) -> dict[str, Tensor]:
+    return {name: torch.tensor(values[frame]) for name, values in placement.times.items()}
+
+
+def _same(conditions: Conditions, placement: Placement | None) -> int | None:
+    """The frame of the source with these conditions."""
+    if placement is None:
+        return None
+    for i in range(len(placement.numbers)):
+        known = _conditions(placement, i)
+        if known.keys() == conditions.keys() and all(
+            torch.allclose(known[k].float(), v.float(), atol=1e-6) for k, v in conditions.items()
+        ):
+            return i
+    return None
+
+
+def _paths(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
+    """One file under its own name, or files in a folder."""
+    suffix = job.out.suffix.lower()
+    if suffix == ".vdb":
+        if len(frames) > 1:
+            raise ConfigError(f"--out {job.out}: {len(frames)} frames; expected a folder")
+        return [job.out]
+    if not job.run.task.conditions:
+        if suffix:
+            raise ConfigError(f"--out {job.out}: expected a file name with .vdb, or a folder")
+        return [job.out / "density.vdb"]
+    width = max(4, len(str(max(f.number for f in frames))))
+    return [job.out / f"density_{f.number:0{width}d}.vdb" for f in frames]
+
+
+def _transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(4, 4) index to world of the user's voxels, with the origin of index space at ``origin`` (3,) of the world."""
+    count, size = job.count("grid", 8, 2048), job.number("voxel_size", 1e-9, 1e9)
+    if count is not None and size is not None:
+        raise ConfigError("grid and voxel_size: expected one of them")
+    corners = np.linalg.inv(scene_from_world)[:3, :3] @ (box[1] - box[0])
+    return scale_transform(size or float(np.abs(corners).max()) / (count or 128), origin.tolist())
+
+
+# ---------------------------------------------------------------- sampling
+
+
+def sampled_grid(
+    job: ExportJob,
+    model: Primitives,
+    conditions: Conditions,
+    transform: np.ndarray,
+    scene_from_world: np.ndarray,
+    name: str,
+    factor: float,
+    threshold: float,
+) -> Grid:
+    """The model's extinction x ``factor`` on voxels of a world, slab by slab; dense memory is that of one slab.
+
+    Args:
+        transform: (4, 4) index to world.
+        threshold: values below it are background.
+
+    Raises:
+        ConfigError: the box of the model has too many voxels.
+    """
+    try:
+        low, high = (v.numpy() for v in model_box(job, [conditions]))
+    except ConfigError:  # nothing lives in this frame: an empty grid is a frame too
+        low = high = (scene_from_world @ transform)[:3, 3]
+    scene_from_index = scene_from_world @ transform
+    corners = np.stack(np.meshgrid(*np.stack([low, high], -1), indexing="ij"), -1).reshape(-1, 3)
+    back = np.linalg.inv(scene_from_index)
+    index = corners @ back[:3, :3].T + back[:3, 3]
+    if not (np.abs(index) < 2**30).all():
+        raise ConfigError(f"the model reaches voxel {np.abs(index).max():.3g}; expected fewer (voxel_size, grid)")
+    first = np.floor(index.min(0)).astype(np.int64) & ~7
+    last = (np.ceil(index.max(0)).astype(np.int64) & ~7) + 8
+    size = last - first
+    if math.prod(size.tolist()) > _MOST_VOXELS:
+        raise ConfigError(
+            f"{' x '.join(map(str, size))} voxels around the model; expected at most {_MOST_VOXELS:.0e} (voxel_size, grid)"
+        )
+    parts = [
+        g
+        for g in _slabs(job, model, conditions, scene_from_index, first, size, name, factor, threshold)
+        if len(g.origins)
+    ]
+    leaves = (
+        np.concatenate([g.origins for g in parts]) if parts else np.zeros((0, 3), np.int32),
+        np.concatenate([g.values for g in parts]) if parts else np.zeros((0, 8, 8, 8), np.float32),
+        np.concatenate([g.masks for g in parts]) if parts else np.zeros((0, 8, 8, 8), bool),
+    )
+    return Grid(name, np.array(transform, np.float64), np.zeros((), np.float32), *leaves, Tiles.none())
+
+
+def _slabs(
+    job: ExportJob,
+    model: Primitives,
+    conditions: Conditions,
+    scene_from_index: np.ndarray,
+    first: np.ndarray,
+    size: np.ndarray,
+    name: str,
+    factor: float,
+    threshold: float,
+) -> Iterator[Grid]:
+    """Sparse grids of blocks of planes that fit in a bounded memory, each a multiple of 8 along the first two axes."""
+    settings = job.run.settings
+    where = computing_device(settings)
+    rows = max(8, min(int(size[1]), _SLAB_BYTES // (32 * int(size[2])) & ~7))
+    planes = max(8, min(int(size[0]), _SLAB_BYTES // (4 * rows * int(size[2])) & ~7))
+    for x in range(0, int(size[0]), planes):
+        for y in range(0, int(size[1]), rows):
+            corner = first + np.array([x, y, 0])
+            shape = (min(planes, int(size[0]) - x), min(rows, int(size[1]) - y), int(size[2]))
+            shifted = scene_from_index.copy()
+            shifted[:3, 3] += shifted[:3, :3] @ corner
+            sigma = density_grid(model, conditions, torch.from_numpy(shifted), shape, settings.threads, where).numpy()
+            values = sigma * np.float32(factor)
+            values[values < threshold] = 0.0
+            yield Grid.from_dense(name, values, lower=corner.tolist())
+
+
+def _errors(
+    job: ExportJob, source: VolumeSource, frame: _GridFrame, path: Path, scene_from_world: np.ndarray, factor: float
+) -> dict[str, float]:
+    """The model and the written file, each against the source on the source's own voxels, as ``metrics.json`` has
+    it."""
+    assert frame.source is not None
+    settings = job.run.settings
+    component = None if source.placement.exact else source.placement.component
+    part: dict[str, str] = {} if component is None else {"component": component}
+    found = frame_errors(
+        job.run.model, frame.conditions, source, frame.source, settings.threads, computing_device(settings), **part
+    )
+    place = source.points(frame.source)
+    if found is None or place is None:
+        return {}
+    name = f"frame_{source.placement.numbers[frame.source]:04d}"
+    result = {f"{name}.{key}": value for key, value in found.items()}
+    grid, written = read_grid(path, str(job.options["name"])), Comparison()
+    if grid.bounds is None:
+        return result
+    dense = grid.to_dense()
+    for matrix, shape in blocks(*place):
+        chain = np.linalg.inv(scene_from_world @ grid.transform) @ matrix.numpy()
+        offset = chain[:3, 3] - np.array(grid.bounds[0])
+        values = ndimage.affine_transform(dense, chain[:3, :3], offset, shape, order=1, mode="grid-constant") / factor
+        written.add(source.grid(frame.source, matrix, shape, **part).numpy(), values)
+    numbers = written.numbers()
+    assert numbers is not None
+    return result | {f"{name}.file_{key}": value for key, value in numbers.items()}
+
+
+EXPORTER = Exporter(
+    API_VERSION,
+    "vdb",
+    "the density as OpenVDB, one file per frame; lossy (sampled)",
+    _write,
+    OPTIONS,
+    conditions=True,
+    default="vdb",
+)

@@ -1,7 +1,0 @@
-"""Looking inside a density field: volumes, isosurfaces, slices and primitives of a run, beside the ground truth where
-there is one."""
-
-from neuprim.plugins.inspect.field import FieldFrame, ViewOptions
-from neuprim.plugins.inspect.frames import corners
-
-__all__ = ["FieldFrame", "ViewOptions", "corners"]

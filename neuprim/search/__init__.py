@@ -1,0 +1,1 @@
+"""Searches over settings and sizes: trade-offs, ablations, targets, pruning and compression."""

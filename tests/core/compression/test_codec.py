@@ -1,0 +1,392 @@
+"""A model in few bits and back: every built-in field, errors as the steps allow, the same bytes and the same floats
+every time."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import neuprim
+import neuprim.core.compression.codec as codec
+from neuprim.core import checkpoint
+from neuprim.core.compression import (
+    LEVELS,
+    BitTable,
+    bit_table,
+    folded,
+    read_compressed,
+    rounded,
+    schemes,
+    schemes_within,
+)
+from neuprim.core.compression.columns import Columns
+from neuprim.core.errors import CheckpointError, ConfigError, FormError
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.fields import pieces_by_name
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import Params
+from neuprim.core.render import RenderSettings, render
+from neuprim.plugins.registry import load_task
+from tests import scenes
+from tests.compressing import FIELDS, example, gaussians, stored, without_pieces
+
+
+def angles(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    cosine = (a.double() * b.double()).sum(1).abs() / a.double().norm(dim=1) / b.double().norm(dim=1)
+    return 2 * cosine.clamp_max(1).acos()
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_model_comes_back_within_its_steps(tmp_path: Path, name: str, level: int) -> None:
+    task, model = example(name)
+    path = tmp_path / "m.neuprim"
+    checkpoint.save_compressed(path, model, task.name, {"background": [0.5], "note": "naïve"}, LEVELS[level])
+    again, header = checkpoint.load_model(path, task)
+    assert header["note"] == "naïve" and header["primitives"] == model.count and header["background"] == [0.5]
+    assert type(again.density) is type(model.density) and again.colour.settings() == model.colour.settings()
+    wanted, made = stored(model, LEVELS[level])
+    for key, value in wanted.params.items():
+        back, scheme = again.params[key].reshape(model.count, value[0].numel()), made[key]
+        if not isinstance(scheme, Columns):
+            assert float(angles(value, back).max()) < 4.0 / scheme.half
+            continue
+        x = value.reshape(back.shape)
+        inside = x.clamp(scheme.low, scheme.high)
+        half = (scheme.high - scheme.low).double() / scheme.last / 2
+        assert bool(((back - inside).double().abs() <= half * 1.001 + 1e-6).all()), key
+        assert float((x != inside).double().mean() if x.numel() else 0.0) <= 0.06, (
+            key
+        )  # at most 1% at either end, of 40 rows
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_compressing_again_changes_nothing(tmp_path: Path, name: str) -> None:
+    task, model = example(name, 300)
+    files = []
+    for i in range(3):
+        path = tmp_path / f"{i}.neuprim"
+        checkpoint.save_compressed(path, model, task.name, {}, LEVELS[3])
+        model, _ = checkpoint.load_model(path, task)
+        files.append((path.read_bytes(), model.params))
+    assert files[0][0] == files[1][0] == files[2][0]
+    assert all(torch.equal(value, files[2][1][key]) for key, value in files[0][1].items())
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_bit_says_who_does_without_a_piece(tmp_path: Path, name: str) -> None:
+    """The same numbers come back as from a file of whole columns, which takes more bytes; compressed again it is the
+    same file."""
+    task, model = example(name, 2000)
+    pruned = without_pieces(model)
+    files = []
+    for path in (tmp_path / "0", tmp_path / "1"):
+        checkpoint.save_compressed(path, pruned, task.name, {}, LEVELS[3])
+        pruned, _ = checkpoint.load_model(path, task)
+        files.append(path.read_bytes())
+    assert files[0] == files[1]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(codec, "_WORTH_A_MASK", 2.0)
+        checkpoint.save_compressed(tmp_path / "2", pruned, task.name, {}, LEVELS[3])
+    plain, _ = checkpoint.load_model(tmp_path / "2", task)
+    assert all(torch.equal(value, plain.params[key]) for key, value in pruned.params.items())
+    if pieces_by_name(model.density, model.colour):
+        assert len(files[0]) < 0.95 * (tmp_path / "2").stat().st_size
+
+
+def test_neither_the_order_of_rows_nor_their_place_matters(tmp_path: Path) -> None:
+    """The same primitives in another order make the same file, and the file's order draws the same image."""
+    task, model = example("static", 200)
+    rows = torch.randperm(200, generator=torch.Generator().manual_seed(1))
+    other = Primitives(model.density, model.colour, model.rows(rows))
+    for i, m in enumerate((model, other)):
+        checkpoint.save_compressed(tmp_path / f"{i}", m, task.name, {}, LEVELS[2])
+    assert (tmp_path / "0").read_bytes() == (tmp_path / "1").read_bytes()
+    wanted, _ = stored(model, LEVELS[2])
+    for backend in ("reference", "cpu"):
+        settings = RenderSettings(backend=backend)
+        with torch.no_grad():
+            a, b = (render(m, scenes.camera(), {}, settings).rgb for m in (folded(model), wanted))
+        assert torch.allclose(a, b, atol=1e-5)
+
+
+def test_more_bits_are_a_better_image(tmp_path: Path) -> None:
+    task, model = example("static", 100)
+    errors, sizes = [], []
+    with torch.no_grad():
+        true = render(model, scenes.camera(), {}, RenderSettings()).rgb
+        for level in LEVELS:
+            checkpoint.save_compressed(tmp_path / "m", model, task.name, {}, LEVELS[level])
+            sizes.append((tmp_path / "m").stat().st_size)
+            errors.append(
+                float(
+                    (
+                        render(
+                            checkpoint.load_model(tmp_path / "m", task)[0], scenes.camera(), {}, RenderSettings()
+                        ).rgb
+                        - true
+                    )
+                    .abs()
+                    .mean()
+                )
+            )
+    assert sizes == sorted(sizes, reverse=True) and errors == sorted(errors) and errors[0] < 0.1 * errors[-1]
+
+
+def test_fields_of_others_come_back(tmp_path: Path) -> None:
+    model = gaussians()
+    task = load_task("static")
+    task = replace(task, fields={**(task.fields or {}), "GaussianDensity": GaussianDensity})
+    checkpoint.save_compressed(tmp_path / "m", model, task.name, {}, LEVELS[3])
+    again, _ = checkpoint.load_model(tmp_path / "m", task)
+    wanted, made = stored(model, LEVELS[3])
+    step = (made["log_amplitude"].high - made["log_amplitude"].low) / made["log_amplitude"].last
+    assert (
+        float((again.params["log_amplitude"] - wanted.params["log_amplitude"]).abs().max()) <= float(step) / 2 * 1.001
+    )
+
+
+# ---------------------------------------------------------------- bits
+
+
+def test_a_column_with_a_few_far_numbers_gets_twice_the_bits() -> None:
+    model = gaussians(4000)
+    model.params["log_amplitude"] = torch.randn(4000, 1, generator=torch.Generator().manual_seed(0))
+    assert schemes(model, LEVELS[3])["log_amplitude"].bits.tolist() == [7]
+    model.params["log_amplitude"][::1000] = 200.0
+    assert schemes(model, LEVELS[3])["log_amplitude"].bits.tolist() == [14]
+    exact = bit_table(3, ["log_amplitude=7"], model.specs)
+    assert schemes(model, exact)["log_amplitude"].bits.tolist() == [7]
+
+
+def test_positions_get_the_bits_that_the_primitives_sizes_ask_for() -> None:
+    model = gaussians(400)
+    model.params["log_scales"] = torch.full((400, 3), -3.0)
+    assert schemes(model, LEVELS[5])["means"].bits.tolist() == [11] * 3
+    model.params["means"][0] = 500.0
+    made = schemes(model, LEVELS[5])["means"]
+    steps = float((made.high - made.low)[0] / made.last[0])
+    assert np.exp(-3.0) / 100 < steps <= np.exp(-3.0) / 50
+    assert schemes(model, bit_table(5, ["means=9"], model.specs))["means"].bits.tolist() == [9] * 3
+
+
+def test_bands_of_harmonics_have_bits_of_their_own() -> None:
+    table = BitTable({"sh_rest": (8, 7, 5)}, 6)
+    assert table.of("sh_rest", (15, 3)) == [8] * 9 + [7] * 15 + [5] * 21
+    assert table.of("sh_rest", (24, 1)) == [8] * 3 + [7] * 5 + [5] * 16
+    assert table.of("sh_rest", (3, 1)) == [8] * 3 and table.of("W1", (4, 3)) == [6] * 12 and table.of("b2", (1,)) == [6]
+
+
+def test_words_over_a_level() -> None:
+    specs = example("dynamic")[1].specs
+    table = bit_table(3, ["sh_rest=6,5", "means=20", "others=9"], specs)
+    assert table.named["sh_rest"] == (6, 5) and table.named["means"] == (20,) and table.of("W_t", (3,)) == [9] * 3
+    assert all(table.of(name, (4,)) == LEVELS[3].of(name, (4,)) for name in ("quats", "W1", "log_scales"))
+    assert {"W_t", "velocity", "sh_rest", "means"} <= table.exact and not {"quats", "W1"} & table.exact
+    assert bit_table(2, [], specs) == LEVELS[2]
+
+
+@pytest.mark.parametrize(
+    ("level", "word", "message"),
+    [
+        (6, "", "--level 6: expected one of 1, 2, 3, 4, 5"),
+        (3, "means", "--bits means: expected NAME=BITS"),
+        (3, "mean=16", "no parameter 'mean'; did you mean 'means'"),
+        (3, "means=21", "--bits means=21: expected 1 to 20"),
+        (3, "means=8,9", "--bits means=8,9: expected 1 to 20"),
+        (3, "quats=2", "expected 3 to 16"),
+        (3, "W1=17", "expected 1 to 16; several"),
+        (3, "W1=0", "expected 1 to 16"),
+        (3, "W1=-1", "expected 1 to 16"),
+        (3, "W1=8.5", "expected 1 to 16"),
+        (3, "W1=", "expected 1 to 16"),
+        (3, "W1=²", "expected 1 to 16"),
+        (3, "others=8,7", "expected 1 to 16"),
+    ],
+)
+def test_words_that_mean_nothing(level: int, word: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        bit_table(level, [word] if word else [], example("static")[1].specs)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_parameter_is_named_once() -> None:
+    with pytest.raises(ConfigError, match="W1 is given twice"):
+        bit_table(3, ["W1=8", "W1=7"], example("static")[1].specs)
+
+
+# ---------------------------------------------------------------- what training may use
+
+
+@pytest.mark.parametrize("name", ["static", "dynamic", "additive"])
+def test_rounded_tensors_are_what_comes_back_with_their_own_gradients(tmp_path: Path, name: str) -> None:
+    task, model = example(name)
+    checkpoint.save_compressed(tmp_path / "m", model, task.name, {}, LEVELS[4])
+    again, _ = checkpoint.load_model(tmp_path / "m", task)
+    wanted, made = stored(model, LEVELS[4])
+    leaves = {key: value.clone().requires_grad_() for key, value in wanted.params.items()}
+    found = rounded(leaves, made)
+    for key, value in found.items():
+        if key == "quats":
+            assert torch.allclose(
+                angles(value.detach(), again.params[key]), torch.zeros(model.count, dtype=torch.float64), atol=1e-3
+            )
+        else:
+            assert torch.equal(value.detach(), again.params[key]), key
+    total = torch.stack([(value * (i + 1)).sum() for i, value in enumerate(found.values())]).sum()
+    grads = torch.autograd.grad(total, list(leaves.values()), allow_unused=True)
+    for i, (grad, leaf) in enumerate(zip(grads, leaves.values(), strict=True)):
+        assert grad is not None and torch.equal(grad, torch.full_like(leaf, i + 1.0))
+
+
+# ---------------------------------------------------------------- as coarse as images allow
+
+
+def effects_of(model: Primitives) -> dict[str, torch.Tensor]:
+    """Some effect of every number, of very different sizes."""
+    generator = torch.Generator().manual_seed(3)
+    return {
+        s.name: 10 ** (2 * torch.rand(s.size, generator=generator, dtype=torch.float64)) * model.count
+        for s in model.specs
+    }
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_every_column_brings_the_error_that_it_may(tmp_path: Path, name: str) -> None:
+    task, model = example(name, 2000)
+    whole, error = folded(model), 1e-4
+    effects = effects_of(whole)
+    made = schemes_within(whole, effects, error)
+    back = rounded(whole.params, made)
+    for spec in whole.specs:
+        if spec.fixed or not spec.size:
+            continue
+        x, y = (values[spec.name].reshape(2000, spec.size).double() for values in (whole.params, back))
+        brought = effects[spec.name] * (x - y).square().mean(0)
+        if spec.name == "quats":  # across, whatever the norm; whole bits are up to 1.4 times too long or too short
+            off = (angles(x, y) / 2).square().mean() * effects["quats"].sum() / 3
+            assert 0.4 * 3 * error < float(off) < 2.2 * 3 * error
+        elif spec.name == "b2" and name == "volume":
+            assert float(brought) < 1e-12  # -1 and 1 are what they are
+        else:
+            varied = effects[spec.name] * x.var(0) > 2 * error  # else a single value says it
+            assert bool((brought < 1.25 * error).all()) and bool((brought > 0.7 * error)[varied].all()), spec.name
+    path = tmp_path / "m"
+    checkpoint.save_compressed(path, whole, task.name, {}, made)
+    again = checkpoint.load_model(path, task)[0]
+    rows = codec.file_order(whole, made)
+    for key in (k for k in back if k != "quats"):
+        assert torch.equal(again.params[key], back[key][rows]), key
+
+
+@pytest.mark.parametrize("name", ["soft", "volume", "additive"])
+def test_more_error_is_fewer_bytes(tmp_path: Path, name: str) -> None:
+    task, model = example(name, 1000)
+    whole = folded(model)
+    sizes = []
+    for error in (1e-7, 1e-5, 1e-3, 1e-1, 1e9):
+        checkpoint.save_compressed(
+            tmp_path / "m", whole, task.name, {}, schemes_within(whole, effects_of(whole), error)
+        )
+        sizes.append((tmp_path / "m").stat().st_size)
+        assert checkpoint.load_model(tmp_path / "m", task)[0].count == 1000
+    assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 0.2 * sizes[0]
+
+
+def test_what_changes_nothing_takes_nothing_and_what_is_gone_stays_gone() -> None:
+    model = folded(without_pieces(example("soft", 400)[1]))
+    effects = {
+        name: torch.zeros_like(value) if name == "log_gain" else value for name, value in effects_of(model).items()
+    }
+    back = rounded(model.params, schemes_within(model, effects, 1e-3))
+    assert len(back["log_gain"].unique()) == 1
+    for name in ("sh_rest", "w2"):
+        gone = model.params[name] == 0
+        assert bool(gone.any()) and bool((back[name][gone] == 0).all())
+    for unknown in (torch.nan, torch.inf):
+        fine = schemes_within(model, {name: torch.full_like(value, unknown) for name, value in effects.items()}, 1e-3)
+        for name, value in rounded(model.params, fine).items():
+            near = angles(value, model.params[name]) if name == "quats" else value - model.params[name]
+            assert float(near.abs().max()) < 1e-3 if name == "quats" else 1e-5, name
+    none = Primitives(model.density, model.colour, {name: value[:0] for name, value in model.params.items()})
+    assert rounded(none.params, schemes_within(none, effects, 1e-3))["means"].shape == (0, 3)
+
+
+# ---------------------------------------------------------------- what cannot be stored
+
+
+def altered(**params: torch.Tensor) -> Primitives:
+    model = example("static")[1]
+    return Primitives(model.density, model.colour, {**model.params, **params})
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        (
+            {"b1": torch.full((40, 3), float("nan"))},
+            "parameter b1 of primitive 0 is [nan, nan, nan], which cannot be compressed",
+        ),
+        (
+            {"b2": torch.cat([torch.zeros(39, 1), torch.full((1, 1), float("inf"))])},
+            "parameter b2 of primitive 39 is [inf]",
+        ),
+        ({"quats": torch.zeros(40, 4)}, "parameter quats of primitive 0 is [0.0, 0.0, 0.0, 0.0]"),
+        ({"b2": torch.zeros(40, 1, dtype=torch.int64)}, "parameter b2 is torch.int64; only torch.float32"),
+        ({"b2": torch.zeros(40, 1, dtype=torch.float64)}, "parameter b2 is torch.float64; only torch.float32"),
+    ],
+)
+def test_numbers_that_cannot_be_stored(tmp_path: Path, params: dict[str, torch.Tensor], message: str) -> None:
+    with pytest.raises(CheckpointError) as caught:
+        checkpoint.save_compressed(tmp_path / "m", altered(**params), "static", {}, LEVELS[3])
+    assert message in str(caught.value) and not (tmp_path / "m").exists()
+
+
+def test_a_field_that_folds_into_something_else_is_named() -> None:
+    class Loses(CosineDensity):
+        def folded(self, params: Params) -> dict[str, torch.Tensor]:
+            return {name: value[:-1] for name, value in params.items()}
+
+    model = example("static")[1]
+    with pytest.raises(FormError, match="density field Loses: folded returned tensors of other names or shapes"):
+        folded(Primitives(Loses(3), model.colour, model.params))
+
+
+def test_no_primitives_at_all(tmp_path: Path) -> None:
+    task, model = example("static")
+    none = Primitives(model.density, model.colour, {name: value[:0] for name, value in model.params.items()})
+    checkpoint.save_compressed(tmp_path / "m", none, task.name, {}, LEVELS[3])
+    assert checkpoint.load_model(tmp_path / "m", task)[0].count == 0
+
+
+def test_a_model_of_nothing_but_zeros_is_no_bomb(tmp_path: Path) -> None:
+    """What compresses without end is stored as it is, so that what strangers send need not be believed."""
+    task, model = example("static", 40_000)
+    params = {name: torch.zeros_like(value) for name, value in model.params.items()}
+    params["quats"][:, 0] = 1.0
+    path = tmp_path / "m"
+    checkpoint.save_compressed(
+        path, Primitives(model.density, model.colour, params), task.name, {}, LEVELS[3], "task: static\n"
+    )
+    numbers = 4 * 40_000 * model.parameters_per_primitive
+    assert numbers > 2**20 and path.stat().st_size * 64 + 2**20 >= numbers > 10 * path.stat().st_size
+    assert all(torch.equal(value, params[name]) for name, value in read_compressed(path)[1].items())
+
+
+def test_the_levels_are_those_of_the_documentation() -> None:
+    text = (Path(neuprim.__file__).parents[1] / "docs" / "export.md").read_text(encoding="utf-8")
+    head, _, *rows = [
+        line.strip("| \n").split(" | ") for line in text.split("| level |", 1)[1].split("\n\n", 1)[0].splitlines()
+    ]
+    names = [re.findall(r"\w+", cell) for cell in head]
+    found = {int(row[0]): [int(cell) for cell in row[1:]] for row in rows}
+    assert found.keys() == LEVELS.keys() and "others" in names[-1]
+    for level, table in LEVELS.items():
+        said = {name: (bits,) for group, bits in zip(names[:-1], found[level][:-1], strict=True) for name in group}
+        assert said == dict(table.named) and found[level][-1] == table.others and not table.exact

@@ -1,0 +1,549 @@
+"""The file byte by byte: as the documentation says, and refused by name where it is anything else."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import math
+import os
+import random
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from neuprim.core import checkpoint
+from neuprim.core.compression import CONFIG, LEVELS, Section, is_compressed, write_compressed
+from neuprim.core.compression.packing import packed_planes
+from neuprim.core.errors import CheckpointError
+from neuprim.core.model.pieces import alive
+from neuprim.core.model.primitives import Primitives
+from neuprim.tasks.static import TASK
+from tests.compressing import FIELDS, example, goners, without_pieces
+from tests.systems import posix
+
+CONFIG_TEXT = "task: static\nnote: naïve\n"
+
+
+@pytest.fixture(scope="module", params=["whole", "pruned"])
+def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A file of a static model, and of one of which every other primitive does without something."""
+    path, model = tmp_path_factory.mktemp("whole") / "m.neuprim", example("static", 50)[1]
+    model = model if request.param == "whole" else without_pieces(model)
+    checkpoint.save_compressed(path, model, "static", {"note": "naïve"}, LEVELS[3], CONFIG_TEXT)
+    return path.read_bytes()
+
+
+def refused(path: Path, *words: str) -> str:
+    """The message with which a file is refused, of one line; within a second of computing, whatever else the machine
+    does."""
+    start = time.thread_time()
+    with pytest.raises(CheckpointError) as caught:
+        checkpoint.load_model(path, TASK)
+    assert time.thread_time() - start < 1.0
+    message = str(caught.value)
+    assert str(path) in message and "\n" not in message
+    assert all(word in message for word in words), message
+    return message
+
+
+# ---------------------------------------------------------------- another reader, and another writer, from
+# docs/data_formats.md alone
+
+
+def table_rows(table: bytes, sections: int) -> list[dict[str, Any]]:
+    rows, at = [], 0
+    for _ in range(sections):
+        length = table[at]
+        name = table[at + 1 : at + 1 + length].decode()
+        at += 1 + length
+        coding, packing, dimensions = table[at : at + 3]
+        shape = struct.unpack_from(f"<{dimensions}I", table, at + 3)
+        at += 3 + 4 * dimensions
+        planes, size, crc = struct.unpack_from("<QQI", table, at)
+        at += 20
+        rows.append(
+            {
+                "name": name,
+                "coding": coding,
+                "packing": packing,
+                "shape": shape,
+                "planes": planes,
+                "size": size,
+                "crc": crc,
+            }
+        )
+    assert at == len(table)
+    return rows
+
+
+def read_by_the_book(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
+    assert data[:8] == bytes.fromhex("894E45555052494D")
+    version, sections, count, header_size, table_size, crc = struct.unpack_from("<IIQIII", data, 8)
+    body = 36 + header_size
+    assert version == 1 and crc == zlib.crc32(data[8:32] + data[36 : body + table_size])
+    header, at, text = json.loads(data[36:body]), body + table_size, ""
+    found: dict[str, np.ndarray] = {}
+    masks: list[list[int]] = []
+    for row in table_rows(data[body:at], sections):
+        part, at = data[at : at + row["size"]], at + row["size"]
+        assert zlib.crc32(part) == row["crc"]
+        columns = math.prod(row["shape"])
+        split = {0: 0, 1: 9 * columns, 2: 27, 3: 1, 4: 0, 5: 11 * columns}[row["coding"]]
+        head, packed = part[:split], part[split:]
+        content = zstandard.ZstdDecompressor().decompress(packed) if row["packing"] else packed
+        assert len(content) == row["planes"]
+        if row["coding"] == 0:
+            text = content.decode()
+            continue
+        if row["coding"] == 4:
+            width = -(-count // 8)
+            for k in range(columns):
+                mask = content[k * width : (k + 1) * width]
+                masks.append([n for n in range(count) if mask[n // 8] >> n % 8 & 1])
+            continue
+        stream = io.BytesIO(content)
+
+        def codes(bits: int, rows: int = count, stream: io.BytesIO = stream) -> np.ndarray:
+            planes = [np.frombuffer(stream.read(rows), np.uint8).astype(object) for _ in range(-(-bits // 8))]
+            return sum(plane * 256**i for i, plane in enumerate(planes))  # type: ignore[return-value]
+
+        if row["coding"] == 3:
+            h = 2 ** (head[0] - 1) - 1
+            g, *others = (codes(b) for b in (2, head[0], head[0], head[0]))
+            values = np.zeros((count, 4))
+            for n in range(count):
+                u = [int(c[n]) - h for c in others]
+                q = [x / math.sqrt(2 * h * h) for x in u]
+                q.insert(int(g[n]), math.sqrt(max(2 * h * h - sum(x * x for x in u), 0)) / math.sqrt(2 * h * h))
+                values[n] = q
+        else:
+            records = [struct.unpack_from("<Bff", head, 9 * i) for i in range(columns)]
+            whose = struct.unpack_from(f"<{columns}H", head, 9 * columns) if row["coding"] == 5 else [0] * columns
+            own = [masks[k - 1] if k else list(range(count)) for k in whose]
+            if row["coding"] == 2:
+                b = records[0][0]
+                keys = np.cumsum(codes(3 * b))
+                cells = [
+                    np.array([sum(int(key) >> (3 * i + axis) & 1 and 1 << i for i in range(b)) for key in keys])
+                    for axis in range(3)
+                ]
+            else:
+                cells = [codes(b, len(rows)) for (b, _, _), rows in zip(records, own, strict=True)]
+            values = np.zeros((count, columns))
+            for j, (b, low, high) in enumerate(records):
+                m = 2**b - 1
+                values[own[j], j] = [(low * (m - int(c)) + high * int(c)) / m for c in cells[j]]
+        found[row["name"]] = values.astype(np.float32).reshape(count, *row["shape"])
+    assert at == len(data)
+    return header, found, text
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("name", FIELDS)
+def test_the_documentation_is_all_that_a_reader_needs(tmp_path: Path, name: str, level: int) -> None:
+    task, model = example(name, 25)
+    checkpoint.save_compressed(tmp_path / "m", model, task.name, {"note": "naïve"}, LEVELS[level], CONFIG_TEXT)
+    header, found, text = read_by_the_book((tmp_path / "m").read_bytes())
+    again, wanted = checkpoint.load_model(tmp_path / "m", task)
+    assert header == wanted and text == CONFIG_TEXT == checkpoint.stored_config(tmp_path / "m")
+    assert found.keys() == again.params.keys()
+    for key, value in again.params.items():
+        assert found[key].tobytes() == value.numpy().tobytes(), key
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_pruned_model_is_read_by_the_book_as_well(tmp_path: Path, name: str) -> None:
+    task, model = example(name, 25)
+    pruned = without_pieces(model)
+    checkpoint.save_compressed(tmp_path / "m", pruned, task.name, {}, LEVELS[3], CONFIG_TEXT)
+    _, found, _ = read_by_the_book((tmp_path / "m").read_bytes())
+    again, _ = checkpoint.load_model(tmp_path / "m", task)
+    for key, value in again.params.items():
+        assert np.array_equal(found[key], value.numpy()), key
+    for piece, gone in goners(model).values():
+        assert int((~alive(piece, again.params)).sum()) >= int(
+            gone.sum()
+        )  # single numbers of others may be rounded to zero
+
+
+def by_hand(**changes: Any) -> bytes:
+    """A model of two primitives without neurons, written from the page: see the comments."""
+    # means: 2 bits; codes (0, 1, 2) and (3, 3, 3): key 0 has bit 1 (y) and bit 5 (z, second), 34; key 1 all six, 63;
+    # steps 34, 29
+    record = lambda bits, low, high: struct.pack("<Bff", bits, low, high)  # noqa: E731
+    constant = record(1, 0.5, 0.5)
+    sections = {
+        "means": (2, (3,), record(2, -1, 2) * 3, bytes([34, 29])),
+        "log_scales": (1, (3,), record(8, -2.0, -1.0) + record(4, -3.0, 0.0) + constant, bytes([0, 255, 5, 15, 0, 1])),
+        "quats": (
+            3,
+            (4,),
+            bytes([3]),
+            bytes([0, 3, 3, 6, 3, 3, 3, 0]),
+        ),  # h = 3: no turn; u = (3, 0, -3) before z, which is 0
+        "W1": (1, (0, 3), b"", b""),
+        "b1": (1, (0,), b"", b""),
+        "w2": (1, (0,), b"", b""),
+        "b2": (1, (1,), record(12, 0.0, 4095.0), bytes([0x02, 0xFF, 0x01, 0x0F])),  # 258 and 4095
+        "sh_dc": (1, (3,), constant * 3, bytes(6)),
+        **changes.pop("sections", {}),
+    }
+    sections = {**changes.pop("first", {}), **sections}
+    header = {
+        "format": 1, "kind": "model", "task": "static", "primitives": 2,
+        "density": {"class": "CosineDensity", "settings": {"neurons": 0}},
+        "colour": {"class": "SphericalHarmonics", "settings": {"degree": 0, "channels": 3}},
+        **changes.pop("header", {}),
+    }  # fmt: skip
+    return assembled(json.dumps(header).encode(), sections, **changes)
+
+
+def assembled(
+    text: bytes,
+    sections: dict[str, tuple[int, tuple[int, ...], bytes, bytes]],
+    version: int = 1,
+    count: int = 2,
+    packing: int = 0,
+    **table: Any,
+) -> bytes:
+    """A file of these parts, whose check sums are right, whatever else is not."""
+    rows, parts = [], []
+    for name, (coding, shape, head, planes) in sections.items():
+        part = head + planes
+        sizes = {
+            "planes": len(planes),
+            "size": len(part),
+            "crc": zlib.crc32(part),
+            "packing": packing,
+            **table.get(name, {}),
+        }
+        label = sizes.get("label", name.encode())
+        row = (
+            bytes([len(label)])
+            + label
+            + bytes([coding, sizes["packing"], len(shape)])
+            + struct.pack(f"<{len(shape)}I", *shape)
+        )
+        rows.append(row + struct.pack("<QQI", sizes["planes"], sizes["size"], sizes["crc"]))
+        parts.append(sizes.get("part", part))
+    start = struct.pack("<IIQII", version, table.get("number", len(rows)), count, len(text), len(b"".join(rows)))
+    return (
+        b"\x89NEUPRIM"
+        + start
+        + struct.pack("<I", zlib.crc32(start + text + b"".join(rows)))
+        + text
+        + b"".join(rows + parts)
+    )
+
+
+def test_a_file_by_hand_is_read_as_the_page_says(tmp_path: Path) -> None:
+    path = tmp_path / "any name"
+    path.write_bytes(by_hand())
+    model, header = checkpoint.load_model(path, TASK)
+    p = model.params
+    assert p["means"].tolist() == [[-1.0, 0.0, 1.0], [2.0, 2.0, 2.0]]
+    assert p["log_scales"].tolist() == [[-2.0, -2.0, 0.5], [-1.0, 0.0, 0.5]]
+    assert p["quats"][0].tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert p["quats"][1].tolist() == pytest.approx([0.5**0.5, 0.0, -(0.5**0.5), 0.0])
+    assert (
+        p["b2"].tolist() == [[258.0], [4095.0]]
+        and p["sh_dc"].tolist() == [[0.5] * 3] * 2
+        and p["W1"].shape == (2, 0, 3)
+    )
+    assert header["task"] == "static" and checkpoint.stored_config(path) is None and is_compressed(path)
+    assert checkpoint.read_header(path, "model") == header
+    with pytest.raises(CheckpointError, match="kind is 'model'; expected 'checkpoint'"):
+        checkpoint.read_header(path, "checkpoint")
+
+
+# ---------------------------------------------------------------- what is damaged
+
+
+def test_truncated_anywhere(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "m"
+    for cut in sorted({*range(60), *(i * len(whole) // 200 for i in range(200)), len(whole) - 1}):
+        path.write_bytes(whole[:cut])
+        refused(path)
+    path.write_bytes(whole + b"\0")
+    refused(path, "follow it")
+    path.write_bytes(whole)
+    checkpoint.load_model(path, TASK)
+
+
+def test_every_flipped_bit_is_noticed(tmp_path: Path, whole: bytes) -> None:
+    """Check sums cover every byte."""
+    path, numbers = tmp_path / "m", random.Random(0)
+    for i in (*range(400), *numbers.sample(range(400, len(whole)), 300)):
+        damaged = bytearray(whole)
+        damaged[i] ^= 1 << numbers.randrange(8)
+        path.write_bytes(damaged)
+        refused(path)
+
+
+def sparse(whose: int, codes: bytes) -> tuple[int, tuple[int, ...], bytes, bytes]:
+    """A section of one sparse column: 8 bits from 0 to 255."""
+    return 5, (1,), struct.pack("<BffH", 8, 0.0, 255.0, whose), codes
+
+
+def test_sparse_columns_by_hand(tmp_path: Path) -> None:
+    """The second of two primitives has a number, then both, then neither."""
+    rows = {"rows|": (4, (3,), b"", bytes([0b10, 0b11, 0b00]))}
+    for whose, codes, wanted in (
+        (1, b"\x07", [0.0, 7.0]),
+        (2, b"\x05\x06", [5.0, 6.0]),
+        (3, b"", [0.0, 0.0]),
+        (0, b"\x01\x02", [1.0, 2.0]),
+    ):
+        (tmp_path / "m").write_bytes(by_hand(first=rows, sections={"b2": sparse(whose, codes)}))
+        assert checkpoint.load_model(tmp_path / "m", TASK)[0].params["b2"].flatten().tolist() == wanted
+
+
+def resummed(data: bytearray) -> bytes:
+    """With the check sums that somebody malicious would write, as far as sizes still make sense."""
+    try:
+        _, sections, _, header_size, table_size, _ = struct.unpack_from("<IIQIII", data, 8)
+        body, at = 36 + header_size, 36 + header_size + table_size
+        place = body
+        for row in table_rows(bytes(data[body:at]), min(sections, 100)):
+            place += 1 + len(row["name"].encode()) + 3 + 4 * len(row["shape"]) + 20
+            struct.pack_into("<I", data, place - 4, zlib.crc32(bytes(data[at : at + row["size"]])))
+            at += row["size"]
+        struct.pack_into("<I", data, 32, zlib.crc32(bytes(data[8:32] + data[36 : body + table_size])))
+    except (struct.error, AssertionError, IndexError, ValueError, OverflowError):
+        pass
+    return bytes(data)
+
+
+@settings(
+    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
+)
+@given(
+    changes=st.lists(st.tuples(st.integers(0, 2**20), st.integers(0, 255)), min_size=1, max_size=6), near=st.booleans()
+)
+def test_what_has_the_right_check_sums_is_refused_or_a_model(
+    tmp_path: Path, whole: bytes, changes: list[tuple[int, int]], near: bool
+) -> None:
+    """Bytes changed by somebody who knows the format: never another error, and what is read is whole, finite and of the
+    right shapes."""
+    data = bytearray(whole)
+    for place, value in changes:
+        data[8 + place % (1800 if near else len(data) - 8)] = value
+    path = tmp_path / "m"
+    path.write_bytes(resummed(data))
+    try:
+        model, header = checkpoint.load_model(path, TASK)
+    except CheckpointError as error:
+        assert str(path) in str(error) and "\n" not in str(error)
+        return
+    assert isinstance(model, Primitives) and header["kind"] == "model"
+    assert all(bool(torch.isfinite(value).all()) for value in model.params.values())
+
+
+def zstd(data: bytes, **options: Any) -> bytes:
+    return zstandard.ZstdCompressor(**options).compress(data)
+
+
+BOMB = zstd(bytes(200_000_000), level=1)
+RECORD = struct.pack("<Bff", 8, 0.0, 1.0)
+DAMAGE: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
+    "version": (lambda: by_hand(version=2), ("format version is 2", "reads 1")),
+    "count": (lambda: by_hand(count=3), ("header says 2 primitives; expected 3",)),
+    "both counts": (lambda: by_hand(count=3, header={"primitives": 3}), ("section 'means'", "2 bytes; expected 3")),
+    "no count": (lambda: by_hand(count=2**63), ("claims 9223372036854775808 primitives",)),
+    "count in the header": (lambda: by_hand(header={"primitives": 3}), ("header says 3 primitives; expected 2",)),
+    "sections": (lambda: by_hand(number=2**32 - 1), ("claims 4294967295 sections; expected at most 4096",)),
+    "more rows": (lambda: by_hand(number=9), ("row 8 of the table of 9 sections",)),
+    "fewer rows": (lambda: by_hand(number=7), ("goes on after 7 sections",)),
+    "header not JSON": (lambda: assembled(b"{", {}), ("header is not valid JSON",)),
+    "header nested": (lambda: assembled(b"[" * 200_000, {}), ("header is not valid JSON",)),
+    "header a list": (lambda: assembled(b"[]", {}), ("header is a list",)),
+    "kind": (lambda: by_hand(header={"kind": "checkpoint"}), ("kind is 'checkpoint'; expected 'model'",)),
+    "format": (lambda: by_hand(header={"format": 9}), ("format version is 9",)),
+    "task": (lambda: by_hand(header={"task": "dynamic"}), ("written for task 'dynamic'",)),
+    "neurons": (lambda: by_hand(header={"density": {"class": "CosineDensity", "settings": {"neurons": 1}}}), ("W1",)),
+    "field": (lambda: by_hand(header={"density": {"class": "os.system", "settings": {}}}), ("unknown density field",)),
+    "twice": (lambda: by_hand(b1={"label": b"W1"}), ("section 'W1' is there twice",)),
+    "name": (lambda: by_hand(b2={"label": b"\xff\xfe"}), ("row 6",)),
+    "missing": (lambda: by_hand(b2={"label": b"b3"}), ("b3",)),
+    "coding": (lambda: by_hand(sections={"b2": (6, (1,), RECORD, b"ab")}), ("section 'b2' has coding 6",)),
+    "rows of another name": (lambda: by_hand(sections={"b2": (4, (1,), b"", b"a")}), ("section 'b2' of rows", "'rows|'")),
+    "rows of another coding": (lambda: by_hand(first={"rows|": (1, (1,), RECORD, b"ab")}), ("section 'rows|' of columns",)),
+    "rows without a mask": (lambda: by_hand(first={"rows|": (4, (0,), b"", b"")}), ("section 'rows|' of rows has shape (0,)",)),
+    "rows of two dimensions": (lambda: by_hand(first={"rows|": (4, (1, 1), b"", b"a")}), ("section 'rows|' of rows has shape (1, 1)",)),
+    "rows too long": (lambda: by_hand(first={"rows|": (4, (1,), b"", b"ab")}), ("section 'rows|' is damaged: its planes have 2 bytes; expected 1",)),
+    "rows beyond": (lambda: by_hand(first={"rows|": (4, (1,), b"", b"\x07")}), ("bits beyond those of 2 primitives",)),
+    "no rows": (lambda: by_hand(sections={"b2": sparse(1, b"a")}), ("section 'b2' is damaged: a column of the primitives of mask 1; expected at most 0",)),
+    "rows that come later": (
+        lambda: by_hand(sections={"b2": sparse(1, b"a"), "rows|": (4, (1,), b"", b"\x01")}),
+        ("mask 1; expected at most 0",),
+    ),
+    "another mask": (
+        lambda: by_hand(first={"rows|": (4, (1,), b"", b"\x01")}, sections={"b2": sparse(2, b"a")}),
+        ("mask 2; expected at most 1",),
+    ),
+    "more than the mask has": (
+        lambda: by_hand(first={"rows|": (4, (1,), b"", b"\x01")}, sections={"b2": sparse(1, b"ab")}),
+        ("section 'b2' is damaged: its planes have 2 bytes; expected 1",),
+    ),
+    "packing": (lambda: by_hand(b2={"packing": 2}), ("section 'b2' has packing 2",)),
+    "text": (lambda: by_hand(sections={"b2": (0, (), b"", b"ab")}), ("section 'b2' has coding text",)),
+    "config": (lambda: by_hand(sections={CONFIG: (1, (), RECORD, b"ab")}), ("section 'config.yaml' has coding columns",)),
+    "config not UTF-8": (lambda: by_hand(sections={CONFIG: (0, (), b"", b"\xff")}), ("section 'config.yaml' is damaged",)),
+    "config too long": (lambda: by_hand(sections={CONFIG: (0, (), b"", bytes(2**20 + 1))}), ("1048577 bytes; expected at most 1048576",)),
+    "dimensions": (lambda: by_hand(sections={"W1": (1, (0,) * 5, b"", b"")}), ("5 dimensions",)),
+    "shape": (lambda: by_hand(sections={"W1": (1, (2**32 - 1, 0), b"", b"")}), ("expected at most 1048576 numbers",)),
+    "large shape": (lambda: by_hand(sections={"W1": (1, (2**31, 2**31, 2**31, 2**31), b"", b"")}), ("expected at most",)),
+    "positions' shape": (lambda: by_hand(sections={"means": (2, (4,), RECORD * 4, b"ab")}), ("of positions has shape (4,)",)),
+    "positions' bits": (
+        lambda: by_hand(sections={"means": (2, (3,), RECORD * 2 + struct.pack("<Bff", 9, 0.0, 1.0), bytes(6))}),
+        ("three columns of as many bits",),
+    ),
+    "bits": (lambda: by_hand(sections={"b2": (1, (1,), struct.pack("<Bff", 21, 0, 1), bytes(6))}), ("column 0 has 21 bits",)),
+    "no bits": (lambda: by_hand(sections={"b2": (1, (1,), struct.pack("<Bff", 0, 0, 1), b"")}), ("column 0 has 0 bits",)),
+    "ends": (lambda: by_hand(sections={"b2": (1, (1,), struct.pack("<Bff", 8, 1, 0), b"ab")}), ("goes from 1.0 to 0.0",)),
+    "NaN": (lambda: by_hand(sections={"b2": (1, (1,), struct.pack("<Bff", 8, math.nan, 0), b"ab")}), ("goes from nan",)),
+    "infinite": (lambda: by_hand(sections={"b2": (1, (1,), struct.pack("<Bff", 8, 0, math.inf), b"ab")}), ("to inf",)),
+    "code": (lambda: by_hand(sections={"b2": (1, (1,), struct.pack("<Bff", 7, 0, 1), bytes([128, 0]))}), ("7 bits that is not among 0 to 127",)),
+    "key": (lambda: by_hand(sections={"means": (2, (3,), struct.pack("<Bff", 2, 0, 1) * 3, bytes([34, 30]))}), ("leave its 6 bits",)),
+    "wide key": (
+        lambda: by_hand(sections={"means": (2, (3,), struct.pack("<Bff", 20, 0, 1) * 3, bytes([255] * 16))}),
+        ("a code of 60 bits",),
+    ),
+    "rotation bits": (lambda: by_hand(sections={"quats": (3, (4,), bytes([2]), bytes(8))}), ("2 bits for rotations",)),
+    "largest": (lambda: by_hand(sections={"quats": (3, (4,), bytes([3]), bytes([4] + [0] * 7))}), ("not among 0 to 3",)),
+    "rotation code": (lambda: by_hand(sections={"quats": (3, (4,), bytes([3]), bytes([0] * 7 + [7]))}), ("not among 0 to 6",)),
+    "planes": (lambda: by_hand(b2={"planes": 3, "size": 12, "part": RECORD + b"abc"}), ("section 'b2' is damaged",)),
+    "too many planes": (lambda: by_hand(b2={"planes": 2**60}), ("planes of 1152921504606846976 bytes; expected at most 6",)),
+    "size": (lambda: by_hand(b2={"size": 2**60}), ("stored in 1152921504606846976 bytes",)),
+    "size of zstd": (lambda: by_hand(b2={"size": 2**60, "packing": 1}), ("the sections take 115292150460684",)),
+    "no zstd": (lambda: by_hand(packing=1), ("section 'means' is damaged: zstd",)),
+    "zstd states more": (
+        lambda: by_hand(sections={"b2": (1, (1,), RECORD, BOMB)}, b2={"packing": 1, "planes": 2}),
+        ("its zstd frame states 200000000 bytes; expected 2",),
+    ),
+    "zstd states nothing": (
+        lambda: by_hand(sections={"b2": (1, (1,), RECORD, zstd(b"ab", write_content_size=False))}, b2={"packing": 1, "planes": 2}),
+        ("its zstd frame states",),
+    ),
+    "two zstd frames": (
+        lambda: by_hand(sections={"b2": (1, (1,), RECORD, zstd(b"ab") * 2)}, b2={"packing": 1, "planes": 2}),
+        ("section 'b2' is damaged: zstd",),
+    ),
+    "a bomb of primitives": (
+        lambda: assembled(
+            json.dumps({"primitives": 60_000_000}).encode(),
+            {"b2": (1, (1,), RECORD, zstd(bytes(60_000_000), level=1))}, count=60_000_000, b2={"packing": 1, "planes": 60_000_000},
+        ),
+        ("expected at most 64 times its size",),
+    ),
+}  # fmt: skip
+"""Name -> a file with right check sums, and what the message says."""
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_lies_are_named(tmp_path: Path, name: str) -> None:
+    make, words = DAMAGE[name]
+    path = tmp_path / "m"
+    path.write_bytes(make())
+    refused(path, *words)
+
+
+MEMORY = """
+import resource, sys
+from pathlib import Path
+from neuprim.core import checkpoint
+from neuprim.core.errors import CheckpointError
+from neuprim.tasks.static import TASK
+checkpoint.load_model(Path(sys.argv[1]), TASK)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for name in sys.argv[2:]:
+    try:
+        checkpoint.load_model(Path(name), TASK)
+        raise SystemExit(f"{name} was read")
+    except CheckpointError:
+        pass
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+
+
+@posix
+def test_lies_take_no_memory(tmp_path: Path) -> None:
+    """All together less than one of the bombs would."""
+    names = [tmp_path / "good", *(tmp_path / str(i) for i in range(len(DAMAGE)))]
+    for path, data in zip(names, [by_hand(), *(make() for make, _ in DAMAGE.values())], strict=True):
+        path.write_bytes(data)
+    done = subprocess.run([sys.executable, "-c", MEMORY, *map(str, names)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr + done.stdout
+    grown = int(done.stdout) / (2**20 if sys.platform == "darwin" else 2**10)
+    assert grown < 40, f"{grown} MiB"
+
+
+def test_other_files(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "model.neuprim"
+    path.write_bytes(b"")
+    refused(path, "safetensors")
+    path.write_bytes(b"\x89PNG" + whole)
+    refused(path, "safetensors")
+    assert not is_compressed(path) and not is_compressed(tmp_path) and not is_compressed(tmp_path / "none")
+
+
+# ---------------------------------------------------------------- writing
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path: Path, whole: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "m"
+    path.write_bytes(whole)
+
+    def full(*places: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("neuprim.core.io.files.os.replace", full)
+    with pytest.raises(CheckpointError, match=r"could not write the model: .*No space left on device") as caught:
+        checkpoint.save_compressed(path, example("static", 9)[1], "static", {}, LEVELS[3])
+    monkeypatch.undo()
+    assert str(path) in str(caught.value)
+    assert path.read_bytes() == whole and [p.name for p in tmp_path.iterdir()] == ["m"]
+
+
+def test_headers_and_texts_that_no_reader_would_take(tmp_path: Path) -> None:
+    model = example("static", 9)[1]
+    with pytest.raises(CheckpointError, match="the header has 5000"):
+        checkpoint.save_compressed(tmp_path / "m", model, "static", {"note": "x" * 5_000_000}, LEVELS[3])
+    with pytest.raises(CheckpointError, match=r"config\.yaml has more than 1048576 bytes"):
+        checkpoint.save_compressed(tmp_path / "m", model, "static", {}, LEVELS[3], "x" * 2_000_000)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1, 1, 1), (2**20 + 1,), (2**10, 2**11)])
+def test_parameters_that_no_reader_would_take(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    with pytest.raises(CheckpointError, match=r"parameter 'p' of shape .* cannot be stored; at most"):
+        write_compressed(tmp_path / "m", {}, 0, [Section("p", 1, shape)])
+    with pytest.raises(CheckpointError, match="cannot be stored; at most a name of 255 bytes"):
+        write_compressed(tmp_path / "m", {}, 0, [Section("ü" * 128, 1, (1,))])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_blocks_are_cut_where_that_helps() -> None:
+    """Wide and narrow columns in turns: less than one frame without cuts, and not more than a frame for each."""
+    numbers = np.random.default_rng(0)
+    planes = [np.clip(numbers.normal(128, width, 3000), 0, 255).astype(np.uint8).tobytes() for width in (3, 12) * 12]
+    found, whole = packed_planes(planes), b"".join(planes)
+    assert len(found) < 0.97 * len(zstd(whole, level=19)) and len(found) <= sum(
+        len(packed_planes([plane])) for plane in planes
+    )
+    assert zstandard.ZstdDecompressor().decompress(found) == whole
+    noise = numbers.bytes(1000)
+    assert packed_planes([noise]) == noise and packed_planes([]) == b""

@@ -1,0 +1,201 @@
+"""Trials of a tiny scene: what their folders hold, and that none is trained twice or half."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import neuprim.runs.fit as fitting
+from neuprim.config import RunConfig, compose
+from neuprim.core import checkpoint
+from neuprim.core.errors import DataError
+from neuprim.core.io.files import write_json
+from neuprim.core.train.trainer import StepReport, Trainer
+from neuprim.runs.draw import render_run
+from neuprim.runs.events import Event, Note, Step
+from neuprim.runs.fit import fit
+from neuprim.runs.measure import evaluate_run
+from neuprim.runs.open import load_dataset, load_run
+from neuprim.search.tradeoff.subject import load_subject
+from neuprim.search.trials import FILE, Outcome, Trial, read_outcome, run_trial
+from neuprim.tasks.static import TASK
+from tests.core import tiny
+from tests.short_runs import words
+from tests.systems import posix
+
+STEPS = 40
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny.write_blender(tmp_path_factory.mktemp("data") / "two")
+
+
+def config_of(scene: Path, folder: Path, *more: str) -> RunConfig:
+    return compose(words(scene, folder, STEPS, *more), check_output=False)
+
+
+@pytest.fixture(scope="module")
+def done(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    folder = tmp_path_factory.mktemp("trials") / "one"
+    return folder, run_trial(Trial(config_of(scene, folder)))
+
+
+def steps_of(heard: list[Event]) -> int:
+    return sum(isinstance(event, Step) for event in heard)
+
+
+def test_a_trial_is_a_run_without_report_and_pictures(done: tuple[Path, Outcome], tmp_path: Path) -> None:
+    folder = done[0]
+    assert sorted(p.name for p in folder.iterdir()) == sorted(
+        ["checkpoint.safetensors", "config.yaml", "metrics.jsonl", "model.safetensors", FILE]
+    )
+    assert load_run(folder)[2].count == 40 and load_subject(folder, (), 2).truths[0].view.name
+    assert len(render_run(folder, "test", (12, 12), "png", tmp_path / "drawn", 60, {})) == 2
+
+
+def test_an_outcome_is_what_evaluating_the_folder_measures(done: tuple[Path, Outcome]) -> None:
+    folder, outcome = done
+    metrics = evaluate_run(folder)
+    assert outcome.psnr == pytest.approx(metrics["psnr"], abs=1e-9) and outcome.ssim == pytest.approx(
+        metrics["ssim"], abs=1e-9
+    )
+    assert outcome.primitives == 40 and outcome.parameters_per_primitive == metrics["parameters_per_primitive"]
+    assert outcome.bytes == (folder / "model.safetensors").stat().st_size and outcome.steps == STEPS
+    assert outcome.seconds > 0 and outcome.ms_per_frame > 0
+    assert [progress for progress, _ in outcome.curve] == [0.25, 0.5, 0.75, 1.0] and outcome.curve[-1][
+        1
+    ] == pytest.approx(outcome.psnr, abs=1e-3)
+    assert Outcome.from_dict(json.loads(json.dumps(outcome.to_dict()))) == outcome == read_outcome(folder)
+    perfect = replace(outcome, psnr=float("inf"))
+    assert Outcome.from_dict(json.loads(json.dumps(perfect.to_dict(), allow_nan=False))) == perfect
+
+
+def test_what_is_done_is_read_back_and_nothing_is_loaded(
+    done: tuple[Path, Outcome], scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, outcome = done
+    monkeypatch.setattr("neuprim.runs.fit.load_dataset", lambda *args: pytest.fail("loaded"))
+    before = (folder / "checkpoint.safetensors").stat().st_mtime_ns
+    assert (
+        run_trial(Trial(config_of(scene, folder))) == outcome
+        and (folder / "checkpoint.safetensors").stat().st_mtime_ns == before
+    )
+
+
+def test_other_settings_are_trained_anew_and_said(scene: Path, tmp_path: Path) -> None:
+    folder, heard = tmp_path / "t", list[Event]()
+    first = run_trial(Trial(config_of(scene, folder)))
+    second = run_trial(Trial(config_of(scene, folder, "model.neurons=0")), events=heard.append)
+    said = [event.text for event in heard if isinstance(event, Note)]
+    assert f"{folder}: tried with another model.neurons; trained anew" in said and steps_of(heard) == STEPS
+    assert second.parameters_per_primitive < first.parameters_per_primitive
+    heard.clear()
+    run_trial(Trial(config_of(scene, folder, "model.neurons=0"), hold_out=3), events=heard.append)
+    assert (
+        any("another hold_out" in event.text for event in heard if isinstance(event, Note)) and steps_of(heard) == STEPS
+    )
+
+
+def test_other_views_are_measured_and_not_trained_for(scene: Path, tmp_path: Path) -> None:
+    folder, heard = tmp_path / "t", list[Event]()
+    both = run_trial(Trial(config_of(scene, folder)))
+    one = run_trial(Trial(config_of(scene, folder), views=1), events=heard.append)
+    metrics = evaluate_run(folder)
+    assert (
+        steps_of(heard) == 0
+        and one.psnr == pytest.approx(metrics["per_view"][0]["psnr"])
+        and one.psnr != both.psnr
+        and one.steps == STEPS
+    )
+
+
+def test_views_that_judge_are_not_learned_from(scene: Path, tmp_path: Path) -> None:
+    config = config_of(scene, tmp_path / "t")
+    whole = load_dataset(config, TASK)
+    learned = set[str]()
+
+    def hear(event: Event) -> None:
+        if isinstance(event, Step):
+            learned.add(event.report.view)
+
+    outcome = run_trial(Trial(config, hold_out=3), whole, hear)
+    names = [whole.train.view(i).name for i in range(len(whole.train))]
+    assert learned == {name for i, name in enumerate(names) if i not in (0, 4)} and len(names) == 6
+    fitted = fit(config_of(scene, tmp_path / "other"), dataset=whole)
+    assert outcome.psnr != pytest.approx(fitted.metrics()["psnr"], abs=1e-6), "the test views do not judge"
+
+
+def test_a_task_that_knows_its_test_views_is_not_asked_about_others(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Films and facts are those of the data as they came; indices of the test split would mean other views."""
+    from neuprim.core.data import Clip
+
+    mine = replace(
+        TASK,
+        clips=lambda dataset: [Clip("all", [0, 1])],
+        judge=lambda dataset, index, rendered, truth: pytest.fail("asked"),
+    )
+    monkeypatch.setattr("neuprim.tasks.static.TASK", mine)
+    assert run_trial(Trial(config_of(scene, tmp_path / "t"), hold_out=6)).psnr > 5, (
+        "one view is held out, and the film has two"
+    )
+
+
+class Halting(Trainer):
+    """Presses Ctrl-C in the 15th step."""
+
+    def train_step(self) -> StepReport:
+        if self.step == 15 and self.model.count == 40:
+            os.kill(os.getpid(), signal.SIGINT)
+        return super().train_step()
+
+
+@posix
+def test_interrupted_it_goes_on_to_the_same_end(
+    done: tuple[Path, Outcome], scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, heard = tmp_path / "t", list[Event]()
+    monkeypatch.setattr(fitting, "Trainer", Halting)
+    with pytest.raises(KeyboardInterrupt):
+        run_trial(Trial(config_of(scene, folder)))
+    monkeypatch.undo()
+    assert (
+        checkpoint.read_header(folder / "checkpoint.safetensors", "checkpoint")["step"] == 16
+        and read_outcome(folder) is None
+    )
+    outcome = run_trial(Trial(config_of(scene, folder)), events=heard.append)
+    assert steps_of(heard) == STEPS - 16 and outcome.psnr == done[1].psnr and len(outcome.curve) == 4
+    assert (folder / "model.safetensors").read_bytes() != b"" and outcome.steps == STEPS
+
+
+def test_a_run_that_is_no_trial_is_left_alone(scene: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "config.yaml").write_text("mine")
+    with pytest.raises(DataError, match=r"run: holds a run and no trial\.json; expected a new folder"):
+        run_trial(Trial(config_of(scene, folder)))
+    assert (folder / "config.yaml").read_text() == "mine" and len(list(folder.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"format": 1}', '{"format": 9, "asked": {}, "views": 8, "outcome": null}']
+)
+def test_a_damaged_record_is_refused(scene: Path, tmp_path: Path, text: str) -> None:
+    (tmp_path / FILE).write_text(text)
+    with pytest.raises(DataError, match=r"trial\.json: .*delete its folder to train anew"):
+        run_trial(Trial(config_of(scene, tmp_path)))
+
+
+@pytest.mark.parametrize("change", [{"psnr": "much"}, {"curve": [1]}, {"bytes": None}])
+def test_a_damaged_outcome_is_refused(done: tuple[Path, Outcome], tmp_path: Path, change: dict[str, object]) -> None:
+    record = json.loads((done[0] / FILE).read_text())
+    write_json(tmp_path / FILE, {**record, "outcome": {**record["outcome"], **change}})
+    with pytest.raises(DataError, match=r"trial\.json: .*delete its folder"):
+        read_outcome(tmp_path)

@@ -16,10 +16,9 @@ hold. Parts:
     and few steps, equal count
               and equal bytes, beside the other forms in the same conditions
 
-Each form learns at the best rates of `screening.py`, which sees no test view. Means over seeds +- half the spread, of
-the last checkpoint, on the test views. Results go to benchmarks/results/expressivity.json after every run, and only
-what is missing is run; models to outputs/expressivity, from which docs/pictures/expressivity.png is drawn (Figure 9 of
-the paper). --docs puts the tables between the markers in docs/expressivity.md; --print runs nothing.
+Numbers are means over seeds +- half the spread, of the last checkpoint, on the test views. Results go to
+benchmarks/results/expressivity.json after every run, and only what is missing is run. --docs puts the tables between
+the markers in docs/expressivity.md; --print runs nothing.
 """
 
 from __future__ import annotations
@@ -42,44 +41,12 @@ from neuprim.core.compute.machine import cpu_name
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "expressivity.json"
 DOCS = HERE.parent / "docs" / "expressivity.md"
-PICTURE = HERE.parent / "docs" / "pictures" / "expressivity.png"
 KEYS = (
     "psnr", "psnr_worst", "ssim", "psnr_mask", "psnr_linear_clamped", "psnr_pooled_cast_shadow", "psnr_pooled_highlight",
     "sigma_relative_l2_early", "sigma_relative_l2_middle", "sigma_relative_l2_late",
     "parameters", "parameters_per_primitive", "primitives", "backend",
 )  # fmt: skip
 
-# The presets' rates are those that `screening.py` found, in dB of (solids, chair) at the bytes of 400 and 1,500 steps,
-# and they are the same for each form:
-# K = 8 hard: as before 27.60, 29.88; b2, w2 0.03 28.16, 30.08; 0.1 28.08, 30.26; 0.03 and log_scales 0.06 *28.29,
-# 30.22*; 0.03 and means 1e-3 28.01, -.
-# K = 2 p = 2: b2, w2 0.01 29.64, 30.82; 0.03 29.68, 30.78; 0.1 29.71, 30.74; 0.03 and log_scales 0.02 29.29, 30.63; and
-# 0.06 *29.96, 30.92*;
-# and log_gain 0.05 29.49, 30.69; and 0.5 29.59, 30.91; and W1, b1 0.02 29.73, 30.88; and means 1e-3 29.77, 30.83; and
-# model.init.scale 1.4 29.41, 30.70;
-# log_scales 0.06 and W1, b1 0.02 29.92, 30.90. K = 0 p = 2: 0.01 29.32, 30.58; 0.03 29.35, 30.54; 0.1 29.21, 30.56;
-# 0.03 and log_scales 0.06
-# *29.51, 30.66*; and log_gain 0.5 29.22, 30.51; and means 1e-3 29.30, 30.59.
-# The fire, inside the mask, images alone, bytes of 2,000: K = 0 p = 2 38.09, log_scales 0.04 *38.63*, b2 0.01 37.91;
-# with log_scales 0.04 and b2, w2 0.01
-# K = 2 p = 2 37.92 to 38.31 and K = 8 hard 37.44 to 37.62.
-# lit_solids, clamped, held-out training views, bytes of 2,000, 2,000 steps: K = 2 p = 2 28.96; log_scales 0.04 29.31;
-# 0.06 and b2, w2 0.03 *29.37*; half
-# the network's rates 28.90; only idle primitives moved 28.84. With those of 29.37 K = 0 p = 2 29.27, K = 8 hard 28.47
-# (at the old rates 28.8 on the test views).
-# smoke_fire, 10,000 steps, K = 0 p = 2, bytes of 2,000: the least used moved 47.74 dB, only the idle *48.65*; on the
-# fire, 7,000 steps, level.
-# Voxels beside images on the fire at equal seconds, inside the mask and relative L2 of sigma: images 40.52 .148 .222
-# .312; 8,192 points in every
-# fourth step 40.62 .102 .189 .281, in every sixteenth *40.64 .114 .198 .290*; the first with four times the weight
-# 40.19 .097 .188 .279; 4,096 in every
-# second 40.55 .095 .187 .276. On smoke_fire with quick's 13,500 primitives: images 45.74 .251 .322 .328; every
-# sixteenth 44.89 .285 .294 .309; every
-# fourth 44.15 .330 .273 .300; every step 42.70 .323 .288 .295.
-# smoke_fire again, judged by another rig (scene.cameras=38), K = 0 p = 2, bytes of 1,000, at equal seconds (6,000,
-# 5,249 and 3,855 steps), two seeds, inside
-# the mask: images 42.36 and 42.92, every sixteenth 41.15 and 41.43, every fourth 40.57 and 41.38. The fire gets its
-# voxels for nothing and smoke does not.
 FORMS = {
     "static": ("8:0", "0:2", "2:2", "4:2"),
     "dynamic": ("8:0@images", "0:2@images", "0:2", "2:2"),
@@ -157,8 +124,7 @@ def plan(args: argparse.Namespace, paces: dict[str, float]) -> list[Trial]:
     ) -> None:
         facts = (("part", part), ("scene", scene), ("form", form), ("size", size))
         name = f"{part}-{scene}-{size}-{form}-{count}-{steps}-{seed}"
-        kept = args.models / name if seed == 0 and part != "slope" and SCENES[scene].task == "static" else None
-        trials.append(Trial(name, (*words_of(form, scene, args, count), *further), steps, seed, 0, facts, kept))
+        trials.append(Trial(name, (*words_of(form, scene, args, count), *further), steps, seed, 0, facts))
 
     for seed in range(args.seeds):
         for scene in args.scenes:
@@ -283,17 +249,6 @@ def _sigma(runs: list[dict[str, Any]]) -> str:
     return " / ".join(spread([r[k] for r in runs], 2) for k in keys) if all(k in runs[0] for k in keys) else ""
 
 
-def _pictured(trials: list[dict[str, Any]], scene: str) -> list[dict[str, Any]]:
-    """Of each form the run of seed 0 at the bytes of 400; of the Gaussian the one at equal bytes."""
-    own = [r for r in trials if r["scene"] == scene and r["seed"] == 0]
-    rows = [r for r in own if r["part"] == "forms" and r["size"] == 400]
-    rows.sort(key=lambda r: r["form"] != str(PAPER))
-    gaussians = [
-        r for r in own if r["part"] == "gaussian" and r["form"] == "gaussian" and r["primitives"] != SMALL["primitives"]
-    ]
-    return [*rows, *gaussians]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
@@ -306,11 +261,8 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="*", type=int, default=[], help="some of the scenes' sizes")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
-    parser.add_argument(
-        "--models", type=Path, default=Path("outputs") / "expressivity", help="folder for the fitted models"
-    )
     parser.add_argument("--print", action="store_true", help="train nothing")
-    parser.add_argument("--docs", action="store_true", help="write tables and picture into docs")
+    parser.add_argument("--docs", action="store_true", help="write the tables into docs")
     parser.add_argument("--readme", action="store_true", help="write a short table into README.md")
     args = parser.parse_args()
     if not args.print:
@@ -332,13 +284,6 @@ def main() -> None:
             between_markers(DOCS, name, text)
     if args.readme:
         between_markers(README, "expressivity", short_table(trials))
-    if args.docs:
-        from expressivity_picture import draw_figure
-
-        static = [scene for scene in args.scenes if SCENES[scene].task == "static"]
-        wanted = [args.models / row["trial"] for scene in static for row in _pictured(trials, scene)]
-        if wanted and all((folder / "model.safetensors").exists() for folder in wanted):
-            draw_figure(wanted, PICTURE, len(wanted) // len(static))
 
 
 if __name__ == "__main__":

@@ -40,14 +40,6 @@ def test_the_page_shows_what_was_recorded(budget: ModuleType) -> None:
     assert budget.PICTURE.exists()
 
 
-def test_the_page_shows_the_populations_that_were_recorded(budget: ModuleType) -> None:
-    population = importlib.import_module("population")
-    rows = json.loads(population.RESULTS.read_text(encoding="utf-8"))["trials"]
-    page = (ROOT / "docs" / "budgets.md").read_text(encoding="utf-8")
-    assert f"{population.table(rows)}\n\n{population.caption(rows)}" in page
-    assert {row["variant"] for row in rows} == set(population.VARIANTS)
-
-
 def test_a_fall_is_listed_and_a_small_one_is_not(budget: ModuleType) -> None:
     rows = [row(100, 0, 30.0), row(200, 0, 29.95, 19.8), row(400, 0, 31.0, 21.0)]
     assert budget.gains(rows, "chair", "psnr") == [(100, 200, pytest.approx(-0.05)), (200, 400, pytest.approx(1.05))]

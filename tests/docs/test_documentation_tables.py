@@ -13,13 +13,8 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
-import torch
 from PIL import Image
 
-from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.geometry import GEOMETRY_SPECS
-from neuprim.core.model.primitives import Primitives
-from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.docs.pages import ROOT, links, prose
 
 RESULTS = ROOT / "benchmarks" / "results"
@@ -115,11 +110,6 @@ def test_the_readme_is_a_page_with_one_large_picture_curves_and_a_front_per_task
     assert "generated data" in prose(README).lower()
 
 
-def test_the_table_of_voxels_is_that_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
-    recorded = json.loads((RESULTS / "voxels.json").read_text(encoding="utf-8"))
-    assert between("docs/dynamic.md", "voxels") == benchmark("voxels").table(recorded)
-
-
 def test_the_tables_of_web_pages_are_those_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
     script, found = benchmark("webpage"), json.loads((RESULTS / "webpage.json").read_text(encoding="utf-8"))
     assert between("docs/export.md", "webpage") == str(script.page_table(found["runs"]))
@@ -127,11 +117,6 @@ def test_the_tables_of_web_pages_are_those_of_the_recorded_results(benchmark: Ca
     assert {run["task"] for run in found["runs"].values()} == {"static", "dynamic", "relight"}
     for run in found["runs"].values():
         assert max(view["whole"] for view in run["views"]) < 1e-5 and len(run["views"]) == 8
-
-
-def test_the_table_of_factors_is_that_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
-    recorded = json.loads((RESULTS / "factors.json").read_text(encoding="utf-8"))["trials"]
-    assert between("docs/tradeoffs.md", "factors") == str(benchmark("factors").table(recorded))
 
 
 def test_the_fronts_are_those_that_were_measured_and_reach_far(benchmark: Callable[[str], ModuleType]) -> None:
@@ -175,37 +160,12 @@ def test_the_levels_of_effort_are_those_that_were_measured(benchmark: Callable[[
         ) == script.frozen(rows, scene)
 
 
-def test_eight_bits_are_half_a_step_off_and_a_quarter_of_the_bytes(benchmark: Callable[[str], ModuleType]) -> None:
-    script = benchmark("voxels")
-    generator = torch.Generator().manual_seed(0)
-    x = torch.randn(5000, generator=generator, dtype=torch.float64).numpy()
-    codes, back = script.coded(x)
-    kept = abs(back - x) < abs(x).max() / 2
-    assert codes.dtype == "uint8" and abs(back - x)[kept].max() < (x.max() - x.min()) / 255 and kept.mean() > 0.95
-    assert not script.coded(x * 0)[1].any()
-    model = even_model(generator)
-    coarse, size = script.eight_bits(model)
-    order = torch.from_numpy(script.morton(model.params["means"].numpy()).argsort(kind="stable"))
-    assert size < sum(v.numel() for v in model.params.values()) + 8 * 60
-    for name, value in model.params.items():
-        assert (coarse.params[name] - value[order]).abs().max() <= 0.02 * (value.max() - value.min()), name
-
-
-def even_model(generator: torch.Generator) -> Primitives:
-    """Numbers spread evenly, which eight bits hold to half a step."""
-    density, colour = CosineDensity(2), SphericalHarmonics(0)
-    specs = (*GEOMETRY_SPECS, *density.parameters(), *colour.parameters())
-    return Primitives(density, colour, {s.name: torch.rand((2000, *s.shape), generator=generator) for s in specs})
-
-
 def test_the_tables_of_the_forms_are_those_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
     found = json.loads((RESULTS / "expressivity.json").read_text(encoding="utf-8"))
     script = benchmark("expressivity")
     assert between("docs/expressivity.md", "expressivity") == script.forms_table(found)
     assert between("docs/expressivity.md", "expressivity-gaussian") == script.gaussian_table(found["trials"])
     assert between("README.md", "expressivity") == script.short_table(found["trials"])
-    grid = json.loads((RESULTS / "screening.json").read_text(encoding="utf-8"))
-    assert between("docs/expressivity.md", "screening") == benchmark("screening").grid_table(grid["trials"])
 
 
 class Busy:
@@ -286,49 +246,3 @@ def test_the_table_of_photographs_is_that_of_the_recorded_results(benchmark: Cal
     rows = json.loads((RESULTS / "photographs.json").read_text(encoding="utf-8"))["trials"]
     script = benchmark("photographs")
     assert between("docs/static.md", "photographs") == f"{script.table(rows)}\n\n{script.caption(rows)}"
-
-
-def test_the_tables_of_parts_and_of_the_cost_model_are_those_of_the_recorded_results(
-    benchmark: Callable[[str], ModuleType],
-) -> None:
-    shards, costs = benchmark("shards"), benchmark("cost_model")
-    parts, record = (
-        json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for name in ("shards", "cost_model")
-    )
-    assert between("docs/scaling.md", "shards") == shards.table(parts)
-    for kind, terms in costs.model_of(record).items():
-        assert record["model"][kind] == pytest.approx(terms, rel=1e-6)
-    for name, text in (
-        ("cost-terms", costs.table_of_terms(record)),
-        ("cost-judged", costs.table_of_judged(record)),
-        ("cost-paper", costs.table_of_scenes(record["model"])),
-    ):
-        assert between("docs/scaling.md", name) == text
-    for place in ("around", "within"):  # state halves, whatever else there is
-        half = max(rank["state"] for rank in parts[place]["parts"])
-        assert half == pytest.approx(parts[place]["alone"][0]["state"] / 2, rel=0.01)
-
-
-def test_a_cost_model_finds_the_terms_that_times_are_made_of(benchmark: Callable[[str], ModuleType]) -> None:
-    costs = benchmark("cost_model")
-    known = [1e-3, 2e-7, 0.0, 5e-8]
-    rows = [[1.0, 10.0**i * (1 + j), 3.0**j, 1e4 * (1 + i * j)] for i in range(2, 5) for j in range(4)]
-    seconds = [sum(c * n for c, n in zip(known, row, strict=True)) for row in rows]
-    assert costs.fitted(rows, seconds) == pytest.approx(known, rel=1e-6, abs=1e-12)
-
-
-def test_amounts_on_paper_are_those_of_a_step(benchmark: Callable[[str], ModuleType]) -> None:
-    """Of a scene of which a view shows all, parts hold the state divided by the ranks, and send what their formula
-    says."""
-    paper = benchmark("shared.paper_scenes")
-    scene = paper.Paper("", 1000, 70, 1.0, 10.0, 64 * 64, 5, 2)
-    found = paper.amounts(scene)
-    assert found["state"] == 1000 * (4 * 4 * 70 + 8) and found["steps"] == 10
-    assert found["parts send"] == 1000 * (8 * 70 + 8) and found["whole sends"] == 2 * 4 * 1000 * 72
-    model = {
-        "step": dict.fromkeys(benchmark("cost_model").TERMS, 0.0),
-        "adam": {"a number": 1.0},
-        "sight": {"a primitive": 0.0},
-        "exchange": {"a byte": 0.0},
-    }
-    assert [paper.seconds_here(scene, model, 8, parts)["Adam"] for parts in (False, True)] == [70_000, 8750]

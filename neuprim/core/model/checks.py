@@ -4,7 +4,7 @@ expected.
 Compiled kernels index without looking. A tensor that is too short would be read and written beyond its end, one of
 another layout would be read as something else, and torch would broadcast what does not fit. Here every closed form says
 what its tensors must be, with the sizes they share, and the first that does not fit is named. That costs microseconds
-per frame (``benchmarks/form_checks.py``).
+per frame.
 
 Tensors are float32 or float64, in any mix, dense and all on one device; their strides do not matter, as backends copy
 what is not contiguous.

@@ -43,9 +43,13 @@ EXPORTS = (
 )
 
 VOLATILE = re.compile(
-    rb'("train_seconds": )[-+.\de]+|(neuprim[": ]+)\d+\.\d+\.\d+|(output_dir[=: ]+)[^\s"\\]+|[\da-f]{8}(-[\da-f]{4}){3}-[\da-f]{12}'
+    rb'("train_seconds": )[-+.\de]+|(neuprim[": ]+)\d+\.\d+\.\d+|(output_dir[=: ]+)[^\s"\\]+'
+    rb"|[\da-f]{8}(-[\da-f]{4}){3}-[\da-f]{12}"
+    rb'|nonce[-=]"?[\da-f]{32}|^\s*//[^\n]*',
+    re.MULTILINE,
 )
-"""What two runs of the same code may write differently: durations, versions, paths, the UUID of a VDB file."""
+"""What two runs of the same code may write differently: durations, versions, paths, the UUID of a VDB file, comments
+of a page's scripts and the nonce that is their hash."""
 
 
 def make(checkout: Path, folder: Path) -> None:

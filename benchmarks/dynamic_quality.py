@@ -2,7 +2,7 @@
 
     python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 13500x4000] [--presets quick equations hard]
     [--seeds 3]
-        [--parts main variants control between equations] [--edges 0 2] [--neurons 0 8] [--jobs 2] [--readme] [--docs]
+        [--parts main variants control between equations] [--edges 0 2] [--neurons 0 8] [--jobs 2] [--docs]
 
 DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40). Parts:
 
@@ -20,7 +20,7 @@ DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free 
 Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds
 +- half the spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json, part by part; of main
 and equations only what is missing is run, --jobs at a time, one thread each. --docs puts the recorded tables
-between the markers of docs/dynamic.md, --readme a short one into README.md; without DIR nothing is run.
+between the markers of docs/dynamic.md; without DIR nothing is run.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared.tables import README, ROOT, between_markers, spread
+from shared.tables import ROOT, between_markers, spread
 from shared.trials import Trial, run_all
 
 from neuprim.config import compose
@@ -78,11 +78,6 @@ HARD = (
 """The paper's primitive from images alone."""
 EVERY = "train.population.every=400"  # as the preset has it, however short
 PRESETS = {"quick": (), "equations": ("preset=equations",), "hard": HARD}
-WHICH = {
-    "quick": "preset `quick`: windows and motion, K = 0 with a soft edge, voxels and images",
-    "equations": "preset `equations`: the paper's equations 10 to 13",
-    "hard": "windows and motion, K = 8 with a hard edge, images alone",
-}
 KEYS = (
     "psnr", "psnr_mask", "psnr_pooled_mask", "psnr_black_image", "psnr_black_image_mask", "psnr_srgb", "ssim", "ssim_srgb",
     "sigma_correlation_early", "sigma_correlation_middle", "sigma_correlation_late",
@@ -222,7 +217,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=2500, help="of every run but those of main")
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time of main and equations, one thread each")
-    parser.add_argument("--readme", action="store_true")
     parser.add_argument("--docs", action="store_true")
     args = parser.parse_args()
     recorded: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
@@ -280,8 +274,6 @@ def main() -> None:
         if args.docs:
             between_markers(ROOT / "docs" / "dynamic.md", name, text)
         print(f"\n{text}")
-    if args.readme:
-        between_markers(README, "dynamic-quality", short_table(recorded))
 
 
 def _machines(recorded: dict[str, Any]) -> dict[str, str]:
@@ -340,32 +332,6 @@ def main_table(recorded: dict[str, Any]) -> str:
         line("primitives that never show", lambda own: f"{100 * statistics.mean(r['invisible_fraction'] for r in own):.1f} %"),
         line("seeds", lambda own: f"{len(own)}"),
     ])  # fmt: skip
-
-
-def _percent(runs: list[dict[str, Any]], key: str) -> str:
-    return f"{100 * statistics.mean(r[key] for r in runs):.0f} %"
-
-
-def short_table(recorded: dict[str, Any]) -> str:
-    """Means over frames, and the hardest frame, beside what a black image scores."""
-    runs = _part(recorded, "main")
-    if not runs:
-        return "not measured"
-    frames = len(runs[0]["per_frame"])
-    lines = [
-        f"| EmberGen fire, {SIZE}×{SIZE} | primitives | model | training | PSNR | PSNR inside the mask | SSIM | σ off by, early / late | hardest of {frames} frames, inside the mask |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-        f"| black image |  |  |  | {runs[0]['psnr_black_image']:.1f} dB | {runs[0]['psnr_black_image_mask']:.1f} dB |  |  |  |",
-    ]
-    for own in _columns(runs):
-        hardest = min(range(frames), key=lambda t: statistics.mean(r["per_frame"][t] for r in own))
-        worst, preset = spread([r["per_frame"][hardest] for r in own], 1), own[0]["preset"]
-        lines.append(
-            f"| {WHICH[preset]} | {own[0]['primitives']:,} | {own[0]['model_bytes'] / 1e6:.2f} MB "
-            f"| {_budget(own[0])[1]:,} steps | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB "
-            f"| {_spread(own, 'ssim', 4)} | {' / '.join(_percent(own, f'sigma_relative_l2_{third}') for third in ('early', 'late'))} | frame {hardest + 1}: {worst} dB |"
-        )
-    return "\n".join(lines)
 
 
 def variants_table(recorded: dict[str, Any]) -> str:

@@ -33,7 +33,7 @@ from typing import Any
 
 import torch
 from shared.forms import AS_RECORDED, PAPER, SCENES, Form
-from shared.tables import README, between_markers, spread
+from shared.tables import between_markers, spread
 from shared.trials import Trial, begin, paces_of, run_all
 
 from neuprim.core.compute.machine import cpu_name
@@ -189,31 +189,6 @@ def forms_table(found: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-SHORT = {
-    "solids": ("`solids` (generated)", ("8:0", "0:2", "2:2")),
-    "chair": ("NeRF-synthetic chair", ("8:0", "0:2", "2:2")),
-    "fire": ("EmberGen fire, images alone, inside the mask", ("8:0@images", "0:2@images", None)),
-    "smoke_fire": ("`smoke_fire` (simulated), images alone, inside the mask", ("8:0@images", "0:2@images", None)),
-    "lit_solids": ("`lit_solids` (generated), clamped linear", ("8:0", "0:2", "2:2")),
-}
-
-
-def short_table(trials: list[dict[str, Any]]) -> str:
-    """The paper's form beside soft ones without and with neurons, at each scene's largest size."""
-    lines = [
-        "| equal bytes, equal seconds | bytes of | the paper's: K = 8, hard edge | soft edge, K = 0 | soft edge, K = 2 |",
-        "| --- | --- | --- | --- | --- |",
-    ]
-    for scene, (name, forms) in SHORT.items():
-        own = [r for r in trials if r["part"] == "forms" and r["scene"] == scene]
-        if own:
-            size = max(r["size"] for r in own)
-            cells = [[r[SCENES[scene].judged] for r in own if (r["form"], r["size"]) == (form, size)] for form in forms]
-            shown = " | ".join(f"{spread(values, 2)} dB" if values else "" for values in cells)
-            lines.append(f"| {name} | {size:,} | {shown} |")
-    return "\n".join(lines)
-
-
 def gaussian_table(trials: list[dict[str, Any]]) -> str:
     """Equal count and equal bytes in the conditions that a Gaussian can be trained in."""
     lines = [
@@ -263,7 +238,6 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
     parser.add_argument("--print", action="store_true", help="train nothing")
     parser.add_argument("--docs", action="store_true", help="write the tables into docs")
-    parser.add_argument("--readme", action="store_true", help="write a short table into README.md")
     args = parser.parse_args()
     if not args.print:
         paces = measured_paces(args) if {"forms", "slope"} & set(args.parts) else {}
@@ -282,8 +256,6 @@ def main() -> None:
         print(f"\n{text}")
         if args.docs:
             between_markers(DOCS, name, text)
-    if args.readme:
-        between_markers(README, "expressivity", short_table(trials))
 
 
 if __name__ == "__main__":

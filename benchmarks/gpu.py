@@ -1,6 +1,6 @@
 """The CUDA backend on a card: parity with the float64 reference, times, frames per second, peak memory.
 
-    python benchmarks/gpu.py [--parts parity times kernels train race] [--scenes 5000 20000 100000 300000 1000000]
+    python benchmarks/gpu.py [--parts parity times kernels train] [--scenes 5000 20000 100000 300000 1000000]
     [--sizes 800x800 1920x1080]
         [--chair DIR] [--fire DIR] [--trained chair fire lit_solids] [--record]
 
@@ -12,10 +12,6 @@
               forward and backward pass, and a whole training step (L1 loss, Adam on every parameter), medians by CUDA
               events; frames per second, peak memory, primitive-pixel hits
     kernels   where a training step's time goes, kernel by kernel, of the scene with the most primitives up to 100,000
-    race      gsplat, if it is installed (pip install gsplat), on chair: as many Gaussians as neuprim has primitives,
-    then twice as many again and
-              again up to neuprim's PSNR; the same steps, ms a step and a frame, bytes. Needs the part train, or its
-              record
     train     preset quick of each task with its usual steps on the card: ms a step of the second half, PSNR on the test
     views
 
@@ -212,51 +208,13 @@ def train(names: list[str], folders: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def race(
-    folders: dict[str, Any], trained: list[dict[str, Any]], steps: int | None = None, where: str = "cuda"
-) -> dict[str, Any] | None:
-    """gsplat against what was trained on chair; None where it is not installed."""
-    from dataclasses import asdict
-
-    from shared.forms import SCENES
-    from shared.race import equal_psnr, lap, opened
-    from shared.trials import Trial, begin
-
-    gsplat = opened()
-    if gsplat is None:
-        print("gsplat is not installed: no race (pip install gsplat)")
-        return None
-    own = next((row for row in trained if row["scene"] == "chair"), None)
-    if own is None:
-        raise SystemExit(
-            "--parts race: nothing was trained on chair; expected the part train with --trained chair, before or in a record"
-        )
-    steps = own["steps"] if steps is None else steps
-    dataset = begin(Trial("chair", SCENES["chair"].all_words(folders, "chair"), steps)).dataset
-    counts = [own["primitives"] << n for n in range(DOUBLINGS)]
-    laps, level = equal_psnr(lambda count: lap(gsplat, dataset, count, steps, torch.device(where)), counts, own["psnr"])
-    table = Table("", "count", "PSNR", "ms a step", "ms a frame", "bytes")
-    table.row("neuprim", own["primitives"], f"{own['psnr']:.2f}", f"{own['step_ms']:.2f}", "–", "–")
-    for one in laps:
-        table.row("gsplat", one.count, f"{one.psnr:.2f}", f"{one.step_ms:.2f}", f"{one.frame_ms:.2f}", one.bytes)
-    print("equal PSNR: " + (f"{level.count} Gaussians" if level else f"not with {counts[-1]} Gaussians"))
-    return {
-        "gsplat": str(getattr(gsplat, "__version__", "unknown")), "steps": steps, "neuprim": own, "laps": [asdict(one) for one in laps],
-        "equal": None if level is None else level.count,
-    }  # fmt: skip
-
-
-DOUBLINGS = 6
-"""Most counts of Gaussians that are tried, each twice the one before."""
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument(
         "--parts",
         nargs="*",
-        default=["parity", "times", "kernels", "train", "race"],
-        choices=("parity", "times", "kernels", "train", "race"),
+        default=["parity", "times", "kernels", "train"],
+        choices=("parity", "times", "kernels", "train"),
     )
     parser.add_argument("--scenes", nargs="*", type=int, default=[5_000, 20_000, 100_000, 300_000, 1_000_000])
     parser.add_argument("--sizes", nargs="*", default=["800x800", "1920x1080"])
@@ -281,9 +239,6 @@ def main() -> None:
         result["train"] = train(args.trained, vars(args))
     path = RESULTS / (re.sub(r"[^a-z0-9]+", "_", result["device"].lower()).strip("_") + ".json")
     kept = json.loads(path.read_text()) if path.exists() else {}
-    if "race" in args.parts and args.chair is not None:
-        raced = race(vars(args), result.get("train", kept.get("train", [])))
-        result |= {} if raced is None else {"race": raced}
     if args.record:
         RESULTS.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(kept | result, indent=1) + "\n")

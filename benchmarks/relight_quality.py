@@ -2,7 +2,7 @@
 and losses.
 
     python benchmarks/relight_quality.py [--steps 2600] [--seeds 3] [--parts forms losses] [--variants ...] [--once ...]
-    [--continue] [--tune] [--readme] [--docs]
+    [--continue] [--tune] [--docs]
 
 Parts:
 
@@ -16,20 +16,18 @@ for as many steps as it makes while the default makes --steps, so that neither o
 disturbs the comparisons. Images are 128 x 128, 500 for training, 100 held out (new lights, new views, both), linear
 light over the exposure, clamped to 0..1, black background; means over seeds +- half the spread, of the last checkpoint.
 --tune tests on every eighth training view instead. Results go to benchmarks/results/relight_quality.json. --docs puts
-the table between the markers of docs/relighting.md, --readme a short one into
-README.md; with --parts none nothing is run, and both are made of the recorded results.
+the table between the markers of docs/relighting.md; with --parts none nothing is run, and the table is made of the recorded results.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import statistics
 from pathlib import Path
 from typing import Any
 
 import torch
-from shared.tables import README, ROOT, between_markers, spread
+from shared.tables import ROOT, between_markers, spread
 from shared.trials import paces_of
 
 from neuprim.config import compose
@@ -60,7 +58,6 @@ BASELINES = {
     "nearest_light_of_25": "nearest light of 25, same camera",
 }
 DEFAULT = "equation 14, visibility per primitive"
-HEADLINES = {"equation 14": "equation 14 alone, as in the paper", DEFAULT: "with visibility of the light (default)"}
 SIZE = 128
 CLASSES = ("lit", "cast_shadow", "attached_shadow", "highlight")
 KEYS = (
@@ -109,7 +106,6 @@ def main() -> None:
         "--continue", dest="go_on", action="store_true", help="keep recorded runs and paces; add what is missing"
     )
     parser.add_argument("--tune", action="store_true", help="held-out training views; nothing is recorded")
-    parser.add_argument("--readme", action="store_true")
     parser.add_argument("--docs", action="store_true")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -157,31 +153,6 @@ def main() -> None:
     print(f"\n{table}")
     if args.docs:
         between_markers(ROOT / "docs" / "relighting.md", "relight-quality", table)
-    if args.readme:
-        between_markers(README, "relight-quality", short_table(recorded))
-
-
-def short_table(recorded: dict[str, Any]) -> str:
-    """The default, the paper's form and a baseline; of the classes of pixels the shadows and the one that the default
-    draws worst."""
-    own = {name: [e for e in recorded["forms"] if e["name"] == name] for name in HEADLINES}
-    hardest = min(CLASSES, key=lambda c: statistics.mean(e[f"psnr_pooled_{c}"] for e in own[DEFAULT]))
-    classes = [("cast shadows", "cast_shadow"), (f"hardest: {hardest.replace('_', ' ')}s", hardest)]
-    baseline = recorded["baselines"]["nearest_light_of_25"]
-    without = " | ".join(f"{baseline[f'psnr_pooled_{c}']:.1f} dB" for _, c in classes)
-    lines = [
-        f"| `lit_solids` (generated), {SIZE}×{SIZE} | primitives | training | PSNR | SSIM, sRGB | {' | '.join(name for name, _ in classes)} |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-        f"| {BASELINES['nearest_light_of_25']} |  |  | {baseline['psnr_linear_clamped']:.2f} dB |  | {without} |",
-    ]
-    for name, shown in HEADLINES.items():
-        runs = own[name]
-        pooled = " | ".join(f"{spread([e[f'psnr_pooled_{c}'] for e in runs], 1)} dB" for _, c in classes)
-        lines.append(
-            f"| {shown} | {runs[0]['primitives']:,} | {runs[0]['iterations']:,} steps | {spread([e['psnr_linear_clamped'] for e in runs], 2)} dB "
-            f"| {spread([e['ssim_display'] for e in runs], 3)} | {pooled} |"
-        )
-    return "\n".join(lines)
 
 
 def quality_table(recorded: dict[str, Any]) -> str:

@@ -1,14 +1,13 @@
 """Quality of the static task on a NeRF-synthetic scene: PSNR by primitives and steps, of the preset and of the paper's
 form.
 
-    python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2800x2500 2000x2500x8:0 ...] [--jobs 2] [--readme]
-    [--docs]
+    python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2800x2500 2000x2500x8:0 ...] [--jobs 2] [--docs]
 
 DIR holds the scene (transforms_train.json, ...). Every run is the preset `quick`, its own form or another, K:EDGE, for
 so many steps, one view each, on one thread: budgets in steps are the same on every machine. Numbers are means over
 seeds +- half the spread, on the test views, of the last checkpoint. Results go to
 benchmarks/results/static_quality.json after every run, and only what is missing is run. --docs puts the table between
-the markers in docs/static.md, --readme a short one in README.md; without DIR nothing is run.
+the markers in docs/static.md; without DIR nothing is run.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from PIL import Image
-from shared.forms import PAPER, Form
-from shared.tables import README, ROOT, between_markers, spread
+from shared.forms import Form
+from shared.tables import ROOT, between_markers, spread
 from shared.trials import Trial, run_all
 
 from neuprim.core.compute.machine import cpu_name
@@ -93,31 +92,12 @@ def shown(form: str) -> str:
     return Form.named(form).label + (", the default" if form == DEFAULT else "")
 
 
-def short_table(results: dict[str, Any]) -> str:
-    """The default and the paper's form, the smallest and the largest of each."""
-    lines = [
-        f"| {results['name']}, {results['size']}×{results['size']} | primitives | model | training | PSNR | SSIM | hardest of {results['views']} views |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    found = groups(results)
-    for form in (DEFAULT, str(PAPER)):
-        own = [group for group in found if group[2] == form]
-        for group in dict.fromkeys((own[0], own[-1])) if own else ():
-            runs = found[group]
-            lines.append(
-                f"| {shown(form)} | {group[0]:,} | {runs[0]['model_bytes'] / 1e6:.2f} MB | {group[1]:,} steps | {spread([r['psnr'] for r in runs], 2)} dB "
-                f"| {spread([r['ssim'] for r in runs], 4)} | {spread([r['psnr_worst'] for r in runs], 1)} dB |"
-            )
-    return "\n".join(lines)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, nargs="?")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--rows", nargs="*", default=list(ROWS), help="PRIMITIVESxSTEPS[xK:EDGE]")
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
-    parser.add_argument("--readme", action="store_true", help="write the recorded results into README.md, in short")
     parser.add_argument("--docs", action="store_true", help="write the recorded table into docs/static.md")
     args = parser.parse_args()
     if args.scene:
@@ -133,8 +113,6 @@ def main() -> None:
         )
     results = json.loads(RESULTS.read_text())
     print(table(results))
-    if args.readme:
-        between_markers(README, "static-quality", short_table(results))
     if args.docs:
         between_markers(ROOT / "docs" / "static.md", "static-quality", table(results))
 

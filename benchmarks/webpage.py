@@ -1,4 +1,4 @@
-"""Pages of models: how exact they are, how large, how long a frame is prepared, and how much a card computes.
+"""Pages of models: how exact they are, how large, how long a frame is prepared.
 
     python benchmarks/webpage.py ROW=RUN_DIR … [--views 8] [--docs]
     python benchmarks/webpage.py --prepare [--docs]
@@ -7,11 +7,8 @@
 ROW=RUN_DIR: a name in the table, and a finished run whose data are at hand. Held-out views of it, evenly spread, are
 drawn by its page, with every bit of its numbers, in headless Chromium and read back as floats, and by the run's
 backend, without a limit of transmittance (blending cannot stop a ray) and with the run's own: largest differences,
-colours
-as the model has them. Sizes and errors are those of pages at levels 0, 1 and 3, pictures of held-out views among them.
-Chords are the pixels of the silhouettes in the first view at 1280 x 720. Instructions of a chord are those of the
-page's own fragment shader after inlining and simplification (glslangValidator and spirv-opt; without them the column
-stays empty).
+colours as the model has them. Sizes and errors are those of pages at levels 0, 1 and 3, pictures of held-out views among them.
+Chords are the pixels of the silhouettes in the first view at 1280 x 720.
 
 --prepare: milliseconds of the worker, preparation and sort, for models of 5,000 and 20,000 primitives where the
 trainings of `solids`, `smoke_fire` and `lit_solids` begin: the median of 60 frames after 60, while the camera moves,
@@ -35,7 +32,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared.shaders import LISTEN, instructions
 from shared.tables import ROOT, Table, between_markers
 from torch import Tensor
 
@@ -87,10 +83,9 @@ def measured(chromium: Any, run_dir: Path, count: int, folder: Path) -> dict[str
     for level, path in pages.items():
         report = export_run(run_dir, "html", path, (f"level={level}",), overwrite=True)
         found["levels"][str(level)] = {"bytes": path.stat().st_size, **report.errors}
-    with open_tab(chromium, pages[0], script=LISTEN) as tab:
+    with open_tab(chromium, pages[0]) as tab:
         found["views"] = list(differences(tab, run, count))
         found["chords"] = chords(tab, run)
-        found["instructions"] = instructions(tab.page.evaluate("sources"))
         assert not tab.faults, tab.faults
     return found
 
@@ -206,7 +201,7 @@ _TIMES = """async frames => {
 def page_table(runs: Mapping[str, dict[str, Any]]) -> Table:
     table = Table(
         "run", "primitives", "brightest value", "without `transmittance_min`", "as configured", "page, level 0", "level 1", "level 3",
-        "chords at 1280×720", "instructions of a chord, texels", "integrated graphics, by its peak",
+        "chords at 1280×720",
     )  # fmt: skip
     for name, run in runs.items():
         worst = [f"{max(view[key] for view in run['views']):.1e}" for key in ("whole", "configured")]
@@ -215,17 +210,13 @@ def page_table(runs: Mapping[str, dict[str, Any]]) -> Table:
             f"{one['bytes'] / 1e6:.2f} MB" + (f", {one['psnr']:.1f} dB" if "psnr" in one else "")
             for one in run["levels"].values()
         ]
-        work, chord = run["instructions"], run["chords"]
-        low, high = (1e3 * chord * work["arithmetic"] / rate for rate in reversed(RATES)) if work else (0.0, 0.0)
-        spent = (f"{work['arithmetic']}, {work['texels']}", f"{low:.0f}–{high:.0f} ms") if work else ("", "")
         table.row(
             f"`{name}`, {len(run['views'])} views",
             f"{run['primitives']:,}",
             f"{brightest:.2f}",
             *worst,
             *sizes,
-            f"{chord / 1e6:.1f} M",
-            *spent,
+            f"{run['chords'] / 1e6:.1f} M",
         )
     return table
 

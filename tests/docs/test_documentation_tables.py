@@ -13,9 +13,8 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
-from PIL import Image
 
-from tests.docs.pages import ROOT, links, prose
+from tests.docs.pages import ROOT, prose
 
 RESULTS = ROOT / "benchmarks" / "results"
 README = ROOT / "README.md"
@@ -46,67 +45,17 @@ def between(page: str, name: str) -> str:
         ("relight", "docs/relighting.md", "quality_table"),
     ],
 )
-def test_tables_are_those_of_the_recorded_results(
+def test_quality_tables_show_the_recorded_results(
     task: str, page: str, full: str, benchmark: Callable[[str], ModuleType]
 ) -> None:
-    script = benchmark(f"{task}_quality")
     recorded: dict[str, Any] = json.loads((RESULTS / f"{task}_quality.json").read_text(encoding="utf-8"))
-    short = script.short_table(recorded)
-    assert between("README.md", f"{task}-quality") == short
-    assert between(page, f"{task}-quality").startswith(getattr(script, full)(recorded))
-    assert len(short.splitlines()) <= 6, "the README's tables are small"
-    header = short.splitlines()[0]
-    assert re.search(r"\d+×\d+", header) and "primitives" in header and "training" in header and "hardest" in header
+    table = getattr(benchmark(f"{task}_quality"), full)(recorded)
+    assert between(page, f"{task}-quality").startswith(table)
 
 
-def test_the_dynamic_tables_say_which_preset_is_which(benchmark: Callable[[str], ModuleType]) -> None:
-    script = benchmark("dynamic_quality")
-    recorded: dict[str, Any] = json.loads((RESULTS / "dynamic_quality.json").read_text(encoding="utf-8"))
-    count = script.as_many_bytes(13500, *script.PRESETS["equations"])
-    short = script.short_table(recorded).splitlines()
-    assert len(short) == 6 and "K = 0 with a soft edge, voxels and images | 13,500 |" in short[3]
-    assert (
-        f"equations 10 to 13 | {count:,} |" in short[4] and "K = 8 with a hard edge, images alone | 5,008 |" in short[5]
-    )
-    full = script.main_table(recorded).splitlines()
-    assert "`quick`, 13,500 primitives" in full[0] and f"`equations`, {count:,} primitives" in full[0]
-    assert len({line.count("|") for line in full}) == 1
-
-
-@pytest.mark.parametrize("task", ["static", "dynamic", "relight"])
-def test_a_benchmark_rewrites_its_tables_without_measuring(
-    task: str, benchmark: Callable[[str], ModuleType], tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    script = benchmark(f"{task}_quality")
-    page = {"static": "static", "dynamic": "dynamic", "relight": "relighting"}[task]
-    before = {}
-    for name in ("README.md", f"docs/{page}.md"):
-        text = (ROOT / name).read_text(encoding="utf-8")
-        emptied = re.sub(r"(<!-- (\w+-\w+) -->\n).*?(<!-- /\2 -->)", r"\1\3", text, flags=re.DOTALL)
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(emptied, encoding="utf-8")
-        before[name] = text
-        assert len(emptied) < len(text)
-    monkeypatch.setattr(script, "README", tmp_path / "README.md")
-    monkeypatch.setattr(script, "ROOT", tmp_path)
-    monkeypatch.setattr(
-        sys, "argv", ["benchmark", "--readme", "--docs", *(["--parts", "none"] if task == "relight" else [])]
-    )
-    script.main()
-    for name, text in before.items():
-        wanted = re.findall(rf"<!-- {task}-\w+ -->\n.*?<!-- /{task}-\w+ -->", text, re.DOTALL)
-        written = (tmp_path / name).read_text(encoding="utf-8")
-        assert wanted
-        for table in wanted:
-            assert (table in written) == ("-baselines" not in table and "-environment" not in table), table[:40]
-
-
-def test_the_readme_is_a_page_with_one_large_picture_curves_and_a_front_per_task() -> None:
-    assert len(README.read_text(encoding="utf-8").splitlines()) <= 120
-    picture, *curves = [target for target in links(README) if target.endswith(".png")]
-    assert curves == ["docs/pictures/budgets.png", "docs/pictures/fronts.png"]
-    with Image.open(ROOT / picture) as image:
-        assert image.width >= 3 * 256 and image.height >= 2 * 256
+def test_the_readme_is_one_page_with_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 100
+    assert between("README.md", "results") == benchmark("readme").results_table()
     assert "generated data" in prose(README).lower()
 
 
@@ -165,7 +114,6 @@ def test_the_tables_of_the_forms_are_those_of_the_recorded_results(benchmark: Ca
     script = benchmark("expressivity")
     assert between("docs/expressivity.md", "expressivity") == script.forms_table(found)
     assert between("docs/expressivity.md", "expressivity-gaussian") == script.gaussian_table(found["trials"])
-    assert between("README.md", "expressivity") == script.short_table(found["trials"])
 
 
 class Busy:

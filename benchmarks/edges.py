@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from render import ours
+from render import make_passes
 from shared.scenes import lower, random_scene, view
 from shared.tables import PERFORMANCE, Table, between_markers
 from shared.timing import fastest
@@ -48,7 +48,7 @@ def main() -> None:
                 factor = NORMS[0] / NORMS[edge]
                 lowered = lower(scene | {"w2": scene["w2"] * factor, "b2": scene["b2"] * factor})
                 assert isinstance(lowered.density, Cosine)
-                made.append(ours(replace(lowered, density=replace(lowered.density, edge=edge)), view(size), 1))
+                made.append(make_passes(replace(lowered, density=replace(lowered.density, edge=edge)), view(size), 1))
             for i, name in enumerate(("forward", "backward")):
                 times = fastest([passes[i] for passes, _ in made], args.rounds)
                 lanes = [t / counts[name] * 1e9 for t, (_, counts) in zip(times, made, strict=True)]

@@ -1,23 +1,16 @@
-"""Speed of the cpu backend: time per evaluated lane, lanes per true hit, arithmetic rate, memory; and ratios against
-another program.
+"""Speed of the CPU backend: time per evaluated lane, lanes per true hit, arithmetic rate and memory.
 
-    python benchmarks/render.py [--scenes 5000x400 20000x400 20000x800] [--threads 1 2] [--rounds 9] [--against DIR]
-    [--record]
+    python benchmarks/render.py [--scenes 5000x400 20000x400 20000x800] [--threads 1 2] [--rounds 9] [--record]
 
-DIR holds the numba study this backend grew out of (common.py, numk_fi.py): both draw the same primitives from the same
-camera, alternating in one process, and the ratio of their fastest rounds is printed (below 1 this backend is faster).
-Preparation and binning are inside on both sides; a step is forward, backward and Adam on all parameters; three colours,
-no depth. Absolute times are of this machine in its present mood: only ratios travel.
-
-Flops are counted by one rule: 420 per evaluated lane forward, 1,100 backward (K = 8). --record writes the result to
-benchmarks/results/render.json and docs/performance.md.
+Draws random scenes, with preparation and binning. A step is forward, backward and Adam on all parameters; three
+colours, no depth. Flops are counted by one rule: 420 per evaluated lane forward, 1,100 backward (K = 8). --record
+writes the result to benchmarks/results/render.json and docs/performance.md.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -73,7 +66,7 @@ def true_hits(lowered: Lowered, camera: Camera) -> int:
     return int(_count_hits(*parts, rows[:, layout.TC], rows[:, [layout.UX, layout.UY]], frame.boxes))
 
 
-def ours(lowered: Lowered, camera: Camera, threads: int) -> tuple[Passes, dict[str, int]]:
+def make_passes(lowered: Lowered, camera: Camera, threads: int) -> tuple[Passes, dict[str, int]]:
     settings, background = RenderSettings(backend="cpu", threads=threads), torch.zeros(3)
     g_rgb = torch.ones(camera.height, camera.width, 3)
     kept = render_lowered(lowered, camera, settings, background)
@@ -110,43 +103,6 @@ def ours(lowered: Lowered, camera: Camera, threads: int) -> tuple[Passes, dict[s
     return (forward, backward, step), {**lanes, "pairs": kept.stats.pairs}
 
 
-def study(folder: Path, p: dict[str, torch.Tensor], size: int, threads: int) -> Passes:
-    """The study's preparation (torch), binning (numpy), kernels (numba) and torch's Adam, on float32 parameters."""
-    sys.path.insert(0, str(folder))
-    import common
-    import numk_fi
-
-    cam = common.camera(size, size)
-    g_rgb = np.ones((size, size, 3), np.float32)
-    leaves = {k: v.float().requires_grad_() for k, v in p.items()}
-    adam = torch.optim.Adam(leaves.values(), lr=0.0)
-
-    def draw() -> tuple[Any, torch.Tensor]:
-        rows, centre = common.preprocess(leaves, cam)
-        kernel = numk_fi.K().setup(rows, common.bounds(leaves, cam), centre, cam)
-        kernel.fwd(threads)
-        return kernel, rows
-
-    def forward() -> None:
-        with torch.no_grad():
-            draw()
-
-    kept, kept_rows = draw()
-
-    def backward() -> None:
-        kept.bwd(g_rgb, threads)
-        torch.autograd.grad(kept_rows, list(leaves.values()), torch.from_numpy(kept.G), retain_graph=True)
-
-    def step() -> None:
-        adam.zero_grad()
-        kernel, rows = draw()
-        kernel.bwd(g_rgb, threads)
-        rows.backward(torch.from_numpy(kernel.G))
-        adam.step()
-
-    return forward, backward, step
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--scenes", nargs="*", default=["5000x400", "20000x400", "20000x800"], help="PRIMITIVESxSIZE")
@@ -155,7 +111,6 @@ def main() -> None:
         "--rate", type=float, default=4.0, help="largest phase rate per axis, radians per m (trained models: about 10)"
     )
     parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--against", type=Path)
     parser.add_argument("--record", action="store_true")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -165,17 +120,16 @@ def main() -> None:
         f"{4 * gradient_width(8, 3)} bytes more for each (K = 8, three colours), and what the forward pass keeps for it: 6 bytes a pair and 4 a lane."
     )
     print(memory)
-    table = Table("scene", "largest rate", "threads", "pass", "ms", "ns/lane", "lanes/hit", "GFLOP/s", "ratio")
+    table = Table("scene", "largest rate", "threads", "pass", "ms", "ns/lane", "lanes/hit", "GFLOP/s")
     for text in args.scenes:
         count, size = (int(x) for x in text.split("x"))
         p, camera = random_scene(count, rate=args.rate), view(size)
         lowered = lower(p)
         hits = true_hits(lowered, camera)
         for threads in args.threads:
-            mine, counts = ours(lowered, camera, threads)
-            other = study(args.against, p, size, threads) if args.against else None
+            passes, counts = make_passes(lowered, camera, threads)
             for i, name in enumerate((*FLOPS, "step")):
-                times = fastest([mine[i], *([other[i]] if other else [])], args.rounds)
+                times = fastest([passes[i]], args.rounds)
                 row: dict[str, Any] = {
                     "scene": text,
                     "rate": args.rate,
@@ -183,26 +137,21 @@ def main() -> None:
                     "pass": name,
                     "ms": times[0] * 1e3,
                 }
-                row["ratio"] = times[0] / times[1] if other else None
                 lanes = counts["forward"] + counts["backward"] if name == "step" else counts[name]
                 flops = sum(counts[k] * FLOPS[k] for k in FLOPS) if name == "step" else lanes * FLOPS[name]
                 row |= {"ns_per_lane": times[0] / lanes * 1e9 * threads, "lanes_per_hit": counts["forward"] / hits}
                 row["gflops"] = flops / times[0] / 1e9
-                ratio = "" if row["ratio"] is None else f"{row['ratio']:.2f}"
                 cells = (
                     f"{row['ms']:.1f}",
                     f"{row['ns_per_lane']:.1f}",
                     f"{row['lanes_per_hit']:.2f}",
                     f"{row['gflops']:.0f}",
-                    ratio,
                 )
                 table.row(text, f"{args.rate:g}", threads, name, *cells)
                 rows.append(row)
     if args.record:
         RESULTS.parent.mkdir(exist_ok=True)
-        RESULTS.write_text(
-            json.dumps({"cpu": cpu_name(), "against": bool(args.against), "rows": rows}, indent=1) + "\n"
-        )
+        RESULTS.write_text(json.dumps({"cpu": cpu_name(), "rows": rows}, indent=1) + "\n")
         between_markers(PERFORMANCE, "render", f"{table}\n\n{cpu_name()}. {memory}")
 
 

@@ -31,14 +31,18 @@ RUNS: dict[str, tuple[tuple[str, ...], int, str, tuple[str, ...]]] = {
     "chair_2000": ((*CHAIR, "model.primitives=2800"), 2500, "chair", ("psnr", "psnr_worst")),
     "chair_5000": ((*CHAIR, "model.primitives=7000"), 4000, "chair", ("psnr", "psnr_worst")),
     "fire": (
-        ("task=dynamic", "scene=vdb", "scene.frames='1:40'", "scene.look=embergen_fire", "scene.size=96"), 4000, "fire",
+        ("task=dynamic", "scene=vdb", "scene.frames='1:40'", "scene.look=embergen_fire", "scene.size=96"),
+        4000,
+        "fire",
         ("psnr_mask", "sigma_relative_l2_early", "sigma_relative_l2_late"),
     ),
     "lit_solids": (
-        ("task=relight", "scene=lit_solids", "scene.size=128"), 2600, "",
+        ("task=relight", "scene=lit_solids", "scene.size=128"),
+        2600,
+        "",
         ("psnr_linear_clamped", "psnr_pooled_cast_shadow", "psnr_pooled_highlight"),
     ),
-}  # fmt: skip
+}
 """Words, steps, the data, and the measures. As many primitives as have the bytes of 2,000 or 5,000 of the paper's in
 `chair_*`."""
 

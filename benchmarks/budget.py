@@ -46,9 +46,13 @@ TITLES = {
 }
 _VOLUME = {"psnr": "all pixels", "psnr_mask": "inside the mask", "psnr_pooled_mask": "inside the mask, pooled"}
 _LIT = {
-    "psnr_linear_clamped": "clamped", "psnr": "unclamped", "psnr_pooled_lit": "lit pixels", "psnr_pooled_cast_shadow": "cast shadows",
-    "psnr_pooled_attached_shadow": "attached shadows", "psnr_pooled_highlight": "highlights",
-}  # fmt: skip
+    "psnr_linear_clamped": "clamped",
+    "psnr": "unclamped",
+    "psnr_pooled_lit": "lit pixels",
+    "psnr_pooled_cast_shadow": "cast shadows",
+    "psnr_pooled_attached_shadow": "attached shadows",
+    "psnr_pooled_highlight": "highlights",
+}
 MEASURES = {
     "chair": {"psnr": "all pixels", "psnr_worst": "worst view"},
     "smoke_fire": _VOLUME,
@@ -159,7 +163,10 @@ def falls(rows: Sequence[Mapping[str, Any]]) -> str:
     if not found:
         return f"Of {doublings} doublings (every measure by itself) none made anything worse by more than {FALL} dB."
     listed = "\n".join(f"* {line}" for line in found)
-    return f"Of {doublings} doublings (every measure by itself) {len(found)} made something worse by more than {FALL} dB:\n\n{listed}"
+    return (
+        f"Of {doublings} doublings (every measure by itself) {len(found)} made something worse by more than "
+        f"{FALL} dB:\n\n{listed}"
+    )
 
 
 def draw(rows: Sequence[Mapping[str, Any]]) -> None:

@@ -79,11 +79,29 @@ HARD = (
 EVERY = "train.population.every=400"  # as the preset has it, however short
 PRESETS = {"quick": (), "equations": ("preset=equations",), "hard": HARD}
 KEYS = (
-    "psnr", "psnr_mask", "psnr_pooled_mask", "psnr_black_image", "psnr_black_image_mask", "psnr_srgb", "ssim", "ssim_srgb",
-    "sigma_correlation_early", "sigma_correlation_middle", "sigma_correlation_late",
-    "sigma_relative_l2_early", "sigma_relative_l2_middle", "sigma_relative_l2_late",
-    "invisible_fraction", "primitives", "parameters_per_primitive", "model_bytes", "vdb_bytes", "iterations", "train_seconds", "seed",
-)  # fmt: skip
+    "psnr",
+    "psnr_mask",
+    "psnr_pooled_mask",
+    "psnr_black_image",
+    "psnr_black_image_mask",
+    "psnr_srgb",
+    "ssim",
+    "ssim_srgb",
+    "sigma_correlation_early",
+    "sigma_correlation_middle",
+    "sigma_correlation_late",
+    "sigma_relative_l2_early",
+    "sigma_relative_l2_middle",
+    "sigma_relative_l2_late",
+    "invisible_fraction",
+    "primitives",
+    "parameters_per_primitive",
+    "model_bytes",
+    "vdb_bytes",
+    "iterations",
+    "train_seconds",
+    "seed",
+)
 
 
 def fit(words: list[str], change: Callable[[Trainer], None] = lambda trainer: None) -> tuple[Trainer, dict[str, Any]]:
@@ -224,9 +242,13 @@ def main() -> None:
         if {"variants", "control", "between"} & set(args.parts):
             recorded |= {"cpu": cpu_name(), "cores": core_count()}
         data = [
-            "scene=vdb", f"scene.vdb='{args.folder.resolve()}'", f"scene.frames='{args.frames}'", "scene.look=embergen_fire", f"scene.size={SIZE}",
+            "scene=vdb",
+            f"scene.vdb='{args.folder.resolve()}'",
+            f"scene.frames='{args.frames}'",
+            "scene.look=embergen_fire",
+            f"scene.size={SIZE}",
             "train.eval_every=0",
-        ]  # fmt: skip
+        ]
         short = [*HARD, "model.primitives=2000", "train.max_seconds=null", f"train.iterations={args.iterations}"]
 
         def keep(part: str, entry: dict[str, Any]) -> None:
@@ -317,40 +339,55 @@ def main_table(recorded: dict[str, Any]) -> str:
     def thirds(key: str) -> Callable[[list[dict[str, Any]]], str]:
         return lambda own: " / ".join(_spread(own, f"sigma_{key}_{third}", 3) for third in ("early", "middle", "late"))
 
-    return "\n".join([
-        line("", lambda own: f"`{own[0]['preset']}`, {own[0]['primitives']:,} primitives, {own[0]['iterations']:,} steps", "black image"),
-        "| --- |" + " --- |" * (len(columns) + 1),
-        line("PSNR, whole image", lambda own: f"{_spread(own, 'psnr')} dB", f"{black:.1f} dB"),
-        line("PSNR inside the union mask", lambda own: f"{_spread(own, 'psnr_mask')} dB", f"{inside:.1f} dB"),
-        line("PSNR of the pooled error inside the mask", lambda own: f"{_spread(own, 'psnr_pooled_mask')} dB"),
-        line("PSNR after the sRGB curve", lambda own: f"{_spread(own, 'psnr_srgb')} dB"),
-        line("SSIM, linear / sRGB", lambda own: f"{_spread(own, 'ssim', 4)} / {_spread(own, 'ssim_srgb', 4)}"),
-        line("correlation of σ with the files, early / middle / late frames", thirds("correlation")),
-        line("relative L2 error of σ, early / middle / late frames", thirds("relative_l2")),
-        line("model, with the errors above", lambda own: f"{own[0]['model_bytes'] / 1e6:.2f} MB"),
-        line("the .vdb files, which have none", lambda own: f"{own[0]['vdb_bytes'] / 1e6:.2f} MB"),
-        line("primitives that never show", lambda own: f"{100 * statistics.mean(r['invisible_fraction'] for r in own):.1f} %"),
-        line("seeds", lambda own: f"{len(own)}"),
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            line(
+                "",
+                lambda own: (
+                    f"`{own[0]['preset']}`, {own[0]['primitives']:,} primitives, {own[0]['iterations']:,} steps"
+                ),
+                "black image",
+            ),
+            "| --- |" + " --- |" * (len(columns) + 1),
+            line("PSNR, whole image", lambda own: f"{_spread(own, 'psnr')} dB", f"{black:.1f} dB"),
+            line("PSNR inside the union mask", lambda own: f"{_spread(own, 'psnr_mask')} dB", f"{inside:.1f} dB"),
+            line("PSNR of the pooled error inside the mask", lambda own: f"{_spread(own, 'psnr_pooled_mask')} dB"),
+            line("PSNR after the sRGB curve", lambda own: f"{_spread(own, 'psnr_srgb')} dB"),
+            line("SSIM, linear / sRGB", lambda own: f"{_spread(own, 'ssim', 4)} / {_spread(own, 'ssim_srgb', 4)}"),
+            line("correlation of σ with the files, early / middle / late frames", thirds("correlation")),
+            line("relative L2 error of σ, early / middle / late frames", thirds("relative_l2")),
+            line("model, with the errors above", lambda own: f"{own[0]['model_bytes'] / 1e6:.2f} MB"),
+            line("the .vdb files, which have none", lambda own: f"{own[0]['vdb_bytes'] / 1e6:.2f} MB"),
+            line(
+                "primitives that never show",
+                lambda own: f"{100 * statistics.mean(r['invisible_fraction'] for r in own):.1f} %",
+            ),
+            line("seeds", lambda own: f"{len(own)}"),
+        ]
+    )
 
 
 def variants_table(recorded: dict[str, Any]) -> str:
     """One row per way of varying in time."""
     runs = recorded.get("variants", [])
     lines = [
-        "| model.density.time | numbers per primitive | PSNR | inside the mask | pooled, inside | σ correlation, late | invisible | ms a step |",
+        "| model.density.time | numbers per primitive | PSNR | inside the mask | pooled, inside | σ correlation, "
+        "late | invisible | ms a step |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for time in dict.fromkeys(r["time"] for r in runs):
         own = [r for r in runs if r["time"] == time]
         lines.append(
-            f"| {time} | {own[0]['parameters_per_primitive']} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB "
+            f"| {time} | {own[0]['parameters_per_primitive']} | {_spread(own, 'psnr')} dB | "
+            f"{_spread(own, 'psnr_mask')} dB "
             f"| {_spread(own, 'psnr_pooled_mask')} dB | {_spread(own, 'sigma_correlation_late', 3)} "
-            f"| {100 * statistics.mean(r['invisible_fraction'] for r in own):.0f} % | {1e3 * statistics.mean(r['train_seconds'] / r['iterations'] for r in own):.0f} |"
+            f"| {100 * statistics.mean(r['invisible_fraction'] for r in own):.0f} % | "
+            f"{1e3 * statistics.mean(r['train_seconds'] / r['iterations'] for r in own):.0f} |"
         )
     if runs:
         lines.append(
-            f"\n{runs[0]['primitives']:,} primitives, {runs[0]['iterations']:,} iterations, {len({r['seed'] for r in runs})} seed(s)."
+            f"\n{runs[0]['primitives']:,} primitives, {runs[0]['iterations']:,} iterations, "
+            f"{len({r['seed'] for r in runs})} seed(s)."
         )
     return "\n".join(lines)
 
@@ -369,8 +406,10 @@ def equations_table(recorded: dict[str, Any]) -> str:
         own = [r for r in runs if (r["form"], r["edge"], r["neurons"]) == key]
         step = 1e3 * statistics.mean(r["cpu_seconds"] / r["iterations"] for r in own)
         lines.append(
-            f"| {key[0]} | {key[1]}{', gain' if own[0]['gain'] else ''} | {key[2]} | {own[0]['parameters_per_primitive']} "
-            f"| {own[0]['primitives']:,} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB | {_spread(own, 'psnr_pooled_mask')} dB "
+            f"| {key[0]} | {key[1]}{', gain' if own[0]['gain'] else ''} | {key[2]} | "
+            f"{own[0]['parameters_per_primitive']} "
+            f"| {own[0]['primitives']:,} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB | "
+            f"{_spread(own, 'psnr_pooled_mask')} dB "
             f"| {100 * statistics.mean(r['invisible_fraction'] for r in own):.0f} % | {step:.0f} |"
         )
     steps = [r["iterations"] for r in runs]
@@ -388,7 +427,8 @@ def control_table(recorded: dict[str, Any]) -> str:
         lines.append(f"| {name} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB |")
     lines += [
         "",
-        "| learned from | learned frames, inside the mask | frames between | real frame before instead | largest step |",
+        "| learned from | learned frames, inside the mask | frames between | real frame before instead | largest "
+        "step |",
     ]
     lines.append("| --- | --- | --- | --- | --- |")
     for every in dict.fromkeys(r["every"] for r in recorded.get("between", [])):

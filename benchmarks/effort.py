@@ -166,7 +166,8 @@ def chosen(rows: Sequence[Mapping[str, Any]], scene: str, level: int) -> Mapping
 def frozen(rows: Sequence[Mapping[str, Any]], scene: str) -> str:
     """A task's file of levels."""
     lines = [
-        "# Levels of effort: the best use of 1/16 to 4 times the time that the preset takes, as measured by `python benchmarks/effort.py --write`",
+        "# Levels of effort: the best use of 1/16 to 4 times the time that the preset takes, as measured by "
+        "`python benchmarks/effort.py --write`",
         f"# on {TITLES[scene].partition(': ')[2]}. Tables: docs/tradeoffs.md",
         "",
         "preset: quick",

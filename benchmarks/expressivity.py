@@ -42,10 +42,21 @@ HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "expressivity.json"
 DOCS = HERE.parent / "docs" / "expressivity.md"
 KEYS = (
-    "psnr", "psnr_worst", "ssim", "psnr_mask", "psnr_linear_clamped", "psnr_pooled_cast_shadow", "psnr_pooled_highlight",
-    "sigma_relative_l2_early", "sigma_relative_l2_middle", "sigma_relative_l2_late",
-    "parameters", "parameters_per_primitive", "primitives", "backend",
-)  # fmt: skip
+    "psnr",
+    "psnr_worst",
+    "ssim",
+    "psnr_mask",
+    "psnr_linear_clamped",
+    "psnr_pooled_cast_shadow",
+    "psnr_pooled_highlight",
+    "sigma_relative_l2_early",
+    "sigma_relative_l2_middle",
+    "sigma_relative_l2_late",
+    "parameters",
+    "parameters_per_primitive",
+    "primitives",
+    "backend",
+)
 
 FORMS = {
     "static": ("8:0", "0:2", "2:2", "4:2"),
@@ -154,7 +165,8 @@ def forms_table(found: dict[str, Any]) -> str:
     """One row per form, scene and size; the best in bold, and all whose mean lies within its half spread."""
     trials = found["trials"]
     lines = [
-        "| scene | bytes of | primitive | primitives | numbers each | steps | PSNR | worst view | SSIM | last doubling | error of σ |",
+        "| scene | bytes of | primitive | primitives | numbers each | steps | PSNR | worst view | SSIM | last "
+        "doubling | error of σ |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     groups: dict[tuple[str, int, str], list[dict[str, Any]]] = {}
@@ -176,15 +188,23 @@ def forms_table(found: dict[str, Any]) -> str:
         ]
         first = next(r[judged] for r in runs if r["seed"] == 0)
         lines.append(
-            f"| {scene} | {size} | {Form.named(form).label} | {runs[0]['primitives']} | {runs[0]['parameters_per_primitive']} | {runs[0]['iterations']} "
-            f"| {f'**{text}**' if _mean(runs) >= _mean(top) - (max(values) - min(values)) / 2 else text} | {spread([r['psnr_worst'] for r in runs], 1)} dB "
-            f"| {spread([r['ssim'] for r in runs], 4)} | {f'{first - half[0]:+.2f} dB' if half else ''} | {_sigma(runs)} |"
+            f"| {scene} | {size} | {Form.named(form).label} | {runs[0]['primitives']} | "
+            f"{runs[0]['parameters_per_primitive']} | {runs[0]['iterations']} "
+            f"| {f'**{text}**' if _mean(runs) >= _mean(top) - (max(values) - min(values)) / 2 else text} | "
+            f"{spread([r['psnr_worst'] for r in runs], 1)} dB "
+            f"| {spread([r['ssim'] for r in runs], 4)} | {f'{first - half[0]:+.2f} dB' if half else ''} | "
+            f"{_sigma(runs)} |"
         )
     seeds = sorted({len(runs) for runs in groups.values()})
     lines.append(
-        f"\nPreset `quick` with all primitives from the start and without a cool-down, {' to '.join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1])))} seed(s), mean ± half the spread; *bytes of* so many of the paper's primitives; steps: as many as fit into "
-        "the seconds of the paper's form, at paces measured in turns over whole runs; *error of σ*: relative L2 over the files' voxels, early / middle / late; *last doubling*: what the second half of the budget brought, first seed. PSNR is of "
-        f"the whole image (solids, chair at 200×200 on white), inside the mask (fire, smoke_fire), clamped linear (lit_solids). {found['cpu']}, one thread."
+        f"\nPreset `quick` with all primitives from the start and without a cool-down, "
+        f"{' to '.join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1])))} seed(s), mean ± half the spread; "
+        f"*bytes of* so many of the paper's primitives; steps: as many as fit into "
+        "the seconds of the paper's form, at paces measured in turns over whole runs; *error of σ*: relative L2 "
+        "over the files' voxels, early / middle / late; *last doubling*: what the second half of the budget "
+        "brought, first seed. PSNR is of "
+        f"the whole image (solids, chair at 200×200 on white), inside the mask (fire, smoke_fire), clamped linear "
+        f"(lit_solids). {found['cpu']}, one thread."
     )
     return "\n".join(lines)
 
@@ -205,11 +225,13 @@ def gaussian_table(trials: list[dict[str, Any]]) -> str:
     ):
         same = "" if count == size and form != str(PAPER) else " (equal bytes)" if count != size else " (both)"
         lines.append(
-            f"| {scene} | {Form.named(form).label} | {count}{same} | {runs[0]['parameters']} | {spread([r['psnr'] for r in runs], 2)} dB "
+            f"| {scene} | {Form.named(form).label} | {count}{same} | {runs[0]['parameters']} | "
+            f"{spread([r['psnr'] for r in runs], 2)} dB "
             f"| {spread([r['psnr_worst'] for r in runs], 1)} dB | {runs[0]['backend']} |"
         )
     lines.append(
-        f"\nReduced: solids at {SMALL['size']}×{SMALL['size']}, the folder's images averaged down {SMALL['downsample']} times, {SMALL['iterations']} steps of every form "
+        f"\nReduced: solids at {SMALL['size']}×{SMALL['size']}, the folder's images averaged down "
+        f"{SMALL['downsample']} times, {SMALL['iterations']} steps of every form "
         "(not equal seconds: the backends differ)."
     )
     return "\n".join(lines)

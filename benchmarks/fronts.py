@@ -127,7 +127,10 @@ def reach(result: Mapping[str, Any], front: str, cost: str) -> float:
 def report(name: str, result: Mapping[str, Any]) -> str:
     """Prints the table of a scene; returns it with what is said about it."""
     speed, size = reach(result, "speed", "time_ratio"), reach(result, "size", "bytes")
-    title = f"**{SCENES[name].title}** (`{' '.join(result['words'])}`): {speed:.1f} times in the time of a frame, {size:.0f} times in bytes. {result['length']}"
+    title = (
+        f"**{SCENES[name].title}** (`{' '.join(result['words'])}`): {speed:.1f} times in the time of a frame, "
+        f"{size:.0f} times in bytes. {result['length']}"
+    )
     print(f"\n{title}\n")
     table = Table("model", "front of", "PSNR, dB", "SSIM", "time", "ms", "bytes", "steps", "ms/step")
     models: Sequence[Mapping[str, Any]] = result["models"]

@@ -196,10 +196,22 @@ def import_table(edges: Sequence[int]) -> str:
 
 def trained(folder: Path, neurons: int, edge: int, iterations: int) -> Path:
     words = [
-        "task=static", "scene=solids", "scene.size=128", "model.primitives=500", f"model.neurons={neurons}", f"model.density.edge={edge}",
-        f"model.density.gain={'true' if edge else 'false'}", f"train.iterations={iterations}", "train.max_seconds=null", "train.eval_every=0",
-        f"train.population.every={max(iterations // 15, 1)}", "train.rates.b2=0.03", "train.rates.w2=0.03", "train.rates.log_scales=0.04", f"output_dir='{folder}'",
-    ]  # fmt: skip
+        "task=static",
+        "scene=solids",
+        "scene.size=128",
+        "model.primitives=500",
+        f"model.neurons={neurons}",
+        f"model.density.edge={edge}",
+        f"model.density.gain={'true' if edge else 'false'}",
+        f"train.iterations={iterations}",
+        "train.max_seconds=null",
+        "train.eval_every=0",
+        f"train.population.every={max(iterations // 15, 1)}",
+        "train.rates.b2=0.03",
+        "train.rates.w2=0.03",
+        "train.rates.log_scales=0.04",
+        f"output_dir='{folder}'",
+    ]
     return run(compose(words))
 
 

@@ -128,9 +128,18 @@ def times(counts: list[int], sizes: list[tuple[int, int]]) -> list[dict[str, Any
                 ms = [median_ms(run) for run in runs]
                 peak = torch.cuda.max_memory_allocated() / 1e6
                 row = {
-                    "form": name, "primitives": count, "width": width, "height": height, "pairs": stats.pairs, "slots": stats.extra["hits"],
-                    "delicate": stats.extra["float64"], "forward_ms": ms[0], "both_ms": ms[1], "step_ms": ms[2], "peak_mb": peak,
-                }  # fmt: skip
+                    "form": name,
+                    "primitives": count,
+                    "width": width,
+                    "height": height,
+                    "pairs": stats.pairs,
+                    "slots": stats.extra["hits"],
+                    "delicate": stats.extra["float64"],
+                    "forward_ms": ms[0],
+                    "both_ms": ms[1],
+                    "step_ms": ms[2],
+                    "peak_mb": peak,
+                }
                 rows.append(row)
                 shown = [f"{x:.2f}" for x in ms]
                 table.row(

@@ -69,10 +69,13 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         return
     if name == BESIDE:
         for title, made in (
-            ("harmonics", sh_warp._kernels(3)), ("Adam", adam_warp._kernels()), ("SSIM", ssim_warp._kernels()),
-            ("light", (visibility_warp._kernel(),)), ("grid", (grid_warp._kernel(),)),
+            ("harmonics", sh_warp._kernels(3)),
+            ("Adam", adam_warp._kernels()),
+            ("SSIM", ssim_warp._kernels()),
+            ("light", (visibility_warp._kernel(),)),
+            ("grid", (grid_warp._kernel(),)),
             ("rays of volumes", (traverse_warp._radiances(), traverse_warp._depths(), traverse_warp._extinctions())),
-        ):  # fmt: skip
+        ):
             for number, kernel in enumerate(made, 1):
                 yield f"{title} {number}" if len(made) > 1 else title, kernel, BLOCK
         return
@@ -158,9 +161,12 @@ def document(record: dict[str, Any]) -> str:
     shared = max(r["shared"] for r in record["kernels"])
     most = max((r for r in record["kernels"] if r["form"] == EVERY), key=lambda r: r["registers"])
     said = (
-        f"Registers a thread on sm_{' / '.join(str(a) for a in ARCHS)}, one number where they agree, with bytes of stack where registers "
-        f'spill, "capped" where a kernel asks for fewer than it could use; C = 3 channels, H = 8 units of a colour network. Of the kernels that every frame needs {most["kernel"]} takes the most, '
-        f"{most['registers']}; no block has more than {shared:,} bytes of shared memory. Compiled with Warp {record['warp']}."
+        f"Registers a thread on sm_{' / '.join(str(a) for a in ARCHS)}, one number where they agree, with bytes "
+        f"of stack where registers "
+        f'spill, "capped" where a kernel asks for fewer than it could use; C = 3 channels, H = 8 units of a '
+        f"colour network. Of the kernels that every frame needs {most['kernel']} takes the most, "
+        f"{most['registers']}; no block has more than {shared:,} bytes of shared memory. Compiled with Warp "
+        f"{record['warp']}."
     )
     return f"{said}\n\n" + "\n".join(lines)
 

@@ -62,7 +62,8 @@ def trained(folder: Path, planes: Sequence[float]) -> None:
                 worst = max(worst, (images[0] - images[1]).abs().max().item())
         mean = sum(counts) / len(counts)
         print(
-            f"near {near:g}: {mean:.1f} of {model.count} primitives in float64 ({min(counts)} to {max(counts)} a view), largest error {worst:.1e}"
+            f"near {near:g}: {mean:.1f} of {model.count} primitives in float64 ({min(counts)} to {max(counts)} a "
+            f"view), largest error {worst:.1e}"
         )
 
 

@@ -96,7 +96,10 @@ def caption(rows: Sequence[Mapping[str, Any]]) -> str:
     counts, steps = ({row[key] for row in rows} for key in ("primitives", "iterations"))
     seeds = sorted(Counter((row["scene"], row["row"]) for row in rows).values())
     said = " to ".join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1])))
-    return f"{' or '.join(f'{n:,}' for n in sorted(counts))} primitives, {' or '.join(f'{n:,}' for n in sorted(steps))} steps, {said} seed(s)."
+    return (
+        f"{' or '.join(f'{n:,}' for n in sorted(counts))} primitives, "
+        f"{' or '.join(f'{n:,}' for n in sorted(steps))} steps, {said} seed(s)."
+    )
 
 
 def main() -> None:

@@ -111,9 +111,15 @@ def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, An
     view = trainer.dataset.train.view(0).camera
     numbers = sum(value.numel() for value in trainer.model.params.values())
     return {
-        "scene": scene, "size": [view.width, view.height], "primitives": trainer.model.count, "numbers": numbers,
-        "sent": sent, "steps": steps, "seconds": times, "processor": used,
-    }  # fmt: skip
+        "scene": scene,
+        "size": [view.width, view.height],
+        "primitives": trainer.model.count,
+        "numbers": numbers,
+        "sent": sent,
+        "steps": steps,
+        "seconds": times,
+        "processor": used,
+    }
 
 
 def worker(scenes: list[str], rounds: int, seconds: float, out: Path) -> None:
@@ -136,9 +142,17 @@ def worker(scenes: list[str], rounds: int, seconds: float, out: Path) -> None:
 
 def table(record: dict[str, Any]) -> str:
     rows = Table(
-        "scene", "image", "primitives", "views/s of 2 ranks × 1 thread", "over 1 process × 2 threads, 2 views a step", "over the same, 1 view a step",
-        "over 1 process × 1 thread, 2 views", "processor time of a view, over 1 process × 2 threads", "a step sends, measured", "by the formula",
-    )  # fmt: skip
+        "scene",
+        "image",
+        "primitives",
+        "views/s of 2 ranks × 1 thread",
+        "over 1 process × 2 threads, 2 views a step",
+        "over the same, 1 view a step",
+        "over 1 process × 1 thread, 2 views",
+        "processor time of a view, over 1 process × 2 threads",
+        "a step sends, measured",
+        "by the formula",
+    )
     for scene, found in record["scenes"].items():
         times = found["seconds"]
 
@@ -152,10 +166,21 @@ def table(record: dict[str, Any]) -> str:
         width, height = found["size"]
         formula = 4 * (found["numbers"] + 2 * found["primitives"]) + 2048
         rows.row(
-            TITLES.get(scene, f"`{scene}`"), f"{width}×{height}", f"{found['primitives']:,}", f"{1 / statistics.median(times['together']):.1f}",
-            ratio("two threads"), ratio("single view"), ratio("one thread"), f"{work:.2f}", f"{found['sent']:,} B", f"{formula:,} B",
-        )  # fmt: skip
-    note = f"Each ratio: median of {record['rounds']} rounds; of the fastest turns. {record['cpu']}, {record['cores']} cores that other work shared."
+            TITLES.get(scene, f"`{scene}`"),
+            f"{width}×{height}",
+            f"{found['primitives']:,}",
+            f"{1 / statistics.median(times['together']):.1f}",
+            ratio("two threads"),
+            ratio("single view"),
+            ratio("one thread"),
+            f"{work:.2f}",
+            f"{found['sent']:,} B",
+            f"{formula:,} B",
+        )
+    note = (
+        f"Each ratio: median of {record['rounds']} rounds; of the fastest turns. {record['cpu']}, "
+        f"{record['cores']} cores that other work shared."
+    )
     return f"{rows}\n\n{note}"
 
 
@@ -185,7 +210,8 @@ def table_of_steps(found: dict[str, Any]) -> str:
         rows.row(views, f"{found['views'] // int(views):,}", f"{spread(values, 2)} dB")
     seeds = len(next(iter(found["psnr"].values())))
     return (
-        f"{rows}\n\n`neuprim run {' '.join(found['words'])}`, {found['views']:,} views in all, rates as for one view a step, means of {seeds} seeds "
+        f"{rows}\n\n`neuprim run {' '.join(found['words'])}`, {found['views']:,} views in all, rates as for one "
+        f"view a step, means of {seeds} seeds "
         "± half the spread."
     )
 

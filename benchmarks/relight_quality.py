@@ -16,7 +16,8 @@ for as many steps as it makes while the default makes --steps, so that neither o
 disturbs the comparisons. Images are 128 x 128, 500 for training, 100 held out (new lights, new views, both), linear
 light over the exposure, clamped to 0..1, black background; means over seeds +- half the spread, of the last checkpoint.
 --tune tests on every eighth training view instead. Results go to benchmarks/results/relight_quality.json. --docs puts
-the table between the markers of docs/relighting.md; with --parts none nothing is run, and the table is made of the recorded results.
+the table between the markers of docs/relighting.md; with --parts none nothing is run, and the table is made of the
+recorded results.
 """
 
 from __future__ import annotations
@@ -61,10 +62,19 @@ DEFAULT = "equation 14, visibility per primitive"
 SIZE = 128
 CLASSES = ("lit", "cast_shadow", "attached_shadow", "highlight")
 KEYS = (
-    "psnr_linear_clamped", "psnr_display", "ssim_display", *(f"psnr_pooled_{c}" for c in CLASSES),
-    "psnr_linear_clamped_new_view", "psnr_linear_clamped_new_light", "psnr_linear_clamped_new_both",
-    "primitives", "parameters_per_primitive", "iterations", "train_seconds", "seed",
-)  # fmt: skip
+    "psnr_linear_clamped",
+    "psnr_display",
+    "ssim_display",
+    *(f"psnr_pooled_{c}" for c in CLASSES),
+    "psnr_linear_clamped_new_view",
+    "psnr_linear_clamped_new_light",
+    "psnr_linear_clamped_new_both",
+    "primitives",
+    "parameters_per_primitive",
+    "iterations",
+    "train_seconds",
+    "seed",
+)
 
 
 def prepared(words: list[str], dataset: Dataset | None) -> Fitted:
@@ -158,7 +168,8 @@ def main() -> None:
 def quality_table(recorded: dict[str, Any]) -> str:
     """One row per baseline, form and loss."""
     lines = [
-        "| `lit_solids`, equally long training | numbers per primitive | PSNR | lit | cast shadow | attached shadow | highlight | PSNR display | steps |",
+        "| `lit_solids`, equally long training | numbers per primitive | PSNR | lit | cast shadow | attached "
+        "shadow | highlight | PSNR display | steps |",
         "| --- |" + " --- |" * 8,
     ]
     for key, name in BASELINES.items():
@@ -174,13 +185,15 @@ def quality_table(recorded: dict[str, Any]) -> str:
 
             pooled = " | ".join(cell(f"psnr_pooled_{c}", 1) for c in CLASSES)
             lines.append(
-                f"| {prefix}{name} | {own[0]['parameters_per_primitive']} | {cell('psnr_linear_clamped', 2)} | {pooled} "
+                f"| {prefix}{name} | {own[0]['parameters_per_primitive']} | {cell('psnr_linear_clamped', 2)} | "
+                f"{pooled} "
                 f"| {cell('psnr_display', 2)} | {own[0]['iterations']:,} |"
             )
     seeds = len({e["seed"] for e in recorded.get("forms", recorded.get("losses", []))})
     counts = sorted({e["primitives"] for e in recorded.get("forms", [])})
     lines.append(
-        f"\n{' or '.join(f'{n:,}' for n in counts)} primitives of equal bytes; rows with ± are means over {seeds} seeds, others one run; {recorded['cores']} cores of {recorded['cpu']}."
+        f"\n{' or '.join(f'{n:,}' for n in counts)} primitives of equal bytes; rows with ± are means over {seeds} "
+        f"seeds, others one run; {recorded['cores']} cores of {recorded['cpu']}."
     )
     return "\n".join(lines)
 

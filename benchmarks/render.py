@@ -116,8 +116,10 @@ def main() -> None:
     torch.set_num_threads(1)
     rows = []
     memory = (
-        f"Per primitive {4 * row_width(8) + 4 * SPAN_WIDTH} bytes of rows and spans and per pair 8 bytes of lists; a backward pass takes "
-        f"{4 * gradient_width(8, 3)} bytes more for each (K = 8, three colours), and what the forward pass keeps for it: 6 bytes a pair and 4 a lane."
+        f"Per primitive {4 * row_width(8) + 4 * SPAN_WIDTH} bytes of rows and spans and per pair 8 bytes of "
+        f"lists; a backward pass takes "
+        f"{4 * gradient_width(8, 3)} bytes more for each (K = 8, three colours), and what the forward pass keeps "
+        f"for it: 6 bytes a pair and 4 a lane."
     )
     print(memory)
     table = Table("scene", "largest rate", "threads", "pass", "ms", "ns/lane", "lanes/hit", "GFLOP/s")

@@ -186,7 +186,8 @@ def gridded(name: str, where: Sequence[str], work: Path) -> dict[str, Any]:
                 }
             )
             print(
-                f"{name}: {size} primitives {less}: {outcome.psnr:.2f} dB, {grid[-1]['bytes']} bytes, {outcome.seconds:.0f} s",
+                f"{name}: {size} primitives {less}: {outcome.psnr:.2f} dB, {grid[-1]['bytes']} bytes, "
+                f"{outcome.seconds:.0f} s",
                 flush=True,
             )
     return {"words": scene.words, "hold_out": every, "grid": grid}

@@ -7,7 +7,8 @@
 ROW=RUN_DIR: a name in the table, and a finished run whose data are at hand. Held-out views of it, evenly spread, are
 drawn by its page, with every bit of its numbers, in headless Chromium and read back as floats, and by the run's
 backend, without a limit of transmittance (blending cannot stop a ray) and with the run's own: largest differences,
-colours as the model has them. Sizes and errors are those of pages at levels 0, 1 and 3, pictures of held-out views among them.
+colours as the model has them. Sizes and errors are those of pages at levels 0, 1 and 3, pictures of held-out views
+among them.
 Chords are the pixels of the silhouettes in the first view at 1280 x 720.
 
 --prepare: milliseconds of the worker, preparation and sort, for models of 5,000 and 20,000 primitives where the
@@ -200,9 +201,16 @@ _TIMES = """async frames => {
 
 def page_table(runs: Mapping[str, dict[str, Any]]) -> Table:
     table = Table(
-        "run", "primitives", "brightest value", "without `transmittance_min`", "as configured", "page, level 0", "level 1", "level 3",
+        "run",
+        "primitives",
+        "brightest value",
+        "without `transmittance_min`",
+        "as configured",
+        "page, level 0",
+        "level 1",
+        "level 3",
         "chords at 1280×720",
-    )  # fmt: skip
+    )
     for name, run in runs.items():
         worst = [f"{max(view[key] for view in run['views']):.1e}" for key in ("whole", "configured")]
         brightest = max(view["brightest"] for view in run["views"])

@@ -1,7 +1,9 @@
 """What mkdocs does not do by itself; used by ``mkdocs.yml`` (``hooks``).
 
-* Links of a page to files of the repository outside ``docs/`` work on the code host as they are; on the site the file is copied along.
-* ``:class:`~neuprim.core.errors.DataError` `` in docstrings becomes a link where the object is documented, else its name.
+* Links of a page to files of the repository outside ``docs/`` work on the code host as they are; on the site the file
+  is copied along.
+* ``:class:`~neuprim.core.errors.DataError` `` in docstrings becomes a link where the object is documented, else its
+  name.
 * A page that would load something from the network fails the strict build.
 """
 

@@ -1,9 +1,11 @@
-"""The figures of docs/mathematics.md: one primitive, one ray and the integral of the density along their chord; the weights of soft edges.
+"""The figures of docs/mathematics.md: one primitive, one ray and the integral of the density along their chord; the
+weights of soft edges.
 
 python docs/make_figures.py docs/pictures/chord.png
 python docs/make_figures.py docs/pictures/edges.png
 
-Everything in them is computed by the package: the field by `cosine_density`, the integral once by the renderer and once by summing.
+Everything in them is computed by the package: the field by `cosine_density`, the integral once by the renderer and once
+by summing.
 """
 
 from __future__ import annotations

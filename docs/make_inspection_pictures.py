@@ -2,7 +2,8 @@
 
     python docs/make_inspection_pictures.py RUN_DIR [AGAINST] [TIME]
 
-AGAINST is a folder of OpenVDB files, or "scene" (the default) for what the run's own scene was made from. Pictures are stored with 6 bits per channel.
+AGAINST is a folder of OpenVDB files, or "scene" (the default) for what the run's own scene was made from. Pictures are
+stored with 6 bits per channel.
 """
 
 from __future__ import annotations

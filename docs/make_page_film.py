@@ -4,10 +4,12 @@
     neuprim run task=dynamic scene=smoke_fire output_dir=SMOKE
     neuprim run task=relight scene=lit_solids model.primitives=5000 train.iterations=6000 output_dir=LIT
     neuprim export SOLIDS --format html --out docs/pages/solids.html level=2 views=3          # and SMOKE, LIT
-    python docs/make_page_film.py docs/pages/solids.html docs/pages/smoke_fire.html docs/pages/lit_solids.html docs/pictures/pages.webp
+    python docs/make_page_film.py docs/pages/solids.html docs/pages/smoke_fire.html docs/pages/lit_solids.html
+    docs/pictures/pages.webp
 
-Arguments: PAGE … TARGET [--side 240] [--frames 60]. Every frame is the page's own canvas, drawn at twice the side in headless Chromium; a page with a time plays it,
-one with a light leads it around, and all turn. Needs a Chromium and the package playwright.
+Arguments: PAGE … TARGET [--side 240] [--frames 60]. Every frame is the page's own canvas, drawn at twice the side in
+headless Chromium; a page with a time plays it, one with a light leads it around, and all turn. Needs a Chromium and the
+package playwright.
 """
 
 from __future__ import annotations

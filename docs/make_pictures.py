@@ -8,7 +8,8 @@
     python docs/make_pictures.py RUN_DIR docs/pictures/lit_solids.png 6 160
 
 Arguments: RUN_DIR TARGET [VIEWS] [SIDE].
-VIEWS pictures of the run (4), each SIDE pixels wide (as rendered). A run with films shows its first held-out camera over time.
+VIEWS pictures of the run (4), each SIDE pixels wide (as rendered). A run with films shows its first held-out camera
+over time.
 """
 
 from __future__ import annotations

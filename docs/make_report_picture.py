@@ -1,4 +1,5 @@
-"""A picture of the top of a run's report, or of another page, for docs/getting_started.md and docs/launching.md. Needs Chromium or Chrome on the PATH.
+"""A picture of the top of a run's report, or of another page, for docs/getting_started.md and docs/launching.md. Needs
+Chromium or Chrome on the PATH.
 
 python docs/make_report_picture.py RUN_DIR docs/pictures/report.png [HEIGHT]
 python docs/make_report_picture.py SWEEP_DIR/sweep.html docs/pictures/sweep.png [HEIGHT]

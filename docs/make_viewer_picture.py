@@ -1,4 +1,5 @@
-"""A picture of the viewer at a held-out view, for docs/viewer.md. Needs viser, Playwright and Chromium or Chrome on the PATH.
+"""A picture of the viewer at a held-out view, for docs/viewer.md. Needs viser, Playwright and Chromium or Chrome on the
+PATH.
 
 python docs/make_viewer_picture.py RUN_DIR docs/pictures/viewer.png [VIEW]
 """

@@ -30,10 +30,15 @@ def train(steps: int = 200) -> list[float]:
     images = truth(viewmats, Ks)
 
     primitives = {  # in the order of rasterize's arguments
-        "means": torch.rand(COUNT, 3) - 0.5, "log_scales": torch.full((COUNT, 3), 0.2).log(), "quats": torch.randn(COUNT, 4),
-        "W1": (torch.rand(COUNT, NEURONS, 3) - 0.5) / 3, "b1": torch.rand(COUNT, NEURONS), "w2": 0.1 * torch.randn(COUNT, NEURONS),
-        "b2": torch.full((COUNT, 1), 0.3), "colors": torch.rand(COUNT, 3),
-    }  # fmt: skip
+        "means": torch.rand(COUNT, 3) - 0.5,
+        "log_scales": torch.full((COUNT, 3), 0.2).log(),
+        "quats": torch.randn(COUNT, 4),
+        "W1": (torch.rand(COUNT, NEURONS, 3) - 0.5) / 3,
+        "b1": torch.rand(COUNT, NEURONS),
+        "w2": 0.1 * torch.randn(COUNT, NEURONS),
+        "b2": torch.full((COUNT, 1), 0.3),
+        "colors": torch.rand(COUNT, 3),
+    }
     rates = {
         "means": 3e-3,
         "log_scales": 1e-2,

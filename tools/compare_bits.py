@@ -25,7 +25,8 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 
 RUNS = {
     "static": "scene=solids scene.size=64 model.primitives=600 train.iterations=400 renderer.sort=entry",
-    "dynamic": "scene=smoke_fire scene.size=32 scene.cameras=8 scene.timesteps=8 scene.resolution=24 model.primitives=800 "
+    "dynamic": "scene=smoke_fire scene.size=32 scene.cameras=8 scene.timesteps=8 scene.resolution=24 "
+    "model.primitives=800 "
     "train.iterations=300",
     "relight": "scene=lit_solids scene.size=48 model.primitives=500 train.iterations=300",
 }

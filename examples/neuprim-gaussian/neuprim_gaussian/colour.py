@@ -1,4 +1,5 @@
-"""Colour that changes with the side a primitive is seen from: spherical harmonics, of which neuprim's core has the basis."""
+"""Colour that changes with the side a primitive is seen from: spherical harmonics, of which neuprim's core has the
+basis."""
 
 from __future__ import annotations
 

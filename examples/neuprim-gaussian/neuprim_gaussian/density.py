@@ -58,10 +58,12 @@ class BellDensity(DensityField):
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Opaque:
         """The integral of sigma over a chord, in closed form.
 
-        With q the whitened middle of the chord, v the whitened direction, a = |v|^2, u = q.v/a the way from the ray's closest approach
-        to the middle and h half the chord, the exponent at distance t from the middle is -c^2/2 (|q - u v|^2 + a (u + t)^2), so
+        With q the whitened middle of the chord, v the whitened direction, a = |v|^2, u = q.v/a the way from the ray's
+        closest approach to the middle and h half the chord, the exponent at distance t from the middle is -c^2/2 (|q -
+        u v|^2 + a (u + t)^2), so
 
-            I = kappa/m exp(-c^2/2 |q - u v|^2) B(g u, g h)/g,   g = c sqrt(a/2),   B(z, w) = integral of exp(-t^2) over z - w .. z + w.
+            I = kappa/m exp(-c^2/2 |q - u v|^2) B(g u, g h)/g,   g = c sqrt(a/2),   B(z, w) = integral of exp(-t^2) over
+            z - w .. z + w.
         """
         c = self.deviations
         whiten = geometry.rotations.double().transpose(1, 2) / geometry.scales.double()[:, :, None]
@@ -101,8 +103,8 @@ class BellDensity(DensityField):
 def bell(z: Tensor, w: Tensor) -> Tensor:
     """The integral of exp(-t^2) from z - w to z + w, w >= 0, float64; three forms, each where it keeps its digits.
 
-    Where the interval holds 0, a sum of two erf. In a tail, where erf is all but 1, a difference of two erfc. And where it is short
-    against the curve, w (1 + |z|) < 0.01, both would cancel: three terms of the Taylor series about z.
+    Where the interval holds 0, a sum of two erf. In a tail, where erf is all but 1, a difference of two erfc. And where
+    it is short against the curve, w (1 + |z|) < 0.01, both would cancel: three terms of the Taylor series about z.
     """
     side = z.abs()
     around = torch.erf(side + w) - torch.erf(side - w)

@@ -33,7 +33,8 @@ def test_conforms_with_a_hard_edge(check: Callable[[], None]) -> None:
 
 
 def test_the_integral_keeps_its_digits() -> None:
-    """Against Gauss-Legendre quadrature, relative to the integral itself: around 0, in the tails, on short intervals."""
+    """Against Gauss-Legendre quadrature, relative to the integral itself: around 0, in the tails, on short
+    intervals."""
     x, weights = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(100))
     z, w = torch.meshgrid(
         torch.linspace(-6, 6, 49, dtype=torch.float64), torch.logspace(-9, 0.3, 60, dtype=torch.float64), indexing="ij"

@@ -1,26 +1,22 @@
 """Quality of the dynamic task on a real sequence, and which way of varying in time is worth its parameters.
 
     python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 13500x4000] [--presets quick equations hard]
-    [--seeds 3]
-        [--parts main variants control between equations] [--edges 0 2] [--neurons 0 8] [--jobs 2] [--docs]
+        [--seeds 3] [--parts main control between equations] [--edges 0 2] [--neurons 0 8] [--jobs 2] [--docs]
 
 DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40). Parts:
 
-    main       presets by primitives and steps (--rows); presets other than quick get as many primitives as have its
-    bytes; `hard` is the
-               paper's primitive, learned from images alone, with quick's windows and motion
-    variants   ways of varying in time, 2,000 primitives of the paper's, the same iterations; a table of parameters and
-    quality; so are the next control    times shuffled among the training images: a model of time must lose by it
-    between    every second frame is learned; the others are compared with the real ones, and steps between frames are
-    measured equations  the form of preset quick, that of the paper's equations 10 to 13 and their union, for each of
-    --edges and --neurons, all at
-               the bytes of --primitives of quick's; the same iterations. Without
-               neurons equation 13 changes nothing, and the equations' colour alone varies
+    main       presets by primitives and steps (--rows), at equal bytes; `hard` is the paper's primitive, learned from
+               images alone, with the windows and motion of `quick`
+    control    times shuffled among the training images: a model of time must lose by it
+    between    every second frame is learned; the others are compared with the real ones, and steps between frames
+               are measured
+    equations  the form of `quick`, that of the paper's equations 10 to 13 and their union, for each of --edges and
+               --neurons, all with the bytes of --primitives of quick's and the same iterations
 
 Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds
 +- half the spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json, part by part; of main
-and equations only what is missing is run, --jobs at a time, one thread each. --docs puts the recorded tables
-between the markers of docs/dynamic.md; without DIR nothing is run.
+and equations only what is missing is run, --jobs at a time, one thread each. --docs puts the recorded tables between
+the markers of docs/dynamic.md; without DIR nothing is run.
 """
 
 from __future__ import annotations
@@ -54,14 +50,6 @@ from neuprim.tasks.dynamic.volume.dataset import Recording
 RESULTS = Path(__file__).parent / "results" / "dynamic_quality.json"
 SIZE = 96
 COLOUR = ("model.colour.powers=4", "model.colour.waves=4")
-VARIANTS = {
-    **{
-        time: (f"model.density.time={time}",)
-        for time in ("phase", "offset", "window", "phase+offset", "phase+motion", "window+motion")
-    },
-    "phase, colour in time": ("model.density.time=phase", *COLOUR),
-    "window+motion, colour in time": ("model.density.time=window+motion", *COLOUR),
-}
 FORMS = {
     "quick: window, motion": ("model.density.time=window+motion",),
     "equations 10 to 13, degree 3": ("preset=equations",),
@@ -224,14 +212,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--frames", default="1:40")
-    parser.add_argument("--parts", nargs="*", default=["main", "variants", "control", "between"])
+    parser.add_argument("--parts", nargs="*", default=["main", "control", "between"])
     parser.add_argument("--rows", nargs="*", default=["13500x4000"], help="PRIMITIVESxSTEPS, of main")
     parser.add_argument("--presets", nargs="*", default=list(PRESETS), choices=list(PRESETS), help="of main")
     parser.add_argument("--edges", nargs="*", type=int, default=[0, 2], help="of equations")
     parser.add_argument("--neurons", nargs="*", type=int, default=[0, 8], help="of equations")
     parser.add_argument("--forms", nargs="*", default=list(FORMS), help="of equations")
     parser.add_argument("--primitives", type=int, default=5400, help="of equations")
-    parser.add_argument("--variants", nargs="*", default=list(VARIANTS))
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=2500, help="of every run but those of main")
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time of main and equations, one thread each")
@@ -239,7 +226,7 @@ def main() -> None:
     args = parser.parse_args()
     recorded: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     if args.folder:
-        if {"variants", "control", "between"} & set(args.parts):
+        if {"control", "between"} & set(args.parts):
             recorded |= {"cpu": cpu_name(), "cores": core_count()}
         data = [
             "scene=vdb",
@@ -266,14 +253,8 @@ def main() -> None:
         trials += equation_trials(args, ["task=dynamic", *data]) if "equations" in args.parts else []
         run_all(trials, RESULTS, kept, args.jobs, lambda row: f"{row['psnr_mask']:.2f} dB", {"main_cpu": cpu_name()})
         recorded |= json.loads(RESULTS.read_text())
-        if "variants" in args.parts:
-            recorded["variants"] = [e for e in recorded.get("variants", []) if e["time"] not in args.variants]
         for seed in range(args.seeds):
             own = [*data, f"seed={seed}"]
-            if "variants" in args.parts:
-                for time in args.variants:
-                    _, m = fit([*own, *short, *VARIANTS[time]])
-                    keep("variants", {"time": time, **{k: m[k] for k in KEYS}})
             if "control" in args.parts:
                 for name, change in (("true times", lambda trainer: None), ("shuffled times", shuffled_times)):
                     _, m = fit([*own, *short], change)
@@ -286,7 +267,6 @@ def main() -> None:
     notes = {where: f"\n\nMeans over seeds ± half the spread; {cpu}." for where, cpu in _machines(recorded).items()}
     tables = {
         "dynamic-quality": main_table,
-        "dynamic-variants": variants_table,
         "dynamic-control": control_table,
         "dynamic-equations": equations_table,
     }
@@ -365,31 +345,6 @@ def main_table(recorded: dict[str, Any]) -> str:
             line("seeds", lambda own: f"{len(own)}"),
         ]
     )
-
-
-def variants_table(recorded: dict[str, Any]) -> str:
-    """One row per way of varying in time."""
-    runs = recorded.get("variants", [])
-    lines = [
-        "| model.density.time | numbers per primitive | PSNR | inside the mask | pooled, inside | σ correlation, "
-        "late | invisible | ms a step |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for time in dict.fromkeys(r["time"] for r in runs):
-        own = [r for r in runs if r["time"] == time]
-        lines.append(
-            f"| {time} | {own[0]['parameters_per_primitive']} | {_spread(own, 'psnr')} dB | "
-            f"{_spread(own, 'psnr_mask')} dB "
-            f"| {_spread(own, 'psnr_pooled_mask')} dB | {_spread(own, 'sigma_correlation_late', 3)} "
-            f"| {100 * statistics.mean(r['invisible_fraction'] for r in own):.0f} % | "
-            f"{1e3 * statistics.mean(r['train_seconds'] / r['iterations'] for r in own):.0f} |"
-        )
-    if runs:
-        lines.append(
-            f"\n{runs[0]['primitives']:,} primitives, {runs[0]['iterations']:,} iterations, "
-            f"{len({r['seed'] for r in runs})} seed(s)."
-        )
-    return "\n".join(lines)
 
 
 def equations_table(recorded: dict[str, Any]) -> str:

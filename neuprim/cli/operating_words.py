@@ -5,10 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["DRAWN", "OPERATING", "operating_words"]
-
-DRAWN = ("eval", "render", "tradeoff")
-"""Commands that take them."""
+__all__ = ["OPERATING", "operating_words"]
 
 _HEADS = (
     "renderer",

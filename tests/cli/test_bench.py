@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from neuprim.cli import main
-from neuprim.cli.bench import table_numbers
+from neuprim.cli.bench_command import parse_table_numbers
 from neuprim.config import presets
 from neuprim.core.errors import ConfigError
 from neuprim.plugins.registry import load_task
@@ -70,7 +70,7 @@ def test_without_data_it_lists(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_words() -> None:
-    assert table_numbers("3-5,7") == {3, 4, 5, 7}
+    assert parse_table_numbers("3-5,7") == {3, 4, 5, 7}
     assert (budget_words("full"), budget_words("90s"), budget_words("1.5h")) == (
         [],
         ["train.max_seconds=90"],
@@ -78,7 +78,7 @@ def test_words() -> None:
     )
     for wrong in ("2", "3-8", "5-3", "", "all"):
         with pytest.raises(ConfigError, match=f"--tables {wrong}: .*expected numbers from 3 to 7"):
-            table_numbers(wrong)
+            parse_table_numbers(wrong)
     for wrong in ("10", "0m", "m", "ten minutes"):
         with pytest.raises(ConfigError, match=f"--budget {wrong}: expected full, or"):
             budget_words(wrong)

@@ -11,7 +11,7 @@ import pytest
 import neuprim
 from neuprim import runs
 from neuprim.cli import main
-from neuprim.cli.metrics_report import print_metrics
+from neuprim.cli.eval_command import print_metrics
 from neuprim.config import RunConfig
 from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import DataError, NonFiniteError

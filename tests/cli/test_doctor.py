@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 import neuprim.core.render as rendering
-from neuprim.cli import doctor
+from neuprim.cli import doctor_command as doctor
 from neuprim.core.compute import device
 from neuprim.core.render import backends
 from neuprim.core.render.backends import Backend
@@ -15,7 +15,7 @@ from neuprim.core.render.backends import Backend
 
 def report() -> tuple[int, str]:
     console = Console(file=io.StringIO(), width=200)
-    status = doctor.doctor(console)
+    status = doctor.print_report(console)
     return status, console.file.getvalue()  # type: ignore[attr-defined]
 
 

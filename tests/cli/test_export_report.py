@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from neuprim.cli.export_report import print_report
+from neuprim.cli.export_command import print_report
 from neuprim.core.extensions import ExportReport
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from neuprim.cli.listing import list_plugins
+from neuprim.cli.tasks_command import list_plugins
 from neuprim.config import RunConfig, compose, compose_all, presets
 from neuprim.config.effort import LEVELS, levels_of
 from neuprim.conformance import ConformanceError, named_checks

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 import torch
 
-from neuprim.cli import _parsers
-from neuprim.cli.operating_words import DRAWN, operating_words
-from neuprim.cli.tradeoff import of_words
+from neuprim.cli import COMMANDS
+from neuprim.cli.operating_words import operating_words
+from neuprim.cli.tradeoff_command import of_words
 from neuprim.config import compose, compose_all
 from neuprim.config.launcher import launcher_words
 from neuprim.config.overrides import without_place
@@ -183,47 +183,37 @@ def conditions() -> list[ConditionSpec]:
 
 def check(words: list[str], conditions: list[ConditionSpec]) -> None:
     """Raises where the command line or the configuration would refuse ``neuprim WORDS``."""
-    parser, known = _parsers(with_tasks=False)
-    args, rest = parser.parse_known_args(words)
-    if args.command == "run":
-        rest += args.overrides
-        settings = [word for word in rest if not word.startswith("-")]
-        rest = [word for word in rest if word.startswith("-")]
-        _, settings = viewer_words(settings)
-        _, settings = launcher_words(settings)
-        _, settings = target_words(settings)
+    name = words[0]
+    args, rest = COMMANDS[name].build_parser().parse_known_args(words[1:])
+    settings = [*getattr(args, "overrides", []), *(word for word in rest if not word.startswith("-"))]
+    flags = [word for word in rest if word.startswith("-")]
+    if name == "run":
+        for take in (viewer_words, launcher_words, target_words):
+            _, settings = take(settings)
         if (args.multirun and not without_place(settings)) or args.config is not None:
             settings = ["task=static", *settings]  # the others are in a file
         (compose_all if args.multirun else compose)(settings, False)
-    if args.command == "truth":
-        rest += args.overrides
-        (compose_all if args.multirun else compose)(
-            launcher_words([word for word in rest if not word.startswith("-")])[1], False
-        )
-        rest = [word for word in rest if word.startswith("-")]
-    if args.command == "bench":
-        rest += args.overrides
-        compose(["scene=blender", "scene.path=DIR", *(word for word in rest if not word.startswith("-"))], False)
-        rest = [word for word in rest if word.startswith("-")]
-    if args.command == "tradeoff" and of_words(args.run_dir):
-        typed = [word for word in (args.run_dir, *rest) if not word.startswith(("-", "budget="))]
+        rest = flags
+    elif name == "truth":
+        (compose_all if args.multirun else compose)(launcher_words(settings)[1], False)
+        rest = flags
+    elif name == "bench":
+        compose(["scene=blender", "scene.path=DIR", *settings], False)
+        rest = flags
+    elif name == "tradeoff" and of_words(args.run_dir):
+        typed = [word for word in (args.run_dir, *settings) if not word.startswith("budget=")]
         compose(launcher_words(typed)[1], False)
-        rest = [word for word in rest if word.startswith("-")]
-    elif args.command in DRAWN:
+        rest = flags
+    elif name in ("eval", "render", "tradeoff"):
         _, rest = operating_words(rest)
-    if args.command in ("render", "inspect", "export"):
+    if name in ("render", "inspect", "export"):
         given, rest = split_words(rest, conditions)
-        assert (
-            read_conditions(
-                conditions, {name: text for name, text in given.items() if not PLACEHOLDER.search(text)}, pytest.fail
-            )
-            is not None
-        )
-    if args.command == "export":
+        known = {condition: text for condition, text in given.items() if not PLACEHOLDER.search(text)}
+        read_conditions(conditions, known, pytest.fail)
+    if name == "export":
         options = load_exporter(args.format).options if not PLACEHOLDER.search(args.format) else {}
         rest = [word for word in rest if word.partition("=")[0] not in options]
-    assert rest == [], f"{rest} is no argument of neuprim {args.command}"
-    assert args.command in known
+    assert rest == [], f"{rest} is no argument of neuprim {name}"
 
 
 @pytest.mark.parametrize("block", [b for b in SHELL if any(commands(b, "neuprim"))], ids=place)
@@ -257,7 +247,7 @@ def test_commands(
 )
 def test_a_wrong_command_is_noticed(line: str, conditions: list[ConditionSpec]) -> None:
     (words,) = commands(Block(ROOT / "x.md", 1, "sh", f"cd x && .venv/bin/{line}  # text\n", None), "neuprim")
-    with pytest.raises((AssertionError, NeuprimError)):
+    with pytest.raises((AssertionError, KeyError, NeuprimError)):
         check(words, conditions)
 
 

@@ -19,7 +19,7 @@ import torch
 from rich.console import Console
 
 import neuprim
-from neuprim.cli import doctor, main
+from neuprim.cli import doctor_command, main
 from neuprim.config import RunConfig, compose
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError
@@ -150,7 +150,7 @@ def test_numbers_that_are_not_finite_are_refused_for_it(fake: Fake) -> None:
 
 def diagnosis() -> dict[str, str]:
     console = Console(file=io.StringIO(), width=200)
-    doctor.doctor(console)
+    doctor_command.print_report(console)
     text = console.file.getvalue()  # type: ignore[attr-defined]
     return dict(re.findall(r"^\W*(fake|cpu|reference)\W+((?:works|does not work)[^\n│]*?)\W*$", text, re.M))
 

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuprim.cli import arguments
+from neuprim.cli.command import Command, add_trust_flag, check_run_directory, parse_count
+from neuprim.cli.operating_words import OPERATING, operating_words
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -15,9 +16,12 @@ if TYPE_CHECKING:
 
     from neuprim.search.tradeoff.record import Measured, Record
 
-__all__ = ["FORMS", "for_tradeoff", "of_words", "tradeoff"]
+__all__ = ["COMMAND", "of_words"]
 
-FORMS = """\
+_USAGE = """\
+neuprim tradeoff RUN_DIR | KEY=VALUE ... [KEY=VALUE ...] [--views N] [--repeats N] [--knobs NAME ...] [--budget TIME]
+                       [--seeds N] [--lpips FILE]"""
+_FORMS = """\
 neuprim tradeoff RUN_DIR measures the knobs of drawing on a finished run.
 neuprim tradeoff task=NAME scene=NAME budget=20m [KEY=VALUE ...] [output_dir=DIR]
   trains a designed set of models around the one that these words of `neuprim run` name, and measures them side by side.
@@ -30,15 +34,14 @@ def of_words(first: str) -> bool:
     return "=" in first and not Path(first).exists()
 
 
-def for_tradeoff(parser: argparse.ArgumentParser) -> None:
-    """Adds the arguments."""
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.usage = _USAGE
+    add_trust_flag(parser)
     parser.add_argument("run_dir", metavar="RUN_DIR|KEY=VALUE", help="a finished run, or words of `neuprim run`")
     parser.add_argument(
-        "--views", type=arguments.count, default=5, metavar="N", help="held-out views, evenly spread (default: 5)"
+        "--views", type=parse_count, default=5, metavar="N", help="held-out views, evenly spread (default: 5)"
     )
-    parser.add_argument(
-        "--repeats", type=arguments.count, default=15, metavar="N", help="rounds of timing (default: 15)"
-    )
+    parser.add_argument("--repeats", type=parse_count, default=15, metavar="N", help="rounds of timing (default: 15)")
     parser.add_argument(
         "--knobs", nargs="+", default=[], metavar="NAME", help="some of them, e.g. alpha_min sort (default: all)"
     )
@@ -47,14 +50,32 @@ def for_tradeoff(parser: argparse.ArgumentParser) -> None:
         metavar="TIME",
         help="about how long, e.g. 90s or 10m; what does not fit is left out (default: 5m, 20m of trainings)",
     )
-    parser.add_argument("--seeds", type=arguments.count, metavar="N", help="trainings of every model (default: 1)")
+    parser.add_argument("--seeds", type=parse_count, metavar="N", help="trainings of every model (default: 1)")
     parser.add_argument(
         "--lpips", type=Path, metavar="FILE", help="measure LPIPS with these weights of your own, a file or a folder"
     )
 
 
-def tradeoff(args: argparse.Namespace) -> int:
-    """Measures, writes RUN_DIR/tradeoff and prints the fronts."""
+def _take_rest(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
+    if of_words(arguments.run_dir):
+        arguments.words = [word for word in rest if not word.startswith("-")]
+        return [word for word in rest if word.startswith("-") and word != "--"]
+    arguments.words, rest = operating_words(rest)
+    return rest
+
+
+def _tradeoff(args: argparse.Namespace) -> int:
+    if of_words(args.run_dir):
+        from neuprim.cli.tradeoff_models import tradeoff_models
+
+        return tradeoff_models(args)
+    args.run_dir = Path(args.run_dir)
+    check_run_directory(args.run_dir)
+    return _tradeoff_of_run(args)
+
+
+def _tradeoff_of_run(args: argparse.Namespace) -> int:
+    """Measure, write RUN_DIR/tradeoff and print the fronts."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
     from neuprim.search.tradeoff.record import command
@@ -114,3 +135,13 @@ def _cells(point: Measured) -> tuple[str, ...]:
         *(f"{q['psnr']:.2f}", f"{q['ssim']:.4f}", f"{q['psnr_exact']:.1f}", f"{point.bytes:,}"),
         "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e6:.1f}",
     )
+
+
+COMMAND = Command(
+    "tradeoff",
+    "measure what speed and size cost in accuracy: how a run is drawn, or what is trained",
+    _add_arguments,
+    _tradeoff,
+    epilog=_FORMS + OPERATING,
+    take_rest=_take_rest,
+)

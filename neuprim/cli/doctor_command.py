@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from packaging.requirements import Requirement
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from neuprim.cli.console import plain_console
-from neuprim.core.compute.machine import cpu_name
+from neuprim.cli.command import Command
 from neuprim.version import __version__
 
-__all__ = ["doctor"]
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = ["COMMAND", "print_report"]
 
 NOT_FOR_USERS = ("test", "docs", "dev")
 """Extras that only people who work on neuprim itself need."""
@@ -25,8 +26,17 @@ NOT_FOR_USERS = ("test", "docs", "dev")
 Rows = list[tuple[str, str]]
 
 
-def doctor(console: Console | None = None) -> int:
-    """Prints the report; returns 0, or 1 if no backend works."""
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    pass
+
+
+def print_report(console: Console | None = None) -> int:
+    """Print what is installed and what works; return 0, or 1 if no backend works."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from neuprim.cli.console import plain_console
+
     console = console or plain_console()
     backends, working = _backends()
     for title, rows in (
@@ -48,6 +58,8 @@ def doctor(console: Console | None = None) -> int:
 
 
 def _machine() -> Rows:
+    from neuprim.core.compute.machine import cpu_name
+
     return [
         ("neuprim", __version__),
         ("python", f"{platform.python_version()} ({platform.python_implementation()})"),
@@ -191,3 +203,11 @@ def _caches() -> Rows:
         ("kernels", f"{kernels()} (set by NUMBA_CACHE_DIR)"),
         ("generated scenes", f"{everything() / 'scenes'} (set by NEUPRIM_CACHE_DIR)"),
     ]
+
+
+COMMAND = Command(
+    "doctor",
+    "show versions, devices and which renderer backends work here",
+    _add_arguments,
+    lambda arguments: print_report(),
+)

@@ -1,4 +1,4 @@
-"""``neuprim view``, and what a viewer beside a training prints."""
+"""``neuprim view``: look at a run in the browser; and the viewer of a training."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neuprim.cli.command import Command
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -14,29 +15,25 @@ if TYPE_CHECKING:
     from neuprim.config import RunConfig
     from neuprim.config.viewer import ViewerSettings
 
-__all__ = ["for_view", "run_viewed", "view"]
+__all__ = ["COMMAND", "run_viewed"]
 
 
-def for_view(parser: argparse.ArgumentParser) -> None:
-    """Adds the arguments."""
-    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    parser.add_argument(
-        "--port", type=_port, default=8080, metavar="N", help="of the page's address; 0 for any (default: 8080)"
-    )
-    parser.add_argument(
-        "--host", metavar="ADDRESS", help="to listen on (default: 127.0.0.1, which this machine alone reaches)"
-    )
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    port = "of the page's address; 0 for any (default: 8080)"
+    parser.add_argument("--port", type=_parse_port, default=8080, metavar="N", help=port)
+    host = "to listen on (default: 127.0.0.1, which this machine alone reaches)"
+    parser.add_argument("--host", metavar="ADDRESS", help=host)
 
 
-def view(args: argparse.Namespace) -> int:
-    """Shows the run until Ctrl-C."""
+def _view(args: argparse.Namespace) -> int:
+    """Show the run until Ctrl-C."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import LineProgress
     from neuprim.config.viewer import ViewerSettings
     from neuprim.viewer.view import view_run
 
     settings = ViewerSettings(port=args.port) if args.host is None else ViewerSettings(args.host, args.port)
-    _warn_of_others(settings)
+    _warn_of_open_host(settings)
     console = plain_console(stderr=True)
 
     def opened(address: str) -> None:
@@ -56,31 +53,41 @@ def view(args: argparse.Namespace) -> int:
 
 
 def run_viewed(config: RunConfig, events: RunProgress, settings: ViewerSettings) -> Path:
-    """``neuprim run`` with a page beside the training; raises as :func:`neuprim.runs.run.run`."""
+    """Run a training with a live viewer; raise as :func:`neuprim.runs.run.run`."""
     from neuprim.runs.events import Note
     from neuprim.runs.run import run
     from neuprim.viewer.training import LiveTraining
 
-    _warn_of_others(settings)
+    _warn_of_open_host(settings)
     with LiveTraining(settings, config, lambda address: events(Note(f"the viewer is at {address}")), events) as live:
         return run(config, live, live.between)
 
 
-def _warn_of_others(settings: ViewerSettings) -> None:
-    """A page that others can reach is worth a word."""
+def _warn_of_open_host(settings: ViewerSettings) -> None:
     from neuprim.config.viewer import LOOPBACK
     from neuprim.viewer.server import is_loopback
 
     if is_loopback(settings.host):
         return
+    port = settings.port or 8080
     print(
-        f"neuprim: warning: the viewer at {settings.host} is reached from other machines, without encryption: whoever can read the network can "
-        f"read its token. Safer: leave the host out, and on the other machine `ssh -L {settings.port or 8080}:{LOOPBACK}:{settings.port or 8080} THIS_MACHINE`",
+        f"neuprim: warning: other machines can reach the viewer at {settings.host}, without encryption: whoever can "
+        "read the network can read its token. Safer: leave the host out, and type on the other machine "
+        f"`ssh -L {port}:{LOOPBACK}:{port} THIS_MACHINE`",
         file=sys.stderr,
     )
 
 
-def _port(text: str) -> int:
+def _parse_port(text: str) -> int:
     if not (text.isascii() and text.isdigit()) or int(text) > 65535:
         raise ConfigError(f"--port {text}: expected a port, 1 to 65535, or 0 for any")
     return int(text)
+
+
+COMMAND = Command(
+    "view",
+    "look at a run in the browser: turn it, play it, move its light, edit a camera path",
+    _add_arguments,
+    _view,
+    opens_run=True,
+)

@@ -5,18 +5,20 @@ from __future__ import annotations
 import argparse
 import shlex
 
+from neuprim.cli.command import Command, take_overrides
 from neuprim.core.errors import ConfigError
 
-__all__ = ["TRUTH_HELP", "for_truth", "truth"]
+__all__ = ["COMMAND"]
 
-TRUTH_HELP = """Frames that are there are not made again; a run with the same scene reads them. With a launcher they are made side by side:
+_HELP = """\
+Frames that are there are not made again; a run with the same scene reads them. With a launcher they are made side by
+side:
   neuprim truth task=dynamic scene=vdb scene.vdb=DIR launcher=processes
   neuprim truth task=dynamic scene=vdb scene.vdb=DIR scene.cache=DIR launcher=slurm
 Prints where they are."""
 
 
-def for_truth(parser: argparse.ArgumentParser) -> None:
-    """Adds the arguments of ``neuprim truth``."""
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "overrides", nargs="*", metavar="KEY=VALUE", help="settings of the scene and of the launcher, as of neuprim run"
     )
@@ -25,8 +27,7 @@ def for_truth(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def truth(args: argparse.Namespace) -> int:
-    """Render what is missing; the exit status."""
+def _truth(args: argparse.Namespace) -> int:
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import RunProgress
     from neuprim.config import compose, compose_all
@@ -48,3 +49,13 @@ def truth(args: argparse.Namespace) -> int:
         command = shlex.join(["neuprim", "truth", *(["-m"] if args.multirun else []), *args.overrides])
         raise KeyboardInterrupt(f"; frames made so far are kept; to go on:\n  {command}") from None
     return 0
+
+
+COMMAND = Command(
+    "truth",
+    "render the ground truth of a scene before runs need it",
+    _add_arguments,
+    _truth,
+    epilog=_HELP,
+    take_rest=take_overrides,
+)

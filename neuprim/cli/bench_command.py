@@ -5,28 +5,50 @@ from __future__ import annotations
 import argparse
 import re
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from neuprim.config import RunConfig
-from neuprim.config.overrides import Typed
+from neuprim.cli.command import Command, parse_count, take_overrides
 from neuprim.core.errors import ConfigError
-from neuprim.runs.open import read_metrics
-from neuprim.runs.paper import Planned, Table, compared, pace, plan, tables
 
-__all__ = ["bench", "table_numbers"]
+if TYPE_CHECKING:
+    from neuprim.runs.paper import Planned, Table
 
-_RULES = "PSNR of floats; SSIM and LPIPS by the rule of 3DGS's tools (ssim_3dgs, lpips_3dgs; metrics.lpips=FILE has your weights of VGG)"
+__all__ = ["COMMAND", "parse_table_numbers"]
+
+_RULES = """\
+PSNR of floats; SSIM and LPIPS by the rule of 3DGS's tools (ssim_3dgs, lpips_3dgs; metrics.lpips=FILE has your weights
+of VGG)"""
 
 
-def bench(args: argparse.Namespace, fit: Callable[[RunConfig, Typed], Path]) -> int:
-    """Lists the tables, or runs what stands for their rows.
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("what", choices=["paper"], help="which tables")
+    settings = "settings over the protocol's, e.g. scene.downsample=4"
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help=settings)
+    numbers = "numbers of the paper's tables, e.g. 3-5 or 6,7 (default: 3-7)"
+    parser.add_argument("--tables", default="3-7", metavar="N", help=numbers)
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a folder per scene; without it the tables are listed")
+    scenes = "some of them, e.g. chair,lego; chair=FOLDER where the folder has another name"
+    parser.add_argument("--scenes", metavar="NAME", help=scenes)
+    parser.add_argument("--rows", metavar="NAME", help="some of the rows: 200, 5k, nolimit, real")
+    budget = "training time of a run, e.g. 10m; full: 100,000 steps (default)"
+    parser.add_argument("--budget", default="full", metavar="TIME", help=budget)
+    seeds = "runs of each, with seeds from 0 (default: 1)"
+    parser.add_argument("--seeds", type=parse_count, default=1, metavar="N", help=seeds)
+    out = "gets a run directory each"
+    parser.add_argument("--out", type=Path, default=Path("outputs/paper"), metavar="DIR", help=out)
+    parser.add_argument("--estimate", action="store_true", help="only say what would run, and for how long")
 
-    Args:
-        fit: runs a configuration and returns its directory.
-    """
-    wanted = table_numbers(args.tables)
+
+def _bench(args: argparse.Namespace) -> int:
+    """List the tables, or run what stands for their rows."""
+    from neuprim.cli.run_command import run_one
+    from neuprim.config.overrides import Typed
+    from neuprim.runs.open import read_metrics
+    from neuprim.runs.paper import plan, tables
+
+    wanted = parse_table_numbers(args.tables)
     chosen = [table for table in tables() if wanted & set(table.numbers)]
     if args.data is None:
         print(*_listing(chosen), sep="\n")
@@ -40,14 +62,14 @@ def bench(args: argparse.Namespace, fit: Callable[[RunConfig, Typed], Path]) -> 
     results = []
     for number, one in enumerate(planned, 1):
         print(f"[{number}/{len(planned)}] {one.config.output_dir}", flush=True)
-        results.append((one, read_metrics(fit(one.config, Typed(one.config.overrides)))))
+        results.append((one, read_metrics(run_one(one.config, Typed(one.config.overrides)))))
         print(*_result(*results[-1]), sep="\n", flush=True)
     print(*_means(results), _RULES, sep="\n")
     return 0
 
 
-def table_numbers(words: str) -> set[int]:
-    """The numbers of tables that ``3-5,7`` names.
+def parse_table_numbers(words: str) -> set[int]:
+    """Return the numbers of the tables that ``3-5,7`` names.
 
     Raises:
         ConfigError: it names something else than tables 3 to 7.
@@ -90,6 +112,8 @@ def _listing(chosen: Sequence[Table]) -> Iterator[str]:
 def _estimate(planned: Sequence[Planned]) -> Iterator[str]:
     """What would run, and for how long: seconds of a budget, else steps at the pace of the first ones in the first
     scene of each row."""
+    from neuprim.runs.paper import pace
+
     total, paces, grows = 0.0, dict[tuple[str, str], float](), False
     for one in planned:
         train, key = one.config.train, (one.table.title, one.row.name)
@@ -114,6 +138,8 @@ def _duration(seconds: float) -> str:
 
 
 def _result(one: Planned, metrics: Mapping[str, Any]) -> Iterator[str]:
+    from neuprim.runs.paper import compared
+
     steps, seconds = metrics["iterations"], _duration(metrics["train_seconds"])
     width, height = metrics["image_size"]
     yield f"{one.scene}, {one.row.name}: preset={one.row.preset}, seed {one.config.seed}, {metrics['checkpoint']} checkpoint after {steps:,} steps in {seconds}"
@@ -133,6 +159,8 @@ def _others(one: Planned) -> str:
 def _means(results: Sequence[tuple[Planned, Mapping[str, Any]]]) -> Iterator[str]:
     """Per row, over scenes and seeds that have both numbers; the paper's are of its best checkpoint on the test views,
     ours of the last."""
+    from neuprim.runs.paper import compared
+
     rows = dict.fromkeys((one.table.title, one.row.name) for one, _ in results)
     for title, name in rows:
         own = [(one, metrics) for one, metrics in results if (one.table.title, one.row.name) == (title, name)]
@@ -148,3 +176,12 @@ def _means(results: Sequence[tuple[Planned, Mapping[str, Any]]]) -> Iterator[str
             if both:
                 ours, theirs = (statistics.mean(column) for column in zip(*both, strict=True))
                 yield f"  {kind:10} {_number(ours, kind):>9}   paper {_number(theirs, kind)}"
+
+
+COMMAND = Command(
+    "bench",
+    "the paper's tables, and runs of their protocol on data that you have",
+    _add_arguments,
+    _bench,
+    take_rest=take_overrides,
+)

@@ -2,48 +2,61 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-
-from neuprim.cli.console import plain_console
+from neuprim.cli.command import Command
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import Grid, GridHeader, read_grids, read_header, sequence
 
-__all__ = ["describe_file", "vdb_info"]
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from neuprim.core.io.vdb import Grid, GridHeader
+
+__all__ = ["COMMAND"]
 
 COLUMNS = ("grid", "type", "compression", "voxel size", "bounds", "active", "range", "dense")
 
 
-def vdb_info(path: Path, as_json: bool = False, console: Console | None = None) -> int:
-    """Prints the report on a file, or on every file of a folder; returns 0.
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("action", choices=("info",), metavar="info", help="what to do")
+    parser.add_argument("path", type=Path, metavar="FILE|DIR", help="a .vdb file, or a folder of frames")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _print_info(arguments: argparse.Namespace) -> int:
+    """Print a report on a file, or on every file of a folder.
 
     Raises:
         DataError: nothing there, or a damaged file.
     """
-    files, notes = _files(path)
-    if as_json:
-        print(json.dumps({"files": [describe_file(file) for file in files], "notes": notes}, indent=1, allow_nan=False))
+    files, notes = _find_files(arguments.path)
+    if arguments.json:
+        record = {"files": [_describe_file(file) for file in files], "notes": notes}
+        print(json.dumps(record, indent=1, allow_nan=False))
         return 0
-    console = console or plain_console()
+    from rich.text import Text
+
+    from neuprim.cli.console import plain_console
+
+    console = plain_console()
     for file in files:
-        _print(console, describe_file(file))
+        _print_file(console, _describe_file(file))
     for note in notes:
         console.print(Text(note))
     return 0
 
 
-def _files(path: Path) -> tuple[list[Path], list[str]]:
-    """The files to show, in the order of their frames where they are frames, and remarks on the whole."""
+def _find_files(path: Path) -> tuple[list[Path], list[str]]:
+    """Return the files to show, frames in their order, and notes on the whole folder."""
     if not path.is_dir():
         return [path], []
+    from neuprim.core.io.vdb import sequence
+
     try:
         frames = sequence(path)
     except DataError as error:
@@ -58,9 +71,10 @@ def _files(path: Path) -> tuple[list[Path], list[str]]:
     return [frame.path for frame in frames.frames], [note]
 
 
-def describe_file(path: Path) -> dict[str, Any]:
-    """Everything the report shows, as JSON-ready values: lengths in world units, bounds in voxel indices (upper ones
-    excluded)."""
+def _describe_file(path: Path) -> dict[str, Any]:
+    """Return JSON-ready values: lengths in world units, bounds in voxel indices (upper ones excluded)."""
+    from neuprim.core.io.vdb import read_grids, read_header
+
     header = read_header(path)
     grids = read_grids(path, level_sets=True)  # in the same order, one in memory at a time
     return {
@@ -117,7 +131,11 @@ def _number(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value  # JSON knows no NaN
 
 
-def _print(console: Console, file: dict[str, Any]) -> None:
+def _print_file(console: Console, file: dict[str, Any]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+    from rich.text import Text
+
     count = len(file["grids"])
     title = f"{file['path']}  (version {file['version']}, {count} {'grid' if count == 1 else 'grids'})"
     table = Table(title=Text(_clean(title)), title_justify="left", box=SIMPLE_HEAD)
@@ -165,3 +183,12 @@ def _bytes(count: int) -> str:
 def _clean(text: str) -> str:
     """Names in files may hold control characters; a terminal must not act on them."""
     return "".join(c if c.isprintable() or c == "\n" else "�" for c in text)
+
+
+COMMAND = Command(
+    "vdb",
+    "look into OpenVDB files",
+    _add_arguments,
+    _print_info,
+    epilog="`info` lists grids: type, transform, bounds, active voxels, values, memory.",
+)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 from typing import TYPE_CHECKING, Any
 
-from neuprim.config import check_groups, check_scene, presets, task_choices
-from neuprim.config.effort import LEVELS, levels_of
+from neuprim.cli.command import Command
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.plugins.registry import EXPORTERS, INSPECTORS, LOSSES, SCENES, Group, PluginReport, list_tasks, survey
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension, SceneExtension
     from neuprim.core.task import TaskSpec
 
-__all__ = ["list_plugins"]
+__all__ = ["COMMAND", "list_plugins"]
 
 _OTHERS: tuple[tuple[str, Group[Any]], ...] = (
     ("losses (train.loss=NAME)", LOSSES),
@@ -66,6 +66,9 @@ def _note(report: PluginReport[Any]) -> str:
 
 
 def _task(spec: TaskSpec, added: list[PluginReport[SceneExtension]]) -> list[str]:
+    from neuprim.config import check_groups, presets, task_choices
+    from neuprim.config.effort import LEVELS, levels_of
+
     check_groups(spec)
     default = task_choices(spec)
     rows = [(s.name, f"{s.summary}{' (default)' if s.name == default.scene else ''}") for s in spec.scenes]
@@ -96,9 +99,25 @@ def _scene(spec: TaskSpec, report: PluginReport[SceneExtension]) -> tuple[str, s
     if any(scene.name == name for scene in spec.scenes):
         note = f"  [hidden by the task's own; {SCENES.choice(report.info)} chooses it]"
     if report.spec is not None:
+        from neuprim.config import check_scene
+
         try:
             check_scene(spec, name, report.spec.config_package)
             return name, f"({report.info.origin})  {report.spec.scene.summary}{note}"
         except ConfigError as error:
             problem = str(error)
     return name, f"BROKEN  ({report.info.origin})  {problem}{note}"
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    pass
+
+
+def _tasks(arguments: argparse.Namespace) -> int:
+    print(*list_plugins(), sep="\n")
+    return 0
+
+
+COMMAND = Command(
+    "tasks", "list tasks, scenes, presets and other plugins, and the packages they come from", _add_arguments, _tasks
+)

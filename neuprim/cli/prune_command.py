@@ -1,4 +1,4 @@
-"""``neuprim prune``: its arguments, and what it prints."""
+"""``neuprim prune``: remove what a run's scene does not require."""
 
 from __future__ import annotations
 
@@ -6,36 +6,33 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuprim.cli import arguments
+from neuprim.cli.command import Command, parse_decibels, parse_seconds, parse_whole
 
 if TYPE_CHECKING:
     from neuprim.search.prune.run import Pruning
 
-__all__ = ["for_prune", "prune"]
+__all__ = ["COMMAND"]
 
 
-def for_prune(parser: argparse.ArgumentParser) -> None:
-    """Adds the arguments."""
-    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--tolerance",
-        type=arguments.decibels,
+        type=parse_decibels,
         default=0.1,
         metavar="DB",
         help="how much worse it may get (default: 0.1dB)",
     )
     parser.add_argument(
-        "--seconds", type=arguments.duration, default=60.0, metavar="S", help="of fine-tuning; 0 for none (default: 60)"
+        "--seconds", type=parse_seconds, default=60.0, metavar="S", help="of fine-tuning; 0 for none (default: 60)"
     )
     parser.add_argument(
-        "--steps", type=arguments.whole, metavar="N", help="of fine-tuning instead, for the same model on every machine"
+        "--steps", type=parse_whole, metavar="N", help="of fine-tuning instead, for the same model on every machine"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="the new run's directory (default: RUN_DIR-pruned)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
 
 
-def prune(args: argparse.Namespace) -> int:
-    """Prunes, writes a run directory and prints what became of the model."""
+def _prune(args: argparse.Namespace) -> int:
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
     from neuprim.search.prune.run import Request, prune_run
@@ -79,3 +76,12 @@ def _report(made: Pruning, tolerance: float) -> None:
     for line in kept_words(made.kept):
         print(line)
     print(f"fine-tuned for {made.steps:,} steps, {made.seconds:.0f} s in all")
+
+
+COMMAND = Command(
+    "prune",
+    "remove what a run's scene does not require, and write the rest as a run",
+    _add_arguments,
+    _prune,
+    opens_run=True,
+)

@@ -1,0 +1,160 @@
+"""``neuprim run``: fit a scene, a sweep of scenes, or search for a model that reaches a target."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from neuprim.cli.command import Command, add_trust_flag, take_overrides
+from neuprim.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from neuprim.config import RunConfig
+    from neuprim.config.launcher import LauncherSettings
+    from neuprim.config.overrides import Typed
+    from neuprim.config.viewer import ViewerSettings
+
+__all__ = ["COMMAND", "run_one"]
+
+_COMMON_KEYS = """\
+commonest keys:
+  task=NAME scene=NAME preset=NAME     what to fit, and how (`neuprim tasks` lists them)
+  effort=N                             1 (fast) to 9 (good): how many primitives and views, where the task has measured it
+  scene.path=DIR                       data of a scene that reads files
+  output_dir=DIR resume=true           where to write; continue an interrupted run
+  train.iterations=N train.max_seconds=S
+  model.primitives=N model.neurons=K model.sh_degree=D
+  train.rates.NAME=R                   learning rate of one parameter; train.rate_units.NAME=absolute|extent
+  renderer.backend=auto|NAME           `neuprim doctor` lists them
+  renderer.sort=center|entry           renderer.samples=N (rays per pixel side) renderer.threads=N
+  seed=N
+  viewer=true viewer.port=N            look at the model in the browser while it is trained; pause, step, save, stop
+  target.psnr=DB budget=10m            the smallest model that has it, searched and trained in that time; also target.ssim=S,
+                                       with target.megabytes=M and target.fps=F as limits, or these alone: the best within them
+  launcher=inline|processes|ray|slurm  where runs work; launcher.workers=N launcher.threads=N launcher.retries=N
+                                       launcher.address=... launcher.options.KEY=VALUE (docs/launching.md)
+  scene.cache=DIR|URL                  volumes: where their ground truth is kept (`neuprim truth` makes it before)
+`neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted
+twice, for the shell and for the grammar: "scene.path='a=b, c'"."""
+
+_EXAMPLES = """\
+examples:
+  neuprim run task=dynamic scene=smoke_fire
+  neuprim run task=dynamic scene=vdb scene.vdb=DIR scene.frames=0:100:2
+  neuprim run task=static scene=solids
+  neuprim run task=static scene=blender scene.path=DIR preset=paper
+  neuprim run -m model.primitives=200,1000 train.max_seconds=60 launcher=processes
+  neuprim run --config RUN_DIR/config.yaml seed=1
+  torchrun --nproc-per-node 2 -m neuprim run task=static scene=solids      (one scene by two processes)"""
+
+
+def _help(words: Sequence[str]) -> str:
+    """Return the text below the arguments; it lists the installed tasks."""
+    if not {"-h", "--help"} & set(words):
+        return ""
+    from neuprim.plugins.registry import TASKS, list_tasks
+
+    tasks = [f"  {TASKS.word(info)}  ({info.origin})" for info in list_tasks()] or ["  none is installed"]
+    return "\n\n".join([_COMMON_KEYS, "\n".join(["tasks:", *tasks]), _EXAMPLES])
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings, in Hydra's grammar")
+    sweep = "run every combination of values separated by commas"
+    parser.add_argument("-m", "--multirun", action="store_true", help=sweep)
+    stored = "start with the settings of RUN_DIR/config.yaml; words beside it come first"
+    parser.add_argument("--config", type=Path, metavar="FILE", help=stored)
+    parser.add_argument("--cfg", action="store_true", help="print the resolved configuration and stop")
+    add_trust_flag(parser)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from neuprim.config import compose, compose_all, stored_config
+    from neuprim.config.launcher import LauncherSettings, launcher_words
+    from neuprim.config.overrides import Typed, without_place
+    from neuprim.config.target import target_words
+    from neuprim.config.viewer import viewer_words
+    from neuprim.core.train.distributed.place import place_of
+    from neuprim.runs.chunks.asked import asked, refuse_chunks
+
+    place = place_of()
+    if place is not None:
+        from neuprim.cli.ranks import run_as_rank
+
+        return run_as_rank(place, args.overrides, args.multirun or args.cfg or args.config is not None)
+    check, typed = not args.cfg, Typed(args.overrides, args.config)
+    viewer, words = viewer_words(args.overrides)
+    launcher, words = launcher_words(words)
+    wanted, words = target_words(words)
+    elsewhere = launcher != LauncherSettings()
+    beside = {"-m": args.multirun, "target": wanted is not None, "launcher": elsewhere}
+    if viewer is not None and any(beside.values()):
+        raise ConfigError(
+            f"viewer=true: shows one run; expected no {next(word for word, on in beside.items() if on)} beside it"
+        )
+    if wanted is not None and args.multirun:
+        raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
+    if args.multirun and not without_place(words):
+        from neuprim.runs.sweep.record import begun_words
+
+        words = begun_words(words)
+        typed = Typed([*words, *args.overrides], args.config)  # what goes on with it says all of it
+    stored = None if args.config is None else stored_config(args.config)
+    configs = compose_all(words, check, stored) if args.multirun else [compose(words, check, stored)]
+    if args.cfg:
+        if wanted is not None:
+            print(f"# {wanted[0]} budget={wanted[1]:g}s; the search starts from")
+        print("---\n".join(config.to_yaml() for config in configs), end="")
+        return 0
+    if wanted is not None:
+        from neuprim.cli.target import fit_target
+
+        return fit_target(configs[0], *wanted, launcher, typed)
+    if len(configs) > 1:
+        from neuprim.cli.sweep import sweep
+
+        return sweep(configs, words, launcher, typed)
+    if viewer is not None:
+        refuse_chunks(configs[0], "viewer=true shows one training")
+    if elsewhere and not asked(configs[0]):  # the chunks of a scene in chunks are what runs elsewhere
+        from neuprim.cli.sweep import launch_one
+
+        return launch_one(configs[0], launcher, typed)
+    print(run_one(configs[0], typed, viewer, launcher))
+    return 0
+
+
+def run_one(
+    config: RunConfig, typed: Typed, viewer: ViewerSettings | None = None, launcher: LauncherSettings | None = None
+) -> Path:
+    """Run one configuration in this process and return its directory.
+
+    An interruption says where the run is and the command that continues it.
+
+    Args:
+        launcher: where the chunks of a scene that is fitted in chunks work; None: here.
+    """
+    from neuprim.cli.console import plain_console
+    from neuprim.cli.progress import RunProgress
+    from neuprim.cli.view_command import run_viewed
+    from neuprim.config.launcher import LauncherSettings
+    from neuprim.runs.run import run
+
+    try:
+        with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}") as events:
+            return (
+                run(config, events, launcher=launcher or LauncherSettings())
+                if viewer is None
+                else run_viewed(config, events, viewer)
+            )
+    except KeyboardInterrupt:
+        begun = any((config.output_dir / file).exists() for file in ("checkpoint.safetensors", "chunks.json"))
+        there = "has the run up to here" if begun else "has no checkpoint yet"
+        command = shlex.join(["neuprim", "run", *typed.resuming(config.output_dir)])
+        raise KeyboardInterrupt(f"; {config.output_dir} {there}; to go on:\n  {command}") from None
+
+
+COMMAND = Command("run", "fit a scene", _add_arguments, _run, epilog=_help, take_rest=take_overrides)

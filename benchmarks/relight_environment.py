@@ -34,10 +34,10 @@ from neuprim.core.io.images import write_exr, write_png
 from neuprim.core.metrics import psnr
 from neuprim.runs.measure import draw_sum
 from neuprim.runs.open import load_dataset, load_run
+from neuprim.scenes.lit.generate import INTENSITY, picture
+from neuprim.scenes.lit.scene import solids
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight.environment import illuminate
-from neuprim.tasks.relight.lit.generate import INTENSITY, picture
-from neuprim.tasks.relight.lit.scene import solids
 
 PAGE = ROOT / "docs" / "relighting.md"
 MANY, DISTANT = 1024, 1e4

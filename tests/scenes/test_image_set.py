@@ -18,10 +18,10 @@ import pytest
 from neuprim.core.errors import DataError
 from neuprim.scenes.cached import cached_folder
 from neuprim.scenes.image_set import ImageSet
+from neuprim.scenes.lit.generate import LitSettings
 from neuprim.scenes.poses import camera_to_world, direction
 from neuprim.scenes.side_by_side import THREADS, side_by_side
-from neuprim.tasks.relight.lit.generate import LitSettings
-from neuprim.tasks.static.solids.generate import SolidsSettings
+from neuprim.scenes.solids.generate import SolidsSettings
 
 
 def quiet(text: str, fraction: float) -> None:

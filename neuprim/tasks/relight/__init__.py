@@ -73,7 +73,7 @@ def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, Co
 
 
 def _lit_solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.relight.lit import load
+    from neuprim.tasks.relight.lit_solids import load
 
     return load(settings, context)
 

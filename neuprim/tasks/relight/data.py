@@ -39,7 +39,7 @@ class Lighting:
         divide by
             it; "none" where intensities are given as they arrive, or nobody knows.
         classes: index of a test view -> (H, W) uint8, what its pixels show, indices of
-        :data:`~neuprim.tasks.relight.measure.CLASSES`;
+        :data:`~neuprim.scenes.lit.CLASSES`;
             errors are then told by class.
         parts: beginnings of the names of test views whose scores are also told apart, e.g. those with a new light.
         baselines: name -> function of a test view's index that gives (H, W, 3) linear light over the exposure, an image

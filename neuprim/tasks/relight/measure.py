@@ -15,11 +15,9 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.images import linear_to_srgb
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.metrics.flip import flip, flip_available
+from neuprim.scenes.lit import CLASSES
 
-__all__ = ["CLASSES", "class_errors", "class_shares", "scores"]
-
-CLASSES = ("background", "lit", "cast_shadow", "attached_shadow", "highlight")
-"""Names of the values 0 to 4 of a map of pixel classes."""
+__all__ = ["class_errors", "class_shares", "scores"]
 
 
 def scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> dict[str, float]:

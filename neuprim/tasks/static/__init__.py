@@ -44,15 +44,15 @@ def _trade(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
 
 
 def _solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.static.solids import load
+    from neuprim.tasks.static.generated import load_solids
 
-    return load(settings, context)
+    return load_solids(settings, context)
 
 
 def _room(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.static.room import load
+    from neuprim.tasks.static.generated import load_room
 
-    return load(settings, context)
+    return load_room(settings, context)
 
 
 def _mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:

@@ -14,9 +14,10 @@ import yaml
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.metrics import means, psnr
 from neuprim.core.metrics.flip import flip, flip_available
+from neuprim.scenes.lit import CLASSES
+from neuprim.tasks.relight import lit_solids as lit
 from neuprim.tasks.relight import measure, olat
-from neuprim.tasks.relight.lit import dataset as lit
-from neuprim.tasks.relight.measure import CLASSES, class_errors, class_shares, scores
+from neuprim.tasks.relight.measure import class_errors, class_shares, scores
 
 CONF = Path(olat.__file__).parent / "conf" / "scene" / "relight"
 

@@ -27,12 +27,12 @@ from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import SceneContext
 from neuprim.plugins.judging import facts_of
 from neuprim.runs.measure import draw_sum
+from neuprim.scenes.lit.scene import solids
+from neuprim.scenes.lit.shading import shade
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.relight.environment import FAR, illuminate, summary
-from neuprim.tasks.relight.lit.scene import solids
-from neuprim.tasks.relight.lit.shading import shade
 from tests import scenes
 
 UNSHADOWED = "none"  # LightNetwork's ``visibility``

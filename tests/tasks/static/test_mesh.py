@@ -26,6 +26,8 @@ from neuprim.runs.run import run
 from neuprim.scenes.meshes import ball, corner_normals
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shapes import Solid, plain
+from neuprim.scenes.solids.generate import SolidsSettings
+from neuprim.scenes.solids.shading import encode_srgb
 from neuprim.tasks.static.mesh import generate as generator
 from neuprim.tasks.static.mesh.files import Folder
 from neuprim.tasks.static.mesh.generate import MeshSettings, generate, load
@@ -34,8 +36,6 @@ from neuprim.tasks.static.mesh.obj import read_obj
 from neuprim.tasks.static.mesh.parts import GREY, read_parts
 from neuprim.tasks.static.mesh.surface import FARTHEST, Surface
 from neuprim.tasks.static.mesh.textures import Texture, decode
-from neuprim.tasks.static.solids.generate import SolidsSettings
-from neuprim.tasks.static.solids.shading import encode_srgb
 from tests.models import BLUE, GREEN, RED, YELLOW, cube, gltf, quarters, textured, write_glb, write_obj, write_ply
 
 SMALL = {"size": 48, "train_views": 4, "test_views": 2, "supersampling": 2}

@@ -15,11 +15,11 @@ import trimesh
 
 from neuprim.core import notices
 from neuprim.core.errors import DataError
+from neuprim.scenes.solids.shading import encode_srgb, radiance
 from neuprim.tasks.static.mesh import generate as generator
 from neuprim.tasks.static.mesh.files import Folder
 from neuprim.tasks.static.mesh.parts import GREY, Part, read_parts
 from neuprim.tasks.static.mesh.surface import Surface
-from neuprim.tasks.static.solids.shading import encode_srgb, radiance
 from tests.models import BLUE, GREEN, RED, YELLOW, cube, gltf, quarters
 
 DOWN = [[0.0, 0.0, -1.0]]

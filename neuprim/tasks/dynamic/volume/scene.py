@@ -21,7 +21,7 @@ from neuprim.core.io.vdb import VdbFrame, sequence
 from neuprim.core.notices import warn_once
 from neuprim.core.task import Chunks, SceneContext
 from neuprim.core.volumes.source import Extent
-from neuprim.tasks.dynamic.simulation import simulate
+from neuprim.scenes.smoke import simulate
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.chunks import number_of_chunks, planned
 from neuprim.tasks.dynamic.volume.dataset import TRAINING, stored_points, volume_dataset

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from neuprim.core.checked import Accepts, Range, converted, text, verify
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.tasks.dynamic.simulation.generate import TIMESTEPS, Resolution
+from neuprim.scenes.smoke.generate import TIMESTEPS, Resolution
 
 __all__ = ["GRIDS", "Axis", "Meaning", "VolumeSettings", "choose_frames"]
 

@@ -26,14 +26,14 @@ from neuprim.core.task import SceneContext
 from neuprim.scenes.image_set import Progress
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.settings import settings_key
+from neuprim.scenes.solids.generate import FIELD_OF_VIEW, Seen, SolidsSettings, image_set
+from neuprim.scenes.solids.shading import DAYLIGHT, Daylight, radiance
 from neuprim.tasks.static.mesh.files import Folder, Model, Up, model_file
 from neuprim.tasks.static.mesh.gltf import read_gltf
 from neuprim.tasks.static.mesh.obj import read_obj
 from neuprim.tasks.static.mesh.parts import read_parts
 from neuprim.tasks.static.mesh.scans import read_ply, read_stl
 from neuprim.tasks.static.mesh.surface import Surface
-from neuprim.tasks.static.solids.generate import FIELD_OF_VIEW, Seen, SolidsSettings, image_set
-from neuprim.tasks.static.solids.shading import DAYLIGHT, Daylight, radiance
 
 __all__ = ["GENERATOR_VERSION", "LIGHT", "MeshSettings", "generate", "load"]
 

@@ -19,9 +19,10 @@ from neuprim.scenes import rays
 from neuprim.scenes.meshes import ball, chamfered_box, corner_normals, rod
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shapes import Solid, build, plain, srgb
-from neuprim.tasks.static.solids import generate as generator
-from neuprim.tasks.static.solids.generate import SolidsSettings, camera_matrices, generate, load, picture
-from neuprim.tasks.static.solids.shading import DAYLIGHT, encode_srgb, radiance
+from neuprim.scenes.solids import generate as generator
+from neuprim.scenes.solids.generate import SolidsSettings, camera_matrices, generate, picture
+from neuprim.scenes.solids.shading import DAYLIGHT, encode_srgb, radiance
+from neuprim.tasks.static.generated import load_solids as load
 
 SMALL = {"size": 32, "train_views": 3, "test_views": 2, "supersampling": 2}
 

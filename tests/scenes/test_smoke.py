@@ -12,10 +12,10 @@ import torch
 
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import read_grids, read_header, sequence
-from neuprim.tasks.dynamic.simulation import SCENES, generate, simulate
-from neuprim.tasks.dynamic.simulation.generate import THRESHOLD, box_of, cache_key, grids_of
-from neuprim.tasks.dynamic.simulation.scenes import Scene, Stage
-from neuprim.tasks.dynamic.simulation.solver import State, advance
+from neuprim.scenes.smoke import SCENES, generate, simulate
+from neuprim.scenes.smoke.generate import THRESHOLD, box_of, cache_key, grids_of
+from neuprim.scenes.smoke.scenes import Scene, Stage
+from neuprim.scenes.smoke.solver import State, advance
 
 TINY, FEW = 24, 8
 

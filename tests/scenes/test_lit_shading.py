@@ -6,14 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from neuprim.scenes.lit import CLASSES
+from neuprim.scenes.lit import generate as generator
+from neuprim.scenes.lit.generate import FIELD_OF_VIEW, camera_to_world, picture
+from neuprim.scenes.lit.rig import CIRCLE_FRAMES, DISTANCE, NEAR_LIGHTS, PARTS, splits
+from neuprim.scenes.lit.shading import Shaded, shade
 from neuprim.scenes.meshes import ball, chamfered_box
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shapes import Solid, plain, srgb
-from neuprim.tasks.relight.lit import generate as generator
-from neuprim.tasks.relight.lit.generate import FIELD_OF_VIEW, camera_to_world, picture
-from neuprim.tasks.relight.lit.rig import CIRCLE_FRAMES, DISTANCE, NEAR_LIGHTS, PARTS, splits
-from neuprim.tasks.relight.lit.shading import Shaded, shade
-from neuprim.tasks.relight.measure import CLASSES
 
 GREY = "#808080"
 FLOOR = Solid("floor", chamfered_box([4, 4, 0.1], [0, 0, -0.05], 0.001), plain(GREY), 0.0)

@@ -4,7 +4,7 @@
 ``noise``: turbulence in sources), ``generate`` writes a sequence of OpenVDB files.
 """
 
-from neuprim.tasks.dynamic.simulation.generate import simulate
-from neuprim.tasks.dynamic.simulation.scenes import SCENES, Scene
+from neuprim.scenes.smoke.generate import simulate
+from neuprim.scenes.smoke.scenes import SCENES, Scene
 
 __all__ = ["SCENES", "Scene", "simulate"]

@@ -11,37 +11,33 @@ Room, cameras, light, exposures and points are fixed: equal settings give equal 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from neuprim.core.checked import Range, checked, verify
-from neuprim.core.data import Dataset
+from neuprim.core.checked import Range, verify
 from neuprim.core.data.distortion import Radial
 from neuprim.core.io.files import write_json
 from neuprim.core.io.ply import write_ply
-from neuprim.core.task import SceneContext
 from neuprim.scenes.cached import cached_folder
 from neuprim.scenes.image_set import Progress
 from neuprim.scenes.rays import pixel_means
+from neuprim.scenes.room.layout import furnishings
+from neuprim.scenes.room.lens import LENS, Lens, bands
+from neuprim.scenes.room.path import camera_matrices
+from neuprim.scenes.room.points import Found, found_points
+from neuprim.scenes.room.scene import Room
+from neuprim.scenes.room.shading import radiance
 from neuprim.scenes.settings import ImageSize, Supersampling, settings_key
 from neuprim.scenes.shapes import build
 from neuprim.scenes.side_by_side import side_by_side
-from neuprim.tasks.static.room.layout import furnishings
-from neuprim.tasks.static.room.lens import LENS, Lens, bands
-from neuprim.tasks.static.room.path import camera_matrices
-from neuprim.tasks.static.room.points import Found, found_points
-from neuprim.tasks.static.room.scene import Room
-from neuprim.tasks.static.room.shading import radiance
-from neuprim.tasks.static.solids.shading import encode_srgb
+from neuprim.scenes.solids.shading import encode_srgb
 
-__all__ = ["GENERATOR_VERSION", "RoomSettings", "gains", "generate", "lens", "load", "picture", "room"]
+__all__ = ["GENERATOR_VERSION", "RoomSettings", "gains", "generate", "lens", "picture", "room"]
 
 GENERATOR_VERSION = 1
 """Part of the cache's key: to be raised with every change to the room, its light, cameras or file layout."""
@@ -79,20 +75,6 @@ class RoomSettings:
     def key(self) -> str:
         """A short hash of every setting and the generator's version."""
         return settings_key(self, GENERATOR_VERSION)
-
-
-def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """The data set of ``scene=room``, drawn on first use and read from ``context.cache_dir`` afterwards.
-
-    Raises:
-        ConfigError: unknown setting or impossible value, or too few views for the points.
-        DataError: the cache directory cannot be written.
-    """
-    folder = generate(checked(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
-    from neuprim.tasks.static.datasets import nerfstudio
-
-    found = nerfstudio.load({"path": str(folder)}, context)
-    return replace(found, name="room", data_source="generated", up=torch.tensor([0.0, 0.0, 1.0]))
 
 
 def generate(settings: RoomSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:

@@ -16,16 +16,15 @@ from neuprim.core.data.views import ImageViews
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import read_image
 from neuprim.core.task import SceneContext
+from neuprim.scenes.lit import CLASSES
+from neuprim.scenes.lit import generate as generator
+from neuprim.scenes.lit.generate import INTENSITY, LitSettings, camera_to_world, generate, picture
+from neuprim.scenes.lit.rig import PARTS
+from neuprim.scenes.lit.scene import RADIUS, solids
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight import judging, olat
 from neuprim.tasks.relight.data import bright, lighting_of
-from neuprim.tasks.relight.lit import generate as generator
-from neuprim.tasks.relight.lit import load
-from neuprim.tasks.relight.lit.dataset import classes
-from neuprim.tasks.relight.lit.generate import INTENSITY, LitSettings, camera_to_world, generate, picture
-from neuprim.tasks.relight.lit.rig import PARTS
-from neuprim.tasks.relight.lit.scene import RADIUS, solids
-from neuprim.tasks.relight.measure import CLASSES
+from neuprim.tasks.relight.lit_solids import classes, load
 
 SMALL = {"size": 24, "train_views": 4, "test_views": 3, "supersampling": 2}
 FEW_FRAMES = 4
@@ -46,7 +45,7 @@ def one_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Building the scene takes a second: once is enough; nor does the film need all of its frames."""
     monkeypatch.setattr(generator, "Scene", lambda solids: scene)
     monkeypatch.setattr(generator, "solids", list)
-    monkeypatch.setattr("neuprim.tasks.relight.lit.rig.CIRCLE_FRAMES", FEW_FRAMES)
+    monkeypatch.setattr("neuprim.scenes.lit.rig.CIRCLE_FRAMES", FEW_FRAMES)
     yield
 
 
@@ -55,7 +54,7 @@ def forty(cache: Path, scene: Scene) -> Dataset:
     """Enough views to mean something."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generator, "Scene", lambda solids: scene)
-        patch.setattr("neuprim.tasks.relight.lit.rig.CIRCLE_FRAMES", FEW_FRAMES)
+        patch.setattr("neuprim.scenes.lit.rig.CIRCLE_FRAMES", FEW_FRAMES)
         return load({"size": 48, "train_views": 40, "test_views": 12}, SceneContext(seed=0, cache_dir=cache))
 
 

@@ -3,7 +3,7 @@
     transforms_train.json, transforms_test.json, transforms_circle.json      camera_angle_x, poses with OpenGL axes,
     pl_pos, pl_intensity train/r_0000.exr                 RGBA, linear radiance over the exposure, premultiplied, half
     floats train/r_0000_unshadowed.exr      the same as if nothing cast a shadow (attached shadows stay)
-    train/r_0000_classes.png         8-bit grey, index into CLASSES of :mod:`neuprim.tasks.relight.measure`
+    train/r_0000_classes.png         8-bit grey, index into CLASSES of :mod:`neuprim.scenes.lit`
     test/new_light_03_nearest.exr    test views only: the camera's view under the nearest of 25 training lights
 
 A pixel is background where fewer than half of its rays hit anything; else it has the class of more than half of those
@@ -28,14 +28,14 @@ from PIL import Image
 from neuprim.core.checked import Range, verify
 from neuprim.core.io.images import write_exr
 from neuprim.scenes.image_set import ImageSet, Progress
+from neuprim.scenes.lit import CLASSES
+from neuprim.scenes.lit.rig import DISTANCE, LitView, splits
+from neuprim.scenes.lit.scene import RADIUS, solids
+from neuprim.scenes.lit.shading import shade
 from neuprim.scenes.poses import camera_to_world
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.rays import bands, pixel_means
 from neuprim.scenes.settings import ImageSize, Supersampling, settings_key
-from neuprim.tasks.relight.lit.rig import DISTANCE, LitView, splits
-from neuprim.tasks.relight.lit.scene import RADIUS, solids
-from neuprim.tasks.relight.lit.shading import shade
-from neuprim.tasks.relight.measure import CLASSES
 
 __all__ = ["GENERATOR_VERSION", "INTENSITY", "LitSettings", "Picture", "camera_to_world", "generate", "picture"]
 
@@ -80,7 +80,7 @@ class Picture:
     Attributes:
         rgba: (size, size, 4) float32 linear radiance and coverage, premultiplied.
         unshadowed: (size, size, 4) the same as if nothing cast a shadow.
-        classes: (size, size) uint8, index into :data:`neuprim.tasks.relight.measure.CLASSES`.
+        classes: (size, size) uint8, index into :data:`neuprim.scenes.lit.CLASSES`.
     """
 
     rgba: NDArray[np.float32]

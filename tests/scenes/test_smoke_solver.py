@@ -8,11 +8,11 @@ import math
 import pytest
 import torch
 
-from neuprim.tasks.dynamic.simulation import SCENES
-from neuprim.tasks.dynamic.simulation.advection import advect
-from neuprim.tasks.dynamic.simulation.generate import box_of
-from neuprim.tasks.dynamic.simulation.noise import Noise
-from neuprim.tasks.dynamic.simulation.projection import (
+from neuprim.scenes.smoke import SCENES
+from neuprim.scenes.smoke.advection import advect
+from neuprim.scenes.smoke.generate import box_of
+from neuprim.scenes.smoke.noise import Noise
+from neuprim.scenes.smoke.projection import (
     Box,
     Faces,
     divergence,
@@ -21,8 +21,8 @@ from neuprim.tasks.dynamic.simulation.projection import (
     to_centres,
     to_faces,
 )
-from neuprim.tasks.dynamic.simulation.scenes import Stage
-from neuprim.tasks.dynamic.simulation.solver import Forcing, SolverSettings, Source, State, advance, step
+from neuprim.scenes.smoke.scenes import Stage
+from neuprim.scenes.smoke.solver import Forcing, SolverSettings, Source, State, advance, step
 
 BOXES = [Box((17, 12, 23), 1 / 17, sides, top) for sides, top in itertools.product((True, False), repeat=2)]
 STILL = SolverSettings(buoyancy=0.0, weight=0.0, confinement=0.0, cooling=0.0, dissipation=0.0, burn=0.0)

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from neuprim.scenes.lit import CLASSES
+from neuprim.scenes.lit.rig import DISTANCE
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.reflectance import dot, lobes
-from neuprim.tasks.relight.lit.rig import DISTANCE
-from neuprim.tasks.relight.measure import CLASSES
 
 __all__ = ["BRIGHT", "Shaded", "shade"]
 
@@ -38,7 +38,7 @@ class Shaded:
     Attributes:
         rgb: (N, 3) float32 linear radiance, zero where nothing is hit.
         unshadowed: (N, 3) the same as if nothing cast a shadow.
-        classes: (N,) uint8, index into :data:`neuprim.tasks.relight.measure.CLASSES`; 0 where nothing is hit.
+        classes: (N,) uint8, index into :data:`neuprim.scenes.lit.CLASSES`; 0 where nothing is hit.
     """
 
     rgb: NDArray[np.float32]

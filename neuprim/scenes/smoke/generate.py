@@ -29,9 +29,9 @@ from neuprim.core.checked import Range, converted
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.scenes.cached import cached_folder
-from neuprim.tasks.dynamic.simulation.projection import Box
-from neuprim.tasks.dynamic.simulation.scenes import SCENES, Scene, Stage
-from neuprim.tasks.dynamic.simulation.solver import State, advance
+from neuprim.scenes.smoke.projection import Box
+from neuprim.scenes.smoke.scenes import SCENES, Scene, Stage
+from neuprim.scenes.smoke.solver import State, advance
 
 __all__ = ["SOLVER_VERSION", "THRESHOLD", "TIMESTEPS", "Resolution", "box_of", "cache_key", "grids_of", "simulate"]
 
@@ -64,7 +64,7 @@ def simulate(
     only when complete, so an interrupted run leaves nothing that could be taken for a sequence.
 
     Args:
-        name: one of :data:`~neuprim.tasks.dynamic.simulation.scenes.SCENES`.
+        name: one of :data:`~neuprim.scenes.smoke.scenes.SCENES`.
         frames: how many frames from the start; None is the scene's own number.
         resolution: cells across the box, which is half as high again as it is wide.
         seed: of the turbulence; not negative.

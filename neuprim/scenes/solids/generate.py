@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -18,16 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from neuprim.core.checked import Range, checked, verify
-from neuprim.core.data import Dataset
-from neuprim.core.task import SceneContext
+from neuprim.core.checked import Range, verify
 from neuprim.scenes.image_set import ImageSet, Progress
 from neuprim.scenes.poses import camera_to_world, direction
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.rays import bands, pixel_means
 from neuprim.scenes.settings import ImageSize, Supersampling, settings_key
 from neuprim.scenes.shapes import build
-from neuprim.tasks.static.solids.shading import encode_srgb, radiance
+from neuprim.scenes.solids.shading import encode_srgb, radiance
 
 __all__ = [
     "FIELD_OF_VIEW",
@@ -37,12 +35,11 @@ __all__ = [
     "camera_matrices",
     "generate",
     "image_set",
-    "load",
     "picture",
 ]
 
 Seen = Callable[[Any, NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float32], NDArray[np.bool_]]]
-"""(scene, origins, directions) -> what :func:`~neuprim.tasks.static.solids.shading.radiance` returns."""
+"""(scene, origins, directions) -> what :func:`~neuprim.scenes.solids.shading.radiance` returns."""
 
 GENERATOR_VERSION = 1
 """Part of the cache's key: to be raised with every change to shapes, light, cameras or file layout."""
@@ -78,19 +75,6 @@ class SolidsSettings:
 class _View(NamedTuple):
     name: str
     eye: NDArray[np.float64]
-
-
-def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """The data set of ``scene=solids``, drawn on first use and read from ``context.cache_dir`` afterwards.
-
-    Raises:
-        ConfigError: unknown setting or impossible value.
-        DataError: the cache directory cannot be written.
-    """
-    folder = generate(checked(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
-    from neuprim.tasks.static.datasets import blender
-
-    return replace(blender.load({"path": str(folder)}, context), name="solids", data_source="generated")
 
 
 def generate(settings: SolidsSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:

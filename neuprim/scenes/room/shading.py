@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neuprim.scenes.reflectance import dot, reflected
-from neuprim.tasks.static.room.layout import BULB, LAMP
-from neuprim.tasks.static.room.scene import Room
-from neuprim.tasks.static.solids.shading import Colour, add_surroundings, unshadowed
+from neuprim.scenes.room.layout import BULB, LAMP
+from neuprim.scenes.room.scene import Room
+from neuprim.scenes.solids.shading import Colour, add_surroundings, unshadowed
 
 __all__ = ["LAMPLIGHT", "Lamplight", "radiance"]
 

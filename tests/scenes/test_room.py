@@ -19,15 +19,16 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.ply import read_ply
 from neuprim.core.task import SceneContext
 from neuprim.runs.run import run
+from neuprim.scenes.room import generate as generator
+from neuprim.scenes.room import lens as lenses
+from neuprim.scenes.room.generate import RoomSettings, gains, generate, lens, picture, room
+from neuprim.scenes.room.layout import HIGH, LOW
+from neuprim.scenes.room.lens import LENS, Lens
+from neuprim.scenes.room.path import FARTHEST, HIGHEST, LOWEST, NEAREST, camera_matrices, places
+from neuprim.scenes.room.points import NOISE, OUTLIERS, Found, found_points
+from neuprim.scenes.room.scene import Room
 from neuprim.scenes.shapes import build
-from neuprim.tasks.static.room import generate as generator
-from neuprim.tasks.static.room import lens as lenses
-from neuprim.tasks.static.room.generate import RoomSettings, gains, generate, lens, load, picture, room
-from neuprim.tasks.static.room.layout import HIGH, LOW
-from neuprim.tasks.static.room.lens import LENS, Lens
-from neuprim.tasks.static.room.path import FARTHEST, HIGHEST, LOWEST, NEAREST, camera_matrices, places
-from neuprim.tasks.static.room.points import NOISE, OUTLIERS, Found, found_points
-from neuprim.tasks.static.room.scene import Room
+from neuprim.tasks.static.generated import load_room as load
 
 SMALL = {"size": 40, "train_views": 6, "test_views": 3, "supersampling": 1, "points": 300}
 

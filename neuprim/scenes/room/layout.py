@@ -13,8 +13,7 @@ import numpy as np
 import trimesh
 
 from neuprim.scenes.meshes import ball, chamfered_box, lathe, merged, rod
-from neuprim.scenes.shapes import FLOOR
-from neuprim.tasks.static.room.textures import (
+from neuprim.scenes.room.textures import (
     Texture,
     books,
     bricks,
@@ -28,6 +27,7 @@ from neuprim.tasks.static.room.textures import (
     speckled,
     wallpaper,
 )
+from neuprim.scenes.shapes import FLOOR
 
 __all__ = ["FREE", "HIGH", "LAMP", "LOW", "Furnishing", "furnishings"]
 

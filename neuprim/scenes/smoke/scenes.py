@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neuprim.tasks.dynamic.simulation.noise import Noise
-from neuprim.tasks.dynamic.simulation.projection import Box
-from neuprim.tasks.dynamic.simulation.solver import Forcing, SolverSettings, Source
+from neuprim.scenes.smoke.noise import Noise
+from neuprim.scenes.smoke.projection import Box
+from neuprim.scenes.smoke.solver import Forcing, SolverSettings, Source
 
 __all__ = ["SCENES", "Scene", "Stage"]
 
@@ -58,7 +58,7 @@ class Scene:
     Attributes:
         timesteps: frames of the whole sequence.
         frame_time: seconds between two of them.
-        grids: what is written; see :mod:`neuprim.tasks.dynamic.simulation.generate`.
+        grids: what is written; see :mod:`neuprim.scenes.smoke.generate`.
         solver: what the gas is like.
         forcing: sources and forces at a time in seconds.
     """

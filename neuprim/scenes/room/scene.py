@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from neuprim.scenes.raycast import Engine, Hits, Scene
 from neuprim.scenes.reflectance import dot
+from neuprim.scenes.room.layout import Furnishing
 from neuprim.scenes.shapes import Solid, plain
-from neuprim.tasks.static.room.layout import Furnishing
 
 __all__ = ["Room"]
 

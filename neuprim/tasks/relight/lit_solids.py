@@ -22,10 +22,10 @@ from neuprim.core.data.views import ImageViews
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import read_image
 from neuprim.core.task import SceneContext
+from neuprim.scenes.lit.generate import LitSettings, generate
+from neuprim.scenes.lit.rig import NEAR_LIGHTS, PARTS
 from neuprim.tasks.relight import olat
 from neuprim.tasks.relight.data import Lighting
-from neuprim.tasks.relight.lit.generate import LitSettings, generate
-from neuprim.tasks.relight.lit.rig import NEAR_LIGHTS, PARTS
 
 __all__ = ["LitSolidsSettings", "classes", "companion", "load"]
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from neuprim.scenes.room.patterns import cells, checks, mix, noise, stripes
 from neuprim.scenes.shapes import srgb
-from neuprim.tasks.static.room.patterns import cells, checks, mix, noise, stripes
 
 __all__ = [
     "Texture",

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.checked import Range, verify
-from neuprim.tasks.dynamic.simulation.advection import advect
-from neuprim.tasks.dynamic.simulation.projection import Box, Faces, expansion_flow, project, to_centres, to_faces
+from neuprim.scenes.smoke.advection import advect
+from neuprim.scenes.smoke.projection import Box, Faces, expansion_flow, project, to_centres, to_faces
 
 __all__ = ["Forcing", "SolverSettings", "Source", "State", "advance", "step"]
 

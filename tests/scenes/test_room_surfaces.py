@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from neuprim.scenes.meshes import ball, chamfered_box
+from neuprim.scenes.room.layout import FREE, HIGH, LAMP, LOW, Furnishing, furnishings
+from neuprim.scenes.room.path import FARTHEST
+from neuprim.scenes.room.patterns import cells, checks, mix, noise, stripes
+from neuprim.scenes.room.scene import Room
+from neuprim.scenes.room.shading import LAMPLIGHT, radiance
+from neuprim.scenes.room.textures import chequered, speckled
 from neuprim.scenes.shapes import build, plain, srgb
-from neuprim.tasks.static.room.layout import FREE, HIGH, LAMP, LOW, Furnishing, furnishings
-from neuprim.tasks.static.room.path import FARTHEST
-from neuprim.tasks.static.room.patterns import cells, checks, mix, noise, stripes
-from neuprim.tasks.static.room.scene import Room
-from neuprim.tasks.static.room.shading import LAMPLIGHT, radiance
-from neuprim.tasks.static.room.textures import chequered, speckled
 
 
 @pytest.fixture(scope="module")

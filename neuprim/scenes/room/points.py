@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuprim.core.errors import ConfigError
-from neuprim.tasks.static.room.lens import Lens
-from neuprim.tasks.static.room.scene import Room
-from neuprim.tasks.static.room.shading import radiance
-from neuprim.tasks.static.solids.shading import encode_srgb
+from neuprim.scenes.room.lens import Lens
+from neuprim.scenes.room.scene import Room
+from neuprim.scenes.room.shading import radiance
+from neuprim.scenes.solids.shading import encode_srgb
 
 __all__ = ["NOISE", "OUTLIERS", "Found", "found_points"]
 

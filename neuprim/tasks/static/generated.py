@@ -1,0 +1,43 @@
+"""Load the generated scenes of the static task: ``scene=solids`` and ``scene=room``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from neuprim.core.checked import checked
+from neuprim.core.data import Dataset
+from neuprim.core.task import SceneContext
+from neuprim.scenes.room.generate import RoomSettings
+from neuprim.scenes.room.generate import generate as generate_room
+from neuprim.scenes.solids.generate import SolidsSettings
+from neuprim.scenes.solids.generate import generate as generate_solids
+from neuprim.tasks.static.datasets import blender, nerfstudio
+
+__all__ = ["load_room", "load_solids"]
+
+
+def load_solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """Load ``scene=solids``: drawn on first use, read from ``context.cache_dir`` afterwards.
+
+    Raises:
+        ConfigError: unknown setting or impossible value.
+        DataError: the cache directory cannot be written.
+    """
+    folder = generate_solids(checked(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
+    return replace(blender.load({"path": str(folder)}, context), name="solids", data_source="generated")
+
+
+def load_room(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """Load ``scene=room``: drawn on first use, read from ``context.cache_dir`` afterwards.
+
+    Raises:
+        ConfigError: unknown setting or impossible value, or too few views for the points.
+        DataError: the cache directory cannot be written.
+    """
+    folder = generate_room(checked(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
+    dataset = nerfstudio.load({"path": str(folder)}, context)
+    return replace(dataset, name="room", data_source="generated", up=torch.tensor([0.0, 0.0, 1.0]))

@@ -7,18 +7,20 @@ from __future__ import annotations
 
 from typing import Any
 
-from neuprim.core.compute.device import CARD, card_missing
+from neuprim.core.compute.device import CUDA, cuda_unavailable
 from neuprim.core.render.backends import ORACLE, TABLE, Backend
 
 
 def _place(backend: Backend) -> str | None:
     """The kind of device that it can draw on here, its own first; None if there is none."""
-    here = [kind for kind in backend.devices if kind != CARD or card_missing() is None]
+    here = [kind for kind in backend.devices if kind != CUDA or cuda_unavailable() is None]
     return here[0] if here and backend.missing() is None else None
 
 
 _PLACES = {backend.name: place for backend in TABLE if (place := _place(backend)) is not None}
-LEFT_OUT = {backend.name: backend.missing() or str(card_missing()) for backend in TABLE if backend.name not in _PLACES}
+LEFT_OUT = {
+    backend.name: backend.missing() or str(cuda_unavailable()) for backend in TABLE if backend.name not in _PLACES
+}
 """Why tests do not run over the others."""
 
 BACKENDS = list(_PLACES)

@@ -10,9 +10,9 @@ from torch import Tensor
 from neuprim.core.compression import BitTable, Schemes, file_order, folded, schemes
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
-from neuprim.core.model.fields import ColourField, DensityField, pieces_by_name
-from neuprim.core.model.pieces import Piece, without
+from neuprim.core.model.fields import ColourField, DensityField, prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.prunable import PrunableUnit, zero_units
 from neuprim.core.model.schema import InitContext
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.registry import load_task
@@ -76,9 +76,9 @@ def example(name: str, count: int = 40) -> tuple[TaskSpec, Primitives]:
     return load_task(task), random_model(*make(), count=count)
 
 
-def goners(model: Primitives) -> dict[str, tuple[Piece, Tensor]]:
+def goners(model: Primitives) -> dict[str, tuple[PrunableUnit, Tensor]]:
     """Of every piece of a model, every k-th primitive, with another k for each."""
-    pieces = pieces_by_name(model.density, model.colour)
+    pieces = prunable_units_by_name(model.density, model.colour)
     return {
         name: (piece, torch.arange(model.count) % (2 + i % 3) == 0) for i, (name, piece) in enumerate(pieces.items())
     }
@@ -86,7 +86,7 @@ def goners(model: Primitives) -> dict[str, tuple[Piece, Tensor]]:
 
 def without_pieces(model: Primitives) -> Primitives:
     """The model as pruning leaves it: :func:`goners` are zero."""
-    return Primitives(model.density, model.colour, without(goners(model), model.params))
+    return Primitives(model.density, model.colour, zero_units(goners(model), model.params))
 
 
 def gaussians(count: int = 30) -> Primitives:

@@ -20,7 +20,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def either_way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Once as compiled for the processor, once by the twins in torch code that tensors on a card take."""
     if request.param == "twin":
-        monkeypatch.setattr(device, "fused", lambda *tensors: False)
+        monkeypatch.setattr(device, "on_numba", lambda *tensors: False)
     return str(request.param)
 
 
@@ -30,5 +30,5 @@ def either_kernel(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
     processor's memory."""
     if request.param == "card":
         pytest.importorskip("warp", reason="the kernels of a card are written in Warp: pip install 'neuprim[cuda]'")
-        monkeypatch.setattr(device, "computes", lambda where: True)
+        monkeypatch.setattr(device, "has_warp", lambda where: True)
     return str(request.param)

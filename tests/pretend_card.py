@@ -135,13 +135,15 @@ def pretended(monkeypatch: pytest.MonkeyPatch, memory: int = 1 << 30) -> Iterato
     """Inside, this machine has a card with some bytes of memory, and a backend that draws on it: the processor's, with
     what it takes and makes moved."""
     with monkeypatch.context() as patch:
-        patch.setattr(device, "CARD", CARD.type)
-        patch.setattr(device, "KINDS", ("cpu", CARD.type))
-        patch.setattr(device, "card_missing", lambda: None)
-        patch.setattr(device, "of_kind", torch.device)
-        patch.setattr(device, "spare_memory", lambda where: memory)
+        patch.setattr(device, "CUDA", CARD.type)
+        patch.setattr(device, "DEVICE_TYPES", ("cpu", CARD.type))
+        patch.setattr(device, "cuda_unavailable", lambda: None)
+        patch.setattr(device, "current_device", torch.device)
+        patch.setattr(device, "free_cuda_memory", lambda where: memory)
         patch.setattr(
-            device, "from_host", lambda tensor, where: tensor.to(where) if where != CARD else _OnCard(tensor.clone())
+            device,
+            "copy_from_host",
+            lambda tensor, where: tensor.to(where) if where != CARD else _OnCard(tensor.clone()),
         )  # in any thread
         patch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # which knows nothing of this device
         card = Card()

@@ -32,7 +32,7 @@ def run_as_rank(place: Place, words: list[str], more: bool) -> int:
         words: the overrides.
         more: whether anything but one run is asked for.
     """
-    from neuprim.core.compute.threads import machine_cores, sharing
+    from neuprim.core.compute.threads import limit_process_threads, machine_cores
     from neuprim.core.train.distributed.group import Group
     from neuprim.core.train.distributed.wire import Wire
 
@@ -47,7 +47,7 @@ def run_as_rank(place: Place, words: list[str], more: bool) -> int:
         signal.SIGTERM, terminated
     )  # torchrun sends it where another rank died; a training listens for it itself
     try:
-        with sharing(max(machine_cores() // place.local_size, 1)):
+        with limit_process_threads(max(machine_cores() // place.local_size, 1)):
             _fit(_composed(words, more, group), words, group)
         failed = False
         return 0
@@ -100,15 +100,15 @@ def _choose_card(config: RunConfig, place: Place) -> None:
     """
     import torch
 
-    from neuprim.core.compute.device import PROCESSOR
+    from neuprim.core.compute.device import CPU
 
     cards = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if cards == 0 or config.renderer.device == PROCESSOR:
+    if cards == 0 or config.renderer.device == CPU:
         return
     if cards < place.local_size:
         raise BackendUnavailable(
             f"renderer.device={config.renderer.device}: {cards} cards for {place.local_size} ranks of this machine; "
-            f"expected a card for each, or renderer.device={PROCESSOR}"
+            f"expected a card for each, or renderer.device={CPU}"
         )
     torch.cuda.set_device(place.local_rank)
 

@@ -11,7 +11,7 @@ from neuprim.conformance.integrals import Alive, by_quadrature, chords, inside, 
 from neuprim.conformance.subject import EXACT, Frozen, Subject, watched
 from neuprim.core.cameras import Camera
 from neuprim.core.data import View
-from neuprim.core.model.fields import LoweredColour, LoweredDensity, Opaque
+from neuprim.core.model.fields import CustomDensity, LoweredColour, LoweredDensity
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import render, render_lowered
@@ -69,16 +69,16 @@ def check_alive(t: Subject) -> None:
     generator = torch.Generator().manual_seed(3)
     params = model.of(model.density)
     for view in map(double, t.views()):
-        rows = model.density.alive(params, view.conditions)
+        rows = model.density.active_rows(params, view.conditions)
         if rows is None:
             continue
         fine = rows.dtype == torch.int64 and bool((rows[1:] > rows[:-1]).all())
-        t.require(fine, "density.alive", f"{rows.dtype} {rows.tolist()}", "ascending int64 rows")
+        t.require(fine, "density.active_rows", f"{rows.dtype} {rows.tolist()}", "ascending int64 rows")
         left = torch.ones(model.count, dtype=torch.bool).index_fill_(0, rows, False).nonzero()[:, 0]
         moved = model.density.move(params, model.geometry, view.conditions)
         sigma = model.density.density(params, model.geometry, left, inside(moved, left, generator), view.conditions)
         worst = float(sigma.abs().max()) if len(left) else 0.0
-        t.require(worst == 0.0, "density.alive: density of a primitive that it leaves out", f"{worst:g}", "0")
+        t.require(worst == 0.0, "density.active_rows: density of a primitive that it leaves out", f"{worst:g}", "0")
 
 
 def check_line_integral(t: Subject) -> None:
@@ -121,7 +121,7 @@ def check_line_integral(t: Subject) -> None:
                     t.require(
                         False, place, f"{float(a[worst]):.6g}", f"{float(b[worst]):.6g}, the integral of density(...)"
                     )
-    t.require(tested > 0, "density.alive", "no primitive in any view", "some")
+    t.require(tested > 0, "density.active_rows", "no primitive in any view", "some")
 
 
 def check_opaque_twin(t: Subject) -> None:
@@ -140,7 +140,7 @@ def check_opaque_twin(t: Subject) -> None:
                 return by_quadrature(model, alive, view.conditions, prim, o, d, t0, t1)[0]
 
             plain = Lowered(
-                lowered.geometry, Opaque(twin), opaque_colour(lowered.colour, lowered.geometry), lowered.rows
+                lowered.geometry, CustomDensity(twin), opaque_colour(lowered.colour, lowered.geometry), lowered.rows
             )
             a, b = (render_lowered(x, view.camera, EXACT) for x in (lowered, plain))
             seen = max(seen, float(a.alpha.max()))

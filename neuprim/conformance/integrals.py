@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.model.fields import Conditions, LoweredColour, LoweredDensity, OpaqueColour
+from neuprim.core.model.fields import Conditions, CustomColour, LoweredColour, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Primitives
@@ -38,7 +38,7 @@ class Alive:
 
     @classmethod
     def of(cls, model: Primitives, conditions: Conditions) -> Alive:
-        rows = model.density.alive(model.of(model.density), conditions)
+        rows = model.density.active_rows(model.of(model.density), conditions)
         rows = torch.arange(model.count) if rows is None else rows
         params = {name: value[rows] for name, value in model.of(model.density).items()}
         home = model.geometry[rows]
@@ -84,11 +84,11 @@ def by_quadrature(
     return (sigma * weights).sum(-1) * (t1 - t0), sigma.abs().amax(-1) if len(prim) else sigma.sum(-1)
 
 
-def opaque_colour(colour: LoweredColour, geometry: Geometry) -> OpaqueColour:
+def opaque_colour(colour: LoweredColour, geometry: Geometry) -> CustomColour:
     """The same colour as torch code per ray-primitive pair."""
 
     def radiance(prim: Tensor, x: Tensor, d: Tensor) -> Tensor:
         nothing = x.new_zeros(len(x))
-        return colour.seen(Pairs.of(geometry, prim, x, d, nothing, nothing))
+        return colour.chord_colours(Pairs.of(geometry, prim, x, d, nothing, nothing))
 
-    return OpaqueColour(radiance, colour.channels)
+    return CustomColour(radiance, colour.channels)

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 
 from neuprim.conformance.subject import Subject
-from neuprim.core.model.fields import Field, pieces_by_name
-from neuprim.core.model.less import with_less
-from neuprim.core.model.pieces import Piece, alive, without
+from neuprim.core.model.fields import Field, prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.prunable import PrunableUnit, nonzero_rows, zero_units
+from neuprim.core.model.reduction import reduce_model
 
 __all__ = ["check_pieces", "check_reductions"]
 
@@ -31,9 +31,9 @@ def check_reductions(t: Subject) -> None:
 
 
 def _smaller(t: Subject, model: Primitives, kind: str, own: Field, name: str, value: int) -> None:
-    where = f"{type(own).__name__}.reduced({name!r}, {value})"
+    where = f"{type(own).__name__}.reduce({name!r}, {value})"
     try:
-        less = with_less(model, kind, name, value)
+        less = reduce_model(model, kind, name, value)
     except (ValueError, AssertionError) as error:
         t.require(
             False, where, f"tensors or a field that do not fit ({error})", "a field of the same kind and its tensors"
@@ -61,17 +61,19 @@ def check_pieces(t: Subject) -> None:
     pruning may leave it out of files."""
     model = t.model(torch.float32)
     for own in (model.density, model.colour):
-        names = [piece.name for piece in own.pieces()]
-        t.require(len(set(names)) == len(names), f"{type(own).__name__}.pieces()", names, "names that are there once")
-    pieces = pieces_by_name(model.density, model.colour)
+        names = [piece.name for piece in own.prunable_units()]
+        t.require(
+            len(set(names)) == len(names), f"{type(own).__name__}.prunable_units()", names, "names that are there once"
+        )
+    pieces = prunable_units_by_name(model.density, model.colour)
     taken = {name: torch.zeros_like(value, dtype=torch.bool) for name, value in model.params.items()}
     drawn: set[str] = set()
     for name, piece in pieces.items():
         _place(t, model.params, taken, name, piece)
         gone = torch.arange(model.count) % 2 == 0
-        less = Primitives(model.density, model.colour, without({name: (piece, gone)}, model.params))
+        less = Primitives(model.density, model.colour, zero_units({name: (piece, gone)}, model.params))
         t.require(
-            bool((alive(piece, less.params) == ~gone).all()),
+            bool((nonzero_rows(piece, less.params) == ~gone).all()),
             f"piece {name!r}",
             "numbers that stay",
             "zeros where it is gone",
@@ -84,7 +86,7 @@ def check_pieces(t: Subject) -> None:
         drawn |= {piece.group} - {""}
 
 
-def _place(t: Subject, params: Mapping[str, Any], taken: dict[str, Any], name: str, piece: Piece) -> None:
+def _place(t: Subject, params: Mapping[str, Any], taken: dict[str, Any], name: str, piece: PrunableUnit) -> None:
     t.require(bool(piece.places), f"piece {name!r}", "no numbers", "some")
     for parameter, place in piece.places.items():
         where = f"piece {name!r}: {parameter}"

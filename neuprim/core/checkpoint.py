@@ -22,9 +22,9 @@ from neuprim.core.errors import CheckpointError, cut, nearest
 from neuprim.core.io.files import atomic_path
 from neuprim.core.io.pieces import Kind, write_pieces
 from neuprim.core.io.plain import finite, load_json
-from neuprim.core.model.fields import ColourField, DensityField, pieces_by_name
+from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.zeros import of_pieces, split_off, whole
+from neuprim.core.model.sparse_storage import load_sparse, store_sparse
 from neuprim.core.task import TaskSpec
 
 __all__ = [
@@ -172,11 +172,11 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
     """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source.
 
     Args:
-        without_zeros: whether zeros of the fields are left out (:mod:`neuprim.core.model.zeros`), as in models that
+        without_zeros: whether zeros of the fields are left out (:mod:`neuprim.core.model.sparse_storage`), as in models that
         were pruned.
     """
     specs = (*model.density.parameters(), *model.colour.parameters()) if without_zeros else ()
-    tensors, sparse = split_off(model.params, specs)
+    tensors, sparse = store_sparse(model.params, specs)
     write(path, "model", tensors, {**model_header(model, task, extra), **({"sparse": sparse} if sparse else {})})
 
 
@@ -255,9 +255,7 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
         )
     own = (*density.parameters(), *colour.parameters())
     if "sparse" in header:
-        tensors = whole(tensors, header.pop("sparse"), own, str(path))
-    elif "apart" in header:
-        tensors = of_pieces(tensors, header.pop("apart"), own, pieces_by_name(density, colour, earlier=True), str(path))
+        tensors = load_sparse(tensors, header.pop("sparse"), own, str(path))
     try:
         model = Primitives(density, colour, tensors)
     except (ValueError, KeyError, TypeError, IndexError) as error:

@@ -87,7 +87,7 @@ def harmonics_of(run: TrainedModel, conditions: Conditions) -> Harmonics:
     """
     model = run.model
     with torch.no_grad():
-        params = model.living(conditions).params
+        params = model.active(conditions).params
         exact = model.colour.harmonics({spec.name: params[spec.name] for spec in model.colour.parameters()}, conditions)
         if exact is not None:
             return Harmonics(exact[0], exact[1], 0.0)

@@ -47,7 +47,7 @@ class Gaussians:
     Attributes:
         means: (M, 3), covariances: (M, 3, 3), scene units.
         opacities: (M,) alpha at the middle of the footprint, 0..1.
-        rows: (M,) which of the living primitives each stands for.
+        rows: (M,) which of the active primitives each stands for.
     """
 
     means: Tensor
@@ -82,8 +82,8 @@ def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gauss
     """
     model = run.model
     with torch.no_grad():
-        living = model.living(conditions)
-        own, still, moved = living.own, living.stored, living.geometry
+        active = model.active(conditions)
+        own, still, moved = active.own, active.stored, active.geometry
         parts = [
             _fit(model.density.density, {n: v[i : i + _CHUNK] for n, v in own.items()}, still[i : i + _CHUNK], moved[i : i + _CHUNK], conditions, size)
             for i in range(0, still.count, _CHUNK)

@@ -108,7 +108,7 @@ def _draw(run: TrainedModel) -> Draw:
 
 def _error(job: ExportJob, held: Primitives, views: Sequence[PageView], moment: Mapping[str, Tensor]) -> float:
     """dB over some views of the page, or over an orbit where it has none."""
-    if not views and not job.run.model.places(moment)[1].count:
+    if not views and not job.run.model.active_geometry(moment)[1].count:
         return math.inf  # nothing is active anywhere: both are the background
     draw, shown = _draw(job.run), [(view.camera, view.conditions) for view in views[:_MEASURED]]
     shown = shown or [(view.camera, moment) for view in comparison_views(job, "orbit", moment)[0]]

@@ -205,8 +205,8 @@ def _colours(
 ) -> np.ndarray:
     """(V, C) of the primitives around each point, weighted by density; of the nearest one where none reaches."""
     with torch.no_grad():
-        living = job.run.model.living(conditions)
-        moved = living.geometry
+        active = job.run.model.active(conditions)
+        moved = active.geometry
         whiten = moved.rotations.double().transpose(1, 2) / moved.scales.double()[:, :, None]
         total, weight = (
             torch.zeros(len(points), colours.dc.shape[1], dtype=torch.float64),
@@ -222,7 +222,7 @@ def _colours(
             y = (whiten[prim] @ (x - moved.means.double()[prim])[:, :, None])[..., 0]
             inside = y.square().sum(-1) < 1
             prim, vertex, x = prim[inside], vertex[inside], x[inside]
-            rho = living.sigma(prim, x.float()).double().clamp_min(0)
+            rho = active.sigma(prim, x.float()).double().clamp_min(0)
             seen = colours.towards(prim, -torch.from_numpy(normals)[vertex])
             total.index_add_(0, vertex, rho[:, None] * seen)
             weight.index_add_(0, vertex, rho)

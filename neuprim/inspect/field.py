@@ -17,7 +17,7 @@ from neuprim.core.conditions import flag
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Living, Primitives
+from neuprim.core.model.primitives import ActiveSet, Primitives
 from neuprim.core.volumes.grid import density_grid
 from neuprim.inspect.layers import Scale
 
@@ -126,20 +126,20 @@ class FieldFrame:
         return self.of_side("model").sigma - self.of_side("truth").sigma
 
     @cached_property
-    def living(self) -> Living:
+    def active(self) -> ActiveSet:
         """The primitives that live in this frame, without gradients."""
         with torch.no_grad():
-            return self.model.living(self.conditions)
+            return self.model.active(self.conditions)
 
     @cached_property
     def alive(self) -> np.ndarray:
         """(M,) int64 rows of the model that live in this frame, in the order of :attr:`geometry`."""
-        return np.arange(self.model.count) if self.living.rows is None else self.living.rows.numpy()
+        return np.arange(self.model.count) if self.active.rows is None else self.active.rows.numpy()
 
     @property
     def geometry(self) -> Geometry:
         """Where the M primitives of :attr:`alive` are, float32."""
-        return self.living.geometry
+        return self.active.geometry
 
     def density(self, row: int, points: Tensor) -> np.ndarray:
         """(P,) float64 unclamped extinction of one primitive of the model at (P, 3) points inside it."""
@@ -153,8 +153,8 @@ class FieldFrame:
 
     @cached_property
     def masses(self) -> np.ndarray:
-        """(M,) float64 what each living primitive absorbs in all, see :func:`absorbed`."""
-        return absorbed(self.living)
+        """(M,) float64 what each active primitive absorbs in all, see :func:`absorbed`."""
+        return absorbed(self.active)
 
     @cached_property
     def colours(self) -> np.ndarray:
@@ -195,16 +195,16 @@ class FieldFrame:
         return int(found[0])
 
 
-def absorbed(living: Living) -> np.ndarray:
-    """(M,) float64 what each living primitive absorbs in all: its clamped extinction times its volume, from 33 points
+def absorbed(active: ActiveSet) -> np.ndarray:
+    """(M,) float64 what each active primitive absorbs in all: its clamped extinction times its volume, from 33 points
     inside."""
-    geometry = living.geometry
+    geometry = active.geometry
     every = torch.arange(geometry.count)
     total = torch.zeros(len(every))
     with torch.no_grad():
         for u in _ball():
             x = geometry.means + (geometry.rotations @ (geometry.scales * u)[..., None])[..., 0]
-            total += living.sigma(every, x).clamp_min(0)
+            total += active.sigma(every, x).clamp_min(0)
     return np.asarray((total / len(_ball()) * geometry.scales.prod(1) * 4.18879).double().numpy())
 
 

@@ -16,8 +16,8 @@ from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
 from neuprim.core.data.held_out import held_out
 from neuprim.core.metrics.lpips import Lpips
-from neuprim.core.model.less import fewer_fields
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.reduction import reduce_fields
 from neuprim.core.render import backends
 from neuprim.core.task import Loss, TaskSpec
 from neuprim.core.train.distributed.refusals import refuse_parts
@@ -241,7 +241,7 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
     origin = suspects_of(config).task.origin
     with blamed(origin, f"build of task {task.name!r}", config.output_dir / LOGS):
         density, colour = task.build(build_settings(task, config.model, config.options), dataset)
-    density, colour = fewer_fields(density, colour, config.model.reduced)
+    density, colour = reduce_fields(density, colour, config.model.reduced)
     check_fields(density, colour, dataset, f"build of task {task.name!r} of {origin.origin}")
     model = initial_model(density, colour, dataset, replace(config.model, primitives=_first(config)), config.seed)
     population = config.train.population

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from neuprim.core.model.fields import pieces_by_name
-from neuprim.core.model.pieces import alive, numbers_of
+from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.prunable import count_numbers, nonzero_rows
 
 __all__ = ["PRUNED", "kept_pieces", "kept_words"]
 
@@ -16,10 +16,10 @@ def kept_pieces(model: Primitives) -> dict[str, float]:
     """Group of pieces -> share of its numbers that are kept, 0 to 1, as ``density.neuron 0`` and ``colour.band 1``."""
     kept: dict[str, float] = {}
     sizes: dict[str, int] = {}
-    for name, piece in pieces_by_name(model.density, model.colour).items():
+    for name, piece in prunable_units_by_name(model.density, model.colour).items():
         group = f"{name.partition('.')[0]}.{piece.group or piece.name}"
-        own = numbers_of(piece, model.params)
-        share = float(alive(piece, model.params).float().mean()) if model.count else 0.0
+        own = count_numbers(piece, model.params)
+        share = float(nonzero_rows(piece, model.params).float().mean()) if model.count else 0.0
         kept[group], sizes[group] = kept.get(group, 0.0) + own * share, sizes.get(group, 0) + own
     return {group: value / sizes[group] for group, value in kept.items()}
 

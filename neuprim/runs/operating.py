@@ -26,8 +26,8 @@ from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.checked import Range, checked, converted
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.core.model.less import KINDS, check_less, less_of, with_less
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.reduction import KINDS, reduce_model, reduction_names, validate_reduction
 from neuprim.core.render import RenderSettings, backends, render
 from neuprim.runs.storage import ALL, FORMATS, FULL, GROUPS, rounded
 
@@ -75,7 +75,7 @@ class OperatingPoint:
         """
         smaller = model
         for (kind, name), value in self.reduced.items():
-            smaller = with_less(smaller, kind, name, value)
+            smaller = reduce_model(smaller, kind, name, value)
         return rounded(smaller, self.stored)
 
     def seen(self, view: View) -> View:
@@ -128,14 +128,14 @@ def read_point(words: Sequence[str], usual: RenderSettings, model: Primitives) -
         elif head == "renderer" and dot:
             values[name] = assignment.value
         elif head in KINDS and dot:
-            reduced[head, name] = check_less(model.density, model.colour, head, name, assignment.value)
+            reduced[head, name] = validate_reduction(model.density, model.colour, head, name, assignment.value)
         elif head == "store" and dot:
             stored |= dict.fromkeys(GROUPS if name == ALL else [name], _format(name, assignment.value))
         else:
             known = [f"renderer.{name}" for name in values] + [
                 "resolution",
                 *(f"store.{name}" for name in (*GROUPS, ALL)),
-                *less_of(model.density, model.colour),
+                *reduction_names(model.density, model.colour),
             ]
             raise ConfigError(
                 f"{assignment.key}: nothing that a finished run is drawn by{nearest(assignment.key, known)}"

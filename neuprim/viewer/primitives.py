@@ -49,7 +49,7 @@ def ellipsoids_of(model: Primitives, look: Look, channels: Channels, most: int) 
         count = lowered.geometry.count
         keep = torch.arange(count)
         if count > most:
-            mass = absorbed(model.to(torch.device("cpu")).living(look.conditions))
+            mass = absorbed(model.to(torch.device("cpu")).active(look.conditions))
             keep = torch.from_numpy(np.sort(np.argsort(-mass, kind="stable")[:most]))
         colours = channels.display_rows(
             lowered.center_colors(look.camera.position.to(lowered.geometry.means)).float().cpu().clamp_min(0)
@@ -67,12 +67,12 @@ def ellipsoid_of(model: Primitives, look: Look, row: int) -> Ellipsoids | None:
     if not 0 <= row < model.count:
         raise ConfigError(f"primitive {row}: the model has {model.count} primitives, 0 to {model.count - 1}")
     with torch.no_grad():
-        living = model.living(look.conditions)
-    rows = torch.arange(model.count) if living.rows is None else living.rows.cpu()
+        active = model.active(look.conditions)
+    rows = torch.arange(model.count) if active.rows is None else active.rows.cpu()
     place = (rows == row).nonzero()[:, 0]
     if not len(place):
         return None
-    return _of(living.geometry, place, rows, np.tile(np.array([[255, 210, 0]], np.uint8), (len(rows), 1)))
+    return _of(active.geometry, place, rows, np.tile(np.array([[255, 210, 0]], np.uint8), (len(rows), 1)))
 
 
 def _of(geometry: Geometry, keep: Tensor, rows: Tensor, colours: np.ndarray) -> Ellipsoids:

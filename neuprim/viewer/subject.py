@@ -139,7 +139,7 @@ class Subject:
                 return View(views[0].name, views[0].camera, _floats(start_of(self.task.conditions, views, {})))
         conditions = _floats(start_of(self.task.conditions, [], {}))
         with torch.no_grad():
-            means = self.model().living(conditions).geometry.means.double().cpu()
+            means = self.model().active(conditions).geometry.means.double().cpu()
         middle = torch.from_numpy(np.asarray(self.center, np.float64))
         radius = (float((means - middle).norm(dim=1).quantile(0.9)) if len(means) else 0.0) or 1.0
         focal = 180 / math.tan(_FOV / 2)

@@ -183,7 +183,7 @@ def fullest(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Ten
     """The conditions where a viewer begins; if no primitive is active there, those among them along one range where
     most are."""
     start = {one.spec.name: one.value for one in conditions}
-    if model.places(start)[1].count:
+    if model.active_geometry(start)[1].count:
         return start
     ranges = [one.spec for one in conditions if one.spec.shape == () and one.spec.range[1] - one.spec.range[0] <= _WIDE]
     others = [
@@ -191,16 +191,16 @@ def fullest(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Ten
         for spec in ranges
         for x in torch.linspace(*spec.range, FRAMES).tolist()
     ]
-    return max(others, key=lambda found: model.places(found)[1].count, default=start)
+    return max(others, key=lambda found: model.active_geometry(found)[1].count, default=start)
 
 
 @torch.no_grad()
 def _extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tuple[list[float], float, float]:
     """Middle and radius of what is drawn, and a density that few centres are above."""
-    living = model.living(conditions)
+    active = model.active(conditions)
     means, scales = (
-        living.geometry.means.double(),
-        living.geometry.scales.double().amax(1) if living.geometry.count else torch.zeros(0),
+        active.geometry.means.double(),
+        active.geometry.scales.double().amax(1) if active.geometry.count else torch.zeros(0),
     )
     if not len(means):
         return [0.0, 0.0, 0.0], 1.0, 1.0
@@ -208,7 +208,7 @@ def _extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tuple[list[f
     middle = (low + high) / 2
     radius = float(torch.quantile(((means - middle).norm(dim=1) + scales)[:100_000], 0.98))
     inside = torch.arange(len(means))
-    sigma = living.sigma(inside, living.geometry.means).clamp_min(0).double()
+    sigma = active.sigma(inside, active.geometry.means).clamp_min(0).double()
     return middle.tolist(), radius or 1.0, float(torch.quantile(sigma[:100_000], 0.95)) or 1.0
 
 

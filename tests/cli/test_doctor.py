@@ -116,9 +116,9 @@ def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypa
 
 def test_it_says_whether_runs_use_a_card_and_why_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_probe", lambda name: None)
-    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
     assert dict(doctor._cuda())["used by runs"] == "no: torch finds no CUDA device" and "used by runs" in report()[1]
-    monkeypatch.setattr(device, "card_missing", lambda: None)
+    monkeypatch.setattr(device, "cuda_unavailable", lambda: None)
     row = Backend(
         "card", lambda: pytest.fail("loaded"), missing=lambda: "pip install 'neuprim[cuda]'", devices=("cuda",)
     )

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neuprim.core.compute import threads
-from neuprim.core.compute.threads import limited, parallel_for
+from neuprim.core.compute.threads import limit_threads, parallel_for
 
 
 def workers(count: int = 40, asked: int = 0) -> int:
@@ -27,20 +27,20 @@ def workers(count: int = 40, asked: int = 0) -> int:
 def test_all_cores_are_as_many_as_the_limit_says(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "core_count", lambda: 4)
     assert workers() == 4
-    with limited(1):
+    with limit_threads(1):
         assert workers() == 1
         assert workers(asked=3) == 3, "who says how many gets them"
-        with limited(0):
+        with limit_threads(0):
             assert workers() == 4
         assert workers() == 1
     assert workers() == 4
 
 
 def test_a_limit_ends_with_an_error_and_is_not_another_threads() -> None:
-    with pytest.raises(KeyError), limited(1):
+    with pytest.raises(KeyError), limit_threads(1):
         raise KeyError
     assert threads._limit.get() == 0
-    with limited(1):
+    with limit_threads(1):
         found = []
         other = threading.Thread(target=lambda: found.append(threads._limit.get()))
         other.start()
@@ -63,6 +63,6 @@ def test_autograd_goes_back_under_the_same_limit() -> None:
             return g * 2
 
     x = torch.ones(3, requires_grad=True)
-    with limited(2):
+    with limit_threads(2):
         Look.apply(x).sum().backward()
     assert seen == [2]

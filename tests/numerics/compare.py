@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.model.fields import OpaqueColour
+from neuprim.core.model.fields import CustomColour
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.core.render.backends import ORACLE
 from neuprim.core.render.output import Tally
@@ -73,7 +73,7 @@ def near_black(t: dict[str, Tensor], camera: Camera, settings: RenderSettings, g
 
     with torch.no_grad():
         found = render_lowered(
-            replace(low, colour=OpaqueColour(close, 1)), camera, replace(settings, backend="reference", depth=False)
+            replace(low, colour=CustomColour(close, 1)), camera, replace(settings, backend="reference", depth=False)
         )
     return found.rgb[..., 0] > 0
 

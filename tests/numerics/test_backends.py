@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import BackendUnavailable, NonFiniteError
-from neuprim.core.model.fields import Constant, Opaque, OpaqueColour
+from neuprim.core.model.fields import Constant, CustomColour, CustomDensity
 from neuprim.core.render import RenderSettings, choose, render_lowered
 from tests import scenes
 from tests.backends import BACKENDS, FAST, LEFT_OUT, by
@@ -216,11 +216,11 @@ def test_scales_beyond_the_range_are_named(value: float) -> None:
 def test_forms_without_a_kernel_go_to_the_reference() -> None:
     low = scenes.lowered(scenes.tensors(3))
     assert choose(low, RenderSettings()).name == "cpu"
-    opaque = Opaque(lambda prim, o, d, t0, t1: t1 - t0)
+    opaque = CustomDensity(lambda prim, o, d, t0, t1: t1 - t0)
     assert choose(replace(low, density=opaque), RenderSettings()).name == "reference"
-    colour = OpaqueColour(lambda prim, x, d: x, 3)
+    colour = CustomColour(lambda prim, x, d: x, 3)
     assert choose(replace(low, colour=colour), RenderSettings()).name == "reference"
-    with pytest.raises(BackendUnavailable, match="Opaque density"):
+    with pytest.raises(BackendUnavailable, match="CustomDensity density"):
         render_lowered(replace(low, density=opaque), scenes.camera(8, 8), RenderSettings(backend="cpu"))
 
 
@@ -228,8 +228,8 @@ def test_opaque_forms_draw_what_the_closed_forms_draw() -> None:
     t = scenes.tensors(15, 0, dtype=torch.float64)
     low, camera, settings = scenes.lowered(t), scenes.camera(20, 15), RenderSettings(backend="reference")
     m = low.geometry.length_scale
-    opaque = Opaque(lambda prim, o, d, t0, t1: (t1 - t0) * t["b2"][prim, 0] / m[prim])
-    colour = OpaqueColour(lambda prim, x, d: t["colors"][prim], 3)
+    opaque = CustomDensity(lambda prim, o, d, t0, t1: (t1 - t0) * t["b2"][prim, 0] / m[prim])
+    colour = CustomColour(lambda prim, x, d: t["colors"][prim], 3)
     assert isinstance(low.colour, Constant)
     first = render_lowered(low, camera, settings).rgb
     assert first.max() > 0.2

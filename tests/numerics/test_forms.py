@@ -18,7 +18,7 @@ from torch import Tensor
 from neuprim.core.errors import FormError
 from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.fields import Constant, Cosine, Opaque, OpaqueColour, Shading
+from neuprim.core.model.fields import Constant, Cosine, CustomColour, CustomDensity, Shading
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.model.tensors import MOST_UNITS
 from neuprim.core.render import RenderSettings, render, render_lowered
@@ -118,7 +118,7 @@ WRONG: dict[str, tuple[type[CosineDensity], str]] = {
     "no tensor": (lowers("b2", lambda v: 1.0), r"Cosine: b2 has type float; expected a torch tensor"),
     "omega0": (lowers("omega0", lambda v: NAN), r"Cosine: omega0 has value nan; expected a finite number"),
     "a huge omega0": (lowers("omega0", lambda v: 10**400), r"Cosine: omega0 has value beyond the range of float64"),
-    "nothing": (waves(lower=lambda *a: None), r"NoneType; expected Cosine or Opaque"),
+    "nothing": (waves(lower=lambda *a: None), r"NoneType; expected Cosine or CustomDensity"),
 }
 
 
@@ -147,7 +147,7 @@ def test_a_wrong_density_does_not_reach_the_grid(name: str) -> None:
         ),
         (Constant(torch.ones(N - 1, 3)), r"Constant: rgb has shape \(19, 3\)"),
         (Constant(torch.ones(N, 0)), r"Constant: rgb has shape \(20, 0\)"),
-        (torch.ones(N, 3), r"Tensor; expected Constant, RayNet or OpaqueColour"),
+        (torch.ones(N, 3), r"Tensor; expected Constant, RayNet or CustomColour"),
         (
             scenes.colour({**scenes.tensors(N, hidden=4), "bias": torch.ones(N, 5)}),
             r"RayNet: bias has shape \(20, 5\); .* Wx has H=4",
@@ -157,12 +157,12 @@ def test_a_wrong_density_does_not_reach_the_grid(name: str) -> None:
             r"RayNet: Wout has .*; expected \(20, 3, 4\)",
         ),
         (
-            OpaqueColour(lambda prim, x, d: x[:, :2], 3),
-            r"OpaqueColour: radiance returned shape \(\d+, 2\); expected \(\d+, 3\)",
+            CustomColour(lambda prim, x, d: x[:, :2], 3),
+            r"CustomColour: radiance returned shape \(\d+, 2\); expected \(\d+, 3\)",
         ),
-        (OpaqueColour(lambda prim, x, d: x.long(), 3), r"OpaqueColour: radiance returned torch\.int64"),
-        (OpaqueColour(lambda prim, x, d: x, 0), r"OpaqueColour: channels has value 0"),
-        (OpaqueColour(None, 3), r"OpaqueColour: radiance has type NoneType; expected a function"),  # type: ignore[arg-type]
+        (CustomColour(lambda prim, x, d: x.long(), 3), r"CustomColour: radiance returned torch\.int64"),
+        (CustomColour(lambda prim, x, d: x, 0), r"CustomColour: channels has value 0"),
+        (CustomColour(None, 3), r"CustomColour: radiance has type NoneType; expected a function"),  # type: ignore[arg-type]
     ],
 )
 def test_a_wrong_colour_names_its_field(colour: Any, message: str) -> None:
@@ -174,13 +174,15 @@ def test_a_wrong_opaque_density_is_named_wherever_it_is_asked() -> None:
     def column(*a: Tensor) -> Tensor:
         return a[3][:, None]
 
-    wrong = model(waves(lower=lambda *a: Opaque(column)))
-    message = r"^density field Waves lowered to Opaque: line_integral returned shape \((\d+), 1\); expected \(\1,\)"
+    wrong = model(waves(lower=lambda *a: CustomDensity(column)))
+    message = (
+        r"^density field Waves lowered to CustomDensity: line_integral returned shape \((\d+), 1\); expected \(\1,\)"
+    )
     with pytest.raises(FormError, match=message):
         render(wrong, CAMERA)
     with pytest.raises(FormError, match=message):
         joint_volume(wrong.lower(CAMERA, {}), CAMERA)
-    both = model(waves(lower=lambda *a: Opaque(column), density=lambda self, p, g, prim, x, c: x))
+    both = model(waves(lower=lambda *a: CustomDensity(column), density=lambda self, p, g, prim, x, c: x))
     for ask in (
         lambda: density_grid(both, {}, torch.eye(4, dtype=torch.float64) * 0.1, (4, 4, 4)),
         lambda: density_at(both, {}, torch.zeros(3, 3) + both.params["means"][0]),
@@ -195,20 +197,20 @@ def test_a_wrong_opaque_density_is_named_wherever_it_is_asked() -> None:
     ("methods", "message"),
     [
         (
-            {"alive": lambda self, p, c: torch.tensor([3, 99])},
-            r"alive returned rows 3 to 99; expected ascending int64 rows \(M,\) from 0 to 19",
+            {"active_rows": lambda self, p, c: torch.tensor([3, 99])},
+            r"active_rows returned rows 3 to 99; expected ascending int64 rows \(M,\) from 0 to 19",
         ),
-        ({"alive": lambda self, p, c: torch.tensor([-1, 3])}, r"alive returned rows -1 to 3"),
+        ({"active_rows": lambda self, p, c: torch.tensor([-1, 3])}, r"active_rows returned rows -1 to 3"),
         (
-            {"alive": lambda self, p, c: torch.tensor([4, 2, 3, 5])},
-            r"alive returned rows that do not ascend, \[4, 2, 3, 5\]",
+            {"active_rows": lambda self, p, c: torch.tensor([4, 2, 3, 5])},
+            r"active_rows returned rows that do not ascend, \[4, 2, 3, 5\]",
         ),
         (
-            {"alive": lambda self, p, c: torch.ones(N, dtype=torch.bool)},
-            r"alive returned torch\.bool \(20,\) on cpu; expected ascending int64",
+            {"active_rows": lambda self, p, c: torch.ones(N, dtype=torch.bool)},
+            r"active_rows returned torch\.bool \(20,\) on cpu; expected ascending int64",
         ),
-        ({"alive": lambda self, p, c: torch.tensor([1.0])}, r"alive returned torch\.float32 \(1,\)"),
-        ({"alive": lambda self, p, c: [1, 2]}, r"alive returned type list"),
+        ({"active_rows": lambda self, p, c: torch.tensor([1.0])}, r"active_rows returned torch\.float32 \(1,\)"),
+        ({"active_rows": lambda self, p, c: [1, 2]}, r"active_rows returned type list"),
         ({"move": lambda self, p, g, c: g[:3]}, r"move: means has shape \(3, 3\); expected \(20, 3\)"),
         (
             {"move": lambda self, p, g, c: replace(g, quats=g.quats.T)},

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import cosine_density
-from neuprim.core.model.fields import Constant, Cosine, Opaque, OpaqueColour
+from neuprim.core.model.fields import Constant, Cosine, CustomColour, CustomDensity
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.joint import joint_volume, sorting_errors
 from tests import scenes
@@ -173,8 +173,8 @@ def test_other_forms_of_density_and_colour() -> None:
     t = scenes.tensors(15, 0, dtype=torch.float64)
     low, camera = scenes.lowered(t), scenes.camera(10, 8)
     m = low.geometry.length_scale
-    opaque = Opaque(lambda prim, o, d, t0, t1: (t1 - t0) * t["b2"][prim, 0] / m[prim])
-    colour = OpaqueColour(lambda prim, x, d: t["colors"][prim], 3)
+    opaque = CustomDensity(lambda prim, o, d, t0, t1: (t1 - t0) * t["b2"][prim, 0] / m[prim])
+    colour = CustomColour(lambda prim, x, d: t["colors"][prim], 3)
     assert isinstance(low.colour, Constant)
     first = joint_volume(low, camera, EXACT, steps=2).rgb
     other = joint_volume(replace(low, density=opaque, colour=colour), camera, EXACT, steps=2).rgb

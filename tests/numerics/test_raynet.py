@@ -14,7 +14,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.rays import RayCamera
 from neuprim.core.errors import BackendUnavailable, NonFiniteError
-from neuprim.core.model.fields import Constant, Opaque, OpaqueColour, RayNet
+from neuprim.core.model.fields import Constant, CustomColour, CustomDensity, RayNet
 from neuprim.core.render import RenderSettings, choose, render_lowered
 from neuprim.core.render.joint import joint_volume
 from neuprim.core.render.reference.rays import pixel_directions
@@ -207,7 +207,7 @@ def test_reference_gradients_are_finite_differences(hidden: int, distance: float
     assert torch.autograd.gradcheck(image, [x.requires_grad_() for x in inputs], eps=1e-7, atol=2e-6, rtol=1e-5)
 
 
-def as_opaque(t: dict[str, Tensor]) -> OpaqueColour:
+def as_opaque(t: dict[str, Tensor]) -> CustomColour:
     """The formula, from chord middles in the scene."""
     m = t["log_scales"].amax(1).exp()
 
@@ -216,7 +216,7 @@ def as_opaque(t: dict[str, Tensor]) -> OpaqueColour:
         waves = torch.cos(torch.einsum("mhj,mj->mh", t["Wx"][prim], local) + t["bias"][prim])
         return (t["base"][prim] + torch.einsum("mch,mh->mc", t["Wout"][prim], waves)).clamp_min(0)
 
-    return OpaqueColour(radiance, t["base"].shape[1])
+    return CustomColour(radiance, t["base"].shape[1])
 
 
 @pytest.mark.parametrize("sort", ORDERS)
@@ -248,8 +248,8 @@ def test_a_ray_camera_sees_the_same() -> None:
 def test_the_kernels_know_the_form() -> None:
     low = scenes.lowered(scenes.tensors(3, hidden=2))
     assert choose(low, RenderSettings()).name == "cpu"
-    with pytest.raises(BackendUnavailable, match="Opaque density, RayNet colour"):
-        choose(replace(low, density=Opaque(lambda prim, o, d, t0, t1: t1 - t0)), RenderSettings(backend="cpu"))
+    with pytest.raises(BackendUnavailable, match="CustomDensity density, RayNet colour"):
+        choose(replace(low, density=CustomDensity(lambda prim, o, d, t0, t1: t1 - t0)), RenderSettings(backend="cpu"))
     assert isinstance(scenes.lowered(scenes.tensors(3)).colour, Constant)
 
 

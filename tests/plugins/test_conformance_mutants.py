@@ -21,7 +21,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Conditions, ConditionSpec, Constant, Cosine, Field
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pieces import Piece
+from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.task import SceneSpec, Supervision, TaskSpec
 from neuprim.core.train.losses import photometric
@@ -58,21 +58,21 @@ class ForgetsNeurons(CosineDensity):
         return {"neurons": 3}
 
 
-def less_of(values: tuple[Any, ...], make: Any = None) -> type[CosineDensity]:
+def reduction_names(values: tuple[Any, ...], make: Any = None) -> type[CosineDensity]:
     class Less(CosineDensity):
         def reductions(self) -> dict[str, tuple[int, ...]]:
             return {"neurons": values} if self.neurons else {}
 
-        def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> Any:
+        def reduce(self, params: Params, geometry: Geometry, name: str, value: int) -> Any:
             field, fewer = super().reduced(params, geometry, name, value)
             return (Less(field.neurons), fewer) if make is None else make(field, fewer)
 
     return Less
 
 
-def in_pieces(*pieces: Piece) -> type[CosineDensity]:
+def in_pieces(*pieces: PrunableUnit) -> type[CosineDensity]:
     class Pieces(CosineDensity):
-        def pieces(self) -> tuple[Piece, ...]:
+        def prunable_units(self) -> tuple[PrunableUnit, ...]:
             return pieces
 
     return Pieces
@@ -131,12 +131,12 @@ class Transposed(CosineDensity):
 
 
 class LeavesOut(CosineDensity):
-    def alive(self, params: Params, conditions: Conditions) -> Tensor:
+    def active_rows(self, params: Params, conditions: Conditions) -> Tensor:
         return torch.arange(3)
 
 
 class Unsorted(CosineDensity):
-    def alive(self, params: Params, conditions: Conditions) -> Tensor:
+    def active_rows(self, params: Params, conditions: Conditions) -> Tensor:
         return torch.arange(len(params["b2"])).flip(0)
 
 
@@ -153,12 +153,12 @@ class Squares(CosineDensity):
 class FoldsAway(CosineDensity):
     """Half a turn without the weight's other sign."""
 
-    def folded(self, params: Params) -> dict[str, Tensor]:
+    def canonicalize(self, params: Params) -> dict[str, Tensor]:
         return {**params, "w2": params["w2"].abs()}
 
 
 class FoldsOnAndOn(CosineDensity):
-    def folded(self, params: Params) -> dict[str, Tensor]:
+    def canonicalize(self, params: Params) -> dict[str, Tensor]:
         return {**params, "b1": params["b1"] + 2 * math.pi / self.omega0}
 
 
@@ -464,8 +464,8 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
         "layer 'noise' of view",
         using(layers=(replace(GLOW, name="noise", draw=lambda frame: torch.rand(9, 10), channels=("N",)),)),
     ),
-    ("alive", "density.alive: density of a primitive that it leaves out", using(LeavesOut)),
-    ("alive", "density.alive: found torch.int64 [11, 10", using(Unsorted)),
+    ("alive", "density.active_rows: density of a primitive that it leaves out", using(LeavesOut)),
+    ("alive", "density.active_rows: found torch.int64 [11, 10", using(Unsorted)),
     ("line_integral", "density.lower: line integral of a chord, primitive", using(Doubled)),
     ("opaque_twin", "density.lower: alpha of view train0", using(Doubled)),
     (
@@ -490,30 +490,34 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("learning", "mean loss over the training views", using(loss=uphill)),
     ("save_load", "after loading: found a change", using(colour=Progresses)),
     ("save_load", "SwallowsSettings(no_such_setting=1), as a model file has it", using(SwallowsSettings)),
-    ("reductions", "Less.reductions()['neurons']: found ()", using(less_of(()))),
-    ("reductions", "whole numbers from 0", using(less_of((1, 0.5)))),
-    ("reductions", "found (0, 1); expected the largest first", using(less_of((0, 1)))),
+    ("reductions", "Less.reductions()['neurons']: found ()", using(reduction_names(()))),
+    ("reductions", "whole numbers from 0", using(reduction_names((1, 0.5)))),
+    ("reductions", "found (0, 1); expected the largest first", using(reduction_names((0, 1)))),
     (
         "reductions",
         "Less.reduced('neurons', 1): found tensors or a field",
-        using(less_of((1,), lambda f, p: (f, {**p, "w2": p["w2"][:, :0]}))),
+        using(reduction_names((1,), lambda f, p: (f, {**p, "w2": p["w2"][:, :0]}))),
     ),
     (
         "reductions",
         "found CosineDensity; expected a field that TaskSpec.fields lists",
-        unlisted(less_of((1,), lambda f, p: (f, p))),
+        unlisted(reduction_names((1,), lambda f, p: (f, p))),
     ),
-    ("reductions", "image: found", using(less_of((1,), lambda f, p: (f, {**p, "b2": p["b2"] * math.nan})))),
-    ("pieces", "names that are there once", using(in_pieces(Piece("a", {"w2": (0,)}), Piece("a", {"w2": (1,)})))),
-    ("pieces", "w3: found no such parameter", using(in_pieces(Piece("a", {"w3": (0,)})))),
-    ("pieces", "found a place (7,) that it does not have", using(in_pieces(Piece("a", {"w2": (7,)})))),
-    ("pieces", "found an empty place", using(in_pieces(Piece("a", {"w2": (slice(1, 1),)})))),
+    ("reductions", "image: found", using(reduction_names((1,), lambda f, p: (f, {**p, "b2": p["b2"] * math.nan})))),
+    (
+        "pieces",
+        "names that are there once",
+        using(in_pieces(PrunableUnit("a", {"w2": (0,)}), PrunableUnit("a", {"w2": (1,)}))),
+    ),
+    ("pieces", "w3: found no such parameter", using(in_pieces(PrunableUnit("a", {"w3": (0,)})))),
+    ("pieces", "found a place (7,) that it does not have", using(in_pieces(PrunableUnit("a", {"w2": (7,)})))),
+    ("pieces", "found an empty place", using(in_pieces(PrunableUnit("a", {"w2": (slice(1, 1),)})))),
     (
         "pieces",
         "found numbers of another piece",
-        using(in_pieces(Piece("a", {"w2": (0,)}), Piece("b", {"w2": (slice(None),)}))),
+        using(in_pieces(PrunableUnit("a", {"w2": (0,)}), PrunableUnit("b", {"w2": (slice(None),)}))),
     ),
-    ("pieces", "found no numbers", using(in_pieces(Piece("a", {})))),
+    ("pieces", "found no numbers", using(in_pieces(PrunableUnit("a", {})))),
     ("folded", "after folding: found a change of", using(FoldsAway)),
     ("folded", "b1 after folding twice: found other values", using(FoldsOnAndOn)),
     ("resume", "8 steps against 4 + resume + 4", using(Remembers)),

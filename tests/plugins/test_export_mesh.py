@@ -118,7 +118,7 @@ def test_extinction_is_computed_where_the_run_draws(
 ) -> None:
     pytest.importorskip("pyvista", exc_type=ImportError)
     asked: list[torch.device] = []
-    monkeypatch.setattr(device, "computes", lambda where: bool(asked.append(where)))
+    monkeypatch.setattr(device, "has_warp", lambda where: bool(asked.append(where)))
     monkeypatch.setattr(mesh, "computing_device", lambda settings: torch.device("meta"))
     export_run(run_dir, "mesh", tmp_path / "m.ply", ["grid=32"])
     assert set(asked) == {torch.device("meta")}

@@ -122,7 +122,7 @@ def test_extinction_is_computed_where_the_run_draws(
     export_run(moving, "vdb", tmp_path / "own", ["time=0.5", "grid=24"])
     asked: list[torch.device] = []
     with pretended(monkeypatch):
-        monkeypatch.setattr(device, "computes", lambda where: bool(asked.append(where)))
+        monkeypatch.setattr(device, "has_warp", lambda where: bool(asked.append(where)))
         export_run(own, "vdb", tmp_path / "there", ["time=0.5", "grid=24"])
         assert len(asked) >= 2 and set(asked) == {CARD}
         asked.clear()

@@ -56,10 +56,10 @@ def test_the_primitive_under_the_mouse_is_the_one_that_contributes_most(timed: b
 def test_ellipsoids_are_where_the_frame_has_them() -> None:
     model = random_model(TimeDensity(2, "window+motion", edge=2), TimeHarmonics(1), count=40)
     look = Look(camera_at((0.3, -3.0, 1.0)), {"time": torch.tensor(0.3)})
-    living = model.living(look.conditions)
+    active = model.active(look.conditions)
     every = ellipsoids_of(model, look, RGB, 1000)
-    assert np.array_equal(every.rows, living.rows.numpy()) and 0 < len(every.rows) < 40  # type: ignore[union-attr]
-    assert np.allclose(every.positions, living.geometry.means) and np.allclose(every.scales, living.geometry.scales)
+    assert np.array_equal(every.rows, active.rows.numpy()) and 0 < len(every.rows) < 40  # type: ignore[union-attr]
+    assert np.allclose(every.positions, active.geometry.means) and np.allclose(every.scales, active.geometry.scales)
     assert (
         np.allclose(np.linalg.norm(every.wxyz, axis=1), 1, atol=1e-6)
         and every.colours.dtype == np.uint8

@@ -209,7 +209,7 @@ def test_depth_and_density_slices(chromium: Any, tmp_path: Path) -> None:
                 (points - geometry.means[i].double()) @ geometry.rotations[i].double() / geometry.scales[i].double()
             )
             inside = ((whitened**2).sum(-1) < 1).nonzero()[:, 0]
-            sigma[inside] += model.living({}, torch.float64).sigma(torch.full((len(inside),), i), points[inside])
+            sigma[inside] += model.active({}, torch.float64).sigma(torch.full((len(inside),), i), points[inside])
     assert truth.depth is not None
     with open_tab(chromium, tmp_path / "p.html") as tab:
         found = tab.numbers(camera, mode="DEPTH")

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.model.fields import Conditions, DensityField, Opaque
+from neuprim.core.model.fields import Conditions, CustomDensity, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 
@@ -55,7 +55,7 @@ class BellDensity(DensityField):
         ] / geometry.scales[prim]
         return self._peak(params, geometry)[prim] * (-0.5 * self.deviations**2 * y.square().sum(-1)).exp()
 
-    def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Opaque:
+    def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> CustomDensity:
         """The integral of sigma over a chord, in closed form.
 
         With q the whitened middle of the chord, v the whitened direction, a = |v|^2, u = q.v/a the way from the ray's
@@ -79,7 +79,7 @@ class BellDensity(DensityField):
             g = c * (a / 2).sqrt()
             return peak[prim] * (-0.5 * c * c * closest).exp() * bell(g * u, g * (t1 - t0) / 2) / g
 
-        return Opaque(line_integral)
+        return CustomDensity(line_integral)
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         """A factor of zero would be minus infinity here; 1e-30 is as good."""

@@ -65,7 +65,7 @@ def test_wrong_settings_are_refused_before_data_are_loaded() -> None:
 
 
 def test_the_fast_backend_says_why_it_cannot(tmp_path: Path) -> None:
-    with pytest.raises(BackendUnavailable, match="cannot draw Opaque density"):
+    with pytest.raises(BackendUnavailable, match="cannot draw CustomDensity density"):
         run(
             compose(
                 [

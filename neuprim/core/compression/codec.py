@@ -17,9 +17,9 @@ from neuprim.core.compression.rotations import LEAST_BITS, Rotations
 from neuprim.core.compression.sections import COLUMNS, POSITIONS, ROTATIONS, Section, pack, pack_rows, pack_sparse
 from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.model.checks import method
-from neuprim.core.model.fields import pieces_by_name
-from neuprim.core.model.pieces import alive
+from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.prunable import nonzero_rows
 
 __all__ = [
     "Schemes",
@@ -61,7 +61,7 @@ _FINE = 50.0
 
 
 def folded(model: Primitives) -> Primitives:
-    """The same model in the numbers that are stored (:meth:`~neuprim.core.model.fields.Field.folded`), detached and on
+    """The same model in the numbers that are stored (:meth:`~neuprim.core.model.fields.Field.canonicalize`), detached and on
     the processor.
 
     Raises:
@@ -71,10 +71,12 @@ def folded(model: Primitives) -> Primitives:
     params = {name: value.detach().cpu() for name, value in model.params.items()}
     for field in (model.density, model.colour):
         own = {spec.name: params[spec.name] for spec in field.parameters()}
-        found = field.folded(own)
+        found = field.canonicalize(own)
         wanted = {name: tuple(value.shape) for name, value in own.items()}
         if {name: tuple(value.shape) for name, value in found.items()} != wanted:
-            raise FormError(f"{method(field, 'folded')} returned tensors of other names or shapes; expected {wanted}")
+            raise FormError(
+                f"{method(field, 'canonicalize')} returned tensors of other names or shapes; expected {wanted}"
+            )
         params |= found
     for name, value in params.items():
         if value.dtype != torch.float32:
@@ -164,8 +166,8 @@ def _even_positions(x: Tensor, steps: Tensor) -> Columns:
 
 def _sparse(model: Primitives) -> set[str]:
     """Parameters of pieces that some primitives do without: these come back without them."""
-    pieces = pieces_by_name(model.density, model.colour).values()
-    return {name for piece in pieces if not bool(alive(piece, model.params).all()) for name in piece.places}
+    pieces = prunable_units_by_name(model.density, model.colour).values()
+    return {name for piece in pieces if not bool(nonzero_rows(piece, model.params).all()) for name in piece.places}
 
 
 def _positions(model: Primitives, x: Tensor, bits: int, exact: bool) -> Columns:
@@ -224,7 +226,7 @@ def _masks(
     }
     masks: list[np.ndarray] = []
     whose: dict[str, Tensor] = {}
-    for piece in pieces_by_name(model.density, model.colour).values():
+    for piece in prunable_units_by_name(model.density, model.colour).values():
         if not model.count or not set(piece.places) <= zero.keys():
             continue
         parts = [

@@ -1,6 +1,6 @@
 """Where tensors are: the processor's memory or a card's, and what follows from it.
 
-Everything else lets tensors' own ``device`` flow. Operations that are compiled for the processor ask :func:`fused`
+Everything else lets tensors' own ``device`` flow. Operations that are compiled for the processor ask :func:`on_numba`
 whether they may take what they are given; where they may not, a twin in torch code computes the same.
 """
 
@@ -13,17 +13,17 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "CARD", "HOST", "KINDS", "PROCESSOR", "beside", "card_missing", "computes", "from_host", "fused", "kernels", "of_kind", "spare_memory",
+    "CUDA", "HOST", "DEVICE_TYPES", "CPU", "to_like", "cuda_unavailable", "has_warp", "copy_from_host", "on_numba", "on_warp", "current_device", "free_cuda_memory",
 ]  # fmt: skip
 
-PROCESSOR, CARD = "cpu", "cuda"
-KINDS: tuple[str, ...] = (PROCESSOR, CARD)
+CPU, CUDA = "cpu", "cuda"
+DEVICE_TYPES: tuple[str, ...] = (CPU, CUDA)
 """The devices that models are kept on."""
 
-HOST = torch.device(PROCESSOR)
+HOST = torch.device(CPU)
 
 
-def fused(*tensors: Tensor) -> bool:
+def on_numba(*tensors: Tensor) -> bool:
     """Whether operations that are compiled for the processor may read these tensors."""
     return all(tensor.is_cpu for tensor in tensors)
 
@@ -33,45 +33,45 @@ def _warp() -> bool:
     return importlib.util.find_spec("warp") is not None
 
 
-def kernels(*tensors: Tensor) -> bool:
+def on_warp(*tensors: Tensor) -> bool:
     """Whether operations that are compiled for a card may read these tensors."""
     return all(tensor.is_cuda for tensor in tensors) and _warp()
 
 
-def computes(where: torch.device) -> bool:
+def has_warp(where: torch.device) -> bool:
     """Whether operations that are compiled for a card run there; elsewhere the processor's do it."""
     return where.type == "cuda" and _warp()
 
 
 @functools.cache
-def card_missing() -> str | None:
+def cuda_unavailable() -> str | None:
     """Why torch finds no card on this machine; None if it finds one."""
     if torch.cuda.is_available():
         return None
     return "torch finds no CUDA device" if torch.backends.cuda.is_built() else "this torch was built without CUDA"
 
 
-def of_kind(kind: str) -> torch.device:
+def current_device(kind: str) -> torch.device:
     """The device of this kind that a run uses; of several cards torch's current one."""
-    return torch.device(kind, torch.cuda.current_device()) if kind == CARD else torch.device(kind)
+    return torch.device(kind, torch.cuda.current_device()) if kind == CUDA else torch.device(kind)
 
 
-def from_host(tensor: Tensor, device: torch.device) -> Tensor:
+def copy_from_host(tensor: Tensor, device: torch.device) -> Tensor:
     """The tensor on ``device``, itself if it is there already. Copies to a card go by pinned memory and do not wait for
     it."""
     if tensor.device == device:
         return tensor
-    if device.type != CARD or not tensor.is_cpu:
+    if device.type != CUDA or not tensor.is_cpu:
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
 
 
-def beside(tensor: Tensor, like: Tensor) -> Tensor:
+def to_like(tensor: Tensor, like: Tensor) -> Tensor:
     """A few numbers on the device of another tensor, and of its dtype; differentiable. Copies to a card do not wait for
     it."""
     return tensor.to(like, non_blocking=tensor.is_cpu)
 
 
-def spare_memory(device: torch.device) -> int:
+def free_cuda_memory(device: torch.device) -> int:
     """Bytes of a card's memory that nothing uses."""
     return int(torch.cuda.mem_get_info(device)[0])

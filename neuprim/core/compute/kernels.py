@@ -27,7 +27,7 @@ from neuprim.version import __version__
 
 __all__ = [
     "FAST",
-    "by_length",
+    "dispatch_by_length",
     "cache_directory",
     "exact_kernel",
     "inline",
@@ -35,7 +35,7 @@ __all__ = [
     "kernel_sources",
     "sources_hash",
     "strict",
-    "text",
+    "inline_source",
 ]
 
 
@@ -66,7 +66,9 @@ FAST = {"nnan", "nsz", "arcp", "contract", "afn", "reassoc"}
 """Floating-point freedom of the pixel kernels. NaN checks vanish under it: rows are checked before (``prepare``)."""
 
 
-_COMPILED = re.compile(rb"\bnumba\b|\bcompute\.kernels import [^\n]*\b(?:exact_kernel|kernel|inline|strict|text)\b")
+_COMPILED = re.compile(
+    rb"\bnumba\b|\bcompute\.kernels import [^\n]*\b(?:exact_kernel|kernel|inline|strict|inline_source)\b"
+)
 
 
 def kernel_sources(package: Path) -> list[Path]:
@@ -120,7 +122,7 @@ def _jit(**options: Any) -> Callable[[Any], Any]:
 inline = njit(fastmath=FAST, error_model="numpy", forceinline=True)
 """Building block of a pixel kernel; ``forceinline`` so that a cold and a cached process compute the same bits."""
 
-text = njit(fastmath=FAST, error_model="numpy", inline="always")
+inline_source = njit(fastmath=FAST, error_model="numpy", inline="always")
 """As if its text stood in the caller: LLVM sees both at once, and computes the bits that it would compute of one
 function."""
 
@@ -128,7 +130,7 @@ kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
 """A pixel kernel, called from worker threads."""
 
 
-def by_length(*functions: Any) -> Any:
+def dispatch_by_length(*functions: Any) -> Any:
     """One function of (tuple, *arguments) for use in kernels, which calls ``functions[len(tuple)]`` of the arguments.
 
     A tuple's length belongs to its type: the choice is made while a kernel is compiled, and what is not chosen leaves

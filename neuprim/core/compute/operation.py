@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["applied", "asked"]
+__all__ = ["apply_autograd", "needs_grad"]
 
 
 class _Nowhere:
@@ -20,14 +20,14 @@ class _Nowhere:
         pass
 
 
-def asked(*arguments: Any) -> bool:
+def needs_grad(*arguments: Any) -> bool:
     """Whether somebody asks for a gradient with respect to one of them."""
     return torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in arguments)
 
 
-def applied(operation: type[torch.autograd.Function], *arguments: Any) -> Any:
+def apply_autograd(operation: type[torch.autograd.Function], *arguments: Any) -> Any:
     """``operation.apply(*arguments)``; its bookkeeping, which takes longer than the tensors of a small model, is left
     out where no gradient is asked for."""
-    if asked(*arguments):
+    if needs_grad(*arguments):
         return operation.apply(*arguments)
     return operation.forward(_Nowhere(), *arguments)

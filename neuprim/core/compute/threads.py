@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 
-__all__ = ["core_count", "limited", "machine_cores", "parallel_for", "sharing", "threads_of"]
+__all__ = ["core_count", "limit_threads", "machine_cores", "parallel_for", "limit_process_threads", "resolve_threads"]
 
 _limit: ContextVar[int] = ContextVar("threads", default=0)
 _pools: dict[int, ThreadPoolExecutor] = {}
@@ -35,7 +35,7 @@ def core_count() -> int:
 
 
 @contextmanager
-def sharing(threads: int) -> Iterator[None]:
+def limit_process_threads(threads: int) -> Iterator[None]:
     """Inside, the whole process has a share of the cores, as there are others that work beside it; 0: all. One at a
     time."""
     global _share
@@ -47,7 +47,7 @@ def sharing(threads: int) -> Iterator[None]:
 
 
 @contextmanager
-def limited(threads: int) -> Iterator[None]:
+def limit_threads(threads: int) -> Iterator[None]:
     """Inside, "all cores" means ``threads`` of them, 0 for all: for code that is called without being told how many it
     may use, such as a loss or a colour."""
     token = _limit.set(threads)
@@ -57,7 +57,7 @@ def limited(threads: int) -> Iterator[None]:
         _limit.reset(token)
 
 
-def threads_of(threads: int) -> int:
+def resolve_threads(threads: int) -> int:
     """How many :func:`parallel_for` works with, asked for so many."""
     return threads or _limit.get() or core_count()
 
@@ -73,9 +73,9 @@ def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: 
     """Call ``function(start, stop, *args)`` for chunks of ``range(count)``, drawn dynamically; returns the results in
     chunk order.
 
-    ``threads`` 0 is all cores, or as many as :func:`limited` says.
+    ``threads`` 0 is all cores, or as many as :func:`limit_threads` says.
     """
-    threads = threads_of(threads)
+    threads = resolve_threads(threads)
     chunks = -(-count // chunk) if count else 0
     if threads == 1 or chunks <= 1:
         return [function(c * chunk, min(count, (c + 1) * chunk), *args) for c in range(chunks)]

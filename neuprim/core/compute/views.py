@@ -1,4 +1,4 @@
-"""Things that numba has no word for: an array that is lent, sixteen floats at once, and those of sixteen that count."""
+"""Things that numba has no word for: an array that is borrowed, sixteen floats at once, and those of sixteen that count."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
-__all__ = ["copy16", "keep16", "lent", "returned"]
+__all__ = ["copy16", "compress16", "borrow_array", "release_array"]
 
 _COMPRESSES = 19 <= binding.llvm_version_info[0] <= 22
 """Whether LLVM moves the chosen elements of a vector together by one instruction; it is called experimental, and other
@@ -24,7 +24,7 @@ def _lent(context, array):  # type: ignore[no-untyped-def]
 
     Counting is atomic: it costs a pair of a few lanes as much as a vector of arithmetic, and threads that count views
     of one array wait for each other. Only for arrays that somebody else keeps, such as the arguments of a kernel; a
-    kernel's own are given back by :func:`returned` after the last use of what was lent.
+    kernel's own are given back by :func:`release_array` after the last use of what was lent.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -98,7 +98,7 @@ def _returned(context, array):  # type: ignore[no-untyped-def]
     return types.void(array), code
 
 
-lent: Any = intrinsic(_lent)
-returned: Any = intrinsic(_returned)
+borrow_array: Any = intrinsic(_lent)
+release_array: Any = intrinsic(_returned)
 copy16: Any = intrinsic(_copy16)
-keep16: Any = intrinsic(_keep16)
+compress16: Any = intrinsic(_keep16)

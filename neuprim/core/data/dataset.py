@@ -74,8 +74,8 @@ class Pixels:
 
     def to(self, device: torch.device) -> Pixels:
         """The same on another device; copies to a card do not wait for it."""
-        alpha, mask = (None if x is None else hardware.from_host(x, device) for x in (self.alpha, self.mask))
-        return Pixels(hardware.from_host(self.rgb, device), alpha, mask)
+        alpha, mask = (None if x is None else hardware.copy_from_host(x, device) for x in (self.alpha, self.mask))
+        return Pixels(hardware.copy_from_host(self.rgb, device), alpha, mask)
 
     def over(self, background: Tensor) -> Tensor:
         """(H, W, C) composited over a (C,) colour; opaque pixels are returned as they are."""

@@ -24,10 +24,10 @@ from neuprim.core.model.fields import (
     ColourField,
     Constant,
     Cosine,
+    CustomColour,
+    CustomDensity,
     DensityField,
     Field,
-    Opaque,
-    OpaqueColour,
     RayNet,
     Shading,
 )
@@ -50,12 +50,12 @@ __all__ = [
     "method",
 ]
 
-_DENSITIES: tuple[type[Shaped], ...] = (Cosine, Opaque)
-_COLOURS: tuple[type[Shaped], ...] = (Constant, RayNet, OpaqueColour)
+_DENSITIES: tuple[type[Shaped], ...] = (Cosine, CustomDensity)
+_COLOURS: tuple[type[Shaped], ...] = (Constant, RayNet, CustomColour)
 
 
 def _kept(value: Tensor) -> bool:
-    return value.is_cpu or value.device.type in device.KINDS
+    return value.is_cpu or value.device.type in device.DEVICE_TYPES
 
 
 # ---------------------------------------------------------------- entrances
@@ -169,7 +169,7 @@ def check_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
         else f"type {type(value).__name__}"
     )
     raise FormError(
-        f"{who} returned {found}; expected a dense tensor of real numbers on the {' or '.join(device.KINDS)}"
+        f"{who} returned {found}; expected a dense tensor of real numbers on the {' or '.join(device.DEVICE_TYPES)}"
     )
 
 

@@ -21,16 +21,16 @@ from neuprim.core.cameras.world import World
 from neuprim.core.model.forms import (
     Constant,
     Cosine,
+    CustomColour,
+    CustomDensity,
     LoweredColour,
     LoweredDensity,
-    Opaque,
-    OpaqueColour,
     RayNet,
     Shade,
     Shading,
 )
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pieces import Piece
+from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
 
 if TYPE_CHECKING:
@@ -46,12 +46,12 @@ __all__ = [
     "Field",
     "LoweredColour",
     "LoweredDensity",
-    "Opaque",
-    "OpaqueColour",
+    "CustomDensity",
+    "CustomColour",
     "RayNet",
     "Shade",
     "Shading",
-    "pieces_by_name",
+    "prunable_units_by_name",
 ]
 
 Conditions = Mapping[str, Tensor]
@@ -147,7 +147,7 @@ class Field(ABC):
         (2, 1, 0)}``."""
         return {}
 
-    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[Self, dict[str, Tensor]]:
+    def reduce(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[Self, dict[str, Tensor]]:
         """A field with less of one of :meth:`reductions`, and its tensors: what is closest to this one's without
         training again.
 
@@ -163,16 +163,12 @@ class Field(ABC):
             f"{type(self).__name__} names {name} in reductions() and does not know how to reduce it"
         )
 
-    def pieces(self) -> tuple[Piece, ...]:
+    def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """What single primitives can do without, each a set of numbers that mean nothing once they are zero; no number
         is in two of them."""
         return ()
 
-    def earlier_pieces(self) -> tuple[Piece, ...]:
-        """Pieces that are none any more, by which files of earlier versions leave numbers out."""
-        return ()
-
-    def folded(self, params: Params) -> dict[str, Tensor]:
+    def canonicalize(self, params: Params) -> dict[str, Tensor]:
         """The same field in numbers that lie as close together as they can, for files where each has few bits.
 
         Where several sets of numbers mean the same field, as with the sign of a cosine's argument, one of them. Images
@@ -188,12 +184,11 @@ class Field(ABC):
         return None
 
 
-def pieces_by_name(density: DensityField, colour: ColourField, earlier: bool = False) -> dict[str, Piece]:
-    """The pieces of both fields, as ``density.neuron 0`` and ``colour.coefficient 1 +0, channel 2``; ``earlier``: with
-    those of earlier files."""
+def prunable_units_by_name(density: DensityField, colour: ColourField) -> dict[str, PrunableUnit]:
+    """The pieces of both fields, as ``density.neuron 0`` and ``colour.coefficient 1 +0, channel 2``."""
     found = {}
     for kind, own in (("density", density), ("colour", colour)):
-        for piece in (*own.pieces(), *(own.earlier_pieces() if earlier else ())):
+        for piece in own.prunable_units():
             found[f"{kind}.{piece.name}"] = piece
     return found
 
@@ -235,7 +230,7 @@ class DensityField(Field):
         none is known."""
         return None
 
-    def alive(self, params: Params, conditions: Conditions) -> Tensor | None:
+    def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
         """(M,) int64 ascending rows that can absorb anything under these conditions; None for all of them.
 
         The others are left out before anything else is computed, so they cost nothing in such a frame.

@@ -25,8 +25,8 @@ __all__ = [
     "Cosine",
     "LoweredColour",
     "LoweredDensity",
-    "Opaque",
-    "OpaqueColour",
+    "CustomDensity",
+    "CustomColour",
     "RayNet",
     "Shade",
     "Shading",
@@ -130,7 +130,7 @@ class Cosine(Shaped):
 
 
 @dataclass(frozen=True)
-class Opaque(Shaped):
+class CustomDensity(Shaped):
     """Any other density, as torch code per ray-primitive pair; the reference backend renders it.
 
     ``line_integral(prim, origin, direction, t0, t1)`` takes (M,) primitive rows, (M, 3) ray origins and unit directions
@@ -143,20 +143,20 @@ class Opaque(Shaped):
     def fault(self, sizes: Sizes) -> str | None:
         return labelled("line_integral", function_fault(self.line_integral))
 
-    def rows(self, index: Tensor | slice) -> Opaque:
+    def rows(self, index: Tensor | slice) -> CustomDensity:
         """That of some primitives, (M,) int64 or first:end."""
         if isinstance(index, slice):
-            return Opaque(lambda prim, *ray: self.line_integral(prim + (index.start or 0), *ray))
-        return Opaque(lambda prim, *ray: self.line_integral(index[prim], *ray))
+            return CustomDensity(lambda prim, *ray: self.line_integral(prim + (index.start or 0), *ray))
+        return CustomDensity(lambda prim, *ray: self.line_integral(index[prim], *ray))
 
-    def scaled(self, factors: Tensor) -> Opaque:
+    def scaled(self, factors: Tensor) -> CustomDensity:
         """sigma times (N,) factors, at least 0."""
 
         def line_integral(prim: Tensor, *ray: Tensor) -> Tensor:
             found = self.line_integral(prim, *ray)
             return found * factors.to(found)[prim]
 
-        return Opaque(line_integral)
+        return CustomDensity(line_integral)
 
     def optical_depth(self, pairs: Pairs) -> Tensor:
         """Integrals of sigma along chords as the code returns them, unchecked: see
@@ -164,7 +164,7 @@ class Opaque(Shaped):
         return self.line_integral(pairs.prim, pairs.origins, pairs.direction, *pairs.ends)
 
 
-LoweredDensity = Cosine | Opaque
+LoweredDensity = Cosine | CustomDensity
 
 
 # ---------------------------------------------------------------- closed forms of colour
@@ -190,7 +190,7 @@ class Constant(Shaped):
         """The same times (N,) factors, at least 0."""
         return Constant(self.rgb * factors.to(self.rgb)[:, None])
 
-    def seen(self, pairs: Pairs) -> Tensor:
+    def chord_colours(self, pairs: Pairs) -> Tensor:
         """(M, C) float64 colours that are seen along chords."""
         return self.rgb.double()[pairs.prim]
 
@@ -205,7 +205,7 @@ class Constant(Shaped):
 
 
 @dataclass(frozen=True)
-class OpaqueColour(Shaped):
+class CustomColour(Shaped):
     """Any other colour, as torch code per ray-primitive pair; the reference backend renders it.
 
     ``radiance(prim, x, d)`` takes (M,) primitive rows, (M, 3) chord middles in scene units and (M, 3) unit directions,
@@ -223,18 +223,18 @@ class OpaqueColour(Shaped):
         sizes["C"] = (self.channels, "channels")
         return labelled("radiance", function_fault(self.radiance))
 
-    def scaled(self, factors: Tensor) -> OpaqueColour:
+    def scaled(self, factors: Tensor) -> CustomColour:
         """The same times (N,) factors, at least 0."""
 
         def radiance(prim: Tensor, x: Tensor, d: Tensor) -> Tensor:
             found = self.radiance(prim, x, d)
             return found * factors.to(found)[prim, None]
 
-        return OpaqueColour(radiance, self.channels)
+        return CustomColour(radiance, self.channels)
 
-    def seen(self, pairs: Pairs) -> Tensor:
+    def chord_colours(self, pairs: Pairs) -> Tensor:
         """Colours that are seen along chords as the code returns them, unchecked: see
-        :meth:`~neuprim.core.model.primitives.Lowered.seen`."""
+        :meth:`~neuprim.core.model.primitives.Lowered.chord_colours`."""
         return self.radiance(pairs.prim, pairs.points, pairs.direction)
 
     def at_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
@@ -295,7 +295,7 @@ class RayNet(Shaped):
         mixed = (self.Wout.double()[prim] * phase.cos()[:, None, :]).sum(-1)
         return (self.base.double()[prim] + mixed).clamp_min(0)
 
-    def seen(self, pairs: Pairs) -> Tensor:
+    def chord_colours(self, pairs: Pairs) -> Tensor:
         """(M, C) float64 colours that are seen along chords; differentiable."""
         return self.radiance(pairs.prim, pairs.local)
 
@@ -305,7 +305,7 @@ class RayNet(Shaped):
         return self.radiance(torch.arange(geometry.count, device=middles.device), middles)
 
 
-LoweredColour = Constant | RayNet | OpaqueColour
+LoweredColour = Constant | RayNet | CustomColour
 """Of each: ``channels``, and ``per_primitive``, whether a colour at its centre says what a primitive looks like from a
 direction."""
 

@@ -38,7 +38,7 @@ from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import function_fault
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["Living", "Lowered", "Primitives"]
+__all__ = ["ActiveSet", "Lowered", "Primitives"]
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class Lowered:
         check_colour(self.colour, sizes, colour)
         if self.rows is not None:
             check_rows(self.rows, None, "Lowered.rows holds", sizes["N"][0])
-        self.check_seen(viewmat, background)
+        self.check_frame(viewmat, background)
 
-    def check_seen(self, viewmat: Any, background: Any) -> None:
+    def check_frame(self, viewmat: Any, background: Any) -> None:
         """What :meth:`Primitives.lower`, which has looked at the rest, has not seen.
 
         Raises:
@@ -133,18 +133,18 @@ class Lowered:
             self.density.optical_depth(pairs), (len(pairs),), f"{self.source('density')}: line_integral"
         ).double()
 
-    def seen(self, pairs: Pairs) -> Tensor:
+    def chord_colours(self, pairs: Pairs) -> Tensor:
         """(M, C) float64 colours that are seen along chords.
 
         Raises:
             FormError: the colour's own code returned something else.
         """
-        found = self.colour.seen(pairs)
+        found = self.colour.chord_colours(pairs)
         return check_result(found, (len(pairs), self.colour.channels), f"{self.source('colour')}: radiance").double()
 
 
 @dataclass(frozen=True)
-class Living:
+class ActiveSet:
     """The M primitives that can absorb anything under some conditions.
 
     Attributes:
@@ -163,7 +163,7 @@ class Living:
     geometry: Geometry
 
     def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
-        """World density (P,), 1/scene unit, unclamped, of the living primitives ``prim`` (P,), 0..M-1, at points ``x``
+        """World density (P,), 1/scene unit, unclamped, of the active primitives ``prim`` (P,), 0..M-1, at points ``x``
         (P, 3)."""
         found = self.field.density(self.own, self.stored, prim, x, self.conditions)
         return check_result(found, (len(prim),), method(self.field, "density"))
@@ -234,7 +234,7 @@ class Primitives:
         return {name: params[name] for name in self._names[field is self.colour]}
 
     def lower(self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None) -> Lowered:
-        """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left
+        """Fold a frame's conditions into closed forms; differentiable. Primitives that are not active in it are left
         out.
 
         ``settings`` are for images that a colour field needs first, such as a shadow's; None: the defaults.
@@ -242,13 +242,13 @@ class Primitives:
         Raises:
             FormError: a field hands over tensors that do not fit.
         """
-        living = self.living(conditions)
-        geometry = living.geometry
+        active = self.active(conditions)
+        geometry = active.geometry
         names = (type(self.density).__name__, type(self.colour).__name__)
         sizes = check_geometry(geometry, "geometry")
-        density = self._lower_density(living, conditions)
+        density = self._lower_density(active, conditions)
         check_density(density, sizes, names[0])  # before the colour looks at it, which may draw it
-        own = self._of(self.colour, living.params)
+        own = self._of(self.colour, active.params)
         colour = self.colour.lower(own, geometry, camera, conditions)
         check_colour(colour, sizes, names[1])
         check_channels(sizes["C"][0], self.colour)
@@ -256,18 +256,18 @@ class Primitives:
         shading = check_shading(found, geometry.count, method(self.colour, "shade"))
         if shading.primitives is not None:
             colour = colour.scaled(shading.primitives)
-        return Lowered(geometry, density, colour, living.rows, shading.pixels, names)
+        return Lowered(geometry, density, colour, active.rows, shading.pixels, names)
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
         """Where the primitives that live in a frame are, and their density; no camera needed."""
-        living = self.living(conditions)
-        density = self._lower_density(living, conditions)
-        check_density(density, check_geometry(living.geometry, "geometry"), type(self.density).__name__)
-        return living.geometry, density
+        active = self.active(conditions)
+        density = self._lower_density(active, conditions)
+        check_density(density, check_geometry(active.geometry, "geometry"), type(self.density).__name__)
+        return active.geometry, density
 
-    def _lower_density(self, living: Living, conditions: Conditions) -> LoweredDensity:
+    def _lower_density(self, active: ActiveSet, conditions: Conditions) -> LoweredDensity:
         try:
-            return self.density.lower(living.own, living.geometry, conditions)
+            return self.density.lower(active.own, active.geometry, conditions)
         except FormError as error:  # of a sum of forms, which knows no field
             raise FormError(f"{method(self.density, 'lower')}: {error}") from error
 
@@ -294,12 +294,12 @@ class Primitives:
             if value is not own[name]:
                 own[name].copy_(value)
 
-    def living(self, conditions: Conditions, dtype: torch.dtype | None = None) -> Living:
+    def active(self, conditions: Conditions, dtype: torch.dtype | None = None) -> ActiveSet:
         """Which primitives live in a frame, and where; differentiable. With ``dtype``, everything is detached and of
         that type."""
-        rows = self.density.alive(self.of(self.density), conditions)
+        rows = self.density.active_rows(self.of(self.density), conditions)
         if rows is not None:
-            check_rows(rows, self.count, f"{method(self.density, 'alive')} returned")
+            check_rows(rows, self.count, f"{method(self.density, 'active_rows')} returned")
         if rows is None:
             params = self.params
         else:
@@ -314,28 +314,28 @@ class Primitives:
         moved = self.density.move(own, stored, conditions)
         if moved is not stored:
             check_geometry(moved, method(self.density, "move"), stored.count)
-        return Living(self.density, conditions, rows, params, own, stored, moved)
+        return ActiveSet(self.density, conditions, rows, params, own, stored, moved)
 
-    def places(self, conditions: Conditions) -> tuple[Tensor | None, Geometry]:
+    def active_geometry(self, conditions: Conditions) -> tuple[Tensor | None, Geometry]:
         """Rows of the primitives that live in a frame, None for all, and where they are; without gradient, and copying
         what places them alone."""
         own = {name: value.detach() for name, value in self.of(self.density).items()}
-        rows = self.density.alive(own, conditions)
+        rows = self.density.active_rows(own, conditions)
         geometry = Geometry(*(self.params[name].detach() for name in ("means", "log_scales", "quats")))
         if rows is not None:
-            check_rows(rows, self.count, f"{method(self.density, 'alive')} returned")
+            check_rows(rows, self.count, f"{method(self.density, 'active_rows')} returned")
             own, geometry = {name: value[rows] for name, value in own.items()}, geometry[rows]
         moved = self.density.move(own, geometry, conditions)
         check_geometry(moved, method(self.density, "move"), geometry.count)
         return rows, moved
 
-    def forms(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
+    def lower_unchecked(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
         """As :meth:`lower`, unchecked and unshaded: what kind of forms the fields lower to."""
-        living = self.living(conditions)
-        own = self._of(self.colour, living.params)
-        density = self._lower_density(living, conditions)
+        active = self.active(conditions)
+        own = self._of(self.colour, active.params)
+        density = self._lower_density(active, conditions)
         return Lowered(
-            living.geometry, density, self.colour.lower(own, living.geometry, camera, conditions), living.rows
+            active.geometry, density, self.colour.lower(own, active.geometry, camera, conditions), active.rows
         )
 
     def to(self, device: torch.device) -> Primitives:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
-from neuprim.core.compute.operation import applied, asked
+from neuprim.core.compute.operation import apply_autograd, needs_grad
 from neuprim.core.compute.threads import parallel_for
 
 __all__ = ["take_rows"]
@@ -29,9 +29,9 @@ def take_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
 
     Nothing is checked: the kernels would read and write beyond the ends.
     """
-    if not device.fused(rows, *tensors.values()) or (len(rows) < _FEW and not asked(*tensors.values())):
+    if not device.on_numba(rows, *tensors.values()) or (len(rows) < _FEW and not needs_grad(*tensors.values())):
         return {name: value.index_select(0, rows) for name, value in tensors.items()}
-    return dict(zip(tensors, applied(_Rows, rows, *tensors.values()), strict=True))
+    return dict(zip(tensors, apply_autograd(_Rows, rows, *tensors.values()), strict=True))
 
 
 @exact_kernel

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from importlib import resources
 
-__all__ = ["script_beside"]
+__all__ = ["read_script"]
 
 
-def script_beside(package: str, name: str) -> str:
-    """The text of a script of an importable package, ``script_beside(__package__, "density.js")``."""
+def read_script(package: str, name: str) -> str:
+    """The text of a script of an importable package, ``read_script(__package__, "density.js")``."""
     return resources.files(package).joinpath(name).read_text(encoding="utf-8")

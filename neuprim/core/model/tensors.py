@@ -48,8 +48,8 @@ def tensor_fault(value: Any) -> str | None:
     """``"dtype torch.int64; expected torch.float32 or torch.float64"`` and the like of what no kernel can read."""
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}; expected a torch tensor"
-    if not value.is_cpu and value.device.type not in device.KINDS:
-        return f"device {value.device}; expected {' or '.join(device.KINDS)}, where models are kept"
+    if not value.is_cpu and value.device.type not in device.DEVICE_TYPES:
+        return f"device {value.device}; expected {' or '.join(device.DEVICE_TYPES)}, where models are kept"
     if value.layout is not torch.strided or value.is_nested:
         return f"layout {'nested' if value.is_nested else value.layout}; expected a dense tensor"
     if value.dtype not in _DTYPES:

@@ -12,7 +12,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.rays import AnyCamera, RayCamera
 from neuprim.core.compute import device
-from neuprim.core.compute.threads import limited
+from neuprim.core.compute.threads import limit_threads
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.primitives import Lowered, Primitives
@@ -70,10 +70,10 @@ def render(
     """
     settings = settings or RenderSettings(near="auto")
     with (
-        limited(settings.threads) if settings.threads else nullcontext()
+        limit_threads(settings.threads) if settings.threads else nullcontext()
     ):  # fields are lowered by as many threads as pixels
         lowered = model.lower(camera, conditions or {}, settings)
-        lowered.check_seen(camera.viewmat, background)
+        lowered.check_frame(camera.viewmat, background)
         return _drawn(lowered, camera, settings, background)
 
 
@@ -94,7 +94,7 @@ def _drawn(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, backgr
         refuse_non_finite(lowered)
     draw = backend.load()
     if backend.place(settings) != lowered.kind:
-        draw = elsewhere(draw, device.of_kind(backend.place(settings)))
+        draw = elsewhere(draw, device.current_device(backend.place(settings)))
     if background is not None:
         background = background.to(lowered.geometry.means.device, non_blocking=background.is_cpu)
     paint: Draw = draw if lowered.shade is None else with_shade(draw)

@@ -94,13 +94,13 @@ class Backend:
     compiles: bool = False
     checks: bool = False
     differentiates_intrinsics: bool = False
-    devices: tuple[str, ...] = (hardware.PROCESSOR,)
+    devices: tuple[str, ...] = (hardware.CPU,)
     parts: Callable[[], Callable[..., tuple[Tensor, Tensor]] | None] = _nothing
 
     @property
     def lacking(self) -> str | None:
         """Why this machine cannot run it on its own device; None if it can."""
-        return (hardware.card_missing() if self.devices[0] == hardware.CARD else None) or self.missing()
+        return (hardware.cuda_unavailable() if self.devices[0] == hardware.CUDA else None) or self.missing()
 
     def place(self, settings: RenderSettings) -> str:
         """The kind of device that it draws on under these settings."""
@@ -114,7 +114,7 @@ class Backend:
         """Why it cannot draw on this kind of device here, as the rest of a sentence; None if it can."""
         if place not in self.devices:
             return f"draws on the {' or '.join(self.devices)}, but renderer.device is {place}"
-        missing = (hardware.card_missing() if place == hardware.CARD else None) or self.missing()
+        missing = (hardware.cuda_unavailable() if place == hardware.CUDA else None) or self.missing()
         return None if missing is None else f"cannot run here: {missing}"
 
     def fault(self, lowered: Lowered, camera: AnyCamera | None, place: str | None = None) -> str | None:
@@ -172,7 +172,7 @@ def _cuda_parts() -> Callable[..., tuple[Tensor, Tensor]]:
 
 
 def _card() -> str:
-    return "cuda (no card)" if hardware.card_missing() else f"cuda ({torch.cuda.get_device_name()})"
+    return "cuda (no card)" if hardware.cuda_unavailable() else f"cuda ({torch.cuda.get_device_name()})"
 
 
 def _reference() -> Draw:
@@ -189,7 +189,7 @@ TABLE: tuple[Backend, ...] = (
         _card,
         _no_warp,
         checks=True,
-        devices=(hardware.CARD, hardware.PROCESSOR),
+        devices=(hardware.CUDA, hardware.CPU),
         parts=_cuda_parts,
     ),
     Backend("cpu", _cpu, kernels_refuse, compiles=True, checks=True, parts=_cpu_parts),
@@ -229,7 +229,7 @@ def find(name: str) -> Backend:
     raise ConfigError(f"renderer.backend={name}: expected the name of one backend: {', '.join(names())}")
 
 
-def candidates(settings: RenderSettings, kind: str = hardware.PROCESSOR) -> tuple[Backend, ...]:
+def candidates(settings: RenderSettings, kind: str = hardware.CPU) -> tuple[Backend, ...]:
     """Those that may draw tensors on a ``kind`` of device under these settings, whatever is drawn.
 
     Tensors stay where they are if they can: those on the processor go to a card only where the settings say so.
@@ -241,15 +241,15 @@ def candidates(settings: RenderSettings, kind: str = hardware.PROCESSOR) -> tupl
         return (find(settings.backend),)
     chosen = kind if settings.device == AUTO else settings.device
     own = tuple(backend for backend in TABLE if backend.devices[0] == chosen and backend.absent(chosen) is None)
-    if chosen == hardware.PROCESSOR or settings.device != AUTO:
+    if chosen == hardware.CPU or settings.device != AUTO:
         return own
     return own + candidates(settings)
 
 
 def no_card() -> str | None:
     """Why nothing is drawn on a card here, in words; None if something is."""
-    missing = hardware.card_missing()
-    rows = [backend.missing() for backend in TABLE if backend.devices[0] == hardware.CARD]
+    missing = hardware.cuda_unavailable()
+    rows = [backend.missing() for backend in TABLE if backend.devices[0] == hardware.CUDA]
     if missing is None and not rows:
         return "no backend draws there"
     return missing or (None if None in rows else rows[0])
@@ -274,13 +274,13 @@ def check_device(settings: RenderSettings) -> None:
     Raises:
         BackendUnavailable: naming the setting, and why.
     """
-    if settings.device == hardware.CARD:
-        why = no_card() if settings.backend == AUTO else hardware.card_missing()
+    if settings.device == hardware.CUDA:
+        why = no_card() if settings.backend == AUTO else hardware.cuda_unavailable()
         if why is not None:
-            raise BackendUnavailable(f"renderer.device={hardware.CARD}: {why}; expected {hardware.PROCESSOR} or {AUTO}")
+            raise BackendUnavailable(f"renderer.device={hardware.CUDA}: {why}; expected {hardware.CPU} or {AUTO}")
     elif settings.device == AUTO and settings.backend != AUTO:
         backend = find(settings.backend)
-        if backend.devices[0] == hardware.CARD and backend.lacking is not None:
+        if backend.devices[0] == hardware.CUDA and backend.lacking is not None:
             raise BackendUnavailable(
                 f"renderer.backend={backend.name} cannot run here: {backend.lacking}; expected {AUTO} or the name of another backend"
             )
@@ -289,13 +289,13 @@ def check_device(settings: RenderSettings) -> None:
 def at_hand(settings: RenderSettings) -> RenderSettings:
     """The same for what is drawn again later, perhaps on another machine: a card that is not there is not insisted
     on."""
-    gone = settings.device == hardware.CARD and no_card() is not None and settings.backend == AUTO
+    gone = settings.device == hardware.CUDA and no_card() is not None and settings.backend == AUTO
     return replace(settings, device="auto") if gone else settings
 
 
 def compiled_ahead(settings: RenderSettings) -> Backend | None:
     """The one that a run may want to compile beside its other preparations, whatever it will draw."""
-    kind = hardware.CARD if no_card() is None else hardware.PROCESSOR
+    kind = hardware.CUDA if no_card() is None else hardware.CPU
     return next((backend for backend in candidates(settings, kind) if backend.compiles), None)
 
 
@@ -312,15 +312,15 @@ def run_device(settings: RenderSettings, forms: Callable[[], Lowered], camera: A
     kind: str = settings.device
     if kind == AUTO and settings.backend != AUTO:
         kind = find(settings.backend).devices[0]
-        if kind == hardware.CARD and hardware.card_missing() is not None:
-            kind = hardware.PROCESSOR  # the first frame says why it is not drawn
+        if kind == hardware.CUDA and hardware.cuda_unavailable() is not None:
+            kind = hardware.CPU  # the first frame says why it is not drawn
     elif kind == AUTO:
-        kind = hardware.PROCESSOR
+        kind = hardware.CPU
         if no_card() is None:
             lowered = forms()
-            if any(b.fault(lowered, camera) is None for b in TABLE if b.devices[0] == hardware.CARD):
-                kind = hardware.CARD
-    return hardware.of_kind(kind)
+            if any(b.fault(lowered, camera) is None for b in TABLE if b.devices[0] == hardware.CUDA):
+                kind = hardware.CUDA
+    return hardware.current_device(kind)
 
 
 def computing_device(settings: RenderSettings) -> torch.device:
@@ -328,8 +328,8 @@ def computing_device(settings: RenderSettings) -> torch.device:
     allow and that is there."""
     kind: str = settings.device
     if kind == AUTO:
-        kind = hardware.CARD if settings.backend == AUTO else find(settings.backend).devices[0]
-    return hardware.of_kind(hardware.PROCESSOR if kind == hardware.CARD and no_card() is not None else kind)
+        kind = hardware.CUDA if settings.backend == AUTO else find(settings.backend).devices[0]
+    return hardware.current_device(hardware.CPU if kind == hardware.CUDA and no_card() is not None else kind)
 
 
 def choose(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None = None) -> Backend:

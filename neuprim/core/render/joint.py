@@ -217,7 +217,7 @@ def _march(
         tau = tau * scale[chord]
 
     # emission and absorption: a cell's colour is the mean of its primitives', weighted by optical depth
-    c = lowered.seen(chords)
+    c = lowered.chord_colours(chords)
     cells = middle.shape[1]
     at = ray[chord] * cells + cell
     depth = torch.zeros(P * cells, dtype=torch.float64).index_add(0, at, tau)

@@ -23,4 +23,4 @@ def device_of(model: Primitives, settings: RenderSettings, camera: AnyCamera, co
         ConfigError: there is no backend of the name asked for.
     """
     few = Primitives(model.density, model.colour, model.rows(torch.arange(min(model.count, _FEW), device=model.device)))
-    return run_device(settings, lambda: few.forms(camera, conditions), camera)
+    return run_device(settings, lambda: few.lower_unchecked(camera, conditions), camera)

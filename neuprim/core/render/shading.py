@@ -25,9 +25,9 @@ def points_seen(depth: Tensor, camera: AnyCamera) -> Tensor:
     """(H, W, 3) float64 scene points at a depth image (H, W): camera-z, or distance for a ``RayCamera``; no
     gradient."""
     depth = depth.detach().double()
-    view = device.beside(camera.viewmat.detach(), depth)
+    view = device.to_like(camera.viewmat.detach(), depth)
     if isinstance(camera, RayCamera):
-        local = device.beside(camera.directions.detach(), depth) * depth[..., None]
+        local = device.to_like(camera.directions.detach(), depth) * depth[..., None]
     else:
         x = (torch.arange(camera.width, dtype=torch.float64, device=depth.device) + 0.5 - camera.cx) / camera.fx
         y = (torch.arange(camera.height, dtype=torch.float64, device=depth.device) + 0.5 - camera.cy) / camera.fy

@@ -47,7 +47,7 @@ def photometric(settings: Mapping[str, Any]) -> Loss:
 
     def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
         if rendered.dtype == torch.float32 and weight > 0 and min(rendered.shape[:2]) >= 11:
-            if not device.fused(rendered, truth):
+            if not device.on_numba(rendered, truth):
                 return photometric_torch(rendered, truth, weight)
             if rendered.shape[2] <= 51:
                 from neuprim.core.train.ssim_cpu import photometric_fused

@@ -90,7 +90,7 @@ _INFINITY = 0x7F800000
 
 
 def _check_gradient(name: str, grad: Tensor) -> None:
-    if device.fused(grad) and grad.dtype == torch.float32:
+    if device.on_numba(grad) and grad.dtype == torch.float32:
         fine = _largest_bits(grad.contiguous().reshape(-1).numpy()) < _INFINITY
     else:
         fine = bool(torch.isfinite(grad).all())
@@ -141,9 +141,9 @@ class RowAdam:
             value, grad = params[spec.name].detach(), params[spec.name].grad
             if grad is not None and value.numel():
                 updates.append((spec, value, grad))
-        if updates and device.kernels(self.age) and self._step_kernels(updates, rates):
+        if updates and device.on_warp(self.age) and self._step_kernels(updates, rates):
             return
-        fused = device.fused(self.age)
+        fused = device.on_numba(self.age)
         if fused or not _all_finite([grad for _, _, grad in updates]):
             for spec, _, grad in updates:
                 _check_gradient(spec.name, grad)

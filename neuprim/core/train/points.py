@@ -62,16 +62,16 @@ def point_step(
     colour = samples.source is not None and settings.voxel_colour > 0
     found = values_at(model, samples.conditions, samples.points, colour, threads)
     where = found.sigma.device
-    wrong = (found.sigma - device.from_host(samples.sigma, where)) / samples.sigma_scale
+    wrong = (found.sigma - device.copy_from_host(samples.sigma, where)) / samples.sigma_scale
     loss = wrong.square().mean()
     parts = {"voxel_sigma": loss.item()}
     if found.source is not None and samples.source is not None:
-        light = ((found.source - device.from_host(samples.source, where)) / samples.source_scale).square().mean()
+        light = ((found.source - device.copy_from_host(samples.source, where)) / samples.source_scale).square().mean()
         parts["voxel_source"] = light.item()
         loss = loss + settings.voxel_colour * light
     for name, (value, scale) in samples.components.items():
         if name in found.components:
-            part = ((found.components[name] - device.from_host(value, where)) / scale).square().mean()
+            part = ((found.components[name] - device.copy_from_host(value, where)) / scale).square().mean()
             loss = loss + _COMPONENT * part
     peak = max(float(samples.sigma.max()), 1e-30) / samples.sigma_scale
     psnr = -10 * math.log10(max(parts["voxel_sigma"] / peak**2, 1e-20))

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.data import Dataset, PointSamples
-from neuprim.core.model.fields import pieces_by_name
-from neuprim.core.model.pieces import worth
+from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.prunable import removal_effect
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.volumes.points import values_at
 
@@ -56,7 +56,7 @@ class _Sums:
     """What backward passes of random signs say of a model's numbers, summed."""
 
     def __init__(self, model: Primitives) -> None:
-        self._model, self._pieces = model, pieces_by_name(model.density, model.colour)
+        self._model, self._pieces = model, prunable_units_by_name(model.density, model.colour)
         self.pieces = {name: torch.zeros(model.count) for name in self._pieces}
         self.columns = {spec.name: torch.zeros(spec.size, dtype=torch.float64) for spec in model.specs}
 
@@ -66,7 +66,7 @@ class _Sums:
             name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()
         }
         for name, piece in self._pieces.items():
-            self.pieces[name] += worth(piece, params, gradients).square().cpu()
+            self.pieces[name] += removal_effect(piece, params, gradients).square().cpu()
         for name, own in self.columns.items():
             slopes = gradients[name].reshape(self._model.count, len(own))
             if name == "quats":  # a change of a quaternion counts as it turns, whatever its norm
@@ -125,7 +125,7 @@ def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: in
             Primitives(model.density, model.colour, params), samples.conditions, samples.points, False, threads
         )
         signs = (2 * torch.randint(0, 2, (len(samples.points),), generator=generator) - 1).float()
-        signs = device.from_host(signs / samples.sigma_scale / len(signs) ** 0.5, values.sigma.device)
+        signs = device.copy_from_host(signs / samples.sigma_scale / len(signs) ** 0.5, values.sigma.device)
         shares = values.watch(signs)
         (values.sigma * signs).sum().backward()
         rows = torch.arange(model.count) if values.rows is None else values.rows.cpu()

@@ -38,7 +38,7 @@ def _blurred(maps: Tensor) -> Tensor:
 
 def _measured(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
     """Means of |x - y| and of SSIM, (2,) float64, and the gradient (H, W, C); in a few kernels where there are some."""
-    if device.kernels(rendered, truth) and rendered.dtype == truth.dtype == torch.float32:
+    if device.on_warp(rendered, truth) and rendered.dtype == truth.dtype == torch.float32:
         from neuprim.core.train.ssim_warp import similarity
 
         return similarity(rendered, truth, weight)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.compute.threads import limited
+from neuprim.core.compute.threads import limit_threads
 from neuprim.core.data import Dataset, Pixels, PointSamples
 from neuprim.core.data.check import check_pixels
 from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, RankError, nearest
@@ -92,7 +92,7 @@ class Trainer:
         self.device = device_of(model, self.renderer, first.camera, first.conditions)
         model.params = model.to(self.device).params
         self._ahead = (
-            Ahead(self._pixels, device.spare_memory(self.device) // 4) if self.device.type == device.CARD else None
+            Ahead(self._pixels, device.free_cuda_memory(self.device) // 4) if self.device.type == device.CUDA else None
         )
         self.population = make_population(settings.population)
         self.angles = None if settings.angular_size is None else AngularSize(dataset.train, settings.angular_size)
@@ -193,7 +193,7 @@ class Trainer:
         """
         drawn = self.order, self.generator.get_state() if self.ranks.size > 1 else None
         try:
-            with limited(self.renderer.threads):
+            with limit_threads(self.renderer.threads):
                 return self._train_step()
         except (
             RankError

@@ -107,7 +107,7 @@ def density_grid(
         ellipsoids = (geometry.means.double(), geometry.scales.double(), geometry.rotations.double())
         if isinstance(form, Cosine):
             neurons = (form.W1.double(), form.b1.double(), form.w2.double(), form.b2.reshape(-1).double())
-            if device.computes(where):
+            if device.has_warp(where):
                 from neuprim.core.volumes import grid_warp
 
                 ways = torch.from_numpy(forward[:3]), torch.from_numpy(back[:3])
@@ -129,15 +129,15 @@ def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Ten
     """(M,) float64 extinction, 1/scene unit, at (M, 3) points: every primitive at every point, in float64. Slow, short,
     and the oracle."""
     with torch.no_grad():
-        living = model.to(device.HOST).living(conditions, torch.float64)
-        geometry = living.geometry
+        active = model.to(device.HOST).active(conditions, torch.float64)
+        geometry = active.geometry
         total = torch.zeros(len(points), dtype=torch.float64)
         whiten = geometry.rotations / geometry.scales[:, None, :]
         for part in torch.arange(len(points)).split(max(1, _PAIRS // max(geometry.count, 1))):
             x = points[part].double()
             y = torch.einsum("mna,nab->mnb", x[:, None, :] - geometry.means, whiten)
             row, prim = (y.square().sum(-1) < 1.0).nonzero(as_tuple=True)
-            total.index_add_(0, part[row], living.sigma(prim, x[row]).clamp_min(0))
+            total.index_add_(0, part[row], active.sigma(prim, x[row]).clamp_min(0))
     return total
 
 
@@ -146,7 +146,7 @@ def _ask(
 ) -> None:
     """Adds a density in torch code, primitive by primitive in a fixed order, so that the sums are the same every
     time."""
-    living = model.living(conditions, torch.float64)
+    active = model.active(conditions, torch.float64)
     means, scales, R = wide
     limit = np.array(grid.shape)
     for n in range(len(means)):
@@ -164,7 +164,7 @@ def _ask(
             x = index @ P[:3, :3].T + P[:3, 3]
             inside = (np.square(((x - means[n]) @ R[n]) / scales[n]).sum(-1) < 1.0).nonzero()
             points = torch.from_numpy(x[inside])
-            found = living.sigma(torch.full((len(points),), n), points).clamp_min(0).numpy()
+            found = active.sigma(torch.full((len(points),), n), points).clamp_min(0).numpy()
             grid[block][inside] += found.astype(np.float32)
 
 

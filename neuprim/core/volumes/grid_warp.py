@@ -146,8 +146,8 @@ def filled(
             w2 (N, K) and b2 (N,), the same.
         P: (3, 4) float64, indices to the scene. Q: (3, 4), back.
     """
-    W1, b1, w2, b2 = (device.from_host(x, where) for x in neurons)
-    means, scales, rotations = (device.from_host(x, where) for x in ellipsoids)
+    W1, b1, w2, b2 = (device.copy_from_host(x, where) for x in neurons)
+    means, scales, rotations = (device.copy_from_host(x, where) for x in ellipsoids)
     m = scales.amax(1)
     whiten = (rotations / scales[:, None, :]).transpose(1, 2).contiguous()
     prims = (
@@ -155,8 +155,8 @@ def filled(
         array((omega0 * W1 / m[:, None, None]).contiguous(), wp.vec3d), array((omega0 * b1).contiguous(), d),
         array((w2 / m[:, None]).contiguous(), d), array((b2 / m).contiguous(), d),
     )  # fmt: skip
-    rows = array(device.from_host(P.contiguous(), where), wp.vec4d)
-    boxes = _Boxes.of(means, scales, rotations, device.from_host(Q.contiguous(), where), shape)
+    rows = array(device.copy_from_host(P.contiguous(), where), wp.vec4d)
+    boxes = _Boxes.of(means, scales, rotations, device.copy_from_host(Q.contiguous(), where), shape)
     tiles = tuple(-(-n // t) for n, t in zip(shape, _TILE, strict=True))
     planes = max(1, _POINTS // (_TILE[0] * shape[1] * shape[2]))
     grid = np.empty(shape, np.float32)

@@ -23,7 +23,7 @@ from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.colours.sh import C0
 from neuprim.core.model.fields import ColourField, Conditions, Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Living, Primitives
+from neuprim.core.model.primitives import ActiveSet, Primitives
 from neuprim.core.volumes.points_cpu import add_values, count_pairs, fill_pairs, pull_values
 from neuprim.core.volumes.points_prepare import merge_parts, prepare_axes, prepare_values, pull_parameters, sort_points
 from neuprim.core.volumes.points_torch import cosine_values, numbers_finite, pairs_on, summed
@@ -89,24 +89,24 @@ def values_at(
     Raises:
         NonFiniteError: a parameter is NaN or infinite, or so large that the values are.
     """
-    living = model.living(conditions)
-    colors = _flat_colours(model.colour, living, conditions) if colour else None
-    named = model.density.components(living.own)
+    active = model.active(conditions)
+    colors = _flat_colours(model.colour, active, conditions) if colour else None
+    named = model.density.components(active.own)
     columns = [
         *([] if colors is None else [colors]),
         *(share[:, None] for share in named.values()),
     ]  # what sums are weighted by, alike
     weights = torch.cat(columns, 1) if columns else None
-    form = model.density.lower(living.own, living.geometry, conditions)
-    shares = Shares(living.geometry.count, living.geometry.means.device)
+    form = model.density.lower(active.own, active.geometry, conditions)
+    shares = Shares(active.geometry.count, active.geometry.means.device)
     places = points.detach().double().cpu().contiguous().numpy()
-    if not device.fused(living.geometry.means):
-        if not numbers_finite(living.geometry, form):
+    if not device.on_numba(active.geometry.means):
+        if not numbers_finite(active.geometry, form):
             model.check_finite()
             raise NonFiniteError("extinction at points: a product of finite parameters is not finite")
-        sigma, sums = _elsewhere(living, form, places, weights, shares)
+        sigma, sums = _elsewhere(active, form, places, weights, shares)
     elif isinstance(form, Cosine):
-        g, shown = living.geometry, torch.zeros(living.geometry.count, 0) if weights is None else weights
+        g, shown = active.geometry, torch.zeros(active.geometry.count, 0) if weights is None else weights
         given = (g.means, g.log_scales, g.quats, form.W1, form.b1, form.w2, form.b2.reshape(-1), shown)
         try:
             whole = _Values.apply(places, form.omega0, form.edge, shares, threads, *given)
@@ -115,21 +115,21 @@ def values_at(
             raise
         sigma, sums = whole[:, 0], (None if weights is None else whole[:, 1:])
     else:
-        sigma, sums = _asked(living, places, weights, shares)
+        sigma, sums = _asked(active, places, weights, shares)
     width = 0 if colors is None else colors.shape[1]
     source = None if colors is None or sums is None else sums[:, :width]
     return PointValues(
         sigma,
         source,
-        living.rows,
+        active.rows,
         shares,
         {} if sums is None else dict(zip(named, sums[:, width:].unbind(1), strict=True)),
     )
 
 
-def _flat_colours(field: ColourField, living: Living, conditions: Conditions) -> Tensor | None:
+def _flat_colours(field: ColourField, active: ActiveSet, conditions: Conditions) -> Tensor | None:
     """(N, C) the colours without what depends on direction, at least 0."""
-    own = {spec.name: living.params[spec.name] for spec in field.parameters()}
+    own = {spec.name: active.params[spec.name] for spec in field.parameters()}
     found = field.harmonics(own, conditions)
     return None if found is None else (found[0] * C0 + 0.5).clamp_min(0.0)
 
@@ -284,14 +284,14 @@ def pairs_of(geometry: Geometry, points: np.ndarray) -> tuple[Tensor, Tensor]:
 
 
 def _elsewhere(
-    living: Living, form: LoweredDensity, places: np.ndarray, colors: Tensor | None, shares: Shares
+    active: ActiveSet, form: LoweredDensity, places: np.ndarray, colors: Tensor | None, shares: Shares
 ) -> tuple[Tensor, Tensor | None]:
     """The same of a model that compiled code cannot read."""
-    g = living.geometry
+    g = active.geometry
     cells = cells_of(places)
     point, prim = pairs_on(g, cells.order, cells.grid, cells.placed)
-    x = device.from_host(torch.from_numpy(places), g.means.device)[point]
-    values = cosine_values(form, g, prim, x) if isinstance(form, Cosine) else living.sigma(prim, x.to(g.means)).double()
+    x = device.copy_from_host(torch.from_numpy(places), g.means.device)[point]
+    values = cosine_values(form, g, prim, x) if isinstance(form, Cosine) else active.sigma(prim, x.to(g.means)).double()
     sigma = values.clamp_min(0)
     columns = [sigma[:, None]] if colors is None else [sigma[:, None], sigma[:, None] * colors.double()[prim]]
     whole = summed(len(places), point, torch.cat(columns, 1)).float()
@@ -307,9 +307,11 @@ def _elsewhere(
     return whole[:, 0], (None if colors is None else whole[:, 1:])
 
 
-def _asked(living: Living, places: np.ndarray, colors: Tensor | None, shares: Shares) -> tuple[Tensor, Tensor | None]:
-    point, prim = pairs_of(living.geometry, places)
-    sigma = living.sigma(prim, torch.from_numpy(places).to(living.geometry.means)[point]).clamp_min(0)
+def _asked(
+    active: ActiveSet, places: np.ndarray, colors: Tensor | None, shares: Shares
+) -> tuple[Tensor, Tensor | None]:
+    point, prim = pairs_of(active.geometry, places)
+    sigma = active.sigma(prim, torch.from_numpy(places).to(active.geometry.means)[point]).clamp_min(0)
     columns = [sigma[:, None]] if colors is None else [sigma[:, None], sigma[:, None] * colors.to(sigma)[prim]]
     pairs = torch.cat(columns, 1)
     whole = torch.zeros(len(places), pairs.shape[1], dtype=pairs.dtype).index_add(0, point, pairs)

@@ -27,7 +27,7 @@ def pairs_on(geometry: Geometry, sorted_by: np.ndarray, grid: Grid, sorted_point
     """
     means, scales, axes = (x.detach().double() for x in (geometry.means, geometry.scales, geometry.rotations.double()))
     order, starts, low, counts, placed = (
-        device.from_host(torch.from_numpy(x), means.device) for x in (sorted_by, *grid[:2], grid[3], sorted_points)
+        device.copy_from_host(torch.from_numpy(x), means.device) for x in (sorted_by, *grid[:2], grid[3], sorted_points)
     )
     reach = (axes * scales[:, None, :]).norm(dim=2)
     first = ((means - reach - low) / grid[2]).clamp_min(0.0).floor().minimum(counts).long()

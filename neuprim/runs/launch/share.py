@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager, nullcontext
 
 from neuprim.config.launcher import LauncherSettings
-from neuprim.core.compute.threads import machine_cores, sharing
+from neuprim.core.compute.threads import limit_process_threads, machine_cores
 from neuprim.core.errors import ConfigError
 
 __all__ = ["at_once", "own_share", "shared_out"]
@@ -52,4 +52,8 @@ def at_once(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
 def own_share(settings: LauncherSettings) -> AbstractContextManager[None]:
     """Inside, this process has the threads that runs in it shall have; where nothing is said, or they work elsewhere,
     those that it has."""
-    return sharing(settings.threads) if settings.name == "inline" and settings.threads is not None else nullcontext()
+    return (
+        limit_process_threads(settings.threads)
+        if settings.name == "inline" and settings.threads is not None
+        else nullcontext()
+    )

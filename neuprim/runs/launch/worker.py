@@ -100,14 +100,14 @@ class Task:
         os.chdir(self.cwd)
         import torch
 
-        from neuprim.core.compute.threads import sharing
+        from neuprim.core.compute.threads import limit_process_threads
         from neuprim.runs.launch.jobs import Result, perform
         from neuprim.runs.launch.status import Listener
 
         torch.set_num_threads(self.threads)
         listener, result = Listener(self.attempt), None
         try:
-            with sharing(self.threads), _Attendant(self, listener):
+            with limit_process_threads(self.threads), _Attendant(self, listener):
                 result = perform(self.job, self.attempt, listener)
         except KeyboardInterrupt:  # asked to stop as it ended
             pass

@@ -11,7 +11,7 @@ import numpy as np
 
 from neuprim.config import RunConfig, compose
 from neuprim.config.overrides import assigned, parse, word
-from neuprim.core.compute.threads import sharing
+from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.data import Dataset
 from neuprim.core.errors import NeuprimError
 from neuprim.runs.events import Event, Note, Preparing, Step
@@ -141,7 +141,7 @@ class Session:
 
     def with_paces(self, wanted: Sequence[Variant]) -> list[Variant]:
         """Those whose pace could be found in time, and that are models of their own; the others are left out."""
-        with sharing(self._threads):  # as the trainings will have
+        with limit_process_threads(self._threads):  # as the trainings will have
             return self._with_paces(wanted)
 
     def _with_paces(self, wanted: Sequence[Variant]) -> list[Variant]:

@@ -8,10 +8,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neuprim.core.model.fields import pieces_by_name
-from neuprim.core.model.less import with_less
-from neuprim.core.model.pieces import Piece, alive, numbers_of, without
+from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.prunable import PrunableUnit, count_numbers, nonzero_rows, zero_units
+from neuprim.core.model.reduction import reduce_model
 from neuprim.core.train.sensitivity import Sensitivity
 from neuprim.search.prune.judge import Judge
 
@@ -27,14 +27,15 @@ _PROBE = 0.02
 _HALVINGS = 14
 
 
-def _pieces(model: Primitives) -> dict[str, Piece]:
-    return pieces_by_name(model.density, model.colour)
+def _pieces(model: Primitives) -> dict[str, PrunableUnit]:
+    return prunable_units_by_name(model.density, model.colour)
 
 
 def numbers(model: Primitives) -> int:
     """Numbers that a file has to hold: all but the pieces that are zero."""
     left_out = sum(
-        numbers_of(piece, model.params) * int((~alive(piece, model.params)).sum()) for piece in _pieces(model).values()
+        count_numbers(piece, model.params) * int((~nonzero_rows(piece, model.params)).sum())
+        for piece in _pieces(model).values()
     )
     return model.count * model.parameters_per_primitive - left_out
 
@@ -43,7 +44,7 @@ def zeros_of(model: Primitives) -> dict[str, Tensor]:
     """Parameter -> (N, ...) bool of the numbers in pieces that are zero."""
     found: dict[str, Tensor] = {}
     for piece in _pieces(model).values():
-        gone = ~alive(piece, model.params)
+        gone = ~nonzero_rows(piece, model.params)
         if bool(gone.any()):
             for name, place in piece.places.items():
                 mask = found.setdefault(name, torch.zeros_like(model.params[name], dtype=torch.bool))
@@ -57,7 +58,7 @@ def steps_down(model: Primitives) -> list[tuple[str, str, int]]:
     words = [
         (kind, name, value) for kind, own in fields for name, values in own.reductions().items() for value in values
     ]
-    return sorted(words, key=lambda word: with_less(model, *word).parameters_per_primitive)
+    return sorted(words, key=lambda word: reduce_model(model, *word).parameters_per_primitive)
 
 
 def cut_to(model: Primitives, prices: Sensitivity, quality: Callable[[Primitives], float], loss: float) -> Primitives:
@@ -95,8 +96,8 @@ _Share = tuple[Tensor, dict[str, Tensor], dict[str, int]]
 def _share(model: Primitives) -> _Share:
     """(N,) numbers of each primitive that are not zero, and for each piece who has it and how many numbers it is."""
     pieces = _pieces(model)
-    there = {name: alive(piece, model.params).cpu() for name, piece in pieces.items()}
-    sizes = {name: numbers_of(piece, model.params) for name, piece in pieces.items()}
+    there = {name: nonzero_rows(piece, model.params).cpu() for name, piece in pieces.items()}
+    sizes = {name: count_numbers(piece, model.params) for name, piece in pieces.items()}
     own = torch.full((model.count,), float(model.parameters_per_primitive))
     for name, has in there.items():
         own -= sizes[name] * (~has).float()
@@ -112,7 +113,7 @@ def _at(model: Primitives, prices: Sensitivity, share: _Share, price: float) -> 
         name: (pieces[name], (prices.pieces[name] / max(sizes[name], 1) < price) & there[name] & known)
         for name in pieces
     }
-    rows = Primitives(model.density, model.colour, without(gone, model.params)).rows(kept.to(model.device))
+    rows = Primitives(model.density, model.colour, zero_units(gone, model.params)).rows(kept.to(model.device))
     return Primitives(model.density, model.colour, rows)
 
 

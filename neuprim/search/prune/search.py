@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 
 from neuprim.config import RunConfig
 from neuprim.core.data import Dataset
-from neuprim.core.model.less import with_less
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.reduction import reduce_model
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.runs.finetune import fine_tuner
@@ -199,7 +199,7 @@ class Search:
         while again:
             again = False
             for kind, name, value in steps_down(smaller):
-                less = with_less(smaller, kind, name, value)
+                less = reduce_model(smaller, kind, name, value)
                 drop = start - quick(less)
                 if drop <= min(bite, price * _saved(model, less, size)) or drop - lost <= _FREE * self.tolerance:
                     smaller, lost, again = less, max(drop, lost), True
@@ -214,7 +214,7 @@ class Search:
         for word in words:
             place, _, value = word.partition("=")
             kind, _, name = place.partition(".")
-            model = with_less(model, kind, name, int(value))
+            model = reduce_model(model, kind, name, int(value))
         return _State(model, (*state.words, *words), bite=bite, cut=self.judge(model), alone=True)
 
     def _by_price(self, model: Primitives, quality: Callable[[Primitives], float], loss: float) -> Primitives:

@@ -284,10 +284,7 @@ def _describe(record: Record, subject: Subject) -> None:
         "shown": subject.channels.shown,
         "not_measured": {} if subject.lpips is not None else {"lpips": "no weights were given (--lpips FILE)"},
     }
-    if (
-        not Path("/proc/self/clear_refs").exists()
-        and subject.prepared(subject.reference).device.type == device.PROCESSOR
-    ):
+    if not Path("/proc/self/clear_refs").exists() and subject.prepared(subject.reference).device.type == device.CPU:
         record.facts["not_measured"]["peak_bytes"] = UNKNOWN
 
 

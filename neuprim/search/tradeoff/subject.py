@@ -87,7 +87,7 @@ class Subject:
         try:
             backends.check_pair(point.settings)
             model = self.prepared(point)
-            backends.choose(model.forms(view.camera, view.conditions), point.settings, view.camera)
+            backends.choose(model.lower_unchecked(view.camera, view.conditions), point.settings, view.camera)
         except (BackendUnavailable, ConfigError) as error:
             return str(error)
         return None
@@ -95,7 +95,7 @@ class Subject:
     def backend(self, point: OperatingPoint) -> backends.Backend:
         """Which one draws it."""
         model, view = self.prepared(point), self.truths[0].view
-        return backends.choose(model.forms(view.camera, view.conditions), point.settings, view.camera)
+        return backends.choose(model.lower_unchecked(view.camera, view.conditions), point.settings, view.camera)
 
     def differs(self, candidate: Candidate) -> bool:
         """Whether a backend's point is drawn by another one than the reference."""

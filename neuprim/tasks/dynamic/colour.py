@@ -13,9 +13,9 @@ from neuprim.core.compute import device
 from neuprim.core.model.colours import sh
 from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pieces import Piece
+from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
-from neuprim.core.model.scripts import script_beside
+from neuprim.core.model.scripts import read_script
 from neuprim.tasks.dynamic.density import time_of
 
 __all__ = ["TimeHarmonics"]
@@ -90,13 +90,13 @@ class TimeHarmonics(ColourField):
         most = {"degree": self.degree, "powers": self.powers, "waves": self.waves}
         return {name: tuple(range(value - 1, -1, -1)) for name, value in most.items() if value}
 
-    def reduced(
+    def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[TimeHarmonics, dict[str, Tensor]]:
         """Fewer terms in time are those that are closest to all of them, by least squares over the sequence."""
         field = TimeHarmonics(**{**self.settings(), name: value})
         if name == "degree":
-            return field, sh.fewer_bands(params, "sh_rest", value)
+            return field, sh.truncate_bands(params, "sh_rest", value)
         times = (torch.arange(_TIMES, dtype=torch.float64) + 0.5) / _TIMES
         all_terms, fewer = (
             torch.stack([torch.cat([torch.ones_like(x)[None], *f._terms(x).values()]) for x in times])
@@ -105,7 +105,7 @@ class TimeHarmonics(ColourField):
         fit = torch.linalg.pinv(fewer, rtol=_CONDITION) @ all_terms  # coefficients of all terms -> of those that stay
         stored = torch.cat([params["sh_dc"][:, None], *(params[key] for key in _TIME if key in params)], 1)
         sizes = {key: len(basis) for key, basis in field._terms(times[0]).items()}
-        dc, *rest = (device.beside(fit, stored.double()) @ stored.double()).to(stored).split([1, *sizes.values()], 1)
+        dc, *rest = (device.to_like(fit, stored.double()) @ stored.double()).to(stored).split([1, *sizes.values()], 1)
         others = {key: value for key, value in params.items() if key not in _TIME}
         kept = {key: part.contiguous() for key, part in zip(sizes, rest, strict=True) if sizes[key]}
         return field, {**others, **kept, "sh_dc": dc[:, 0].contiguous()}
@@ -123,22 +123,19 @@ class TimeHarmonics(ColourField):
         if self.powers or self.waves:
             for name, basis in self._terms(xi).items():
                 if name in params:
-                    dc = dc + (params[name] * device.beside(basis, dc)[:, None]).sum(1)
+                    dc = dc + (params[name] * device.to_like(basis, dc)[:, None]).sum(1)
         return dc, params.get("sh_rest")
 
-    def pieces(self) -> tuple[Piece, ...]:
+    def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """Coefficients of the direction, each of one channel, and terms in time one by one."""
         return (*sh.coefficients(self.degree, self.channels, "sh_rest"), *self._in_time())
 
-    def earlier_pieces(self) -> tuple[Piece, ...]:
-        return sh.bands(self.degree, "sh_rest")
-
-    def _in_time(self) -> tuple[Piece, ...]:
+    def _in_time(self) -> tuple[PrunableUnit, ...]:
         terms = zip(_TIME, (self.powers, self.waves, self.waves), strict=True)
-        return tuple(Piece(f"{name} {i + 1}", {name: (i,)}) for name, count in terms for i in range(count))
+        return tuple(PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, count in terms for i in range(count))
 
     def script(self) -> str:
-        return script_beside(__package__, "colour.js")
+        return read_script(__package__, "colour.js")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         dc, rest = self.harmonics(params, conditions)

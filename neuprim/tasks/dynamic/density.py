@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
+from neuprim.core.model.canonical import canonicalize_cosines
 from neuprim.core.model.densities.cosine import (
     OMEGA0,
     CosineDensity,
@@ -36,13 +37,12 @@ from neuprim.core.model.densities.cosine import (
     split_cosine,
     split_scale,
 )
-from neuprim.core.model.densities.fewer import fewer_neurons
+from neuprim.core.model.densities.fewer import prune_neurons
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
-from neuprim.core.model.folding import fold_cosines
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pieces import Piece
+from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
-from neuprim.core.model.scripts import script_beside
+from neuprim.core.model.scripts import read_script
 from neuprim.core.train.population import SPLIT_LONG, SPLIT_SHIFT
 from neuprim.tasks.dynamic.seams import checked_seams, shares
 from neuprim.tasks.dynamic.stilled import stilled
@@ -147,7 +147,7 @@ class TimeDensity(DensityField):
 
     # ------------------------------------------------------------ one frame
 
-    def alive(self, params: Params, conditions: Conditions) -> Tensor | None:
+    def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
         if "window" not in self.parts and not self.seams:
             return None
         xi, rows = time_of(conditions), None
@@ -181,8 +181,8 @@ class TimeDensity(DensityField):
             own["b2"] = (
                 b2
                 + (
-                    params["offset_cos"] @ device.beside(angle.cos(), b2)
-                    + params["offset_sin"] @ device.beside(angle.sin(), b2)
+                    params["offset_cos"] @ device.to_like(angle.cos(), b2)
+                    + params["offset_sin"] @ device.to_like(angle.sin(), b2)
                 )[:, None]
             )
         w2, b2 = amplified(own["w2"], own["b2"], own.get("log_gain"))
@@ -210,10 +210,12 @@ class TimeDensity(DensityField):
                 children[name] = params[name] * scale.to(params["b2"])[:, None]
         return children
 
-    def folded(self, params: Params) -> dict[str, Tensor]:
+    def canonicalize(self, params: Params) -> dict[str, Tensor]:
         if not self.static.neurons and "offset" not in self.parts:
-            return self.static.folded(params)
-        return fold_cosines(params, ("W1", "W_t") if "phase" in self.parts else ("W1",), "b1", "w2", self.static.omega0)
+            return self.static.canonicalize(params)
+        return canonicalize_cosines(
+            params, ("W1", "W_t") if "phase" in self.parts else ("W1",), "b1", "w2", self.static.omega0
+        )
 
     def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
         """Windows longer than ``divide_above`` are halved; the halves overlap, as windows fade at their ends.
@@ -242,36 +244,34 @@ class TimeDensity(DensityField):
         """Neurons, and every part of time, which is either there or not."""
         return {**self.static.reductions(), **{part: (0,) for part in PARTS if part in self.parts}}
 
-    def reduced(
+    def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[TimeDensity, dict[str, Tensor]]:
         """Without a part of time: its mean over the sequence, see :mod:`neuprim.tasks.dynamic.stilled`."""
         if name == "neurons":
             field = TimeDensity(**{**self.settings(), "neurons": value})
-            return field, fewer_neurons(params, geometry, value, self.static.omega0)
+            return field, prune_neurons(params, geometry, value, self.static.omega0)
         fewer = stilled(params, geometry, name, self.static.omega0)
         left = "+".join(part for part in PARTS if part in self.parts and part != name) or "none"
         field = TimeDensity(**{**self.settings(), "time": left})
         kept = {"means", *(spec.name for spec in field.parameters())}
         return field, {key: value for key, value in fewer.items() if key in kept}
 
-    def pieces(self) -> tuple[Piece, ...]:
+    def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """Neurons, and what changes in time but for windows, without which nothing would be left."""
         turning = ("W_t",) if "phase" in self.parts else ()
         found = [
-            Piece(one.name, {**one.places, **dict.fromkeys(turning, one.places["b1"])}) for one in self.static.pieces()
+            PrunableUnit(one.name, {**one.places, **dict.fromkeys(turning, one.places["b1"])})
+            for one in self.static.prunable_units()
         ]
         if "offset" in self.parts:
-            found.append(Piece("offset", {"offset_cos": (), "offset_sin": ()}))
+            found.append(PrunableUnit("offset", {"offset_cos": (), "offset_sin": ()}))
         if "motion" in self.parts:
-            found += [Piece(f"{name} {'xyz'[k]}", {name: (k,)}, name) for name in _MOTION for k in range(3)]
+            found += [PrunableUnit(f"{name} {'xyz'[k]}", {name: (k,)}, name) for name in _MOTION for k in range(3)]
         return tuple(found)
 
-    def earlier_pieces(self) -> tuple[Piece, ...]:
-        return tuple(Piece(name, {name: ()}) for name in _MOTION) if "motion" in self.parts else ()
-
     def script(self) -> str:
-        return script_beside(__package__, "density.js")
+        return read_script(__package__, "density.js")
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         scaled = self.static.scale_density(params, factor)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
-from neuprim.core.compute.operation import applied
+from neuprim.core.compute.operation import apply_autograd
 from neuprim.core.model.densities.gain_cpu import scale_backward
 from neuprim.core.model.edge import fade
 
@@ -34,7 +34,7 @@ def in_their_windows(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
     """Ascending int64 rows of ``center`` and ``log_window`` (N, 1) with abs(xi - center) < exp(log_window), in float64;
     no gradient."""
     center, log_window = center.detach(), log_window.detach()
-    if not device.fused(center, log_window):
+    if not device.on_numba(center, log_window):
         return ((xi - center[:, 0].double()).abs() < log_window[:, 0].double().exp()).nonzero()[:, 0]
     rows = np.empty(len(center), np.int64)
     found = _in_their_windows(center.contiguous().numpy(), log_window.contiguous().numpy(), float(xi), rows)
@@ -67,10 +67,10 @@ def fused_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi:
 
     ``center`` and ``log_window`` are (N, 1), all of one dtype; no gradient for the time ``xi`` ().
     """
-    if not device.fused(w2, b2, center, log_window):
+    if not device.on_numba(w2, b2, center, log_window):
         weight = fade(((xi.to(b2.dtype) - center) / log_window.exp()).square(), WINDOW_EDGE)
         return w2 * weight, b2 * weight
-    result: tuple[Tensor, Tensor] = applied(_Window, w2, b2, center, log_window, xi)
+    result: tuple[Tensor, Tensor] = apply_autograd(_Window, w2, b2, center, log_window, xi)
     return result
 
 
@@ -107,8 +107,8 @@ def fused_move(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Te
     ``velocity`` and ``acceleration`` are (N, 3), ``center`` (N, 1), all of one dtype; no gradient for the time ``xi``
     ().
     """
-    if not device.fused(means, velocity, acceleration, center):
+    if not device.on_numba(means, velocity, acceleration, center):
         since = xi.to(velocity.dtype) - center
         return means + (velocity + acceleration * since) * since
-    moved: Tensor = applied(_Move, means, velocity, acceleration, center, xi)
+    moved: Tensor = apply_autograd(_Move, means, velocity, acceleration, center, xi)
     return moved

@@ -21,13 +21,13 @@ from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.compute import device
-from neuprim.core.model.densities.fewer import smaller_counts
+from neuprim.core.model.canonical import canonicalize_cosines
+from neuprim.core.model.densities.fewer import smaller_neuron_counts
 from neuprim.core.model.fields import ColourField, Conditions, LoweredDensity, RayNet, Shading
-from neuprim.core.model.folding import fold_cosines
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pieces import Piece
+from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
-from neuprim.core.model.scripts import script_beside
+from neuprim.core.model.scripts import read_script
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.relight.directions import least_square, unit
 from neuprim.tasks.relight.fewer import fewer_units
@@ -111,9 +111,9 @@ class LightNetwork(ColourField):
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means
         size = geometry.length_scale.detach()[:, None]
-        view = unit(means - device.beside(camera.position, means), size)
-        to_light = device.beside(conditions["light"], means) - means
-        strength = device.beside(conditions["light_intensity"], means).expand(self.channels) / self.typical
+        view = unit(means - device.to_like(camera.position, means), size)
+        to_light = device.to_like(conditions["light"], means) - means
+        strength = device.to_like(conditions["light_intensity"], means).expand(self.channels) / self.typical
         factor = strength.expand(means.shape[0], -1)
         if self.falloff:
             factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(least_square(geometry))
@@ -142,27 +142,28 @@ class LightNetwork(ColourField):
         }
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        return {"hidden": smaller_counts(self.hidden)} if self.hidden else {}
+        return {"hidden": smaller_neuron_counts(self.hidden)} if self.hidden else {}
 
-    def reduced(
+    def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[LightNetwork, dict[str, Tensor]]:
         return LightNetwork(**{**self.settings(), "hidden": value}), fewer_units(
             params, geometry, value, self.boost, self.form == "multiplicative"
         )
 
-    def pieces(self) -> tuple[Piece, ...]:
+    def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """Hidden units."""
         inputs = ("net_x", "net_view", "net_light", "net_phase")
         return tuple(
-            Piece(f"unit {h}", {**dict.fromkeys(inputs, (h,)), "net_out": (slice(None), h)}) for h in range(self.hidden)
+            PrunableUnit(f"unit {h}", {**dict.fromkeys(inputs, (h,)), "net_out": (slice(None), h)})
+            for h in range(self.hidden)
         )
 
     def script(self) -> str:
-        return script_beside(__package__, "colour.js")
+        return read_script(__package__, "colour.js")
 
-    def folded(self, params: Params) -> dict[str, Tensor]:
-        return fold_cosines(params, ("net_x", "net_view", "net_light"), "net_phase", "net_out", self.boost)
+    def canonicalize(self, params: Params) -> dict[str, Tensor]:
+        return canonicalize_cosines(params, ("net_x", "net_view", "net_light"), "net_phase", "net_out", self.boost)
 
 
 _DARKEST = 1e-3

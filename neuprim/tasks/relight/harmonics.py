@@ -10,12 +10,12 @@ from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.compute import device
-from neuprim.core.model.colours.sh import bands, coefficients, fewer_bands
+from neuprim.core.model.colours.sh import coefficients, truncate_bands
 from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pieces import Piece
+from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
-from neuprim.core.model.scripts import script_beside
+from neuprim.core.model.scripts import read_script
 from neuprim.tasks.relight.directions import least_square, unit
 
 __all__ = ["LightHarmonics", "real_harmonics"]
@@ -48,30 +48,27 @@ class LightHarmonics(ColourField):
     def reductions(self) -> dict[str, tuple[int, ...]]:
         return {"degree": tuple(range(self.degree - 1, -1, -1))} if self.degree else {}
 
-    def reduced(
+    def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[LightHarmonics, dict[str, Tensor]]:
-        return LightHarmonics(**{**self.settings(), "degree": value}), fewer_bands(params, "light_sh", value)
+        return LightHarmonics(**{**self.settings(), "degree": value}), truncate_bands(params, "light_sh", value)
 
-    def pieces(self) -> tuple[Piece, ...]:
+    def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """Coefficients, each of one channel."""
         return coefficients(self.degree, self.channels, "light_sh")
 
-    def earlier_pieces(self) -> tuple[Piece, ...]:
-        return bands(self.degree, "light_sh")
-
     def script(self) -> str:
-        return script_beside(__package__, "harmonics.js")
+        return read_script(__package__, "harmonics.js")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         color = params["c_dc"]
-        to_light = device.beside(conditions["light"], color) - geometry.means
+        to_light = device.to_like(conditions["light"], color) - geometry.means
         squared = to_light.square().sum(-1, keepdim=True).clamp_min(least_square(geometry))
         if self.degree:
             bands = real_harmonics(unit(to_light, geometry.length_scale.detach()[:, None]), self.degree)[:, 1:]
             color = color + (bands[:, :, None] * params["light_sh"]).sum(1)
         strength = (
-            device.beside(conditions["light_intensity"], color) / self.typical / (squared if self.falloff else 1.0)
+            device.to_like(conditions["light_intensity"], color) / self.typical / (squared if self.falloff else 1.0)
         )
         return Constant(color.clamp_min(0.0) * strength)
 

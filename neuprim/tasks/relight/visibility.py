@@ -86,23 +86,23 @@ def light_visibility(
         camera = Camera(look_at(light, center, up), focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
         near = max(1e-4 * radius, distance - 1.5 * radius)
         own = replace(settings, depth=True, near=near, samples=1)
-        depths = means @ device.beside(camera.viewmat[2, :3], means) + camera.viewmat[2, 3]
+        depths = means @ device.to_like(camera.viewmat[2, :3], means) + camera.viewmat[2, 3]
         low, high = torch.stack([depths.min(), depths.max()]).tolist()
         edges = torch.linspace(low, high, LAYERS + 1, dtype=torch.float64)
-        slabs = torch.bucketize(depths, device.beside(edges[1:-1], means))
+        slabs = torch.bucketize(depths, device.to_like(edges[1:-1], means))
         opacities, distances = render_parts(geometry, density, slabs, LAYERS, camera, own)
         view, diameter = camera.viewmat[:3].contiguous(), 2.0 * radius
 
     def visibility(points: Tensor) -> Tensor:
         points, limits = points.detach().double().contiguous(), (bias * diameter, softness * diameter)
-        if device.kernels(points, opacities):
+        if device.on_warp(points, opacities):
             from neuprim.tasks.relight import visibility_warp
 
             return visibility_warp.arriving_light(
-                points, device.beside(view, points), near, focal, opacities, distances, *limits
+                points, device.to_like(view, points), near, focal, opacities, distances, *limits
             )
-        if not device.fused(points, opacities):
-            return arriving(points, device.beside(view, points), near, focal, opacities, distances, *limits)
+        if not device.on_numba(points, opacities):
+            return arriving(points, device.to_like(view, points), near, focal, opacities, distances, *limits)
         from neuprim.tasks.relight.visibility_cpu import arriving_light  # numba, loaded when first needed
 
         found = np.empty(len(points), np.float32)

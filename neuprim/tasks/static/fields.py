@@ -11,9 +11,9 @@ from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.model.colours import sh
 from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pieces import Piece
+from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
-from neuprim.core.model.scripts import script_beside
+from neuprim.core.model.scripts import read_script
 
 __all__ = ["SphericalHarmonics"]
 
@@ -48,23 +48,20 @@ class SphericalHarmonics(ColourField):
     def reductions(self) -> dict[str, tuple[int, ...]]:
         return {"degree": tuple(range(self.degree - 1, -1, -1))} if self.degree else {}
 
-    def reduced(
+    def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[SphericalHarmonics, dict[str, Tensor]]:
-        return SphericalHarmonics(value, self.channels), sh.fewer_bands(params, "sh_rest", value)
+        return SphericalHarmonics(value, self.channels), sh.truncate_bands(params, "sh_rest", value)
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
         return params["sh_dc"], params.get("sh_rest")
 
-    def pieces(self) -> tuple[Piece, ...]:
+    def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """Coefficients, each of one channel."""
         return sh.coefficients(self.degree, self.channels, "sh_rest")
 
-    def earlier_pieces(self) -> tuple[Piece, ...]:
-        return sh.bands(self.degree, "sh_rest")
-
     def script(self) -> str:
-        return script_beside(__package__, "fields.js")
+        return read_script(__package__, "fields.js")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         return Constant(sh.colors(geometry.means, params["sh_dc"], params.get("sh_rest"), camera.position, self.active))

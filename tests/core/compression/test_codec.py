@@ -28,7 +28,7 @@ from neuprim.core.compression.columns import Columns
 from neuprim.core.errors import CheckpointError, ConfigError, FormError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
-from neuprim.core.model.fields import pieces_by_name
+from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import Params
 from neuprim.core.render import RenderSettings, render
@@ -96,7 +96,7 @@ def test_a_bit_says_who_does_without_a_piece(tmp_path: Path, name: str) -> None:
         checkpoint.save_compressed(tmp_path / "2", pruned, task.name, {}, LEVELS[3])
     plain, _ = checkpoint.load_model(tmp_path / "2", task)
     assert all(torch.equal(value, plain.params[key]) for key, value in pruned.params.items())
-    if pieces_by_name(model.density, model.colour):
+    if prunable_units_by_name(model.density, model.colour):
         assert len(files[0]) < 0.95 * (tmp_path / "2").stat().st_size
 
 
@@ -350,7 +350,7 @@ def test_numbers_that_cannot_be_stored(tmp_path: Path, params: dict[str, torch.T
 
 def test_a_field_that_folds_into_something_else_is_named() -> None:
     class Loses(CosineDensity):
-        def folded(self, params: Params) -> dict[str, torch.Tensor]:
+        def canonicalize(self, params: Params) -> dict[str, torch.Tensor]:
             return {name: value[:-1] for name, value in params.items()}
 
     model = example("static")[1]

@@ -13,7 +13,7 @@ from torch import Tensor
 from neuprim.conformance.integrals import chords, inside
 from neuprim.core.errors import FormError
 from neuprim.core.model.densities.cosine import cosine_density
-from neuprim.core.model.fields import Cosine, Opaque
+from neuprim.core.model.fields import Cosine, CustomDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered
@@ -71,7 +71,7 @@ def test_a_sum_is_drawn_as_the_sum_of_the_integrals() -> None:
         return sum((f.optical_depth(Pairs.of(geometry, *ray)) for f in (first, second)), torch.zeros(()))
 
     camera = scenes.camera(20, 15)
-    expected = render_lowered(Lowered(geometry, Opaque(added), colour), camera, EXACT).rgb
+    expected = render_lowered(Lowered(geometry, CustomDensity(added), colour), camera, EXACT).rgb
     for backend, bound in (("reference", 1e-12), ("cpu", 2e-5)):
         found = render_lowered(Lowered(geometry, first + second, colour), camera, replace(EXACT, backend=backend)).rgb
         assert expected.max() > 0.3 and (found - expected).abs().max() < bound
@@ -113,4 +113,4 @@ def test_what_cannot_be_added_is_refused(second: Cosine, message: str) -> None:
 
 def test_other_things_are_not_added() -> None:
     with pytest.raises(TypeError, match="unsupported operand"):
-        form(3, 30.0, 1) + Opaque(lambda *a: a[0])  # type: ignore[operator]
+        form(3, 30.0, 1) + CustomDensity(lambda *a: a[0])  # type: ignore[operator]

@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
+from neuprim.core.model.canonical import canonicalize_cosines, canonicalize_gain
 from neuprim.core.model.fields import Constant
-from neuprim.core.model.folding import fold_cosines, fold_gain
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from tests import scenes
@@ -24,7 +24,7 @@ CONDITIONS = {
 def folded(model: Primitives) -> Primitives:
     params = dict(model.params)
     for field in (model.density, model.colour):
-        params |= field.folded(model.of(field))
+        params |= field.canonicalize(model.of(field))
     return Primitives(model.density, model.colour, params)
 
 
@@ -62,7 +62,7 @@ def test_a_phase_at_the_end_of_half_a_turn_stays() -> None:
     """float32 rounds pi/30 up: taken for more than half a turn, it would be folded to just below, then again."""
     end = torch.tensor([[math.pi / 30, 0.0]])
     params = {"W": torch.ones(1, 2, 3), "b": end, "w": torch.ones(1, 2)}
-    made = fold_cosines(params, ("W",), "b", "w", 30.0)
+    made = canonicalize_cosines(params, ("W",), "b", "w", 30.0)
     assert all(torch.equal(made[key], value) for key, value in params.items())
 
 
@@ -81,7 +81,7 @@ def test_one_number_says_how_strong_a_density_without_neurons_is() -> None:
 def test_strengths_that_do_not_fit_into_a_gain_stay() -> None:
     b = torch.tensor([[0.0], [1e-30], [1e30], [-2.0], [3.0], [torch.nan], [torch.inf]])
     g = torch.tensor([[1.0], [-19.0], [19.0], [0.0], [25.0], [0.0], [0.0]])  # beyond 20 a gain counts as 20
-    made = fold_gain({"b": b, "g": g}, "b", "g", 20.0)
+    made = canonicalize_gain({"b": b, "g": g}, "b", "g", 20.0)
     assert made["b"].flatten().tolist()[:5] == [0.0, b[1, 0].item(), b[2, 0].item(), -1.0, 3.0]
     assert made["g"].flatten().tolist() == [1.0, -19.0, 19.0, pytest.approx(math.log(2.0)), 25.0, 0.0, 0.0]
     assert torch.isnan(made["b"][5, 0]) and torch.isinf(made["b"][6, 0])
@@ -93,5 +93,5 @@ def test_fields_without_cosines_stay_as_they_are() -> None:
         model.colour.lower(model.of(model.colour), model.geometry, scenes.camera(), CONDITIONS["relight"]), Constant
     )
     assert all(
-        torch.equal(value, model.params[key]) for key, value in model.colour.folded(model.of(model.colour)).items()
+        torch.equal(value, model.params[key]) for key, value in model.colour.canonicalize(model.of(model.colour)).items()
     )

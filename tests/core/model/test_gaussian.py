@@ -17,7 +17,7 @@ from neuprim.config import compose
 from neuprim.core import checkpoint
 from neuprim.core.errors import BackendUnavailable, CheckpointError, ConfigError
 from neuprim.core.model.densities.gaussian import GaussianDensity, bell_integral
-from neuprim.core.model.fields import Opaque
+from neuprim.core.model.fields import CustomDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
@@ -52,7 +52,7 @@ def integral(
     field: GaussianDensity, t: dict[str, Tensor], prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor
 ) -> Tensor:
     form = field.lower(t, geometry(t), {})
-    assert isinstance(form, Opaque)
+    assert isinstance(form, CustomDensity)
     return form.line_integral(prim, o, d, t0, t1)
 
 
@@ -245,7 +245,7 @@ def test_renders_through_the_reference_backend() -> None:
     output = render(m, scenes.camera(), {}, RenderSettings(backend="auto"))
     assert output.stats.backend == "reference" and output.rgb.dtype == torch.float32
     assert 0.2 < output.alpha.max() <= 1
-    with pytest.raises(BackendUnavailable, match="Opaque density"):
+    with pytest.raises(BackendUnavailable, match="CustomDensity density"):
         render(m, scenes.camera(), {}, RenderSettings(backend="cpu"))
 
 

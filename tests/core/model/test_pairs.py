@@ -15,7 +15,7 @@ from torch import Tensor
 import neuprim
 from neuprim.core.errors import FormError
 from neuprim.core.model.densities.cosine import cosine_density
-from neuprim.core.model.fields import Constant, Cosine, Opaque, OpaqueColour, RayNet
+from neuprim.core.model.fields import Constant, Cosine, CustomColour, CustomDensity, RayNet
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered
 from tests import scenes
@@ -72,7 +72,7 @@ def test_code_is_asked_in_scene_units() -> None:
         asked.extend(given)
         return (given[4] - given[3]).float()
 
-    found = replace(low, density=Opaque(line_integral)).optical_depth(pairs)
+    found = replace(low, density=CustomDensity(line_integral)).optical_depth(pairs)
     assert found.dtype == torch.float64 and torch.allclose(found, t1 - t0, rtol=1e-6)
     for x, y in zip(asked, (pairs.prim, o, d, t0, t1), strict=True):
         assert torch.allclose(x, y)
@@ -84,19 +84,19 @@ def test_colours_along_chords_and_at_centres() -> None:
     position = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     flat = low.colour
     assert isinstance(flat, Constant) and flat.flat is flat.rgb and flat.per_primitive
-    assert torch.equal(low.seen(pairs), flat.rgb[pairs.prim]) and low.center_colors(position) is flat.rgb
+    assert torch.equal(low.chord_colours(pairs), flat.rgb[pairs.prim]) and low.center_colors(position) is flat.rgb
     varies = net.colour
     assert isinstance(varies, RayNet) and varies.flat is None and varies.per_primitive
     phase = (varies.Wx[pairs.prim] * pairs.local[:, None]).sum(-1) + varies.bias[pairs.prim]
     expected = (varies.base[pairs.prim] + (varies.Wout[pairs.prim] * phase.cos()[:, None]).sum(-1)).clamp_min(0)
     assert (
-        torch.allclose(net.seen(pairs), expected)
-        and (net.seen(pairs) - net.center_colors(position)[pairs.prim]).abs().max() > 0.01
+        torch.allclose(net.chord_colours(pairs), expected)
+        and (net.chord_colours(pairs) - net.center_colors(position)[pairs.prim]).abs().max() > 0.01
     )
-    code = OpaqueColour(lambda prim, x, d: torch.cat([x, d[:, :1]], 1), 4)
+    code = CustomColour(lambda prim, x, d: torch.cat([x, d[:, :1]], 1), 4)
     opaque = replace(low, colour=code)
     assert code.flat is None and not code.per_primitive
-    assert torch.allclose(opaque.seen(pairs), torch.cat([pairs.points, d[:, :1]], 1))
+    assert torch.allclose(opaque.chord_colours(pairs), torch.cat([pairs.points, d[:, :1]], 1))
     towards = torch.nn.functional.normalize(low.geometry.means - position, dim=1)
     assert torch.allclose(opaque.center_colors(position), torch.cat([low.geometry.means, towards[:, :1]], 1))
 
@@ -105,13 +105,14 @@ def test_code_that_returns_something_else_is_named() -> None:
     low = model()
     pairs = chords(low)[0]
     with pytest.raises(
-        FormError, match=rf"^density lowered to Opaque: line_integral returned shape \({M}, 1\); expected \({M},\)"
+        FormError,
+        match=rf"^density lowered to CustomDensity: line_integral returned shape \({M}, 1\); expected \({M},\)",
     ):
-        replace(low, density=Opaque(lambda prim, o, d, t0, t1: t0[:, None])).optical_depth(pairs)
+        replace(low, density=CustomDensity(lambda prim, o, d, t0, t1: t0[:, None])).optical_depth(pairs)
     with pytest.raises(
-        FormError, match=rf"^colour lowered to OpaqueColour: radiance returned shape \({M}, 3\); expected \({M}, 2\)"
+        FormError, match=rf"^colour lowered to CustomColour: radiance returned shape \({M}, 3\); expected \({M}, 2\)"
     ):
-        replace(low, colour=OpaqueColour(lambda prim, x, d: x, 2)).seen(pairs)
+        replace(low, colour=CustomColour(lambda prim, x, d: x, 2)).chord_colours(pairs)
 
 
 KERNELS = {
@@ -130,7 +131,7 @@ OWN = {"core/model/forms.py", "tasks/dynamic/invisible.py"}
 
 
 def test_nobody_else_asks_which_form_it_is() -> None:
-    root, forms = Path(neuprim.__file__).parent, {"Cosine", "Opaque", "Constant", "RayNet", "OpaqueColour"}
+    root, forms = Path(neuprim.__file__).parent, {"Cosine", "CustomDensity", "Constant", "RayNet", "CustomColour"}
     asking = {
         file.relative_to(root).as_posix()
         for file in root.rglob("*.py")

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
-from torch import Tensor
 
 from neuprim.core import checkpoint
 from neuprim.core.errors import CheckpointError
 from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.fields import Field, pieces_by_name
-from neuprim.core.model.pieces import alive, numbers_of, without, worth
+from neuprim.core.model.fields import Field, prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.zeros import of_pieces, split_off, whole
+from neuprim.core.model.prunable import count_numbers, nonzero_rows, removal_effect, zero_units
+from neuprim.core.model.sparse_storage import load_sparse, store_sparse
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.registry import load_task
 from neuprim.tasks.dynamic.colour import TimeHarmonics
@@ -39,19 +37,19 @@ PAIRS = [
 def pruned(model: Primitives, seed: int = 5) -> Primitives:
     """The model, in which every piece is gone from half of the primitives."""
     generator = torch.Generator().manual_seed(seed)
-    pieces = pieces_by_name(model.density, model.colour)
+    pieces = prunable_units_by_name(model.density, model.colour)
     gone = {name: (piece, torch.rand(model.count, generator=generator) < 0.5) for name, piece in pieces.items()}
-    return Primitives(model.density, model.colour, without(gone, model.params))
+    return Primitives(model.density, model.colour, zero_units(gone, model.params))
 
 
 @pytest.mark.parametrize(("density", "colour"), PAIRS, ids=lambda field: type(field).__name__)
 def test_no_number_is_in_two_pieces_and_each_has_some(density: Field, colour: Field) -> None:
     model = made(density, colour)
-    pieces = pieces_by_name(model.density, model.colour)
+    pieces = prunable_units_by_name(model.density, model.colour)
     assert pieces
     times = {name: torch.zeros_like(value) for name, value in model.params.items()}
     for piece in pieces.values():
-        assert numbers_of(piece, model.params) > 0
+        assert count_numbers(piece, model.params) > 0
         for name, place in piece.places.items():
             times[name][(slice(None), *place)] += 1
     assert all(float(count.max()) <= 1 for count in times.values() if count.numel())
@@ -62,10 +60,10 @@ def test_of_a_piece_that_is_gone_nothing_is_left(density: Field, colour: Field) 
     """A primitive whose piece is zero looks like one whose other numbers of the piece never were: moving zeros
     elsewhere changes nothing."""
     model = made(density, colour)
-    for name, piece in pieces_by_name(model.density, model.colour).items():
+    for name, piece in prunable_units_by_name(model.density, model.colour).items():
         everywhere = torch.ones(COUNT, dtype=torch.bool)
-        empty = Primitives(model.density, model.colour, without({name: (piece, everywhere)}, model.params))
-        assert not bool(alive(piece, empty.params).any()) and bool(alive(piece, model.params).all())
+        empty = Primitives(model.density, model.colour, zero_units({name: (piece, everywhere)}, model.params))
+        assert not bool(nonzero_rows(piece, empty.params).any()) and bool(nonzero_rows(piece, model.params).all())
         empty.lower(camera(), CONDITIONS).check()
         untouched = [key for key in model.params if key not in piece.places]
         assert all(empty.params[key] is model.params[key] for key in untouched)
@@ -73,8 +71,8 @@ def test_of_a_piece_that_is_gone_nothing_is_left(density: Field, colour: Field) 
 
 def test_a_neuron_that_is_gone_is_a_field_without_it() -> None:
     model = made(*PAIRS[0])
-    piece = pieces_by_name(model.density, model.colour)["density.neuron 1"]
-    empty = without({"": (piece, torch.ones(COUNT, dtype=torch.bool))}, model.params)
+    piece = prunable_units_by_name(model.density, model.colour)["density.neuron 1"]
+    empty = zero_units({"": (piece, torch.ones(COUNT, dtype=torch.bool))}, model.params)
     fewer = {
         name: value[:, [0, 2]] if name in ("W1", "b1", "w2") else value
         for name, value in model.of(model.density).items()
@@ -88,14 +86,14 @@ def test_a_neuron_that_is_gone_is_a_field_without_it() -> None:
 
 def test_worth_is_the_first_order_of_doing_without() -> None:
     model = made(*PAIRS[0])
-    piece = pieces_by_name(model.density, model.colour)["colour.coefficient 2 +0, channel 1"]
+    piece = prunable_units_by_name(model.density, model.colour)["colour.coefficient 2 +0, channel 1"]
     params = {name: value.clone().requires_grad_() for name, value in model.params.items()}
     weights = torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(1))
     colours = 5.0 + sum((params["sh_rest"][:, i] for i in range(15)), torch.zeros(COUNT, 3))  # linear, as harmonics are
     (colours * weights).sum().backward()
     gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()}
     expected = model.params["sh_rest"][:, 5, 1] * weights[:, 1]
-    assert torch.allclose(worth(piece, params, gradients), expected, atol=1e-5)
+    assert torch.allclose(removal_effect(piece, params, gradients), expected, atol=1e-5)
 
 
 # ---------------------------------------------------------------- files
@@ -107,8 +105,8 @@ BITS = (45 * COUNT + 7) // 8  # bytes of the bits of COUNT primitives' coefficie
 def test_files_leave_zeros_out_and_give_them_back(density: Field, colour: Field) -> None:
     model = pruned(made(density, colour))
     own = (*model.density.parameters(), *model.colour.parameters())
-    stored, sparse = split_off(model.params, own)
-    again = whole(stored, sparse, own, "file")
+    stored, sparse = store_sparse(model.params, own)
+    again = load_sparse(stored, sparse, own, "file")
     assert sparse and again.keys() == model.params.keys()
     assert all(
         torch.equal(again[name].view(torch.int32), value.view(torch.int32)) for name, value in model.params.items()
@@ -118,7 +116,7 @@ def test_files_leave_zeros_out_and_give_them_back(density: Field, colour: Field)
 
 def test_a_model_without_zeros_is_stored_as_ever() -> None:
     model = made(*PAIRS[0])
-    stored, sparse = split_off(model.params, (*model.density.parameters(), *model.colour.parameters()))
+    stored, sparse = store_sparse(model.params, (*model.density.parameters(), *model.colour.parameters()))
     assert sparse == [] and stored == model.params
 
 
@@ -126,35 +124,8 @@ def test_a_zero_below_zero_keeps_its_sign() -> None:
     model = pruned(made(*PAIRS[0]))
     model.params["w2"][:, 0] = -0.0
     own = (*model.density.parameters(), *model.colour.parameters())
-    again = whole(*split_off(model.params, own), own, "file")
+    again = load_sparse(*store_sparse(model.params, own), own, "file")
     assert bool(torch.signbit(again["w2"][:, 0]).all())
-
-
-@pytest.mark.parametrize(("density", "colour"), PAIRS, ids=lambda field: type(field).__name__)
-def test_files_of_pieces_as_they_were_load(density: Field, colour: Field) -> None:
-    """Bands, and velocities as a whole, were pieces; what a primitive had of them followed by its name."""
-    model = made(density, colour)
-    pieces = pieces_by_name(model.density, model.colour, earlier=True)
-    taken: dict[str, Tensor] = {name: torch.zeros_like(value) for name, value in model.params.items()}
-    stored, generator = dict(model.params), torch.Generator().manual_seed(2)
-    names = [name for name, piece in pieces.items() if not piece.group]
-    for name in names:
-        has = torch.rand(model.count, generator=generator) < 0.5
-        stored["rows|" + name] = torch.from_numpy(np.packbits(has.numpy(), bitorder="little"))
-        for parameter, value in pieces[name].of(model.params).items():
-            stored.pop(parameter, None)
-            stored[f"{parameter}|{name}"] = value[has]
-            taken[parameter][(has, *pieces[name].places[parameter])] = value[has]
-    own = (*model.density.parameters(), *model.colour.parameters())
-    again = of_pieces(stored, names, own, pieces, "file")
-    apart = {parameter for name in names for parameter in pieces[name].places}
-    assert apart and again.keys() == model.params.keys()
-    assert all(
-        torch.equal(again[name], taken[name] if name in apart else value) for name, value in model.params.items()
-    )
-    stored.pop("rows|" + names[0])
-    with pytest.raises(CheckpointError, match="is missing"):
-        of_pieces(stored, names, own, pieces, "file")
 
 
 @pytest.fixture
@@ -218,10 +189,9 @@ def test_files_that_lie_are_refused(lie: str, file: Path, task: TaskSpec) -> Non
 
 
 @pytest.mark.parametrize("names", ["sh_rest", ["sh_all"], ["means"], [3], {"sh_rest": 1}])
-@pytest.mark.parametrize("key", ["sparse", "apart"])
-def test_a_header_of_what_does_not_exist_is_refused(key: str, names: object, file: Path, task: TaskSpec) -> None:
+def test_a_header_of_what_does_not_exist_is_refused(names: object, file: Path, task: TaskSpec) -> None:
     header, tensors = checkpoint.read(file, "model")
     header = {k: v for k, v in header.items() if k not in ("format", "kind", "sparse")}
-    checkpoint.write(file, "model", tensors, {**header, key: names})
-    with pytest.raises(CheckpointError, match=f"header field '{key}'"):
+    checkpoint.write(file, "model", tensors, {**header, "sparse": names})
+    with pytest.raises(CheckpointError, match="header field 'sparse'"):
         checkpoint.load_model(file, task)

@@ -11,7 +11,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, cosine_density
-from neuprim.core.model.densities.fewer import fewer_neurons, smaller_counts
+from neuprim.core.model.densities.fewer import prune_neurons, smaller_neuron_counts
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Field
 from neuprim.core.model.geometry import Geometry
@@ -43,7 +43,7 @@ def reduced(model: Primitives) -> Iterator[tuple[str, str, int, Primitives]]:
         field = getattr(model, kind)
         for name, values in field.reductions().items():
             for value in values:
-                fewer, tensors = field.reduced(model.of(field), model.geometry, name, value)
+                fewer, tensors = field.reduce(model.of(field), model.geometry, name, value)
                 own = {spec.name for spec in field.parameters()}
                 others = {key: tensor for key, tensor in model.params.items() if key not in own}
                 fields = (fewer, model.colour) if kind == "density" else (model.density, fewer)
@@ -73,7 +73,7 @@ def test_what_has_nothing_to_spare_offers_nothing() -> None:
     assert GaussianDensity().reductions() == {} == LightNetwork(0).reductions()
     assert SphericalHarmonics(0).reductions() == {} == CosineDensity(0).reductions()
     with pytest.raises(NotImplementedError, match="GaussianDensity"):
-        GaussianDensity().reduced({}, made(*PAIRS[3]).geometry, "neurons", 1)
+        GaussianDensity().reduce({}, made(*PAIRS[3]).geometry, "neurons", 1)
 
 
 # ---------------------------------------------------------------- bands
@@ -81,7 +81,7 @@ def test_what_has_nothing_to_spare_offers_nothing() -> None:
 
 def test_dropped_bands_are_the_basis_cut_off() -> None:
     model = made(*PAIRS[0])
-    field, params = SphericalHarmonics(3).reduced(model.of(model.colour), model.geometry, "degree", 1)
+    field, params = SphericalHarmonics(3).reduce(model.of(model.colour), model.geometry, "degree", 1)
     origin = camera().position
     seen = field.lower(params, model.geometry, camera(), {}).rgb
     whole = sh.colors(model.params["means"], model.params["sh_dc"], model.params["sh_rest"], origin, 1)
@@ -93,10 +93,10 @@ def test_dropped_bands_are_the_basis_cut_off() -> None:
 
 def test_counts() -> None:
     assert (
-        smaller_counts(8) == (6, 4, 2, 0)
-        and smaller_counts(2) == (1, 0)
-        and smaller_counts(1) == (0,)
-        and smaller_counts(3) == (2, 1, 0)
+        smaller_neuron_counts(8) == (6, 4, 2, 0)
+        and smaller_neuron_counts(2) == (1, 0)
+        and smaller_neuron_counts(1) == (0,)
+        and smaller_neuron_counts(3) == (2, 1, 0)
     )
 
 
@@ -129,7 +129,7 @@ def test_dropped_neurons_leave_their_mean_and_those_that_stay_matter_most() -> N
     x = inside(model.geometry, 4000, torch.Generator().manual_seed(2))
     whole = sigma(model, x)
     for keep in (6, 4, 2, 0):
-        params = fewer_neurons(model.of(model.density), model.geometry, keep, OMEGA0)
+        params = prune_neurons(model.of(model.density), model.geometry, keep, OMEGA0)
         smaller = Primitives(CosineDensity(keep), model.colour, {**model.params, **params})
         left = sigma(smaller, x)
         scale = whole.std(1)
@@ -141,7 +141,7 @@ def test_dropped_neurons_leave_their_mean_and_those_that_stay_matter_most() -> N
 
 def test_all_neurons_are_the_model_itself() -> None:
     model = made(CosineDensity(4), SphericalHarmonics(0))
-    params = fewer_neurons(model.of(model.density), model.geometry, 4, OMEGA0)
+    params = prune_neurons(model.of(model.density), model.geometry, 4, OMEGA0)
     assert all(torch.equal(params[name], model.params[name]) for name in params)
 
 
@@ -149,7 +149,7 @@ def test_means_of_phases_that_advance_are_those_over_the_sequence() -> None:
     model = made(TimeDensity(3, "phase"), SphericalHarmonics(0), noise=0.02)
     model.params["W_t"] *= 3
     x = inside(model.geometry, 1500, torch.Generator().manual_seed(2))
-    params = fewer_neurons(model.of(model.density), model.geometry, 0, OMEGA0)
+    params = prune_neurons(model.of(model.density), model.geometry, 0, OMEGA0)
     form = [
         TimeDensity(3, "phase").lower(model.of(model.density), model.geometry, {"time": torch.tensor(t)})
         for t in torch.linspace(0, 1, 41).tolist()
@@ -178,7 +178,7 @@ def test_fewer_terms_in_time_are_closer_than_terms_cut_off(name: str) -> None:
     colour = model.colour
     assert isinstance(colour, TimeHarmonics)
     whole = model.of(colour)
-    field, params = colour.reduced(whole, model.geometry, name, 2)
+    field, params = colour.reduce(whole, model.geometry, name, 2)
     cut = TimeHarmonics(**{**colour.settings(), name: 2})
     rows = {"time_poly": 2} if name == "powers" else {"time_cos": 2, "time_sin": 2}
     naive = {key: value[:, : rows[key]] if key in rows else value for key, value in whole.items()}
@@ -194,8 +194,8 @@ def test_no_terms_in_time_leave_the_mean_over_the_sequence() -> None:
     model = made(*PAIRS[1])
     colour = model.colour
     assert isinstance(colour, TimeHarmonics)
-    field, params = colour.reduced(model.of(colour), model.geometry, "powers", 0)
-    field, params = field.reduced(params, model.geometry, "waves", 0)
+    field, params = colour.reduce(model.of(colour), model.geometry, "powers", 0)
+    field, params = field.reduce(params, model.geometry, "waves", 0)
     times = torch.linspace(0, 1, 401)
     mean = torch.stack([colour.harmonics(model.of(colour), {"time": t})[0] for t in times]).mean(0)
     assert torch.allclose(field.harmonics(params, CONDITIONS)[0], mean, atol=5e-3)
@@ -209,7 +209,7 @@ def in_time(time: str, neurons: int = 4) -> Primitives:
 def test_a_still_phase_is_the_mean_of_the_moving_one() -> None:
     model = in_time("phase")
     density = model.density
-    field, params = density.reduced(model.of(density), model.geometry, "phase", 0)
+    field, params = density.reduce(model.of(density), model.geometry, "phase", 0)
     assert field.settings()["time"] == "none" and "W_t" not in params
     prim, x = torch.arange(COUNT), model.params["means"] + 0.01
     times = (torch.arange(400) + 0.5) / 400
@@ -223,7 +223,7 @@ def test_a_still_phase_is_the_mean_of_the_moving_one() -> None:
 def test_a_still_offset_is_the_mean_of_the_changing_one() -> None:
     model = in_time("offset", 0)
     density = model.density
-    field, params = density.reduced(model.of(density), model.geometry, "offset", 0)
+    field, params = density.reduce(model.of(density), model.geometry, "offset", 0)
     times = (torch.arange(400) + 0.5) / 400
     mean = torch.stack([density.lower(model.of(density), model.geometry, {"time": t}).b2 for t in times]).mean(0)
     assert torch.allclose(field.lower(params, model.geometry, CONDITIONS).b2, mean, atol=1e-5)
@@ -232,7 +232,7 @@ def test_a_still_offset_is_the_mean_of_the_changing_one() -> None:
 def test_without_windows_primitives_are_as_dense_as_they_are_in_the_mean() -> None:
     model = in_time("window", 2)
     density = model.density
-    _, params = density.reduced(model.of(density), model.geometry, "window", 0)
+    _, params = density.reduce(model.of(density), model.geometry, "window", 0)
     times = (torch.arange(400) + 0.5) / 400
     for name in ("w2", "b2"):
         lowered = [getattr(density.lower(model.of(density), model.geometry, {"time": t}), name) for t in times]
@@ -242,7 +242,7 @@ def test_without_windows_primitives_are_as_dense_as_they_are_in_the_mean() -> No
 def test_without_windows_motion_goes_on_as_it_was() -> None:
     model = in_time("window+motion", 0)
     density = model.density
-    field, params = density.reduced(model.of(density), model.geometry, "window", 0)
+    field, params = density.reduce(model.of(density), model.geometry, "window", 0)
     moved = Geometry(params.pop("means"), model.geometry.log_scales, model.geometry.quats)
     for time in (0.0, 0.3, 1.0):
         before = density.move(model.of(density), model.geometry, {"time": torch.tensor(time)}).means
@@ -254,7 +254,7 @@ def test_without_windows_motion_goes_on_as_it_was() -> None:
 def test_without_motion_primitives_stand_in_their_mean_place(time: str) -> None:
     model = in_time(time, 0)
     density = model.density
-    field, params = density.reduced(model.of(density), model.geometry, "motion", 0)
+    field, params = density.reduce(model.of(density), model.geometry, "motion", 0)
     times = (torch.arange(400) + 0.5) / 400
     places = torch.stack([density.move(model.of(density), model.geometry, {"time": t}).means for t in times])
     weights = torch.ones(400, COUNT)
@@ -278,8 +278,8 @@ def test_fewer_units_leave_the_mean_colour_behind(form: str) -> None:
         model.params["net_out"] *= 0.3
     colour = model.colour
     generator = torch.Generator().manual_seed(3)
-    field, params = colour.reduced(model.of(colour), model.geometry, "hidden", 0)
-    few, fewer = colour.reduced(model.of(colour), model.geometry, "hidden", 3)
+    field, params = colour.reduce(model.of(colour), model.geometry, "hidden", 0)
+    few, fewer = colour.reduce(model.of(colour), model.geometry, "hidden", 3)
 
     def seen(field: Field, params: dict[str, Tensor], view: Tensor, light: Tensor) -> Tensor:
         eye = Camera(look_at(1e3 * view, torch.zeros(3), torch.tensor([0.0, 0.3, 1.0])), 20.0, 20.0, 8.0, 8.0, 16, 16)

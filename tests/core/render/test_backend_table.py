@@ -23,7 +23,7 @@ from neuprim.cli import doctor_command, main
 from neuprim.config import RunConfig, compose
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.core.model.fields import Constant, Opaque
+from neuprim.core.model.fields import Constant, CustomDensity
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderOutput, RenderSettings, backends, probe, render_lowered
 from neuprim.core.render.backends import Backend
@@ -117,7 +117,9 @@ def test_auto_is_the_first_that_does_not_refuse(fake: Fake) -> None:
     assert render_lowered(low, camera, RenderSettings()).stats.backend == "fake" and fake.frames == 1
     assert backends.choose(net, RenderSettings(), camera).name == "cpu"
     assert (
-        backends.choose(replace(net, density=Opaque(lambda prim, o, d, t0, t1: t1 - t0)), RenderSettings(), camera).name
+        backends.choose(
+            replace(net, density=CustomDensity(lambda prim, o, d, t0, t1: t1 - t0)), RenderSettings(), camera
+        ).name
         == "reference"
     )
     fake.broken = "no such device"

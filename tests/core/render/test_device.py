@@ -15,7 +15,7 @@ from neuprim.config import compose
 from neuprim.core.compute import device
 from neuprim.core.compute.device import HOST
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, FormError
-from neuprim.core.model.fields import Opaque
+from neuprim.core.model.fields import CustomDensity
 from neuprim.core.render import RenderSettings, backends, render_lowered
 from neuprim.core.render.backends import Backend
 from neuprim.core.render.place import device_of
@@ -44,14 +44,14 @@ def frame(seed: int = 0) -> Any:
 
 
 def test_without_a_card_auto_is_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
     trainer = tiny.trainer(tiny.two_primitives(), 1)
     assert trainer.device == torch.device("cpu") and trainer._ahead is None
 
 
 def test_a_card_that_is_asked_for_and_not_there_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before anything is loaded, and in Python code too."""
-    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
     line = r"^renderer\.device=cuda: torch finds no CUDA device; expected cpu or auto$"
     monkeypatch.setattr("neuprim.runs.fit.load_dataset", lambda *_, **__: pytest.fail("loaded"))
     with pytest.raises(BackendUnavailable, match=line):
@@ -62,7 +62,7 @@ def test_a_card_that_is_asked_for_and_not_there_is_one_line(tmp_path: Path, monk
 
 
 def test_so_is_a_backend_of_a_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
     monkeypatch.setattr("neuprim.runs.fit.load_dataset", lambda *_, **__: pytest.fail("loaded"))
     line = r"^renderer\.backend=cuda cannot run here: torch finds no CUDA device; expected auto or the name of another backend$"
     with pytest.raises(BackendUnavailable, match=line):
@@ -70,7 +70,7 @@ def test_so_is_a_backend_of_a_card(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_a_card_that_nothing_draws_on_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "card_missing", lambda: None)
+    monkeypatch.setattr(device, "cuda_unavailable", lambda: None)
     monkeypatch.setattr(backends, "TABLE", tuple(b for b in backends.TABLE if b.devices[0] == "cpu"))
     assert backends.no_card() == "no backend draws there"
     assert tiny.trainer(tiny.two_primitives(), 1).device == torch.device("cpu")
@@ -95,13 +95,13 @@ def test_what_is_no_frame_is_computed_where_frames_are(card: Card) -> None:
 
 
 def test_without_a_card_that_is_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
     assert {backends.computing_device(RenderSettings(backend=name)) for name in ("auto", "cuda", "reference")} == {HOST}
-    assert not device.computes(HOST) and not device.computes(CARD)
+    assert not device.has_warp(HOST) and not device.has_warp(CARD)
     monkeypatch.setattr(device, "_warp", lambda: True)
-    assert device.computes(torch.device("cuda", 0)) and not device.computes(HOST)
+    assert device.has_warp(torch.device("cuda", 0)) and not device.has_warp(HOST)
     monkeypatch.setattr(device, "_warp", lambda: False)
-    assert not device.computes(torch.device("cuda", 0))
+    assert not device.has_warp(torch.device("cuda", 0))
 
 
 def test_a_backend_and_a_device_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
@@ -113,9 +113,9 @@ def test_a_backend_and_a_device_that_do_not_go_together_are_refused(tmp_path: Pa
 
 
 def test_a_run_of_a_card_is_opened_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
     assert backends.at_hand(RenderSettings(device="cuda", near=0.5)) == RenderSettings(near=0.5)
-    monkeypatch.setattr(device, "card_missing", lambda: None)
+    monkeypatch.setattr(device, "cuda_unavailable", lambda: None)
     row = Backend("card", lambda: pytest.fail("loaded"), devices=("cuda",))
     monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE))
     assert backends.at_hand(RenderSettings(device="cuda")) == RenderSettings(device="cuda")
@@ -163,7 +163,7 @@ def test_code_of_a_model_stays_where_it_is(card: Card) -> None:
     """What only the reference draws is not moved to it; a run keeps such a model on the processor in the first
     place."""
     low, camera = frame()
-    own = replace(low, density=Opaque(lambda prim, o, d, t0, t1: t1 - t0))
+    own = replace(low, density=CustomDensity(lambda prim, o, d, t0, t1: t1 - t0))
     assert render_lowered(own, camera, RenderSettings()).stats.backend == "reference"
     away = replace(low.to(CARD), density=own.density)
     with pytest.raises(

@@ -11,7 +11,7 @@ import torch
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.fields import Constant, Cosine, Opaque
+from neuprim.core.model.fields import Constant, Cosine, CustomDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
@@ -69,6 +69,6 @@ def test_the_closed_form_is_the_oracle_itself() -> None:
 
 
 def test_a_density_without_a_closed_form_is_refused() -> None:
-    opaque = replace(scene(), density=Opaque(lambda prim, *ray: torch.zeros(len(prim))))
-    with pytest.raises(ConfigError, match="density Opaque has no closed form"):
+    opaque = replace(scene(), density=CustomDensity(lambda prim, *ray: torch.zeros(len(prim))))
+    with pytest.raises(ConfigError, match="density CustomDensity has no closed form"):
         compare_sampling(opaque, camera(), EXACT)

@@ -99,7 +99,7 @@ def test_a_card_trains_what_the_processor_trains(task: str, tmp_path: Path, monk
     config = configured(task, tmp_path, *(["train.voxels_every=2"] if task == "time" else []))
     own, told = trained(config, None, 8)
     with monkeypatch.context() as patch:
-        patch.setattr(device, "fused", lambda *tensors: False)
+        patch.setattr(device, "on_numba", lambda *tensors: False)
         twin, twins = trained(config, own.dataset, 8)
     with pretended(monkeypatch) as card:
         other, heard = trained(config, own.dataset, 8)

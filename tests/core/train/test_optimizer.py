@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.threads import limited
+from neuprim.core.compute.threads import limit_threads
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.schema import ParameterSpec
 from neuprim.core.train import optimizer as optimizer_module
@@ -208,7 +208,7 @@ def test_it_does_not_depend_on_the_number_of_threads() -> None:
         p = params(30_000, 2)
         optimizer = RowAdam(SPECS, p, 0.99)
         optimizer.age = torch.arange(30_000) % 97 // 3
-        with limited(threads):
+        with limit_threads(threads):
             for step in range(3):
                 set_grads(p, step)
                 optimizer.step(p, RATES)

@@ -8,9 +8,9 @@ import torch
 
 from neuprim.core.data import Dataset
 from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.fields import pieces_by_name
-from neuprim.core.model.pieces import without
+from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.prunable import zero_units
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.train.sensitivity import sensitivity
 from neuprim.tasks.static.fields import SphericalHarmonics
@@ -40,12 +40,12 @@ def test_signs_find_the_mean_squared_change_of_every_piece() -> None:
     views = list(range(len(dataset.train)))[:4]
     whole = images(one, dataset, views)
     trials = [sensitivity(one, dataset, views, SETTINGS, seed) for seed in range(60)]
-    pieces = pieces_by_name(one.density, one.colour)
+    pieces = prunable_units_by_name(one.density, one.colour)
     for name in ("colour.coefficient 1 -1, channel 0", "colour.coefficient 1 +0, channel 2"):
         found = torch.stack([t.pieces[name] for t in trials]).mean(0)
         for row in range(one.count):
             only = torch.arange(one.count) == row
-            less = Primitives(one.density, one.colour, without({"": (pieces[name], only)}, one.params))
+            less = Primitives(one.density, one.colour, zero_units({"": (pieces[name], only)}, one.params))
             true = float((images(less, dataset, views) - whole).square().mean())
             assert abs(float(found[row]) - true) < 0.5 * true + 1e-9
     assert torch.isfinite(torch.stack([t.pieces["density.neuron 0"] for t in trials])).all()

@@ -27,7 +27,7 @@ MATRIX[:3, 3] = torch.tensor([-0.8, -0.8, -0.85])
 
 @pytest.fixture(autouse=True)
 def on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "computes", lambda where: True)
+    monkeypatch.setattr(device, "has_warp", lambda where: True)
 
 
 def model(neurons: int = 3, edge: int = 2) -> Primitives:
@@ -50,7 +50,7 @@ def test_it_is_the_processors(edge: int, neurons: int, monkeypatch: pytest.Monke
     """Sums of the same float32 numbers in the same order: most points have the same bits."""
     m = model(neurons, edge)
     found = density_grid(m, {}, MATRIX, SHAPE)
-    monkeypatch.setattr(device, "computes", lambda where: False)
+    monkeypatch.setattr(device, "has_warp", lambda where: False)
     wanted = density_grid(m, {}, MATRIX, SHAPE)
     assert float(wanted.max()) > 1.0 and torch.allclose(found, wanted, rtol=1e-6, atol=1e-6)
     assert float((found == wanted).float().mean()) > 0.99

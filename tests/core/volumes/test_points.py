@@ -63,15 +63,15 @@ def wide(model: Primitives) -> Primitives:
 
 def oracle(model: Primitives, conditions: Conditions, x: Tensor) -> tuple[Tensor, Tensor]:
     """Sigma (M,) and source (M, 3) by all pairs, in float64 with autograd."""
-    living = model.living(conditions)
-    g = living.geometry
-    own = {spec.name: living.params[spec.name] for spec in model.colour.parameters()}
+    active = model.active(conditions)
+    g = active.geometry
+    own = {spec.name: active.params[spec.name] for spec in model.colour.parameters()}
     harmonics = model.colour.harmonics(own, conditions)
     assert harmonics is not None
     colors = (harmonics[0] * 0.28209479177387814 + 0.5).clamp_min(0)
     point, prim = (i.reshape(-1) for i in torch.meshgrid(torch.arange(len(x)), torch.arange(g.count), indexing="ij"))
     y = torch.einsum("pa,pab->pb", x[point] - g.means[prim], g.rotations[prim]) / g.scales[prim]
-    sigma = living.sigma(prim, x[point]).clamp_min(0) * (y.square().sum(-1) < 1)
+    sigma = active.sigma(prim, x[point]).clamp_min(0) * (y.square().sum(-1) < 1)
     total = torch.zeros(len(x), dtype=torch.float64).index_add(0, point, sigma)
     return total, torch.zeros(len(x), 3, dtype=torch.float64).index_add(0, point, sigma[:, None] * colors[prim])
 
@@ -170,7 +170,7 @@ def test_shares_are_sums_over_points(model: Primitives) -> None:
     assert not bool(shares.weight.any())
     found.sigma.sum().backward()
     point, prim = pairs_of(model.geometry, x.numpy())
-    own = model.living({}).sigma(prim, x[point]).clamp_min(0).detach()
+    own = model.active({}).sigma(prim, x[point]).clamp_min(0).detach()
     for sums, value in ((shares.weight, own), (shares.error_weight, own * error[point])):
         expected = torch.zeros(model.count, dtype=torch.float64).index_add_(0, prim, value)
         assert bool(expected.any()) and torch.allclose(sums.double(), expected, rtol=1e-5, atol=1e-6)

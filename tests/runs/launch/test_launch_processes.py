@@ -14,7 +14,7 @@ import torch
 from neuprim.config import compose
 from neuprim.config.launcher import LauncherSettings
 from neuprim.core import checkpoint
-from neuprim.core.compute.threads import core_count, sharing
+from neuprim.core.compute.threads import core_count, limit_process_threads
 from neuprim.core.errors import ConfigError
 from neuprim.runs.launch import engine
 from neuprim.runs.launch.jobs import Result
@@ -156,7 +156,7 @@ def test_cores_are_shared_out_and_never_promised_twice(asked: dict[str, int], jo
 
 def test_jobs_in_a_worker_keep_its_share_of_the_cores() -> None:
     """As the chunks of a run that is itself one of a sweep."""
-    with sharing(1), own_share(LauncherSettings()):
+    with limit_process_threads(1), own_share(LauncherSettings()):
         assert core_count() == 1
     with own_share(LauncherSettings(threads=1)):
         assert core_count() == 1

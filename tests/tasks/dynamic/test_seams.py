@@ -106,13 +106,13 @@ def test_a_frame_of_one_chunk_is_that_chunks_own_image_to_the_bit() -> None:
     for moment, chunk in ((0.0, 0), (0.25, 0), (0.375, 1), (0.625, 1), (0.75, 2), (1.0, 2)):
         expected = render(models[chunk], camera, at(moment)).rgb
         assert torch.equal(render(whole, camera, at(moment)).rgb, expected)
-        assert len(whole.density.alive(whole.of(whole.density), at(moment))) <= models[chunk].count  # type: ignore[arg-type]
+        assert len(whole.density.active_rows(whole.of(whole.density), at(moment))) <= models[chunk].count  # type: ignore[arg-type]
 
 
 def test_nothing_lives_where_its_chunk_has_seen_nothing_however_long_its_window() -> None:
     whole = joined(three(), [0, 1, 2], SEAMS)
     for moment in torch.linspace(0, 1, 101).tolist():
-        alive = whole.density.alive(whole.of(whole.density), at(moment))
+        alive = whole.density.active_rows(whole.of(whole.density), at(moment))
         assert alive is not None and len(alive)
         for chunk in whole.params["chunk"][alive, 0].unique().tolist():
             begin = SEAMS[int(chunk) - 1][0] if chunk > 0 else 0.0
@@ -124,7 +124,7 @@ def test_nothing_lives_where_its_chunk_has_seen_nothing_however_long_its_window(
 def test_a_chunk_that_holds_nothing_leaves_its_time_empty() -> None:
     first, _, last = three()
     whole = joined([first, last], [0, 2], SEAMS)
-    alive = whole.density.alive(whole.of(whole.density), at(0.5))
+    alive = whole.density.active_rows(whole.of(whole.density), at(0.5))
     assert alive is not None and len(alive) == 0
     assert not bool(render(whole, scenes.camera(), at(0.5)).alpha.any())
 
@@ -158,7 +158,7 @@ def test_children_are_of_their_parents_chunk() -> None:
 
 def test_a_part_of_time_can_be_taken_away() -> None:
     whole = joined(three(), [0, 1, 2], SEAMS)
-    field, fewer = whole.density.reduced(whole.of(whole.density), whole.geometry, "phase", 0)
+    field, fewer = whole.density.reduce(whole.of(whole.density), whole.geometry, "phase", 0)
     assert (
         isinstance(field, TimeDensity) and field.seams == SEAMS and torch.equal(fewer["chunk"], whole.params["chunk"])
     )

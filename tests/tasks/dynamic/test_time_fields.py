@@ -114,12 +114,12 @@ def test_every_variant_draws_finite_images_at_and_beyond_the_ends(time: str) -> 
 def test_primitives_outside_their_window_are_left_out_and_nothing_changes() -> None:
     m = model("window+motion", dtype=torch.float32)
     camera, settings = scenes.camera(), RenderSettings(alpha_min=0.0)
-    rows = m.density.alive(m.of(m.density), at(0.5))
+    rows = m.density.active_rows(m.of(m.density), at(0.5))
     assert rows is not None and 0 < len(rows) < COUNT
     lowered = m.lower(camera, at(0.5))
     assert lowered.geometry.count == len(rows)
     culled = render(m, camera, at(0.5), settings).rgb
-    m.density.alive = lambda params, conditions: None  # type: ignore[method-assign]
+    m.density.active_rows = lambda params, conditions: None  # type: ignore[method-assign]
     assert torch.allclose(culled, render(m, camera, at(0.5), settings).rgb, atol=1e-6)
 
 
@@ -129,7 +129,7 @@ def test_gradients_reach_living_primitives_and_no_others(backend: str) -> None:
     output = render(m, scenes.camera(), at(0.5), RenderSettings(**by(backend)))
     tally = output.watch(torch.ones(output.rgb.shape[:2]))
     (output.rgb * torch.rand(output.rgb.shape, generator=torch.Generator().manual_seed(1))).sum().backward()
-    rows = m.density.alive(m.of(m.density), at(0.5))
+    rows = m.density.active_rows(m.of(m.density), at(0.5))
     assert rows is not None and len(tally.weight) == len(rows)
     weight, _ = tally.of_all(COUNT)
     assert torch.equal(weight[rows], tally.weight)

@@ -38,7 +38,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "computes", lambda where: True)
+    monkeypatch.setattr(device, "has_warp", lambda where: True)
 
 
 def test_a_sequence_is_the_processors_and_lies_in_a_folder_of_its_own(

@@ -10,11 +10,11 @@ from torch import Tensor
 from neuprim.core.compute import device
 from neuprim.core.errors import FormError
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
-from neuprim.core.model.pieces import Piece
+from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import Params
 from neuprim.core.model.tensors import Shape, Sizes, tensors_fault
 
-__all__ = ["C0", "bands", "basis", "coefficient_count", "colors", "fewer_bands", "initial_dc"]
+__all__ = ["C0", "basis", "coefficient_count", "colors", "truncate_bands", "initial_dc"]
 
 
 def coefficient_count(degree: int) -> int:
@@ -66,15 +66,15 @@ def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
     if degree == 0:
         return (dc * C0 + 0.5).clamp_min(0.0)
     assert rest is not None  # checked above
-    if device.fused(means, dc, rest) and dc.dtype == means.dtype == torch.float32:
+    if device.on_numba(means, dc, rest) and dc.dtype == means.dtype == torch.float32:
         from neuprim.core.model.colours.sh_cpu import fused_colors  # numba, loaded when first needed
 
         return fused_colors(means, dc, rest, origin, degree)
-    if device.kernels(means, dc, rest) and dc.dtype == means.dtype == torch.float32:
+    if device.on_warp(means, dc, rest) and dc.dtype == means.dtype == torch.float32:
         from neuprim.core.model.colours import sh_warp
 
         return sh_warp.fused_colors(means, dc, rest, origin, degree)
-    offset = means - device.beside(origin, means)
+    offset = means - device.to_like(origin, means)
     direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
     bands = basis(direction, degree)[:, 1:]
     return (dc * C0 + 0.5 + (bands[:, :, None] * rest[:, : bands.shape[1]]).sum(1)).clamp_min(0.0)
@@ -97,7 +97,7 @@ def _check(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
         raise FormError(f"sh.colors: {fault}")
 
 
-def fewer_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
+def truncate_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
     """The tensors with the bands above ``degree`` gone from the one called ``name``, (N, bands but the first, C); it
     goes with the last of them.
 
@@ -113,22 +113,15 @@ _DARKEST = 1e-3
 black."""
 
 
-def coefficients(degree: int, channels: int, name: str) -> tuple[Piece, ...]:
+def coefficients(degree: int, channels: int, name: str) -> tuple[PrunableUnit, ...]:
     """Every number by itself of coefficients (N, (degree + 1)^2 - 1, C) in the parameter ``name``, told of by bands."""
     return tuple(
-        Piece(
+        PrunableUnit(
             f"coefficient {band} {order - band:+d}, channel {c}", {name: (band * band - 1 + order, c)}, f"band {band}"
         )
         for band in range(1, degree + 1)
         for order in range(2 * band + 1)
         for c in range(channels)
-    )
-
-
-def bands(degree: int, name: str) -> tuple[Piece, ...]:
-    """The bands above the zeroth: pieces, in earlier files."""
-    return tuple(
-        Piece(f"band {band}", {name: (slice(band * band - 1, (band + 1) ** 2 - 1),)}) for band in range(1, degree + 1)
     )
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute.kernels import exact_kernel, strict
-from neuprim.core.compute.operation import applied
+from neuprim.core.compute.operation import apply_autograd
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
 
@@ -155,5 +155,5 @@ def fused_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree
 
     ``origin`` (3,) is the camera centre; gradients flow to all four. ``degree`` 1..3 selects how many bands count.
     """
-    result: Tensor = applied(_Colors, means, dc, rest, origin, degree)
+    result: Tensor = apply_autograd(_Colors, means, dc, rest, origin, degree)
     return result

@@ -128,7 +128,7 @@ class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
         means, dc, rest = (x.detach().contiguous() for x in (means, dc, rest))
-        centre = device.beside(origin.detach(), means).double().contiguous()
+        centre = device.to_like(origin.detach(), means).double().contiguous()
         color = torch.empty(dc.shape, dtype=torch.float32, device=dc.device)
         arrays = (
             array(means, wp.vec3),

@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 from neuprim.core.checked import Range
-from neuprim.core.model.densities.fewer import fewer_neurons, smaller_counts
+from neuprim.core.model.canonical import canonicalize_cosines, canonicalize_gain
+from neuprim.core.model.densities.fewer import prune_neurons, smaller_neuron_counts
 from neuprim.core.model.edge import EDGES, NORMS, fade
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
-from neuprim.core.model.folding import fold_cosines, fold_gain
 from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pieces import Piece
+from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
-from neuprim.core.model.scripts import script_beside
+from neuprim.core.model.scripts import read_script
 from neuprim.core.model.tensors import number_fault
 
 __all__ = [
@@ -119,30 +119,30 @@ class CosineDensity(DensityField):
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
         return split_cosine(params, old, new, self.omega0, self.edge)
 
-    def folded(self, params: Params) -> dict[str, Tensor]:
-        found = fold_cosines(params, ("W1",), "b1", "w2", self.omega0)
-        return fold_gain(found, "b2", "log_gain", GAIN_LIMIT) if self.gain and not self.neurons else found
+    def canonicalize(self, params: Params) -> dict[str, Tensor]:
+        found = canonicalize_cosines(params, ("W1",), "b1", "w2", self.omega0)
+        return canonicalize_gain(found, "b2", "log_gain", GAIN_LIMIT) if self.gain and not self.neurons else found
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
         support, depth = gaussian_support(self.edge, alphas)
         return support.to(alphas), -torch.expm1(-depth).to(alphas)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        return {"neurons": smaller_counts(self.neurons)} if self.neurons else {}
+        return {"neurons": smaller_neuron_counts(self.neurons)} if self.neurons else {}
 
-    def reduced(
+    def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[CosineDensity, dict[str, Tensor]]:
-        return CosineDensity(value, self.omega0, self.edge, self.gain), fewer_neurons(
+        return CosineDensity(value, self.omega0, self.edge, self.gain), prune_neurons(
             params, geometry, value, self.omega0
         )
 
-    def pieces(self) -> tuple[Piece, ...]:
+    def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """Neurons."""
-        return tuple(Piece(f"neuron {k}", {"W1": (k,), "b1": (k,), "w2": (k,)}) for k in range(self.neurons))
+        return tuple(PrunableUnit(f"neuron {k}", {"W1": (k,), "b1": (k,), "w2": (k,)}) for k in range(self.neurons))
 
     def script(self) -> str:
-        return script_beside(__package__, "cosine.js")
+        return read_script(__package__, "cosine.js")
 
     def largest(self, params: Params, geometry: Geometry) -> Tensor:
         w2, b2 = amplified(params["w2"], params["b2"], params.get("log_gain"))

@@ -19,15 +19,15 @@ from neuprim.core.model.edge import sinc
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import Params
 
-__all__ = ["ball_mean", "fewer_neurons", "smaller_counts"]
+__all__ = ["ball_mean", "prune_neurons", "smaller_neuron_counts"]
 
 
-def smaller_counts(neurons: int) -> tuple[int, ...]:
+def smaller_neuron_counts(neurons: int) -> tuple[int, ...]:
     """Three quarters, a half and a quarter of so many neurons, and none."""
     return tuple(sorted({neurons * part // 4 for part in range(4)} - {neurons}, reverse=True))
 
 
-def fewer_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) -> dict[str, Tensor]:
+def prune_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) -> dict[str, Tensor]:
     """The tensors with ``keep`` neurons for each primitive, those whose part of the density varies most; others pass
     through.
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
-from neuprim.core.compute.operation import applied
+from neuprim.core.compute.operation import apply_autograd
 
 __all__ = ["fused_gain", "scale_backward"]
 
@@ -48,8 +48,8 @@ class _Gain(torch.autograd.Function):
 def fused_gain(w2: Tensor, b2: Tensor, log_gain: Tensor, limit: float) -> tuple[Tensor, Tensor]:
     """(w2, b2) (N, K) and (N, 1) times exp(log_gain), (N, 1), which counts as no further from 0 than ``limit``; one
     dtype."""
-    if not device.fused(w2, b2, log_gain):
+    if not device.on_numba(w2, b2, log_gain):
         gain = log_gain.clamp(-limit, limit).exp()
         return w2 * gain, b2 * gain
-    result: tuple[Tensor, Tensor] = applied(_Gain, w2, b2, log_gain, limit)
+    result: tuple[Tensor, Tensor] = apply_autograd(_Gain, w2, b2, log_gain, limit)
     return result

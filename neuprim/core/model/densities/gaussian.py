@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.model.fields import Conditions, DensityField, Opaque
+from neuprim.core.model.fields import Conditions, CustomDensity, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 
@@ -73,7 +73,7 @@ class GaussianDensity(DensityField):
         """As wide as they are: the support ends where it ends for every Gaussian."""
         return torch.full_like(alphas, self.deviations), alphas
 
-    def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Opaque:
+    def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> CustomDensity:
         """The line integral over a chord [t0, t1] in closed form, in float64; differentiable in every argument.
 
         With p = (t0 + t1)/2 the chord's middle, y its whitened point, v = diag(1/s) R^T d, a = v.v and u = y.v/a the
@@ -103,7 +103,7 @@ class GaussianDensity(DensityField):
                 * bell_integral(rate * u, rate * (t1 - t0) / 2)
             )
 
-        return Opaque(line_integral)
+        return CustomDensity(line_integral)
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
         y = (geometry.rotations[prim].transpose(1, 2) @ (x - geometry.means[prim])[:, :, None])[

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.compute.operation import applied, asked
-from neuprim.core.compute.threads import parallel_for, threads_of
+from neuprim.core.compute.operation import apply_autograd, needs_grad
+from neuprim.core.compute.threads import parallel_for, resolve_threads
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import Lowered
@@ -69,7 +69,7 @@ class _Prepared:
     def __post_init__(self) -> None:
         """Fixes the unit of work for both passes: half a row of tiles, or more where threads are few, as every unit
         costs a call."""
-        threads = threads_of(self.settings.threads)
+        threads = resolve_threads(self.settings.threads)
         least = 2 if threads > 1 else _TILES_ALONE
         self.chunk = max(least, -(-self.camera.width // L.TILE) // 2, self.tiles // (_UNITS_PER_THREAD * threads))
 
@@ -338,8 +338,8 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
     tensors = (
         g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), palette, camera.viewmat, background,
     )  # fmt: skip
-    rgb, T, zsum = applied(
-        _Rasterize, *tensors, camera, density.omega0, density.edge, settings, stats, asked(*tensors, *net), *net
+    rgb, T, zsum = apply_autograd(
+        _Rasterize, *tensors, camera, density.omega0, density.edge, settings, stats, needs_grad(*tensors, *net), *net
     )
     dtype = g.means.dtype
     alpha = 1 - T

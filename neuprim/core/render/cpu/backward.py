@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel, inline, kernel
-from neuprim.core.compute.views import copy16, keep16, lent, returned
+from neuprim.core.compute.views import borrow_array, compress16, copy16, release_array
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.gradients import (
@@ -137,10 +137,10 @@ def _lanes_that_count(S, n, with_depths):  # type: ignore[no-untyped-def]
     kept = 0
     for k in range(0, n, L.TILE):
         if with_depths:
-            keep16(S, L.DEPTH + kept, L.DEPTH + k, L.GRAD + k)
-            keep16(S, L.NORM_L + kept, L.NORM_L + k, L.GRAD + k)
-        keep16(S, L.PIXEL + kept, L.PIXEL + k, L.GRAD + k)
-        kept += keep16(S, L.GRAD + kept, L.GRAD + k, L.GRAD + k)
+            compress16(S, L.DEPTH + kept, L.DEPTH + k, L.GRAD + k)
+            compress16(S, L.NORM_L + kept, L.NORM_L + k, L.GRAD + k)
+        compress16(S, L.PIXEL + kept, L.PIXEL + k, L.GRAD + k)
+        kept += compress16(S, L.GRAD + kept, L.GRAD + k, L.GRAD + k)
     for k in range(L.TILE):
         S[index(L.PIXEL + kept + k)], S[index(L.GRAD + kept + k)] = f(0), f(0)
         if with_depths:
@@ -167,15 +167,21 @@ def backward_tiles(  # type: ignore[no-untyped-def]
     ``net``: as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
     """
     depths, rows, wide, slots, spans, kinds = (
-        lent(depths),
-        lent(rows),
-        lent(wide),
-        lent(slots),
-        lent(spans),
-        lent(kinds),
+        borrow_array(depths),
+        borrow_array(rows),
+        borrow_array(wide),
+        borrow_array(slots),
+        borrow_array(spans),
+        borrow_array(kinds),
     )
-    boxes, starts, ids, colors, pair_rows = lent(boxes), lent(starts), lent(ids), lent(colors), lent(pair_rows)
-    live, found = lent(live), lent(found)
+    boxes, starts, ids, colors, pair_rows = (
+        borrow_array(boxes),
+        borrow_array(starts),
+        borrow_array(ids),
+        borrow_array(colors),
+        borrow_array(pair_rows),
+    )
+    live, found = borrow_array(live), borrow_array(found)
     height, width = norms.shape
     across = (width + L.TILE - 1) // L.TILE
     C = colors.shape[1]
@@ -197,9 +203,9 @@ def backward_tiles(  # type: ignore[no-untyped-def]
         aligned((2 + C) * L.TILE),
     )
     ends, begins, lives = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32), aligned(L.TILE)
-    S, D, V = lent(lanes), lent(wide_lanes), lent(slopes).reshape((neurons, L.NEURON_SCRATCH))
-    state, w, cg, sums = lent(pixels), lent(weights), lent(rays), lent(totals)
-    bounds, offset, rows_live = lent(ends), lent(begins), lent(lives)
+    S, D, V = borrow_array(lanes), borrow_array(wide_lanes), borrow_array(slopes).reshape((neurons, L.NEURON_SCRATCH))
+    state, w, cg, sums = borrow_array(pixels), borrow_array(weights), borrow_array(rays), borrow_array(totals)
+    bounds, offset, rows_live = borrow_array(ends), borrow_array(begins), borrow_array(lives)
     evaluated = 0
     for t in range(start, stop):
         if starts[t] == starts[t + 1]:
@@ -327,10 +333,10 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
             chord_gradient(S, n16, p, out, edge, slots[i] >= 0)
     for mine in (lanes, slopes, pixels, weights, rays, totals, lives):
-        returned(mine)
-    returned(wide_lanes)
+        release_array(mine)
+    release_array(wide_lanes)
     for numbers in (ends, begins):
-        returned(numbers)
+        release_array(numbers)
     return evaluated
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuprim.core.compute.kernels import inline, text
+from neuprim.core.compute.kernels import inline, inline_source
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cpu import layout as L
 
@@ -17,7 +17,7 @@ f = np.float32
 _MEANS = tuple(f(n / 2) for n in NORMS)  # of (1 - u^2)^p over [-1, 1]
 
 
-@text
+@inline_source
 def ray(p):  # type: ignore[no-untyped-def]
     """What :func:`chord` reads of a primitive's row, read once for all lanes."""
     return (
@@ -27,7 +27,7 @@ def ray(p):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@text
+@inline_source
 def chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
     """The chord of one pixel of the tile: (du, dv, slide, e, closest point, D, 1/(e.e), tm, h, uncut, mid, half), as in
     the layout.
@@ -61,13 +61,13 @@ def chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
     return du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half
 
 
-@text
+@inline_source
 def by_depth(D, ia, depth_floor, edge):  # type: ignore[no-untyped-def]
     """dh/dD of h = sqrt(D/a), with the floor on D; a soft edge needs none, as D^p tames what grows as D^-1/2."""
     return f(0.5) * ia / np.sqrt(max(D, depth_floor if len(edge) == 0 else f(1e-12)) * ia)
 
 
-@text
+@inline_source
 def weight(D, edge):  # type: ignore[no-untyped-def]
     """FADE of a whole chord, the mean of (1 - |y|^2)^p, and its derivative by D; 1 and 0 for a hard edge."""
     inner = max(D, f(0))

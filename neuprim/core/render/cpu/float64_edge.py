@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuprim.core.compute.kernels import by_length, inline
+from neuprim.core.compute.kernels import dispatch_by_length, inline
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import (
     HALF64,
@@ -155,7 +155,7 @@ def _soft_slopes_2(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
     _soft_slopes(S, X, V, n, p, neurons, 2)
 
 
-neurons_float64 = by_length(hard_neurons_float64, _soft_neurons_1, _soft_neurons_2)
+neurons_float64 = dispatch_by_length(hard_neurons_float64, _soft_neurons_1, _soft_neurons_2)
 """(edge, S, X, n, p, neurons): FADE, and FIELD += the weighted mean of every neuron of a float64 row."""
-slopes_float64 = by_length(hard_slopes_float64, _soft_slopes_1, _soft_slopes_2)
+slopes_float64 = dispatch_by_length(hard_slopes_float64, _soft_slopes_1, _soft_slopes_2)
 """(edge, S, X, V, n, p, neurons): the same, and what the gradients need."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline, kernel
-from neuprim.core.compute.views import lent, returned
+from neuprim.core.compute.views import borrow_array, release_array
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.kept import alive, most_lanes, room
@@ -98,13 +98,26 @@ def composite_tiles(  # type: ignore[no-untyped-def]
     there is to a colour, which leaves no trace of it in the compiled kernel, or the
     :class:`~neuprim.core.render.cpu.colour_net.Net` on that base.
     """
-    rows, wide, slots, spans, kinds, boxes = lent(rows), lent(wide), lent(slots), lent(spans), lent(kinds), lent(boxes)
-    starts, ids, colors, live, found = lent(starts), lent(ids), lent(colors), lent(live), lent(found)
+    rows, wide, slots, spans, kinds, boxes = (
+        borrow_array(rows),
+        borrow_array(wide),
+        borrow_array(slots),
+        borrow_array(spans),
+        borrow_array(kinds),
+        borrow_array(boxes),
+    )
+    starts, ids, colors, live, found = (
+        borrow_array(starts),
+        borrow_array(ids),
+        borrow_array(colors),
+        borrow_array(live),
+        borrow_array(found),
+    )
     height, width = norms.shape
     keep = live.shape[0] > 0
     across = (width + L.TILE - 1) // L.TILE
     found_depths = room(most_lanes(start, stop, across, boxes, starts, ids) if keep else 0)
-    depths = lent(found_depths)
+    depths = borrow_array(found_depths)
     C = colors.shape[1]
     amin, amax, tmin, floor = limits[0], limits[1], limits[2], limits[3]
     scratch = L.FORWARD_SCRATCH
@@ -118,8 +131,8 @@ def composite_tiles(  # type: ignore[no-untyped-def]
         aligned(L.TILE),
     )
     ends, begins, lives = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32), aligned(L.TILE)
-    S, D, state, w = lent(lanes), lent(wide_lanes), lent(pixels), lent(weights)
-    bounds, offset, rows_live = lent(ends), lent(begins), lent(lives)
+    S, D, state, w = borrow_array(lanes), borrow_array(wide_lanes), borrow_array(pixels), borrow_array(weights)
+    bounds, offset, rows_live = borrow_array(ends), borrow_array(begins), borrow_array(lives)
     evaluated = 0
     for t in range(start, stop):
         tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
@@ -239,8 +252,8 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                 for x in range(wide_row):
                     zsum[Y, index(tx + x)] = state[index(j + x + L.ZSUM)]
     for mine in (lanes, pixels, weights, lives):
-        returned(mine)
-    returned(wide_lanes)
+        release_array(mine)
+    release_array(wide_lanes)
     for numbers in (ends, begins):
-        returned(numbers)
+        release_array(numbers)
     return evaluated, found_depths

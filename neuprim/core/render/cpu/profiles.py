@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from neuprim.core.compute.kernels import by_length, inline
+from neuprim.core.compute.kernels import dispatch_by_length, inline
 from neuprim.core.render.cpu import trigonometry as T
 
 __all__ = [
@@ -169,9 +169,9 @@ def _fast(p: int) -> tuple[Kernel, Kernel]:
 
 
 _soft_slow, _soft_medium, _soft_fast = ((kind(1), kind(2)) for kind in (_slow, _medium, _fast))
-profiles_slow = by_length(T.sincs_slow, _soft_slow[0][0], _soft_slow[1][0])
-profiles_medium = by_length(T.sincs_medium, _soft_medium[0][0], _soft_medium[1][0])
-profiles_fast = by_length(T.sincs_fast, _soft_fast[0][0], _soft_fast[1][0])
-slopes_slow = by_length(T.slopes_slow, _soft_slow[0][1], _soft_slow[1][1])
-slopes_medium = by_length(T.slopes_medium, _soft_medium[0][1], _soft_medium[1][1])
-slopes_fast = by_length(T.slopes_fast, _soft_fast[0][1], _soft_fast[1][1])
+profiles_slow = dispatch_by_length(T.sincs_slow, _soft_slow[0][0], _soft_slow[1][0])
+profiles_medium = dispatch_by_length(T.sincs_medium, _soft_medium[0][0], _soft_medium[1][0])
+profiles_fast = dispatch_by_length(T.sincs_fast, _soft_fast[0][0], _soft_fast[1][0])
+slopes_slow = dispatch_by_length(T.slopes_slow, _soft_slow[0][1], _soft_slow[1][1])
+slopes_medium = dispatch_by_length(T.slopes_medium, _soft_medium[0][1], _soft_medium[1][1])
+slopes_fast = dispatch_by_length(T.slopes_fast, _soft_fast[0][1], _soft_fast[1][1])

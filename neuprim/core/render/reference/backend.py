@@ -197,7 +197,7 @@ def _trace(
     if flat is not None:
         rgb = weights.T @ flat.double()[rows]
     else:
-        c = lowered.seen(pairs)
+        c = lowered.chord_colours(pairs)
         rgb = torch.zeros(P, channels, dtype=torch.float64).index_add(0, j, weights[i, j][:, None] * c)
     z = (
         torch.zeros(P, dtype=torch.float64).index_add(0, j, weights[i, j] * mid * m * rays.depth[j])

@@ -122,12 +122,14 @@ class Shards(Alone):
         rows = self._shown(model, look.view)
         if look.beside is None:
             return rows
-        alive, _ = model.places(look.beside)  # all that live: points are anywhere, and sums over them are of all
+        alive, _ = model.active_geometry(
+            look.beside
+        )  # all that live: points are anywhere, and sums over them are of all
         whole = torch.arange(model.count, device=model.device) if alive is None else alive
         return torch.cat([rows, whole]).unique()
 
     def _shown(self, model: Primitives, view: View) -> Tensor:
-        alive, geometry = model.places(view.conditions)
+        alive, geometry = model.active_geometry(view.conditions)
         whole = torch.arange(model.count, device=model.device) if alive is None else alive
         if type(model.colour).shade is not ColourField.shade:
             return whole  # what the camera does not see may cast a shadow on what it does

@@ -103,7 +103,7 @@ class Capture:
             self.samples,
             self.normalisation.to_json(),
         ]
-        parts += [self.device.type] * hardware.computes(self.device)
+        parts += [self.device.type] * hardware.has_warp(self.device)
         return hashlib.sha256(json.dumps(parts, default=_plain).encode()).hexdigest()[:16]
 
     def medium(self, frame: VdbFrame) -> Medium:

@@ -47,11 +47,11 @@ def integrate(
     camera.validate("camera")
     pose = (medium.index_from_scene @ np.linalg.inv(camera.viewmat.detach().double().cpu().numpy()))[:3]
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
-    if device.computes(where):
+    if device.has_warp(where):
         from neuprim.tasks.dynamic.volume import traverse_warp
 
         values, skips = medium.on(where)
-        place, lenses = (device.from_host(torch.from_numpy(np.ascontiguousarray(x)), where) for x in (pose, lens))
+        place, lenses = (device.copy_from_host(torch.from_numpy(np.ascontiguousarray(x)), where) for x in (pose, lens))
         return traverse_warp.radiances(
             values, skips, place, lenses, camera.width, camera.height, samples, subdivisions
         ).cpu()

@@ -93,7 +93,7 @@ class Medium:
     def on(self, where: torch.device) -> tuple[Tensor, Tensor]:
         """``values`` and ``skips`` as tensors there; kept, as many cameras look at them."""
         if where not in self._elsewhere:
-            values, skips = (device.from_host(torch.from_numpy(x), where) for x in (self.values, self.skips))
+            values, skips = (device.copy_from_host(torch.from_numpy(x), where) for x in (self.values, self.skips))
             self._elsewhere[where] = values, skips
         return self._elsewhere[where]
 

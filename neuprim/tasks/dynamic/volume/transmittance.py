@@ -38,10 +38,10 @@ def transmittance(
     if not medium.empty:
         way = medium.index_from_scene[:3, :3] @ (towards / length)
         sigma = np.ascontiguousarray(medium.values[..., 0])
-        if device.computes(where):
+        if device.has_warp(where):
             from neuprim.tasks.dynamic.volume import traverse_warp
 
-            held = (device.from_host(torch.from_numpy(x), where) for x in (sigma, medium.skips, way))
+            held = (device.copy_from_host(torch.from_numpy(x), where) for x in (sigma, medium.skips, way))
             return np.exp(-traverse_warp.depths(*held).cpu().numpy())
         rx, ry, rz = way.tolist()
         parallel_for(depths, len(sigma), 2, threads, sigma, medium.skips, rx, ry, rz, result)

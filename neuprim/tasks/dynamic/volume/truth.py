@@ -37,10 +37,10 @@ def extinction_on(
         return np.zeros(shape, np.float32)
     chain = np.linalg.inv(medium.scene_from_index) @ scene_from_index.numpy()
     sigma = medium.scattering if part and medium.scattering is not None else medium.values[..., 0]
-    if device.computes(where) and not medium.empty and sigma is not medium.scattering:
+    if device.has_warp(where) and not medium.empty and sigma is not medium.scattering:
         from neuprim.tasks.dynamic.volume import traverse_warp
 
-        way = device.from_host(torch.from_numpy(np.ascontiguousarray(chain[:3])), where)
+        way = device.copy_from_host(torch.from_numpy(np.ascontiguousarray(chain[:3])), where)
         return traverse_warp.extinctions(medium.on(where)[0], way, shape).cpu().numpy()
     index = np.indices(shape, dtype=np.float64).reshape(3, -1)
     points = chain[:3, :3] @ index + chain[:3, 3:]

@@ -12,7 +12,7 @@ import torch
 from numba import njit
 
 from neuprim.core.compute import views
-from neuprim.core.compute.views import copy16, keep16, lent
+from neuprim.core.compute.views import borrow_array, compress16, copy16
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.cpu import backend, layout
 from neuprim.core.render.cpu.kept import Kept, alive
@@ -133,7 +133,7 @@ def test_those_of_sixteen_floats_that_count_are_moved_together(
 
     @njit
     def keep(array: Any, at: Any, first: Any, flags: Any) -> Any:
-        return keep16(array, at, first, flags)
+        return compress16(array, at, first, flags)
 
     g = np.random.default_rng(0)
     for chance in (0.0, 0.1, 0.5, 0.9, 1.0):
@@ -152,7 +152,7 @@ def test_those_of_sixteen_floats_that_count_are_moved_together(
 def test_a_lent_array_is_the_same_array_and_its_owner_keeps_it() -> None:
     @njit
     def total(array: Any) -> float:
-        view, result = lent(array), 0.0
+        view, result = borrow_array(array), 0.0
         view[0, 0] = 7
         for row in range(view.shape[0]):
             result += view[row].sum()

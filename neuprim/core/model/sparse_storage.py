@@ -1,30 +1,27 @@
-"""Model files without what is zero, as pruning leaves it (:mod:`neuprim.core.model.pieces`).
+"""Model files without what is zero, as pruning leaves it (:mod:`neuprim.core.model.prunable`).
 
 A parameter is stored as two tensors, if that is less: ``NAME|there``, uint8, a bit for each of its numbers, row by row
-and the lowest bit first, and ``NAME|numbers``, float32, those whose bit is set. Tensors in memory are whole. Earlier
-files name pieces instead, see :func:`of_pieces`.
+and the lowest bit first, and ``NAME|numbers``, float32, those whose bit is set. Tensors in memory are whole.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from neuprim.core.errors import CheckpointError
-from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import ParameterSpec, Params
 
-__all__ = ["of_pieces", "split_off", "whole"]
+__all__ = ["load_sparse", "store_sparse"]
 
 _THERE, _NUMBERS = "|there", "|numbers"
-_ROWS = "rows|"
 
 
-def split_off(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str, Tensor], list[str]]:
+def store_sparse(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str, Tensor], list[str]]:
     """Tensors as a file holds them, and the names of the parameters without their zeros; ``specs`` are those of the
     fields."""
     stored, sparse = dict(params), []
@@ -40,7 +37,7 @@ def split_off(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str,
     return stored, sparse
 
 
-def whole(stored: Params, names: object, specs: Sequence[ParameterSpec], where: str) -> dict[str, Tensor]:
+def load_sparse(stored: Params, names: object, specs: Sequence[ParameterSpec], where: str) -> dict[str, Tensor]:
     """The tensors of a model from those of its file.
 
     Args:
@@ -68,41 +65,6 @@ def whole(stored: Params, names: object, specs: Sequence[ParameterSpec], where: 
             )
         found[name] = torch.zeros(size).masked_scatter_(there, numbers).reshape(count, *shapes[name])
     _no_more(stored, {*found, *(name + part for name in names for part in (_THERE, _NUMBERS))}, where, "no parameter")
-    return found
-
-
-def of_pieces(
-    stored: Params, names: object, specs: Sequence[ParameterSpec], pieces: Mapping[str, Piece], where: str
-) -> dict[str, Tensor]:
-    """The same of a file of earlier, in which a piece was ``NAME|KIND.PIECE`` with the rows that have it, by
-    ``rows|KIND.PIECE``, a bit for each primitive.
-
-    Args:
-        names: of the pieces that are stored apart.
-        pieces: name -> piece, those of earlier included.
-
-    Raises:
-        CheckpointError: they do not fit the model's fields or each other.
-    """
-    if not isinstance(names, list) or not all(isinstance(name, str) and name in pieces for name in names):
-        raise CheckpointError(
-            f"{where}: header field 'apart' is {names!r}; expected pieces of the model's fields: {', '.join(pieces)}"
-        )
-    count, shapes = _count(stored, where), {spec.name: spec.shape for spec in specs}
-    found = {name: value for name, value in stored.items() if "|" not in name}
-    taken = set(found)
-    for name in names:
-        has = _bits(stored.get(_ROWS + name), count, f"{where}: {_ROWS + name}")
-        taken.add(_ROWS + name)
-        for parameter, place in pieces[name].places.items():
-            key = f"{parameter}|{name}"
-            if key not in stored and parameter in stored:
-                continue  # some of a piece's parameters may be whole
-            target = found.setdefault(parameter, torch.zeros(count, *shapes[parameter]))
-            wanted = (int(has.sum()), *target[(slice(None), *place)].shape[1:])
-            target[(has, *place)] = _expected(stored.get(key), wanted, f"{where}: {key}")
-            taken.add(key)
-    _no_more(stored, taken, where, "no piece")
     return found
 
 

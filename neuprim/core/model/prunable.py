@@ -2,7 +2,7 @@
 time.
 
 A piece names numbers that mean nothing once they are zero, as few as can go by themselves. Pruning decides for every
-primitive which pieces it keeps; files leave out what is zero (:mod:`neuprim.core.model.zeros`), and compressed files
+primitive which pieces it keeps; files leave out what is zero (:mod:`neuprim.core.model.sparse_storage`), and compressed files
 have next to nothing to say about it.
 """
 
@@ -17,14 +17,14 @@ from torch import Tensor
 
 from neuprim.core.model.schema import Params
 
-__all__ = ["Piece", "alive", "numbers_of", "without", "worth"]
+__all__ = ["PrunableUnit", "count_numbers", "nonzero_rows", "removal_effect", "zero_units"]
 
 Place = tuple[int | slice, ...]
 """Where in a parameter's own shape, behind the axis of the primitives."""
 
 
 @dataclass(frozen=True)
-class Piece:
+class PrunableUnit:
     """Numbers of a field that go together.
 
     Attributes:
@@ -42,12 +42,12 @@ class Piece:
         return {name: params[name][(slice(None), *place)] for name, place in self.places.items()}
 
 
-def numbers_of(piece: Piece, params: Params) -> int:
+def count_numbers(piece: PrunableUnit, params: Params) -> int:
     """How many numbers of one primitive the piece is."""
     return sum(math.prod(value.shape[1:]) for value in piece.of(params).values())
 
 
-def worth(piece: Piece, params: Params, gradients: Params) -> Tensor:
+def removal_effect(piece: PrunableUnit, params: Params, gradients: Params) -> Tensor:
     """(N,) by how much a sum over pixels, whose gradients these are, changes when each primitive's piece is zero, to
     first order."""
     total: Tensor | None = None
@@ -59,7 +59,7 @@ def worth(piece: Piece, params: Params, gradients: Params) -> Tensor:
     return total
 
 
-def without(pieces: Mapping[str, tuple[Piece, Tensor]], params: Params) -> dict[str, Tensor]:
+def zero_units(pieces: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params) -> dict[str, Tensor]:
     """Copies of the parameters in which pieces are zero.
 
     Args:
@@ -74,7 +74,7 @@ def without(pieces: Mapping[str, tuple[Piece, Tensor]], params: Params) -> dict[
     return found
 
 
-def alive(piece: Piece, params: Params) -> Tensor:
+def nonzero_rows(piece: PrunableUnit, params: Params) -> Tensor:
     """(N,) bool of the primitives of whose piece some number is not zero."""
     return torch.stack([_flat(value.detach() != 0).any(1) for value in piece.of(params).values()]).any(0)
 

@@ -18,13 +18,15 @@ from torch import Tensor
 
 from neuprim.core.model.schema import Params
 
-__all__ = ["fold_cosines", "fold_gain"]
+__all__ = ["canonicalize_cosines", "canonicalize_gain"]
 
 _SLACK = 1e-6
 """Of a turn: phases that rounding left beside an end stay there, so that folding what is folded changes no bit."""
 
 
-def fold_cosines(params: Params, inputs: tuple[str, ...], phase: str, weights: str, rate: float) -> dict[str, Tensor]:
+def canonicalize_cosines(
+    params: Params, inputs: tuple[str, ...], phase: str, weights: str, rate: float
+) -> dict[str, Tensor]:
     """The same sums, every weight of the first output positive or zero and every phase between 0 and half a turn,
     pi/rate.
 
@@ -51,7 +53,7 @@ def fold_cosines(params: Params, inputs: tuple[str, ...], phase: str, weights: s
     return found
 
 
-def fold_gain(params: Params, strength: str, log_gain: str, limit: float) -> dict[str, Tensor]:
+def canonicalize_gain(params: Params, strength: str, log_gain: str, limit: float) -> dict[str, Tensor]:
     """The same products b exp(g), every b -1, 0 or 1.
 
     Args:

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import re
 from pathlib import Path
-
-import pytest
 
 import neuprim
 from neuprim.core.model.schema import ParameterSpec
 
 ROOT = Path(neuprim.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
-MODULES = {
-    ".".join((ROOT.name, *f.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__"): f for f in FILES
-}
 LONGEST = 460
 
 
@@ -190,10 +184,6 @@ def test_tasks_do_not_know_each_other() -> None:
     assert between(2, {name: set() for name in names}, (ROOT.name, "tasks")) == []
 
 
-def test_a_circle_is_found() -> None:
-    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == [["b", "c"]]
-
-
 def test_nothing_imports_a_built_in_task_by_name() -> None:
     """Built-in tasks are found through the entry-point group, like anybody's."""
     wrong = [
@@ -222,52 +212,6 @@ def test_runs_do_not_print() -> None:
         if isinstance(node, ast.Name) and node.id == "print"
     ]
     assert wrong == []
-
-
-def test_the_checker_sees_every_form_of_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(globals(), "ROOT", tmp_path)
-    (tmp_path / "core" / "render").mkdir(parents=True)
-    file = tmp_path / "core" / "render" / "x.py"
-    for text in (
-        "import neuprim.tasks.static",
-        "from neuprim.tasks import static",
-        "from neuprim import tasks",
-        "def f():\n    from neuprim.tasks.static import TASK",
-        "import importlib\nimportlib.import_module('neuprim.tasks.static')",
-    ):
-        file.write_text(text)
-        assert any(within(n, "neuprim.tasks") for n in imported(file)), text
-    file.write_text("from ...tasks import static")
-    assert any(n.endswith(".tasks.static") for n in imported(file))
-    file.write_text("from .settings import RenderSettings")
-    assert any(n.endswith("core.render.settings") for n in imported(file))
-
-
-def needed_at_run_time(path: Path) -> set[str]:
-    """Modules of the package that a file imports, anywhere in it but for type checking."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            node.body = [ast.Pass()]
-    found = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {n if (n := f"{node.module}.{alias.name}") in MODULES else node.module for alias in node.names}
-        elif isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-    return found & MODULES.keys()
-
-
-def test_no_module_imports_itself_by_way_of_others() -> None:
-    """Imports inside functions count: a cycle that they hide is still one. The root package is left out, being behind
-    every import."""
-    graph = {name: needed_at_run_time(file) - {ROOT.name, name} for name, file in MODULES.items() if name != ROOT.name}
-    size = len(graph) + 1
-    while len(graph) < size:  # leave out what needs nothing, and what nothing needs
-        size = len(graph)
-        needed = set().union(*graph.values())
-        graph = {name: needs & graph.keys() for name, needs in graph.items() if needs & graph.keys() and name in needed}
-    assert graph == {}
 
 
 def test_files_stay_small() -> None:
@@ -300,23 +244,6 @@ def test_tests_do_not_import_tests() -> None:
         if any(part.startswith("test_") for part in name.split("."))
     ]
     assert wrong == []
-
-
-def test_what_says_that_it_returns_something_does() -> None:
-    silent = []
-    for f in FILES:
-        for node in ast.walk(ast.parse(f.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.FunctionDef) or not re.search(
-                r"(?:^|[.;:] )returns\b", ast.get_docstring(node) or "", re.I
-            ):
-                continue
-            gives = any(
-                isinstance(n, ast.Yield | ast.YieldFrom) or (isinstance(n, ast.Return) and n.value)
-                for n in ast.walk(node)
-            )
-            abstract = any(ast.unparse(d).endswith("abstractmethod") for d in node.decorator_list)
-            silent += [f"{f.relative_to(ROOT)}:{node.lineno} {node.name}"] * (not gives and not abstract)
-    assert silent == []
 
 
 def test_every_property_of_a_parameter_decides_something() -> None:

@@ -93,5 +93,6 @@ def test_fields_without_cosines_stay_as_they_are() -> None:
         model.colour.lower(model.of(model.colour), model.geometry, scenes.camera(), CONDITIONS["relight"]), Constant
     )
     assert all(
-        torch.equal(value, model.params[key]) for key, value in model.colour.canonicalize(model.of(model.colour)).items()
+        torch.equal(value, model.params[key])
+        for key, value in model.colour.canonicalize(model.of(model.colour)).items()
     )

@@ -34,7 +34,7 @@ from shared.tables import ROOT, Table, between_markers
 from neuprim.config import compose, task_of
 from neuprim.config.target import Target
 from neuprim.core.checkpoint import load_model, save_compressed
-from neuprim.core.compression import USUAL_LEVEL, bit_table
+from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.io.files import write_json
 from neuprim.runs.events import Event, Note
@@ -175,7 +175,7 @@ def gridded(name: str, where: Sequence[str], work: Path) -> dict[str, Any]:
             outcome = run_trial(Trial(config, every, VIEWS), dataset)
             model, _ = load_model(out / "model.safetensors", task)
             packed, text = out / "packed.neuprim", (out / "config.yaml").read_text(encoding="utf-8")
-            save_compressed(packed, model, task.name, {}, bit_table(USUAL_LEVEL, (), model.specs), text)
+            save_compressed(packed, model, task.name, {}, bit_table(DEFAULT_LEVEL, (), model.specs), text)
             grid.append(
                 {
                     "less": less,

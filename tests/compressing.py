@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from neuprim.core.compression import BitTable, Schemes, file_order, folded, schemes
+from neuprim.core.compression import BitTable, Quantizers, canonicalize, fit_quantizers, storage_order
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import ColourField, DensityField, prunable_units_by_name
@@ -94,9 +94,9 @@ def gaussians(count: int = 30) -> Primitives:
     return random_model(GaussianDensity(), field("static", "SphericalHarmonics", degree=1), count)  # type: ignore[arg-type]
 
 
-def stored(model: Primitives, table: BitTable) -> tuple[Primitives, Schemes]:
+def stored(model: Primitives, table: BitTable) -> tuple[Primitives, Quantizers]:
     """The model before any number is rounded, folded and in the order of the file, and how its numbers are coded."""
-    whole = folded(model)
-    made = schemes(whole, table)
-    rows = file_order(whole, made)
+    whole = canonicalize(model)
+    made = fit_quantizers(whole, table)
+    rows = storage_order(whole, made)
     return Primitives(model.density, model.colour, {name: value[rows] for name, value in whole.params.items()}), made

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.cli.command import Command
-from neuprim.cli.operating_words import OPERATING, operating_words
+from neuprim.cli.render_overrides import RENDER_OVERRIDES_HELP, split_render_overrides
 
 __all__ = ["COMMAND", "print_metrics"]
 
@@ -19,7 +19,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _take_rest(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    arguments.words, rest = operating_words(rest)
+    arguments.words, rest = split_render_overrides(rest)
     return rest
 
 
@@ -60,7 +60,7 @@ COMMAND = Command(
     "measure a run on its test views",
     _add_arguments,
     _evaluate,
-    epilog=OPERATING,
+    epilog=RENDER_OVERRIDES_HELP,
     take_rest=_take_rest,
     opens_run=True,
 )

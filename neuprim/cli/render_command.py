@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuprim.cli.command import Command, parse_count, parse_rate, parse_size, take_conditions
-from neuprim.cli.operating_words import OPERATING, operating_words
+from neuprim.cli.render_overrides import RENDER_OVERRIDES_HELP, split_render_overrides
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def _add_environment(parser: argparse.ArgumentParser) -> None:
 
 
 def _take_rest(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    arguments.words, rest = operating_words(rest)
+    arguments.words, rest = split_render_overrides(rest)
     return take_conditions(arguments, rest, parser)
 
 
@@ -144,7 +144,7 @@ COMMAND = Command(
     "draw images of a run",
     _add_arguments,
     _render,
-    epilog=_CONDITIONS + OPERATING,
+    epilog=_CONDITIONS + RENDER_OVERRIDES_HELP,
     take_rest=_take_rest,
     opens_run=True,
 )

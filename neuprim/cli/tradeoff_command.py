@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuprim.cli.command import Command, add_trust_flag, check_run_directory, parse_count
-from neuprim.cli.operating_words import OPERATING, operating_words
+from neuprim.cli.render_overrides import RENDER_OVERRIDES_HELP, split_render_overrides
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def _take_rest(arguments: argparse.Namespace, rest: list[str], parser: argparse.
     if of_words(arguments.run_dir):
         arguments.words = [word for word in rest if not word.startswith("-")]
         return [word for word in rest if word.startswith("-") and word != "--"]
-    arguments.words, rest = operating_words(rest)
+    arguments.words, rest = split_render_overrides(rest)
     return rest
 
 
@@ -142,6 +142,6 @@ COMMAND = Command(
     "measure what speed and size cost in accuracy: how a run is drawn, or what is trained",
     _add_arguments,
     _tradeoff,
-    epilog=_FORMS + OPERATING,
+    epilog=_FORMS + RENDER_OVERRIDES_HELP,
     take_rest=_take_rest,
 )

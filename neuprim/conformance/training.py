@@ -13,7 +13,7 @@ from torch import Tensor
 from neuprim.conformance.subject import ConformanceError, Subject
 from neuprim.core import checkpoint
 from neuprim.core.channels import channels_of
-from neuprim.core.compression import LEVELS, folded
+from neuprim.core.compression import LEVELS, canonicalize
 from neuprim.core.data import Dataset
 from neuprim.core.data import check as data_check
 from neuprim.core.errors import CheckpointError
@@ -263,8 +263,8 @@ def check_folded(t: Subject) -> None:
     """What ``folded`` makes of tensors is the same field, and stays as it is, so that what is compressed again is not
     lost bit by bit."""
     model = t.model(torch.float32)
-    once = folded(model)
-    for name, value in folded(once).params.items():
+    once = canonicalize(model)
+    for name, value in canonicalize(once).params.items():
         t.require(
             torch.equal(value, once.params[name]),
             f"{name} after folding twice",

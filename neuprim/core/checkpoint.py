@@ -185,9 +185,9 @@ def save_compressed(
     model: Primitives,
     task: str,
     extra: Mapping[str, Any],
-    bits: compression.BitTable | compression.Schemes,
+    bits: compression.BitTable | compression.Quantizers,
     config: str | None = None,
-) -> dict[str, compression.Stored]:
+) -> dict[str, compression.StoredSize]:
     """As :func:`save_model`, in few bits; returns what the file has of every parameter.
 
     Args:
@@ -198,16 +198,16 @@ def save_compressed(
         CheckpointError: numbers that cannot be stored, or the file could not be written; names it and the reason.
     """
     if isinstance(bits, compression.BitTable):
-        model = compression.folded(model)
-        made = compression.schemes(model, bits)
+        model = compression.canonicalize(model)
+        made = compression.fit_quantizers(model, bits)
     else:
         made = bits
-    sections = compression.encode(model, made)
+    sections = compression.encode_sections(model, made)
     if config is not None:
         sections.insert(0, compression.Section(compression.CONFIG, compression.TEXT, (), planes=(config.encode(),)))
     header = {"format": FORMAT, "kind": "model", **model_header(model, task, extra)}
     sizes = compression.write_compressed(path, header, model.count, sections)
-    return {name: compression.Stored(compression.bits_in_words(scheme), sizes[name]) for name, scheme in made.items()}
+    return {name: compression.StoredSize(compression.format_bits(scheme), sizes[name]) for name, scheme in made.items()}
 
 
 def stored_config(path: Path) -> str | None:

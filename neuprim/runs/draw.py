@@ -28,7 +28,7 @@ from neuprim.plugins.judging import facts_of, orbit_of
 from neuprim.runs.layers import Layers
 from neuprim.runs.measure import draw_sum
 from neuprim.runs.open import LOGS, load_dataset, load_run, placed
-from neuprim.runs.operating import read_point
+from neuprim.runs.render_config import parse_render_config
 from neuprim.runs.results import refuse_results
 
 __all__ = ["FORMATS", "SETS", "render_run", "with_conditions"]
@@ -79,7 +79,7 @@ def render_run(
         per second. environment: light from all around instead of the task's light.
         tell: called with lines for the user, e.g. what the model never saw.
         progress: called with (text, fraction 0..1) while images are drawn.
-        words: of an operating point (:mod:`neuprim.runs.operating`), over how the run draws.
+        words: of an operating point (:mod:`neuprim.runs.render_config`), over how the run draws.
         layers: of an OpenEXR file, names separated by commas (:mod:`neuprim.core.layers`); None for all but a layer per
         light. space: "world": a file's cameras, lights, and what is written of cameras and depths are in the
         coordinates of the data's files; "scene":
@@ -95,7 +95,7 @@ def render_run(
     config, task, model, header = load_run(run_dir)
     world = World.of(header, str(run_dir)) if space == WORLD else World()
     task = task if space == WORLD else task_of(config, run_dir / "config.yaml")
-    point = read_point(words, config.renderer, model)
+    point = parse_render_config(words, config.renderer, model)
     suspects = suspects_of(config)
     watch = suspects.watch(run_dir / LOGS)
     background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
@@ -133,7 +133,7 @@ def render_run(
         views = [replace(v, conditions={**v.conditions, **lights[0]}) for v in views]
     with watch:
         views, animated = with_conditions(views, task, conditions, tell)
-        model = point.applied(model)
+        model = point.prepare_model(model)
     model = placed(model, point.settings, views[0])
     format = format or _format_of(out, animated)
     for flag_given, value in (("--layers", layers), ("--datatype", datatype)):
@@ -179,10 +179,10 @@ def render_run(
     def image(view: View) -> torch.Tensor:
         with watch:
             if lights:
-                return point.enlarged(
-                    draw_sum(model, point.seen(view), lights, point.settings, background, drawn), view.camera
+                return point.upsample(
+                    draw_sum(model, point.scale_view(view), lights, point.settings, background, drawn), view.camera
                 )
-            return point.draw(model, view, background, drawn)
+            return point.render_view(model, view, background, drawn)
 
     def refuse_empty() -> None:
         """Rule: an image that shows nothing of the model is told, and a shot of such images is an error."""

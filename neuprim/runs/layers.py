@@ -26,7 +26,7 @@ from neuprim.core.render.near import decided
 from neuprim.core.render.output import mean_depth
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import layer_of
-from neuprim.runs.operating import OperatingPoint
+from neuprim.runs.render_config import RenderConfig
 from neuprim.version import __version__
 
 __all__ = ["DATATYPES", "Layers", "linear_light"]
@@ -69,7 +69,7 @@ class Layers:
     run_dir: Path
     task: TaskSpec
     channels: Channels
-    point: OperatingPoint
+    point: RenderConfig
     background: Tensor
     names: str | None = None
     half: bool = False
@@ -118,7 +118,7 @@ class Layers:
             ConfigError: a layer was asked for by name that the model does not have.
             DataError: values that the file cannot hold, or it cannot be written.
         """
-        small = self.point.seen(view)
+        small = self.point.scale_view(view)
         found: dict[str, Tensor] = {}
         present = {spec.name: spec for spec in self.specs()}
         for i, light in enumerate(self.lights or ({},)):
@@ -155,15 +155,15 @@ class Layers:
         """Channel -> values of the view's own size, and the attributes that say what each layer is."""
         planes: dict[str, Plane] = {}
         said: dict[str, str] = {}
-        whole = self.point.enlarged(alpha[..., None], view.camera)
+        whole = self.point.upsample(alpha[..., None], view.camera)
         for name, image in found.items():
             spec = specs.get(name)
             image = image.float()
             if name == "depth":  # as the mean that it is: nothing of the 0 beside a silhouette
-                weighted = self.point.enlarged(image * alpha[..., None], view.camera)
+                weighted = self.point.upsample(image * alpha[..., None], view.camera)
                 image = mean_depth(weighted, whole) / self.world.scale
             else:
-                image = self.point.enlarged(image, view.camera)
+                image = self.point.upsample(image, view.camera)
             if name == "beauty":
                 image = self._beauty(image, whole[..., 0], "alpha" in found)
             light = spec is None or spec.light

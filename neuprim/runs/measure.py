@@ -39,8 +39,7 @@ from neuprim.core.render import RenderSettings, choose, render
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import clips_of, diagnosed, judged, mask_of
 from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, placed
-from neuprim.runs.operating import read_point
-from neuprim.runs.storage import file_bytes
+from neuprim.runs.render_config import estimate_file_bytes, parse_render_config
 from neuprim.version import __version__
 
 __all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "quality", "summary"]
@@ -193,12 +192,12 @@ def evaluate_run(run_dir: Path, lpips: str | Path | None = None, words: Sequence
 
     Args:
         lpips: weights for LPIPS; without, those that the run names.
-        words: of an operating point (:mod:`neuprim.runs.operating`), over how the run draws; ``model_bytes`` is the
+        words: of an operating point (:mod:`neuprim.runs.render_config`), over how the run draws; ``model_bytes`` is the
         size of the run's file
             but for what these change.
     """
     config, task, model, header = load_run(run_dir)
-    point = read_point(words, config.renderer, model)
+    point = parse_render_config(words, config.renderer, model)
     config = replace(config, renderer=point.settings)
     weights = lpips or config.metrics.lpips
     distance = None if weights is None else Lpips.load(weights)
@@ -210,10 +209,10 @@ def evaluate_run(run_dir: Path, lpips: str | Path | None = None, words: Sequence
         path = model_file(run_dir)
         training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
         channels = channels_of(task, dataset)
-        part = point.applied(model)
-        size = file_bytes(path, model, part, point.stored)
+        part = point.prepare_model(model)
+        size = estimate_file_bytes(path, model, part, point.storage)
         model = placed(part, config.renderer, dataset.test.view(0))
-        views = measure(model, task, dataset, config.renderer, channels, lpips=distance, paint=point.draw)
+        views = measure(model, task, dataset, config.renderer, channels, lpips=distance, paint=point.render_view)
         return summary(config, model, task, dataset, channels, views, size, training, distance)
 
 

@@ -11,8 +11,8 @@ from neuprim.core.metrics.words import in_words
 from neuprim.core.train.distributed import ALONE, Alone
 from neuprim.runs.chunks.asked import asked, refuse_chunks
 from neuprim.runs.chunks.train import train_in_chunks
+from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.events import Events, Finishing, Note, silent
-from neuprim.runs.finish import finish
 from neuprim.runs.lock import held
 from neuprim.runs.open import LOGS
 from neuprim.runs.parts import assemble
@@ -57,7 +57,7 @@ def run(
         if ranks.first:
             events(Finishing("measuring held-out views"))
             assemble(fitted, directory)
-            events(Note(in_words(finish(fitted, directory))))
+            events(Note(in_words(evaluate_fitted(fitted, directory))))
     if interrupted:
         raise KeyboardInterrupt
     return directory

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from neuprim.config import RunConfig, suspects_of
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
-from neuprim.core.compression import USUAL_LEVEL, bit_table
+from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
 from neuprim.core.errors import ConfigError, NeuprimError
@@ -73,7 +73,7 @@ def compress_run(
     are there.
 
     Unless a level or bits are given, training views decide how coarse every number may be: as coarse as ``tolerance``
-    allows. Where the run's data are not there, it is :data:`~neuprim.core.compression.USUAL_LEVEL`.
+    allows. Where the run's data are not there, it is :data:`~neuprim.core.compression.DEFAULT_LEVEL`.
 
     With ``seconds`` or ``steps`` the numbers are trained for the few bits first: every image of a step is drawn of what
     will be read back, and gradients go to the numbers themselves (straight through). What training views say is better,
@@ -81,7 +81,7 @@ def compress_run(
 
     Args:
         level: 1 (nearly everything) to 5 (very little), see :data:`neuprim.core.compression.LEVELS`.
-        bits: words NAME=BITS over the level's own, or over those of :data:`~neuprim.core.compression.USUAL_LEVEL`.
+        bits: words NAME=BITS over the level's own, or over those of :data:`~neuprim.core.compression.DEFAULT_LEVEL`.
         out: the file; None: ``model.neuprim`` in the run directory.
         overwrite: whether a file that exists may be replaced.
         progress: called with (text, fraction 0..1).
@@ -102,7 +102,7 @@ def compress_run(
     refuse_taken(final, overwrite)
     config, task, model, header = load_run(run_dir)
     config = replace(config, output_dir=run_dir)
-    table = bit_table(USUAL_LEVEL if level is None else level, bits, model.specs)
+    table = bit_table(DEFAULT_LEVEL if level is None else level, bits, model.specs)
     extra = extra_of(header)
     notes = ["its primitives are in another order than the run's"]
     dataset: Dataset | None = None
@@ -121,7 +121,7 @@ def compress_run(
         elif dataset is not None and (steps or (steps is None and seconds > 0)):
             fewer = train_for(config, task, dataset, model, table, seconds, steps, progress)
         elif level is None and not bits:
-            notes.append(f"no training views say how coarse its numbers may be; they are of --level {USUAL_LEVEL}")
+            notes.append(f"no training views say how coarse its numbers may be; they are of --level {DEFAULT_LEVEL}")
         notes += () if fewer is None else fewer.notes
         text = (run_dir / "config.yaml").read_text(encoding="utf-8")
         whole, coded = (model, table) if fewer is None else (fewer.model, fewer.made)

@@ -11,7 +11,14 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from neuprim.config import RunConfig
-from neuprim.core.compression import BitTable, Schemes, folded, rounded, schemes, schemes_within
+from neuprim.core.compression import (
+    BitTable,
+    Quantizers,
+    canonicalize,
+    fake_quantize,
+    fit_quantizers,
+    fit_quantizers_to_error,
+)
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
@@ -52,7 +59,7 @@ class Fewer:
     """A folded model, how it is to be coded, the steps that it was trained for, and what there is to say about it."""
 
     model: Primitives
-    made: Schemes
+    made: Quantizers
     steps: int
     notes: tuple[str, ...] = ()
 
@@ -66,7 +73,7 @@ class Rounding:
     """
 
     def __init__(self, model: Primitives, dataset: Dataset, judge: Judge) -> None:
-        self.model = folded(model)
+        self.model = canonicalize(model)
         views = sensitivity(self.model, dataset, judge.others[:_LOOKED_AT], judge.settings)
         if judge.draws:
             views = views.beside(
@@ -81,34 +88,34 @@ class Rounding:
         other.model = trained
         return other
 
-    def schemes(self, share: float) -> Schemes:
+    def fit_quantizers(self, share: float) -> Quantizers:
         """How the model is coded."""
-        return schemes_within(self.model, self._effects, share * self._error)
+        return fit_quantizers_to_error(self.model, self._effects, share * self._error)
 
-    def coarsest(self, enough: Callable[[Schemes], bool], start: float) -> tuple[Schemes, float]:
+    def coarsest(self, enough: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
         """The coarsest schemes that are ``enough``, and their share of the error; or the finest that there are.
 
         Args:
             start: the share that is tried first.
         """
         fine, _ = self._between(enough, start)
-        return self.schemes(fine), fine
+        return self.fit_quantizers(fine), fine
 
-    def finest(self, enough: Callable[[Schemes], bool], start: float) -> tuple[Schemes, float]:
+    def finest(self, enough: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
         """The finest schemes that are ``enough``, and their share of the error; or the coarsest that there are."""
         _, coarse = self._between(lambda made: not enough(made), start)
-        return self.schemes(coarse), coarse
+        return self.fit_quantizers(coarse), coarse
 
-    def read_back(self, made: Schemes) -> Primitives:
+    def read_back(self, made: Quantizers) -> Primitives:
         """The model as it would come back."""
         return read_back(self.model, made)
 
-    def _between(self, fine_enough: Callable[[Schemes], bool], start: float) -> tuple[float, float]:
+    def _between(self, fine_enough: Callable[[Quantizers], bool], start: float) -> tuple[float, float]:
         """Two shares that lie close together, of which the first is fine enough and the second is not; or both an end
         of what is tried."""
         fine, coarse, share = 0.0, 0.0, start
         for _ in range(_LOOKS):
-            if fine_enough(self.schemes(share)):
+            if fine_enough(self.fit_quantizers(share)):
                 fine = share
             else:
                 coarse = share
@@ -142,8 +149,8 @@ def train_for(
     with one_torch_thread():
         if steps is None:
             steps = steps_in(seconds, config, task, dataset, model)
-        whole = folded(model)
-        made, judge = schemes(whole, table), judge_of(config, dataset)
+        whole = canonicalize(model)
+        made, judge = fit_quantizers(whole, table), judge_of(config, dataset)
         before = judge(read_back(whole, made))
         trained = _trained(
             config, task, dataset, whole, made, steps, lambda share: progress("training for few bits", share)
@@ -186,7 +193,7 @@ def train_within(
                 progress("training for few bits", (before + part) / rounds)
 
             share = _share(at_once)
-            made = rounding.schemes(share)
+            made = rounding.fit_quantizers(share)
             own = steps * (number + 1) // rounds - steps * number // rounds
             rounding = rounding.of(_trained(config, task, dataset, rounding.model, made, own, show))
             lost = base - judge(rounding.read_back(made))
@@ -199,7 +206,7 @@ def train_within(
             progress("looking for the coarsest numbers", 1.0)
             tried = [plain, rounding] if rounds else [plain]
 
-            def found(one: Rounding) -> tuple[Primitives, Schemes, float]:
+            def found(one: Rounding) -> tuple[Primitives, Quantizers, float]:
                 return one.model, *one.coarsest(
                     lambda made: base - judge(one.read_back(made)) <= tolerance, _share(tolerance)
                 )
@@ -224,7 +231,7 @@ def _trained(
     task: TaskSpec,
     dataset: Dataset,
     whole: Primitives,
-    made: Schemes,
+    made: Quantizers,
     steps: int,
     progress: Callable[[float], None],
 ) -> Primitives:
@@ -234,7 +241,7 @@ def _trained(
     there = {name: scheme.to(trainer.device) for name, scheme in made.items()}
 
     def stored(params: dict[str, Tensor]) -> dict[str, Tensor]:
-        return rounded(params, there)
+        return fake_quantize(params, there)
 
     trainer.stored = stored
     for done in range(steps):
@@ -246,8 +253,8 @@ def _trained(
     )
 
 
-def read_back(model: Primitives, made: Schemes) -> Primitives:
+def read_back(model: Primitives, made: Quantizers) -> Primitives:
     """A folded model as it would come back."""
     return Primitives(
-        model.density, model.colour, {name: value.detach() for name, value in rounded(model.params, made).items()}
+        model.density, model.colour, {name: value.detach() for name, value in fake_quantize(model.params, made).items()}
     )

@@ -18,7 +18,7 @@ from neuprim.core.io.images import to_uint8
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.inspect.paint import table
-from neuprim.runs.operating import OperatingPoint
+from neuprim.runs.render_config import RenderConfig
 
 __all__ = ["ALPHA", "COLOUR", "DEPTH", "Look", "Picture", "draw_look", "quantities"]
 
@@ -66,7 +66,7 @@ def quantities(channels: Channels) -> list[str]:
     return [COLOUR, ALPHA, DEPTH, *(f"channel {name}" for name in channels.names if channels.count > 1)]
 
 
-def draw_look(model: Primitives, look: Look, point: OperatingPoint, background: Tensor, channels: Channels) -> Picture:
+def draw_look(model: Primitives, look: Look, point: RenderConfig, background: Tensor, channels: Channels) -> Picture:
     """Draw a look of a model that the point is applied to already.
 
     Depth is the mean along each ray, camera-z, in scene units, between its 2nd and 98th percentile on the screen.
@@ -75,7 +75,7 @@ def draw_look(model: Primitives, look: Look, point: OperatingPoint, background: 
         NeuprimError: what the renderer refuses.
     """
     start = time.perf_counter()
-    view = point.seen(View("", look.camera, look.conditions))
+    view = point.scale_view(View("", look.camera, look.conditions))
     settings = replace(point.settings, depth=look.shows == DEPTH)
     width, height = view.camera.width, view.camera.height
     if width * height * settings.samples**2 > _RAYS:

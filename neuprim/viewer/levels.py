@@ -13,7 +13,7 @@ from pathlib import Path
 from neuprim.core.errors import NeuprimError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
-from neuprim.runs.operating import OperatingPoint, read_point
+from neuprim.runs.render_config import RenderConfig, parse_render_config
 from neuprim.search.tradeoff.record import read_record
 from neuprim.search.tradeoff.run import FOLDER
 
@@ -59,7 +59,7 @@ class Level:
         pace: seconds per pixel of the window, measured; None before.
     """
 
-    point: OperatingPoint
+    point: RenderConfig
     ratio: float
     pace: float | None = None
 
@@ -85,10 +85,10 @@ class Levels:
         Raises:
             ConfigError: the words do not fit the model.
         """
-        levels = [Level(read_point(words, settings, model), 1.0)]
+        levels = [Level(parse_render_config(words, settings, model), 1.0)]
         for words, ratio in front.points:
             try:
-                point = read_point(words, settings, model)
+                point = parse_render_config(words, settings, model)
             except NeuprimError as error:  # measured of another model in this directory
                 tell(f"{' '.join(words)}: {error}")
                 continue

@@ -22,7 +22,7 @@ from neuprim.core.render import RenderSettings
 from neuprim.core.task import TaskSpec
 from neuprim.runs.measure import draw
 from neuprim.runs.open import placed
-from neuprim.runs.operating import OperatingPoint
+from neuprim.runs.render_config import RenderConfig
 from neuprim.viewer.frame import Look, Picture, draw_look
 from neuprim.viewer.levels import Front
 from neuprim.webpage.scene import held_out, start_of
@@ -72,25 +72,25 @@ class Subject:
     front: Front = field(default_factory=Front)
     _kept: dict[tuple[object, ...], Primitives] = field(default_factory=dict)
 
-    def prepared(self, point: OperatingPoint, view: View) -> Primitives:
+    def prepared(self, point: RenderConfig, view: View) -> Primitives:
         """The model as a point draws it, where it is best drawn; the last few are kept."""
         model = self.model()
         key = (
             id(model),
             tuple(point.reduced.items()),
-            tuple(point.stored.items()),
+            tuple(point.storage.items()),
             point.settings.device,
             point.settings.backend,
         )
-        if not point.reduced and not point.stored and model.device.type != "cpu":
+        if not point.reduced and not point.storage and model.device.type != "cpu":
             return model  # a training's, where it is
         if key not in self._kept:
             if len(self._kept) > 3:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = placed(point.applied(model), point.settings, view)
+            self._kept[key] = placed(point.prepare_model(model), point.settings, view)
         return self._kept[key]
 
-    def draw(self, look: Look, point: OperatingPoint) -> Picture:
+    def draw(self, look: Look, point: RenderConfig) -> Picture:
         """A picture of the model as it is now.
 
         Raises:
@@ -114,7 +114,7 @@ class Subject:
         index = self._views()[name]
         view, pixels = self.dataset.test.view(index), self.dataset.test.pixels(index)
         truth = pixels.over(self.dataset.background)
-        model = self.prepared(OperatingPoint(self.settings), view)
+        model = self.prepared(RenderConfig(self.settings), view)
         drawn = draw(model, view, self.settings, self.dataset.background)
         images = [np.asarray(to_uint8(self.channels.display(image)).numpy()) for image in (truth, drawn)]
         return Comparison(images[0], images[1], psnr(drawn, truth, pixels.mask))

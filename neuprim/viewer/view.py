@@ -19,7 +19,7 @@ from neuprim.core.errors import NeuprimError
 from neuprim.core.io.records import Record
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.open import LOGS, load_dataset, load_run
-from neuprim.runs.operating import OperatingPoint
+from neuprim.runs.render_config import RenderConfig
 from neuprim.viewer.desk import Desk
 from neuprim.viewer.frame import Look
 from neuprim.viewer.levels import read_front
@@ -102,7 +102,7 @@ def view_run(
     desk, subject = Desk(), open_subject(run_dir, tell, progress)
     progress("preparing the renderer", 0.0)  # the first picture compiles kernels, once per installation
     start = subject.start()
-    subject.draw(Look(start.camera.resized(32, 32), start.conditions), OperatingPoint(subject.settings))
+    subject.draw(Look(start.camera.resized(32, 32), start.conditions), RenderConfig(subject.settings))
     server = PageServer(settings, subject.name)
     try:
         Page(server, subject, desk, run_dir)

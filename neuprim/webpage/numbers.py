@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from neuprim.core.compression import bit_table, file_order, folded, schemes
-from neuprim.core.compression.rotations import Rotations
+from neuprim.core.compression import bit_table, canonicalize, fit_quantizers, storage_order
+from neuprim.core.compression.quantizers import Rotations
 from neuprim.core.compression.sections import COLUMNS, ROTATIONS, pack
 from neuprim.core.model.primitives import Primitives
 
@@ -65,9 +65,9 @@ def _exact(model: Primitives) -> _Made:
 
 
 def _coded(model: Primitives, level: int) -> _Made:
-    own = folded(model)
-    found = schemes(own, bit_table(level, (), own.specs))
-    order = file_order(own, found)
+    own = canonicalize(model)
+    found = fit_quantizers(own, bit_table(level, (), own.specs))
+    order = storage_order(own, found)
     made: _Made = []
     for spec in own.specs:
         scheme = found[spec.name]

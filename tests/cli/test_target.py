@@ -47,7 +47,7 @@ def test_help_names_the_words(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_search_prints_what_it_tried_and_what_came_of_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
+    monkeypatch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 2)
     out = tmp_path / "run"
     assert main(["run", *TINY, "target.psnr=50", "budget=5m", f"output_dir={out}"]) == 0
     printed = capsys.readouterr()

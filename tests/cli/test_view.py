@@ -19,7 +19,7 @@ from tests.short_runs import fit, words
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cli")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 4)
+        patch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 4)
         return fit(words(tiny.write_blender(folder / "two"), folder / "run", 20))
 
 

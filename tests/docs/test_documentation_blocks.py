@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from neuprim.cli import COMMANDS
-from neuprim.cli.operating_words import operating_words
+from neuprim.cli.render_overrides import split_render_overrides
 from neuprim.cli.tradeoff_command import of_words
 from neuprim.config import compose, compose_all
 from neuprim.config.launcher import launcher_words
@@ -205,7 +205,7 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         compose(launcher_words(typed)[1], False)
         rest = flags
     elif name in ("eval", "render", "tradeoff"):
-        _, rest = operating_words(rest)
+        _, rest = split_render_overrides(rest)
     if name in ("render", "inspect", "export"):
         given, rest = split_words(rest, conditions)
         known = {condition: text for condition, text in given.items() if not PLACEHOLDER.search(text)}

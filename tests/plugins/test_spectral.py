@@ -17,7 +17,7 @@ from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
-import neuprim.runs.finish as finishing
+import neuprim.runs.evaluate as finishing
 from neuprim.cli import main
 from neuprim.cli.progress import RunProgress
 from neuprim.conformance import check_task

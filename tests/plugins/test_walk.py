@@ -36,7 +36,7 @@ __all__ = ["site"]
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
+    monkeypatch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 2)
 
 
 @pytest.fixture

@@ -11,5 +11,5 @@ import pytest
 def short_orbits() -> Iterator[None]:
     """Films of four frames."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 4)
+        patch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 4)
         yield

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import neuprim.runs.finish
+import neuprim.runs.evaluate
 import neuprim.runs.training
 from neuprim.config.launcher import LauncherSettings
 from neuprim.core.compute.threads import core_count
@@ -72,7 +72,7 @@ def toil(data: float, attempt: int, events: Events) -> None:
 
 def fit_and_die(data: Mapping[str, Any], attempt: int, events: Events) -> str:
     """A run whose worker is killed in a phase, the first time; without film."""
-    neuprim.runs.finish._ORBIT_FRAMES = 2
+    neuprim.runs.evaluate._ORBIT_FRAMES = 2
     phase = data["phase"] if attempt == 0 else None
 
     def kill(*args: Any) -> None:

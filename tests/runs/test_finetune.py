@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuprim.core.compression import Schemes, bit_table, folded, rounded, schemes
-from neuprim.core.compression.columns import Columns
+from neuprim.core.compression import Quantizers, bit_table, canonicalize, fake_quantize, fit_quantizers
+from neuprim.core.compression.quantizers import Columns
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.finetune import COOL, LEAST_START, LONG, START, fine_tuner, steps_in
@@ -100,10 +100,12 @@ def test_training_for_few_bits_wins_back_what_they_cost(run_dir: Path, dataset: 
     judge = Judge(dataset, config.renderer)
 
     def read_back(one: Primitives, made: dict) -> float:  # type: ignore[type-arg]
-        return judge(Primitives(one.density, one.colour, {n: v.detach() for n, v in rounded(one.params, made).items()}))
+        return judge(
+            Primitives(one.density, one.colour, {n: v.detach() for n, v in fake_quantize(one.params, made).items()})
+        )
 
-    plain = folded(model)
-    at_once = read_back(plain, schemes(plain, table))
+    plain = canonicalize(model)
+    at_once = read_back(plain, fit_quantizers(plain, table))
     fewer = train_for(config, task, dataset, model, table, 0.0, 150, lambda text, fraction: None)
     assert fewer.steps == 150 and fewer.notes == ()
     assert read_back(fewer.model, fewer.made) > at_once + 0.2
@@ -118,9 +120,9 @@ def test_a_tolerance_is_kept(run_dir: Path, dataset: Dataset, steps: int) -> Non
     base = judge(model)
     for allowed in (0.1, 0.5):
         fewer = train_within(config, task, dataset, model, allowed, 0.0, steps, lambda text, fraction: None)
-        back = {n: v.detach() for n, v in rounded(fewer.model.params, fewer.made).items()}
+        back = {n: v.detach() for n, v in fake_quantize(fewer.model.params, fewer.made).items()}
         assert base - judge(Primitives(fewer.model.density, fewer.model.colour, back)) <= allowed + 1e-6
-        assert torch.equal(fewer.model.params["W1"], folded(model).params["W1"]) == (steps == 0)
+        assert torch.equal(fewer.model.params["W1"], canonicalize(model).params["W1"]) == (steps == 0)
 
 
 def test_training_that_spoils_the_model_is_not_stored(
@@ -139,7 +141,7 @@ def test_the_coarsest_numbers_that_are_enough_are_found(run_dir: Path, dataset: 
     config, _, model, _ = load_run(run_dir)
     rounding = Rounding(model, dataset, Judge(dataset, config.renderer))
 
-    def width(made: Schemes) -> float:
+    def width(made: Quantizers) -> float:
         scheme = made["sh_dc"]
         assert isinstance(scheme, Columns)
         return float((scheme.high - scheme.low).double() @ (1.0 / scheme.last).double())
@@ -167,4 +169,4 @@ def test_where_training_brings_nothing_the_model_is_stored_as_it_is(
     monkeypatch.setattr("neuprim.runs.finetune.START", 3e4)  # rates that spoil everything
     fewer = train_for(config, task, dataset, model, bit_table(1, [], model.specs), 0.0, 20, lambda text, fraction: None)
     assert fewer.steps == 20 and len(fewer.notes) == 1 and "brought nothing" in fewer.notes[0]
-    assert all(torch.equal(fewer.model.params[name], value) for name, value in folded(model).params.items())
+    assert all(torch.equal(fewer.model.params[name], value) for name, value in canonicalize(model).params.items())

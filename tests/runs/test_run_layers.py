@@ -25,7 +25,7 @@ from neuprim.core.render import RenderSettings, render
 from neuprim.plugins.judging import TaskFault
 from neuprim.runs.layers import Layers
 from neuprim.runs.measure import draw_sum
-from neuprim.runs.operating import OperatingPoint
+from neuprim.runs.render_config import RenderConfig
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
 from neuprim.tasks.relight.colour import LightNetwork
@@ -48,7 +48,7 @@ VIEW = View("a view", CAMERA, {"time": torch.tensor(0.4)})
 
 
 def layers(space: str = "linear", **changes: Any) -> Layers:
-    return replace(Layers(Path("runs/fire"), DYNAMIC, Channels(color_space=space), OperatingPoint(), BLUE), **changes)
+    return replace(Layers(Path("runs/fire"), DYNAMIC, Channels(color_space=space), RenderConfig(), BLUE), **changes)
 
 
 def written(path: Path, how: Layers, model: Primitives, view: View) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -152,7 +152,7 @@ def test_a_layer_that_the_model_lacks_is_left_out_or_refused_by_name(tmp_path: P
 
 
 def test_a_lower_resolution_keeps_means_at_silhouettes(tmp_path: Path) -> None:
-    found, _ = written(tmp_path / "a.exr", layers(point=OperatingPoint(resolution=0.5)), volume(), VIEW)
+    found, _ = written(tmp_path / "a.exr", layers(point=RenderConfig(resolution=0.5)), volume(), VIEW)
     assert found["depth.Z"].shape == (16, 20)
     seen = found["depth.Z"][found["A"] > 0]
     small = drawn(volume(), replace(VIEW, camera=CAMERA.resized(10, 8))).depth

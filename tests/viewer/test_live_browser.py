@@ -45,7 +45,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("viewed")
     scene = tiny.write_blender(folder / "two")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 4)
+        patch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 4)
         fit(words(scene, folder / "plain", 120))
     shutil.move(folder / "plain", folder / HOSTILE)
     return folder / HOSTILE

@@ -19,7 +19,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.runs.measure import draw
-from neuprim.runs.operating import OperatingPoint, read_point
+from neuprim.runs.render_config import RenderConfig, parse_render_config
 from neuprim.search.tradeoff.record import Measured, Record
 from neuprim.tasks.static.fields import SphericalHarmonics
 from neuprim.viewer.desk import Desk
@@ -42,7 +42,7 @@ def look_at(shows: str = COLOUR) -> Look:
 
 
 def test_colour_is_what_a_render_draws(model: Primitives) -> None:
-    picture = draw_look(model, look_at(), OperatingPoint(SETTINGS), WHITE, RGB)
+    picture = draw_look(model, look_at(), RenderConfig(SETTINGS), WHITE, RGB)
     expected = to_uint8(RGB.display(draw(model, View("", look_at().camera), SETTINGS, WHITE))).numpy()
     assert picture.image.shape == (30, 40, 3) and picture.image.std() > 10 and picture.seconds > 0
     assert np.array_equal(picture.image, expected) and picture.caption == ""
@@ -50,7 +50,7 @@ def test_colour_is_what_a_render_draws(model: Primitives) -> None:
 
 def test_alpha_depth_and_single_channels(model: Primitives) -> None:
     assert quantities(RGB) == [COLOUR, ALPHA, DEPTH, "channel R", "channel G", "channel B"]
-    point = OperatingPoint(SETTINGS)
+    point = RenderConfig(SETTINGS)
     alpha = draw_look(model, look_at(ALPHA), point, WHITE, RGB).image
     assert (alpha[..., 0] == alpha[..., 2]).all() and alpha.max() > 200 and alpha[0, 0].max() == 0
     depth = draw_look(model, look_at(DEPTH), point, WHITE, RGB)
@@ -66,7 +66,7 @@ def test_alpha_depth_and_single_channels(model: Primitives) -> None:
 
 
 def test_lower_resolution_is_sent_as_it_was_drawn(model: Primitives) -> None:
-    assert draw_look(model, look_at(), OperatingPoint(SETTINGS, resolution=0.25), WHITE, RGB).image.shape == (8, 10, 3)
+    assert draw_look(model, look_at(), RenderConfig(SETTINGS, resolution=0.25), WHITE, RGB).image.shape == (8, 10, 3)
 
 
 def test_a_picture_of_too_many_rays_is_refused(model: Primitives) -> None:
@@ -74,7 +74,7 @@ def test_a_picture_of_too_many_rays_is_refused(model: Primitives) -> None:
     with pytest.raises(
         ConfigError, match=r"2048 x 1536 pixels with renderer.samples=16 take more than 67,108,864 rays"
     ):
-        draw_look(model, look, OperatingPoint(replace(SETTINGS, samples=16)), WHITE, RGB)
+        draw_look(model, look, RenderConfig(replace(SETTINGS, samples=16)), WHITE, RGB)
 
 
 def test_levels_without_a_front_are_resolutions(model: Primitives) -> None:
@@ -121,8 +121,8 @@ def test_levels_are_the_front_that_was_measured(model: Primitives, tmp_path: Pat
 
 def test_words_over_the_settings_are_the_full_picture(model: Primitives) -> None:
     levels = Levels.of(model, SETTINGS, Front(), words=("resolution=0.5", "renderer.samples=2"))
-    assert levels.full == Level(read_point(["resolution=0.5", "renderer.samples=2"], SETTINGS, model), 1.0)
-    with pytest.raises(ConfigError, match="nothing that a finished run is drawn by"):
+    assert levels.full == Level(parse_render_config(["resolution=0.5", "renderer.samples=2"], SETTINGS, model), 1.0)
+    with pytest.raises(ConfigError, match="no setting of rendering"):
         Levels.of(model, SETTINGS, Front(), words=("resolutoin=0.5",))
 
 

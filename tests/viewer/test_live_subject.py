@@ -18,7 +18,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
 from neuprim.runs.measure import draw
 from neuprim.runs.open import load_run
-from neuprim.runs.operating import OperatingPoint, read_point
+from neuprim.runs.render_config import RenderConfig, parse_render_config
 from neuprim.tasks.static import TASK as STATIC
 from neuprim.tasks.static.fields import SphericalHarmonics
 from neuprim.viewer.frame import DEPTH, Look
@@ -35,7 +35,7 @@ from tests.short_runs import fit, words
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("subject")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 4)
+        patch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 4)
         return fit(words(tiny.write_blender(folder / "two"), folder / "run", 60))
 
 
@@ -50,9 +50,9 @@ def test_a_run_with_its_data(run_dir: Path) -> None:
     drawn = draw(subject.model(), view, subject.settings, background)
     assert found.psnr == psnr(drawn, truth) > 10
     assert np.array_equal(found.truth, to_uint8(truth).numpy()) and np.array_equal(found.drawn, to_uint8(drawn).numpy())
-    few = read_point(["density.neurons=1"], subject.settings, subject.model())
+    few = parse_render_config(["density.neurons=1"], subject.settings, subject.model())
     look = Look(view.camera, view.conditions)
-    assert not np.array_equal(subject.draw(look, few).image, subject.draw(look, OperatingPoint(subject.settings)).image)
+    assert not np.array_equal(subject.draw(look, few).image, subject.draw(look, RenderConfig(subject.settings)).image)
 
 
 def test_a_run_whose_data_are_gone_is_shown_without_held_out_views(run_dir: Path, tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_a_run_whose_data_are_gone_is_shown_without_held_out_views(run_dir: Path
         subject.dataset is None and subject.view_names() == [] and len(told) == 1 and "no held-out views: " in told[0]
     )
     start = subject.start()
-    image = subject.draw(Look(start.camera.resized(96, 54), start.conditions), OperatingPoint(subject.settings)).image
+    image = subject.draw(Look(start.camera.resized(96, 54), start.conditions), RenderConfig(subject.settings)).image
     assert image.std() > 10, "the model is in the picture"
     middle = image[18:36, 32:64].astype(float)
     assert np.abs(middle - image[0, 0]).mean() > np.abs(image.astype(float) - image[0, 0]).mean(), "and in its middle"
@@ -94,7 +94,7 @@ def test_a_model_on_a_card_is_drawn_and_asked_like_any(monkeypatch: pytest.Monke
         )
         start = subject.start()
         assert start.camera.viewmat.isfinite().all()
-        picture = subject.draw(look, OperatingPoint(settings)).image
+        picture = subject.draw(look, RenderConfig(settings)).image
         return picture, ellipsoids_of(model, look, channels, 5).rows, strongest(model, look, direction, settings)
 
     expected = asked()

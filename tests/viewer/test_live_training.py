@@ -38,7 +38,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(config: RunConfig, live: LiveTraining | None = None) -> None:
     """To the end, in this thread."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 4)
+        patch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 4)
         if live is None:
             run(config)
         else:

@@ -1,43 +1,43 @@
-"""Models in few bytes: codes of a few bits a number, the file that holds them, and the way back for every command.
+"""Quantized models in ``.neuprim`` files.
 
-``bits`` says how many, ``columns`` and ``rotations`` what a code stands for, ``order`` in which order primitives are,
-``sections`` how codes become bytes, ``file`` how these lie on disk, ``codec`` how a model is taken apart.
+``bits`` chooses the bits of each parameter, ``quantizers`` maps numbers to codes, ``sections`` packs codes into bytes,
+``file`` reads and writes the container, ``codec`` converts models to sections.
 """
 
-from neuprim.core.compression.bits import LEVELS, USUAL_LEVEL, BitTable, bit_table
+from neuprim.core.compression.bits import DEFAULT_LEVEL, LEVELS, BitTable, bit_table
 from neuprim.core.compression.codec import (
-    Schemes,
-    Stored,
-    bits_in_words,
-    encode,
-    file_order,
-    folded,
-    rounded,
-    schemes,
-    schemes_within,
+    Quantizers,
+    StoredSize,
+    canonicalize,
+    encode_sections,
+    fake_quantize,
+    fit_quantizers,
+    fit_quantizers_to_error,
+    format_bits,
+    storage_order,
 )
 from neuprim.core.compression.file import CONFIG, is_compressed, read_compressed, read_head, write_compressed
 from neuprim.core.compression.sections import TEXT, Section
 
 __all__ = [
     "CONFIG",
+    "DEFAULT_LEVEL",
     "LEVELS",
     "TEXT",
-    "USUAL_LEVEL",
     "BitTable",
-    "Schemes",
+    "Quantizers",
     "Section",
-    "Stored",
+    "StoredSize",
     "bit_table",
-    "bits_in_words",
-    "encode",
-    "file_order",
-    "folded",
+    "canonicalize",
+    "encode_sections",
+    "fake_quantize",
+    "fit_quantizers",
+    "fit_quantizers_to_error",
+    "format_bits",
     "is_compressed",
     "read_compressed",
     "read_head",
-    "rounded",
-    "schemes",
-    "schemes_within",
+    "storage_order",
     "write_compressed",
 ]

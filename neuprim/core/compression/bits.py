@@ -1,4 +1,4 @@
-"""How many bits each parameter gets: named levels, a user's own numbers over them, and where the data ask for more."""
+"""Bits per parameter: five named levels, and a user's own numbers over them."""
 
 from __future__ import annotations
 
@@ -6,27 +6,24 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from neuprim.core.compression.columns import MOST_BITS
-from neuprim.core.compression.rotations import LEAST_BITS
+from neuprim.core.compression.quantizers import MAX_BITS, MIN_BITS
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.model.schema import ParameterSpec
 
-__all__ = ["LEVELS", "USUAL_LEVEL", "BitTable", "bit_table"]
+__all__ = ["LEVELS", "DEFAULT_LEVEL", "BitTable", "bit_table"]
 
 OTHERS = "others"
 
 
 @dataclass(frozen=True)
 class BitTable:
-    """Bits of a number, by parameter.
+    """Bits per number, by parameter.
 
     Attributes:
-        named: parameter -> bits; several numbers are for the bands of spherical harmonics, degrees 1, 2, ... in the
-        order of 3D Gaussian
-            splatting, the last for all that follow.
-        others: of every other parameter.
-        exact: parameters that get just that; of the others, columns that need more get more
-        (:mod:`neuprim.core.compression.codec`).
+        named: parameter -> bits. Several values are for the degrees 1, 2, ... of spherical harmonics (in the order of
+            3D Gaussian splatting); the last holds for all higher degrees.
+        others: bits of every other parameter.
+        exact: parameters that get exactly these bits. Other parameters get more where their data need it.
     """
 
     named: Mapping[str, tuple[int, ...]]
@@ -34,7 +31,7 @@ class BitTable:
     exact: frozenset[str] = frozenset()
 
     def of(self, name: str, shape: tuple[int, ...]) -> list[int]:
-        """Bits of each column of a parameter with this shape per primitive."""
+        """Return the bits of each column of a parameter of this shape."""
         bits = self.named.get(name, (self.others,))
         if len(bits) == 1 or len(shape) < 2:
             return [bits[0]] * math.prod(shape)
@@ -42,38 +39,27 @@ class BitTable:
         return [bits[min(degree, len(bits)) - 1] for degree in degrees for _ in range(math.prod(shape[1:]))]
 
 
-def _level(
-    means: int, shapes: int, quats: int, gain: int, W1: int, rest: int, sh_dc: int, sh_rest: int, others: int
-) -> BitTable:
-    """``shapes`` of log_scales, ``rest`` of the density's other numbers."""
-    named = {
-        "means": means,
-        "log_scales": shapes,
-        "quats": quats,
-        "log_gain": gain,
-        "W1": W1,
-        "sh_dc": sh_dc,
-        "sh_rest": sh_rest,
-    }
-    return BitTable({name: (bits,) for name, bits in (named | {"b1": rest, "w2": rest, "b2": rest}).items()}, others)
+_NAMED = ("means", "log_scales", "quats", "log_gain", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest")
+
+
+def _level(*bits: int, others: int) -> BitTable:
+    return BitTable({name: (own,) for name, own in zip(_NAMED, bits, strict=True)}, others)
 
 
 LEVELS: dict[int, BitTable] = {
-    1: _level(means=16, shapes=11, quats=11, gain=11, W1=10, rest=9, sh_dc=10, sh_rest=9, others=10),
-    2: _level(means=14, shapes=9, quats=9, gain=9, W1=8, rest=7, sh_dc=8, sh_rest=7, others=8),
-    3: _level(means=13, shapes=8, quats=8, gain=8, W1=7, rest=6, sh_dc=7, sh_rest=6, others=7),
-    4: _level(means=12, shapes=7, quats=7, gain=7, W1=6, rest=5, sh_dc=6, sh_rest=5, others=5),
-    5: _level(means=11, shapes=6, quats=6, gain=6, W1=5, rest=4, sh_dc=5, sh_rest=4, others=4),
+    1: _level(16, 11, 11, 11, 10, 9, 9, 9, 10, 9, others=10),
+    2: _level(14, 9, 9, 9, 8, 7, 7, 7, 8, 7, others=8),
+    3: _level(13, 8, 8, 8, 7, 6, 6, 6, 7, 6, others=7),
+    4: _level(12, 7, 7, 7, 6, 5, 5, 5, 6, 5, others=5),
+    5: _level(11, 6, 6, 6, 5, 4, 4, 4, 5, 4, others=4),
 }
-"""From nearly everything to very little. What a primitive has few of and images depend on has more bits: its place,
-shape and strength."""
+"""From nearly lossless (1) to very small (5). Position, shape and strength have more bits, as images depend on them."""
 
-USUAL_LEVEL = 3
+DEFAULT_LEVEL = 3
 
 
 def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) -> BitTable:
-    """A level's table under a user's words NAME=BITS, where NAME is a parameter of the model or ``others``, and BITS a
-    number or several.
+    """Return a level's table with ``NAME=BITS`` overrides, where NAME is a parameter of the model or ``others``.
 
     Raises:
         ConfigError: no such level or parameter, or no such number of bits.
@@ -100,7 +86,7 @@ def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) 
 
 
 def _numbers(word: str, text: str, name: str) -> tuple[int, ...]:
-    low, high = (LEAST_BITS, 16) if name == "quats" else (1, MOST_BITS if name == "means" else 16)
+    low, high = (MIN_BITS, 16) if name == "quats" else (1, MAX_BITS if name == "means" else 16)
     several = name not in ("means", "quats", OTHERS)
     parts = text.split(",")
     if any(not p.isascii() or not p.isdigit() or len(p) > 2 or not low <= int(p) <= high for p in parts) or (

@@ -11,10 +11,26 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compression.bits import BitTable
-from neuprim.core.compression.columns import MOST_BITS, Columns, even_columns, fit_columns, keep_zero, spread_error
-from neuprim.core.compression.order import morton
-from neuprim.core.compression.rotations import LEAST_BITS, Rotations
-from neuprim.core.compression.sections import COLUMNS, POSITIONS, ROTATIONS, Section, pack, pack_rows, pack_sparse
+from neuprim.core.compression.quantizers import (
+    MAX_BITS,
+    MIN_BITS,
+    Columns,
+    Rotations,
+    columns_of_step,
+    fit_columns,
+    relative_error,
+    snap_to_zero,
+)
+from neuprim.core.compression.sections import (
+    COLUMNS,
+    POSITIONS,
+    ROTATIONS,
+    Section,
+    morton_encode,
+    pack,
+    pack_masks,
+    pack_sparse,
+)
 from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.model.checks import method
 from neuprim.core.model.fields import prunable_units_by_name
@@ -22,23 +38,23 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import nonzero_rows
 
 __all__ = [
-    "Schemes",
-    "Stored",
-    "bits_in_words",
-    "encode",
-    "file_order",
-    "folded",
-    "rounded",
-    "schemes",
-    "schemes_within",
+    "Quantizers",
+    "StoredSize",
+    "format_bits",
+    "encode_sections",
+    "storage_order",
+    "canonicalize",
+    "fake_quantize",
+    "fit_quantizers",
+    "fit_quantizers_to_error",
 ]
 
-Schemes = dict[str, Columns | Rotations]
+Quantizers = dict[str, Columns | Rotations]
 """Parameter -> how its numbers are coded."""
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredSize:
     """What a file has of a parameter: bits of a number, as text, and bytes."""
 
     bits: str
@@ -46,23 +62,20 @@ class Stored:
 
 
 _SPIKY = 12.0
-"""Columns whose error is more times the usual one than this get twice the bits: a few of their numbers lie far from all
-others."""
+"""A column whose error is this many times the usual one has outliers and gets twice the bits."""
 
 _LABEL = 16
-"""Bits of a number that is not learned, at every level: it tells one thing from another, and half of it says
-nothing."""
+"""Bits of a number that is not learned, such as a label, at every level."""
 
-_WORTH_A_MASK = 0.02
-"""Share of the primitives without a piece from which on a bit for each says so."""
+_MIN_MASKED = 0.02
+"""A piece that a smaller share of the primitives lacks has no bit mask."""
 
-_FINE = 50.0
-"""Steps of a position in the median of the primitives' longest semi-axes, at least."""
+_POSITION_STEPS = 50.0
+"""Smallest number of position steps in the median of the primitives' longest semi-axes."""
 
 
-def folded(model: Primitives) -> Primitives:
-    """The same model in the numbers that are stored (:meth:`~neuprim.core.model.fields.Field.canonicalize`), detached and on
-    the processor.
+def canonicalize(model: Primitives) -> Primitives:
+    """Return the equal model in the numbers that files store, detached, on the CPU.
 
     Raises:
         CheckpointError: numbers that cannot be stored: not float32, not finite, or a quaternion of zeros.
@@ -86,16 +99,14 @@ def folded(model: Primitives) -> Primitives:
             bad |= (value == 0).all(1)
         if bool(bad.any()):
             row = int(bad.nonzero()[0])
-            raise CheckpointError(
-                f"parameter {name} of primitive {row} is {value[row].flatten()[:8].tolist()}, which cannot be compressed"
-            )
+            values = value[row].flatten()[:8].tolist()
+            raise CheckpointError(f"parameter {name} of primitive {row} is {values}, which cannot be compressed")
     return Primitives(model.density, model.colour, params)
 
 
-def schemes(model: Primitives, table: BitTable) -> Schemes:
-    """How a folded model's numbers are coded: ends from its own numbers, bits from the table and, where it leaves it
-    open, from them."""
-    found: Schemes = {}
+def fit_quantizers(model: Primitives, table: BitTable) -> Quantizers:
+    """Return quantizers of a canonical model: ranges from its numbers, bits from the table."""
+    found: Quantizers = {}
     sparse = _sparse(model)
     for spec in model.specs:
         x, bits = model.params[spec.name].reshape(model.count, spec.size), table.of(spec.name, spec.shape)
@@ -108,41 +119,37 @@ def schemes(model: Primitives, table: BitTable) -> Schemes:
         else:
             columns = fit_columns(x, bits)
             if spec.name not in table.exact and model.count:
-                spiky = spread_error(x, columns) > _SPIKY
+                spiky = relative_error(x, columns) > _SPIKY
                 if bool(spiky.any()):
                     columns = fit_columns(
                         x, [min(2 * b, 16) if more else b for b, more in zip(bits, spiky.tolist(), strict=True)]
                     )
-            found[spec.name] = keep_zero(columns) if spec.name in sparse else columns
+            found[spec.name] = snap_to_zero(columns) if spec.name in sparse else columns
     return found
 
 
-def schemes_within(model: Primitives, effects: Mapping[str, Tensor], error: float) -> Schemes:
-    """How a folded model's numbers are coded so that each of them brings the same error, as little as that is: a step
-    is as long as images allow.
+def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], error: float) -> Quantizers:
+    """Return quantizers of a canonical model with which every column adds the same error.
 
-    A number rounded to steps of length s is off by s^2 / 12 in the mean of squares. Of all ways to spend so many bits,
-    those by which the last bit of every number is worth as much are the best (reverse water filling), and codes that no
-    number has take next to no bytes.
+    Rounding to steps of length s has a mean squared error of s^2 / 12. Equal errors spend bits best (reverse water
+    filling), and codes that no number has take next to no bytes.
 
     Args:
-        effects: parameter -> (C,) mean squared change of what is looked at, when its numbers change by independent
-        amounts of variance 1
-            (:class:`~neuprim.core.train.sensitivity.Sensitivity`).
-        error: mean squared change that the numbers of one column may bring together.
+        effects: parameter -> (C,) mean squared change of images when its numbers change by independent amounts of
+            variance 1 (:class:`~neuprim.core.train.sensitivity.Sensitivity`).
+        error: mean squared change that one column may add.
     """
-    found: Schemes = {}
+    found: Quantizers = {}
     sparse = _sparse(model)
     for spec in model.specs:
         x = model.params[spec.name].reshape(model.count, spec.size)
-        own = (
-            effects[spec.name].double().nan_to_num(nan=torch.inf, posinf=torch.inf)
-        )  # what cannot be told is stored as finely as can be
+        # An unknown effect counts as infinite: the column is stored as finely as possible.
+        own = effects[spec.name].double().nan_to_num(nan=torch.inf, posinf=torch.inf)
         steps = (12.0 * error / own).sqrt()  # infinite where nothing changes
         if spec.name == "quats":
-            turn = float((12.0 * 3.0 * error / own.sum()).sqrt())  # three numbers tell of four
+            turn = float((12.0 * 3.0 * error / own.sum()).sqrt())  # three of four components are stored
             found[spec.name] = Rotations(
-                min(max(round(math.log2(2**0.5 / turn + 2)), LEAST_BITS), 16) if turn > 0 else 16
+                min(max(round(math.log2(2**0.5 / turn + 2)), MIN_BITS), 16) if turn > 0 else 16
             )
         elif spec.fixed:
             found[spec.name] = fit_columns(x, [_LABEL] * spec.size, clips=(0.0,))
@@ -150,14 +157,14 @@ def schemes_within(model: Primitives, effects: Mapping[str, Tensor], error: floa
             found[spec.name] = _even_positions(x, steps)
         else:
             zero = spec.name in sparse
-            columns = even_columns(x, steps, 0.0 if zero else x.double().mean(0))
-            found[spec.name] = keep_zero(columns) if zero else columns
+            columns = columns_of_step(x, steps, 0.0 if zero else x.double().mean(0))
+            found[spec.name] = snap_to_zero(columns) if zero else columns
     return found
 
 
 def _even_positions(x: Tensor, steps: Tensor) -> Columns:
-    """As :func:`even_columns`, with as many bits for each axis."""
-    own = even_columns(x, steps, x.double().mean(0) if len(x) else 0.0)
+    """Return :func:`columns_of_step` with equal bits for all axes."""
+    own = columns_of_step(x, steps, x.double().mean(0) if len(x) else 0.0)
     bits = int(own.bits.max())
     low = own.low.double()
     step = torch.where(own.high > own.low, (own.high.double() - low) / own.last, 0.0)
@@ -165,45 +172,44 @@ def _even_positions(x: Tensor, steps: Tensor) -> Columns:
 
 
 def _sparse(model: Primitives) -> set[str]:
-    """Parameters of pieces that some primitives do without: these come back without them."""
+    """Return the parameters of pieces that some primitives lack; their zeros must stay zeros."""
     pieces = prunable_units_by_name(model.density, model.colour).values()
     return {name for piece in pieces if not bool(nonzero_rows(piece, model.params).all()) for name in piece.places}
 
 
 def _positions(model: Primitives, x: Tensor, bits: int, exact: bool) -> Columns:
-    """No position is clipped: what is far away stays there, and if need be costs everybody a bit more."""
+    """Return columns of positions, without clipping; distant primitives raise the bits of all."""
     if model.count and not exact:
         width = (x.amax(0) - x.amin(0)).double().max()
         size = model.params["log_scales"].double().amax(1).exp().median()
-        while bits < MOST_BITS and width / (2**bits - 1) * _FINE > size:
+        while bits < MAX_BITS and width / (2**bits - 1) * _POSITION_STEPS > size:
             bits += 1
     return fit_columns(x, [bits] * 3, clips=(0.0,))
 
 
-def file_order(model: Primitives, made: Schemes) -> Tensor:
-    """(N,) int64 rows of a folded model as they follow each other in a file: along a Z curve through the positions'
-    codes."""
+def storage_order(model: Primitives, made: Quantizers) -> Tensor:
+    """Return the (N,) int64 rows of a canonical model in file order: along a Z curve through the positions' codes."""
     places = made["means"]
     assert isinstance(places, Columns)
     return torch.from_numpy(
-        np.argsort(morton(places.codes(model.params["means"]).numpy(), int(places.bits[0])), kind="stable")
+        np.argsort(morton_encode(places.codes(model.params["means"]).numpy(), int(places.bits[0])), kind="stable")
     )
 
 
-def encode(model: Primitives, made: Schemes) -> list[Section]:
-    """The sections of a folded model, in the order of the file."""
-    order = file_order(model, made)
+def encode_sections(model: Primitives, made: Quantizers) -> list[Section]:
+    """Return the sections of a canonical model, in file order."""
+    order = storage_order(model, made)
     codes = {
         spec.name: made[spec.name].codes(model.params[spec.name].reshape(model.count, spec.size)[order])
         for spec in model.specs
     }
-    masks, whose = _masks(model, made, codes)
-    sections = [pack_rows(masks)] if masks else []
+    masks, mask_of = _masks(model, made, codes)
+    sections = [pack_masks(masks)] if masks else []
     for spec in model.specs:
         scheme, own = made[spec.name], codes[spec.name].numpy()
-        if spec.name in whose:
+        if spec.name in mask_of:
             assert isinstance(scheme, Columns)
-            sections.append(pack_sparse(spec.name, spec.shape, scheme, own, whose[spec.name], masks))
+            sections.append(pack_sparse(spec.name, spec.shape, scheme, own, mask_of[spec.name], masks))
             continue
         coding = ROTATIONS if isinstance(scheme, Rotations) else POSITIONS if spec.name == "means" else COLUMNS
         sections.append(pack(spec.name, spec.shape, scheme, own, coding))
@@ -211,12 +217,11 @@ def encode(model: Primitives, made: Schemes) -> list[Section]:
 
 
 def _masks(
-    model: Primitives, made: Schemes, codes: Mapping[str, Tensor]
+    model: Primitives, made: Quantizers, codes: Mapping[str, Tensor]
 ) -> tuple[list[np.ndarray], dict[str, list[int]]]:
-    """Who has which piece, of pieces that come back as zeros for some primitives, and of their parameters the number of
-    each column's mask.
+    """Return bit masks of pieces that some primitives lack, and parameter -> each column's mask number (0: none).
 
-    One bit then says what would else be the most frequent code of every column of the piece.
+    One bit then replaces the most frequent code of every column of the piece.
     """
     shapes = {spec.name: spec.shape for spec in model.specs}
     zero = {
@@ -225,7 +230,7 @@ def _masks(
         if isinstance(s, Columns) and n != "means"
     }
     masks: list[np.ndarray] = []
-    whose: dict[str, Tensor] = {}
+    mask_of: dict[str, Tensor] = {}
     for piece in prunable_units_by_name(model.density, model.colour).values():
         if not model.count or not set(piece.places) <= zero.keys():
             continue
@@ -233,27 +238,26 @@ def _masks(
             zero[name][(slice(None), *place)].reshape(model.count, -1).all(1) for name, place in piece.places.items()
         ]
         without = torch.stack(parts).all(0)
-        if float(without.double().mean()) < _WORTH_A_MASK:
+        if float(without.double().mean()) < _MIN_MASKED:
             continue
         masks.append((~without).numpy())
         for name, place in piece.places.items():
-            whose.setdefault(name, torch.zeros(shapes[name], dtype=torch.int64))[place] = len(masks)
-    return masks, {name: of.flatten().tolist() for name, of in whose.items()}
+            mask_of.setdefault(name, torch.zeros(shapes[name], dtype=torch.int64))[place] = len(masks)
+    return masks, {name: of.flatten().tolist() for name, of in mask_of.items()}
 
 
-def rounded(params: Mapping[str, Tensor], made: Schemes) -> dict[str, Tensor]:
-    """Tensors as they would come back, row by row, with the gradients of the tensors themselves (straight through).
+def fake_quantize(params: Mapping[str, Tensor], made: Quantizers) -> dict[str, Tensor]:
+    """Quantize and dequantize tensors, with straight-through gradients, for quantization-aware training.
 
-    For training that knows what will be stored: the schemes are fixed meanwhile, and numbers beyond a column's ends
-    come back as the end.
+    Numbers beyond a column's range become its end.
     """
     return {
-        name: made[name].rounded(x.reshape(len(x), math.prod(x.shape[1:]))).reshape(x.shape)
+        name: made[name].fake_quantize(x.reshape(len(x), math.prod(x.shape[1:]))).reshape(x.shape)
         for name, x in params.items()
     }
 
 
-def bits_in_words(scheme: Columns | Rotations) -> str:
-    """``"7"``, ``"6 to 8"`` of several columns."""
+def format_bits(scheme: Columns | Rotations) -> str:
+    """Return ``"7"``, or ``"6 to 8"`` where columns differ."""
     bits = sorted({scheme.bits} if isinstance(scheme, Rotations) else set(scheme.bits.tolist()))
     return " to ".join(map(str, bits if len(bits) < 2 else (bits[0], bits[-1])))

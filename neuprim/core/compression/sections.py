@@ -1,6 +1,6 @@
-"""Codes as bytes: byte planes, which compress better than numbers one by one, and the way back from bytes of strangers.
+"""Pack codes into byte planes, and unpack and validate them.
 
-All numbers are little-endian. What every section holds stands in docs/data_formats.md, byte by byte.
+All numbers are little-endian. docs/data_formats.md describes every byte.
 """
 
 from __future__ import annotations
@@ -12,64 +12,69 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import zstandard
 from torch import Tensor
 
-from neuprim.core.compression.columns import MOST_BITS, Columns
-from neuprim.core.compression.order import morton, unmorton
-from neuprim.core.compression.rotations import LEAST_BITS, Rotations
+from neuprim.core.compression.quantizers import MAX_BITS, MIN_BITS, Columns, Rotations
 
 __all__ = [
     "CODINGS",
     "COLUMNS",
-    "MOST_TEXT",
+    "MAX_TEXT",
     "POSITIONS",
     "ROTATIONS",
-    "ROWS",
-    "ROWS_NAME",
+    "MASKS",
+    "MASKS_NAME",
     "SPARSE",
     "TEXT",
-    "Damaged",
+    "CorruptSection",
     "Section",
+    "compress_planes",
     "content_size",
+    "morton_encode",
     "pack",
-    "pack_rows",
+    "pack_masks",
     "pack_sparse",
     "unpack",
-    "unpack_rows",
+    "unpack_masks",
 ]
 
-TEXT, COLUMNS, POSITIONS, ROTATIONS, ROWS, SPARSE = range(6)
+TEXT, COLUMNS, POSITIONS, ROTATIONS, MASKS, SPARSE = range(6)
 CODINGS = {
     TEXT: "text",
     COLUMNS: "columns",
     POSITIONS: "positions",
     ROTATIONS: "rotations",
-    ROWS: "rows",
+    MASKS: "rows",
     SPARSE: "sparse columns",
 }
 
-ROWS_NAME = "rows|"
-"""Of the one section that says which primitives have what; no parameter is called so."""
+MASKS_NAME = "rows|"
+"""Name of the one section of bit masks; no parameter can have it."""
 
-MOST_TEXT = 2**20
-"""Bytes of a text."""
+MAX_TEXT = 2**20
+"""Largest number of bytes of a text."""
+
+_ZSTD_LEVELS = 19, 1
+"""Low levels search fewer repetitions, which in noise cost more than they save."""
 
 _RECORD = struct.Struct("<Bff")
-_WHOSE = struct.Struct("<H")
+_MASK_NUMBER = struct.Struct("<H")
 
 
-class Damaged(Exception):
-    """What is wrong with a section's content, without the file's and the section's name."""
+class CorruptSection(Exception):
+    """Invalid content of a section; the message lacks the names of file and section."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A parameter, or the one text, as it goes into a file.
+    """A parameter, or the one text, of a file.
 
     Attributes:
-        coding, shape: one of :data:`CODINGS`, and the shape of one primitive's row.
-        head: how its numbers are coded: a record per column, of sparse ones then whose they are, or the bits of
-        rotations. planes: its codes, a byte plane each; of a text all of it.
+        coding: one of :data:`CODINGS`.
+        shape: shape of one primitive's row.
+        head: quantizer: a record per column, then mask numbers of sparse columns; or the bits of rotations.
+        planes: byte planes of the codes, or the text.
     """
 
     name: str
@@ -85,28 +90,28 @@ class Section:
 
     @property
     def head_size(self) -> int:
-        """Bytes of the head, which follow from the rest."""
-        record = _RECORD.size + (_WHOSE.size if self.coding == SPARSE else 0)
-        return {TEXT: 0, ROWS: 0, ROTATIONS: 1}.get(self.coding, record * self.columns)
+        """Bytes of the head, from coding and shape."""
+        record = _RECORD.size + (_MASK_NUMBER.size if self.coding == SPARSE else 0)
+        return {TEXT: 0, MASKS: 0, ROTATIONS: 1}.get(self.coding, record * self.columns)
 
 
 def pack(name: str, shape: tuple[int, ...], scheme: Columns | Rotations, codes: np.ndarray, coding: int) -> Section:
-    """The section of codes (N, C). Positions must be in their order already."""
+    """Return the section of codes (N, C). Positions must be in file order."""
     if isinstance(scheme, Rotations):
         planes = [*_planes(codes[:, 0], 2), *(plane for i in (1, 2, 3) for plane in _planes(codes[:, i], scheme.bits))]
         return Section(name, coding, shape, bytes([scheme.bits]), tuple(planes))
     bits, head = scheme.bits.tolist(), _head(scheme)
     if coding == POSITIONS:
-        planes = _planes(np.diff(morton(codes, bits[0]), prepend=np.uint64(0)), 3 * bits[0])
+        planes = _planes(np.diff(morton_encode(codes, bits[0]), prepend=np.uint64(0)), 3 * bits[0])
     else:
         planes = [plane for i, b in enumerate(bits) for plane in _planes(codes[:, i], b)]
     return Section(name, coding, shape, head, tuple(planes))
 
 
-def pack_rows(masks: Sequence[np.ndarray]) -> Section:
-    """The section of (N,) bool masks: who has what, a bit per primitive, the lowest first."""
+def pack_masks(masks: Sequence[np.ndarray]) -> Section:
+    """Return the section of (N,) bool masks, a bit per primitive, the lowest first."""
     return Section(
-        ROWS_NAME, ROWS, (len(masks),), planes=tuple(np.packbits(mask, bitorder="little").tobytes() for mask in masks)
+        MASKS_NAME, MASKS, (len(masks),), planes=tuple(np.packbits(mask, bitorder="little").tobytes() for mask in masks)
     )
 
 
@@ -115,13 +120,13 @@ def pack_sparse(
     shape: tuple[int, ...],
     scheme: Columns,
     codes: np.ndarray,
-    whose: Sequence[int],
+    mask_of: Sequence[int],
     masks: Sequence[np.ndarray],
 ) -> Section:
-    """The section of codes (N, C) of which column i has those of mask ``whose[i] - 1`` alone, or all of them for 0."""
-    own = [codes[:, i] if of == 0 else codes[masks[of - 1], i] for i, of in enumerate(whose)]
+    """Return the section of codes (N, C); column i has the rows of mask ``mask_of[i] - 1``, or all rows for 0."""
+    own = [codes[:, i] if of == 0 else codes[masks[of - 1], i] for i, of in enumerate(mask_of)]
     planes = [plane for column, b in zip(own, scheme.bits.tolist(), strict=True) for plane in _planes(column, b)]
-    return Section(name, SPARSE, shape, _head(scheme) + b"".join(map(_WHOSE.pack, whose)), tuple(planes))
+    return Section(name, SPARSE, shape, _head(scheme) + b"".join(map(_MASK_NUMBER.pack, mask_of)), tuple(planes))
 
 
 def _head(scheme: Columns) -> bytes:
@@ -131,7 +136,7 @@ def _head(scheme: Columns) -> bytes:
 
 
 def _planes(codes: np.ndarray, bits: int) -> list[bytes]:
-    """Low bytes of all codes, then the next, as many as so many bits need."""
+    """Return the byte planes of codes, low bytes first."""
     return [
         ((codes >> codes.dtype.type(8 * i)) & codes.dtype.type(255)).astype(np.uint8).tobytes()
         for i in range(_bytes(bits))
@@ -143,46 +148,45 @@ def _bytes(bits: int) -> int:
 
 
 def content_size(section: Section, count: int, masks: Sequence[np.ndarray] = ()) -> int:
-    """Bytes of the planes of a section with this head, of ``count`` primitives.
+    """Return the bytes of a section's planes, from its head.
 
     Args:
-        masks: those of the file.
+        masks: bit masks of the file.
 
     Raises:
-        Damaged: the head is not one.
+        CorruptSection: the head is invalid.
     """
-    if section.coding == ROWS:
+    if section.coding == MASKS:
         return section.columns * ((count + 7) // 8)
     if section.coding == ROTATIONS:
         return count * (1 + 3 * _bytes(_rotations(section).bits))
     bits = _records(section).bits.tolist()
     if section.coding == POSITIONS:
         if len(set(bits)) != 1 or len(bits) != 3:
-            raise Damaged(f"{bits} bits; expected three columns of as many bits each")
+            raise CorruptSection(f"{bits} bits; expected three columns of as many bits each")
         return count * _bytes(3 * bits[0])
     return sum(_bytes(b) * n for b, n in zip(bits, _counts(section, count, masks), strict=True))
 
 
-def unpack_rows(section: Section, content: bytes, count: int) -> list[np.ndarray]:
-    """(count,) bool masks of a section's ``content``.
+def unpack_masks(section: Section, content: bytes, count: int) -> list[np.ndarray]:
+    """Return the (count,) bool masks of a section's ``content``.
 
     Raises:
-        Damaged: bits of primitives that do not exist.
+        CorruptSection: bits of primitives that do not exist.
     """
     bits = np.unpackbits(
         np.frombuffer(content, np.uint8).reshape(section.columns, (count + 7) // 8), axis=1, bitorder="little"
     )
     if bits[:, count:].any():
-        raise Damaged(f"bits beyond those of {count} primitives")
+        raise CorruptSection(f"bits beyond those of {count} primitives")
     return list(bits[:, :count].astype(bool))
 
 
 def unpack(section: Section, content: bytes, count: int, masks: Sequence[np.ndarray] = ()) -> Tensor:
-    """(count, *shape) float32 of a section's head and ``content``, :func:`content_size` bytes; what a sparse column
-    does not have is 0.
+    """Decode a section: (count, *shape) float32 of its head and ``content`` of :func:`content_size` bytes.
 
     Raises:
-        Damaged: codes that do not exist.
+        CorruptSection: codes that do not exist.
     """
     planes = _Planes(content)
     if section.coding == ROTATIONS:
@@ -193,7 +197,7 @@ def unpack(section: Section, content: bytes, count: int, masks: Sequence[np.ndar
     if section.coding == POSITIONS:
         return columns.values(torch.from_numpy(_cells(planes, count, int(columns.bits[0]))))
     values = torch.zeros(count, section.columns)
-    for i, (of, own) in enumerate(zip(_whose(section), _counts(section, count, masks), strict=True)):
+    for i, (of, own) in enumerate(zip(_mask_numbers(section), _counts(section, count, masks), strict=True)):
         one = Columns(columns.bits[i : i + 1], columns.low[i : i + 1], columns.high[i : i + 1])
         found = one.values(torch.from_numpy(planes.codes(own, int(one.bits), int(one.last))[:, None]))[:, 0]
         if of:
@@ -203,40 +207,36 @@ def unpack(section: Section, content: bytes, count: int, masks: Sequence[np.ndar
     return values.reshape(count, *section.shape)
 
 
-def _whose(section: Section) -> list[int]:
-    """Of each column the number of its mask, 0 for all primitives."""
+def _mask_numbers(section: Section) -> list[int]:
+    """Return the mask number of each column, 0 for all primitives."""
     if section.coding != SPARSE:
         return [0] * section.columns
-    return [of for (of,) in _WHOSE.iter_unpack(section.head[_RECORD.size * section.columns :])]
+    return [of for (of,) in _MASK_NUMBER.iter_unpack(section.head[_RECORD.size * section.columns :])]
 
 
 def _counts(section: Section, count: int, masks: Sequence[np.ndarray]) -> list[int]:
-    """Primitives that each column has numbers of."""
-    whose = _whose(section)
-    if max(whose, default=0) > len(masks):
-        raise Damaged(
-            f"a column of the primitives of mask {max(whose)}; expected at most {len(masks)}, as many as there are before it"
-        )
-    sizes = {
-        of: int(masks[of - 1].sum()) if of else count for of in set(whose)
-    }  # no more work than the section has numbers
-    return [sizes[of] for of in whose]
+    """Return how many primitives each column has numbers of."""
+    mask_of = _mask_numbers(section)
+    if max(mask_of, default=0) > len(masks):
+        raise CorruptSection(f"a column refers to mask {max(mask_of)}; expected at most {len(masks)}")
+    sizes = {of: int(masks[of - 1].sum()) if of else count for of in set(mask_of)}
+    return [sizes[of] for of in mask_of]
 
 
 def _rotations(section: Section) -> Rotations:
     bits = section.head[0]
-    if not LEAST_BITS <= bits <= 16:
-        raise Damaged(f"{bits} bits for rotations; expected {LEAST_BITS} to 16")
+    if not MIN_BITS <= bits <= 16:
+        raise CorruptSection(f"{bits} bits for rotations; expected {MIN_BITS} to 16")
     return Rotations(bits)
 
 
 def _records(section: Section) -> Columns:
     found = list(_RECORD.iter_unpack(section.head[: _RECORD.size * section.columns]))
     for i, (bits, low, high) in enumerate(found):
-        if not 1 <= bits <= MOST_BITS:
-            raise Damaged(f"column {i} has {bits} bits; expected 1 to {MOST_BITS}")
+        if not 1 <= bits <= MAX_BITS:
+            raise CorruptSection(f"column {i} has {bits} bits; expected 1 to {MAX_BITS}")
         if not -np.inf < low <= high < np.inf:
-            raise Damaged(f"column {i} goes from {low} to {high}; expected two finite numbers, ascending")
+            raise CorruptSection(f"column {i} goes from {low} to {high}; expected two finite numbers, ascending")
     bits, low, high = zip(*found, strict=True) if found else ((), (), ())
     return Columns(
         torch.tensor(bits, dtype=torch.int64),
@@ -248,23 +248,75 @@ def _records(section: Section) -> Columns:
 def _cells(planes: _Planes, count: int, bits: int) -> np.ndarray:
     keys = np.cumsum(planes.codes(count, 3 * bits, (1 << 3 * bits) - 1), dtype=np.int64)
     if len(keys) and (keys.min() < 0 or keys.max() >= 1 << 3 * bits):  # a step is too small to pass over both
-        raise Damaged(f"steps along the curve leave its {3 * bits} bits")
-    return unmorton(keys.astype(np.uint64), bits)
+        raise CorruptSection(f"steps along the curve leave its {3 * bits} bits")
+    return morton_decode(keys.astype(np.uint64), bits)
 
 
 class _Planes:
-    """Byte planes from front to back."""
+    """Reader of byte planes."""
 
     def __init__(self, content: bytes) -> None:
         self._bytes, self._at = np.frombuffer(content, np.uint8), 0
 
     def codes(self, count: int, bits: int, last: int) -> np.ndarray:
-        """(count,) int64 out of as many planes as so many bits need, each at most ``last``."""
+        """Return the next (count,) int64 codes, each at most ``last``."""
         found = np.zeros(count, np.int64)
         if count:
             for i in range(_bytes(bits)):
                 found |= self._bytes[self._at : self._at + count].astype(np.int64) << (8 * i)
                 self._at += count
             if found.min() < 0 or found.max() > last:
-                raise Damaged(f"a code of {bits} bits that is not among 0 to {last}")
+                raise CorruptSection(f"a code of {bits} bits that is not among 0 to {last}")
         return found
+
+
+def morton_encode(cells: np.ndarray, bits: int) -> np.ndarray:
+    """Return (N,) uint64 places of ``cells`` (N, 3) on a Z curve (Morton 1966): bit 3 b + axis is bit b of the axis."""
+    wide = cells.astype(np.uint64)
+    keys = np.zeros(len(wide), np.uint64)
+    for bit in range(bits):
+        for axis in range(3):
+            keys |= ((wide[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return keys
+
+
+def morton_decode(keys: np.ndarray, bits: int) -> np.ndarray:
+    """Invert :func:`morton_encode`: (N, 3) int64."""
+    cells = np.zeros((len(keys), 3), np.uint64)
+    for bit in range(bits):
+        for axis in range(3):
+            cells[:, axis] |= ((keys >> np.uint64(3 * bit + axis)) & np.uint64(1)) << np.uint64(bit)
+    return cells.astype(np.int64)
+
+
+def compress_planes(planes: Sequence[bytes]) -> bytes:
+    """Return the smallest of several zstd frames, or the plain planes where no frame is smaller.
+
+    A block of a frame has one entropy table. Similar columns best share a block; others have their own.
+    """
+    whole = b"".join(planes)
+    cuts = ([whole], _runs(planes), planes)
+    return min([whole, *(_frame(parts, len(whole), level) for level in _ZSTD_LEVELS for parts in cuts)], key=len)
+
+
+def _runs(planes: Sequence[bytes]) -> list[bytes]:
+    """Join neighbouring planes whose codes have equal bits."""
+    made: list[list[bytes]] = []
+    last = -1
+    for plane in planes:
+        bits = max(plane, default=0).bit_length()
+        if bits != last:
+            made.append([])
+        made[-1].append(plane)
+        last = bits
+    return [b"".join(run) for run in made]
+
+
+def _frame(parts: Sequence[bytes], size: int, level: int) -> bytes:
+    """Return a zstd frame with one or more blocks per part."""
+    packer = zstandard.ZstdCompressor(level=level).compressobj(size=size)
+    made = []
+    for i, part in enumerate(parts):
+        made += [packer.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)] if i else []
+        made.append(packer.compress(part))
+    return b"".join([*made, packer.flush()])

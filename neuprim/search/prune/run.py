@@ -21,8 +21,8 @@ from neuprim.core.io.files import write_json, write_text
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer
+from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.finetune import steps_in
-from neuprim.runs.finish import finish
 from neuprim.runs.fit import Fitted, make_loss, one_torch_thread, settings_for
 from neuprim.runs.kept import PRUNED, kept_pieces
 from neuprim.runs.measure import draw, quality
@@ -195,7 +195,7 @@ def _written(
     final.mkdir(parents=True, exist_ok=True)
     write_text(final / "config.yaml", small.to_yaml())
     save(fitted)
-    finish(fitted, final)
+    evaluate_fitted(fitted, final)
 
 
 def _record(request: Request, made: Pruning) -> dict[str, Any]:

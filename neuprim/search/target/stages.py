@@ -15,13 +15,13 @@ import torch
 from neuprim.config import suspects_of, task_of
 from neuprim.config.target import Target
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
-from neuprim.core.compression import Schemes
+from neuprim.core.compression import Quantizers
 from neuprim.core.data.held_out import held_out
 from neuprim.core.io.files import atomic_path, write_text
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.model.primitives import Primitives
+from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.events import Finishing
-from neuprim.runs.finish import finish
 from neuprim.runs.measure import draw, quality
 from neuprim.runs.open import COMPRESSED, placed, read_metrics
 from neuprim.runs.training import train
@@ -163,7 +163,7 @@ def _directory(trying: Trying, attempt: Attempt) -> Finished:
     final = replace(fitted.config, output_dir=trying.folder, resume=False)
     write_text(trying.folder / "config.yaml", final.to_yaml())
     dataset = replace(trying.dataset, train=fitted.dataset.train)
-    finish(replace(fitted, config=final, dataset=dataset), trying.folder)
+    evaluate_fitted(replace(fitted, config=final, dataset=dataset), trying.folder)
     metrics = read_metrics(trying.folder)
     return Finished(
         trying.folder,
@@ -186,11 +186,11 @@ def quantised(shop: Workshop, before: Finished) -> Finished:
     views = replace(trying.dataset, train=held_out(trying.dataset, trying.record.hold_out).train)
     rounding = Rounding(model, views, judge_of(trying.config, views))
 
-    def stored(made: Schemes) -> int:
+    def stored(made: Quantizers) -> int:
         save_compressed(file, rounding.model, task.name, extra_of(header), made, words)
         return file.stat().st_size
 
-    def enough(made: Schemes) -> bool:
+    def enough(made: Quantizers) -> bool:
         held = shop.measured(rounding.read_back(made))
         return judge.margin(held) >= least if target.quality else before.held["psnr"] - held["psnr"] <= ALLOWANCE
 

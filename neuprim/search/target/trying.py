@@ -12,7 +12,7 @@ from typing import Any
 from neuprim.config import RunConfig, task_of
 from neuprim.config.launcher import LauncherSettings
 from neuprim.core.checkpoint import load_model, save_compressed
-from neuprim.core.compression import USUAL_LEVEL, bit_table
+from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.settings import PopulationSettings
@@ -235,7 +235,7 @@ def packed_bytes(folder: Path, task: TaskSpec) -> int:
     """Bytes of a training's model when compressed at the usual level."""
     file, words = folder / "packed.neuprim", (folder / "config.yaml").read_text(encoding="utf-8")
     model, _ = load_model(folder / "model.safetensors", task)
-    save_compressed(file, model, task.name, {}, bit_table(USUAL_LEVEL, (), model.specs), words)
+    save_compressed(file, model, task.name, {}, bit_table(DEFAULT_LEVEL, (), model.specs), words)
     size = file.stat().st_size
     file.unlink()
     return size

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from neuprim.runs.operating import OperatingPoint
+from neuprim.runs.render_config import RenderConfig
 from neuprim.search.tradeoff.front import Move, Spot, chain, front
 from neuprim.search.tradeoff.knobs import COMBINED, joined
 from neuprim.search.tradeoff.record import Measured, Record
@@ -19,10 +19,10 @@ _MOST = 12
 _DIGITS = 2
 """Decimals of PSNR, dB, that count: smaller differences decide nothing."""
 
-Found = Sequence[tuple[OperatingPoint, Measured]]
+Found = Sequence[tuple[RenderConfig, Measured]]
 
 
-def speed_points(reference: OperatingPoint, found: Found) -> list[OperatingPoint]:
+def speed_points(reference: RenderConfig, found: Found) -> list[RenderConfig]:
     """Combinations along the front of time: knobs that save more of it than chance does. What storage changes is left
     out."""
 
@@ -32,12 +32,12 @@ def speed_points(reference: OperatingPoint, found: Found) -> list[OperatingPoint
     own = [
         (p, m, gain(m))
         for p, m in found
-        if m.knob != COMBINED and m.ratios and p.stored == reference.stored and p != reference
+        if m.knob != COMBINED and m.ratios and p.storage == reference.storage and p != reference
     ]
     return _together(reference, found, [(p, m, g) for p, m, g in own if g > 0])
 
 
-def size_points(reference: OperatingPoint, found: Found, subject: Subject) -> list[OperatingPoint]:
+def size_points(reference: RenderConfig, found: Found, subject: Subject) -> list[RenderConfig]:
     """Combinations along the front of bytes; those of the model's file are counted, so nothing is uncertain."""
     whole = found[0][1].bytes
     own = [
@@ -52,8 +52,8 @@ def size_points(reference: OperatingPoint, found: Found, subject: Subject) -> li
 
 
 def _together(
-    reference: OperatingPoint, found: Found, gaining: Sequence[tuple[OperatingPoint, Measured, float]]
-) -> list[OperatingPoint]:
+    reference: RenderConfig, found: Found, gaining: Sequence[tuple[RenderConfig, Measured, float]]
+) -> list[RenderConfig]:
     """The combinations of :func:`~neuprim.search.tradeoff.front.chain`, without points that were measured alone."""
     best = found[0][1].quality["psnr"]
     usual = found[0][0]
@@ -73,7 +73,7 @@ def _together(
     return [point for point in made if point not in known]
 
 
-def fronts(reference: OperatingPoint, points: Sequence[OperatingPoint], record: Record) -> tuple[list[int], list[int]]:
+def fronts(reference: RenderConfig, points: Sequence[RenderConfig], record: Record) -> tuple[list[int], list[int]]:
     """Numbers of the record's points on the front of time, and on that of bytes, both against PSNR."""
     measured = record.points
 
@@ -87,7 +87,7 @@ def fronts(reference: OperatingPoint, points: Sequence[OperatingPoint], record: 
         return Spot(float(measured[i].bytes), quality(i))
 
     every = range(len(measured))
-    speed = front([i for i in every if measured[i].ratios and points[i].stored == reference.stored], in_time)
+    speed = front([i for i in every if measured[i].ratios and points[i].storage == reference.storage], in_time)
     same = [
         i for i in every if points[i].settings == reference.settings and points[i].resolution == reference.resolution
     ]

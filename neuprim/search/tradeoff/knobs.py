@@ -10,8 +10,7 @@ from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, backends
-from neuprim.runs.operating import OperatingPoint
-from neuprim.runs.storage import FORMATS, FULL, GROUPS
+from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RenderConfig
 
 __all__ = ["COMBINED", "Candidate", "LeftOut", "candidates", "check_knobs", "joined", "knobs_of"]
 
@@ -24,7 +23,7 @@ class Candidate:
     """A point to measure; ``knob`` is what it turns."""
 
     knob: str
-    point: OperatingPoint
+    point: RenderConfig
 
 
 @dataclass(frozen=True)
@@ -36,40 +35,40 @@ class LeftOut:
     reason: str
 
 
-Ladder = Callable[[OperatingPoint, Primitives], Iterable[OperatingPoint]]
+Ladder = Callable[[RenderConfig, Primitives], Iterable[RenderConfig]]
 
 
 def _setting(name: str, *values: Any) -> Ladder:
     """One setting of the renderer at several values."""
 
-    def ladder(reference: OperatingPoint, model: Primitives) -> Iterator[OperatingPoint]:
+    def ladder(reference: RenderConfig, model: Primitives) -> Iterator[RenderConfig]:
         for value in values:
             yield replace(reference, settings=replace(reference.settings, **{name: value}))
 
     return ladder
 
 
-def _resolution(reference: OperatingPoint, model: Primitives) -> Iterator[OperatingPoint]:
+def _resolution(reference: RenderConfig, model: Primitives) -> Iterator[RenderConfig]:
     for part in (1.0, 0.75, 0.5, 0.25):
         yield replace(reference, resolution=part)
 
 
-def _backends(reference: OperatingPoint, model: Primitives) -> Iterator[OperatingPoint]:
+def _backends(reference: RenderConfig, model: Primitives) -> Iterator[RenderConfig]:
     for name in backends.names():
         yield replace(reference, settings=replace(reference.settings, backend=name))
 
 
-def _threads(reference: OperatingPoint, model: Primitives) -> Iterator[OperatingPoint]:
+def _threads(reference: RenderConfig, model: Primitives) -> Iterator[RenderConfig]:
     counts = sorted({1, 0, *(2**k for k in range(1, 7) if 2**k < core_count())})
     yield from _setting("threads", *(counts if core_count() > 1 else ()))(reference, model)
 
 
-def _stored(reference: OperatingPoint, model: Primitives) -> Iterator[OperatingPoint]:
+def _stored(reference: RenderConfig, model: Primitives) -> Iterator[RenderConfig]:
     for name in FORMATS:
-        if name != FULL:
+        if name != FLOAT32:
             for group in GROUPS:
-                yield replace(reference, stored=dict(sorted({**reference.stored, group: name}.items())))
-            yield replace(reference, stored=dict.fromkeys(sorted(GROUPS), name))
+                yield replace(reference, storage=dict(sorted({**reference.storage, group: name}.items())))
+            yield replace(reference, storage=dict.fromkeys(sorted(GROUPS), name))
 
 
 LADDERS: Mapping[str, Ladder] = {
@@ -88,7 +87,7 @@ colour.NAME."""
 
 
 def _less(kind: str, name: str, values: Sequence[int]) -> Ladder:
-    def ladder(reference: OperatingPoint, model: Primitives) -> Iterator[OperatingPoint]:
+    def ladder(reference: RenderConfig, model: Primitives) -> Iterator[RenderConfig]:
         for value in values:
             yield replace(reference, reduced=dict(sorted({**reference.reduced, (kind, name): value}.items())))
 
@@ -115,9 +114,9 @@ def check_knobs(names: Sequence[str], model: Primitives) -> None:
 
 def candidates(
     names: Sequence[str],
-    reference: OperatingPoint,
+    reference: RenderConfig,
     model: Primitives,
-    fault: Callable[[OperatingPoint], str | None],
+    fault: Callable[[RenderConfig], str | None],
     usual: RenderSettings,
 ) -> tuple[list[Candidate], list[LeftOut]]:
     """Every point that turns one of these knobs, without the reference itself, and what cannot be.
@@ -141,7 +140,7 @@ def candidates(
             if reason is None:
                 found.append(Candidate(name, point))
             else:
-                out.append(LeftOut(name, point.words(usual), reason))
+                out.append(LeftOut(name, point.to_overrides(usual), reason))
     for kind, field in (("density", model.density), ("colour", model.colour)):
         if not names and not field.reductions():
             out.append(
@@ -152,7 +151,7 @@ def candidates(
     return found, out
 
 
-def joined(reference: OperatingPoint, points: Iterable[OperatingPoint]) -> OperatingPoint:
+def joined(reference: RenderConfig, points: Iterable[RenderConfig]) -> RenderConfig:
     """The point that has everything in which any of these differs from the reference; the last one's, where they
     disagree."""
     result = reference
@@ -162,10 +161,10 @@ def joined(reference: OperatingPoint, points: Iterable[OperatingPoint]) -> Opera
             for name in RenderSettings.__dataclass_fields__
             if getattr(point.settings, name) != getattr(reference.settings, name)
         }
-        result = OperatingPoint(
+        result = RenderConfig(
             replace(result.settings, **changed),
             result.resolution if point.resolution == reference.resolution else point.resolution,
             dict(sorted({**result.reduced, **point.reduced}.items())),
-            dict(sorted({**result.stored, **point.stored}.items())),
+            dict(sorted({**result.storage, **point.storage}.items())),
         )
     return result

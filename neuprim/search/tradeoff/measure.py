@@ -16,8 +16,7 @@ from torch import Tensor
 from neuprim.core.data import View
 from neuprim.core.metrics import psnr, ssim, ssim_3dgs
 from neuprim.core.model.primitives import Primitives
-from neuprim.runs.operating import OperatingPoint
-from neuprim.runs.storage import file_bytes
+from neuprim.runs.render_config import RenderConfig, estimate_file_bytes
 from neuprim.search.tradeoff.memory import peak_bytes
 from neuprim.search.tradeoff.record import Measured
 from neuprim.search.tradeoff.subject import Exact, Subject
@@ -50,8 +49,8 @@ class Models:
         self._subject = subject
         self._kept: dict[tuple[tuple[str, ...], str], Primitives] = {}
 
-    def of(self, point: OperatingPoint) -> Primitives:
-        own = OperatingPoint(reduced=point.reduced, stored=point.stored).words(OperatingPoint().settings)
+    def of(self, point: RenderConfig) -> Primitives:
+        own = RenderConfig(reduced=point.reduced, storage=point.storage).to_overrides(RenderConfig().settings)
         key = own, f"{point.settings.backend} {point.settings.device}"
         if key not in self._kept:
             found = self._subject.prepared(point)
@@ -61,13 +60,13 @@ class Models:
             self._kept[key] = found
         return self._kept[key]
 
-    def ready(self, point: OperatingPoint) -> Drawing:
+    def ready(self, point: RenderConfig) -> Drawing:
         """What draws the views of a point, with its model at hand."""
         model = self.of(point)
-        return lambda view: point.draw(model, view, self._subject.background)
+        return lambda view: point.render_view(model, view, self._subject.background)
 
 
-def look(subject: Subject, models: Models, knob: str, point: OperatingPoint, exact: Exact) -> tuple[Measured, float]:
+def look(subject: Subject, models: Models, knob: str, point: RenderConfig, exact: Exact) -> tuple[Measured, float]:
     """A point's images against ground truth and exact images, its size and memory; and the seconds that all images took
     together.
 
@@ -82,7 +81,7 @@ def look(subject: Subject, models: Models, knob: str, point: OperatingPoint, exa
     _warm(models.ready(point), subject.truths[0].view)
     for truth, ideal in zip(subject.truths, exact.images, strict=True):
         start = time.perf_counter()
-        image, peak = peak_bytes(lambda: point.draw(model, truth.view, subject.background), card)  # noqa: B023 - called at once
+        image, peak = peak_bytes(lambda: point.render_view(model, truth.view, subject.background), card)  # noqa: B023 - called at once
         seconds += time.perf_counter() - start
         peaks += [] if peak is None else [peak]
         seen, wanted = masked(image, truth), truth.image
@@ -98,7 +97,7 @@ def look(subject: Subject, models: Models, knob: str, point: OperatingPoint, exa
     error = quality.pop("mse_exact")
     against = -10.0 * math.log10(error) if error > 0 else math.inf
     quality["psnr_exact"] = against if exact.error is None else min(against, exact.error)
-    size = file_bytes(subject.file, subject.model, model, point.stored)
+    size = estimate_file_bytes(subject.file, subject.model, model, point.storage)
     return Measured(knob, subject.words(point), quality, size, max(peaks, default=None)), seconds
 
 

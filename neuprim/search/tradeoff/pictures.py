@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from neuprim.report.tradeoff import Picture
-from neuprim.runs.operating import read_point
+from neuprim.runs.render_config import parse_render_config
 from neuprim.search.tradeoff.measure import Models
 from neuprim.search.tradeoff.record import Record
 from neuprim.search.tradeoff.subject import Subject
@@ -20,8 +20,8 @@ def pictures(subject: Subject, record: Record, models: Models) -> dict[int, Pict
     found = {-1: Picture(wanted, None)}
     base = None
     for number in dict.fromkeys((0, *record.speed, *record.size)):
-        point = read_point(record.points[number].words, subject.config.renderer, subject.model)
-        image = masked(point.draw(models.of(point), truth.view, subject.background), truth)
+        point = parse_render_config(record.points[number].words, subject.config.renderer, subject.model)
+        image = masked(point.render_view(models.of(point), truth.view, subject.background), truth)
         shown = subject.channels.display(image).clamp(0.0, 1.0)
         base = shown if base is None else base
         found[number] = Picture(shown, None if number == 0 else base)

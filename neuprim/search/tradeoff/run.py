@@ -25,7 +25,7 @@ from neuprim.core.render.marched import compare_sampling
 from neuprim.report.tradeoff import write_tradeoff
 from neuprim.runs.fit import one_torch_thread
 from neuprim.runs.open import LOGS
-from neuprim.runs.operating import OperatingPoint, read_point
+from neuprim.runs.render_config import RenderConfig, parse_render_config
 from neuprim.search.tradeoff.combine import fronts, size_points, speed_points
 from neuprim.search.tradeoff.knobs import COMBINED, Candidate, LeftOut, candidates, check_knobs
 from neuprim.search.tradeoff.measure import Models, look, take_turns
@@ -94,7 +94,7 @@ class _Work:
     record: Record
     progress: Progress
     begun: float = field(default_factory=time.monotonic)
-    points: dict[tuple[str, ...], OperatingPoint] = field(default_factory=dict)
+    points: dict[tuple[str, ...], RenderConfig] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.models, self.file = Models(self.subject), self.request.run_dir / FOLDER / "tradeoff.json"
@@ -207,7 +207,7 @@ def tradeoff_run(
         _describe(record, subject)
         work.look_at(singles, _SEEN)
         work.take_times(_TIMED)
-        found = [(read_point(m.words, subject.config.renderer, subject.model), m) for m in record.points]
+        found = [(parse_render_config(m.words, subject.config.renderer, subject.model), m) for m in record.points]
         together = {
             subject.words(p): p for p in (*speed_points(reference, found), *size_points(reference, found, subject))
         }
@@ -216,7 +216,9 @@ def tradeoff_run(
         if not record.marching:
             record.marching = _marching(subject)
         record.speed, record.size = fronts(
-            reference, [read_point(m.words, subject.config.renderer, subject.model) for m in record.points], record
+            reference,
+            [parse_render_config(m.words, subject.config.renderer, subject.model) for m in record.points],
+            record,
         )
         record.write(work.file)
         write_csv(folder / "tradeoff.csv", record, lambda number: subject.model.count)

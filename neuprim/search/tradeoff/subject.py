@@ -21,7 +21,7 @@ from neuprim.core.render import backends
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.blame import Suspects
 from neuprim.runs.open import load_dataset, load_run, model_file, placed
-from neuprim.runs.operating import OperatingPoint, read_point
+from neuprim.runs.render_config import RenderConfig, parse_render_config
 from neuprim.search.tradeoff.knobs import Candidate
 from neuprim.search.truths import Truth, truths_of
 
@@ -50,7 +50,7 @@ class Subject:
     dataset: Dataset
     channels: Channels
     suspects: Suspects
-    reference: OperatingPoint
+    reference: RenderConfig
     truths: list[Truth]
     file: Path
     lpips: Lpips | None = None
@@ -73,17 +73,17 @@ class Subject:
         scale = min(1.0, longer / max(width, height))
         return replace(view, camera=view.camera.resized(max(1, round(scale * width)), max(1, round(scale * height))))
 
-    def words(self, point: OperatingPoint) -> tuple[str, ...]:
+    def words(self, point: RenderConfig) -> tuple[str, ...]:
         """What reproduces a point with ``neuprim render`` or ``neuprim eval``."""
-        return point.words(self.config.renderer)
+        return point.to_overrides(self.config.renderer)
 
-    def prepared(self, point: OperatingPoint) -> Primitives:
+    def prepared(self, point: RenderConfig) -> Primitives:
         """The model as a point draws it, where its frames are drawn."""
-        return placed(point.applied(self.model), point.settings, self.truths[0].view)
+        return placed(point.prepare_model(self.model), point.settings, self.truths[0].view)
 
-    def fault(self, point: OperatingPoint) -> str | None:
+    def fault(self, point: RenderConfig) -> str | None:
         """Why a point cannot be drawn here; None if it can."""
-        view = point.seen(self.truths[0].view)
+        view = point.scale_view(self.truths[0].view)
         try:
             backends.check_pair(point.settings)
             model = self.prepared(point)
@@ -92,7 +92,7 @@ class Subject:
             return str(error)
         return None
 
-    def backend(self, point: OperatingPoint) -> backends.Backend:
+    def backend(self, point: RenderConfig) -> backends.Backend:
         """Which one draws it."""
         model, view = self.prepared(point), self.truths[0].view
         return backends.choose(model.lower_unchecked(view.camera, view.conditions), point.settings, view.camera)
@@ -120,7 +120,7 @@ def load_subject(
         NeuprimError: no such run, no held-out views, or words that do not fit.
     """
     config, task, model, _ = load_run(run_dir)
-    reference = read_point(words, config.renderer, model)
+    reference = parse_render_config(words, config.renderer, model)
     weights = lpips or config.metrics.lpips
     distance = None if weights is None else Lpips.load(weights)
     suspects = suspects_of(config)
@@ -179,22 +179,22 @@ def exact_images(subject: Subject, allowed: float, float64: bool | None = None) 
         float64: which of both, where that is decided already.
     """
     settings = replace(subject.reference.settings, alpha_min=0.0, transmittance_min=0.0)
-    uncut = OperatingPoint(settings)
-    oracle = OperatingPoint(replace(settings, backend=backends.ORACLE, device="auto"))
+    uncut = RenderConfig(settings)
+    oracle = RenderConfig(replace(settings, backend=backends.ORACLE, device="auto"))
     double, small = subject.double, subject.small(_SMALL)
     background = subject.background.double()
     size = (small.camera.width, small.camera.height)
     start = time.perf_counter()
-    check = oracle.draw(double, small, background)
+    check = oracle.render_view(double, small, background)
     pixels = sum(t.view.camera.width * t.view.camera.height for t in subject.truths) / len(subject.truths)
     slow = (time.perf_counter() - start) * pixels / (size[0] * size[1])
     start = time.perf_counter()
     if float64 or (float64 is None and slow * len(subject.truths) <= allowed):
-        images = [oracle.draw(double, t.view, background) for t in subject.truths]
+        images = [oracle.render_view(double, t.view, background) for t in subject.truths]
         seconds = (time.perf_counter() - start) / len(images)
         return Exact(images, True, None, size, seconds, seconds)
     model = subject.prepared(uncut)
-    images = [uncut.draw(model, t.view, subject.background).double() for t in subject.truths]
+    images = [uncut.render_view(model, t.view, subject.background).double() for t in subject.truths]
     seconds = (time.perf_counter() - start) / len(images)
-    error = min(psnr(uncut.draw(model, small, subject.background).double(), check), _EQUAL)
+    error = min(psnr(uncut.render_view(model, small, subject.background).double(), check), _EQUAL)
     return Exact(images, False, error, size, seconds, slow)

@@ -18,13 +18,13 @@ from neuprim.core.compression import (
     LEVELS,
     BitTable,
     bit_table,
-    folded,
+    canonicalize,
+    fake_quantize,
+    fit_quantizers,
+    fit_quantizers_to_error,
     read_compressed,
-    rounded,
-    schemes,
-    schemes_within,
 )
-from neuprim.core.compression.columns import Columns
+from neuprim.core.compression.quantizers import Columns
 from neuprim.core.errors import CheckpointError, ConfigError, FormError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
@@ -92,7 +92,7 @@ def test_a_bit_says_who_does_without_a_piece(tmp_path: Path, name: str) -> None:
         files.append(path.read_bytes())
     assert files[0] == files[1]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(codec, "_WORTH_A_MASK", 2.0)
+        patch.setattr(codec, "_MIN_MASKED", 2.0)
         checkpoint.save_compressed(tmp_path / "2", pruned, task.name, {}, LEVELS[3])
     plain, _ = checkpoint.load_model(tmp_path / "2", task)
     assert all(torch.equal(value, plain.params[key]) for key, value in pruned.params.items())
@@ -112,7 +112,7 @@ def test_neither_the_order_of_rows_nor_their_place_matters(tmp_path: Path) -> No
     for backend in ("reference", "cpu"):
         settings = RenderSettings(backend=backend)
         with torch.no_grad():
-            a, b = (render(m, scenes.camera(), {}, settings).rgb for m in (folded(model), wanted))
+            a, b = (render(m, scenes.camera(), {}, settings).rgb for m in (canonicalize(model), wanted))
         assert torch.allclose(a, b, atol=1e-5)
 
 
@@ -158,22 +158,22 @@ def test_fields_of_others_come_back(tmp_path: Path) -> None:
 def test_a_column_with_a_few_far_numbers_gets_twice_the_bits() -> None:
     model = gaussians(4000)
     model.params["log_amplitude"] = torch.randn(4000, 1, generator=torch.Generator().manual_seed(0))
-    assert schemes(model, LEVELS[3])["log_amplitude"].bits.tolist() == [7]
+    assert fit_quantizers(model, LEVELS[3])["log_amplitude"].bits.tolist() == [7]
     model.params["log_amplitude"][::1000] = 200.0
-    assert schemes(model, LEVELS[3])["log_amplitude"].bits.tolist() == [14]
+    assert fit_quantizers(model, LEVELS[3])["log_amplitude"].bits.tolist() == [14]
     exact = bit_table(3, ["log_amplitude=7"], model.specs)
-    assert schemes(model, exact)["log_amplitude"].bits.tolist() == [7]
+    assert fit_quantizers(model, exact)["log_amplitude"].bits.tolist() == [7]
 
 
 def test_positions_get_the_bits_that_the_primitives_sizes_ask_for() -> None:
     model = gaussians(400)
     model.params["log_scales"] = torch.full((400, 3), -3.0)
-    assert schemes(model, LEVELS[5])["means"].bits.tolist() == [11] * 3
+    assert fit_quantizers(model, LEVELS[5])["means"].bits.tolist() == [11] * 3
     model.params["means"][0] = 500.0
-    made = schemes(model, LEVELS[5])["means"]
+    made = fit_quantizers(model, LEVELS[5])["means"]
     steps = float((made.high - made.low)[0] / made.last[0])
     assert np.exp(-3.0) / 100 < steps <= np.exp(-3.0) / 50
-    assert schemes(model, bit_table(5, ["means=9"], model.specs))["means"].bits.tolist() == [9] * 3
+    assert fit_quantizers(model, bit_table(5, ["means=9"], model.specs))["means"].bits.tolist() == [9] * 3
 
 
 def test_bands_of_harmonics_have_bits_of_their_own() -> None:
@@ -231,7 +231,7 @@ def test_rounded_tensors_are_what_comes_back_with_their_own_gradients(tmp_path: 
     again, _ = checkpoint.load_model(tmp_path / "m", task)
     wanted, made = stored(model, LEVELS[4])
     leaves = {key: value.clone().requires_grad_() for key, value in wanted.params.items()}
-    found = rounded(leaves, made)
+    found = fake_quantize(leaves, made)
     for key, value in found.items():
         if key == "quats":
             assert torch.allclose(
@@ -260,10 +260,10 @@ def effects_of(model: Primitives) -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize("name", FIELDS)
 def test_every_column_brings_the_error_that_it_may(tmp_path: Path, name: str) -> None:
     task, model = example(name, 2000)
-    whole, error = folded(model), 1e-4
+    whole, error = canonicalize(model), 1e-4
     effects = effects_of(whole)
-    made = schemes_within(whole, effects, error)
-    back = rounded(whole.params, made)
+    made = fit_quantizers_to_error(whole, effects, error)
+    back = fake_quantize(whole.params, made)
     for spec in whole.specs:
         if spec.fixed or not spec.size:
             continue
@@ -280,7 +280,7 @@ def test_every_column_brings_the_error_that_it_may(tmp_path: Path, name: str) ->
     path = tmp_path / "m"
     checkpoint.save_compressed(path, whole, task.name, {}, made)
     again = checkpoint.load_model(path, task)[0]
-    rows = codec.file_order(whole, made)
+    rows = codec.storage_order(whole, made)
     for key in (k for k in back if k != "quats"):
         assert torch.equal(again.params[key], back[key][rows]), key
 
@@ -288,11 +288,11 @@ def test_every_column_brings_the_error_that_it_may(tmp_path: Path, name: str) ->
 @pytest.mark.parametrize("name", ["soft", "volume", "additive"])
 def test_more_error_is_fewer_bytes(tmp_path: Path, name: str) -> None:
     task, model = example(name, 1000)
-    whole = folded(model)
+    whole = canonicalize(model)
     sizes = []
     for error in (1e-7, 1e-5, 1e-3, 1e-1, 1e9):
         checkpoint.save_compressed(
-            tmp_path / "m", whole, task.name, {}, schemes_within(whole, effects_of(whole), error)
+            tmp_path / "m", whole, task.name, {}, fit_quantizers_to_error(whole, effects_of(whole), error)
         )
         sizes.append((tmp_path / "m").stat().st_size)
         assert checkpoint.load_model(tmp_path / "m", task)[0].count == 1000
@@ -300,22 +300,24 @@ def test_more_error_is_fewer_bytes(tmp_path: Path, name: str) -> None:
 
 
 def test_what_changes_nothing_takes_nothing_and_what_is_gone_stays_gone() -> None:
-    model = folded(without_pieces(example("soft", 400)[1]))
+    model = canonicalize(without_pieces(example("soft", 400)[1]))
     effects = {
         name: torch.zeros_like(value) if name == "log_gain" else value for name, value in effects_of(model).items()
     }
-    back = rounded(model.params, schemes_within(model, effects, 1e-3))
+    back = fake_quantize(model.params, fit_quantizers_to_error(model, effects, 1e-3))
     assert len(back["log_gain"].unique()) == 1
     for name in ("sh_rest", "w2"):
         gone = model.params[name] == 0
         assert bool(gone.any()) and bool((back[name][gone] == 0).all())
     for unknown in (torch.nan, torch.inf):
-        fine = schemes_within(model, {name: torch.full_like(value, unknown) for name, value in effects.items()}, 1e-3)
-        for name, value in rounded(model.params, fine).items():
+        fine = fit_quantizers_to_error(
+            model, {name: torch.full_like(value, unknown) for name, value in effects.items()}, 1e-3
+        )
+        for name, value in fake_quantize(model.params, fine).items():
             near = angles(value, model.params[name]) if name == "quats" else value - model.params[name]
             assert float(near.abs().max()) < 1e-3 if name == "quats" else 1e-5, name
     none = Primitives(model.density, model.colour, {name: value[:0] for name, value in model.params.items()})
-    assert rounded(none.params, schemes_within(none, effects, 1e-3))["means"].shape == (0, 3)
+    assert fake_quantize(none.params, fit_quantizers_to_error(none, effects, 1e-3))["means"].shape == (0, 3)
 
 
 # ---------------------------------------------------------------- what cannot be stored
@@ -354,8 +356,8 @@ def test_a_field_that_folds_into_something_else_is_named() -> None:
             return {name: value[:-1] for name, value in params.items()}
 
     model = example("static")[1]
-    with pytest.raises(FormError, match="density field Loses: folded returned tensors of other names or shapes"):
-        folded(Primitives(Loses(3), model.colour, model.params))
+    with pytest.raises(FormError, match="density field Loses: canonicalize returned tensors of other names or shapes"):
+        canonicalize(Primitives(Loses(3), model.colour, model.params))
 
 
 def test_no_primitives_at_all(tmp_path: Path) -> None:

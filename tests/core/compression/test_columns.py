@@ -12,9 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from neuprim.core.compression.columns import MOST_BITS, Columns, even_columns, fit_columns, keep_zero, spread_error
-from neuprim.core.compression.order import morton, unmorton
-from neuprim.core.compression.rotations import Rotations
+from neuprim.core.compression.quantizers import (
+    MAX_BITS,
+    Columns,
+    Rotations,
+    columns_of_step,
+    fit_columns,
+    relative_error,
+    snap_to_zero,
+)
+from neuprim.core.compression.sections import morton_decode, morton_encode
 
 finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
@@ -72,7 +79,7 @@ def test_the_clip_with_the_least_squares_is_taken() -> None:
         return float((c.values(c.codes(x)) - x).square().mean())
 
     assert float(made.high) < 10 and error(made) < 0.5 * error(whole)
-    assert spread_error(x, whole)[0] > spread_error(x, made)[0] > 1.0
+    assert relative_error(x, whole)[0] > relative_error(x, made)[0] > 1.0
 
 
 @given(st.lists(finite, min_size=1, max_size=30), st.floats(1e-30, 1e30), st.floats(0, 1))
@@ -81,16 +88,16 @@ def test_even_steps_reach_every_number_and_pass_through_one_place(
 ) -> None:
     x = torch.tensor(values)[:, None]
     through = (1 - place) * float(x.min()) + place * float(x.max())
-    made = even_columns(x, torch.tensor([step]), through)
+    made = columns_of_step(x, torch.tensor([step]), through)
     assert (
-        1 <= int(made.bits) <= MOST_BITS
+        1 <= int(made.bits) <= MAX_BITS
         and bool(made.low <= made.high)
         and bool(torch.isfinite(made.low) & torch.isfinite(made.high))
     )
     codes = made.codes(x)
     assert int(codes.max()) <= int(made.last) and int(codes.min()) >= 0
     size, width = float(x.double().abs().max()), float(x.double().max() - x.double().min())
-    taken = max(step, width / 2 ** (MOST_BITS - 1))  # of what 20 bits cannot say the step is longer
+    taken = max(step, width / 2 ** (MAX_BITS - 1))  # of what 20 bits cannot say the step is longer
     off = (made.values(codes).double() - x.double()).abs().max()
     assert float(off) <= 0.5 * taken * (1 + 1e-3) + 5e-7 * size + 1e-40
     near = (made.values(made.codes(torch.tensor([[through]], dtype=torch.float64))).double() - through).abs()
@@ -100,7 +107,7 @@ def test_even_steps_reach_every_number_and_pass_through_one_place(
 def test_steps_are_as_long_as_they_were_asked_for() -> None:
     x = torch.randn(2000, 3, generator=torch.Generator().manual_seed(0))
     steps = torch.tensor([0.37, 0.011, 1e-3])
-    made = even_columns(x, steps, x.double().mean(0))
+    made = columns_of_step(x, steps, x.double().mean(0))
     assert torch.allclose((made.high - made.low).double() / made.last, steps.double(), rtol=1e-5)
     rms = (made.values(made.codes(x)).double() - x.double()).square().mean(0).sqrt()
     assert torch.allclose(rms, steps.double() / 12**0.5, rtol=0.03)
@@ -108,13 +115,15 @@ def test_steps_are_as_long_as_they_were_asked_for() -> None:
 
 def test_numbers_within_one_step_are_a_single_value() -> None:
     x = torch.tensor([[1.0, -3.0], [1.2, -3.0], [0.9, -3.0]])
-    made = even_columns(x, torch.tensor([torch.inf, 5.0]), x.double().mean(0))
+    made = columns_of_step(x, torch.tensor([torch.inf, 5.0]), x.double().mean(0))
     assert torch.allclose(made.values(made.codes(x)), x.mean(0).expand(3, 2)) and torch.equal(made.low, made.high)
-    assert even_columns(torch.zeros(0, 2), torch.ones(2), 0.0).values(torch.zeros(0, 2, dtype=torch.int64)).shape == (
+    assert columns_of_step(torch.zeros(0, 2), torch.ones(2), 0.0).values(
+        torch.zeros(0, 2, dtype=torch.int64)
+    ).shape == (
         0,
         2,
     )
-    assert even_columns(torch.zeros(5, 0), torch.ones(0), 0.0).codes(torch.zeros(5, 0)).shape == (5, 0)
+    assert columns_of_step(torch.zeros(5, 0), torch.ones(0), 0.0).codes(torch.zeros(5, 0)).shape == (5, 0)
 
 
 def test_columns_of_one_value_and_no_rows() -> None:
@@ -136,7 +145,7 @@ def test_extreme_numbers(value: float) -> None:
 def test_gradients_go_straight_through() -> None:
     x = torch.randn(6, 2, requires_grad=True)
     made = fit_columns(x, [3, 3])
-    out = made.rounded(x)
+    out = made.fake_quantize(x)
     assert torch.equal(out.detach(), made.values(made.codes(x))) and not torch.equal(out.detach(), x.detach())
     (grad,) = torch.autograd.grad((out * torch.arange(12.0).reshape(6, 2)).sum(), x)
     assert torch.equal(grad, torch.arange(12.0).reshape(6, 2))
@@ -183,7 +192,7 @@ def test_no_turn_and_quarter_turns_stay_exact() -> None:
 
 def test_rounded_orientations_keep_norm_sign_and_gradient() -> None:
     q = (3 * torch.randn(50, 4, generator=torch.Generator().manual_seed(0))).requires_grad_()
-    out = Rotations(5).rounded(q)
+    out = Rotations(5).fake_quantize(q)
     assert torch.allclose(out.norm(dim=1), q.norm(dim=1)) and bool(((out * q).sum(1) > 0).all())
     assert 0 < float(angle(q.detach(), out.detach()).max()) < 0.3
     (grad,) = torch.autograd.grad(out.sum(), q)
@@ -196,8 +205,8 @@ def test_rounded_orientations_keep_norm_sign_and_gradient() -> None:
 @pytest.mark.parametrize("bits", [1, 7, 16, 20])
 def test_the_curve_and_back(bits: int) -> None:
     cells = np.random.default_rng(0).integers(0, 2**bits, (200, 3))
-    assert (unmorton(morton(cells, bits), bits) == cells).all()
-    assert morton(np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0]]), max(bits, 2)).tolist() == [1, 2, 4, 8]
+    assert (morton_decode(morton_encode(cells, bits), bits) == cells).all()
+    assert morton_encode(np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0]]), max(bits, 2)).tolist() == [1, 2, 4, 8]
 
 
 @given(st.integers(0, 2**31 - 1), st.integers(1, 16), st.floats(-6, 6), st.floats(0, 1))
@@ -209,11 +218,11 @@ def test_columns_with_a_zero_bring_it_back_and_are_coded_again_as_they_were(
     x[torch.rand(60, 4, generator=generator) < share] = 0.0
     x[0] = 0.0
     plain = fit_columns(x, [bits] * 4)
-    columns = keep_zero(plain)
+    columns = snap_to_zero(plain)
     back = columns.values(columns.codes(x))
     assert bool((back[x == 0] == 0).all())
     low, high = plain.low.double().clamp(max=0), plain.high.double().clamp(min=0)
     off = (back.double() - x.double().clamp(low, high)).abs()
     assert bool((off <= (2.6 / columns.last + 2.0 ** (bits - 22)) * (high - low)).all())
-    again = keep_zero(fit_columns(back, [bits] * 4))
+    again = snap_to_zero(fit_columns(back, [bits] * 4))
     assert torch.equal(again.values(again.codes(back)), back)

@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 
 from neuprim.core import checkpoint
 from neuprim.core.compression import CONFIG, LEVELS, Section, is_compressed, write_compressed
-from neuprim.core.compression.packing import packed_planes
+from neuprim.core.compression.sections import compress_planes
 from neuprim.core.errors import CheckpointError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import nonzero_rows
@@ -131,8 +131,8 @@ def read_by_the_book(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]
                 values[n] = q
         else:
             records = [struct.unpack_from("<Bff", head, 9 * i) for i in range(columns)]
-            whose = struct.unpack_from(f"<{columns}H", head, 9 * columns) if row["coding"] == 5 else [0] * columns
-            own = [masks[k - 1] if k else list(range(count)) for k in whose]
+            mask_of = struct.unpack_from(f"<{columns}H", head, 9 * columns) if row["coding"] == 5 else [0] * columns
+            own = [masks[k - 1] if k else list(range(count)) for k in mask_of]
             if row["coding"] == 2:
                 b = records[0][0]
                 keys = np.cumsum(codes(3 * b))
@@ -293,21 +293,21 @@ def test_every_flipped_bit_is_noticed(tmp_path: Path, whole: bytes) -> None:
         refused(path)
 
 
-def sparse(whose: int, codes: bytes) -> tuple[int, tuple[int, ...], bytes, bytes]:
+def sparse(mask_of: int, codes: bytes) -> tuple[int, tuple[int, ...], bytes, bytes]:
     """A section of one sparse column: 8 bits from 0 to 255."""
-    return 5, (1,), struct.pack("<BffH", 8, 0.0, 255.0, whose), codes
+    return 5, (1,), struct.pack("<BffH", 8, 0.0, 255.0, mask_of), codes
 
 
 def test_sparse_columns_by_hand(tmp_path: Path) -> None:
     """The second of two primitives has a number, then both, then neither."""
     rows = {"rows|": (4, (3,), b"", bytes([0b10, 0b11, 0b00]))}
-    for whose, codes, wanted in (
+    for mask_of, codes, wanted in (
         (1, b"\x07", [0.0, 7.0]),
         (2, b"\x05\x06", [5.0, 6.0]),
         (3, b"", [0.0, 0.0]),
         (0, b"\x01\x02", [1.0, 2.0]),
     ):
-        (tmp_path / "m").write_bytes(by_hand(first=rows, sections={"b2": sparse(whose, codes)}))
+        (tmp_path / "m").write_bytes(by_hand(first=rows, sections={"b2": sparse(mask_of, codes)}))
         assert checkpoint.load_model(tmp_path / "m", TASK)[0].params["b2"].flatten().tolist() == wanted
 
 
@@ -385,7 +385,7 @@ DAMAGE: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
     "rows of two dimensions": (lambda: by_hand(first={"rows|": (4, (1, 1), b"", b"a")}), ("section 'rows|' of rows has shape (1, 1)",)),
     "rows too long": (lambda: by_hand(first={"rows|": (4, (1,), b"", b"ab")}), ("section 'rows|' is damaged: its planes have 2 bytes; expected 1",)),
     "rows beyond": (lambda: by_hand(first={"rows|": (4, (1,), b"", b"\x07")}), ("bits beyond those of 2 primitives",)),
-    "no rows": (lambda: by_hand(sections={"b2": sparse(1, b"a")}), ("section 'b2' is damaged: a column of the primitives of mask 1; expected at most 0",)),
+    "no rows": (lambda: by_hand(sections={"b2": sparse(1, b"a")}), ("section 'b2' is damaged: a column refers to mask 1; expected at most 0",)),
     "rows that come later": (
         lambda: by_hand(sections={"b2": sparse(1, b"a"), "rows|": (4, (1,), b"", b"\x01")}),
         ("mask 1; expected at most 0",),
@@ -540,10 +540,10 @@ def test_blocks_are_cut_where_that_helps() -> None:
     """Wide and narrow columns in turns: less than one frame without cuts, and not more than a frame for each."""
     numbers = np.random.default_rng(0)
     planes = [np.clip(numbers.normal(128, width, 3000), 0, 255).astype(np.uint8).tobytes() for width in (3, 12) * 12]
-    found, whole = packed_planes(planes), b"".join(planes)
+    found, whole = compress_planes(planes), b"".join(planes)
     assert len(found) < 0.97 * len(zstd(whole, level=19)) and len(found) <= sum(
-        len(packed_planes([plane])) for plane in planes
+        len(compress_planes([plane])) for plane in planes
     )
     assert zstandard.ZstdDecompressor().decompress(found) == whole
     noise = numbers.bytes(1000)
-    assert packed_planes([noise]) == noise and packed_planes([]) == b""
+    assert compress_planes([noise]) == noise and compress_planes([]) == b""

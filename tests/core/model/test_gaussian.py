@@ -267,7 +267,7 @@ def test_checkpoint(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("preset", "strategy"), [("quick", "relocate"), ("paper", "gradient")])
 def test_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, strategy: str) -> None:
-    monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
+    monkeypatch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 2)
     scene, out = tiny.write_blender(tmp_path / "two"), tmp_path / "run"
     words = [
         "task=static", "scene=blender", f"scene.path={scene}", f"preset={preset}", "model.density.form=gaussian", "model.primitives=30",

@@ -74,7 +74,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_commands_know_it(fake: Fake, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
+    monkeypatch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 2)
     monkeypatch.setattr(
         "neuprim.runs.compile.subprocess.Popen", lambda *a, **k: pytest.fail("nothing of this run compiles ahead")
     )

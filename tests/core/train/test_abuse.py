@@ -142,7 +142,7 @@ def test_a_run_forced_out_of_the_finite_keeps_the_checkpoint_before(
     assert header["step"] == 6
     assert all(bool(torch.isfinite(v).all()) for v in saved.values() if v.is_floating_point())
     monkeypatch.undo()
-    monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
+    monkeypatch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 2)
     fit([*words(scene, out, 10), "resume=true"])
     header, _ = checkpoint.read(out / "checkpoint.safetensors", "checkpoint")
     assert header["step"] == 10

@@ -179,7 +179,7 @@ def test_what_begins_on_one_goes_on_on_the_other(strategy: str, monkeypatch: pyt
 
 def test_a_run_on_a_card_is_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Metrics, pictures and report; measured again on either device; resumed on the other."""
-    monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
+    monkeypatch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 2)
     config = configured("static", tmp_path)
     with pretended(monkeypatch):
         folder = run(compose(config))

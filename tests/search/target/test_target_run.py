@@ -31,7 +31,7 @@ BUDGET = 400.0
 @pytest.fixture(scope="module", autouse=True)
 def short_orbits() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 4)
+        patch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 4)
         yield
 
 

@@ -24,7 +24,7 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.metrics import psnr
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run
-from neuprim.runs.operating import OperatingPoint, read_point
+from neuprim.runs.render_config import RenderConfig, parse_render_config
 from neuprim.search.tradeoff import memory
 from neuprim.search.tradeoff.knobs import LADDERS, joined, knobs_of
 from neuprim.search.tradeoff.measure import Models, take_turns
@@ -115,8 +115,8 @@ def test_where_the_oracle_takes_too_long_its_error_is_known(bare: Path) -> None:
         subject,
         Models(subject),
         "alpha_min",
-        OperatingPoint(
-            read_point(
+        RenderConfig(
+            parse_render_config(
                 ["renderer.alpha_min=0", "renderer.transmittance_min=0"], subject.config.renderer, subject.model
             ).settings
         ),
@@ -132,9 +132,9 @@ def test_combinations_join_single_knobs(measured: tuple[Path, Record]) -> None:
     for point in record.points:
         if point.knob == "combined":
             assert len(point.words) > 1 and all(word in single or word == "store.all=float16" for word in point.words)
-    reference = OperatingPoint(config.renderer)
+    reference = RenderConfig(config.renderer)
     parts = [
-        read_point([word], config.renderer, model)
+        parse_render_config([word], config.renderer, model)
         for word in ("renderer.alpha_min=0.25", "resolution=0.5", "store.means=float16", "colour.degree=1")
     ]
     words = ("renderer.alpha_min=0.25", "resolution=0.5", "colour.degree=1", "store.means=float16")
@@ -177,16 +177,19 @@ def test_the_words_of_a_point_reproduce_its_images(measured: tuple[Path, Record]
 def test_in_a_round_every_point_is_timed_once_a_view(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     subject = load_subject(bare, (), 2)
     names = ("renderer.alpha_min=0.1", "renderer.alpha_min=0.2", "store.means=float16")
-    points = [subject.reference, *(read_point([name], subject.config.renderer, subject.model) for name in names)]
+    points = [
+        subject.reference,
+        *(parse_render_config([name], subject.config.renderer, subject.model) for name in names),
+    ]
     drawn: list[tuple[int, str]] = []
-    draw = OperatingPoint.draw
+    draw = RenderConfig.draw
 
-    def noted(self: OperatingPoint, model: Any, view: Any, background: Any) -> Any:
+    def noted(self: RenderConfig, model: Any, view: Any, background: Any) -> Any:
         if view.camera.width == 24:  # not those that only warm up
             drawn.append((points.index(self), view.name))
         return draw(self, model, view, background)
 
-    monkeypatch.setattr(OperatingPoint, "draw", noted)
+    monkeypatch.setattr(RenderConfig, "draw", noted)
     pairs = [(point, Measured("", subject.words(point), {}, 0)) for point in points]
     take_turns(
         subject.truths, Models(subject).ready, pairs, lambda m: 4, 1e18, lambda number, count: None, lambda: None
@@ -260,7 +263,7 @@ def test_what_is_measured_is_not_measured_again(bare: Path, tmp_path: Path, monk
     turns: list[int] = []
     look, times = engine.look, engine.take_turns
 
-    def counted(subject: Any, models: Any, knob: str, point: OperatingPoint, exact: Any) -> Any:
+    def counted(subject: Any, models: Any, knob: str, point: RenderConfig, exact: Any) -> Any:
         if len(looked) == stop:
             raise KeyboardInterrupt
         looked.append(subject.words(point))

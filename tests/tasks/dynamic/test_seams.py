@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core import checkpoint
 from neuprim.core.compression.bits import LEVELS
-from neuprim.core.compression.codec import folded, rounded, schemes
+from neuprim.core.compression.codec import canonicalize, fake_quantize, fit_quantizers
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
@@ -176,7 +176,7 @@ def test_files_keep_seams_and_labels(tmp_path: Path) -> None:
 def test_labels_survive_every_level_of_compression() -> None:
     count = 40
     whole = joined([three()[0]] * count, range(count), tuple((n / count, (n + 0.5) / count) for n in range(1, count)))
-    small = folded(whole)
+    small = canonicalize(whole)
     for table in LEVELS.values():
-        back = rounded(small.params, schemes(small, table))["chunk"]
+        back = fake_quantize(small.params, fit_quantizers(small, table))["chunk"]
         assert torch.equal(back.round(), small.params["chunk"])

@@ -82,7 +82,7 @@ def test_first_gradients_are_the_cpu_backends(task: str, tmp_path: Path) -> None
 def test_a_run_is_the_cpu_backends(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From data to report. Adam's first steps are as long where a gradient is nothing but rounding, so that runs drift
     apart a little."""
-    monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
+    monkeypatch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 2)
     monkeypatch.setattr(notices, "_said", set())
     numbers: list[dict[str, Any]] = []
     for name, more in (("cpu", ["renderer.backend=cpu"]), ("cuda", [*BLOCKS])):

@@ -39,7 +39,7 @@ class Decimate(Population):
 def third(monkeypatch: pytest.MonkeyPatch) -> type[Decimate]:
     monkeypatch.setitem(population.TABLE, "decimate", Decimate)
     monkeypatch.setattr(Decimate, "asked", 0)
-    monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
+    monkeypatch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 2)
     return Decimate
 
 

@@ -1,4 +1,4 @@
-"""The end of a run: metrics, pictures, films and the report, from the same tensors that lie on disk."""
+"""Evaluate a trained model: metrics, pictures, films and the report, from the tensors on disk."""
 
 from __future__ import annotations
 
@@ -22,15 +22,14 @@ from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import draw, measure, summary
 from neuprim.webpage.scene import held_out, scene_page, start_of
 
-__all__ = ["finish"]
+__all__ = ["evaluate_fitted"]
 
 _SHOWN_VIEWS = 8  # held-out views in renders/ and the report
 _ORBIT_FRAMES = 36
 
 
-def finish(fitted: Fitted, directory: Path) -> dict[str, Any]:
-    """Writes ``metrics.json``, ``renders/`` and the report of a run whose model is on disk in ``directory``; returns
-    the metrics."""
+def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
+    """Write ``metrics.json``, ``renders/`` and the report of a model saved in ``directory``; returns the metrics."""
     config, task, dataset, channels, model = fitted.config, fitted.task, fitted.dataset, fitted.channels, fitted.model
     fitted.unlock()
     count = len(dataset.test)
@@ -43,44 +42,44 @@ def finish(fitted: Fitted, directory: Path) -> dict[str, Any]:
     open_reel: list[Reel] = []
     regions = Regions(channels.display)
 
-    def film(clip: Clip, index: int, rendered: torch.Tensor, truth: torch.Tensor) -> None:
+    def add_frame(clip: Clip, index: int, rendered: torch.Tensor, truth: torch.Tensor) -> None:
         if not open_reel:
             open_reel.append(Reel(folder))
         open_reel[0].add(torch.cat([channels.display(x) for x in (truth, rendered)], dim=1))
         if index == clip.views[-1]:
             open_reel.pop().write(folder / f"clip_{clip.name}.webp", clip.fps)
 
-    def keep(index: int, view: View, rendered: torch.Tensor, truth: torch.Tensor) -> None:
+    def write_view(index: int, view: View, rendered: torch.Tensor, truth: torch.Tensor) -> None:
         regions.look(view.name, rendered, truth)
         clip = reels.get(index)
         if clip is not None:
-            film(clip, index, rendered, truth)
+            add_frame(clip, index, rendered, truth)
         if index in shown:
             stem = f"test_{index:03d}_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in view.name)
             images.write_png(folder / f"{stem}.png", channels.display(rendered))
             images.write_png(folder / f"{stem}_truth.png", channels.display(truth))
             images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
 
-    views = measure(model, task, dataset, config.renderer, channels, keep, fitted.lpips)
+    views = measure(model, task, dataset, config.renderer, channels, write_view, fitted.lpips)
     regions.write(folder)
     for clip in clips:
         if clip.source is None:
-            continue  # drawn above
+            continue  # its frames are test views, written above
         for i in clip.views:
             truth = clip.source.pixels(i).over(dataset.background)
-            film(clip, i, draw(model, clip.source.view(i), config.renderer, dataset.background), truth)
+            add_frame(clip, i, draw(model, clip.source.view(i), config.renderer, dataset.background), truth)
     size = (directory / "model.safetensors").stat().st_size
     metrics = summary(config, model, task, dataset, channels, views, size, fitted.training, fitted.lpips)
     write_json(directory / "metrics.json", metrics)
     views_around = orbit_of(task, dataset, _ORBIT_FRAMES)
     frames = [channels.display(draw(model, v, config.renderer, dataset.background)) for v in views_around]
     images.write_animation(folder / "orbit.webp", frames, fps=12.0)
-    write_report(directory, task.conditions, _viewer(fitted, directory))
+    write_report(directory, task.conditions, _embedded_viewer(fitted, directory))
     return metrics
 
 
-def _viewer(fitted: Fitted, directory: Path) -> Viewer | None:
-    """The page that draws the model; None of a model that no page can show."""
+def _embedded_viewer(fitted: Fitted, directory: Path) -> Viewer | None:
+    """Return the viewer page of the model; None of a model that a page cannot show."""
     config, task, dataset, channels = fitted.config, fitted.task, fitted.dataset, fitted.channels
     if (
         channels.own is not None
@@ -90,7 +89,7 @@ def _viewer(fitted: Fitted, directory: Path) -> Viewer | None:
     ):
         return None
 
-    def look(model: Primitives, camera: Camera, conditions: Conditions) -> torch.Tensor:
+    def render_image(model: Primitives, camera: Camera, conditions: Conditions) -> torch.Tensor:
         return draw(model, View("", camera, conditions), config.renderer, dataset.background)
 
     views = held_out(dataset, channels, _SHOWN_VIEWS)
@@ -100,7 +99,7 @@ def _viewer(fitted: Fitted, directory: Path) -> Viewer | None:
             fitted.model,
             channels,
             config.renderer,
-            look,
+            render_image,
             specs=task.conditions,
             start=start_of(task.conditions, views, {}),
             views=views,
@@ -109,6 +108,6 @@ def _viewer(fitted: Fitted, directory: Path) -> Viewer | None:
             task=task.name,
             data_source=dataset.data_source,
         )
-    except (CheckpointError, FormError):  # numbers that no code of few bits can stand for; the report does without
+    except (CheckpointError, FormError):  # numbers that cannot be quantized
         return None
     return Viewer(page.text, page.nonce)

@@ -1,0 +1,226 @@
+"""Quantizers: numbers to integer codes of a few bits and back.
+
+A column of a parameter has even steps between two float32 ends. With m = 2^bits - 1, in double precision,
+
+    value = float32((low (m - code) + high code) / m)
+
+Both products are exact, so every IEEE 754 implementation decodes the same bits, with or without fused multiply-add.
+Encoding a decoded value returns its code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = [
+    "CLIPS",
+    "MAX_BITS",
+    "MIN_BITS",
+    "Columns",
+    "Rotations",
+    "columns_of_step",
+    "fit_columns",
+    "relative_error",
+    "snap_to_zero",
+]
+
+MIN_BITS = 3
+"""Smallest bits of a component of an orientation."""
+
+MAX_BITS = 20
+"""Largest bits of a column: products of a float32 and a code stay exact in double precision."""
+
+_MANTISSA = 24
+"""Bits of a float32."""
+
+_LARGEST = float(torch.finfo(torch.float32).max)
+
+CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
+"""Candidate shares of a column beyond either end; the one of least mean squared error is taken."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Uniform quantizer of C columns: ``bits`` (C,) int64, first and last value ``low`` and ``high`` (C,) float32."""
+
+    bits: Tensor
+    low: Tensor
+    high: Tensor
+
+    @property
+    def last(self) -> Tensor:
+        """Largest codes, (C,) int64."""
+        return (1 << self.bits) - 1
+
+    def codes(self, x: Tensor) -> Tensor:
+        """Return the (N, C) int64 codes of the values nearest to x (N, C)."""
+        low, width = self.low.double(), self.high.double() - self.low.double()
+        scale = torch.where(width > 0, self.last / width, 0.0)
+        return torch.minimum(((x.detach().double() - low) * scale).round().clamp_min(0), self.last.double()).long()
+
+    def values(self, codes: Tensor) -> Tensor:
+        """Return the (N, C) float32 values of codes (N, C)."""
+        m, c = self.last.double(), codes.double()
+        return ((self.low.double() * (m - c) + self.high.double() * c) / m).float()
+
+    def fake_quantize(self, x: Tensor) -> Tensor:
+        """Quantize and dequantize x, with straight-through gradients."""
+        return self.values(self.codes(x)).to(x) + (x - x.detach())
+
+    def to(self, device: torch.device) -> Columns:
+        """Move the quantizer to a device."""
+        return Columns(self.bits.to(device), self.low.to(device), self.high.to(device))
+
+
+def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) -> Columns:
+    """Fit the ends of every column of x (N, C), finite, on the CPU.
+
+    Args:
+        bits: one per column, 1 to :data:`MAX_BITS`.
+        clips: candidate shares of the column beyond either end; the first wins a tie.
+    """
+    wanted = torch.tensor(list(bits), dtype=torch.int64)
+    best = Columns(wanted, torch.zeros(len(wanted)), torch.zeros(len(wanted)))
+    if not x.numel():
+        return best
+    least = torch.full((len(wanted),), torch.inf, dtype=torch.float64)
+    ordered = np.sort(x.detach().double().numpy(), axis=0)
+    for clip in clips:
+        low, high = (torch.from_numpy(_quantile(ordered, q).astype(np.float32)) for q in (clip, 1 - clip))
+        tried = Columns(wanted, low, high)
+        error = (tried.values(tried.codes(x)).double() - x.detach().double()).square().mean(0)
+        better = error < least
+        least = torch.where(better, error, least)
+        best = Columns(wanted, torch.where(better, low, best.low), torch.where(better, high, best.high))
+    return best
+
+
+def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> Columns:
+    """Return columns of step ``steps`` (C,) that reach all of x (N, C), finite, on the CPU.
+
+    Steps grow where they would need more than :data:`MAX_BITS`. A column within one step is a single value.
+
+    Args:
+        through: (C,) or a number that is one of the values, within the column's range.
+    """
+    if not x.numel():
+        return fit_columns(x, [1] * x.shape[1])
+    y = x.detach().double()
+    through = torch.as_tensor(through, dtype=torch.float64).expand(y.shape[1])
+    low, high = torch.minimum(y.amin(0), through), torch.maximum(y.amax(0), through)
+    steps = torch.maximum(steps.double(), (high - low) / (2**MAX_BITS - 3)).clamp(max=2.0 * _LARGEST)
+    wide = torch.where(steps > 0, steps, 1.0)
+    below, above = (((side / wide) - 0.5).ceil().clamp(min=0.0) for side in (through - low, high - through))
+    bits = torch.log2(below + above + 1).ceil().clamp(min=1.0).long()
+    first = through - below * steps
+    last = torch.where(below + above > 0, first + ((1 << bits) - 1) * steps, first)
+    return Columns(bits, first.clamp(min=-_LARGEST).float(), last.clamp(max=_LARGEST).float())
+
+
+def snap_to_zero(columns: Columns) -> Columns:
+    """Move the ends inwards, by two steps at most, so that 0 is one of the values and decodes to exactly 0.
+
+    Ends are whole multiples of a step with so few mantissa bits that both are float32 numbers.
+    """
+    low, high, last = columns.low.double().clamp(max=0.0), columns.high.double().clamp(min=0.0), columns.last.double()
+    width = high - low
+    place = -low / torch.where(width > 0, width, 1.0) * last  # of zero, between two codes
+    tried = torch.stack([place.floor(), place.ceil()])
+    below = torch.where(tried > 0, -low / tried.clamp(min=1.0), torch.inf)
+    above = torch.where(tried < last, high / (last - tried).clamp(min=1.0), torch.inf)
+    steps, better = torch.minimum(below, above).max(0)
+    code = tried.gather(0, better[None])[0]
+    mantissa, exponent = torch.frexp(steps)
+    parts = torch.exp2((_MANTISSA - columns.bits).clamp(min=2).double())
+    step = torch.ldexp((mantissa * parts).floor() / parts, exponent)
+    return Columns(columns.bits, (-code * step).float(), ((last - code) * step).float())
+
+
+def _quantile(ordered: np.ndarray, q: float) -> np.ndarray:
+    """Return a quantile of sorted columns (N, C), by linear interpolation."""
+    place = q * (len(ordered) - 1)
+    below = int(place)
+    above, share = min(below + 1, len(ordered) - 1), place - below
+    return np.asarray(ordered[below] * (1 - share) + ordered[above] * share)
+
+
+def relative_error(x: Tensor, columns: Columns) -> Tensor:
+    """Return the (C,) root mean squared errors over those of steps between -1 and 1 standard deviations.
+
+    A normal distribution has about 4; a column with outliers has tens and more.
+    """
+    y = x.detach().double()
+    error = (columns.values(columns.codes(x)).double() - y).square().mean(0).sqrt()
+    usual = (y - y.mean(0)).square().mean(0).sqrt() * 2 / columns.last / 12**0.5
+    return torch.where(usual > 0, error / usual, 0.0)
+
+
+@dataclass(frozen=True)
+class Rotations:
+    """Quantizer of unit quaternions: the three smallest components, ``bits`` each (:data:`MIN_BITS` to 16).
+
+    With h = 2^(bits-1) - 1, the three are u / (h sqrt 2) for whole u from -h to h, in their order. The largest is
+    sqrt(2 h^2 - u1^2 - u2^2 - u3^2) / (h sqrt 2), positive. Sums are of whole numbers, root and quotient are rounded
+    once: the same bits everywhere. The identity decodes exactly.
+    """
+
+    bits: int
+
+    @property
+    def half(self) -> int:
+        """Return h: codes are u + h, 0 to 2 h."""
+        return (1 << (self.bits - 1)) - 1
+
+    def codes(self, quats: Tensor) -> Tensor:
+        """Return (N, 4) int64 of wxyz (N, 4) of any norm but 0: number of the largest component, codes of the others.
+
+        Where rounding makes another component as large as the largest, it is reduced, so that codes are stable.
+        """
+        q = quats.detach().double()
+        q = q / q.abs().amax(1, keepdim=True)  # the square of a tiny norm would underflow
+        q = q / q.norm(dim=1, keepdim=True)
+        largest = q.abs().argmax(1)
+        q = torch.where(q.gather(1, largest[:, None]) < 0, -q, q)
+        u = (q.gather(1, self._others(largest)) * (self.half * 2**0.5)).round().long().clamp(-self.half, self.half)
+        while True:
+            most, which = u.abs().max(1)
+            over = (self._left(u) < (most + 1).square()) & (most > 0)
+            if not bool(over.any()):
+                return torch.cat([largest[:, None], u + self.half], 1)
+            u = u.scatter_add(
+                1, which[:, None], torch.where(over, -u.gather(1, which[:, None])[:, 0].sign(), 0)[:, None]
+            )
+
+    def values(self, codes: Tensor) -> Tensor:
+        """Return the (N, 4) float32 unit quaternions wxyz of codes (N, 4)."""
+        u = codes[:, 1:] - self.half
+        norm = torch.tensor(2 * self.half * self.half, dtype=torch.float64, device=codes.device).sqrt()
+        made = torch.empty(len(codes), 4, dtype=torch.float64, device=codes.device)
+        made.scatter_(1, codes[:, :1], self._left(u).clamp_min(0).double().sqrt()[:, None] / norm)
+        made.scatter_(1, self._others(codes[:, 0]), u.double() / norm)
+        return made.float()
+
+    def fake_quantize(self, quats: Tensor) -> Tensor:
+        """Quantize and dequantize, keeping norm and sign, with straight-through gradients."""
+        q = quats.detach()
+        back = self.values(self.codes(q)).to(q)
+        back = back * q.norm(dim=1, keepdim=True) * torch.where((back * q).sum(1, keepdim=True) < 0, -1.0, 1.0).to(q)
+        return back + (quats - q)
+
+    def to(self, device: torch.device) -> Rotations:
+        """Return itself; it has no tensors."""
+        return self
+
+    def _left(self, u: Tensor) -> Tensor:
+        return 2 * self.half * self.half - u.square().sum(1)
+
+    @staticmethod
+    def _others(largest: Tensor) -> Tensor:
+        """Return the (N, 3) numbers of the other components, ascending."""
+        first = torch.arange(3, device=largest.device).expand(len(largest), 3)
+        return first + (first >= largest[:, None])

@@ -60,7 +60,7 @@ def test_the_wheel_holds_the_whole_package(tmp_path: Path) -> None:
             "pyproject.toml",
             ', "**/*.html"',
             "",
-            "none-any.whl lacks neuprim/report/template.html",
+            "none-any.whl lacks neuprim/report/page.html",
             marks=pytest.mark.slow,
         ),
         ("pyproject.toml", 'include = ["neuprim*"]', 'include = ["neuprim*", "tests"]', "which is not the package's"),

@@ -4,7 +4,7 @@
 :func:`error_map` colours the error of a rendered view on the fixed scale that the page's colour bar shows.
 """
 
-from neuprim.report.page import Viewer, write_report
 from neuprim.report.pictures import ERROR_SCALE, error_map
+from neuprim.report.run_report import Viewer, write_report
 
 __all__ = ["ERROR_SCALE", "Viewer", "error_map", "write_report"]

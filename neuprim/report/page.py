@@ -1,85 +1,206 @@
-"""The page: sections put into the template, written so that a reader never sees half of it."""
+"""The one template of all report pages, the elements they are made of, and values as text.
+
+Every page stands alone: pictures and charts are part of the file, and its content policy forbids loading anything.
+Every function that takes a text from a file or a user escapes it, unless it says that it takes HTML.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import html
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 
-from neuprim.core.io.files import write_text
-from neuprim.core.model.fields import ConditionSpec
-from neuprim.report import sections
-from neuprim.report.record import RunRecord, read_run
-from neuprim.report.text import escape
+from neuprim.report.charts import Chart, draw_svg
+from neuprim.report.pictures import Inlined, inline
+from neuprim.report.run_record import as_number
 
-__all__ = ["LIMIT", "Viewer", "render_page", "style", "write_report"]
+__all__ = [
+    "MISSING",
+    "badge",
+    "banner",
+    "chart_panels",
+    "escape",
+    "fact_list",
+    "figure",
+    "format_bytes",
+    "format_count",
+    "format_decimal",
+    "format_duration",
+    "format_setting",
+    "masthead",
+    "number_table",
+    "picture",
+    "render_page",
+    "section",
+    "tiles",
+]
 
-LIMIT = 4_000_000
-"""Bytes of a report with a viewer in it; of a larger one the viewer is a page beside it."""
+MISSING = "–"
 
-_BESIDE = "viewer.html"
-
-
-@dataclass(frozen=True)
-class Viewer:
-    """A page that draws the model, and the nonce of its scripts, which this page's own policy must let through."""
-
-    text: str
-    nonce: str
+PIXELATED_BELOW = 256
+"""Pictures narrower than this many pixels are enlarged with hard pixel edges."""
 
 
-def write_report(run_dir: Path, conditions: Sequence[ConditionSpec] = (), viewer: Viewer | None = None) -> Path:
-    """Write ``report.html`` into a run directory, finished or not, and return its path.
+def render_page(title: str, sections: Iterable[str], kind: str = "", policy: str = "", script: str = "") -> str:
+    """Return a whole page.
 
-    ``conditions`` are those of the run's task; the commands that the page offers animate them. ``viewer`` becomes a
-    part of the page, or where both would have more than :data:`LIMIT` bytes, ``viewer.html`` beside it.
-
-    The page needs nothing else: pictures and charts are part of the file, and its content policy forbids loading
-    anything. An earlier report is replaced only once the new one is complete.
-
-    Raises:
-        DataError: the directory is no run, or its ``config.yaml`` or ``metrics.json`` is damaged.
+    Args:
+        title: of the browser's tab.
+        sections: HTML, in their order; empty ones leave no gap.
+        kind: class of the page's body; ``compared`` for pages that compare runs.
+        policy: appended to the content policy.
+        script: HTML of a script, which ``policy`` must allow.
     """
-    run_dir = Path(run_dir)
-    run, beside, target = read_run(run_dir), run_dir / _BESIDE, run_dir / "report.html"
-    page = render_page(run, conditions, viewer)
-    if viewer is not None and len(page.encode()) > LIMIT:
-        write_text(beside, viewer.text)
-        page = render_page(run, conditions, linked=_BESIDE)
-    else:
-        beside.unlink(missing_ok=True)  # of an earlier report
-    write_text(target, page)
-    return target
+    template = Template(files("neuprim.report").joinpath("page.html").read_text(encoding="utf-8"))
+    body = "\n".join(section for section in sections if section)
+    return template.substitute(title=escape(title), body=body, kind=kind, policy=policy, script=script)
 
 
-def render_page(
-    run: RunRecord, conditions: Sequence[ConditionSpec] = (), viewer: Viewer | None = None, linked: str = ""
-) -> str:
-    """The report as HTML text, with a viewer in it or a link to one."""
-    template = Template(files("neuprim.report").joinpath("template.html").read_text(encoding="utf-8"))
-    names = [name for name in (run.name_of("task"), run.name_of("scene")) if name]
-    return template.substitute(
-        title=escape(" / ".join(names) or run.run_dir.name),
-        scripts="" if viewer is None else f"; script-src 'nonce-{viewer.nonce}'; worker-src blob:",
-        heading=sections.heading(run),
-        banner=sections.banner(run),
-        headline=sections.headline(run),
-        viewer=sections.viewer("" if viewer is None else viewer.text, linked),
-        films=sections.films(run),
-        held_out=sections.held_out(run),
-        regions=sections.regions(run),
-        charts=sections.charts(run),
-        view_table=sections.view_table(run),
-        settings=sections.settings(run),
-        facts=sections.facts(run),
-        commands=sections.commands(run, conditions),
-        config=sections.config(run),
+# ---------------------------------------------------------------- elements
+
+
+def section(title: str, body: str) -> str:
+    """Return HTML under a heading; "" where there is none."""
+    return f"<section><h2>{title}</h2>{body}</section>\n" if body else ""
+
+
+def masthead(eyebrow: str, title: str, more: str = "") -> str:
+    """Return the head of a page: a small line, its heading, and more HTML."""
+    return (
+        f'<header class="masthead"><div><p class="eyebrow">{escape(eyebrow)}</p>\n<h1>{escape(title)}</h1>'
+        f"{more}</div></header>"
     )
 
 
-def style() -> str:
-    """The style sheet of a run's report, for other pages."""
-    text = files("neuprim.report").joinpath("template.html").read_text(encoding="utf-8")
-    return text.partition("<style>")[2].partition("</style>")[0]
+def badge(name: str, text: str = "") -> str:
+    """Return a marked note."""
+    return f'\n<p class="badge"><strong>{escape(name)}</strong> <span>{"" if not text else escape(text)}</span></p>'
+
+
+def banner(notes: Iterable[str]) -> str:
+    """Return notes, HTML, on what is not as it should be."""
+    return "".join(f'<p class="banner" role="status">{note}</p>' for note in notes)
+
+
+def tiles(items: Sequence[tuple[str, str, str, str]], lead: range = range(1)) -> str:
+    """Return numbers in large type.
+
+    Args:
+        items: label, value, unit and note of each, as HTML.
+        lead: those that stand out.
+    """
+    cells = []
+    for i, (label, value, unit, note) in enumerate(items):
+        small = f"<small>{unit}</small>" if unit else ""
+        kind = "tile lead" if i in lead else "tile"
+        cells.append(
+            f'<div class="{kind}"><dt>{label}</dt><dd>{value}{small}</dd><dd class="note" title="{note}">{note}</dd></div>'
+        )
+    return f'<dl class="tiles">{"".join(cells)}</dl>'
+
+
+def figure(path: Path | None, caption: str, alternative: str, attributes: str = "") -> str:
+    """Return a picture file with its caption; a box with a note where the file is missing or damaged.
+
+    Args:
+        caption, alternative, attributes: HTML.
+    """
+    return picture(None if path is None else inline(path), caption, alternative, path is not None, attributes)
+
+
+def picture(shown: Inlined | None, caption: str, alternative: str, exists: bool = True, attributes: str = "") -> str:
+    """Return a picture as :func:`figure` does; ``exists`` says whether one of None is damaged or missing."""
+    under = f"<figcaption>{caption}</figcaption>" if caption else ""
+    if shown is None:
+        note = "file damaged" if exists else "no picture"
+        return f'<figure{attributes}><div class="absent">{note}</div>{under}</figure>'
+    kind = ' class="pixelated"' if shown.width < PIXELATED_BELOW else ""
+    size = f'width="{shown.width}" height="{shown.height}"'
+    return f'<figure{attributes}><img src="{shown.url}" {size} alt="{alternative}"{kind}>{under}</figure>'
+
+
+def chart_panels(charts: Iterable[tuple[str, Chart]], kind: str = "panels") -> str:
+    """Return charts with their captions, HTML; those without points are left out."""
+    panels = [
+        f'<figure class="panel"><figcaption>{caption}</figcaption>{drawn}</figure>'
+        for caption, chart in charts
+        if (drawn := draw_svg(chart)) is not None
+    ]
+    return f'<div class="{kind}">{"".join(panels)}</div>' if panels else ""
+
+
+def number_table(head: Iterable[str], rows: Iterable[str], kind: str = "numbers") -> str:
+    """Return a table of HTML rows under titles, as HTML."""
+    titles = "".join(title if title.startswith("<th") else f"<th>{title}</th>" for title in head)
+    return (
+        f'<div class="scroll"><table class="{kind}"><thead><tr>{titles}</tr></thead>'
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def fact_list(pairs: Iterable[tuple[str, object]]) -> str:
+    """Return names and values, both as text."""
+    cells = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs)
+    return f'<dl class="facts">{cells}</dl>'
+
+
+# ---------------------------------------------------------------- values as text
+
+
+def escape(value: object) -> str:
+    """Return ``value`` as HTML text that is also safe inside a quoted attribute."""
+    return MISSING if value is None or value == "" else html.escape(format_setting(value), quote=True)
+
+
+def format_setting(value: object) -> str:
+    """Write a setting as users type it: ``true``, ``null``, ``0.001``, ``[1, 2]``; strings bare. Not escaped."""
+    if isinstance(value, str):
+        return value
+    if value is None or isinstance(value, bool | int | float | Sequence | Mapping):
+        return json.dumps(value, ensure_ascii=False, default=str)
+    return str(value)
+
+
+def format_decimal(value: float | None, digits: int) -> str:
+    """Write a fixed number of decimals; the infinity sign for infinite values."""
+    if value is None:
+        return MISSING
+    return f"{value:,.{digits}f}" if math.isfinite(value) else ("∞" if value > 0 else "−∞")
+
+
+def format_count(value: object) -> str:
+    """Write a whole number with thousands separated; other numbers with up to two decimals."""
+    found = as_number(value)
+    if found is None or not math.isfinite(found):
+        return MISSING
+    return f"{round(found):,}" if found == round(found) else f"{found:,.2f}"
+
+
+def format_bytes(value: object) -> tuple[str, str]:
+    """Return (number, unit) of a size in bytes, in powers of 1000."""
+    found = as_number(value)
+    if found is None or not math.isfinite(found):
+        return MISSING, ""
+    for unit in ("B", "kB", "MB"):
+        if abs(found) < 1000:
+            return (f"{found:.0f}" if unit == "B" else f"{found:.3g}" if found < 100 else f"{found:.0f}"), unit
+        found /= 1000
+    return f"{found:,.2f}", "GB"
+
+
+def format_duration(seconds: object) -> str:
+    """Write ``8.3 s``, ``4 min 07 s`` or ``2 h 05 min``."""
+    found = as_number(seconds)
+    if found is None or not math.isfinite(found) or found < 0:
+        return MISSING
+    if found < 59.95:
+        return f"{found:.1f} s"
+    whole = round(found)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    minutes = round(found / 60)
+    return f"{minutes // 60} h {minutes % 60:02d} min"

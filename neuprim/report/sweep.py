@@ -9,16 +9,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from string import Template
 
 from neuprim.core.io.files import write_text
 from neuprim.core.metrics import from_json
-from neuprim.report.curves import series, together
-from neuprim.report.page import style
-from neuprim.report.pictures import inline
-from neuprim.report.record import RunRecord, ViewFiles
-from neuprim.report.text import byte_size, count, decimal, duration, escape
-from neuprim.report.tradeoff import PIXELATED_BELOW, section
+from neuprim.report import page
+from neuprim.report.charts import LARGE, Points, curve_chart
+from neuprim.report.page import escape, format_bytes, format_count, format_decimal, format_duration, section
+from neuprim.report.run_record import RunRecord, ViewFiles
 
 __all__ = ["Compared", "numbers_of", "write_sweep"]
 
@@ -105,17 +102,27 @@ def write_sweep(folder: Path, runs: Sequence[Compared], words: Sequence[str]) ->
     Args:
         words: what the sweep was asked for, after ``neuprim run -m``.
     """
-    page, assets = _Page(folder, runs, words), files("neuprim.report")
-    script = assets.joinpath("sweep.js").read_text(encoding="utf-8")
-    names = ("heading", "banner", "headline", "table", "charts", "pictures", "facts")
-    parts = {name: getattr(page, name)() for name in names}
-    nonce = hashlib.sha256("".join([script, *parts.values()]).encode()).hexdigest()[:32]  # no text inside can know it
-    template = Template(assets.joinpath("sweep.html").read_text(encoding="utf-8"))
+    drawn = _Page(folder, runs, words)
+    script = files("neuprim.report").joinpath("sweep.js").read_text(encoding="utf-8")
+    sections = [
+        drawn.heading(),
+        drawn.banner(),
+        drawn.headline(),
+        drawn.table(),
+        drawn.charts(),
+        drawn.pictures(),
+        drawn.facts(),
+    ]
+    nonce = hashlib.sha256("".join([script, *sections]).encode()).hexdigest()[:32]  # no text inside can know it
     target = folder / "sweep.html"
-    write_text(
-        target,
-        template.substitute(title=escape(folder.resolve().name), style=style(), script=script, nonce=nonce, **parts),
+    text = page.render_page(
+        f"{folder.resolve().name} – sweep",
+        sections,
+        "compared",
+        f"; script-src 'nonce-{nonce}'",
+        f'<script nonce="{nonce}">\n{script}\n</script>',
     )
+    write_text(target, text)
     return target
 
 
@@ -145,8 +152,8 @@ class _Page:
 
     def heading(self) -> str:
         command = shlex.join(["neuprim", "run", "-m", *self.words])
-        title = escape(self.folder.resolve().name)
-        return f'<p class="eyebrow">sweep</p>\n<h1>{title}</h1>\n<p class="note"><code>{escape(command)}</code></p>'
+        line = f'\n<p class="note"><code>{escape(command)}</code></p>'
+        return page.masthead("sweep", self.folder.resolve().name, line)
 
     def banner(self) -> str:
         lines = []
@@ -155,11 +162,11 @@ class _Page:
                 lines.append(f"<strong>{escape(run.name)} failed:</strong> {escape(run.line)}")
             elif run.state != "done":
                 lines.append(f"<strong>{escape(run.name)}</strong> has not finished.")
-        return "".join(f'<p class="banner" role="status">{line}</p>' for line in lines)
+        return page.banner(lines)
 
     def headline(self) -> str:
         done = sum(run.state == "done" for run in self.runs)
-        tiles = [("Runs", count(len(self.runs)), "", f"{count(done)} done")]
+        tiles = [("Runs", format_count(len(self.runs)), "", f"{format_count(done)} done")]
         for name, title in (
             ("psnr", "Best PSNR"),
             ("ssim", "Best SSIM"),
@@ -170,23 +177,19 @@ class _Page:
             if best is not None:
                 number, unit = _shown(name, self.numbers[best.name][name])
                 tiles.append((title, number, unit, escape(best.name)))
-        cells = "".join(
-            f'<div class="tile{" lead" if i else ""}"><dt>{title}</dt><dd>{value}{f"<small>{unit}</small>" if unit else ""}</dd>'
-            f'<dd class="note" title="{note}">{note}</dd></div>'
-            for i, (title, value, unit, note) in enumerate(tiles)
-        )
-        return f'<dl class="tiles">{cells}</dl><p class="rule">Metrics of the last checkpoints, on the held-out views of each run.</p>'
+        rule = "Metrics of the last checkpoints, on the held-out views of each run."
+        return page.tiles(tiles, lead=range(1, len(tiles))) + f'<p class="rule">{rule}</p>'
 
     def table(self) -> str:
         keys = list(dict.fromkeys(key for run in self.runs for key in run.swept))
         best = {name: self._best(name) for name in self.metrics}
-        heads = "".join(f"<th>{escape(title)}</th>" for title in ("run", *keys, "state"))
-        heads += "".join(
+        heads = [escape(title) for title in ("run", *keys, "state")]
+        heads += [
             f'<th data-metric="{escape(m)}" data-better="{better(m) or ""}">{escape(_title(m))}</th>'
             for m in self.metrics
-        )
-        body = "".join(self._row(run, keys, best) for run in self.runs)
-        table = f'<div class="scroll"><table class="numbers runs"><thead><tr>{heads}<th>seconds in all</th></tr></thead><tbody>{body}</tbody></table></div>'
+        ]
+        rows = [self._row(run, keys, best) for run in self.runs]
+        table = page.number_table([*heads, "seconds in all"], rows, "numbers runs")
         options = "".join(
             f'<option value="{escape(name)}">{escape(_title(name))}</option>'
             for name in self.metrics
@@ -219,22 +222,24 @@ class _Page:
             cells.append(
                 f'<td{kind} data-value="{"" if value is None else _sortable(value)}">{" ".join(filter(None, _shown(metric, value)))}</td>'
             )
-        cells.append(f'<td data-value="{run.seconds:.3f}">{decimal(run.seconds, 1)}</td>')
+        cells.append(f'<td data-value="{run.seconds:.3f}">{format_decimal(run.seconds, 1)}</td>')
         return f'<tr data-run="{escape(run.name)}">{"".join(cells)}</tr>'
 
     def charts(self) -> str:
         known = [(run, run.run) for run in self.runs if run.run is not None]
-        panels = ""
-        for x, title in (("seconds", "Held-out PSNR over training time, dB"), ("step", "Held-out PSNR over steps, dB")):
-            drawn = together(
-                [(series(record, x, "eval_psnr"), self.colours[run.name]) for run, record in known], x, title
-            )
-            panels += f'<figure class="panel"><figcaption>{title}</figcaption>{drawn}</figure>' if drawn else ""
+        charts = []
+        for x, unit, title in (
+            ("seconds", "seconds", "Held-out PSNR over training time, dB"),
+            ("step", "steps", "Held-out PSNR over steps, dB"),
+        ):
+            lines = [Points(*record.series(x, "eval_psnr"), self.colours[run.name]) for run, record in known]
+            charts.append((title, curve_chart(title, unit, lines, size=LARGE)))
+        panels = page.chart_panels(charts, "charts")
         keys = "".join(
             f'<li><span class="chip" style="background: {self.colours[run.name]}"></span>{escape(run.name)}</li>'
             for run, _ in known
         )
-        return section("Curves", f'<div class="charts">{panels}</div><ul class="keys">{keys}</ul>') if panels else ""
+        return section("Curves", f'{panels}<ul class="keys">{keys}</ul>') if panels else ""
 
     def pictures(self) -> str:
         """The same views of the best runs; runs of different data have views of their own."""
@@ -260,7 +265,7 @@ class _Page:
                 if same is not None:
                     psnr = from_json(record.view_numbers(same), "psnr")
                     figures += _figure(
-                        same.render, f"{escape(run.name)} <b>{decimal(psnr, 2)}</b> dB", view.stem, run.name
+                        same.render, f"{escape(run.name)} <b>{format_decimal(psnr, 2)}</b> dB", view.stem, run.name
                     )
             html += f'<h3>{escape(view.stem or view.index)}</h3><div class="pictures">{figures}</div>'
         return html
@@ -269,9 +274,8 @@ class _Page:
         tried = [run for run in self.runs if run.attempts > 1]
         pairs = [("directory", str(self.folder)), ("all numbers", "sweep.csv"), ("what was asked", "sweep.json")]
         pairs += [(f"{run.name}", f"started {run.attempts} times, as its worker died") for run in tried]
-        pairs += [("time of all runs together", duration(sum(run.seconds for run in self.runs)))]
-        cells = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs)
-        return section("Where the numbers come from", f'<dl class="facts">{cells}</dl>')
+        pairs += [("time of all runs together", format_duration(sum(run.seconds for run in self.runs)))]
+        return section("Where the numbers come from", page.fact_list(pairs))
 
     def _best(self, name: str) -> Compared | None:
         sign = {MORE: 1.0, LESS: -1.0, None: math.nan}[better(name)]
@@ -294,16 +298,16 @@ def _title(name: str) -> str:
 def _shown(name: str, value: float | None) -> tuple[str, str]:
     """(number, unit) of a metric's value."""
     if value is None:
-        return decimal(None, 0), ""
+        return format_decimal(None, 0), ""
     if name.endswith("bytes"):
-        return byte_size(value)
+        return format_bytes(value)
     if name.endswith("seconds"):
-        return decimal(value, 1), "s"
+        return format_decimal(value, 1), "s"
     if "psnr" in name:
-        return decimal(value, 2), "dB"
+        return format_decimal(value, 2), "dB"
     if name.startswith(("primitives", "parameters", "iterations", "train_views")):
-        return count(value), ""
-    return decimal(value, 1 if name.endswith("fps") else 4), ""
+        return format_count(value), ""
+    return format_decimal(value, 1 if name.endswith("fps") else 4), ""
 
 
 def _sortable(value: float) -> str:
@@ -317,12 +321,8 @@ def _link(name: str) -> str:
 
 
 def _figure(path: Path, caption: str, view: str, run: str | None) -> str:
-    picture, own = inline(path), "" if run is None else f' data-run="{escape(run)}"'
-    if picture is None:
-        return f'<figure{own}><div class="absent">file damaged</div><figcaption>{caption}</figcaption></figure>'
-    kind = ' class="pixelated"' if picture.width < PIXELATED_BELOW else ""
-    alternative = f"view {escape(view)}, {escape(run or 'ground truth')}"
-    return f'<figure{own}><img src="{picture.url}" width="{picture.width}" height="{picture.height}" alt="{alternative}"{kind}><figcaption>{caption}</figcaption></figure>'
+    attribute = "" if run is None else f' data-run="{escape(run)}"'
+    return page.figure(path, caption, f"view {escape(view)}, {escape(run or 'ground truth')}", attribute)
 
 
 def _spread(views: Sequence[ViewFiles], most: int) -> list[ViewFiles]:

@@ -7,9 +7,7 @@ import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import torch
@@ -18,18 +16,15 @@ from torch import Tensor
 from neuprim.core.io.files import write_text
 from neuprim.core.io.images import write_png
 from neuprim.core.metrics import from_json
-from neuprim.report.page import style
+from neuprim.report import page as elements
+from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
+from neuprim.report.page import escape, format_bytes, format_count, format_decimal, section
 from neuprim.report.pictures import Inlined, color_bar, error_map, inline
-from neuprim.report.scatter import Chart, Dot, chart_svg, write_charts
-from neuprim.report.text import byte_size, count, decimal, escape
 
-__all__ = ["DIFFERENCE", "Page", "Picture", "section", "write_page", "write_tradeoff"]
+__all__ = ["DIFFERENCE", "Page", "Picture", "write_page", "write_tradeoff"]
 
 DIFFERENCE = 0.05
 """Difference from the reference point at the bright end of its colours."""
-
-PIXELATED_BELOW = 200
-"""Pictures narrower than this many pixels are enlarged with hard pixel edges."""
 
 TIME = "time of a frame, as a multiple of the reference’s"
 
@@ -60,14 +55,19 @@ def write_tradeoff(
 
 def write_page(folder: Path, page: Page) -> None:
     """Write ``tradeoff.html`` and ``front.png`` into ``folder``."""
-    template = Template(files("neuprim.report").joinpath("tradeoff.html").read_text(encoding="utf-8"))
-    title = f"{page.record['task']} / {page.record['scene']}"
-    sections = {
-        name: getattr(page, name)()
-        for name in ("heading", "headline", "charts", "speed", "size", "table", "left_out", "facts")
-    }
-    write_charts(folder / "front.png", page.fronts())
-    write_text(folder / "tradeoff.html", template.substitute(title=escape(title), style=style(), **sections))
+    title = f"{page.record['task']} / {page.record['scene']} – speed and accuracy"
+    sections = [
+        page.heading(),
+        page.headline(),
+        page.charts(),
+        page.speed(),
+        page.size(),
+        page.table(),
+        page.left_out(),
+        page.facts(),
+    ]
+    write_png_charts(folder / "front.png", page.fronts())
+    write_text(folder / "tradeoff.html", elements.render_page(title, sections, "compared"))
 
 
 class Page:
@@ -106,32 +106,26 @@ class Page:
     # ------------------------------------------------------------ sections
 
     def heading(self) -> str:
-        r = self.record
-        html = f'<p class="eyebrow">{self.eyebrow}</p>\n<h1>{escape(r["task"])} / {escape(r["scene"])}</h1>'
+        r, mark = self.record, ""
         if r["data_source"] != "real":
-            html += f'\n<p class="badge"><strong>{escape(r["data_source"])} data</strong></p>'
-        return html
+            mark = elements.badge(f"{r['data_source']} data")
+        return elements.masthead(self.eyebrow, f"{r['task']} / {r['scene']}", mark + self.remark())
+
+    def remark(self) -> str:
+        """HTML below the heading."""
+        return ""
 
     def headline(self) -> str:
         base = self.points[0]
-        size, unit = byte_size(base["bytes"])
+        size, unit = format_bytes(base["bytes"])
         tiles = [
-            ("As compared with", decimal(base.get("ms_per_frame"), 2), "ms a frame", escape(self.name(0))),
-            ("PSNR", decimal(self.quality(0), 2), "dB", f"{len(self.record['same']['views'])} held-out views"),
-            ("Model file", size, unit, f"{count(self.record['primitives'])} primitives"),
+            ("As compared with", format_decimal(base.get("ms_per_frame"), 2), "ms a frame", escape(self.name(0))),
+            ("PSNR", format_decimal(self.quality(0), 2), "dB", f"{len(self.record['same']['views'])} held-out views"),
+            ("Model file", size, unit, f"{format_count(self.record['primitives'])} primitives"),
             *self._within("speed", "Fastest", lambda i: f"{1 / self.ratio(i):.2f}"),
             *self._within("size", "Smallest", lambda i: f"{base['bytes'] / self.points[i]['bytes']:.2f}"),
         ]
-        return self.tiles(tiles)
-
-    def tiles(self, tiles: Sequence[tuple[str, str, str, str]]) -> str:
-        """Label, value, unit and note of each; those after the third stand out."""
-        cells = "".join(
-            f'<div class="tile{" lead" if i > 2 else ""}"><dt>{label}</dt><dd>{value}<small>{unit}</small></dd>'
-            f'<dd class="note" title="{note}">{note}</dd></div>'
-            for i, (label, value, unit, note) in enumerate(tiles)
-        )
-        return f'<dl class="tiles">{cells}</dl>'
+        return elements.tiles(tiles, lead=range(3, len(tiles)))
 
     def _within(self, front: str, label: str, value: Any) -> list[tuple[str, str, str, str]]:
         """The last point of a front that loses at most a tenth of a decibel."""
@@ -148,8 +142,8 @@ class Page:
         in_time = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr")
         in_bytes = self._dots("size", smaller, lambda i: bytes_of[i], lambda i: 0.0, "psnr")
         return [
-            Chart("PSNR against time", self.time_is, "PSNR, dB", in_time, most=SLOWEST),
-            Chart("PSNR against size", "bytes of the model file", "PSNR, dB", in_bytes),
+            front_chart("PSNR against time", self.time_is, "PSNR, dB", in_time, most=SLOWEST),
+            front_chart("PSNR against size", "bytes of the model file", "PSNR, dB", in_bytes),
         ]
 
     def _dots(
@@ -166,19 +160,17 @@ class Page:
     def charts(self) -> str:
         near = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr_exact")
         more = [
-            Chart("PSNR against the exact image", self.time_is, "dB", near, joined=False, most=SLOWEST),
+            front_chart("PSNR against the exact image", self.time_is, "dB", near, joined=False, most=SLOWEST),
             *self._marching(),
         ]
-        panels = ""
-        for chart in [*self.fronts(), *more]:
-            drawn = chart_svg(chart)
-            if drawn is not None:
-                panels += f'<figure class="panel"><figcaption>{escape(chart.title)}, dB</figcaption>{drawn}</figure>'
+        panels = elements.chart_panels(
+            [(f"{escape(chart.title)}, dB", chart) for chart in [*self.fronts(), *more]], "charts"
+        )
         note = (
             '<p class="note">Ringed: the reference. Orange and numbered: the front. Bars: half the range between the quartiles of all rounds.'
             f"{self._march_note()}</p>"
         )
-        return section("Fronts", f'<div class="charts">{panels}</div>{note}')
+        return section("Fronts", f"{panels}{note}")
 
     def _marching(self) -> list[Chart]:
         rows = self.record["marching"].get("rows", [])
@@ -191,7 +183,7 @@ class Page:
             if row["psnr"] is not None
         ]
         return [
-            Chart(
+            front_chart(
                 "Sampled chords against the closed form",
                 "time of the integrals, as a multiple of the closed form's",
                 "dB",
@@ -205,7 +197,7 @@ class Page:
             return f" Sampling of chords: not measured, {escape(marching.get('not_measured'))}."
         width, height = marching["image_size"]
         return (
-            f" Sampled chords: n midpoint samples on each of {count(marching['chords'])} chords of an image of {width}×{height}, in float64 torch; "
+            f" Sampled chords: n midpoint samples on each of {format_count(marching['chords'])} chords of an image of {width}×{height}, in float64 torch; "
             "numbers are n, and the closed form takes 1."
         )
 
@@ -236,10 +228,10 @@ class Page:
             html += self._pair(self.pictures[number], name)
         if number < 0:
             return html + "</article>"
-        point, (size, unit) = self.points[number], byte_size(self.points[number]["bytes"])
+        point, (size, unit) = self.points[number], format_bytes(self.points[number]["bytes"])
         numbers = (
-            f"{decimal(self.quality(number), 2)} dB ({self.lost(number)}), SSIM {decimal(self.quality(number, 'ssim'), 4)}; "
-            f"{decimal(point.get('ms_per_frame'), 2)} ms, {decimal(point.get('frames_per_second'), 1)} frames/s; {size} {unit}"
+            f"{format_decimal(self.quality(number), 2)} dB ({self.lost(number)}), SSIM {format_decimal(self.quality(number, 'ssim'), 4)}; "
+            f"{format_decimal(point.get('ms_per_frame'), 2)} ms, {format_decimal(point.get('frames_per_second'), 1)} frames/s; {size} {unit}"
         )
         return f"{html}<p>{numbers}</p><code>{escape(self.command(point['words']))}</code></article>"
 
@@ -249,11 +241,10 @@ class Page:
             images.append(torch.from_numpy(error_map(picture.image, picture.against, self.difference)).float() / 255)
         drawn = [_inlined(image) for image in images]
         captions = (escape(name), f"difference of {escape(name)}")
-        return (
-            '<div class="pair">'
-            + "".join(_figure(one, text) for one, text in zip(drawn, captions, strict=False))
-            + "</div>"
-        )
+        figures = [
+            elements.picture(one, "", text) for one, text in zip(drawn, captions, strict=False) if one is not None
+        ]
+        return f'<div class="pair">{"".join(figures)}</div>'
 
     def table(self) -> str:
         head = "".join(
@@ -277,21 +268,24 @@ class Page:
         rows = "".join(self._row(i, i in marked) for i in range(len(self.points)))
         table = f'<div class="scroll"><table class="numbers"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
         note = '<p class="note">Time and ± are multiples of the reference’s of the same round; orange: on a front.</p>'
-        return section(f"All {count(len(self.points))} points", table + note)
+        return section(f"All {format_count(len(self.points))} points", table + note)
 
     def _row(self, i: int, marked: bool) -> str:
         p = self.points[i]
         peak = None if p["peak_bytes"] is None else p["peak_bytes"] / 1e6
         cells = (
-            *(decimal(p.get("time_ratio"), 3), decimal(self.spread(i), 3) if len(p["ratios"]) > 2 else "–"),
-            *(decimal(p.get("ms_per_frame"), 2), decimal(p.get("frames_per_second"), 1)),
             *(
-                decimal(self.quality(i), 3),
-                self.lost(i),
-                decimal(self.quality(i, "ssim"), 4),
-                decimal(self.quality(i, "psnr_exact"), 1),
+                format_decimal(p.get("time_ratio"), 3),
+                format_decimal(self.spread(i), 3) if len(p["ratios"]) > 2 else "–",
             ),
-            *(count(p["bytes"]), decimal(peak, 1), count(len(p["ms"]))),
+            *(format_decimal(p.get("ms_per_frame"), 2), format_decimal(p.get("frames_per_second"), 1)),
+            *(
+                format_decimal(self.quality(i), 3),
+                self.lost(i),
+                format_decimal(self.quality(i, "ssim"), 4),
+                format_decimal(self.quality(i, "psnr_exact"), 1),
+            ),
+            *(format_count(p["bytes"]), format_decimal(peak, 1), format_count(len(p["ms"]))),
         )
         kind = ' class="front"' if marked else ""
         return (
@@ -320,7 +314,7 @@ class Page:
             ""
             if exact.get("float64", True)
             else (
-                f"; {decimal(exact['psnr_against_float64'], 0)} dB from float64 at {'×'.join(map(str, exact['checked_size']))}"
+                f"; {format_decimal(exact['psnr_against_float64'], 0)} dB from float64 at {'×'.join(map(str, exact['checked_size']))}"
             )
         )
         pairs = [
@@ -333,8 +327,7 @@ class Page:
             ("model", same["model"][:16]),
             *((f"{name} not measured", str(why)) for name, why in r.get("not_measured", {}).items()),
         ]
-        cells = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs)
-        return section("Where the numbers come from", f'<dl class="facts">{cells}</dl>')
+        return section("Where the numbers come from", elements.fact_list(pairs))
 
 
 def _inlined(image: Tensor) -> Inlined | None:
@@ -342,14 +335,3 @@ def _inlined(image: Tensor) -> Inlined | None:
         path = Path(folder) / "picture.png"
         write_png(path, image)
         return inline(path)
-
-
-def _figure(picture: Inlined | None, text: str) -> str:
-    if picture is None:
-        return ""
-    kind = ' class="pixelated"' if picture.width < PIXELATED_BELOW else ""
-    return f'<figure><img src="{picture.url}" width="{picture.width}" height="{picture.height}" alt="{text}"{kind}></figure>'
-
-
-def section(title: str, body: str) -> str:
-    return f"<section><h2>{title}</h2>{body}</section>\n"

@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuprim.report.scatter import Chart, chart_svg
-from neuprim.report.text import byte_size, count, decimal, escape
-from neuprim.report.tradeoff import Page, Picture, section, write_page
+from neuprim.report import page as elements
+from neuprim.report.charts import Chart, front_chart
+from neuprim.report.page import escape, format_bytes, format_count, format_decimal, section
+from neuprim.report.tradeoff import Page, Picture, write_page
 
 __all__ = ["write_models"]
 
@@ -34,42 +35,38 @@ class _Models(Page):
     def name(self, number: int) -> str:
         return str(self.points[number]["name"])
 
-    def heading(self) -> str:
-        return super().heading() + f'\n<p class="note">{escape(self.record["length"])}</p>'
+    def remark(self) -> str:
+        return f'\n<p class="note">{escape(self.record["length"])}</p>'
 
     def headline(self) -> str:
         base = self.points[0]
-        size, unit = byte_size(base["bytes"])
+        size, unit = format_bytes(base["bytes"])
         tiles = [
             (
                 "The centre",
-                decimal(base.get("ms_per_frame"), 2),
+                format_decimal(base.get("ms_per_frame"), 2),
                 "ms a frame",
-                f"{count(base['primitives'])} primitives",
+                f"{format_count(base['primitives'])} primitives",
             ),
-            ("PSNR", decimal(self.quality(0), 2), "dB", f"{len(self.record['same']['views'])} test views"),
+            ("PSNR", format_decimal(self.quality(0), 2), "dB", f"{len(self.record['same']['views'])} test views"),
             ("Model file", size, unit, f"{base['parameters_per_primitive']} numbers per primitive"),
             *self._within("speed", "Fastest", lambda i: f"{1 / self.ratio(i):.2f}"),
             *self._within("size", "Smallest", lambda i: f"{base['bytes'] / self.points[i]['bytes']:.2f}"),
         ]
-        return self.tiles(tiles)
+        return elements.tiles(tiles, lead=range(3, len(tiles)))
 
     def charts(self) -> str:
         near = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr_exact")
         drawn = [
             *self.fronts(),
-            Chart("PSNR against the model’s own exact image", self.time_is, "dB", near, joined=False),
+            front_chart("PSNR against the model’s own exact image", self.time_is, "dB", near, joined=False),
         ]
-        panels = "".join(
-            f'<figure class="panel"><figcaption>{escape(chart.title)}, dB</figcaption>{svg}</figure>'
-            for chart in drawn
-            if (svg := chart_svg(chart)) is not None
-        )
+        panels = elements.chart_panels([(f"{escape(chart.title)}, dB", chart) for chart in drawn], "charts")
         note = (
             '<p class="note">Ringed: the centre. Orange and numbered: the front. Bars: half the range between the quartiles of all rounds. '
             "Each model was trained once per seed; trainings with another seed differ by some hundredths to tenths of a decibel.</p>"
         )
-        return section("Fronts", f'<div class="charts">{panels}</div>{note}')
+        return section("Fronts", f"{panels}{note}")
 
     def fronts(self) -> list[Chart]:
         in_time = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr")
@@ -77,8 +74,8 @@ class _Models(Page):
             "size", range(len(self.points)), lambda i: float(self.points[i]["bytes"]), lambda i: 0.0, "psnr"
         )
         return [
-            Chart("PSNR against time", self.time_is, "PSNR, dB", in_time),
-            Chart("PSNR against size", "bytes of the model file", "PSNR, dB", in_bytes),
+            front_chart("PSNR against time", self.time_is, "PSNR, dB", in_time),
+            front_chart("PSNR against size", "bytes of the model file", "PSNR, dB", in_bytes),
         ]
 
     def speed(self) -> str:
@@ -123,28 +120,32 @@ class _Models(Page):
             '<p class="note">Time and ± are multiples of the centre’s of the same round, step is a training step’s time beside the centre’s; '
             "ms a step, seconds: of the model’s own training; orange: on a front.</p>"
         )
-        return section(f"All {count(len(self.points))} models", table + note)
+        return section(f"All {format_count(len(self.points))} models", table + note)
 
     def _row(self, i: int, marked: bool) -> str:
         p = self.points[i]
         peak = None if p["peak_bytes"] is None else p["peak_bytes"] / 1e6
         paces = p["steps_in_turns"]
         cells = (
-            *(count(p["primitives"]), count(p["parameters_per_primitive"])),
+            *(format_count(p["primitives"]), format_count(p["parameters_per_primitive"])),
             *(
-                decimal(self.quality(i), 3),
+                format_decimal(self.quality(i), 3),
                 self.lost(i),
-                decimal(self.quality(i, "ssim"), 4),
-                decimal(self.quality(i, "psnr_exact"), 1),
+                format_decimal(self.quality(i, "ssim"), 4),
+                format_decimal(self.quality(i, "psnr_exact"), 1),
             ),
             *(
-                count(p["bytes"]),
-                decimal(p.get("time_ratio"), 3),
-                decimal(self.spread(i), 3) if len(p["ratios"]) > 2 else "–",
+                format_count(p["bytes"]),
+                format_decimal(p.get("time_ratio"), 3),
+                format_decimal(self.spread(i), 3) if len(p["ratios"]) > 2 else "–",
             ),
-            *(decimal(p.get("ms_per_frame"), 2), decimal(p.get("frames_per_second"), 1)),
-            *(count(p["steps"]), decimal(p["ms_per_step"], 2), decimal(sum(paces) / len(paces) if paces else None, 2)),
-            *(decimal(p["seconds"], 1), decimal(peak, 1), count(len(p["ms"]))),
+            *(format_decimal(p.get("ms_per_frame"), 2), format_decimal(p.get("frames_per_second"), 1)),
+            *(
+                format_count(p["steps"]),
+                format_decimal(p["ms_per_step"], 2),
+                format_decimal(sum(paces) / len(paces) if paces else None, 2),
+            ),
+            *(format_decimal(p["seconds"], 1), format_decimal(peak, 1), format_count(len(p["ms"]))),
         )
         kind = ' class="front"' if marked else ""
         return (
@@ -168,5 +169,4 @@ class _Models(Page):
             *((name, str(value)) for name, value in same["versions"].items()),
             *((f"{name} not measured", str(why)) for name, why in r.get("not_measured", {}).items()),
         ]
-        cells = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs)
-        return section("Where the numbers come from", f'<dl class="facts">{cells}</dl>')
+        return section("Where the numbers come from", elements.fact_list(pairs))

@@ -349,7 +349,7 @@ def _read_compressed(folder: Path) -> None:
 
 
 def _read_run(folder: Path) -> None:
-    from neuprim.report.record import per_view, read_run
+    from neuprim.report.run_record import per_view, read_run
     from neuprim.runs.open import open_run, read_metrics
 
     run, record = open_run(folder / "run"), read_run(folder / "run")

@@ -15,7 +15,7 @@ import pytest
 from neuprim.cli import main
 from neuprim.core.errors import ConfigError
 from neuprim.report import Viewer, write_report
-from neuprim.report.page import LIMIT
+from neuprim.report.run_report import LIMIT
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
 from neuprim.tasks.dynamic.colour import TimeHarmonics

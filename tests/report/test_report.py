@@ -20,7 +20,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.metrics import psnr, ssim, to_json
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.report import error_map, write_report
-from neuprim.report.record import read_run
+from neuprim.report.run_record import read_run
 from tests.reports import offered
 
 NAMES = ("r_0", "r_25", "night-view", "r_75")
@@ -142,7 +142,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A tiny finished run to change, for tests that do not look at its charts (which take most of the time)."""
-    monkeypatch.setattr("neuprim.report.sections.charts", lambda run: "")
+    monkeypatch.setattr("neuprim.report.run_report._curves", lambda run: "")
     return make_run(tmp_path / "run", size=(8, 10), lines=4, names=("a", "b"))
 
 
@@ -433,7 +433,7 @@ def test_a_failed_write_keeps_the_old_report(quick: Path, monkeypatch: pytest.Mo
     if step == "replace":
         monkeypatch.setattr(os, "replace", fail)
     else:
-        monkeypatch.setattr("neuprim.report.page.render_page", fail)
+        monkeypatch.setattr("neuprim.report.run_report._render", fail)
     with pytest.raises(OSError, match="disk full"):
         write_report(quick)
     assert (quick / "report.html").read_text() == "old"

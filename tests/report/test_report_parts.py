@@ -15,10 +15,10 @@ from PIL import Image
 
 from neuprim.core.errors import ConfigError, DataError, NonFiniteError
 from neuprim.report import ERROR_SCALE, error_map
-from neuprim.report.curves import curve, dots, series
+from neuprim.report.charts import HELD_OUT, TRAINING, Dot, Points, curve_chart, draw_svg, front_chart, view_chart
+from neuprim.report.page import escape, format_bytes, format_count, format_decimal, format_duration
 from neuprim.report.pictures import inline
-from neuprim.report.record import read_run
-from neuprim.report.text import byte_size, count, decimal, duration, escape
+from neuprim.report.run_record import read_run
 
 
 def test_a_resumed_run_counts_each_step_once(tmp_path: Path) -> None:
@@ -95,42 +95,49 @@ def test_error_map_refuses_what_it_cannot_show() -> None:
         error_map(image, image, scale=0.0)
 
 
-def both(*pairs: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    table = np.array(pairs, dtype=np.float64).reshape(-1, 2)
-    return table[:, 0], table[:, 1]
+Pairs = list[tuple[float, float]]
 
 
-def ticks(svg: str) -> list[str]:
-    return re.findall(r"<text[^>]*>([^<]*)</text>", svg)
+def curve(training: Pairs, held_out: Pairs, unit: str, log: bool = False) -> str | None:
+    """The SVG of a chart with two lines."""
+    both = ((training, TRAINING), (held_out, HELD_OUT))
+    lines = [Points([x for x, _ in pairs], [y for _, y in pairs], colour) for pairs, colour in both]
+    return draw_svg(curve_chart("Loss", unit, lines, log))
+
+
+def texts(svg: str | None) -> set[str]:
+    assert svg is not None
+    return set(re.findall(r"<text[^>]*>([^<]*)</text>", svg))
 
 
 def test_charts_keep_text_as_text_and_follow_the_page() -> None:
-    svg = curve(both((1, 0.5), (50, 0.004), (100, 0.001)), both((50, 0.01)), "step", "Loss over steps", log=True)
-    assert svg is not None
-    assert {"0.001", "0.01", "0.1", "steps", "100"} <= set(ticks(svg))
-    assert "var(--training)" in svg and "var(--held-out)" in svg and "var(--muted)" in svg
+    svg = curve([(1, 0.5), (50, 0.004), (100, 0.001)], [(50, 0.01)], "steps", log=True)
+    assert {"0.001", "0.01", "0.1", "steps", "100"} <= texts(svg)
+    assert svg is not None and "var(--training)" in svg and "var(--held-out)" in svg and "var(--muted)" in svg
     assert not re.search(r"#01020|font-family|<style|<metadata|xmlns|xlink|<!", svg)
 
 
 def test_log_axis_only_where_it_fits() -> None:
-    for values in (((1, 0.5), (2, 0.4)), ((1, 0.0), (2, 100.0))):
-        svg = curve(both(*values), None, "step", "x", log=True)
-        assert svg == curve(both(*values), None, "step", "x", log=False)
+    for values in ([(1, 0.5), (2, 0.4)], [(1, 0.0), (2, 100.0)]):
+        assert curve(values, [], "steps", log=True) == curve(values, [], "steps", log=False)
 
 
 @pytest.mark.parametrize(("last", "unit"), [(100.0, "seconds"), (1000.0, "minutes"), (20000.0, "hours")])
 def test_time_axis_unit(last: float, unit: str) -> None:
-    svg = curve(both((0, 1), (last, 2)), None, "seconds", "x")
-    assert svg is not None and unit in ticks(svg)
+    assert unit in texts(curve([(0, 1), (last, 2)], [], "seconds"))
 
 
 def test_charts_of_nothing_and_of_one_point() -> None:
-    assert curve(both(), both(), "step", "x") is None
-    assert curve(both(), None, "step", "x") is None
-    assert curve(both((0, 3)), None, "step", "x") is not None
-    assert curve(both(), both((7, 3)), "seconds", "x") is not None
-    assert dots([None, math.inf], math.inf, None, "x") is None
-    assert dots([None, 3.0, math.inf], math.inf, "a", "x") is not None
+    assert curve([], [], "steps") is None
+    assert curve([(0, 3)], [], "steps") is not None and curve([], [(7, 3)], "seconds") is not None
+    assert draw_svg(view_chart("x", [None, math.inf], math.inf, None)) is None
+    assert "a" in texts(draw_svg(view_chart("x", [None, 3.0, math.inf, 2.0], 2.5, "a")))
+    assert draw_svg(front_chart("x", "cost", "dB", [Dot(math.nan, 3.0)])) is None
+
+
+def test_a_front_is_marked_and_says_what_is_left_out() -> None:
+    dots = [Dot(1.0, 30.0, reference=True), Dot(0.5, 29.9, mark="1"), Dot(0.4, 28.0, mark="2"), Dot(50.0, 31.0)]
+    assert {"1", "2", "cost (1 beyond 12)"} <= texts(draw_svg(front_chart("x", "cost", "dB", dots, most=12.0)))
 
 
 def test_non_finite_log_values_are_left_out_of_the_curves(tmp_path: Path) -> None:
@@ -143,18 +150,18 @@ def test_non_finite_log_values_are_left_out_of_the_curves(tmp_path: Path) -> Non
     run = read_run(tmp_path)
     assert run.last("loss") == (1, 2) and run.last("psnr") == (1, 3)
     for key, value in (("loss", 2.0), ("psnr", 3.0)):
-        assert [column.tolist() for column in series(run, "step", key)] == [[1.0], [value]]
+        assert run.series("step", key) == ([1.0], [value])
 
 
 def test_numbers_as_text() -> None:
-    assert [duration(s) for s in (8.34, 59.97, 247, 3599.7, 7500, None, -1, math.nan)] == [
+    assert [format_duration(s) for s in (8.34, 59.97, 247, 3599.7, 7500, None, -1, math.nan)] == [
         "8.3 s", "1 min 00 s", "4 min 07 s", "1 h 00 min", "2 h 05 min", "–", "–", "–",
     ]  # fmt: skip
-    assert [byte_size(b) for b in (0, 999, 1234, 45_600_000, 456_700_000, 7.25e9, "x")] == [
+    assert [format_bytes(b) for b in (0, 999, 1234, 45_600_000, 456_700_000, 7.25e9, "x")] == [
         ("0", "B"), ("999", "B"), ("1.23", "kB"), ("45.6", "MB"), ("457", "MB"), ("7.25", "GB"), ("–", ""),
     ]  # fmt: skip
-    assert [count(v) for v in (1234567, 67.25, None, math.inf)] == ["1,234,567", "67.25", "–", "–"]
-    assert [decimal(v, 2) for v in (1.005, math.inf, -math.inf, None)] == ["1.00", "∞", "−∞", "–"]
+    assert [format_count(v) for v in (1234567, 67.25, None, math.inf)] == ["1,234,567", "67.25", "–", "–"]
+    assert [format_decimal(v, 2) for v in (1.005, math.inf, -math.inf, None)] == ["1.00", "∞", "−∞", "–"]
     assert [escape(v) for v in (None, "", 'a"<', True, [1, "b"], 0.001)] == [
         "–",
         "–",

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from neuprim.report.record import read_run
+from neuprim.report.run_record import read_run
 from neuprim.report.sweep import COLOURS, Compared, better, write_sweep
 from tests.browsers import browser
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import write_text
-from neuprim.report.record import RunRecord, read_run
+from neuprim.report.run_record import RunRecord, read_run
 from neuprim.report.sweep import Compared
 from neuprim.runs.sweep.record import SweepRecord
 

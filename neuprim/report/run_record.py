@@ -22,7 +22,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.plain import load_json, load_yaml
 from neuprim.report.regions import RegionFile, read_regions
 
-__all__ = ["RunRecord", "ViewFiles", "number", "read_run"]
+__all__ = ["RunRecord", "ViewFiles", "as_number", "read_run"]
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,16 @@ class RunRecord:
     def last(self, key: str) -> tuple[float, float] | None:
         """(step, value) of the newest log line that has a finite number under ``key``."""
         for line in reversed(self.log):
-            value = number(line.get(key))
+            value = as_number(line.get(key))
             if value is not None and math.isfinite(value):
                 return float(line["step"]), value
         return None
+
+    def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
+        """Return the values of two keys over the log lines that have finite numbers for both."""
+        pairs = [(as_number(line.get(x)), as_number(line.get(y))) for line in self.log]
+        known = [(a, b) for a, b in pairs if a is not None and b is not None and math.isfinite(a) and math.isfinite(b)]
+        return [a for a, _ in known], [b for _, b in known]
 
     def view_numbers(self, view: ViewFiles) -> Mapping[str, Any]:
         """The entry of ``per_view`` that belongs to a view's pictures; empty where none does.
@@ -112,7 +118,7 @@ def per_view(run: RunRecord) -> list[Mapping[str, Any]]:
     return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
 
 
-def number(value: object) -> float | None:
+def as_number(value: object) -> float | None:
     """``value`` as a float if it is a number and not NaN, else None."""
     if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
         return None
@@ -186,7 +192,7 @@ def _log(text: str) -> tuple[list[Mapping[str, Any]], int]:
             line = load_json(raw, infinite=True)
         except (ValueError, RecursionError):
             line = None
-        step = number(line.get("step")) if isinstance(line, Mapping) else None
+        step = as_number(line.get("step")) if isinstance(line, Mapping) else None
         if step is None:
             unreadable += 1
             continue

@@ -1,0 +1,396 @@
+"""Charts: curves over time, one dot a view, and Pareto fronts, as SVG for a page or as a PNG file.
+
+An SVG takes its colours from the page's CSS variables, so that it follows light and dark mode.
+"""
+
+from __future__ import annotations
+
+import html
+import io
+import math
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neuprim.core.io.files import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "HELD_OUT",
+    "LARGE",
+    "TRAINING",
+    "Chart",
+    "Dot",
+    "Points",
+    "curve_chart",
+    "draw_svg",
+    "front_chart",
+    "view_chart",
+    "write_png_charts",
+]
+
+# Placeholder colours that no chart uses otherwise. CSS variables replace them in an SVG, PNG_COLOURS in a PNG.
+INK, GRID, TRAINING, HELD_OUT = "#010203", "#010204", "#010205", "#010206"
+VARIABLES = {INK: "var(--muted)", GRID: "var(--line)", TRAINING: "var(--training)", HELD_OUT: "var(--held-out)"}
+PNG_COLOURS = {INK: "#5d6670", GRID: "#e2e4e3", TRAINING: "#6884a6", HELD_OUT: "#c9551c"}
+
+SMALL, LARGE = (360, 210), (540, 300)
+"""Sizes of a chart in points. Panels are about as wide in CSS pixels, so text keeps its size."""
+
+BUCKETS = 120
+"""A band is drawn where there are more than twice so many points: medians, and the range of each of so many groups."""
+
+FEW = 40
+"""Points of a line up to which each is marked."""
+
+LOG_RATIO = 4.0
+"""A curve with ``log`` gets a logarithmic axis where its positive values span at least this factor."""
+
+FRONT_LOG_RATIO = 1.5
+"""The same for the costs of a front."""
+
+LEAST_DECIBELS = 0.4
+"""Least range of the y axis of a front: smaller differences are invisible."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of one colour; those that are not finite are left out.
+
+    Attributes:
+        joined: connect them by a line.
+        band: draw many points as their median and range.
+        size: diameter in points; None marks the points of a line only while they are few.
+        spread: half-lengths of horizontal error bars.
+        labels: texts below the points.
+    """
+
+    x: Sequence[float] | NDArray[np.float64]
+    y: Sequence[float] | NDArray[np.float64]
+    colour: str = TRAINING
+    joined: bool = True
+    band: bool = False
+    size: float | None = None
+    opacity: float = 1.0
+    spread: Sequence[float] = ()
+    labels: Sequence[str] = ()
+
+    def finite(self) -> Points:
+        """Return those with finite coordinates."""
+        x, y = np.asarray(self.x, dtype=np.float64), np.asarray(self.y, dtype=np.float64)
+        keep = np.isfinite(x) & np.isfinite(y)
+        rows = [i for i in range(len(keep)) if keep[i]]
+        spread = [self.spread[i] for i in rows] if self.spread else ()
+        labels = [self.labels[i] for i in rows] if self.labels else ()
+        return replace(self, x=x[keep], y=y[keep], spread=spread, labels=labels)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart of any kind; :func:`curve_chart`, :func:`view_chart` and :func:`front_chart` make the usual ones.
+
+    Attributes:
+        title: for readers who do not see the chart, and above a PNG.
+        level: y of a dashed line from which the points hang.
+        ring: a point that is ringed.
+        left, right: limits of the x axis.
+        log_x, log_y: which axes are logarithmic.
+        whole: whether x counts things.
+        least: least range of the y axis.
+    """
+
+    title: str
+    points: Sequence[Points]
+    x_label: str
+    y_label: str = ""
+    size: tuple[int, int] = SMALL
+    level: float | None = None
+    ring: tuple[float, float] | None = None
+    left: float | None = None
+    right: float | None = None
+    log_x: bool = False
+    log_y: bool = False
+    whole: bool = False
+    least: float = 0.0
+
+    def known(self) -> list[Points]:
+        """Return what can be drawn."""
+        return [finite for points in self.points if len((finite := points.finite()).x)]
+
+
+@dataclass(frozen=True)
+class Dot:
+    """A point of a Pareto front's chart.
+
+    Attributes:
+        cost, spread: along x, with the half-length of its error bar.
+        good: along y.
+        mark: text beside a point of the front; None for the other points.
+        reference: whether costs are compared with this one; it is ringed.
+    """
+
+    cost: float
+    good: float
+    spread: float = 0.0
+    mark: str | None = None
+    reference: bool = False
+
+
+def curve_chart(
+    title: str, unit: str, lines: Sequence[Points], log: bool = False, size: tuple[int, int] = SMALL
+) -> Chart:
+    """Return a chart of values over seconds, steps or frames.
+
+    Args:
+        unit: "seconds", which become minutes or hours where they are many, or any other label of the x axis.
+        log: use a logarithmic y axis where the values span :data:`LOG_RATIO`.
+    """
+    known = [line.finite() for line in lines]
+    right = max((float(np.max(line.x)) for line in known if len(line.x)), default=0.0)
+    divisor = 1.0
+    if unit == "seconds" and right >= 180:
+        unit, divisor = ("minutes", 60.0) if right < 3 * 3600 else ("hours", 3600.0)
+    values = np.concatenate([line.y for line in known]) if known else np.zeros(0)
+    log = log and values.size > 0 and values.min() > 0 and values.max() / values.min() >= LOG_RATIO
+    scaled = [replace(line, x=np.asarray(line.x) / divisor) for line in known]
+    return Chart(
+        title, scaled, unit, size=size, left=0, right=right / divisor * 1.02 if right > 0 else 1, log_y=bool(log)
+    )
+
+
+def view_chart(title: str, values: Sequence[float | None], mean: float | None, lowest: str | None) -> Chart:
+    """Return a chart of one value a view, hung from their mean.
+
+    Args:
+        lowest: text beside the lowest dot, e.g. the view's name.
+    """
+    known = [(i, v) for i, v in enumerate(values) if v is not None and math.isfinite(v)]
+    labels = [""] * len(known)
+    if lowest and len(known) > 1:
+        labels[min(range(len(known)), key=lambda i: known[i][1])] = lowest
+    size = 4.5 if len(known) <= 60 else 2.5
+    points = Points([i for i, _ in known], [v for _, v in known], HELD_OUT, False, size=size, labels=labels)
+    level = mean if mean is not None and math.isfinite(mean) else None
+    return Chart(title, [points], "view", level=level, left=-0.7, right=len(values) - 0.3, whole=True)
+
+
+def front_chart(
+    title: str, x_label: str, y_label: str, dots: Sequence[Dot], joined: bool = True, most: float = math.inf
+) -> Chart:
+    """Return a chart of quality against cost with the Pareto front marked.
+
+    Args:
+        joined: connect the points of the front by a line.
+        most: points that cost more and are not on the front are left out; the x axis says how many.
+    """
+    known = [dot for dot in dots if math.isfinite(dot.cost) and math.isfinite(dot.good) and dot.cost > 0]
+    drawn = [dot for dot in known if dot.cost <= most or dot.mark is not None]
+    if len(drawn) < len(known):
+        x_label += f" ({len(known) - len(drawn)} beyond {most:g})"
+    marked = sorted((dot for dot in drawn if dot.mark is not None), key=lambda dot: dot.cost)
+    others = [dot for dot in drawn if dot.mark is None]
+    points = [
+        Points(
+            [dot.cost for dot in group],
+            [dot.good for dot in group],
+            colour,
+            line and len(group) > 1,
+            size=size,
+            opacity=opacity,
+            spread=[dot.spread for dot in group],
+            labels=[dot.mark or "" for dot in group],
+        )
+        for group, colour, line, size, opacity in (
+            (others, TRAINING, False, 4.5, 0.75),
+            (marked, HELD_OUT, joined, 6.0, 1.0),
+        )
+    ]
+    costs = [dot.cost for dot in drawn]
+    log = bool(costs) and max(costs) / min(costs) >= FRONT_LOG_RATIO
+    ring = next(((dot.cost, dot.good) for dot in drawn if dot.reference), None)
+    return Chart(title, points, x_label, y_label, LARGE, ring=ring, log_x=log, least=LEAST_DECIBELS)
+
+
+def draw_svg(chart: Chart) -> str | None:
+    """Return the chart as an ``<svg>`` element in the page's colours; None where there is nothing to draw."""
+    from matplotlib.figure import Figure
+
+    if not chart.known():
+        return None
+    width, height = chart.size
+    with _style():
+        figure = Figure(figsize=(width / 72, height / 72))
+        left, bottom = 41.4 / width, 42 / height  # room for the labels
+        _draw(figure.add_axes((left, bottom, 0.98 - left, 0.96 - bottom)), chart, {name: name for name in VARIABLES})
+        return _to_element(figure, chart.title)
+
+
+def write_png_charts(path: Path, charts: Sequence[Chart]) -> None:
+    """Write charts side by side into a PNG file."""
+    from matplotlib.figure import Figure
+
+    charts = [chart for chart in charts if chart.known()]
+    width, height = LARGE
+    with _style():
+        figure = Figure(figsize=(len(charts) * width / 72, 1.12 * height / 72), layout="constrained", facecolor="white")
+        for axes, chart in zip(figure.subplots(1, len(charts), squeeze=False)[0], charts, strict=True):
+            _draw(axes, chart, PNG_COLOURS)
+            axes.set_title(chart.title, fontsize=11, loc="left", color=PNG_COLOURS[INK])
+            axes.set_ylabel(chart.y_label, color=PNG_COLOURS[INK])
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, format="png", dpi=130)
+
+
+# ---------------------------------------------------------------- drawing
+
+
+def _draw(axes: Axes, chart: Chart, palette: Mapping[str, str]) -> None:
+    known = chart.known()
+    if chart.level is not None:
+        axes.axhline(chart.level, color=palette[INK], linewidth=1, linestyle=(0, (4, 3)), zorder=2)
+        for points in known:
+            axes.vlines(points.x, chart.level, points.y, color=palette[points.colour], linewidth=1, alpha=0.45)
+    for points in known:
+        _draw_points(axes, points, palette.get(points.colour, points.colour))
+        _draw_labels(axes, points, chart.level is not None, palette[INK])
+    if chart.ring is not None:
+        x, y = chart.ring
+        axes.plot([x], [y], marker="o", markersize=11, markerfacecolor="none", markeredgecolor=palette[INK], zorder=4)
+    axes.set_xlabel(chart.x_label, color=palette[INK])
+    axes.margins(x=0.05, y=0.14 if chart.level is not None else 0.12 if chart.least else 0.05)
+    if chart.log_x:
+        axes.set_xscale("log")
+    if chart.log_y:
+        axes.set_yscale("log")
+    axes.set_xlim(chart.left, chart.right)
+    _set_ticks(axes.xaxis, 6, chart.log_x, _values(known, "x"), chart.whole)
+    _set_ticks(axes.yaxis, 5, chart.log_y, _values(known, "y"))
+    bottom, top = axes.get_ylim()
+    if top - bottom < chart.least:
+        axes.set_ylim((bottom + top - chart.least) / 2, (bottom + top + chart.least) / 2)
+    axes.tick_params(colors=palette[GRID], labelcolor=palette[INK])
+    axes.grid(True, axis="both" if chart.least else "y", color=palette[GRID])
+    for spine in axes.spines.values():
+        spine.set_color(palette[GRID])
+
+
+def _draw_points(axes: Axes, points: Points, colour: str) -> None:
+    x, y = np.asarray(points.x), np.asarray(points.y)
+    marked = x.size == 1 if points.band else x.size <= FEW
+    size = points.size if points.size is not None else 4.0 if marked else 0.0
+    if points.band and x.size > 2 * BUCKETS:
+        groups = np.array_split(np.arange(x.size), BUCKETS)
+        middle, low, high = (np.array([f(y[group]) for group in groups]) for f in (np.median, np.min, np.max))
+        x, y = np.array([x[group].mean() for group in groups]), middle
+        axes.fill_between(x, low, high, color=colour, alpha=0.22, linewidth=0, zorder=2)
+    if points.joined:
+        axes.plot(x, y, color=colour, linewidth=1.5, zorder=3)
+    if size:
+        errors = points.spread if any(points.spread) else None
+        axes.errorbar(
+            x,
+            y,
+            xerr=errors,
+            linestyle="none",
+            marker="o",
+            markersize=size,
+            markeredgewidth=0,
+            color=colour,
+            alpha=points.opacity,
+            elinewidth=1,
+            zorder=4,
+        )
+
+
+def _draw_labels(axes: Axes, points: Points, aside: bool, colour: str) -> None:
+    """Write each point's label below it, or ``aside``, towards the middle of the chart."""
+    for i, text in enumerate(points.labels):
+        if not text:
+            continue
+        right = i < len(points.labels) / 2
+        offset = ((8 if right else -8), 0) if aside else (0, -13)
+        axes.annotate(
+            text,
+            (float(points.x[i]), float(points.y[i])),
+            offset,
+            textcoords="offset points",
+            ha="center" if not aside else "left" if right else "right",
+            va="center" if aside else "baseline",
+            fontsize=9,
+            color=colour,
+            parse_math=False,
+        )
+
+
+def _values(known: Sequence[Points], axis: str) -> NDArray[np.float64]:
+    return np.concatenate([np.asarray(getattr(points, axis), dtype=np.float64) for points in known])
+
+
+def _set_ticks(axis: Axis, most: int, log: bool, values: NDArray[np.float64], whole: bool = False) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+    if log:
+        ratio = float(values.max() / values.min())
+        few, many = (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+        axis.set_major_locator(LogLocator(subs=(1.0,) if ratio > 300 else few if ratio > LOG_RATIO else many))
+        axis.set_minor_locator(NullLocator())
+    else:
+        axis.set_major_locator(MaxNLocator(nbins=most, steps=[1, 2, 2.5, 5, 10], integer=whole))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _format_tick(value)))
+
+
+def _format_tick(value: float) -> str:
+    """Write a number without powers of ten: 12k, 0.002, 3M."""
+    for size, suffix in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:g}{suffix}"
+    return f"{value:g}".replace("-", "−")
+
+
+def _style() -> AbstractContextManager[None]:
+    """Return matplotlib's settings of every chart, held from the axes' creation to the file."""
+    import matplotlib  # slow to import, and only reports need it
+
+    settings: Any = {
+        "svg.fonttype": "none",
+        "svg.hashsalt": "neuprim",
+        "font.size": 10,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.spines.left": False,
+        "axes.axisbelow": True,
+        "grid.linewidth": 0.8,
+        "ytick.major.size": 0,
+        "xtick.major.size": 3,
+    }
+    return matplotlib.rc_context(settings)
+
+
+def _to_element(figure: Figure, label: str) -> str:
+    """Return a figure as an element of a page: no outside addresses or global styles, own ids, the page's font."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True)
+    body = buffer.getvalue()
+    body = body[body.index("<svg") :]
+    body = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->|<style.*?</style>", "", body, flags=re.DOTALL)
+    width, height = 72 * figure.get_size_inches()
+    name, box = html.escape(label, quote=True), f"0 0 {width:g} {height:g}"
+    body = f'<svg class="chart" role="img" aria-label="{name}" viewBox="{box}">' + body[body.index(">") + 1 :]
+    body = re.sub(r'\bfont: ([\d.]+px) [^;"]*', r"font-size: \1", body)
+    body = re.sub(r'\bfont-family: [^;"]*;? ?', "", body)
+    prefix = re.sub(r"\W+", "-", label.lower()) + "-"
+    body = re.sub(r'\bid="', f'id="{prefix}', body.replace("xlink:href", "href"))
+    body = body.replace('href="#', f'href="#{prefix}').replace("url(#", f"url(#{prefix}")
+    for colour, variable in VARIABLES.items():
+        body = body.replace(colour, variable)
+    return re.sub(r"\s*\n\s*", " ", body)

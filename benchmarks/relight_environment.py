@@ -30,7 +30,8 @@ from neuprim.core.cameras import Camera
 from neuprim.core.channels import Channels
 from neuprim.core.data import View
 from neuprim.core.environment import Environment
-from neuprim.core.io.images import write_exr, write_png
+from neuprim.core.io.exr import write_exr
+from neuprim.core.io.images import write_png
 from neuprim.core.metrics import psnr
 from neuprim.runs.measure import draw_sum
 from neuprim.runs.open import load_dataset, load_run

@@ -31,7 +31,7 @@ MOVED = {
     "neuprim.core.density_truth": "neuprim.core.volumes.truth",
     "neuprim.core.fields": "neuprim.core.model.fields",
     "neuprim.core.files": "neuprim.core.io.files",
-    "neuprim.core.film": "neuprim.core.io.film",
+    "neuprim.core.film": "neuprim.core.io.animation",
     "neuprim.core.flip": "neuprim.core.metrics.flip",
     "neuprim.core.gaussian": "neuprim.core.model.densities.gaussian",
     "neuprim.core.geometry": "neuprim.core.model.geometry",

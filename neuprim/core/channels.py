@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
-from neuprim.core.io.channel_names import default_names, names_fault
+from neuprim.core.io.exr import channel_name_error, default_channel_names
 from neuprim.core.io.images import linear_to_srgb
 from neuprim.core.task import Display, TaskSpec
 
@@ -69,7 +69,7 @@ class Channels:
         """What pictures show, in words; empty for red, green and blue, or grey, without a display of the task's own."""
         if self.own is not None:
             return f"{self.listed} through the display of task {self.task!r}"
-        if self.names == default_names(self.count) and not self.partial:
+        if self.names == default_channel_names(self.count) and not self.partial:
             return ""
         if self.count == 1:
             return f"{self.names[0]} as grey"
@@ -142,7 +142,7 @@ def channels_of(task: TaskSpec, dataset: Dataset) -> Channels:
             f"{dataset.name}: the background has shape {tuple(dataset.background.shape)}; expected ({dataset.channels},), a number per channel"
         )
     return Channels(
-        tuple(task.channels) or default_names(dataset.channels), dataset.color_space, task.display, task.name
+        tuple(task.channels) or default_channel_names(dataset.channels), dataset.color_space, task.display, task.name
     )
 
 
@@ -158,8 +158,8 @@ def stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec, coun
     """
     names = header.get("channels")
     if names is None:  # written before models kept them
-        names = task.channels if len(task.channels) == count else default_names(count)
-    elif not isinstance(names, list) or len(names) != count or names_fault(names):
+        names = task.channels if len(task.channels) == count else default_channel_names(count)
+    elif not isinstance(names, list) or len(names) != count or channel_name_error(names):
         raise CheckpointError(
             f"{where}: the model's header names the channels {str(names)[:100]}; expected {count} different names"
         )

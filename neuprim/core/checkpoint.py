@@ -20,8 +20,8 @@ from torch import Tensor
 from neuprim.core import compression
 from neuprim.core.errors import CheckpointError, cut, nearest
 from neuprim.core.io.files import atomic_path
-from neuprim.core.io.pieces import Kind, write_pieces
 from neuprim.core.io.plain import finite, load_json
+from neuprim.core.io.safetensors_stream import TensorType, write_safetensors_stream
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.sparse_storage import load_sparse, store_sparse
@@ -112,15 +112,15 @@ def _checked(path: Path, header: Any, kind: str) -> dict[str, Any]:
 def write_in_pieces(
     path: Path,
     kind: str,
-    kinds: Mapping[str, Kind],
+    kinds: Mapping[str, TensorType],
     header: Mapping[str, Any],
     pieces: Callable[[str], Iterable[Tensor]],
 ) -> None:
-    """As :func:`write`, of tensors that are nowhere whole, see :func:`~neuprim.core.io.pieces.write_pieces`."""
+    """As :func:`write`, of tensors that are nowhere whole, see :func:`~neuprim.core.io.safetensors_stream.write_safetensors_stream`."""
     text = json.dumps({"format": FORMAT, "kind": kind, **header}, allow_nan=False)
     try:
         with atomic_path(path) as temporary:
-            write_pieces(temporary, kinds, {_KEY: text}, pieces)
+            write_safetensors_stream(temporary, kinds, {_KEY: text}, pieces)
     except OSError as error:
         raise CheckpointError(
             f"{path}: could not write the {kind}: {error}; the previous one, if any, is untouched"

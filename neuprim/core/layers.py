@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.channel_names import names_fault
+from neuprim.core.io.exr import channel_name_error
 from neuprim.core.render.layers import LayerFrame
 
 __all__ = ["COMMON", "LIGHTS", "LayerFrame", "LayerSpec", "chosen_layers", "layer_fault"]
@@ -91,7 +91,7 @@ def layer_fault(layers: object) -> str | None:
             return f"[{i}].draw is of type {type(spec.draw).__name__}; expected a function"
         if not isinstance(spec.channels, tuple | list):
             return f"[{i}].channels is of type {type(spec.channels).__name__}; expected a tuple of names"
-        wrong = names_fault(spec.channels)
+        wrong = channel_name_error(spec.channels)
         if wrong:
             return f"[{i}].channels{wrong}"
         taken.add(spec.name)

@@ -10,7 +10,7 @@ from typing import Any
 from neuprim.core.checked import converted, option_type
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension
-from neuprim.core.io.channel_names import names_fault
+from neuprim.core.io.exr import channel_name_error
 from neuprim.core.layers import layer_fault
 from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.task import SceneSpec, TaskSpec
@@ -130,7 +130,7 @@ def _task(spec: TaskSpec) -> str | None:
         return f"example is of type {type(spec.example).__name__}; expected a function or None"
     if not isinstance(spec.channels, tuple | list):
         return f"channels is of type {type(spec.channels).__name__}; expected a tuple of names"
-    wrong = names_fault(spec.channels)
+    wrong = channel_name_error(spec.channels)
     if wrong:
         return f"channels{wrong}"
     if spec.display is not None and not callable(spec.display):

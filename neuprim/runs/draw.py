@@ -18,9 +18,9 @@ from neuprim.core.data import View
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io import images
+from neuprim.core.io.animation import write_animation
 from neuprim.core.io.files import write_npy
-from neuprim.core.io.film import write_film
-from neuprim.core.io.records import Record
+from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
@@ -203,7 +203,7 @@ def render_run(
     if animate:
         stack = [channels.display(image(v)) for v in views]
         refuse_empty()
-        write_film(targets[0], stack, fps or min(30.0, max(len(views) / 4.0, 5.0)))
+        write_animation(targets[0], stack, fps or min(30.0, max(len(views) / 4.0, 5.0)))
         return targets
     for v, path in zip(views, targets, strict=True):
         if layered is None:
@@ -246,7 +246,7 @@ def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fp
     elif format == "webp":
         images.write_webp(path, channels.display(pixels))
     else:
-        write_film(path, [channels.display(pixels)], fps or 12.0)
+        write_animation(path, [channels.display(pixels)], fps or 12.0)
 
 
 def _views_of(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
@@ -272,7 +272,7 @@ def _illumination(
         facts = facts_of(task, load_dataset(config, task))
     if not isinstance(facts, dict):
         raise DataError(f"the model's header: data is {type(facts).__name__}; expected an object")
-    up = Record(facts, "the model's header: data").array("up", (3,), "3 numbers")
+    up = JsonReader(facts, "the model's header: data").array("up", (3,), "3 numbers")
     found = task.environment(read_environment(choice.path, up, choice.rotation, choice.scale), choice.samples, facts)
     clash = sorted(conditions.keys() & found.conditions[0].keys())
     if clash:

@@ -11,8 +11,8 @@ from neuprim.core.cameras import Camera
 from neuprim.core.data import Clip, View
 from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.io import images
+from neuprim.core.io.animation import FrameSpool, write_animation
 from neuprim.core.io.files import write_json
-from neuprim.core.io.reel import Reel
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.plugins.judging import clips_of, orbit_of
@@ -38,20 +38,20 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
     folder.mkdir(exist_ok=True)
 
     clips = clips_of(task, dataset)
-    reels = {i: clip for clip in clips if clip.source is None for i in clip.views}
-    open_reel: list[Reel] = []
+    spooled = {i: clip for clip in clips if clip.source is None for i in clip.views}
+    open_spool: list[FrameSpool] = []
     regions = Regions(channels.display)
 
     def add_frame(clip: Clip, index: int, rendered: torch.Tensor, truth: torch.Tensor) -> None:
-        if not open_reel:
-            open_reel.append(Reel(folder))
-        open_reel[0].add(torch.cat([channels.display(x) for x in (truth, rendered)], dim=1))
+        if not open_spool:
+            open_spool.append(FrameSpool(folder))
+        open_spool[0].add(torch.cat([channels.display(x) for x in (truth, rendered)], dim=1))
         if index == clip.views[-1]:
-            open_reel.pop().write(folder / f"clip_{clip.name}.webp", clip.fps)
+            open_spool.pop().write(folder / f"clip_{clip.name}.webp", clip.fps)
 
     def write_view(index: int, view: View, rendered: torch.Tensor, truth: torch.Tensor) -> None:
         regions.look(view.name, rendered, truth)
-        clip = reels.get(index)
+        clip = spooled.get(index)
         if clip is not None:
             add_frame(clip, index, rendered, truth)
         if index in shown:
@@ -73,7 +73,7 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
     write_json(directory / "metrics.json", metrics)
     views_around = orbit_of(task, dataset, _ORBIT_FRAMES)
     frames = [channels.display(draw(model, v, config.renderer, dataset.background)) for v in views_around]
-    images.write_animation(folder / "orbit.webp", frames, fps=12.0)
+    write_animation(folder / "orbit.webp", frames, fps=12.0)
     write_report(directory, task.conditions, _embedded_viewer(fitted, directory))
     return metrics
 

@@ -17,7 +17,7 @@ from neuprim.core.compression import is_compressed
 from neuprim.core.conditions import flag, named, read_conditions, split_words
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
-from neuprim.core.io.drafts import Draft, drafted, refuse_taken
+from neuprim.core.io.files import StagedOutput, refuse_existing, staged
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.blame import origin_of, reported
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
@@ -56,18 +56,18 @@ def export_run(
         load_run(run_dir)  # that the run's own package is gone says more
         raise
     final = _destination(run_dir, exporter, out)
-    refuse_taken(final, overwrite)
+    refuse_existing(final, overwrite)
     run = open_run(run_dir, progress)
     options, conditions = _options(words, exporter, run.task.conditions)
     notes: list[str] = []
     read_conditions(run.task.conditions, conditions, notes.append)
-    with drafted(final, overwrite) as draft:
-        job = ExportJob(run, draft.out, options, conditions, progress)
+    with staged(final, overwrite) as output:
+        job = ExportJob(run, output.out, options, conditions, progress)
         with reported(EXPORTERS, name, [run_dir / "logs", final.absolute().parent]):
             report = exporter.write(job)
-        files = _files(report, draft, name)
-        draft.publish()
-    report = replace(report, files=files, notes=(*notes, *(draft.words(note) for note in report.notes)))
+        files = _files(report, output, name)
+        output.publish()
+    report = replace(report, files=files, notes=(*notes, *(output.final_text(note) for note in report.notes)))
     return record_export(name, job, report)
 
 
@@ -81,17 +81,17 @@ def _destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
     return out
 
 
-def _files(report: Any, draft: Draft, name: str) -> tuple[Path, ...]:
+def _files(report: Any, output: StagedOutput, name: str) -> tuple[Path, ...]:
     """Where the files of a report will be."""
     who = f"exporter {name!r} of {origin_of(EXPORTERS, name).origin}"
     if not isinstance(report, ExportReport):
         raise PluginError(f"{who}: write returned {type(report).__name__}; expected an ExportReport")
     files = []
     for path in map(Path, report.files):
-        place = draft.place(path)
+        place = output.final_path(path)
         if place is None:
             raise PluginError(
-                f"{who}: wrote {path} instead of {draft.out}, past everything that keeps files from being replaced"
+                f"{who}: wrote {path} instead of {output.out}, past everything that keeps files from being replaced"
             )
         if not path.exists():
             raise PluginError(f"{who}: reports {path}, which it did not write")
@@ -186,7 +186,10 @@ def import_model(stored: StoredModel, path: Path, out: Path) -> Path:
     header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
     tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}
     return _run_of(
-        path, out, stored.config, lambda draft: checkpoint.write(draft / "model.safetensors", "model", tensors, header)
+        path,
+        out,
+        stored.config,
+        lambda output: checkpoint.write(output / "model.safetensors", "model", tensors, header),
     )
 
 
@@ -194,25 +197,25 @@ def _import_compressed(path: Path, out: Path) -> Path:
     config = checkpoint.stored_config(path)
     if config is None:
         raise DataError(f"{path}: holds no config.yaml; expected a file written by `neuprim compress`")
-    return _run_of(path, out, config, lambda draft: shutil.copyfile(path, draft / COMPRESSED))
+    return _run_of(path, out, config, lambda output: shutil.copyfile(path, output / COMPRESSED))
 
 
 def _run_of(path: Path, out: Path, config: str, write: Callable[[Path], object]) -> Path:
     """A run directory with this text of ``config.yaml`` and the model that ``write`` puts there."""
     out.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    output = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     try:
-        draft.chmod(0o755)
-        (draft / "config.yaml").write_text(config, encoding="utf-8", newline="")
+        output.chmod(0o755)
+        (output / "config.yaml").write_text(config, encoding="utf-8", newline="")
         try:
-            write(draft)
-            RunConfig.from_yaml(draft / "config.yaml")
-            load_run(draft, named=False)
+            write(output)
+            RunConfig.from_yaml(output / "config.yaml")
+            load_run(output, named=False)
         except (NeuprimError, ValueError, TypeError) as error:  # of a file that is not yet there under this name
-            raise DataError(f"{path}: {str(error).replace(str(draft), 'its model')}") from error
+            raise DataError(f"{path}: {str(error).replace(str(output), 'its model')}") from error
         if out.exists():
             out.rmdir()
-        draft.rename(out)
+        output.rename(out)
     finally:
-        shutil.rmtree(draft, ignore_errors=True)
+        shutil.rmtree(output, ignore_errors=True)
     return out

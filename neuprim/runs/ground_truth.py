@@ -13,7 +13,7 @@ from neuprim.config import RunConfig, scene_of, suspects_of, task_of
 from neuprim.config.launcher import LauncherSettings
 from neuprim.core.data.ground_truth import GroundTruth
 from neuprim.core.errors import DataError, NeuprimError
-from neuprim.core.io.store import WAITING
+from neuprim.core.io.store import WAIT_MESSAGE
 from neuprim.plugins.blame import blamed
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.launch.engine import Hear
@@ -194,7 +194,7 @@ class _Told:
         name = self._truth.frames[self._parts[number][0]]
         if status.state == "waiting":
             self._note(f"{name}: its worker died; what it had not finished is made again")
-        elif status.text.startswith(WAITING):
+        elif status.text.startswith(WAIT_MESSAGE):
             self._note(status.text)
         elif status.text.startswith("no sign"):
             self._note(f"{name}: no sign of its worker for a minute")

@@ -14,8 +14,8 @@ from torch import Tensor
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.extensions import Inspector
 from neuprim.core.io import images
-from neuprim.core.io.drafts import refuse_taken
-from neuprim.core.io.film import write_film
+from neuprim.core.io.animation import write_animation
+from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.fields import Conditions
 from neuprim.core.render.backends import computing_device
 from neuprim.core.volumes.errors import frame_errors
@@ -153,7 +153,7 @@ def _pictures(request: Request, film: _Film, window: Window, kind: str) -> list[
     if kind == ".png":
         return _each(request, film, lambda path, frame: images.write_png(path, drawn(frame)))
     request.out.parent.mkdir(parents=True, exist_ok=True)
-    write_film(request.out, [drawn(film.frame(i)) for i in range(len(film))], min(24.0, max(len(film) / 4.0, 4.0)))
+    write_animation(request.out, [drawn(film.frame(i)) for i in range(len(film))], min(24.0, max(len(film) / 4.0, 4.0)))
     return [request.out]
 
 
@@ -185,7 +185,7 @@ class _Film:
             pairs = pair(wanted, self.truth, bool(request.conditions))
         self.pairs = pairs
         for path in [] if request.out is None else _paths(request.out, len(pairs)):
-            refuse_taken(path, request.overwrite)
+            refuse_existing(path, request.overwrite)
         box = self.world.scene_box(request.box) if request.box is not None else self._box()
         if request.grid**3 > POINTS_LIMIT:
             raise ConfigError(f"--grid {request.grid}: expected at most {round(POINTS_LIMIT ** (1 / 3))}")

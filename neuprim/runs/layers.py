@@ -17,7 +17,7 @@ from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.exr import Plane, write_layers
+from neuprim.core.io.exr import ExrChannel, write_exr_layers
 from neuprim.core.io.images import srgb_to_linear
 from neuprim.core.layers import LIGHTS, LayerFrame, LayerSpec, chosen_layers
 from neuprim.core.model.fields import Conditions
@@ -139,7 +139,7 @@ class Layers:
             drawn(frame.drawn.alpha)
         alpha = frame.drawn.alpha.cpu()
         planes, summaries = self._planes(found, present, alpha, view)
-        write_layers(path, planes, {**self._attributes(model, view), **summaries})
+        write_exr_layers(path, planes, {**self._attributes(model, view), **summaries})
 
     def _drawn(self, spec: LayerSpec, frame: LayerFrame) -> Tensor | None:
         """(H, W, C) on the processor; float64 where several lights add up."""
@@ -151,9 +151,9 @@ class Layers:
 
     def _planes(
         self, found: Mapping[str, Tensor], specs: Mapping[str, LayerSpec], alpha: Tensor, view: View
-    ) -> tuple[dict[str, Plane], dict[str, str]]:
+    ) -> tuple[dict[str, ExrChannel], dict[str, str]]:
         """Channel -> values of the view's own size, and the attributes that say what each layer is."""
-        planes: dict[str, Plane] = {}
+        planes: dict[str, ExrChannel] = {}
         said: dict[str, str] = {}
         whole = self.point.upsample(alpha[..., None], view.camera)
         for name, image in found.items():
@@ -170,7 +170,7 @@ class Layers:
             names = self.channels.names if spec is None or not spec.channels else spec.channels
             prefix = "" if name in ("beauty", "alpha") else f"{name}."
             planes |= {
-                f"{prefix}{c}": Plane(image[..., i], self.half and (light or name == "alpha"))
+                f"{prefix}{c}": ExrChannel(image[..., i], self.half and (light or name == "alpha"))
                 for i, c in enumerate(names)
             }
             said[f"neuprim:layer:{name}"] = (

@@ -19,7 +19,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.files import remove_left
+from neuprim.core.io.files import remove_leftovers
 from neuprim.core.io.plain import load_json
 
 __all__ = ["FILE", "held"]
@@ -56,7 +56,7 @@ def held(directory: Path, what: str = "run") -> Iterator[None]:
                 json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "since": time.strftime("%F %T")}),
                 encoding="utf-8",
             )
-        remove_left(directory)
+        remove_leftovers(directory)
         yield
     finally:
         with suppress(OSError):

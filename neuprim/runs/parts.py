@@ -16,7 +16,7 @@ from torch import Tensor
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.errors import CheckpointError
-from neuprim.core.io.pieces import Kind, in_order
+from neuprim.core.io.safetensors_stream import TensorType, storage_order
 from neuprim.core.train.distributed import Alone
 from neuprim.core.train.distributed.refusals import refuse_parts
 from neuprim.core.train.restoring import by_row, by_row_name
@@ -59,7 +59,7 @@ def write_parts(
         CheckpointError: the file could not be written; names it and the reason.
     """
     ranks = trainer.ranks
-    kinds: dict[str, Kind] = {}
+    kinds: dict[str, TensorType] = {}
     for name, value in tensors.items():
         kinds[name] = value.dtype, ((trainer.count, *value.shape[1:]) if rows(name, value) else tuple(value.shape))
 
@@ -70,7 +70,7 @@ def write_parts(
     if ranks.first:
         checkpoint.write_in_pieces(path, kind, kinds, header, pieces)
         return
-    for name in in_order(kinds):
+    for name in storage_order(kinds):
         for _ in pieces(name):
             pass
 

@@ -13,7 +13,7 @@ from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
 from neuprim.core.errors import ConfigError, NeuprimError
-from neuprim.core.io.drafts import refuse_taken
+from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.runs.measure import quality
@@ -99,7 +99,7 @@ def compress_run(
     final = run_dir / COMPRESSED if out is None else out
     if final.is_dir():
         raise ConfigError(f"--out {final}: is a folder; expected the name of a file")
-    refuse_taken(final, overwrite)
+    refuse_existing(final, overwrite)
     config, task, model, header = load_run(run_dir)
     config = replace(config, output_dir=run_dir)
     table = bit_table(DEFAULT_LEVEL if level is None else level, bits, model.specs)

@@ -16,7 +16,7 @@ from neuprim.core.cameras.world import World
 from neuprim.core.channels import stored_channels
 from neuprim.core.data import Dataset
 from neuprim.core.errors import NeuprimError
-from neuprim.core.io.records import Record
+from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.open import LOGS, load_dataset, load_run
 from neuprim.runs.render_config import RenderConfig
@@ -76,7 +76,7 @@ def _fact(header: Mapping[str, Any], name: str, otherwise: torch.Tensor) -> torc
     facts = header.get("data")
     if not isinstance(facts, dict) or name not in facts:
         return otherwise
-    return Record(facts, "the model's header: data").array(name, (3,), "3 numbers")
+    return JsonReader(facts, "the model's header: data").array(name, (3,), "3 numbers")
 
 
 def view_run(

@@ -13,7 +13,7 @@ from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.addresses import picture_address
+from neuprim.core.io.images import webp_data_uri
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
@@ -36,7 +36,7 @@ def held_out(dataset: Dataset, channels: Channels, most: int) -> list[PageView]:
         view = dataset.test.view(index)
         if isinstance(view.camera, Camera):
             image = channels.display(dataset.test.pixels(index).over(dataset.background)).clamp(0.0, 1.0)
-            found.append(PageView(view.name, view.camera, view.conditions, picture_address(image, _WIDEST)))
+            found.append(PageView(view.name, view.camera, view.conditions, webp_data_uri(image, _WIDEST)))
             contrasts.append(float(image.std()))
     if found:  # a sequence may begin with nothing
         found.insert(0, found.pop(contrasts.index(max(contrasts))))
@@ -89,7 +89,7 @@ def scene_page(
     still = ""
     if views:
         image = draw(model, views[0].camera, views[0].conditions or start)
-        still = picture_address(channels.display(image).clamp(0.0, 1.0), _STILL)
+        still = webp_data_uri(channels.display(image).clamp(0.0, 1.0), _STILL)
     return web_page(
         name,
         model,

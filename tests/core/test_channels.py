@@ -15,7 +15,7 @@ from torch import Tensor
 from neuprim.core.channels import Channels, channels_of, stored_channels
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.io import images
-from neuprim.core.io.channel_names import default_names, names_fault
+from neuprim.core.io.exr import channel_name_error, default_channel_names, exr_channels, write_exr
 from neuprim.tasks.static import TASK
 from tests.core import tiny
 
@@ -38,7 +38,7 @@ def test_three_channels_without_a_display_are_shown_as_ever() -> None:
 
 
 def test_one_channel_is_grey() -> None:
-    grey = Channels(default_names(1), "linear")
+    grey = Channels(default_channel_names(1), "linear")
     assert torch.equal(grey.display(image(1)), images.linear_to_srgb(image(1).clamp_min(0.0)).expand(-1, -1, 3))
     assert grey.shown == "" and not grey.partial and not grey.plain
     assert Channels(("heat",)).shown == "heat as grey"
@@ -47,7 +47,7 @@ def test_one_channel_is_grey() -> None:
 @pytest.mark.parametrize(
     ("names", "shown", "indices"),
     [
-        (default_names(5), "c0, c1, c2 of 5 channels as red, green, blue", (0, 1, 2)),
+        (default_channel_names(5), "c0, c1, c2 of 5 channels as red, green, blue", (0, 1, 2)),
         (BANDS, "450nm, 550 nm, Ünïcode of 5 channels as red, green, blue", (0, 1, 2)),
         (("NIR", "B", "G", "R"), "R, G, B of 4 channels as red, green, blue", (3, 2, 1)),
         (("700nm", "550nm", "450nm"), "700nm, 550nm, 450nm as red, green, blue", (0, 1, 2)),
@@ -64,7 +64,7 @@ def test_without_a_display_it_is_said_what_is_shown(names: tuple[str, ...], show
 
 
 def test_many_names_are_listed_by_their_ends() -> None:
-    assert Channels(default_names(31)).listed == "c0, c1, c2, … c30 (31 channels)"
+    assert Channels(default_channel_names(31)).listed == "c0, c1, c2, … c30 (31 channels)"
 
 
 def test_the_tasks_own_display_is_what_is_shown() -> None:
@@ -132,7 +132,7 @@ def test_a_model_keeps_its_names_and_old_ones_get_some(tmp_path: Path) -> None:
     ],
 )
 def test_names_that_no_file_holds(names: list[Any], text: str) -> None:
-    assert text in (names_fault(names) or "")
+    assert text in (channel_name_error(names) or "")
 
 
 # ---------------------------------------------------------------- OpenEXR
@@ -140,15 +140,15 @@ def test_names_that_no_file_holds(names: list[Any], text: str) -> None:
 
 @pytest.mark.parametrize("half", [True, False])
 @pytest.mark.parametrize(
-    "names", [BANDS, ("R", "G", "B"), ("Y",), ("NIR", "B", "G", "R"), ("z" * 31, "ü" * 15), default_names(31)]
+    "names", [BANDS, ("R", "G", "B"), ("Y",), ("NIR", "B", "G", "R"), ("z" * 31, "ü" * 15), default_channel_names(31)]
 )
 def test_exr_gives_back_every_channel_by_its_name(tmp_path: Path, names: tuple[str, ...], half: bool) -> None:
     path, values = tmp_path / "a.exr", image(len(names))
-    images.write_exr(path, values, half=half, names=names)
+    write_exr(path, values, half=half, names=names)
     read = images.read_image(path, (6, 4), names)
     expected = values.half() if half else values
     assert read.dtype == expected.dtype and torch.equal(read, expected)
-    assert images.exr_channels(path) == tuple(sorted(names, key=str.encode))
+    assert exr_channels(path) == tuple(sorted(names, key=str.encode))
     assert images.image_info(path, names) == images.ImageInfo(6, 4, len(names), True)
     assert torch.equal(images.read_image(path, channels=names[-1:]), expected[..., -1:])
     with OpenEXR.File(str(path), separate_channels=True) as file:
@@ -156,8 +156,8 @@ def test_exr_gives_back_every_channel_by_its_name(tmp_path: Path, names: tuple[s
 
 
 def test_rgb_by_name_is_the_file_that_it_was(tmp_path: Path) -> None:
-    images.write_exr(tmp_path / "a.exr", image(3))
-    images.write_exr(tmp_path / "b.exr", image(3), names=("R", "G", "B"))
+    write_exr(tmp_path / "a.exr", image(3))
+    write_exr(tmp_path / "b.exr", image(3), names=("R", "G", "B"))
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
 
 
@@ -169,14 +169,14 @@ def test_exr_refusals_name_the_channels(tmp_path: Path) -> None:
             call()
         assert all(w in str(caught.value) for w in (str(path), *words)), caught.value
 
-    refuses(lambda: images.write_exr(path, image(5)), "(4, 6, 5); expected (H, W, 3) or (H, W, 4)")
+    refuses(lambda: write_exr(path, image(5)), "(4, 6, 5); expected (H, W, 3) or (H, W, 4)")
     refuses(
-        lambda: images.write_exr(path, image(4), names=BANDS),
+        lambda: write_exr(path, image(4), names=BANDS),
         "(4, 6, 4); expected (H, W, 5), for the channels 450nm, 550 nm",
     )
-    refuses(lambda: images.write_exr(path, image(2), names=("a", "a")), "names[1] is 'a' once more")
+    refuses(lambda: write_exr(path, image(2), names=("a", "a")), "names[1] is 'a' once more")
     assert not path.exists()
-    images.write_exr(path, image(5), names=BANDS)
+    write_exr(path, image(5), names=BANDS)
     refuses(
         lambda: images.read_image(path),
         "channels are 450nm, 550 nm, NIR, layer.R, Ünïcode; expected R, G, B and optionally A",
@@ -185,4 +185,4 @@ def test_exr_refusals_name_the_channels(tmp_path: Path) -> None:
     refuses(lambda: images.read_image(path, channels=()), "expected some to be asked for")
     images.write_png(path, torch.zeros(2, 2, 3))
     refuses(lambda: images.read_image(path, channels=("NIR",)), "not an OpenEXR file")
-    refuses(lambda: images.exr_channels(path), "not an OpenEXR file")
+    refuses(lambda: exr_channels(path), "not an OpenEXR file")

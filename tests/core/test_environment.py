@@ -13,7 +13,8 @@ from torch import Tensor
 
 from neuprim.core.environment import Environment, read_environment
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.images import linear_to_srgb, write_exr, write_png
+from neuprim.core.io.exr import write_exr
+from neuprim.core.io.images import linear_to_srgb, write_png
 
 
 def dark(height: int = 8) -> Tensor:

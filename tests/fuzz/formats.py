@@ -212,7 +212,7 @@ def _images(*suffixes: str) -> Callable[[Path], None]:
 
 
 def _exr(folder: Path) -> None:
-    from neuprim.core.io.images import write_exr
+    from neuprim.core.io.exr import write_exr
 
     write_exr(folder / "a.exr", torch.rand(6, 12, 4))
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from neuprim.cli import main
 from neuprim.core import checkpoint
-from neuprim.core.io.images import write_exr
+from neuprim.core.io.exr import write_exr
 from tests.plugins.fakes import install, site
 
 __all__ = ["site"]

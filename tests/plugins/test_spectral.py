@@ -25,6 +25,7 @@ from neuprim.core import checkpoint
 from neuprim.core.channels import stored_channels
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimError
 from neuprim.core.io import images
+from neuprim.core.io.exr import exr_channels
 from neuprim.core.model.colours import sh
 from neuprim.core.render import render
 from neuprim.export import appearance, mesh
@@ -209,8 +210,8 @@ def test_whole_models_keep_every_channel(trained: Path, tmp_path: Path) -> None:
         back = import_run(export_run(trained, name, tmp_path / f"m.{name}").files[0], tmp_path / name)
         (exr,) = render_run(back, "orbit", None, "exr", tmp_path / f"{name}_out", 1, {})
         (own,) = render_run(trained, "orbit", None, "exr", tmp_path / "own", 1, {})
-        every = images.exr_channels(own)
-        assert images.exr_channels(exr) == every and len(every) == 8
+        every = exr_channels(own)
+        assert exr_channels(exr) == every and len(every) == 8
         assert torch.equal(images.read_image(exr, channels=every), images.read_image(own, channels=every))
 
 

@@ -23,7 +23,8 @@ from neuprim.conformance import ConformanceError, named_checks
 from neuprim.core.cameras import Camera, orbit
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import Exporter
-from neuprim.core.io.images import write_exr, write_png
+from neuprim.core.io.exr import write_exr
+from neuprim.core.io.images import write_png
 from neuprim.plugins.members import fault
 from neuprim.plugins.registry import TASKS, list_tasks, load_task
 from neuprim.runs.open import load_run, read_metrics

@@ -152,14 +152,14 @@ def test_two_makers_at_once_and_a_job_that_is_done_twice(files: Path, tmp_path: 
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_made(
     files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    genuine = capture.images.write_exr
+    genuine = capture.write_exr
 
     def write(path: Path, *args: Any, **more: Any) -> None:
         if "frame_00003" in str(path) and path.name == "cam_02.exr":
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         genuine(path, *args, **more)
 
-    monkeypatch.setattr(capture.images, "write_exr", write)
+    monkeypatch.setattr(capture, "write_exr", write)
     with pytest.raises(DataError) as caught:
         made(config(files, tmp_path, "scene.frames='1:4'"))
     place = next((tmp_path / "cache" / "volumes").iterdir())
@@ -180,9 +180,9 @@ def test_a_shared_folder_that_vanishes(
     back: bool,
 ) -> None:
     """Renamed away in the middle of a frame, and back or not."""
-    monkeypatch.setattr(stores, "EVERY", 0.05)
-    monkeypatch.setattr(stores, "PATIENCE", 30.0 if back else 0.5)
-    cache, away, genuine = tmp_path / "cache", tmp_path / "away", capture.images.write_exr
+    monkeypatch.setattr(stores, "POLL_INTERVAL", 0.05)
+    monkeypatch.setattr(stores, "MAX_WAIT", 30.0 if back else 0.5)
+    cache, away, genuine = tmp_path / "cache", tmp_path / "away", capture.write_exr
     gone: list[threading.Timer] = []
 
     def write(path: Path, *args: Any, **more: Any) -> None:
@@ -193,7 +193,7 @@ def test_a_shared_folder_that_vanishes(
                 gone[0].start()
         genuine(path, *args, **more)
 
-    monkeypatch.setattr(capture.images, "write_exr", write)
+    monkeypatch.setattr(capture, "write_exr", write)
     heard: list[Event] = []
     if back:
         made(config(files, tmp_path), heard=heard)

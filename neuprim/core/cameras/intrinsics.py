@@ -22,7 +22,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
 from neuprim.core.errors import DataError
-from neuprim.core.io.records import Record
+from neuprim.core.io.json_reader import JsonReader
 
 __all__ = [
     "COEFFICIENTS",
@@ -76,7 +76,7 @@ class Target:
 class _Level:
     """The fields of a frame, or of its file, and the size in pixels that lengths among them belong to."""
 
-    record: Record
+    record: JsonReader
     size: tuple[int, int]
 
     def has(self, group: tuple[str, ...]) -> bool:
@@ -100,13 +100,13 @@ def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(size[0] * scale - other[0]) <= 1.0 and abs(size[1] * scale - other[1]) <= 1.0
 
 
-def _owner(group: tuple[str, ...], frame: Record, file: Record) -> Record:
+def _owner(group: tuple[str, ...], frame: JsonReader, file: JsonReader) -> JsonReader:
     """The record that a group of keys is taken from whole."""
     return frame if any(frame.has(key) for key in group) else file
 
 
 def camera_of(
-    frame: Record, file: Record, target: Target, viewmat: Tensor | None = None, say: Say = lambda text: None
+    frame: JsonReader, file: JsonReader, target: Target, viewmat: Tensor | None = None, say: Say = lambda text: None
 ) -> Camera:
     """The pinhole of a frame.
 
@@ -138,7 +138,7 @@ def camera_of(
     return Camera(viewmat, fx, fy, cx, cy, target.width, target.height)
 
 
-def _size(record: Record, default: tuple[int, int]) -> tuple[int, int]:
+def _size(record: JsonReader, default: tuple[int, int]) -> tuple[int, int]:
     """The size that a record states."""
     return record.count("w") if record.has("w") else default[0], record.count("h") if record.has("h") else default[1]
 
@@ -146,7 +146,7 @@ def _size(record: Record, default: tuple[int, int]) -> tuple[int, int]:
 # ---------------------------------------------------------------- focal lengths
 
 
-def _focal(frame: Record, level: _Level, target: Target, say: Say) -> tuple[float, float]:
+def _focal(frame: JsonReader, level: _Level, target: Target, say: Say) -> tuple[float, float]:
     """fx, fy in pixels of the target."""
     x, y = _stated(level, 0, target), _stated(level, 1, target)
     if not x and not y:
@@ -206,7 +206,7 @@ def _stated(level: _Level, axis: int, target: Target) -> dict[str, float]:
     return found
 
 
-def _intrinsics(record: Record) -> list[float]:
+def _intrinsics(record: JsonReader) -> list[float]:
     """[cx, cy, fx, fy] of ``camera_intrinsics``, pixels."""
     values: list[float] = record.array("camera_intrinsics", (4,), "[cx, cy, fx, fy] in pixels").tolist()
     if not (values[2] > 0 and values[3] > 0):
@@ -299,13 +299,13 @@ def _check_one_lens(frame: _Level, file: _Level, target: Target) -> None:
         raise DataError(f"{frame.record.where}: {found}; expected {', '.join(left)} in the frame, too")
 
 
-def lens_of(frame: Record, file: Record) -> dict[str, float]:
+def lens_of(frame: JsonReader, file: JsonReader) -> dict[str, float]:
     """The coefficients of the lens distortion by name, 0 where none is stated."""
     record = _owner(COEFFICIENTS, frame, file)
     return {key: record.number_or(key, 0.0) for key in COEFFICIENTS}
 
 
-def is_fisheye(frame: Record, file: Record, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
+def is_fisheye(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
     """Whether the lens is OpenCV's fisheye.
 
     Args:

@@ -13,7 +13,7 @@ from neuprim.core.cameras.keys import check_keys
 from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
 from neuprim.core.cameras.views import LARGEST, MOST, RATES, CameraViews
 from neuprim.core.errors import DataError
-from neuprim.core.io.records import Record, read_json
+from neuprim.core.io.json_reader import JsonReader
 
 __all__ = ["read_json_cameras"]
 
@@ -29,7 +29,7 @@ def read_json_cameras(path: Path, size: tuple[int, int] | None = None) -> Camera
     Raises:
         DataError: names the file, the frame and the field that is missing or wrong.
     """
-    document = read_json(path, _MAX_BYTES)
+    document = JsonReader.open(path, _MAX_BYTES)
     if document.has("camera_path"):
         return _camera_path(document, size)
     if not document.has("frames"):
@@ -37,14 +37,14 @@ def read_json_cameras(path: Path, size: tuple[int, int] | None = None) -> Camera
     return _frames(document, size)
 
 
-def _checked(document: Record, key: str) -> list[Record]:
+def _checked(document: JsonReader, key: str) -> list[JsonReader]:
     records = list(document.objects(key))
     if len(records) > MOST:
         raise DataError(f"{document.where}: {key} has {len(records)} cameras; expected at most {MOST}")
     return records
 
 
-def _size(record: Record, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
+def _size(record: JsonReader, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
     found = [
         record.count(key) if record.has(key) or size is None else fallback
         for key, fallback in zip(keys, size or (0, 0), strict=True)
@@ -55,12 +55,12 @@ def _size(record: Record, keys: tuple[str, str], size: tuple[int, int] | None) -
     return found[0], found[1]
 
 
-def _times(records: list[Record], key: str) -> tuple[float, ...] | None:
+def _times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
     """The times of all cameras, where all have one."""
     return tuple(r.number(key, "a time") for r in records) if all(r.has(key) for r in records) else None
 
 
-def _rate(document: Record, count: int) -> float | None:
+def _rate(document: JsonReader, count: int) -> float | None:
     """``fps``, else the ``count`` of frames over ``seconds``; None where the file says neither."""
     for key, rate in (("fps", lambda value: value), ("seconds", lambda value: count / value)):
         if document.has(key):
@@ -74,7 +74,7 @@ def _rate(document: Record, count: int) -> float | None:
 # ---------------------------------------------------------------- frames
 
 
-def _frames(document: Record, size: tuple[int, int] | None) -> CameraViews:
+def _frames(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
     """``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``; a frame may override
     every intrinsic."""
     records, found, bent = _checked(document, "frames"), [], 0
@@ -87,7 +87,7 @@ def _frames(document: Record, size: tuple[int, int] | None) -> CameraViews:
                 f"{record.where}: the camera is a fisheye (camera_model, is_fisheye); expected one of {', '.join(MODELS)}"
             )
         bent += any(lens_of(record, document).values())
-        stated = Record(
+        stated = JsonReader(
             {key: r.values[key] for r in (document, record) for key in ("w", "h") if r.has(key)}, record.where
         )
         target = Target(*_size(stated, ("w", "h"), size))
@@ -103,7 +103,7 @@ def _frames(document: Record, size: tuple[int, int] | None) -> CameraViews:
 # ---------------------------------------------------------------- nerfstudio's viewer
 
 
-def _camera_path(document: Record, size: tuple[int, int] | None) -> CameraViews:
+def _camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
     """``{"render_width", "render_height", "fps", "seconds", "camera_path": [{"camera_to_world": 16 numbers, "fov":
     degrees}]}``: ``fov`` is vertical, the middle of the image is the principal point, and axes are OpenGL's.
     """
@@ -123,12 +123,12 @@ def _camera_path(document: Record, size: tuple[int, int] | None) -> CameraViews:
     return CameraViews(tuple(found), _times(records, "render_time"), _rate(document, len(found)), (note,))
 
 
-def _flat_matrix(record: Record, key: str) -> Tensor:
+def _flat_matrix(record: JsonReader, key: str) -> Tensor:
     """(4, 4) of 16 numbers row by row, or of rows."""
     value = record.values.get(key)
     if isinstance(value, list) and len(value) == 16:
         rows = [value[i : i + 4] for i in (0, 4, 8, 12)]
-        return Record({key: rows}, record.where).matrix(key)
+        return JsonReader({key: rows}, record.where).matrix(key)
     if not isinstance(value, list) or len(value) not in (3, 4):
         raise record.fail(key, "16 numbers, row by row")
     return record.matrix(key)

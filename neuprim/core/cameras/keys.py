@@ -12,7 +12,7 @@ from typing import Any
 
 from neuprim.core.cameras.intrinsics import COEFFICIENTS, FOCAL, MIDDLE, MODELS, SIZE
 from neuprim.core.errors import DataError
-from neuprim.core.io.records import Record
+from neuprim.core.io.json_reader import JsonReader
 
 __all__ = ["READ", "check_keys", "unknown_keys"]
 
@@ -76,7 +76,7 @@ _ELSEWHERE = {"time": "task=dynamic scene=multiview reads it", "pl_pos": "task=r
 _LISTED = 8
 
 
-def check_keys(record: Record) -> None:
+def check_keys(record: JsonReader) -> None:
     """Refuse a record with a key that changes the picture and that nothing here honours.
 
     Raises:
@@ -105,7 +105,7 @@ def _says(value: Any) -> bool:
     return bool(value)
 
 
-def unknown_keys(file: Record, frames: Iterable[Record], read: Iterable[str]) -> str:
+def unknown_keys(file: JsonReader, frames: Iterable[JsonReader], read: Iterable[str]) -> str:
     """A line that names the keys that neither are read nor known to be harmless; "" for none."""
     known = READ | _HARMLESS | _REFUSED.keys() | {*_KINDS, *read}
     found = dict.fromkeys(k for k in file.values if k not in known)

@@ -21,7 +21,7 @@ from neuprim.core.cameras import usd_stage
 from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
 from neuprim.core.cameras.views import LARGEST, MOST, RATES, CameraViews
 from neuprim.core.errors import BackendUnavailable, DataError
-from neuprim.core.io.records import Record
+from neuprim.core.io.json_reader import JsonReader
 
 __all__ = ["is_usd", "read_usd_cameras"]
 
@@ -62,7 +62,7 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
     wanted = size or _resolution(stage, path)
     records = list(stage.objects("frames"))
     cameras = [
-        _camera(Record(r.values, where if len(records) == 1 else f"{where}, frame {i}"), wanted)
+        _camera(JsonReader(r.values, where if len(records) == 1 else f"{where}, frame {i}"), wanted)
         for i, r in enumerate(records)
     ]
     note = f"{stage.text('up')} is up and a unit is {stage.number('meters', 'metres per unit', 0.0):g} m in this file; taken as the axes and units of the run's data"
@@ -72,7 +72,7 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
     return CameraViews(tuple((f"camera_{i:03d}", camera) for i, camera in enumerate(cameras)), None, fps, (note,))
 
 
-def _stage(path: Path, prim: str) -> Record:
+def _stage(path: Path, prim: str) -> JsonReader:
     """What the process printed."""
     if path.stat().st_size > _MAX_BYTES:
         raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {_MAX_BYTES}")
@@ -90,12 +90,12 @@ def _stage(path: Path, prim: str) -> Record:
         said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
         raise DataError(f"{path}: {said[:300]}")
     try:
-        return Record(json.loads(done.stdout.strip().splitlines()[-1]), str(path))
+        return JsonReader(json.loads(done.stdout.strip().splitlines()[-1]), str(path))
     except (ValueError, IndexError) as error:
         raise DataError(f"{path}: not a readable USD file ({error})") from None
 
 
-def _resolution(stage: Record, path: Path) -> tuple[int, int]:
+def _resolution(stage: JsonReader, path: Path) -> tuple[int, int]:
     if not stage.has("resolution"):
         raise DataError(f"{path}: names no size of an image (renderSettingsPrimPath); give --size WxH")
     width, height = (int(x) for x in stage.array("resolution", (2,), "width and height").tolist())
@@ -104,7 +104,7 @@ def _resolution(stage: Record, path: Path) -> tuple[int, int]:
     return width, height
 
 
-def _camera(record: Record, size: tuple[int, int]) -> Camera:
+def _camera(record: JsonReader, size: tuple[int, int]) -> Camera:
     if record.text("projection") != "perspective":
         raise record.fail("projection", "perspective; others are not drawn")
     focal = record.number("focal", "a focal length above 0", 0.0)

@@ -26,7 +26,7 @@ from neuprim.core.data.settings import FolderSettings
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import image_info
-from neuprim.core.io.records import Record
+from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.notices import warn_once
 
 __all__ = ["Layout", "read_frames", "read_splits", "split_frames"]
@@ -34,7 +34,7 @@ __all__ = ["Layout", "read_frames", "read_splits", "split_frames"]
 _POSES = ("transform_matrix", "R_opt", "T_opt")
 
 
-def _viewmat(record: Record) -> Tensor:
+def _viewmat(record: JsonReader) -> Tensor:
     return opengl_to_viewmat(record.matrix("transform_matrix"))
 
 
@@ -51,20 +51,22 @@ class Layout:
     """
 
     keys: tuple[str, ...] = ()
-    name: Callable[[Record], str] = lambda record: record.text("file_path")
-    image: Callable[[Path, Record], Path | None] = lambda folder, record: find_image(folder, record.text("file_path"))
-    viewmat: Callable[[Record], Tensor] = _viewmat
+    name: Callable[[JsonReader], str] = lambda record: record.text("file_path")
+    image: Callable[[Path, JsonReader], Path | None] = lambda folder, record: find_image(
+        folder, record.text("file_path")
+    )
+    viewmat: Callable[[JsonReader], Tensor] = _viewmat
     masks: bool = False
 
 
 def read_frames(
     folder: Path,
-    document: Record,
-    records: list[Record],
+    document: JsonReader,
+    records: list[JsonReader],
     settings: FolderSettings,
     layout: Layout,
     skip_missing: bool = False,
-) -> tuple[list[Record], list[ImageFrame]]:
+) -> tuple[list[JsonReader], list[ImageFrame]]:
     """The frames whose images exist and are good, and their records, both in the order of ``records``; names are unique
     among them.
 
@@ -89,7 +91,7 @@ def read_frames(
         raise missing_files(document.where, absent, "" if skip_missing else _skip_hint(settings))
     present = [(r, f, n) for r, f, n in zip(records, files, names, strict=True) if f is not None]
     masks = _masks(folder, document, [(r, f) for r, f, _ in present], layout)
-    kept: list[Record] = []
+    kept: list[JsonReader] = []
     frames: list[ImageFrame] = []
     bad = BadViews(document.where, settings.strict)
     for (record, file, _), mask, name in zip(
@@ -126,13 +128,13 @@ def _skip_hint(settings: FolderSettings) -> str:
     return "; scene.skip_missing=true leaves such frames out" if hasattr(settings, "skip_missing") else ""
 
 
-def _pose(record: Record, layout: Layout) -> Tensor:
+def _pose(record: JsonReader, layout: Layout) -> Tensor:
     viewmat = layout.viewmat(record)
     check_viewmat(viewmat, record.where)
     return viewmat
 
 
-def _damaged(record: Record) -> bool:
+def _damaged(record: JsonReader) -> bool:
     """Whether a pose has numbers that are not finite, or only zeros."""
     poses = [_numbers(record.values.get(key)) for key in _POSES]
     return any(not all(map(math.isfinite, numbers)) for numbers in poses) or bool(poses[0] and not any(poses[0]))
@@ -147,7 +149,9 @@ def _numbers(value: object) -> list[float]:
     return [value] if isinstance(value, float) else []
 
 
-def _masks(folder: Path, document: Record, present: Sequence[tuple[Record, Path]], layout: Layout) -> list[Mask | None]:
+def _masks(
+    folder: Path, document: JsonReader, present: Sequence[tuple[JsonReader, Path]], layout: Layout
+) -> list[Mask | None]:
     """The mask of every frame: what ``mask_path`` names, in the frame or in the file, else what lies beside the
     images."""
     if layout.masks and not any(r.has("mask_path") for r in (document, *(r for r, _ in present))):
@@ -164,7 +168,7 @@ def _masks(folder: Path, document: Record, present: Sequence[tuple[Record, Path]
     return masks
 
 
-def _distortion(record: Record, document: Record, fisheye: bool) -> Distortion | None:
+def _distortion(record: JsonReader, document: JsonReader, fisheye: bool) -> Distortion | None:
     """The lens; None where all of its coefficients are zero."""
     lens = lens_of(record, document)
     k, p = [lens[f"k{i}"] for i in (1, 2, 3, 4)], [lens["p1"], lens["p2"]]
@@ -206,7 +210,7 @@ def read_splits(
 
 
 def split_frames(
-    document: Record, records: Sequence[Record], frames: Sequence[ImageFrame], every: int
+    document: JsonReader, records: Sequence[JsonReader], frames: Sequence[ImageFrame], every: int
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
     """(training, test) by ``train_filenames``, ``val_filenames`` and ``test_filenames``; without any every n-th is a
     test view.

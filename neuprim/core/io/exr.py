@@ -1,52 +1,238 @@
-"""OpenEXR files out: one image, or several layers of one, always linear light, whole or not at all, compressed without
-loss (ZIP).
+"""Read and write OpenEXR files: linear light, any named channels, atomic writes, lossless ZIP compression.
 
-Channels follow the format's own convention: those without a prefix are the image that every reader shows (R, G, B and
-premultiplied A), and a layer is a prefix and a dot, ``depth.Z`` (OpenEXR, "Technical Introduction": channel names and
-layers), as Nuke and Blender read them.
+Channels without a prefix are the image that every reader shows (R, G, B and premultiplied A). A prefix and a dot name a
+layer, e.g. ``depth.Z``, as Nuke and Blender read it (OpenEXR, "Technical Introduction": channel names and layers).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenEXR
+import torch
 from torch import Tensor
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.channel_names import names_fault
-from neuprim.core.io.files import writing
+from neuprim.core.io.files import checked_atomic_path
 
-__all__ = ["Plane", "check_finite", "write_exr", "write_layers"]
+__all__ = [
+    "MAX_PIXELS",
+    "ExrChannel",
+    "channel_name_error",
+    "check_pixel_count",
+    "default_channel_names",
+    "exr_channels",
+    "is_exr",
+    "read_exr",
+    "read_exr_layout",
+    "refuse_out_of_memory",
+    "write_exr",
+    "write_exr_layers",
+]
 
-_LARGEST = 65504.0  # of a 16-bit float
+MAX_PIXELS = 64 * 2**20
+"""Most pixels of an image: 67,108,864 (8192 x 8192). Larger images are refused before pixel memory is allocated."""
+
+_MAX_VALUES = 16 * MAX_PIXELS  # of all channels of a file, as all are decoded together
+_MAX_HALF = 65504.0
+_MAX_NAME_BYTES = 31  # that every reader of OpenEXR takes
+_MAGIC = b"\x76\x2f\x31\x01"
 
 
-@dataclass(frozen=True)
-class Plane:
-    """One channel of a file.
+def check_pixel_count(path: Path, width: int, height: int) -> None:
+    """Raise DataError unless a header's size is positive and at most :data:`MAX_PIXELS`."""
+    if width <= 0 or height <= 0:
+        raise DataError(f"{path}: header claims {width}x{height} pixels; expected a positive size")
+    if width * height > MAX_PIXELS:
+        raise DataError(f"{path}: header claims {width}x{height} pixels; at most {MAX_PIXELS} are accepted")
 
-    Attributes:
-        values: (H, W) finite numbers.
-        half: stored as 16-bit instead of 32-bit floats.
+
+@contextmanager
+def refuse_out_of_memory(path: Path) -> Iterator[None]:
+    """Turn MemoryError into a DataError that names the image; damaged files also claim more than they hold."""
+    try:
+        yield
+    except MemoryError:
+        raise DataError(
+            f"{path}: reading the image takes more memory than there is; is it damaged, or too large?"
+        ) from None
+
+
+# ---------------------------------------------------------------- names of channels
+
+
+def default_channel_names(count: int) -> tuple[str, ...]:
+    """R, G, B for three channels, Y for one, else c0, c1, ..."""
+    return {1: ("Y",), 3: ("R", "G", "B")}.get(count, tuple(f"c{i}" for i in range(count)))
+
+
+def channel_name_error(names: Sequence[Any]) -> str | None:
+    """``"PROBLEM; expected ..."`` for the first name that an OpenEXR file cannot hold or that is ambiguous, else None.
+
+    "A" is reserved for alpha. Any other printable text of at most 31 bytes is allowed, e.g. ``450 nm``.
     """
+    used: set[str] = set()
+    for i, name in enumerate(names):
+        if not isinstance(name, str):
+            return f"[{i}] is of type {type(name).__name__}; expected text"
+        if not name.strip() or name != name.strip() or not name.isprintable() or len(name.encode()) > _MAX_NAME_BYTES:
+            return (
+                f"[{i}] is {name[:60]!r}; "
+                f"expected 1 to {_MAX_NAME_BYTES} bytes of printable text without blanks around it"
+            )
+        if name == "A":
+            return f"[{i}] is 'A'; expected another name, as A is alpha in OpenEXR files"
+        if name in used:
+            return f"[{i}] is {name!r} once more; expected different names"
+        used.add(name)
+    return None
 
-    values: Tensor
-    half: bool = False
+
+# ---------------------------------------------------------------- reading
 
 
-def check_finite(path: Path, pixels: np.ndarray) -> None:
-    """Raise :class:`DataError` that names the first NaN or infinite value of (H, W, C) pixels."""
+def is_exr(path: Path, required: bool = False) -> bool:
+    """Whether a file starts as OpenEXR; with ``required`` any other format raises.
+
+    Raises:
+        DataError: missing, empty or unreadable file.
+    """
+    try:
+        with open(path, "rb") as file:
+            head = file.read(8)
+    except FileNotFoundError:
+        raise DataError(f"{path}: file not found; expected an image") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error}); expected an image") from None
+    if not head:
+        raise DataError(f"{path}: file is empty; expected an image")
+    if required and head[:4] != _MAGIC:
+        raise DataError(f"{path}: not an OpenEXR file; expected one, as channels have names in no other")
+    return head[:4] == _MAGIC
+
+
+def exr_channels(path: Path) -> tuple[str, ...]:
+    """Names of all channels of an OpenEXR file, in the file's alphabetical order.
+
+    Raises:
+        DataError: missing, empty, damaged, another format, or larger than :data:`MAX_PIXELS`.
+    """
+    is_exr(path, required=True)
+    return tuple(_read_header(path)[0])
+
+
+def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[list[str], int, int]:
+    """From the header: names of the wanted channels, or of R, G, B(, A) of the only layer that has them; width; height.
+
+    Raises:
+        DataError: damaged, too large, or without these channels.
+    """
+    channels, width, height = _read_header(path)
+    names, expected = list(wanted or ()), ", ".join(wanted or ())
+    if wanted is None:
+        prefixes = [n[:-1] for n in channels if n.endswith("R") and {n[:-1] + "G", n[:-1] + "B"} <= channels.keys()]
+        prefixes = [""] if "" in prefixes else prefixes
+        names = [prefixes[0] + c for c in "RGBA" if prefixes[0] + c in channels] if len(prefixes) == 1 else []
+        expected = "R, G, B and optionally A, of one layer"
+    if not names or not set(names) <= channels.keys():
+        raise DataError(
+            f"{path}: OpenEXR channels are {', '.join(channels) or 'none'}; "
+            f"expected {expected or 'some to be asked for'}"
+        )
+    if any(channels[n].xSampling != 1 or channels[n].ySampling != 1 for n in names):
+        raise DataError(f"{path}: OpenEXR colour channels are subsampled; expected one value per pixel")
+    return names, width, height
+
+
+def _read_header(path: Path) -> tuple[dict[str, Any], int, int]:
+    """Channels by name, width and height."""
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            parts = len(file.parts)
+            header = dict(file.parts[0].header)  # the file's own is emptied when it closes
+            low, high, full_low, full_high = (
+                [int(v) for v in corner] for window in ("dataWindow", "displayWindow") for corner in header[window]
+            )
+            channels = {c.name: c for c in header["channels"]}
+            flat = header.get("type", OpenEXR.scanlineimage) in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
+    except Exception as error:  # also KeyError and UnicodeDecodeError, from damaged attributes
+        raise DataError(f"{path}: OpenEXR header is truncated or corrupt ({type(error).__name__}: {error})") from None
+    if parts != 1 or not flat:
+        raise DataError(
+            f"{path}: OpenEXR file has {parts} parts of type {header.get('type')}; "
+            "expected 1 part of flat scan lines or tiles"
+        )
+    if (low, high) != (full_low, full_high):
+        raise DataError(
+            f"{path}: OpenEXR data window {low}..{high} is not its display window {full_low}..{full_high}; "
+            "expected equal windows"
+        )
+    width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
+    check_pixel_count(path, width, height)
+    if width * height * len(channels) > _MAX_VALUES:
+        raise DataError(
+            f"{path}: header claims {len(channels)} channels of {width}x{height} pixels; "
+            f"at most {_MAX_VALUES} values are accepted"
+        )
+    return channels, width, height
+
+
+def read_exr(path: Path, names: Sequence[str], width: int, height: int) -> Tensor:
+    """(H, W, C) float16 or float32 values of the named channels, as stored.
+
+    Raises:
+        DataError: truncated or corrupt data, another size or type than in the header, NaN or infinite values.
+    """
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            planes = [np.array(file.channels()[name].pixels) for name in names]
+    except MemoryError:
+        raise
+    except Exception as error:
+        raise DataError(
+            f"{path}: OpenEXR data is truncated or corrupt ({error}); expected a complete {width}x{height} image"
+        ) from None
+    if any(p.dtype not in (np.float16, np.float32) for p in planes):
+        kinds = ", ".join(str(p.dtype) for p in planes)
+        raise DataError(f"{path}: OpenEXR colour channels are {kinds}; expected half or float")
+    if any(p.shape != (height, width) for p in planes):
+        actual = f"{planes[0].shape[1]}x{planes[0].shape[0]}"
+        raise DataError(f"{path}: OpenEXR data is {actual}; expected {width}x{height} as in its header")
+    pixels = np.stack(planes, axis=-1)
+    _check_finite(path, pixels)
+    return torch.from_numpy(pixels)
+
+
+def _check_finite(path: Path, pixels: np.ndarray) -> None:
+    """Raise DataError that names the first NaN or infinite value of (H, W, C) pixels."""
     bad = ~np.isfinite(pixels)
     if bad.any():
         row, column, channel = (int(i[0]) for i in np.nonzero(bad))
         raise DataError(
-            f"{path}: value {pixels[row, column, channel]} at row {row}, column {column}, channel {channel}; expected finite numbers"
+            f"{path}: value {pixels[row, column, channel]} at row {row}, column {column}, channel {channel}; "
+            "expected finite numbers"
         )
+
+
+# ---------------------------------------------------------------- writing
+
+
+@dataclass(frozen=True)
+class ExrChannel:
+    """One channel to write.
+
+    Attributes:
+        values: (H, W) finite numbers.
+        half: store 16-bit instead of 32-bit floats.
+    """
+
+    values: Tensor
+    half: bool = False
 
 
 def write_exr(
@@ -56,80 +242,80 @@ def write_exr(
     extra: Mapping[str, Tensor] | None = None,
     names: Sequence[str] | None = None,
 ) -> None:
-    """Write (H, W, 3 or 4) *linear* values, alpha premultiplied, or channels of other names as OpenEXR without
-    clamping; atomic.
+    """Write (H, W, 3 or 4) *linear* values with premultiplied alpha, or (H, W, C) named channels, without clamping.
 
     Args:
         half: store colour as 16-bit instead of 32-bit floats.
         extra: further channels by name, each (H, W), stored as 32-bit floats, e.g. ``{"Z": depth}``.
-        names: of the channels C of an (H, W, C) image that is not R, G, B(, A).
+        names: channel names of an image that is not R, G, B(, A).
 
     Raises:
         DataError: wrong shapes or names, colour values that are not finite or (with ``half``) beyond 65504, or the file
-        cannot be written.
+            cannot be written.
     """
-    wrong = None if names is None else names_fault(names)
-    if wrong:
-        raise DataError(f"{path}: names{wrong}")
-    if (
-        image.ndim != 3
-        or 0 in image.shape
-        or (image.shape[-1] not in (3, 4) if names is None else image.shape[-1] != len(names))
-    ):
-        expected = (
-            "(H, W, 3) or (H, W, 4)" if names is None else f"(H, W, {len(names)}), for the channels {', '.join(names)}"
-        )
+    error = None if names is None else channel_name_error(names)
+    if error:
+        raise DataError(f"{path}: names{error}")
+    counts = (3, 4) if names is None else (len(names),)
+    if image.ndim != 3 or 0 in image.shape or image.shape[-1] not in counts:
+        expected = "(H, W, 3) or (H, W, 4)"
+        if names is not None:
+            expected = f"(H, W, {len(names)}), for the channels {', '.join(names)}"
         raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected {expected}")
-    check_finite(path, image.detach().cpu().float().numpy())
-    channels = {c: _stored(path, c, image[..., i], half) for i, c in enumerate(names or "RGBA"[: image.shape[-1]])}
+    _check_finite(path, image.detach().cpu().float().numpy())
+    names = names or "RGBA"[: image.shape[-1]]
+    channels = {name: _stored_values(path, name, image[..., i], half) for i, name in enumerate(names)}
     for name, plane in (extra or {}).items():
         if tuple(plane.shape) != tuple(image.shape[:2]) or name in channels:
             raise DataError(
-                f"{path}: channel {name!r} has shape {tuple(plane.shape)}; expected {tuple(image.shape[:2])} and a name of its own"
+                f"{path}: channel {name!r} has shape {tuple(plane.shape)}; "
+                f"expected {tuple(image.shape[:2])} and a name of its own"
             )
-        channels[name] = _stored(path, name, plane, False)
-    _write(path, channels, {})
+        channels[name] = _stored_values(path, name, plane, False)
+    _write_file(path, channels, {})
 
 
-def write_layers(path: Path, planes: Mapping[str, Plane], attributes: Mapping[str, Any] | None = None) -> None:
+def write_exr_layers(
+    path: Path, channels: Mapping[str, ExrChannel], attributes: Mapping[str, Any] | None = None
+) -> None:
     """Write an image of several layers as one OpenEXR file; atomic.
 
     Args:
-        planes: channel name, with its layer's prefix, -> (H, W) values, all of one size.
-        attributes: of the file's header: texts, numbers, float32 arrays of 2, 3 or 4 x 4 numbers, lists of floats.
+        channels: by name with the layer's prefix, all of one size.
+        attributes: of the file's header: text, numbers, float32 arrays of 2, 3 or 4 x 4 numbers, lists of floats.
 
     Raises:
         DataError: no channels, different sizes, values that are not finite or (where half) beyond 65504, or the file
-        cannot be written.
+            cannot be written.
     """
-    shapes = sorted({tuple(plane.values.shape) for plane in planes.values()})
+    shapes = sorted({tuple(channel.values.shape) for channel in channels.values()})
     if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:
         raise DataError(f"{path}: channels to write have shapes {shapes}; expected one (H, W)")
-    for name, plane in planes.items():
-        bad = (~plane.values.isfinite()).nonzero()
+    for name, channel in channels.items():
+        bad = (~channel.values.isfinite()).nonzero()
         if len(bad):
             y, x = bad[0].tolist()
             raise DataError(
-                f"{path}: channel {name}: value {float(plane.values[y, x])} at row {y}, column {x}; expected finite numbers"
+                f"{path}: channel {name}: value {float(channel.values[y, x])} at row {y}, column {x}; "
+                "expected finite numbers"
             )
-    _write(
-        path, {name: _stored(path, name, plane.values, plane.half) for name, plane in planes.items()}, attributes or {}
-    )
+    stored = {name: _stored_values(path, name, c.values, c.half) for name, c in channels.items()}
+    _write_file(path, stored, attributes or {})
 
 
-def _stored(path: Path, name: str, plane: Tensor, half: bool) -> np.ndarray:
+def _stored_values(path: Path, name: str, plane: Tensor, half: bool) -> np.ndarray:
     values = plane.detach().cpu().float().numpy()
-    if half and np.abs(values).max() > _LARGEST:
-        largest = f"{np.abs(values).max():.6g}"
+    if half and np.abs(values).max() > _MAX_HALF:
         raise DataError(
-            f"{path}: channel {name}: value {largest} does not fit 16-bit floats ({_LARGEST:.0f}); write 32-bit floats (half=False)"
+            f"{path}: channel {name}: value {np.abs(values).max():.6g} does not fit 16-bit floats ({_MAX_HALF:.0f}); "
+            "write 32-bit floats (half=False)"
         )
     return np.ascontiguousarray(values, dtype=np.float16 if half else np.float32)
 
 
-def _write(path: Path, channels: dict[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
+def _write_file(path: Path, channels: dict[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
     header = {**attributes, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with writing(path) as temporary:
+    with checked_atomic_path(path) as temporary:
         try:
             with OpenEXR.File(header, channels) as file:
                 file.write(str(temporary))

@@ -1,4 +1,4 @@
-"""Where things are kept, and writes that either happen whole or not at all."""
+"""Write files so that they are complete or absent, and the folder for caches."""
 
 from __future__ import annotations
 
@@ -14,22 +14,26 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim.core.errors import DataError
+from neuprim.core.errors import ConfigError, DataError, NeuprimError
 from neuprim.core.io.plain import load_json
 
 if TYPE_CHECKING:
     import numpy as np
 
 __all__ = [
+    "StagedOutput",
     "atomic_path",
     "cache_directory",
+    "checked_atomic_path",
+    "fill_folder",
     "publish_folder",
     "read_json",
-    "remove_left",
+    "refuse_existing",
+    "remove_leftovers",
+    "staged",
     "write_json",
     "write_npy",
     "write_text",
-    "writing",
 ]
 
 
@@ -46,12 +50,15 @@ def cache_directory() -> Path:
     return base / "neuprim"
 
 
+# ---------------------------------------------------------------- one file
+
+
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary file beside ``path`` that replaces it when the block ends well; the old file survives any failure.
+    """Yield a temporary file that replaces ``path`` when the block succeeds; the old file survives any failure.
 
     Raises:
-        OSError: it cannot be written, as on a full disk; names ``path``.
+        OSError: the file cannot be written, e.g. because the disk is full; names ``path``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary: Path | None = None
@@ -60,7 +67,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         os.close(handle)
         temporary = Path(name)
         yield temporary
-        with open(temporary, "r+b") as written:  # Windows flushes only what may be written
+        with open(temporary, "r+b") as written:  # Windows flushes only files opened for writing
             os.fsync(written.fileno())
         umask = os.umask(0)
         os.umask(umask)
@@ -68,60 +75,16 @@ def atomic_path(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     except OSError as error:
         if error.errno is not None and (error.filename is None or str(error.filename).endswith(".tmp")):
-            error.filename = str(path)  # of a failed write there is no name, and nobody knows the temporary one
+            error.filename = str(path)  # a failed write names no file, or the temporary one
         raise
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
 
 
-def remove_left(folder: Path) -> None:
-    """Remove the temporary files and drafts of writers that were killed, from a folder and those in it; for whoever
-    holds its lock.
-
-    A writer of this machine that is at work keeps its files, any for a day.
-    """
-    for place in (
-        folder,
-        *(path for path in folder.iterdir() if path.name[0] != "." and path.is_dir() and not path.is_symlink()),
-    ):
-        for path in place.iterdir():
-            match = _TEMPORARY.fullmatch(path.name)
-            with suppress(OSError):
-                if match is None or (
-                    _works(match["pid"] or match["draft"]) and time.time() - path.lstat().st_mtime < _DAY
-                ):
-                    continue
-                if path.is_dir() and not path.is_symlink():
-                    shutil.rmtree(path, ignore_errors=True)
-                else:
-                    path.unlink()
-
-
-_TEMPORARY = re.compile(r"\..+?\.(?:(?P<pid>\d{1,10})\.)?\w{8}\.tmp|\.neuprim\.(?P<draft>\d{1,10})\.\w{8}")
-_DAY = 86400.0
-
-
-def _works(number: str | None) -> bool:
-    """Whether another process of this machine has that number."""
-    if (
-        number is None or int(number) == os.getpid()
-    ):  # in a container numbers come again: whoever asks holds the lock, and writes nothing yet
-        return False
-    if sys.platform == "win32":  # where this question would end it
-        return True
-    try:
-        os.kill(int(number), 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):
-        return True
-    return True
-
-
 @contextmanager
-def writing(path: Path) -> Iterator[Path]:
-    """:func:`atomic_path` in a folder that exists, with the file's errors as DataError."""
+def checked_atomic_path(path: Path) -> Iterator[Path]:
+    """:func:`atomic_path` in an existing folder; errors of the disk become DataError."""
     if not path.parent.is_dir():
         raise DataError(f"{path}: cannot be written (no such folder {path.parent})")
     try:
@@ -131,37 +94,6 @@ def writing(path: Path) -> Iterator[Path]:
         raise DataError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
-def publish_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
-    """Have ``write`` fill a folder that gets the name ``final`` only when it is done, unless a complete one is there.
-
-    An interrupted run leaves nothing behind. Of several processes at once the first one wins, so all must write the
-    same files.
-
-    Args:
-        write: fills the empty folder that it is given.
-        complete: whether nothing is missing from a folder; what lies at ``final`` and is not complete is deleted.
-
-    Raises:
-        OSError: the folder's place cannot be written.
-    """
-    if complete(final):
-        return
-    final.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
-    try:
-        draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared cache from its other users
-        write(draft)
-        if final.exists() and not complete(final):
-            shutil.rmtree(final)  # somebody deleted part of it
-        try:
-            draft.rename(final)
-        except OSError:
-            if not complete(final):
-                raise
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-
-
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically."""
     with atomic_path(path) as temporary:
@@ -169,13 +101,13 @@ def write_text(path: Path, text: str) -> None:
 
 
 def read_json(path: Path, what: str, instead: str) -> Any:
-    """What a JSON file of ours holds; None where there is no file.
+    """Read a JSON file that neuprim wrote; None if there is no file.
 
     Args:
-        what, instead: for the message: what the file turned out not to be, and what the user can do.
+        what, instead: for the message: what the file should be, and what the user can do.
 
     Raises:
-        DataError: it cannot be read, or is no JSON.
+        DataError: the file cannot be read, is not JSON, or holds null.
     """
     try:
         data = load_json(path.read_text(encoding="utf-8"))
@@ -194,8 +126,175 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def write_npy(path: Path, values: np.ndarray) -> None:
-    """Write an array as ``numpy.load(path, allow_pickle=False)`` reads it, atomically."""
+    """Write an array atomically, for ``numpy.load(path, allow_pickle=False)``."""
     import numpy as np
 
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.save(file, values, allow_pickle=False)
+
+
+# ---------------------------------------------------------------- files of killed writers
+
+_TEMPORARY = re.compile(r"\..+?\.(?:(?P<pid>\d{1,10})\.)?\w{8}\.tmp|\.neuprim\.(?P<staging>\d{1,10})\.\w{8}")
+_DAY = 86400.0
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove temporary files and staging folders of killed writers, from a folder and its subfolders.
+
+    Call it while holding the folder's lock. A running process of this machine keeps files younger than a day.
+    """
+    subfolders = (p for p in folder.iterdir() if p.name[0] != "." and p.is_dir() and not p.is_symlink())
+    for place in (folder, *subfolders):
+        for path in place.iterdir():
+            match = _TEMPORARY.fullmatch(path.name)
+            with suppress(OSError):
+                if match is None:
+                    continue
+                if _is_running(match["pid"] or match["staging"]) and time.time() - path.lstat().st_mtime < _DAY:
+                    continue
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink()
+
+
+def _is_running(number: str | None) -> bool:
+    """Whether another process of this machine has that number."""
+    # Containers reuse numbers. A file with this process's own number is old: the lock's holder has not written yet.
+    if number is None or int(number) == os.getpid():
+        return False
+    if sys.platform == "win32":  # os.kill(pid, 0) would end the process there
+        return True
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
+
+
+# ---------------------------------------------------------------- folders
+
+
+def publish_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
+    """Have ``write`` fill a folder that is renamed to ``final`` when it is done, unless a complete one exists.
+
+    An interrupted call leaves nothing behind. Of several processes the first one wins, so all must write the same
+    files.
+
+    Args:
+        write: fills the empty folder that it is given.
+        complete: whether a folder has all files; an incomplete one at ``final`` is deleted.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    if complete(final):
+        return
+    final.parent.mkdir(parents=True, exist_ok=True)
+    fill_folder(final, write, complete)
+
+
+def fill_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
+    """:func:`publish_folder` in a parent folder that must exist already."""
+    draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
+    try:
+        draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared folder from its other users
+        write(draft)
+        if final.exists() and not complete(final):
+            shutil.rmtree(final)  # somebody deleted part of it
+        try:
+            os.replace(draft, final)
+        except OSError:
+            if not complete(final):
+                raise
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+# ---------------------------------------------------------------- output of code that is not ours
+
+
+def refuse_existing(final: Path, overwrite: bool) -> None:
+    """Raise ConfigError if ``final`` is a file or a folder that is not empty, unless it may be overwritten."""
+    if overwrite or not os.path.lexists(final):
+        return
+    if not final.is_dir():
+        raise ConfigError(f"{final}: exists; --force replaces it, --out PATH writes elsewhere")
+    if any(final.iterdir()):
+        raise ConfigError(
+            f"{final}: exists and is not empty; --force replaces files of the same name, --out PATH writes elsewhere"
+        )
+
+
+class StagedOutput:
+    """A place to write what becomes ``final`` once :meth:`publish` moves it.
+
+    Attributes:
+        out: a path with the name of ``final`` that does not exist yet, in a private folder of the same file system.
+    """
+
+    def __init__(self, folder: Path, final: Path, overwrite: bool) -> None:
+        self._folder, self._final, self._overwrite = folder, final, overwrite
+        self.out = folder / (final.name if final.name not in ("", "..") else "out")
+
+    def final_path(self, path: Path) -> Path | None:
+        """Where a staged file ends up; None for a file that was written elsewhere."""
+        try:
+            parts = path.resolve().relative_to(self._folder.resolve()).parts
+        except ValueError:
+            return None
+        if not parts:
+            return None
+        return self._final.joinpath(*parts[1:]) if parts[0] == self.out.name else self._final.parent.joinpath(*parts)
+
+    def final_text(self, text: str) -> str:
+        """A text with staged paths replaced by final ones."""
+        return text.replace(str(self.out), str(self._final)).replace(str(self._folder), str(self._final.parent))
+
+    def publish(self) -> None:
+        """Move everything to its place, file by file, also into existing folders.
+
+        Raises:
+            ConfigError: something is in the way; then nothing is moved.
+        """
+        moves: list[tuple[Path, Path]] = []
+        for entry in sorted(self._folder.iterdir()):
+            target = self.final_path(entry)
+            assert target is not None
+            merge = entry.is_dir() and target.is_dir()
+            sources = [p for p in sorted(entry.rglob("*")) if not p.is_dir()] if merge else [entry]
+            moves += [(source, target / source.relative_to(entry)) for source in sources]
+        for source, target in moves:
+            refuse_existing(target, self._overwrite)
+            if os.path.lexists(target) and source.is_dir() != target.is_dir():
+                actual, wanted = ("folder", "file") if target.is_dir() else ("file", "folder")
+                raise ConfigError(f"{target}: is a {actual}; expected a {wanted}, or nothing")
+        for source, target in moves:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(source, target)
+
+
+@contextmanager
+def staged(final: Path, overwrite: bool) -> Iterator[StagedOutput]:
+    """Yield a :class:`StagedOutput` that is deleted after the block; errors name final paths, not staged ones."""
+    existing = final if final.is_dir() else next(p for p in (*final.parents, Path(".")) if p.exists())
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=f".neuprim.{os.getpid()}.", dir=existing))
+    except OSError as error:
+        error.filename = str(final)  # the user does not know the temporary name
+        raise
+    output = StagedOutput(folder, final, overwrite)
+    try:
+        yield output
+    except NeuprimError as error:
+        error.args = tuple(output.final_text(part) if isinstance(part, str) else part for part in error.args)
+        raise
+    except OSError as error:
+        if isinstance(error.filename, str | Path):
+            error.filename = output.final_text(str(error.filename))
+        raise
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,63 +1,57 @@
-"""Image files at the edge: PNG, JPEG, WebP and OpenEXR in; PNG, OpenEXR, WebP and GIF out; the sRGB transfer curve.
+"""Read and write PNG, JPEG, WebP and OpenEXR images, and convert between sRGB and linear light.
 
-PNG, JPEG and WebP hold display-referred sRGB values with *straight* alpha; OpenEXR holds linear light with
-*premultiplied* alpha.
-Nothing here converts between the two silently. What 8-bit RGB or RGBA holds without loss is read as such (grey,
-palettes); all else is refused by name. Colour profiles and EXIF orientation are not applied, as in COLMAP and in the
-loaders of the data sets read here.
-
-Every failure is a :class:`~neuprim.core.errors.DataError` that names the file, what was found and what was expected.
+PNG, JPEG and WebP hold display-referred sRGB values with *straight* alpha. OpenEXR holds linear light with
+*premultiplied* alpha. Nothing here converts between the two silently. Images that 8-bit RGB or RGBA holds without loss
+(grey, palettes) are read as such; others are refused by name. Colour profiles and EXIF orientation are not applied, as
+in COLMAP. Every failure is a :class:`~neuprim.core.errors.DataError` that names the file, the problem and what was
+expected.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import base64
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import OpenEXR
 import torch
 from PIL import Image
 from torch import Tensor
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.exr import check_finite, write_exr, write_layers
-from neuprim.core.io.files import writing
-from neuprim.core.io.pictures import (
-    MAX_PIXELS,
-    check_pixels,
-    decode,
-    enough_memory,
-    open_picture,
-    orientation_of,
-    rgb_mode,
-)
+from neuprim.core.io.exr import MAX_PIXELS, check_pixel_count, is_exr, read_exr, read_exr_layout, refuse_out_of_memory
+from neuprim.core.io.files import checked_atomic_path
 
 __all__ = [
-    "MAX_PIXELS",
     "ImageInfo",
-    "exr_channels",
     "image_info",
     "linear_to_srgb",
     "pillow_image",
     "read_image",
     "read_mask",
-    "save_animation",
     "srgb_to_linear",
     "to_uint8",
-    "write_animation",
-    "write_exr",
-    "write_layers",
+    "webp_data_uri",
     "write_png",
     "write_webp",
 ]
 
-_MAX_FLOATS = 16 * MAX_PIXELS
-"""Most channel values in one OpenEXR file, as all of its channels are decoded together."""
+_OTHER_FORMATS = {
+    "AVIF": (4, (b"ftypavif", b"ftypavis")),
+    "HEIF": (4, (b"ftyphei", b"ftyphev", b"ftypmif1", b"ftypmsf1")),
+    "TIFF": (0, (b"II*\0", b"MM\0*")),
+    "GIF": (0, (b"GIF8",)),
+    "BMP": (0, (b"BM",)),
+    "JPEG 2000": (4, (b"jP  ",)),
+    "JPEG XL": (0, (b"\xff\x0a", b"\0\0\0\x0cJXL ")),
+}
+"""Formats that are refused by name -> byte offset of their signature, and possible signatures."""
 
-_EXR = b"\x76\x2f\x31\x01"
+_PNG_KINDS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
+_EXIF_ORIENTATION = 0x0112
 
 
 @dataclass(frozen=True)
@@ -66,9 +60,9 @@ class ImageInfo:
 
     Attributes:
         width, height: pixels.
-        channels: 3 (RGB) or 4 (RGBA), or as many as were asked for by name.
-        linear: True for OpenEXR (linear light, premultiplied alpha), False for PNG, JPEG and WebP (sRGB, straight
-        alpha). orientation: EXIF's, 1 to 8; pixels are read as they are stored whatever it says.
+        channels: 3 (RGB), 4 (RGBA), or the number of named channels.
+        linear: True for OpenEXR (linear light, premultiplied alpha), False for the others (sRGB, straight alpha).
+        orientation: EXIF's, 1 to 8; pixels are read as stored whatever it says.
     """
 
     width: int
@@ -82,67 +76,53 @@ class ImageInfo:
 
 
 def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
-    """Size and channels of an image from its header alone; ``channels`` as of :func:`read_image`.
+    """Read size and channels of an image from its header; ``channels`` as in :func:`read_image`.
 
     Raises:
-        DataError: missing, empty, not PNG/JPEG/WebP/OpenEXR, nothing that 8-bit RGB(A) or float RGB(A) holds, without a
-        channel that was
-            asked for, or larger than :data:`MAX_PIXELS`.
+        DataError: missing, empty, another format, not representable as 8-bit or float RGB(A), without a named channel,
+            or larger than :data:`~neuprim.core.io.exr.MAX_PIXELS`.
     """
-    if _is_exr(path, channels is not None):
-        names, width, height = _exr_layout(path, channels)
+    if is_exr(path, required=channels is not None):
+        names, width, height = read_exr_layout(path, channels)
         return ImageInfo(width, height, len(names), True)
-    with enough_memory(path), open_picture(path) as image:
-        return ImageInfo(image.width, image.height, len(rgb_mode(path, image)), False, orientation_of(image))
-
-
-def exr_channels(path: Path) -> tuple[str, ...]:
-    """Names of all channels of an OpenEXR file, in the file's own order, which is that of the alphabet.
-
-    Raises:
-        DataError: missing, empty, damaged, another format, or larger than :data:`MAX_PIXELS`.
-    """
-    _is_exr(path, named=True)
-    return tuple(_exr_header(path)[0])
+    with refuse_out_of_memory(path), _open_image(path) as image:
+        return ImageInfo(image.width, image.height, len(_lossless_mode(path, image)), False, _exif_orientation(image))
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequence[str] | None = None) -> Tensor:
-    """(H, W, 3 or 4) pixels as stored: uint8 sRGB with straight alpha (PNG, JPEG, WebP), or linear premultiplied float
-    (OpenEXR).
+    """(H, W, 3 or 4) pixels as stored: uint8 sRGB with straight alpha, or linear premultiplied float (OpenEXR).
 
-    Grey and palette images come as RGB, or RGBA where they have alpha. OpenEXR values come as float16 or float32, as in
-    the file, and are never clamped.
+    Grey and palette images become RGB, or RGBA if they have alpha. OpenEXR values stay float16 or float32 and are never
+    clamped.
 
     Args:
-        size: expected (width, height); any other is an error.
-        channels: names of the channels C of an OpenEXR file to read in their stead, in this order, as (H, W, C).
+        size: expected (width, height).
+        channels: names of OpenEXR channels to read instead of R, G, B(, A), in this order, as (H, W, C).
 
     Raises:
-        DataError: as :func:`image_info`; also for truncated or corrupt data, a wrong size, NaN or infinite values.
+        DataError: as :func:`image_info`; also truncated or corrupt data, another size, NaN or infinite values.
     """
-    with enough_memory(path):
-        if _is_exr(path, channels is not None):
-            names, width, height = _exr_layout(path, channels)
+    with refuse_out_of_memory(path):
+        if is_exr(path, required=channels is not None):
+            names, width, height = read_exr_layout(path, channels)
             _check_size(path, width, height, size)
-            return _read_exr(path, names, width, height)
-        with open_picture(path) as image:
-            mode = rgb_mode(path, image)
+            return read_exr(path, names, width, height)
+        with _open_image(path) as image:
+            mode = _lossless_mode(path, image)
             _check_size(path, image.width, image.height, size)
-            return torch.from_numpy(decode(path, image, mode))
+            return torch.from_numpy(_decode(path, image, mode))
 
 
 def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
-    """(H, W) bool from an 8-bit PNG, JPEG or WebP: True where any colour channel is not zero.
-
-    An alpha channel, if there is one, is ignored.
+    """(H, W) bool from an 8-bit PNG, JPEG or WebP: True where any colour channel is not zero; alpha is ignored.
 
     Raises:
         DataError: as :func:`read_image`.
     """
-    with enough_memory(path), open_picture(path) as image:
-        rgb_mode(path, image)
+    with refuse_out_of_memory(path), _open_image(path) as image:
+        _lossless_mode(path, image)
         _check_size(path, image.width, image.height, size)
-        return torch.from_numpy(decode(path, image, "RGB").any(axis=-1))
+        return torch.from_numpy(_decode(path, image, "RGB").any(axis=-1))
 
 
 def _check_size(path: Path, width: int, height: int, size: tuple[int, int] | None) -> None:
@@ -150,104 +130,93 @@ def _check_size(path: Path, width: int, height: int, size: tuple[int, int] | Non
         raise DataError(f"{path}: image is {width}x{height}; expected {size[0]}x{size[1]}")
 
 
-def _is_exr(path: Path, named: bool = False) -> bool:
+@contextmanager
+def _open_image(path: Path) -> Iterator[Image.Image]:
+    """The opened image, not decoded yet; refuses other formats and sizes beyond MAX_PIXELS."""
     try:
-        with open(path, "rb") as file:
-            head = file.read(8)
+        image = Image.open(path, formats=("PNG", "JPEG", "WEBP"))
     except FileNotFoundError:
         raise DataError(f"{path}: file not found; expected an image") from None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror or error}); expected an image") from None
-    if not head:
-        raise DataError(f"{path}: file is empty; expected an image")
-    if named and head[:4] != _EXR:
-        raise DataError(f"{path}: not an OpenEXR file; expected one, as channels have names in no other")
-    return head[:4] == _EXR
-
-
-def _exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
-    """Channels by name, width and height."""
-    try:
-        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
-            parts = len(file.parts)
-            header = dict(file.parts[0].header)  # the file's own is emptied when it closes
-            low, high, full_low, full_high = (
-                [int(v) for v in c] for w in ("dataWindow", "displayWindow") for c in header[w]
-            )
-            channels = {c.name: c for c in header["channels"]}
-            flat = header.get("type", OpenEXR.scanlineimage) in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
-    except Exception as error:  # also KeyError and UnicodeDecodeError, from damaged attributes
-        raise DataError(f"{path}: OpenEXR header is truncated or corrupt ({type(error).__name__}: {error})") from None
-    if parts != 1 or not flat:
-        raise DataError(
-            f"{path}: OpenEXR file has {parts} parts of type {header.get('type')}; expected 1 part of flat scan lines or tiles"
-        )
-    if (low, high) != (full_low, full_high):
-        raise DataError(
-            f"{path}: OpenEXR data window {low}..{high} is not its display window {full_low}..{full_high}; expected equal windows"
-        )
-    width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
-    check_pixels(path, width, height)
-    if width * height * len(channels) > _MAX_FLOATS:
-        raise DataError(
-            f"{path}: header claims {len(channels)} channels of {width}x{height} pixels; at most {_MAX_FLOATS} values are accepted"
-        )
-    return channels, width, height
-
-
-def _exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[list[str], int, int]:
-    """Names of the wanted channels, or of R, G, B(, A), width and height, from the header."""
-    channels, width, height = _exr_header(path)
-    names, expected = list(wanted or ()), ", ".join(wanted or ())
-    if wanted is None:
-        layers = [
-            name[:-1]
-            for name in channels
-            if name.endswith("R") and {name[:-1] + "G", name[:-1] + "B"} <= channels.keys()
-        ]
-        layers = [""] if "" in layers else layers
-        names = [layers[0] + c for c in "RGBA" if layers[0] + c in channels] if len(layers) == 1 else []
-        expected = "R, G, B and optionally A, of one layer"
-    if not names or not set(names) <= channels.keys():
-        raise DataError(
-            f"{path}: OpenEXR channels are {', '.join(channels) or 'none'}; expected {expected or 'some to be asked for'}"
-        )
-    if any(channels[n].xSampling != 1 or channels[n].ySampling != 1 for n in names):
-        raise DataError(f"{path}: OpenEXR colour channels are subsampled; expected one value per pixel")
-    return names, width, height
-
-
-def _read_exr(path: Path, names: list[str], width: int, height: int) -> Tensor:
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            planes = [np.array(file.channels()[name].pixels) for name in names]
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise DataError(f"{path}: header claims more than {MAX_PIXELS} pixels; larger images are refused") from None
     except MemoryError:
         raise
-    except Exception as error:
+    except Exception as error:  # Pillow's plugins raise many types for damaged headers
+        with open(path, "rb") as file:
+            head = file.read(16)
+        for name, (at, signatures) in _OTHER_FORMATS.items():
+            if head[at:].startswith(signatures):
+                raise DataError(
+                    f"{path}: image is {name}; expected PNG, JPEG, WebP or OpenEXR: convert it to one of them"
+                ) from None
         raise DataError(
-            f"{path}: OpenEXR data is truncated or corrupt ({error}); expected a complete {width}x{height} image"
+            f"{path}: not a readable PNG or JPEG image ({type(error).__name__}: {error}); "
+            "expected PNG, JPEG, WebP or OpenEXR"
         ) from None
-    if any(p.dtype not in (np.float16, np.float32) for p in planes):
+    with image:
+        check_pixel_count(path, image.width, image.height)
+        yield image
+
+
+def _png_depth_and_kind(path: Path) -> tuple[int, int]:
+    """(bit depth, colour type) of a PNG; (0, -1) for other files. Pillow opens 16-bit RGB silently as 8-bit."""
+    with open(path, "rb") as file:
+        head = file.read(26)
+    return (head[24], head[25]) if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 26 else (0, -1)
+
+
+def _lossless_mode(path: Path, image: Image.Image) -> str:
+    """RGB or RGBA, whichever holds the image without loss.
+
+    Raises:
+        DataError: neither does, or it is an animation.
+    """
+    depth, kind = _png_depth_and_kind(path)
+    if depth == 16 or image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
+        what = {"L": "8-bit grey JPEG", "CMYK": "CMYK JPEG"}.get(image.mode, f"{image.format} of mode {image.mode}")
+        if kind >= 0:
+            what = f"{depth}-bit {_PNG_KINDS.get(kind, 'unknown')} PNG"
+        raise DataError(f"{path}: image is {what}; expected 8-bit RGB or RGBA")
+    if image.mode != "P" and "transparency" in image.info:
+        raise DataError(f"{path}: image is {image.mode} with a transparent colour key (tRNS); expected RGB or RGBA")
+    # Cameras keep previews in the further pictures of a JPEG, which Pillow calls MPO.
+    if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
+        raise DataError(f"{path}: image is an animation; expected one picture")
+    return "RGBA" if image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info else "RGB"
+
+
+def _exif_orientation(image: Image.Image) -> int:
+    """EXIF's orientation; 1 if there is none that is readable."""
+    if "exif" not in image.info:  # getexif would decode a PNG to look for a chunk behind the pixels
+        return 1
+    try:
+        orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+    except Exception:
+        return 1
+    return orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
+
+
+def _decode(path: Path, image: Image.Image, mode: str) -> np.ndarray:
+    try:
+        image.load()
+        return np.array(image if image.mode == mode else image.convert(mode))
+    except MemoryError:
+        raise
+    except Exception as error:  # Pillow's decoders raise OSError, SyntaxError, ValueError, struct.error, ...
         raise DataError(
-            f"{path}: OpenEXR colour channels are {', '.join(str(p.dtype) for p in planes)}; expected half or float"
-        )
-    if any(p.shape != (height, width) for p in planes):
-        raise DataError(
-            f"{path}: OpenEXR data is {planes[0].shape[1]}x{planes[0].shape[0]}; expected {width}x{height} as in its header"
-        )
-    pixels = np.stack(planes, axis=-1)
-    check_finite(path, pixels)
-    return torch.from_numpy(pixels)
+            f"{path}: image data is truncated or corrupt ({error}); "
+            f"expected a complete {image.width}x{image.height} image"
+        ) from None
 
 
 # ---------------------------------------------------------------- writing
 
 
 def to_uint8(image: Tensor) -> Tensor:
-    """Display-referred values 0..1 of any shape as uint8, rounded and clamped; uint8 is returned as it is.
+    """Display-referred values 0..1 of any shape as uint8, rounded and clamped; uint8 is returned unchanged.
 
     Raises:
-        DataError: NaN values, which have no place on the scale.
+        DataError: NaN values.
     """
     if image.dtype == torch.uint8:
         return image
@@ -257,8 +226,11 @@ def to_uint8(image: Tensor) -> Tensor:
 
 
 def pillow_image(path: Path, image: Tensor) -> Image.Image:
-    """(H, W, 3 or 4) sRGB values as Pillow's image of 8 bits; ``path`` is for messages. Raises DataError: wrong shape,
-    NaN values."""
+    """Convert (H, W, 3 or 4) sRGB values to an 8-bit Pillow image; ``path`` is for messages.
+
+    Raises:
+        DataError: wrong shape or NaN values.
+    """
     if image.ndim != 3 or image.shape[-1] not in (3, 4) or 0 in image.shape:
         raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected (H, W, 3) or (H, W, 4)")
     try:
@@ -267,70 +239,45 @@ def pillow_image(path: Path, image: Tensor) -> Image.Image:
         raise DataError(f"{path}: {error}") from None
 
 
-def _save(path: Path, image: Image.Image, kind: str, **options: Any) -> None:
-    with writing(path) as temporary:
-        image.save(temporary, format=kind, **options)
-
-
 def write_png(path: Path, image: Tensor) -> None:
     """Write (H, W, 3 or 4) sRGB values, float 0..1 (clamped, rounded) or uint8, with straight alpha; atomic.
 
     Raises:
         DataError: wrong shape, NaN values, or the file cannot be written.
     """
-    _save(path, pillow_image(path, image), "PNG")
+    picture = pillow_image(path, image)
+    with checked_atomic_path(path) as temporary:
+        picture.save(temporary, format="PNG")
 
 
 def write_webp(path: Path, image: Tensor, quality: int = 90, lossless: bool = False) -> None:
-    """Write (H, W, 3 or 4) sRGB values as a still WebP; arguments and errors as :func:`write_png`; atomic."""
-    _save(path, pillow_image(path, image), "WEBP", quality=quality, lossless=lossless)
+    """Write (H, W, 3 or 4) sRGB values as a still WebP; arguments and errors as in :func:`write_png`; atomic."""
+    picture = pillow_image(path, image)
+    with checked_atomic_path(path) as temporary:
+        picture.save(temporary, format="WEBP", quality=quality, lossless=lossless)
 
 
-def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: int = 80) -> None:
-    """Write (H, W, 3 or 4) sRGB frames as an endless animation; the suffix ``.webp`` or ``.gif`` picks the format;
-    atomic.
-
-    GIF keeps 256 colours a frame and whole hundredths of a second, so its rate is the nearest it can hold.
-
-    Raises:
-        DataError: no frames, frames of different shapes, an unknown suffix, a rate that is not positive, or as
-        :func:`write_png`.
-    """
-    if not frames or not 0.0 < fps < float("inf"):
-        raise DataError(
-            f"{path}: {len(frames)} frames at {fps} frames per second; expected at least one frame and a positive rate"
-        )
-    shapes = sorted({tuple(f.shape) for f in frames})
-    if len(shapes) != 1:
-        raise DataError(f"{path}: frames have shapes {shapes}; expected one shape")
-    images = [pillow_image(path, f) for f in frames]
-    save_animation(path, images[0], fps, quality, images[1:])
-
-
-def save_animation(
-    path: Path, first: Image.Image, fps: float, quality: int = 80, rest: Sequence[Image.Image] = ()
-) -> None:
-    """Write Pillow's images, each with all of its own frames, as :func:`write_animation` does."""
-    kind = {".webp": "WEBP", ".gif": "GIF"}.get(path.suffix.lower())
-    if kind is None:
-        raise DataError(f"{path}: unknown animation format {path.suffix!r}; expected .webp or .gif")
-    options: dict[str, Any] = {"quality": quality} if kind == "WEBP" else {"disposal": 2}
-    duration = max(1, round(1000.0 / fps)) if kind == "WEBP" else 10 * max(1, round(100.0 / fps))
-    _save(path, first, kind, save_all=True, append_images=list(rest), duration=duration, loop=0, **options)
+def webp_data_uri(image: Tensor, max_width: int, quality: int = 85) -> str:
+    """Encode (H, W, 3) sRGB values 0..1 as a ``data:`` URI of a WebP, scaled down to at most ``max_width`` pixels."""
+    picture = Image.fromarray(to_uint8(image).numpy())
+    if picture.width > max_width:
+        height = max(1, round(picture.height * max_width / picture.width))
+        picture = picture.resize((max_width, height), Image.Resampling.LANCZOS)
+    file = io.BytesIO()
+    picture.save(file, "WEBP", quality=quality)
+    return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
 
 
 # ---------------------------------------------------------------- transfer curve
 
 
 def srgb_to_linear(values: Tensor) -> Tensor:
-    """IEC 61966-2-1 display-referred values to linear light, any shape; differentiable, not clamped (odd below 0 by its
-    linear part)."""
+    """Convert sRGB (IEC 61966-2-1) to linear light; any shape, differentiable, not clamped, linear below 0."""
     curve = ((values.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(values <= 0.04045, values / 12.92, curve)
 
 
 def linear_to_srgb(values: Tensor) -> Tensor:
-    """Linear light to IEC 61966-2-1 display-referred values, any shape; differentiable, not clamped; finite gradient at
-    0."""
+    """Convert linear light to sRGB (IEC 61966-2-1); any shape, differentiable also at 0, not clamped."""
     curve = 1.055 * values.clamp_min(0.0031308) ** (1.0 / 2.4) - 0.055
     return torch.where(values <= 0.0031308, values * 12.92, curve)

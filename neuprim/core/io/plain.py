@@ -1,8 +1,8 @@
-"""JSON and YAML text as plain data.
+"""Parse untrusted JSON and YAML text as plain data.
 
-Rule: every JSON or YAML file that a run or a user's folder brings is parsed here. Its numbers are finite, and whole
-ones have at most 64 bits, so that no conversion of them can overflow later. YAML has neither anchors nor aliases, of
-which a few lines describe more than any memory holds. Nothing in the text is executed or looked up.
+Rule: every JSON or YAML file of a run or of a user's folder is parsed here. Numbers are finite and whole ones have at
+most 64 bits, so that converting them later cannot overflow. YAML may not use anchors or aliases, which let a few lines
+describe more than memory holds. Nothing in the text is executed or looked up.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ from neuprim.core.errors import cut
 
 __all__ = ["finite", "load_json", "load_yaml"]
 
-_DIGITS = 20
-"""A whole number of 64 bits has no more."""
+_MAX_DIGITS = 20  # of a whole number of 64 bits
 
 
 def finite(value: object) -> float | None:
-    """A number of a file as a float; None for what is no finite number: text, true, a list, NaN, 1e400."""
+    """A number of a file as a float; None for text, true, a list, NaN, 1e400 and the like."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -33,27 +32,24 @@ def finite(value: object) -> float | None:
 
 
 def load_json(text: str | bytes, infinite: bool = False) -> Any:
-    """What a JSON text holds.
+    """Parse JSON text.
 
     Args:
-        infinite: whether NaN and Infinity are read, for a report, which shows a dash in their place.
+        infinite: accept NaN and infinite numbers, for callers that check each number they use.
 
     Raises:
-        ValueError, RecursionError: no JSON, or a number beyond the limits.
+        ValueError, RecursionError: not JSON, or a number beyond the limits.
     """
-    return json.loads(
-        text,
-        parse_int=_whole,
-        parse_float=float if infinite else _float,
-        parse_constant=float if infinite else _constant,
-    )
+    parse_float = float if infinite else _parse_float
+    parse_constant = float if infinite else _refuse_constant
+    return json.loads(text, parse_int=_parse_int, parse_float=parse_float, parse_constant=parse_constant)
 
 
 def load_yaml(text: str) -> Any:
-    """What a YAML text holds.
+    """Parse YAML text.
 
     Raises:
-        yaml.YAMLError, ValueError, RecursionError: no YAML, an anchor or an alias, or a number beyond the limits.
+        yaml.YAMLError, ValueError, RecursionError: not YAML, an anchor or an alias, or a number beyond the limits.
     """
     loader = _Loader(text)
     try:
@@ -62,20 +58,20 @@ def load_yaml(text: str) -> Any:
         loader.dispose()
 
 
-def _whole(text: str) -> int:
-    if len(text.lstrip("-")) > _DIGITS or not -(2**63) <= int(text) < 2**64:
+def _parse_int(text: str) -> int:
+    if len(text.lstrip("-")) > _MAX_DIGITS or not -(2**63) <= int(text) < 2**64:
         raise ValueError(f"{cut(text)} has more than 64 bits")
     return int(text)
 
 
-def _float(text: str) -> float:
+def _parse_float(text: str) -> float:
     value = float(text)
     if math.isinf(value):
         raise ValueError(f"{cut(text)} is larger than any number here")
     return value
 
 
-def _constant(text: str) -> float:
+def _refuse_constant(text: str) -> float:
     raise ValueError(f"{text} is no finite number")
 
 
@@ -84,15 +80,15 @@ class _Loader(yaml.SafeLoader):
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         event = self.peek_event()
-        if getattr(event, "anchor", None) is not None:  # of an alias, too
+        if getattr(event, "anchor", None) is not None:  # also an alias
             raise yaml.composer.ComposerError(None, None, "anchors and aliases are not read", event.start_mark)
         return super().compose_node(parent, index)
 
     def number(self, node: Any) -> Any:
         kind = node.tag.rpartition(":")[2]
-        plain = self.construct_yaml_int if kind == "int" else self.construct_yaml_float
+        construct = self.construct_yaml_int if kind == "int" else self.construct_yaml_float
         try:
-            value = None if len(node.value) > 4 * _DIGITS else plain(node)
+            value = None if len(node.value) > 4 * _MAX_DIGITS else construct(node)
         except (ValueError, OverflowError):
             value = None
         if value is None or (kind == "int" and not -(2**63) <= value < 2**64):

@@ -1,8 +1,7 @@
-"""PLY files (Turk 1994), with any properties; for untrusted files.
+"""Read untrusted PLY files (Turk 1994) with any elements and properties; write vertices.
 
-Read are ASCII and binary files of either byte order, their elements in any order; written are the vertices of binary
-little-endian ones.
-No claim in a header makes memory be taken that the file's bytes do not pay for.
+ASCII and binary files of either byte order are read; binary little-endian files are written. Memory is allocated only
+for data that the file's bytes can hold, whatever the header claims.
 """
 
 from __future__ import annotations
@@ -21,26 +20,6 @@ from neuprim.core.io.files import atomic_path
 
 __all__ = ["PlyElement", "PlyList", "PlyVertices", "read_elements", "read_ply", "write_ply"]
 
-_TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "double": "f8",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "int64": "i8",
-    "uint64": "u8",
-    "float32": "f4",
-    "float64": "f8",
-}
 _NAMES = {
     "i1": "char",
     "u1": "uchar",
@@ -51,15 +30,23 @@ _NAMES = {
     "f4": "float",
     "f8": "double",
 }
+_TYPES = {name: kind for kind, name in _NAMES.items()} | {
+    name: np.dtype(name).str[1:]
+    for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
+}
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_HEADER_BYTES = 4 * 2**20
-_PROPERTIES = 10_000
+_MAX_HEADER_BYTES = 4 * 2**20
+_MAX_PROPERTIES = 10_000
 
 
 @dataclass(frozen=True)
 class PlyVertices:
-    """``rows`` is a structured array (N,) with one field per scalar property, in the file's byte order; ``comments``
-    without the keyword."""
+    """Vertices of a file.
+
+    Attributes:
+        rows: structured array (N,) with one field per scalar property, in the file's byte order.
+        comments: without the keyword.
+    """
 
     rows: np.ndarray
     comments: tuple[str, ...] = ()
@@ -70,16 +57,14 @@ class PlyVertices:
 
     def columns(self, names: Sequence[str]) -> np.ndarray:
         """(N, len(names)) float64."""
-        return (
-            np.stack([self.rows[name].astype(np.float64) for name in names], -1)
-            if names
-            else np.zeros((len(self.rows), 0))
-        )
+        if not names:
+            return np.zeros((len(self.rows), 0))
+        return np.stack([self.rows[name].astype(np.float64) for name in names], -1)
 
 
 @dataclass(frozen=True)
 class PlyList:
-    """A list property: row i has ``sizes[i]`` of the ``values``, which follow each other without gaps."""
+    """A list property: row i has ``sizes[i]`` of the ``values``, which are stored without gaps."""
 
     sizes: np.ndarray
     values: np.ndarray
@@ -87,14 +72,14 @@ class PlyList:
 
 @dataclass(frozen=True)
 class PlyElement(PlyVertices):
-    """The rows of any element, and its list properties by name."""
+    """Rows and list properties of any element."""
 
     lists: dict[str, PlyList] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class _Declared:
-    """An element as the header declares it: (property, type, type of the length of a list or "" for a scalar)."""
+class _ElementHeader:
+    """An element of the header; fields are (property, type, type of the list's length or "" for a scalar)."""
 
     name: str
     count: int
@@ -123,10 +108,10 @@ def write_ply(path: Path, rows: np.ndarray, comments: Sequence[str] = ()) -> Non
 
 
 def read_ply(path: Path) -> PlyVertices:
-    """The vertices of a file.
+    """Read the vertices of a file.
 
     Raises:
-        DataError: names the file, what was found and what was expected.
+        DataError: missing or damaged file; names the file, the problem and what was expected.
     """
     try:
         with open(path, "rb") as file:
@@ -136,42 +121,44 @@ def read_ply(path: Path) -> PlyVertices:
 
 
 def read_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) -> dict[str, PlyElement]:
-    """Those of the ``wanted`` elements that a file has; vertices must be there. What follows the last of them is left
-    alone.
+    """Read the ``wanted`` elements that a file has and no data behind them; the header must have vertices.
 
     Args:
-        size: of the file, in bytes. path: for messages.
+        size: of the file, in bytes.
+        path: for messages.
 
     Raises:
         DataError: as :func:`read_ply`.
     """
-    order, elements, comments = _header(file, path)
-    found: dict[str, PlyElement] = {}
+    order, elements, comments = _read_header(file, path)
+    result: dict[str, PlyElement] = {}
     missing = set(wanted) & {element.name for element in elements}
     for element in elements:
         if not missing:
             break
         left = size - file.tell()
-        rows, lists = _binary(file, path, element, order, left) if order else _ascii(file, path, element, left)
+        rows, lists = (
+            _read_binary(file, path, element, order, left) if order else _read_ascii(file, path, element, left)
+        )
         if element.name in missing:
-            found[element.name] = PlyElement(rows, comments, lists)
+            result[element.name] = PlyElement(rows, comments, lists)
             missing.remove(element.name)
-    return found
+    return result
 
 
-def _header(file: BinaryIO, path: Path) -> tuple[str, list[_Declared], tuple[str, ...]]:
+def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_ElementHeader], tuple[str, ...]]:
     """Byte order ("" for ASCII), elements, comments."""
     order: str | None = None
-    elements: list[_Declared] = []
+    elements: list[_ElementHeader] = []
     comments: list[str] = []
-    budget = _HEADER_BYTES
+    budget = _MAX_HEADER_BYTES
     for number in itertools.count():
         raw = file.readline(budget + 1)
         budget -= len(raw)
         if budget < 0 or not raw.endswith(b"\n"):
             raise DataError(
                 f"{path}: header has no end_header"
-                + f" in {_HEADER_BYTES} bytes" * (budget < 0)
+                + f" in {_MAX_HEADER_BYTES} bytes" * (budget < 0)
                 + "; expected a PLY file"
             )
         line = raw.decode("utf-8", "replace").rstrip("\r\n")
@@ -188,11 +175,11 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, list[_Declared], tuple[str
         elif words[0] == "element" and len(words) == 3:
             if any(element.name == words[1] for element in elements):
                 raise DataError(f"{path}: element {words[1][:40]} twice")
-            elements.append(_Declared(words[1], _count(words[1], words[2], path), []))
+            elements.append(_ElementHeader(words[1], _parse_count(words[1], words[2], path), []))
         elif words[0] == "property" and elements:
-            elements[-1].fields.append(_property(words, path))
-            if sum(len(element.fields) for element in elements) > _PROPERTIES:
-                raise DataError(f"{path}: more than {_PROPERTIES} properties")
+            elements[-1].fields.append(_parse_property(words, path))
+            if sum(len(element.fields) for element in elements) > _MAX_PROPERTIES:
+                raise DataError(f"{path}: more than {_MAX_PROPERTIES} properties")
         elif words == ["end_header"]:
             break
         else:
@@ -210,13 +197,13 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, list[_Declared], tuple[str
     return order, elements, tuple(comments)
 
 
-def _count(name: str, text: str, path: Path) -> int:
+def _parse_count(name: str, text: str, path: Path) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 12):
         raise DataError(f"{path}: {text[:20]!r} for the number of {name[:20]}; expected a count")
     return int(text)
 
 
-def _property(words: list[str], path: Path) -> tuple[str, str, str]:
+def _parse_property(words: list[str], path: Path) -> tuple[str, str, str]:
     if len(words) == 3 and words[1] in _TYPES:
         return words[2], _TYPES[words[1]], ""
     if len(words) == 5 and words[1] == "list" and words[3] in _TYPES and _TYPES.get(words[2], "f")[0] != "f":
@@ -229,12 +216,12 @@ def _property(words: list[str], path: Path) -> tuple[str, str, str]:
 _Values = tuple[np.ndarray, dict[str, PlyList]]
 
 
-def _what(element: _Declared) -> str:
+def _describe(element: _ElementHeader) -> str:
     return {"vertex": "vertices", "face": "faces"}.get(element.name, f"rows of {element.name[:40]}")
 
 
-def _binary(file: BinaryIO, path: Path, element: _Declared, order: str, left: int) -> _Values:
-    """Rows of equal size are read at once; where lists differ in length, row by row."""
+def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str, left: int) -> _Values:
+    """Read rows of equal size at once, and rows whose lists differ in length one by one."""
     count, fields = element.count, element.fields
     if not count or not fields:
         return np.zeros(0, [(name, order + kind) for name, kind, length in fields if not length]), {}
@@ -243,12 +230,11 @@ def _binary(file: BinaryIO, path: Path, element: _Declared, order: str, left: in
     file.seek(start)
     if sizes is not None:
         dtype = np.dtype(
-            [part for field_, size in zip(fields, sizes, strict=True) for part in _parts(field_, size, order)]
+            [part for field_, size in zip(fields, sizes, strict=True) for part in _row_layout(field_, size, order)]
         )
         if count * dtype.itemsize <= left:
-            table = np.frombuffer(
-                bytearray(file.read(count * dtype.itemsize)), dtype
-            )  # of a bytearray, that it may be written to
+            data = bytearray(file.read(count * dtype.itemsize))  # writable, unlike bytes
+            table = np.frombuffer(data, dtype)
             lists = [(name, size) for (name, _, length), size in zip(fields, sizes, strict=True) if length]
             if all((table["#" + name] == size).all() for name, size in lists):
                 scalars = [name for name, _, length in fields if not length]
@@ -259,18 +245,19 @@ def _binary(file: BinaryIO, path: Path, element: _Declared, order: str, left: in
             file.seek(start)
         elif not any(length for _, _, length in fields):
             raise DataError(
-                f"{path}: {count} {_what(element)} of {dtype.itemsize} bytes; only {left} bytes follow; expected a complete file"
+                f"{path}: {count} {_describe(element)} of {dtype.itemsize} bytes; "
+                f"only {left} bytes follow; expected a complete file"
             )
-    return _walked(file, path, element, order, left)
+    return _read_row_by_row(file, path, element, order, left)
 
 
-def _parts(declared: tuple[str, str, str], size: int, order: str) -> list[tuple]:
+def _row_layout(declared: tuple[str, str, str], size: int, order: str) -> list[tuple]:
     name, kind, length = declared
     return [("#" + name, order + length), (name, order + kind, (size,))] if length else [(name, order + kind)]
 
 
 def _first_sizes(file: BinaryIO, fields: list[tuple[str, str, str]], order: str) -> list[int] | None:
-    """The lengths of the lists of the first row, 1 for scalars; None where they are no lengths."""
+    """Lengths of the first row's lists, 1 for scalars; None if they are implausible."""
     sizes = []
     for _, kind, length in fields:
         size = 1
@@ -284,7 +271,7 @@ def _first_sizes(file: BinaryIO, fields: list[tuple[str, str, str]], order: str)
     return sizes
 
 
-def _walked(file: BinaryIO, path: Path, element: _Declared, order: str, left: int) -> _Values:
+def _read_row_by_row(file: BinaryIO, path: Path, element: _ElementHeader, order: str, left: int) -> _Values:
     data, place = file.read(left), 0
     start = file.tell() - len(data)
     byteorder = "little" if order == "<" else "big"
@@ -301,7 +288,7 @@ def _walked(file: BinaryIO, path: Path, element: _Declared, order: str, left: in
             sizes[i].append(size)
             place += size * width
             if place > len(data) or size < 0:
-                raise DataError(f"{path}: {element.count} {_what(element)} announced; the file ends in row {row}")
+                raise DataError(f"{path}: {element.count} {_describe(element)} announced; the file ends in row {row}")
     file.seek(start + place)
     octets = np.frombuffer(data, np.uint8)
     scalars = [(name, order + kind) for name, kind, length in element.fields if not length]
@@ -318,11 +305,12 @@ def _walked(file: BinaryIO, path: Path, element: _Declared, order: str, left: in
     return rows, lists
 
 
-def _ascii(file: BinaryIO, path: Path, element: _Declared, left: int) -> _Values:
+def _read_ascii(file: BinaryIO, path: Path, element: _ElementHeader, left: int) -> _Values:
     count, fields = element.count, element.fields
     if count * (2 * len(fields)) > left + 1:  # a digit and a blank each
         raise DataError(
-            f"{path}: {count} {_what(element)} of {len(fields)} numbers; only {left} bytes follow; expected a complete file"
+            f"{path}: {count} {_describe(element)} of {len(fields)} numbers; only {left} bytes follow; "
+            "expected a complete file"
         )
     scalars = [(name, kind) for name, kind, length in fields if not length]
     if not count or not fields:
@@ -334,22 +322,24 @@ def _ascii(file: BinaryIO, path: Path, element: _Declared, left: int) -> _Values
                 warnings.simplefilter("ignore")  # a file without lines; refused below
                 table = np.loadtxt(file, np.float64, max_rows=count, ndmin=2, comments=None, encoding="ascii")
         else:
-            table, lists = _ascii_lists(file, element)
+            table, lists = _read_ascii_lists(file, element)
     except (ValueError, IndexError) as error:
-        raise DataError(f"{path}: {_what(element)} are not numbers ({' '.join(str(error).split())[:120]})") from error
+        raise DataError(
+            f"{path}: {_describe(element)} are not numbers ({' '.join(str(error).split())[:120]})"
+        ) from error
     if table.shape != (count, len(scalars)):
-        found = f"{table.shape[0]} {_what(element)} of {table.shape[1]} numbers"
+        found = f"{table.shape[0]} {_describe(element)} of {table.shape[1]} numbers"
         raise DataError(f"{path}: {found}; expected {count} of {len(scalars)}")
     rows = np.zeros(count, [(name, "<" + kind) for name, kind in scalars])
     for i, (name, kind) in enumerate(scalars):
-        rows[name] = _typed(table[:, i], name, kind, path)
+        rows[name] = _cast(table[:, i], name, kind, path)
     kinds = {name: kind for name, kind, length in fields if length}
     return rows, {
-        name: PlyList(found.sizes, _typed(found.values, name, kinds[name], path)) for name, found in lists.items()
+        name: PlyList(found.sizes, _cast(found.values, name, kinds[name], path)) for name, found in lists.items()
     }
 
 
-def _typed(values: np.ndarray, name: str, kind: str, path: Path) -> np.ndarray:
+def _cast(values: np.ndarray, name: str, kind: str, path: Path) -> np.ndarray:
     info = None if kind[0] == "f" else np.iinfo(kind)
     if info is not None and not ((values >= info.min) & (values <= info.max)).all():
         raise DataError(f"{path}: {name} has values outside its type; expected {info.min} to {info.max}")
@@ -357,7 +347,7 @@ def _typed(values: np.ndarray, name: str, kind: str, path: Path) -> np.ndarray:
         return values.astype(kind)
 
 
-def _ascii_lists(file: BinaryIO, element: _Declared) -> tuple[np.ndarray, dict[str, PlyList]]:
+def _read_ascii_lists(file: BinaryIO, element: _ElementHeader) -> tuple[np.ndarray, dict[str, PlyList]]:
     scalars: list[list[float]] = []
     sizes: dict[str, list[int]] = {name: [] for name, _, length in element.fields if length}
     values: dict[str, list[float]] = {name: [] for name in sizes}

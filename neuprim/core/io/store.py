@@ -1,202 +1,256 @@
-"""Where files lie that several processes and machines make and read: a folder that all of them see, or an object store
-by its URL.
+"""Folders of files that several processes and machines share: a local or mounted folder, or an object store by URL.
 
-A store holds folders of files. A folder counts as there when its last file is: in a file system it is renamed to its
-name as a whole, in an object store, where a put is atomic, the last file is put last. So a maker that is killed leaves
-nothing that is taken for a whole folder, and of two makers of one folder either may win, as both make the same files.
+A folder counts as complete when its last file exists. In a file system a finished folder is renamed as a whole; in an
+object store, where an upload is atomic, the last file is uploaded last. So a killed process leaves nothing that looks
+complete. Of two processes that make the same folder either may win, as both make the same files.
 """
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import shutil
 import tempfile
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from neuprim.core.errors import DataError
-from neuprim.core.io.files import writing
+from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NeuprimError, cut
+from neuprim.core.io.files import atomic_path, checked_atomic_path, fill_folder
 
-__all__ = ["EVERY", "PATIENCE", "WAITING", "LocalStore", "Store", "Tell", "check_size"]
+__all__ = ["MAX_WAIT", "POLL_INTERVAL", "WAIT_MESSAGE", "Store", "open_store"]
 
-PATIENCE = 60.0
-"""Seconds for a shared folder to come back."""
+MAX_WAIT = 60.0
+"""Seconds to wait for a shared folder that disappeared."""
 
-EVERY = 0.5
-"""Seconds between two looks whether it has."""
+POLL_INTERVAL = 0.5
+"""Seconds between two checks whether it is back."""
 
-WAITING = "waiting for"
-"""How the line begins that says so."""
+WAIT_MESSAGE = "waiting for"
+"""Start of the line that says so."""
 
-_AWAY = (errno.ENOENT, errno.ESTALE, errno.ENOTCONN, errno.EIO)
+_DISAPPEARED = (errno.ENOENT, errno.ESTALE, errno.ENOTCONN, errno.EIO)
+_BUCKETS = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "oss")
+PROTOCOLS = ("file", "local", "memory", *_BUCKETS)
+"""Allowed protocols of a URL. fsspec's others run commands, open archives or chain stores."""
 
 T = TypeVar("T")
-Tell = Callable[[str], None]
 
 
-class Store(ABC):
-    """A place of folders with files.
+def open_store(address: str, copies: Path) -> Store:
+    """Open the store at a folder's path or a URL.
 
-    Attributes:
-        address: folder or URL, for people.
-        path: local folder of its files, or of copies of those that were fetched.
+    Args:
+        copies: local folder for copies of files that are fetched from an object store.
+
+    Raises:
+        ConfigError: none of :data:`PROTOCOLS`, or a chain of them.
+        BackendUnavailable: the protocol's package is not installed.
+        DataError: the store cannot be reached.
+    """
+    protocol, is_url, path = address.partition("://")
+    if "::" in address or (is_url and protocol not in PROTOCOLS):
+        what = "a chain of protocols" if "::" in address else f"protocol {cut(protocol)!r}"
+        raise ConfigError(
+            f"{cut(address)}: {what}; expected a folder, or a URL of {', '.join(PROTOCOLS)}, as s3://BUCKET/FOLDER"
+        )
+    if not is_url:
+        return Store.local(Path(address).expanduser().absolute())
+    if protocol in ("file", "local"):
+        return Store.local(Path(path).absolute())
+    import fsspec
+
+    try:
+        system, root = fsspec.core.url_to_fs(address)
+    except ImportError as error:
+        extra = ": pip install 'neuprim[s3]'" if protocol in ("s3", "s3a") else ""
+        raise BackendUnavailable(
+            f"{address}: {protocol}:// needs a package that is not installed ({_line(error)}){extra}"
+        ) from None
+    except ValueError as error:
+        raise ConfigError(
+            f"{address}: {_line(error)}; expected a folder or a URL that fsspec knows, as s3://BUCKET/FOLDER"
+        ) from None
+    except Exception as error:
+        raise DataError(f"{address}: cannot be reached ({_line(error)})") from error
+    digest = hashlib.sha256(address.rstrip("/").encode()).hexdigest()[:16]
+    return Store(address.rstrip("/"), copies / digest, system, root.rstrip("/"))
+
+
+class Store:
+    """Folders of files in one place; the content of a name never changes, so local copies stay valid.
+
+    Args:
+        address: folder or URL, for messages.
+        path: the local folder itself, or that for copies of fetched files.
+        system: fsspec's file system; None for a local folder.
+        root: the place in ``system``.
     """
 
-    address: str
-    path: Path
+    def __init__(self, address: str, path: Path, system: Any = None, root: str = "") -> None:
+        self.address, self.path, self._system, self._root = address, path, system, root
 
-    @abstractmethod
+    @classmethod
+    def local(cls, path: Path) -> Store:
+        """The store in a folder of a file system, of this machine or shared."""
+        return cls(str(path), path)
+
+    @property
+    def is_local(self) -> bool:
+        """Whether files are read in place."""
+        return self._system is None
+
     def at(self, *names: str) -> Store:
-        """The place of that name in it."""
+        """The store in a subfolder."""
+        path, below = self.path.joinpath(*names), "/".join(names)
+        if self.is_local:
+            return Store.local(path)
+        return Store(f"{self.address}/{below}", path, self._system, f"{self._root}/{below}")
 
-    @abstractmethod
-    def begin(self) -> None:
-        """Make the place ready to be written to. Raises OSError or DataError."""
+    def prepare(self) -> None:
+        """Create the folder, so that files can be written. Raises OSError or DataError."""
+        if self.is_local:
+            self.path.mkdir(parents=True, exist_ok=True)
+        elif self.address.partition("://")[0] not in _BUCKETS:  # buckets have no folders; a typo must not create one
+            with self._client_errors("written"):
+                self._system.makedirs(self._root, exist_ok=True)
 
-    @abstractmethod
-    def whole(self, last: str) -> set[str]:
-        """Names of the folders in it that have the file ``last``."""
-
-    @abstractmethod
-    def has(self, name: str) -> bool:
-        """Whether a file is there, by its name with folders, ``"frame_00001/points.npz"``."""
-
-    @abstractmethod
-    def fetch(self, name: str, most: int) -> Path:
-        """A local file with the contents of that one, which may be missing.
-
-        Args:
-            most: bytes; a larger one is refused before it is read.
-
-        Raises:
-            DataError: it is larger, or the store cannot be read.
-        """
-
-    @abstractmethod
-    def publish(self, name: str, write: Callable[[Path], None], last: str) -> None:
-        """Have ``write`` fill an empty folder, and give it its name when it is done, unless a whole one is there by
-        then.
-
-        Raises:
-            OSError, DataError: of ``write``, or the store cannot be written; nothing is there under that name then.
-        """
-
-    @abstractmethod
-    def put(self, name: str, write: Callable[[Path], None]) -> None:
-        """Have ``write`` write one file, which is then there whole, or not at all. Raises OSError or DataError."""
-
-    def patiently(self, call: Callable[[], T], tell: Tell) -> T:
-        """What a call returns; where the store is gone meanwhile, it is waited for and the call made again.
-
-        Raises:
-            DataError: it did not come back within :data:`PATIENCE` seconds, or as the call.
-        """
-        return call()
-
-
-class LocalStore(Store):
-    """A folder of a file system, of this machine or shared."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.address = path, str(path)
-
-    def at(self, *names: str) -> LocalStore:
-        return LocalStore(self.path.joinpath(*names))
-
-    def begin(self) -> None:
-        self.path.mkdir(parents=True, exist_ok=True)
-
-    def whole(self, last: str) -> set[str]:
+    def complete_folders(self, last: str) -> set[str]:
+        """Names of the folders that have the file ``last``."""
+        if not self.is_local:
+            with self._client_errors("read"):
+                self._system.invalidate_cache()
+                files = self._system.glob(f"{self._root}/*/{last}")
+            return {str(name).rstrip("/").split("/")[-2] for name in files}
         try:
-            return {
-                entry.name
-                for entry in os.scandir(self.path)
-                if entry.name[:1] != "." and os.path.isfile(os.path.join(entry.path, last))
-            }
+            entries = list(os.scandir(self.path))
         except FileNotFoundError:
             return set()
+        return {e.name for e in entries if e.name[:1] != "." and os.path.isfile(os.path.join(e.path, last))}
 
-    def has(self, name: str) -> bool:
-        return (self.path / name).is_file()
+    def has_file(self, name: str) -> bool:
+        """Whether a file exists, by its name with folders, ``"frame_00001/points.npz"``."""
+        if self.is_local:
+            return (self.path / name).is_file()
+        with self._client_errors("read"):
+            self._system.invalidate_cache()
+            return bool(self._system.exists(f"{self._root}/{name}"))
 
-    def fetch(self, name: str, most: int) -> Path:
+    def fetch_file(self, name: str, max_bytes: int) -> Path:
+        """Path of a local file with that content; it does not exist if the store has no such file.
+
+        Raises:
+            DataError: the file is larger than ``max_bytes`` (checked before reading), or the store cannot be read.
+        """
         file = self.path / name
-        try:
-            size = file.stat().st_size
-        except OSError:  # whoever reads it says so
+        if self.is_local:
+            try:
+                size = file.stat().st_size
+            except OSError:  # the caller, who reads the file, reports it
+                return file
+            _check_file_size(str(file), size, max_bytes)
             return file
-        check_size(str(file), size, most)
+        if file.is_file():
+            return file
+        remote = f"{self._root}/{name}"
+        with self._client_errors("read"):
+            if self._system.exists(remote):
+                _check_file_size(f"{self.address}/{name}", int(self._system.size(remote)), max_bytes)
+                with atomic_path(file) as draft:
+                    self._system.get_file(remote, str(draft))
         return file
 
-    def publish(self, name: str, write: Callable[[Path], None], last: str) -> None:
-        final = self.path / name
-        draft = Path(
-            tempfile.mkdtemp(prefix=f".{name}-", dir=self.path)
-        )  # of a folder that must be there: else it would be a new one
-        try:
-            draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared folder from its other users
-            write(draft)
-            if final.exists() and not (final / last).is_file():  # somebody deleted part of it
-                shutil.rmtree(final)
-            try:
-                os.replace(draft, final)
-            except OSError:
-                if not (final / last).is_file():
-                    raise
-            for other in self.path.glob(
-                f".{name}-*"
-            ):  # of makers that were killed, or are slower: what they make is there
-                shutil.rmtree(other, ignore_errors=True)
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
+    def write_folder(self, name: str, write: Callable[[Path], None], last: str) -> None:
+        """Have ``write`` fill an empty folder, then publish it under ``name`` unless a complete one exists by then.
 
-    def put(self, name: str, write: Callable[[Path], None]) -> None:
-        with writing(self.path / name) as draft:
-            write(draft)
+        Raises:
+            OSError, DataError: from ``write``, or the store cannot be written; then nothing exists under that name.
+        """
+        if self.is_local:  # the store's folder must exist: creating a lost mount would hide it
+            fill_folder(self.path / name, write, lambda folder: (folder / last).is_file())
+            for draft in self.path.glob(f".{name}-*"):  # of killed or slower processes
+                shutil.rmtree(draft, ignore_errors=True)
+            return
+        with tempfile.TemporaryDirectory(prefix="neuprim-") as folder:
+            write(Path(folder))
+            files = sorted(file.name for file in Path(folder).iterdir() if file.name != last)
+            with self._client_errors("written"):
+                for file in (*files, last):
+                    self._system.put_file(str(Path(folder) / file), f"{self._root}/{name}/{file}")
 
-    def patiently(self, call: Callable[[], T], tell: Tell) -> T:
-        again = True
+    def write_file(self, name: str, write: Callable[[Path], None]) -> None:
+        """Have ``write`` write one file, which then exists completely or not at all. Raises OSError or DataError."""
+        if self.is_local:
+            with checked_atomic_path(self.path / name) as draft:
+                write(draft)
+            return
+        with tempfile.TemporaryDirectory(prefix="neuprim-") as folder:
+            write(Path(folder) / "file")
+            with self._client_errors("written"):
+                self._system.put_file(str(Path(folder) / "file"), f"{self._root}/{name}")
+
+    def retry(self, call: Callable[[], T], notify: Callable[[str], None]) -> T:
+        """Return what ``call`` returns; if a local folder disappeared meanwhile, wait for it and call again.
+
+        Raises:
+            DataError: the folder did not come back within :data:`MAX_WAIT` seconds; or as ``call``.
+        """
+        second_try = True
         while True:
             try:
                 return call()
             except (OSError, DataError) as error:
-                if not self._gone():
-                    if not (again and self._fleeting(error)):
+                if not self.is_local:
+                    raise
+                if not self._is_gone():
+                    if not (second_try and self._may_be_transient(error)):
                         raise
-                    again = False
+                    second_try = False
                     continue
-            self._wait(tell)
+            self._wait(notify)
 
-    def _gone(self) -> bool:
-        """Whether it is not there, or does not answer. A mount that is lost has an empty folder in its place, so that
-        this asks for what is in it."""
+    def _is_gone(self) -> bool:
+        """Whether the folder does not exist or does not answer. A lost mount leaves an empty folder, so ask inside."""
         try:
             return not self.path.is_dir()
         except OSError:
             return True
 
-    def _fleeting(self, error: Exception) -> bool:
-        """Whether an error may be of a moment in which it was not there: of a file in it that was not found."""
+    def _may_be_transient(self, error: Exception) -> bool:
+        """Whether the folder may have been gone for a moment: one of its files was not found."""
         cause = error if isinstance(error, OSError) else error.__cause__
         number = cause.errno if isinstance(cause, OSError) else None
-        return number in (None, *_AWAY) and str(self.path) in str(error)
+        return number in (None, *_DISAPPEARED) and str(self.path) in str(error)
 
-    def _wait(self, tell: Tell) -> None:
-        late = time.monotonic() + PATIENCE
-        tell(f"{WAITING} {self.path}, which is gone")
-        while self._gone():
-            if time.monotonic() > late:
+    def _wait(self, notify: Callable[[str], None]) -> None:
+        deadline = time.monotonic() + MAX_WAIT
+        notify(f"{WAIT_MESSAGE} {self.path}, which is gone")
+        while self._is_gone():
+            if time.monotonic() > deadline:
                 raise DataError(
-                    f"{self.path}: gone for {PATIENCE:.0f} s while it was in use; expected the folder there again (what it holds is kept)"
+                    f"{self.path}: gone for {MAX_WAIT:.0f} s while it was in use; "
+                    "expected the folder there again (what it holds is kept)"
                 )
-            time.sleep(EVERY)
+            time.sleep(POLL_INTERVAL)
+
+    @contextmanager
+    def _client_errors(self, action: str) -> Iterator[None]:
+        """Turn errors of a storage client into DataError."""
+        try:
+            yield
+        except NeuprimError:
+            raise
+        except Exception as error:
+            raise DataError(f"{self.address}: cannot be {action} ({_line(error)})") from error
 
 
-def check_size(file: str, size: int, most: int) -> None:
-    """Refuses a file that is larger than what belongs there can be."""
-    if size > most:
-        raise DataError(f"{file}: {size:,} bytes; expected at most {most:,}")
+def _check_file_size(file: str, size: int, max_bytes: int) -> None:
+    if size > max_bytes:
+        raise DataError(f"{file}: {size:,} bytes; expected at most {max_bytes:,}")
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

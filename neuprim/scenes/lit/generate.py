@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from neuprim.core.checked import Range, verify
-from neuprim.core.io.images import write_exr
+from neuprim.core.io.exr import write_exr
 from neuprim.scenes.image_set import ImageSet, Progress
 from neuprim.scenes.lit import CLASSES
 from neuprim.scenes.lit.rig import DISTANCE, LitView, splits

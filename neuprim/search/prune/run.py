@@ -16,8 +16,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
 from neuprim.core.data.held_out import held_out
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.drafts import refuse_taken
-from neuprim.core.io.files import write_json, write_text
+from neuprim.core.io.files import refuse_existing, write_json, write_text
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer
@@ -102,7 +101,7 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
         raise ConfigError(f"--out {final}: is a file; expected a new folder")
     if final.exists() and final.resolve() == request.run_dir.resolve():
         raise ConfigError(f"--out {final}: is the run itself; expected a new folder")
-    refuse_taken(final, request.overwrite)
+    refuse_existing(final, request.overwrite)
     config, task, model, header = load_run(request.run_dir)
     config = replace(config, output_dir=request.run_dir)
     suspects = suspects_of(config)

@@ -30,7 +30,7 @@ from neuprim.core.data.settings import EveryNth, FolderSettings, SplitName, data
 from neuprim.core.data.transforms import Layout, read_frames, split_frames
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import DataError
-from neuprim.core.io.records import Record, read_json
+from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
 from neuprim.tasks.dynamic.moving import moving_points
 
@@ -55,7 +55,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     name, single = folder.resolve().name, folder / "transforms.json"
     files = {split: folder / f"transforms_{split}.json" for split in (asked.train_split, asked.test_split)}
     if not files[asked.train_split].is_file() and single.is_file():
-        document = read_json(single)
+        document = JsonReader.open(single)
         records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
         clock = _clock(records, [], asked.time_range)
         records, frames = _frames(asked, document, records, clock)
@@ -69,7 +69,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     if not held_out.is_file():
         hint = f"rename {files[asked.train_split].name} to transforms.json, of which every 8th frame is a test view (scene.test_every)"
         raise DataError(f"{held_out}: file not found, so there are no views to judge by; {hint}")
-    documents = {split: read_json(path) for split, path in files.items()}
+    documents = {split: JsonReader.open(path) for split, path in files.items()}
     splits = {split: list(document.objects("frames")) for split, document in documents.items()}
     clock = _clock([r for s in splits.values() for r in s], _others(folder, splits), asked.time_range)
     read = {split: _frames(asked, documents[split], splits[split], clock)[1] for split in splits}
@@ -86,8 +86,8 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
 
 def _frames(
-    asked: MultiviewSettings, document: Record, records: list[Record], clock: _Range
-) -> tuple[list[Record], list[ImageFrame]]:
+    asked: MultiviewSettings, document: JsonReader, records: list[JsonReader], clock: _Range
+) -> tuple[list[JsonReader], list[ImageFrame]]:
     """The frames with their times 0..1, and their records."""
     layout = Layout(keys=("time", "train_filenames", "val_filenames", "test_filenames", "ply_file_path"), masks=True)
     records, frames = read_frames(data_folder(asked.path), document, records, asked, layout)
@@ -102,7 +102,7 @@ def _frames(
 # ---------------------------------------------------------------- time
 
 
-def _clock(records: Sequence[Record], others: Sequence[Path], setting: str) -> _Range:
+def _clock(records: Sequence[JsonReader], others: Sequence[Path], setting: str) -> _Range:
     """The times that become 0 and 1, after a look at the time of every frame.
 
     Args:
@@ -129,7 +129,7 @@ def _clock(records: Sequence[Record], others: Sequence[Path], setting: str) -> _
         return low, high
     times = [_time(r) for r in records]
     for path in others:
-        times += [_time(r) for r in read_json(path).objects("frames")]
+        times += [_time(r) for r in JsonReader.open(path).objects("frames")]
     low, high = min(times), max(times)
     if low == high:
         where = records[0].where.rsplit(": ", 1)[0]
@@ -139,7 +139,7 @@ def _clock(records: Sequence[Record], others: Sequence[Path], setting: str) -> _
     return low, high
 
 
-def _time(record: Record) -> float:
+def _time(record: JsonReader) -> float:
     name = record.text("file_path")
     if "time" not in record.values:
         raise record.fail("time", f"a number for {name}, as other frames have one")

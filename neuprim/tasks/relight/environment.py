@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.environment import Environment, Illumination
-from neuprim.core.io.records import Record
+from neuprim.core.io.json_reader import JsonReader
 
 __all__ = ["FAR", "illuminate", "summary"]
 
@@ -71,13 +71,13 @@ def illuminate(environment: Environment, count: int, facts: Mapping[str, Any]) -
     Raises:
         DataError: facts that are missing or damaged.
     """
-    data = Record(dict(facts), "the model's header: data")
+    data = JsonReader(dict(facts), "the model's header: data")
     center = data.array("center", (3,), "3 numbers")
     up = data.array("up", (3,), "3 numbers")
     lights = data.values.get("lights")
     if not isinstance(lights, dict):
         raise data.fail("lights", "an object with distance, directions, falloff and exposure")
-    known = Record(lights, f"{data.where}: lights")
+    known = JsonReader(lights, f"{data.where}: lights")
     distance = known.number("distance", "a distance above 0", 0.0)
     exposure = known.number("exposure", "a number above 0", 0.0)
     if known.text("falloff") not in ("none", "inverse_square"):

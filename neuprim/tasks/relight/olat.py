@@ -51,7 +51,7 @@ from neuprim.core.data.settings import Background, FolderSettings, HoldOut, Spli
 from neuprim.core.data.transforms import Layout, read_frames, read_splits
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import DataError
-from neuprim.core.io.records import Record, read_json
+from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import SceneContext
 from neuprim.tasks.relight.data import Lighting, bright
@@ -95,7 +95,7 @@ def read_split(folder: Path, split: str, asked: OlatSettings) -> list[ImageFrame
     Raises:
         DataError: as :func:`load`.
     """
-    document = read_json(folder / f"transforms_{split}.json")
+    document = JsonReader.open(folder / f"transforms_{split}.json")
     near = document.number_or("camera_near", 3.0, "a distance above 0", 0.0)
     if document.number_or("camera_far", max(10.0, 2.0 * near), f"a distance above camera_near, {near:g}") <= near:
         raise document.fail("camera_far", f"a distance above camera_near, {near:g}")
@@ -104,16 +104,16 @@ def read_split(folder: Path, split: str, asked: OlatSettings) -> list[ImageFrame
     return [replace(frame, conditions=_light(record, document)) for record, frame in zip(records, frames, strict=True)]
 
 
-def _light(record: Record, document: Record) -> Conditions:
+def _light(record: JsonReader, document: JsonReader) -> Conditions:
     position = record.array("pl_pos", (3,), "the point light's position, 3 numbers")
     return {"light": position, "light_intensity": _intensity(record if record.has("pl_intensity") else document)}
 
 
-def _name(record: Record) -> str:
+def _name(record: JsonReader) -> str:
     return record.text("file_path" if record.has("file_path") or not record.has("img_path") else "img_path")
 
 
-def _image(folder: Path, record: Record) -> Path | None:
+def _image(folder: Path, record: JsonReader) -> Path | None:
     """A frame's file, or None."""
     if record.has("img_path"):
         parts = record.text("img_path").replace("\\", "/").split("/")
@@ -139,7 +139,7 @@ def _file(path: Path) -> Path | None:
         return None
 
 
-def _viewmat(record: Record, ignore_corrections: bool) -> Tensor:
+def _viewmat(record: JsonReader, ignore_corrections: bool) -> Tensor:
     """(4, 4) float64 world-to-camera matrix, OpenCV axes."""
     corrected = record.has("R_opt") or record.has("T_opt")
     if not corrected or ignore_corrections:
@@ -154,7 +154,7 @@ def _viewmat(record: Record, ignore_corrections: bool) -> Tensor:
     return view
 
 
-def _intensity(source: Record) -> Tensor:
+def _intensity(source: JsonReader) -> Tensor:
     """(3,) float32."""
     expected = "3 numbers of at least 0, or one"
     if not source.has("pl_intensity"):

@@ -10,7 +10,7 @@ import pytest
 from neuprim.core.cameras.intrinsics import Target, camera_of, is_fisheye, lens_of
 from neuprim.core.cameras.keys import check_keys, unknown_keys
 from neuprim.core.errors import DataError
-from neuprim.core.io.records import Record
+from neuprim.core.io.json_reader import JsonReader
 
 POSE = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 3.0]]
 IMAGE = Target(64, 48, "a.png")
@@ -23,8 +23,8 @@ def camera(frame: dict[str, Any], file: dict[str, Any], target: Target = IMAGE) 
     """fx, fy, cx, cy and what was said."""
     said: list[str] = []
     found = camera_of(
-        Record({"transform_matrix": POSE, **frame}, "t.json: frames[0]"),
-        Record(file, "t.json"),
+        JsonReader({"transform_matrix": POSE, **frame}, "t.json: frames[0]"),
+        JsonReader(file, "t.json"),
         target,
         None,
         said.append,
@@ -127,12 +127,15 @@ def test_a_picture_to_draw_may_look_past_its_edge_where_its_size_is_stated() -> 
 
 
 def test_a_lens_comes_whole_from_the_frame() -> None:
-    frame, file = Record({"k1": 0.1}, "f"), Record({"k1": 0.5, "k2": 0.5, "camera_model": "OPENCV_FISHEYE"}, "t")
+    frame, file = (
+        JsonReader({"k1": 0.1}, "f"),
+        JsonReader({"k1": 0.5, "k2": 0.5, "camera_model": "OPENCV_FISHEYE"}, "t"),
+    )
     assert (lens_of(frame, file)["k1"], lens_of(frame, file)["k2"]) == (0.1, 0.0)
     assert is_fisheye(frame, file), "the model is not among the coefficients"
-    assert not is_fisheye(Record({"camera_model": "OPENCV"}, "f"), file)
+    assert not is_fisheye(JsonReader({"camera_model": "OPENCV"}, "f"), file)
     with pytest.raises(DataError, match=r"camera_model is .FULL_OPENCV"):
-        is_fisheye(Record({"camera_model": "FULL_OPENCV"}, "f"), file)
+        is_fisheye(JsonReader({"camera_model": "FULL_OPENCV"}, "f"), file)
 
 
 @pytest.mark.parametrize(
@@ -155,7 +158,7 @@ def test_a_lens_comes_whole_from_the_frame() -> None:
 )
 def test_keys_that_change_the_picture_are_refused_by_name(key: str, value: Any) -> None:
     with pytest.raises(DataError, match=f"t.json: {key} "):
-        check_keys(Record({key: value}, "t.json"))
+        check_keys(JsonReader({key: value}, "t.json"))
 
 
 def test_the_same_keys_may_say_nothing() -> None:
@@ -167,18 +170,18 @@ def test_the_same_keys_may_say_nothing() -> None:
         "shift_x": 0,
         "n_frames": 2,
     }
-    check_keys(Record({**nothing, "frames": [{}, {}]}, "t.json"))
+    check_keys(JsonReader({**nothing, "frames": [{}, {}]}, "t.json"))
     with pytest.raises(DataError, match="n_frames is 1; expected 2"):
-        check_keys(Record({"n_frames": 1, "frames": [{}, {}]}, "t.json"))
+        check_keys(JsonReader({"n_frames": 1, "frames": [{}, {}]}, "t.json"))
 
 
 def test_unknown_keys_are_named_once_and_those_of_real_files_are_not() -> None:
-    file = Record(
+    file = JsonReader(
         {"aabb_scale": 16, "applied_transform": POSE, "frames": [], "orientation_override": "none", "exposures": 1},
         "t.json",
     )
     frames = [
-        Record({"file_path": "a", "colmap_im_id": i, "sharpness": 3.0, "time": 0.1, "depth_file_path": "d"}, "f")
+        JsonReader({"file_path": "a", "colmap_im_id": i, "sharpness": 3.0, "time": 0.1, "depth_file_path": "d"}, "f")
         for i in range(3)
     ]
     line = unknown_keys(file, frames, ())

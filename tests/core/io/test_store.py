@@ -14,9 +14,8 @@ import pytest
 
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.io import store as stores
-from neuprim.core.io.npz import read_arrays
-from neuprim.core.io.object_store import ObjectStore, store_at
-from neuprim.core.io.store import LocalStore, Store
+from neuprim.core.io.arrays import read_arrays
+from neuprim.core.io.store import Store, open_store
 
 Make = Callable[[], Store]
 
@@ -30,7 +29,7 @@ def make(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Make]:
         "memory://": "memory://neuprim-tests/s",
     }[request.param]
     copies = iter(range(100))
-    yield lambda: store_at(address, tmp_path / f"copies-{next(copies)}").at("volumes", "key")
+    yield lambda: open_store(address, tmp_path / f"copies-{next(copies)}").at("volumes", "key")
     if request.param == "memory://":
         import fsspec
 
@@ -44,71 +43,71 @@ def two(folder: Path) -> None:
 
 def test_a_folder_is_there_when_its_last_file_is(make: Make) -> None:
     store = make()
-    store.begin()
-    assert store.whole("last") == set() and not store.has("x/last")
-    store.publish("x", two, "last")
+    store.prepare()
+    assert store.complete_folders("last") == set() and not store.has_file("x/last")
+    store.write_folder("x", two, "last")
     other = make()
-    assert other.whole("last") == {"x"} and other.has("x/a")
-    assert other.fetch("x/a", 100).read_text() == "first" and not other.fetch("x/none", 100).exists()
-    store.publish("x", two, "last")
-    store.put("note", lambda path: path.write_text("n") and None)
-    assert make().fetch("note", 1).read_text() == "n" and other.whole("last") == {"x"}
+    assert other.complete_folders("last") == {"x"} and other.has_file("x/a")
+    assert other.fetch_file("x/a", 100).read_text() == "first" and not other.fetch_file("x/none", 100).exists()
+    store.write_folder("x", two, "last")
+    store.write_file("note", lambda path: path.write_text("n") and None)
+    assert make().fetch_file("note", 1).read_text() == "n" and other.complete_folders("last") == {"x"}
 
 
 def test_what_fails_half_way_leaves_nothing(make: Make) -> None:
     store = make()
-    store.begin()
+    store.prepare()
 
     def fails(folder: Path) -> None:
         (folder / "last").write_text("half")
         raise OSError(28, "No space left on device")
 
     with pytest.raises(OSError, match="No space left"):
-        store.publish("x", fails, "last")
-    assert make().whole("last") == set()
-    if isinstance(store, LocalStore):
+        store.write_folder("x", fails, "last")
+    assert make().complete_folders("last") == set()
+    if store.is_local:
         assert list(store.path.iterdir()) == []
 
 
 def test_a_file_larger_than_what_belongs_there_is_not_read(make: Make) -> None:
     store = make()
-    store.begin()
-    store.put("big", lambda path: path.write_bytes(bytes(1000)) and None)
+    store.prepare()
+    store.write_file("big", lambda path: path.write_bytes(bytes(1000)) and None)
     with pytest.raises(DataError, match=r"big: 1,000 bytes; expected at most 999$"):
-        make().fetch("big", 999)
+        make().fetch_file("big", 999)
 
 
 def test_a_folder_without_its_last_file_is_made_anew(tmp_path: Path) -> None:
-    store = LocalStore(tmp_path)
+    store = Store.local(tmp_path)
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / "rest").touch()
     (tmp_path / ".x-killed").mkdir()
-    assert store.whole("last") == set()
-    store.publish("x", two, "last")
+    assert store.complete_folders("last") == set()
+    store.write_folder("x", two, "last")
     assert sorted(f.name for f in tmp_path.rglob("*")) == ["a", "last", "x"]
 
 
 def test_errors_of_a_client_are_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = store_at("memory://neuprim-tests/x", tmp_path)
-    assert isinstance(store, ObjectStore)
+    store = open_store("memory://neuprim-tests/x", tmp_path)
+    assert not store.is_local
 
     class Broken:
         def __getattr__(self, name: str) -> Any:
             raise RuntimeError("no\ncredentials")
 
     monkeypatch.setattr(store, "_system", Broken())
-    for call in (lambda: store.whole("a"), lambda: store.has("a"), lambda: store.fetch("a", 1)):
+    for call in (lambda: store.complete_folders("a"), lambda: store.has_file("a"), lambda: store.fetch_file("a", 1)):
         with pytest.raises(DataError, match=r"^memory://neuprim-tests/x: cannot be read \(no credentials\)$"):
             call()
     with pytest.raises(DataError, match=r"cannot be written \(no credentials\)"):
-        store.publish("x", two, "last")
+        store.write_folder("x", two, "last")
 
 
 def test_no_bucket_is_made(tmp_path: Path) -> None:
     """A typing error would make one."""
-    ObjectStore("s3://bukcet/x", None, "bukcet/x", tmp_path).begin()
+    Store("s3://bukcet/x", tmp_path, object(), "bukcet/x").prepare()
     with pytest.raises(DataError, match="cannot be written"):
-        ObjectStore("sftp://host/x", None, "x", tmp_path).begin()
+        Store("sftp://host/x", tmp_path, object(), "x").prepare()
 
 
 def test_addresses_that_nothing_can_be_made_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,21 +122,21 @@ def test_addresses_that_nothing_can_be_made_of(tmp_path: Path, monkeypatch: pyte
         with pytest.raises(
             ConfigError, match=r"expected a folder, or a URL of file, local, memory, s3, .*, as s3://BUCKET/FOLDER$"
         ) as refused:
-            store_at(address, tmp_path)
+            open_store(address, tmp_path)
         assert str(refused.value).startswith(f"{address}: {'a chain' if '::' in address else 'protocol'}")
     monkeypatch.setitem(sys.modules, "s3fs", None)
     with pytest.raises(
         BackendUnavailable, match=r"^s3://bucket: s3:// needs a package .*: pip install 'neuprim\[s3\]'$"
     ):
-        store_at("s3://bucket", tmp_path)
+        open_store("s3://bucket", tmp_path)
 
 
 def test_a_moments_absence_is_survived_and_other_errors_are_not_tried_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stores, "EVERY", 0.01)
-    store, calls = LocalStore(tmp_path / "s"), []
-    store.begin()
+    monkeypatch.setattr(stores, "POLL_INTERVAL", 0.01)
+    store, calls = Store.local(tmp_path / "s"), []
+    store.prepare()
 
     def away() -> str:
         calls.append("away")
@@ -150,7 +149,7 @@ def test_a_moments_absence_is_survived_and_other_errors_are_not_tried_twice(
         return "done"
 
     said: list[str] = []
-    assert store.patiently(away, said.append) == "done" and len(calls) == 3
+    assert store.retry(away, said.append) == "done" and len(calls) == 3
     assert said == [f"waiting for {store.path}, which is gone"]
 
     def full() -> None:
@@ -158,7 +157,7 @@ def test_a_moments_absence_is_survived_and_other_errors_are_not_tried_twice(
         raise OSError(28, "No space left on device", str(store.path / "f"))
 
     with pytest.raises(OSError, match="No space left"):
-        store.patiently(full, said.append)
+        store.retry(full, said.append)
     assert calls.count("full") == 1
 
 

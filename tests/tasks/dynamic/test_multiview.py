@@ -19,7 +19,7 @@ from torch import Tensor
 from neuprim.core.data.hull import EmptyHull, hull_surface
 from neuprim.core.data.initial import box_points
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.images import write_exr
+from neuprim.core.io.exr import write_exr
 from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.dynamic.moving import moving_points
 from neuprim.tasks.dynamic.multiview import load

@@ -12,7 +12,7 @@ import torch
 
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.store import LocalStore
+from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume.dataset import FrameViews
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
@@ -208,7 +208,7 @@ def test_two_runs_that_render_the_same_frame_do_not_disturb_each_other(
     recording = recorded(data)
     image = recording.capture.image(recording.folder, recording.capture.frames[0], 0)
     before = os.stat(image).st_ino
-    RenderedFrames(recording.capture, LocalStore(tmp_path / "cache")).write(0)  # as the slower one of two does
+    RenderedFrames(recording.capture, Store.local(tmp_path / "cache")).write(0)  # as the slower one of two does
     assert os.stat(image).st_ino == before
     assert not list(recording.folder.path.glob(".*"))
 

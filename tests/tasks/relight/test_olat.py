@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import Dataset
-from neuprim.core.io.images import linear_to_srgb, srgb_to_linear, write_exr, write_png
+from neuprim.core.io.exr import write_exr
+from neuprim.core.io.images import linear_to_srgb, srgb_to_linear, write_png
 from neuprim.core.notices import NeuprimWarning
 from neuprim.core.task import SceneContext
 from neuprim.tasks.relight import judging

@@ -14,7 +14,8 @@ from PIL import Image
 from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.images import exr_channels, read_image, write_exr
+from neuprim.core.io.exr import exr_channels, write_exr
+from neuprim.core.io.images import read_image
 from neuprim.plugins.registry import load_task
 from neuprim.runs.draw import render_run
 from neuprim.runs.fit import make_trainer

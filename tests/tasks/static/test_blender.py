@@ -14,7 +14,7 @@ from PIL import Image
 
 from neuprim.core.data.views import ImageViews
 from neuprim.core.errors import DataError
-from neuprim.core.io.images import write_exr
+from neuprim.core.io.exr import write_exr
 from neuprim.core.notices import NeuprimWarning
 from neuprim.core.task import SceneContext
 from neuprim.tasks.static.datasets.blender import load

@@ -9,7 +9,7 @@ what was found and what was expected; no claim in a file makes memory be taken t
 from neuprim.core.io.vdb.grid import DENSE_LIMIT, Bounds, Grid, Tiles, scale_transform
 from neuprim.core.io.vdb.header import FileHeader, GridHeader, read_header
 from neuprim.core.io.vdb.read import LEAF_LIMIT, read_grid, read_grids
-from neuprim.core.io.vdb.sequence import FrameSurvey, Sequence, Survey, VdbFrame, sequence
+from neuprim.core.io.vdb.sequence import Sequence, VdbFrame, sequence
 from neuprim.core.io.vdb.write import COMPRESSIONS, write_vdb
 
 __all__ = [
@@ -19,11 +19,9 @@ __all__ = [
     "Bounds",
     "FileHeader",
     "VdbFrame",
-    "FrameSurvey",
     "Grid",
     "GridHeader",
     "Sequence",
-    "Survey",
     "Tiles",
     "read_grid",
     "read_grids",

@@ -241,7 +241,8 @@ class Grid:
         size = shape[0] * shape[1] * shape[2] * 4 * self.channels
         if size > max_bytes:
             raise DataError(
-                f"grid {self.name!r}: {' x '.join(map(str, shape))} voxels take {size} bytes when dense; at most {max_bytes} are allowed"
+                f"grid {self.name!r}: {' x '.join(map(str, shape))} voxels take {size} bytes when dense; "
+                f"at most {max_bytes} are allowed"
             )
         padded = np.empty((*shape, *channels), np.float32)
         padded[...] = self.background

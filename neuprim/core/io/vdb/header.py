@@ -1,19 +1,183 @@
-"""What an OpenVDB file says about itself: version, metadata, and a description of every grid, with no tree decoded."""
+"""Read what an OpenVDB file says about itself, through a cursor that checks every length.
+
+No tree is decoded here. Every length is checked against the bytes that are left before anything is allocated.
+"""
 
 from __future__ import annotations
 
+import mmap
 import struct
-from collections.abc import Mapping
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from neuprim.core.errors import DataError, nearest
-from neuprim.core.io.vdb.stream import BLOSC, MASK, ZIP, Cursor, compression_label, opened
+from neuprim.core.errors import BackendUnavailable, DataError, nearest
 
-__all__ = ["MAGIC", "VERSIONS", "FileHeader", "GridHeader", "parse_header", "read_header"]
+__all__ = [
+    "BLOSC",
+    "MAGIC",
+    "MASK",
+    "VERSIONS",
+    "ZIP",
+    "Cursor",
+    "FileHeader",
+    "GridHeader",
+    "blosc_module",
+    "compression_label",
+    "decompressor",
+    "open_cursor",
+    "parse_header",
+    "read_header",
+]
+
+ZIP, MASK, BLOSC = 1, 2, 4
+"""The bits of a grid's compression word."""
+
+_BLOSC_HEADER = struct.Struct("<4xI4xI")
+"""Of a Blosc chunk's 16 bytes: how many bytes it unpacks to, and how many it has."""
+
+
+class Cursor:
+    """A position in a file's bytes that cannot leave them.
+
+    Attributes:
+        path: the file, for messages.
+        data: all bytes of the file.
+        at, end: the next byte, and the first one that must not be read.
+    """
+
+    __slots__ = ("at", "data", "end", "path")
+
+    def __init__(self, path: Path, data: bytes | mmap.mmap, at: int = 0, end: int | None = None) -> None:
+        self.path, self.data, self.at = path, data, at
+        self.end = len(data) if end is None else end
+
+    def fail(self, text: str) -> DataError:
+        """The error to raise for something wrong at or before this place."""
+        return DataError(f"{self.path}: {text}")
+
+    def need(self, count: int, what: str) -> None:
+        """Raises DataError unless ``count`` more bytes are there."""
+        if not 0 <= count <= self.end - self.at:
+            raise self.fail(
+                f"{what} at byte {self.at} needs {count} bytes, but {self.end - self.at} are left there; "
+                "truncated or damaged OpenVDB file"
+            )
+
+    def take(self, count: int, what: str) -> bytes:
+        self.need(count, what)
+        self.at += count
+        return self.data[self.at - count : self.at]
+
+    def skip(self, count: int, what: str) -> None:
+        self.need(count, what)
+        self.at += count
+
+    def unpack(self, layout: str, what: str) -> tuple[Any, ...]:
+        """Little-endian values without padding, as in :mod:`struct`."""
+        return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout), what))
+
+    def text(self, what: str) -> str:
+        """A length (uint32) and so many bytes of UTF-8; bytes that are not become U+FFFD."""
+        (length,) = self.unpack("I", f"length of {what}")
+        return self.take(length, what).decode("utf-8", errors="replace")
+
+
+@contextmanager
+def open_cursor(path: Path) -> Iterator[Cursor]:
+    """A cursor at the start of a file, which is mapped rather than read.
+
+    Raises:
+        DataError: missing, empty, not a file, or not readable.
+    """
+    if not path.exists():
+        raise DataError(f"{path}: file not found; expected an OpenVDB file")
+    if not path.is_file():
+        raise DataError(f"{path}: not a file; expected an OpenVDB file")
+    try:
+        with open(path, "rb") as file:
+            if not file.read(1):
+                raise DataError(f"{path}: file is empty; expected an OpenVDB file")
+            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error}); expected an OpenVDB file") from None
+    with data:
+        yield Cursor(path, data)
+
+
+def compression_label(flags: int) -> str:
+    """The words OpenVDB itself uses, for example ``blosc + active values``."""
+    codec = "blosc" if flags & BLOSC else "zip" if flags & ZIP else ""
+    return " + ".join(word for word in (codec, "active values" if flags & MASK else "") if word) or "none"
+
+
+def blosc_module() -> Any:
+    """The package ``blosc``, set to one thread.
+
+    OpenVDB packs leaves in blocks of 256 bytes; with more threads every leaf of 2 KB would start and join them all.
+
+    Raises:
+        BackendUnavailable: it is not installed.
+    """
+    try:
+        import blosc
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"Blosc-compressed OpenVDB files need the package blosc ({error}): pip install blosc"
+        ) from None
+    blosc.set_nthreads(1)
+    return blosc
+
+
+def decompressor(flags: int) -> Callable[[bytes, int], bytes]:
+    """The function (chunk, size) -> bytes that undoes a grid's compression; it never makes more than ``size`` bytes.
+
+    It raises ValueError, with a text that says what is wrong, for damaged chunks and for any other size.
+    """
+    if not flags & BLOSC:
+        return _unzip
+    blosc = blosc_module()
+    decompress, sizes = blosc.decompress, _BLOSC_HEADER.unpack_from
+
+    def unblosc(chunk: bytes, size: int) -> bytes:
+        if len(chunk) < 16:
+            raise ValueError(f"a Blosc chunk of {len(chunk)} bytes; expected at least 16")
+        claimed, length = sizes(chunk)
+        if claimed != size or length != len(chunk):  # also what keeps the library from allocating gigabytes
+            raise ValueError(f"a Blosc chunk of {length} bytes for {claimed}; expected {len(chunk)} bytes for {size}")
+        if not size:
+            return b""
+        try:
+            values: bytes = decompress(chunk)
+        except MemoryError:
+            raise
+        except Exception as error:  # the extension has an error class of its own
+            raise ValueError(f"a damaged Blosc chunk ({error})") from None
+        if len(values) != size:
+            raise ValueError(f"a Blosc chunk of {len(values)} bytes; expected {size}")
+        return values
+
+    return unblosc
+
+
+def _unzip(chunk: bytes, size: int) -> bytes:
+    try:
+        values = zlib.decompressobj().decompress(chunk, size + 1)
+    except zlib.error as error:
+        raise ValueError(f"a damaged zip chunk ({error})") from None
+    if len(values) != size:
+        raise ValueError(
+            f"a zip chunk of {'more than ' * (len(values) > size)}{min(len(values), size)} bytes; expected {size}"
+        )
+    return values
+
+
+# ---------------------------------------------------------------- headers
 
 MAGIC = 0x56444220
 VERSIONS = (222, 224)
@@ -136,7 +300,7 @@ def read_header(path: Path) -> FileHeader:
     Raises:
         DataError: not an OpenVDB file, a version outside :data:`VERSIONS`, written as a stream, truncated or damaged.
     """
-    with opened(Path(path)) as cursor:
+    with open_cursor(Path(path)) as cursor:
         return parse_header(cursor)
 
 
@@ -177,7 +341,8 @@ def _grid(cursor: Cursor, what: str) -> GridHeader:
         block = end  # OpenVDB leaves it 0: the tree is the parent's
     if not cursor.at <= start <= block <= end <= len(cursor.data):
         raise cursor.fail(
-            f"{what} claims bytes {start} to {block} to {end}; expected rising offsets from {cursor.at} to at most {len(cursor.data)}"
+            f"{what} claims bytes {start} to {block} to {end}; "
+            f"expected rising offsets from {cursor.at} to at most {len(cursor.data)}"
         )
     inner = Cursor(cursor.path, cursor.data, start, end)
     (flags,) = inner.unpack("I", f"compression of {what}")
@@ -237,6 +402,7 @@ def _transform(cursor: Cursor, what: str) -> tuple[str, np.ndarray | None]:
         sound = sound and abs(np.linalg.det(matrix[:3, :3] / size)) > 1e-12 and bool((matrix[3] == (0, 0, 0, 1)).all())
     if not sound:
         raise cursor.fail(
-            f"{what} has the transform {np.array2string(matrix, separator=', ')}; expected finite numbers and voxels of some volume"
+            f"{what} has the transform {np.array2string(matrix, separator=', ')}; "
+            "expected finite numbers and voxels of some volume"
         )
     return mapping, matrix

@@ -1,16 +1,34 @@
-"""Reading grids, one at a time."""
+"""Read grids: decode trees of root, upper nodes (32³ slots of 128³ voxels), lower nodes (16³ slots of 8³) and leaves.
+
+The layout is that of OpenVDB's ``RootNode``, ``InternalNode``, ``LeafNode`` and ``io/Compression.h``, file versions
+222 to 224: first the topology, depth first, in which a leaf is 64 bytes of mask; then all leaf buffers in the same
+order. Memory stays within about 150 times the file's size, as every node and leaf needs bytes in the file.
+"""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-from neuprim.core.io.vdb.grid import Grid
-from neuprim.core.io.vdb.header import FileHeader, GridHeader, parse_header
-from neuprim.core.io.vdb.stream import Cursor, opened
-from neuprim.core.io.vdb.tree import TreeReader
+import numpy as np
 
-__all__ = ["LEAF_LIMIT", "read_grid", "read_grids"]
+from neuprim.core.errors import DataError
+from neuprim.core.io.vdb.grid import TILE_SIZES, Grid, Tiles
+from neuprim.core.io.vdb.header import (
+    BLOSC,
+    MASK,
+    ZIP,
+    Cursor,
+    FileHeader,
+    GridHeader,
+    decompressor,
+    open_cursor,
+    parse_header,
+)
+
+__all__ = ["ALL_VALUES", "LEAF_LIMIT", "LOWER", "UPPER", "Slots", "read_grid", "read_grids"]
 
 LEAF_LIMIT = 4 * 2**30
 """Most bytes of decoded leaves and tiles that :func:`read_grid` takes unless told otherwise: 4 GiB."""
@@ -29,7 +47,7 @@ def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets:
         DataError: no such file or grid; points, a level set or another type that is not read; truncated or damaged.
         BackendUnavailable: the grid is Blosc-compressed, and the package ``blosc`` is missing.
     """
-    with opened(Path(path)) as cursor:
+    with open_cursor(Path(path)) as cursor:
         file = parse_header(cursor)
         return _read(cursor, file, file.grid(name), max_bytes, level_sets)
 
@@ -46,7 +64,7 @@ def read_grids(
     Raises:
         DataError, BackendUnavailable: as :func:`read_grid`, when that grid's turn comes.
     """
-    with opened(Path(path)) as cursor:
+    with open_cursor(Path(path)) as cursor:
         file = parse_header(cursor)
         if names is None:
             names = [g.name for g in file.grids if not (g.undecodable() if level_sets else g.refusal())]
@@ -67,7 +85,7 @@ def _read(cursor: Cursor, file: FileHeader, header: GridHeader, max_bytes: int, 
                 f"{what} shares the tree of {header.parent!r}, which has none of its own or one of another type"
             )
     inner = Cursor(cursor.path, cursor.data, source.tree_at, source.end)
-    tree = TreeReader(inner, source.block, source.flags, source.half, source.channels, what, max_bytes)
+    tree = _TreeReader(inner, source.block, source.flags, source.half, source.channels, what, max_bytes)
     return Grid(
         header.name,
         header.transform,
@@ -80,3 +98,297 @@ def _read(cursor: Cursor, file: FileHeader, header: GridHeader, max_bytes: int, 
         header.half,
         dict(header.metadata),
     )
+
+
+# ---------------------------------------------------------------- trees
+
+ALL_VALUES = 6
+"""The code of a node that stores every value, active or not. Codes of nodes that store active values alone:
+
+0: inactive values are the background; 1: minus the background; 2: one value, given; 3: a mask chooses background or its
+negative; 4: a mask chooses background or one value, given; 5: a mask chooses between two values, given.
+"""
+
+_CHUNK = 1024
+"""Leaves decoded together: 2 MB of float32, which stays in a core's cache."""
+
+_LEAF = 512
+
+
+class Slots:
+    """The children of an internal node.
+
+    Attributes:
+        count: how many: (2 ** log2) ** 3.
+        edge: voxels along one edge of a child.
+        offsets: (count, 3) int32, the lowest index of each relative to the node's.
+    """
+
+    def __init__(self, log2: int, edge: int) -> None:
+        self.count, self.edge = 1 << 3 * log2, edge
+        axes = np.unravel_index(np.arange(self.count), (1 << log2,) * 3)
+        self.offsets = np.stack(axes, 1).astype(np.int32) * np.int32(edge)
+
+
+UPPER, LOWER = Slots(5, 128), Slots(4, 8)
+
+
+class _TreeReader:
+    """Decodes one tree.
+
+    Args:
+        cursor: at the first byte of the tree and ending with its grid.
+        block: where the leaf buffers begin.
+        flags, half, channels: how values are stored.
+        what: the grid, for messages.
+        max_bytes: most memory for the decoded leaves and tiles.
+
+    Attributes:
+        background: () or (3,) float32.
+        origins, values, masks, tiles: as in :class:`~neuprim.core.io.vdb.grid.Grid`.
+
+    Raises:
+        DataError: truncated, inconsistent or damaged, or leaves and tiles that take more than ``max_bytes``.
+        BackendUnavailable: Blosc chunks, but no package ``blosc``.
+    """
+
+    def __init__(
+        self, cursor: Cursor, block: int, flags: int, half: bool, channels: int, what: str, max_bytes: int
+    ) -> None:
+        self._buffers = Cursor(cursor.path, cursor.data, block, cursor.end)
+        self._cursor = Cursor(cursor.path, cursor.data, cursor.at, block)
+        self._flags, self._half, self._what = flags, half, what
+        self._shape = (3,) if channels == 3 else ()
+        self._stored = np.dtype("<f2" if half else "<f4")
+        self._stored_size = self._stored.itemsize * channels
+        self._full_size = 4 * channels
+        self._packed = bool(flags & (ZIP | BLOSC))
+        self._unpack = decompressor(flags)
+        self._leaf_origins: list[np.ndarray] = []
+        self._tiles: list[tuple[np.ndarray, int, np.ndarray, np.ndarray]] = []
+        self._limit = max_bytes
+        self._left = max_bytes  # what tiles have not taken yet
+        self._topology()
+        self.origins = np.concatenate(self._leaf_origins) if self._leaf_origins else np.zeros((0, 3), np.int32)
+        self.tiles = self._collect_tiles(channels)
+        count = len(self.origins)
+        size = count * _LEAF * (self._full_size + 1)
+        if size > self._left:
+            raise cursor.fail(
+                f"{what} has {count} leaves, which take {size} bytes in memory; at most {self._left} are allowed"
+            )
+        self.values: np.ndarray = np.empty((count, _LEAF, *self._shape), np.float32)
+        self.masks: np.ndarray = np.empty((count, _LEAF), bool)
+        for first in range(0, count, _CHUNK):
+            self._leaves(first, min(first + _CHUNK, count))
+        if self._buffers.at != self._buffers.end:
+            raise cursor.fail(
+                f"{what}: leaf buffers end at byte {self._buffers.at}; the header says {self._buffers.end}"
+            )
+        self.values = self.values.reshape(count, 8, 8, 8, *self._shape)
+        self.masks = self.masks.reshape(count, 8, 8, 8)
+
+    # ---------------------------------------------------------------- topology
+
+    def _topology(self) -> None:
+        cursor, what = self._cursor, self._what
+        (buffers,) = cursor.unpack("i", f"number of buffers of {what}")
+        if buffers != 1:
+            raise cursor.fail(f"{what} has {buffers} buffers per leaf; expected 1")
+        self.background = self._floats(cursor.take(self._full_size, f"background of {what}"))
+        tiles, children = cursor.unpack("II", f"root of {what}")
+        layout = np.dtype([("origin", "<i4", 3), ("value", "<f4", self._shape), ("active", "u1")])
+        found = np.frombuffer(cursor.take(tiles * layout.itemsize, f"{tiles} root tiles of {what}"), layout)
+        self._keep_tiles(found["origin"], TILE_SIZES[2], found["value"], found["active"] != 0)
+        seen: set[tuple[int, ...]] = set()
+        for entry in found["origin"].tolist():
+            self._root_entry(seen, tuple(entry))
+        for i in range(children):
+            origin = cursor.unpack("3i", f"root child {i + 1} of {children} of {what}")
+            self._root_entry(seen, origin)
+            self._upper(np.array(origin, np.int32))
+        if cursor.at != cursor.end:
+            raise cursor.fail(f"{what}: nodes end at byte {cursor.at}; the header says {cursor.end}")
+
+    def _root_entry(self, seen: set[tuple[int, ...]], origin: tuple[int, ...]) -> None:
+        if origin in seen or any(v % TILE_SIZES[2] for v in origin):
+            raise self._cursor.fail(
+                f"{self._what} has a root entry at {origin}; expected multiples of {TILE_SIZES[2]}, each once"
+            )
+        seen.add(origin)
+
+    def _upper(self, origin: np.ndarray) -> None:
+        for child in UPPER.offsets[self._node(origin, UPPER)]:
+            lower = origin + child
+            leaves = LOWER.offsets[self._node(lower, LOWER)]
+            self._cursor.skip(
+                64 * len(leaves), f"masks of {len(leaves)} leaves of {self._what}"
+            )  # repeated with the buffers
+            self._leaf_origins.append(lower + leaves)
+
+    def _node(self, origin: np.ndarray, slots: Slots) -> np.ndarray:
+        """Reads an internal node, keeps its tiles, and returns which slots, in order, are children."""
+        cursor, what = self._cursor, f"a node of {self._what}"
+        children, active = (_bits(cursor.take(slots.count // 8, f"masks of {what}")) for _ in range(2))
+        values = self._values(active, slots.count, what)
+        if values is not None:
+            different = (values != self.background).any(-1) if self._shape else values != self.background
+            kept = np.flatnonzero((active | different) & ~children)
+            self._keep_tiles(origin + slots.offsets[kept], slots.edge, values[kept], active[kept])
+        return np.flatnonzero(children)
+
+    def _keep_tiles(self, origins: np.ndarray, size: int, values: np.ndarray, active: np.ndarray) -> None:
+        different = (values != self.background).any(-1) if self._shape else values != self.background
+        kept = active | different  # the others are what is nowhere stored
+        if kept.any():
+            self._left -= int(np.count_nonzero(kept)) * (17 + self._full_size)
+            if self._left < 0:
+                raise self._cursor.fail(
+                    f"{self._what} has tiles that take more bytes in memory than the {self._limit} allowed"
+                )
+            self._tiles.append((origins[kept], size, values[kept], active[kept]))
+
+    def _collect_tiles(self, channels: int) -> Tiles:
+        if not self._tiles:
+            return Tiles.none(channels)
+        origins, sizes, values, active = zip(*self._tiles, strict=True)
+        repeated = np.repeat(np.array(sizes, np.int32), [len(a) for a in active])
+        return Tiles(
+            np.concatenate(origins).astype(np.int32),
+            repeated,
+            np.concatenate(values).astype(np.float32),
+            np.concatenate(active),
+        )
+
+    # ---------------------------------------------------------------- values of one node
+
+    def _values(self, active: np.ndarray, count: int, what: str) -> np.ndarray | None:
+        """(count,) or (count, 3) float32; None where all of them are the background and not active."""
+        cursor = self._cursor
+        code, low, high, chosen = self._inactive(cursor, count, what)
+        whole = not self._flags & MASK or code == ALL_VALUES
+        stored = count if whole else int(np.count_nonzero(active))
+        found = self._decoded(self._payload(cursor, stored, what))
+        if whole:
+            return found
+        if code == 0 and not stored:
+            return None
+        values = np.empty((count, *self._shape), np.float32)
+        values[:] = low
+        if chosen is not None:
+            values[_bits(chosen)] = high
+        values[active] = found
+        return values
+
+    def _inactive(self, cursor: Cursor, count: int, what: str) -> tuple[int, np.ndarray, np.ndarray, bytes | None]:
+        """The code of a node, its two inactive values, and the mask that chooses the second of them."""
+        code = cursor.take(1, f"value code of {what}")[0]
+        if code > ALL_VALUES:
+            raise cursor.fail(f"{what} has the value code {code} at byte {cursor.at - 1}; expected 0 to {ALL_VALUES}")
+        low, high = self.background if code == 0 else -self.background, self.background
+        if code in (2, 4, 5):
+            low = self._floats(cursor.take(self._full_size, f"inactive value of {what}"))
+        if code == 5:
+            high = self._floats(cursor.take(self._full_size, f"inactive value of {what}"))
+        return code, low, high, cursor.take(count // 8, f"selection mask of {what}") if code in (3, 4, 5) else None
+
+    def _payload(self, cursor: Cursor, count: int, what: str) -> bytes:
+        """The bytes of ``count`` stored values."""
+        size = count * self._stored_size
+        if not self._packed:
+            return cursor.take(size, f"values of {what}")
+        if self._half and not count:
+            return b""  # OpenVDB then writes no length either
+        (length,) = cursor.unpack("q", f"size of the values of {what}")
+        if length <= 0:  # minus the size of values that are not packed
+            if -length != size:
+                raise cursor.fail(f"{what} has {-length} bytes of values; expected {size}")
+            return cursor.take(size, f"values of {what}")
+        chunk = cursor.take(length, f"values of {what}")
+        try:
+            return self._unpack(chunk, size)
+        except ValueError as error:
+            raise self._bad(cursor, what, error) from None
+
+    def _bad(self, cursor: Cursor, what: str, error: Exception) -> DataError:
+        return cursor.fail(f"{what} has, before byte {cursor.at}, {error}")
+
+    def _decoded(self, raw: bytes) -> np.ndarray:
+        return np.frombuffer(raw, self._stored).astype(np.float32, copy=False).reshape(-1, *self._shape)
+
+    def _floats(self, raw: bytes) -> np.ndarray:
+        return np.frombuffer(raw, "<f4").reshape(self._shape).astype(np.float32)
+
+    # ---------------------------------------------------------------- leaves
+
+    def _leaves(self, first: int, last: int) -> None:
+        """Decodes leaves ``first`` to ``last`` - 1: one loop over their headers, then whole arrays."""
+        masks, special, whole, payloads = self._leaf_bytes(first, last)
+        active = _bits(masks).reshape(-1, _LEAF)
+        values = self.values[first:last]
+        values[:] = self.background
+        for i, low, high, chosen in special:
+            values[i] = low
+            if chosen is not None:
+                values[i, _bits(chosen)] = high
+        stored = active
+        if whole:
+            stored = active.copy()
+            stored[whole] = True
+        found = self._decoded(payloads)
+        if len(found) == values.shape[0] * _LEAF:
+            values[:] = found.reshape(values.shape)
+        else:
+            values[stored] = found
+        self.masks[first:last] = active
+
+    def _leaf_bytes(
+        self, first: int, last: int
+    ) -> tuple[bytes, list[tuple[int, Any, Any, bytes | None]], list[int], bytes]:
+        """Masks, leaves with inactive values besides the background, leaves that store all values, and all stored
+        values."""
+        cursor, what = self._buffers, f"a leaf of {self._what}"
+        data, unpack, size_at = cursor.data, self._unpack, struct.Struct("<q").unpack_from
+        unit, masked, packed, nothing = self._stored_size, self._flags & MASK, self._packed, self._half
+        masks: list[bytes] = []
+        payloads: list[bytes] = []
+        special: list[tuple[int, Any, Any, bytes | None]] = []
+        whole: list[int] = []
+        at, end = cursor.at, cursor.end
+        for i in range(last - first):
+            if at + 65 > end:
+                cursor.at = at
+                cursor.need(65, f"mask and value code of {what}")
+            mask = data[at : at + 64]
+            masks.append(mask)
+            code = data[at + 64]
+            at += 65
+            if masked and code != ALL_VALUES:
+                count = int.from_bytes(mask, "little").bit_count()
+            else:
+                count = _LEAF
+                whole.append(i)
+            if code and code != ALL_VALUES:
+                cursor.at = at - 1
+                _, low, high, chosen = self._inactive(cursor, _LEAF, what)
+                at = cursor.at
+                special.append((i, low, high, chosen))
+            if packed and at + 8 <= end and (count or not nothing):
+                (length,) = size_at(data, at)
+                if 0 < length <= end - at - 8:
+                    at += 8 + length
+                    try:
+                        payloads.append(unpack(data[at - length : at], count * unit))
+                    except ValueError as error:
+                        cursor.at = at
+                        raise self._bad(cursor, what, error) from None
+                    continue
+            cursor.at = at  # the rarer cases, and all errors
+            payloads.append(self._payload(cursor, count, what))
+            at = cursor.at
+        cursor.at = at
+        return b"".join(masks), special, whole, b"".join(payloads)
+
+
+def _bits(raw: bytes) -> np.ndarray:
+    return np.unpackbits(np.frombuffer(raw, np.uint8), bitorder="little").view(bool)

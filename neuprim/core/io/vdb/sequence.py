@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
+from neuprim.core.errors import DataError
 
-from neuprim.core.errors import DataError, nearest
-from neuprim.core.io.vdb.grid import Bounds, Grid
-from neuprim.core.io.vdb.header import FileHeader, read_header
-from neuprim.core.io.vdb.read import LEAF_LIMIT, read_grid
-
-__all__ = ["VdbFrame", "FrameSurvey", "Sequence", "Survey", "sequence"]
+__all__ = ["Sequence", "VdbFrame", "sequence"]
 
 
 @dataclass(frozen=True)
@@ -24,66 +18,6 @@ class VdbFrame:
 
     number: int
     path: Path
-
-
-@dataclass(frozen=True)
-class FrameSurvey:
-    """What one frame holds of one grid.
-
-    Attributes:
-        frame: the file.
-        present: it has the grid at all. If not, all that follows is None or 0.
-        voxel_size: edges in world units.
-        bounds: box of active voxels, in indices; None if none is active.
-        world_bounds: (2, 3) the same in world units, voxels with their extent.
-        range: least and greatest finite active value.
-        active_voxels, non_finite: counts.
-    """
-
-    frame: VdbFrame
-    present: bool = False
-    voxel_size: tuple[float, float, float] | None = None
-    bounds: Bounds | None = None
-    world_bounds: np.ndarray | None = None
-    range: tuple[float, float] | None = None
-    active_voxels: int = 0
-    non_finite: int = 0
-
-
-@dataclass(frozen=True)
-class Survey:
-    """One grid over all frames of a sequence."""
-
-    name: str
-    frames: tuple[FrameSurvey, ...]
-
-    @property
-    def absent(self) -> tuple[int, ...]:
-        """Numbers of the frames without the grid."""
-        return tuple(f.frame.number for f in self.frames if not f.present)
-
-    @property
-    def empty(self) -> tuple[int, ...]:
-        """Numbers of the frames that have the grid, but no active voxel in it."""
-        return tuple(f.frame.number for f in self.frames if f.present and f.bounds is None)
-
-    @property
-    def voxel_sizes(self) -> tuple[tuple[float, float, float], ...]:
-        """The different voxel sizes, in order of appearance; more than one where the simulation changed its
-        resolution."""
-        return tuple(dict.fromkeys(f.voxel_size for f in self.frames if f.voxel_size is not None))
-
-    @property
-    def world_bounds(self) -> np.ndarray | None:
-        """(2, 3) box around the active voxels of all frames, in world units; None if there are none."""
-        boxes = [f.world_bounds for f in self.frames if f.world_bounds is not None]
-        return np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)]) if boxes else None
-
-    @property
-    def range(self) -> tuple[float, float] | None:
-        """Least and greatest finite active value of all frames."""
-        found = [f.range for f in self.frames if f.range is not None]
-        return (min(r[0] for r in found), max(r[1] for r in found)) if found else None
 
 
 @dataclass(frozen=True)
@@ -102,52 +36,6 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self.frames)
-
-    def headers(self) -> Iterator[FileHeader]:
-        """Every frame's header, one at a time."""
-        return (read_header(frame.path) for frame in self.frames)
-
-    def read(self, index: int, name: str, *, max_bytes: int = LEAF_LIMIT) -> Grid | None:
-        """Grid ``name`` of the frame at position ``index``; None if that frame has no such grid.
-
-        An empty frame gives a grid without leaves, whatever bounding box its metadata claims.
-
-        Raises:
-            DataError: as :func:`~neuprim.core.io.vdb.read.read_grid`.
-        """
-        path = self.frames[index].path
-        if all(grid.name != name for grid in read_header(path).grids):
-            return None
-        return read_grid(path, name, max_bytes=max_bytes)
-
-    def survey(self, name: str) -> Survey:
-        """Reads grid ``name`` of every frame, one at a time, and says what changes.
-
-        Raises:
-            DataError: no frame has it, or a file is damaged.
-        """
-        found: list[FrameSurvey] = []
-        for index, frame in enumerate(self.frames):
-            grid = self.read(index, name)
-            if grid is None:
-                found.append(FrameSurvey(frame))
-                continue
-            found.append(
-                FrameSurvey(
-                    frame,
-                    True,
-                    grid.voxel_size,
-                    grid.bounds,
-                    grid.world_bounds(),
-                    grid.range,
-                    grid.active_voxels,
-                    grid.non_finite,
-                )
-            )
-        if not any(f.present for f in found):
-            names = {grid.name for header in self.headers() for grid in header.grids}
-            raise DataError(f"{self.folder}: none of {len(self)} frames has a grid {name!r}{nearest(name, names)}")
-        return Survey(name, tuple(found))
 
 
 def sequence(folder: Path, prefix: str | None = None) -> Sequence:

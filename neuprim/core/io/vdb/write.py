@@ -1,5 +1,4 @@
-"""Writing OpenVDB files of version 224, in the layout that :mod:`neuprim.core.io.vdb.tree` reads and OpenVDB itself
-writes."""
+"""Write OpenVDB files of version 224, in OpenVDB's own layout."""
 
 from __future__ import annotations
 
@@ -15,9 +14,8 @@ import numpy as np
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.files import atomic_path
 from neuprim.core.io.vdb.grid import TILE_SIZES, Grid
-from neuprim.core.io.vdb.header import MAGIC
-from neuprim.core.io.vdb.stream import BLOSC, MASK, ZIP, blosc_module, compression_label
-from neuprim.core.io.vdb.tree import ALL_VALUES, LOWER, UPPER, Slots
+from neuprim.core.io.vdb.header import BLOSC, MAGIC, MASK, ZIP, blosc_module, compression_label
+from neuprim.core.io.vdb.read import ALL_VALUES, LOWER, UPPER, Slots
 
 __all__ = ["COMPRESSIONS", "write_vdb"]
 
@@ -98,7 +96,8 @@ def _metadata(values: Mapping[str, Any], where: str) -> bytes:
         kind, raw = _metadatum(value)
         if not kind:
             raise DataError(
-                f"{where}: metadata {name!r} is {value!r}; expected text, bool, int (64 bits), float, or three ints or floats"
+                f"{where}: metadata {name!r} is {value!r}; "
+                "expected text, bool, int (64 bits), float, or three ints or floats"
             )
         parts.append(_text(name) + _text(kind) + struct.pack("<I", len(raw)) + raw)
     return b"".join(parts)

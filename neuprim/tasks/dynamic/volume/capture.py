@@ -20,7 +20,7 @@ import torch
 from neuprim.core.cameras import Camera
 from neuprim.core.compute import device as hardware
 from neuprim.core.errors import DataError
-from neuprim.core.io import images
+from neuprim.core.io.exr import write_exr
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.volumes.source import Extent
@@ -129,12 +129,12 @@ class Capture:
     def image(self, store: Store, frame: VdbFrame, camera: int) -> Path:
         """File of one image. Raises DataError where the store cannot be read."""
         pixels = self.cameras[camera].width * self.cameras[camera].height
-        return store.fetch(f"{self.name(frame)}/cam_{camera:02d}.exr", pixels * 4 * 4 + 2**16)
+        return store.fetch_file(f"{self.name(frame)}/cam_{camera:02d}.exr", pixels * 4 * 4 + 2**16)
 
     def points(self, store: Store, frame: VdbFrame) -> Path:
         """File of a frame's points: means (M, 3) scene units, colors (M, 3) linear radiance, weight (), the frame's
         total extinction, and largest (), its largest."""
-        return store.fetch(f"{self.name(frame)}/{LAST}", _POINTS_BYTES)
+        return store.fetch_file(f"{self.name(frame)}/{LAST}", _POINTS_BYTES)
 
     def describe(self) -> dict[str, Any]:
         """What ``scene.json`` holds."""
@@ -167,7 +167,7 @@ class Capture:
                     "expected at most 65504 (scene.optics.emission, ambient and light set it)"
                 )
             brightest = max(brightest, peak)
-            images.write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
+            write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
         largest = medium.values[..., 0].max(initial=0.0)
         np.savez(
             folder / LAST, brightest=np.float32(brightest), largest=np.float32(largest), **_points(medium, frame.number)

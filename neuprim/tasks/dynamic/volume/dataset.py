@@ -17,7 +17,7 @@ from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
-from neuprim.core.io.npz import read_arrays
+from neuprim.core.io.arrays import read_arrays
 from neuprim.core.io.store import Store
 from neuprim.core.notices import warn_once
 from neuprim.tasks.dynamic.volume.capture import Capture
@@ -91,7 +91,7 @@ class FrameViews(ViewSet):
             return images.read_image(path, (camera.width, camera.height))
 
         try:
-            rgba = self.folder.patiently(read, warn_once)
+            rgba = self.folder.retry(read, warn_once)
         except DataError as error:
             raise DataError(
                 f"{error}; delete the folder {self.folder.at(self.capture.name(frame)).address} to render the frame again"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import Survey
 
 __all__ = ["Normalisation"]
 
@@ -44,20 +43,6 @@ class Normalisation:
             )
         x, y, z = ((low + high) / 2).tolist()
         return Normalisation((x, y, z), 1.0 / longest)
-
-    @staticmethod
-    def from_surveys(surveys: Iterable[Survey]) -> Normalisation:
-        """The box around the active voxels of all frames of all surveyed grids.
-
-        Raises:
-            DataError: no frame has an active voxel.
-        """
-        surveys = list(surveys)
-        boxes = [s.world_bounds for s in surveys if s.world_bounds is not None]
-        if not boxes:
-            names = ", ".join(repr(s.name) for s in surveys)
-            raise DataError(f"normalisation: no frame has an active voxel of grid {names}; expected at least one")
-        return Normalisation.from_bounds(np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)]))
 
     def to_scene(self, points: np.ndarray) -> np.ndarray:
         """(…, 3) float64 scene points of world points."""

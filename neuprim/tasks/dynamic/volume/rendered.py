@@ -58,32 +58,32 @@ class RenderedFrames(GroundTruth):
         return self.store.address
 
     def missing(self) -> list[int]:
-        there = self.store.whole(LAST)
+        there = self.store.complete_folders(LAST)
         return [i for i, name in enumerate(self.frames) if name not in there]
 
     def begin(self) -> None:
         with _told(self.store):
-            self.store.begin()
+            self.store.prepare()
 
     def make(self, frame: int, tell: Callable[[str], None] = warn_once) -> None:
-        if not self.store.has(f"{self.frames[frame]}/{LAST}"):
+        if not self.store.has_file(f"{self.frames[frame]}/{LAST}"):
             self.write(frame, tell)
 
     def write(self, frame: int, tell: Callable[[str], None] = warn_once) -> None:
         """Render a frame, and keep it unless it is there by then."""
 
         def attempt() -> None:
-            self.store.publish(
+            self.store.write_folder(
                 self.frames[frame], lambda folder: self.capture.render(self.capture.frames[frame], folder), LAST
             )
 
         with _told(self.store):
-            self.store.patiently(attempt, tell)
+            self.store.retry(attempt, tell)
 
     def complete(self) -> None:
         with _told(self.store):
-            if not self.store.has(_SCENE):
-                self.store.put(_SCENE, lambda path: write_json(path, self.capture.describe()))
+            if not self.store.has_file(_SCENE):
+                self.store.write_file(_SCENE, lambda path: write_json(path, self.capture.describe()))
 
     def take(self, progress: Progress) -> Store:
         """Render what is missing, here; returns where the images are.

@@ -15,8 +15,7 @@ import torch
 from neuprim.core.checked import checked
 from neuprim.core.data import Dataset, DataSource
 from neuprim.core.errors import DataError
-from neuprim.core.io.object_store import store_at
-from neuprim.core.io.store import LocalStore
+from neuprim.core.io.store import Store, open_store
 from neuprim.core.io.vdb import VdbFrame, sequence
 from neuprim.core.notices import warn_once
 from neuprim.core.task import Chunks, SceneContext
@@ -70,7 +69,7 @@ def load_truth(
 
 def _rendered(asked: VolumeSettings, capture: Capture, context: SceneContext) -> RenderedFrames:
     store = (
-        LocalStore(context.cache_dir) if asked.cache is None else store_at(asked.cache, context.cache_dir / "copies")
+        Store.local(context.cache_dir) if asked.cache is None else open_store(asked.cache, context.cache_dir / "copies")
     )
     return RenderedFrames(capture, store)
 

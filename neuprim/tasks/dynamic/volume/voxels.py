@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neuprim.core.data.points import PointSamples, PointSupervision
 from neuprim.core.errors import DataError
-from neuprim.core.io.npz import read_arrays
+from neuprim.core.io.arrays import read_arrays
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.notices import warn_once
@@ -212,15 +212,15 @@ class FrameVoxels(PointSupervision):
         return found
 
     def _read(self, frame: VdbFrame) -> Voxels:
-        return self.folder.patiently(lambda: self._read_or_make(frame), warn_once)
+        return self.folder.retry(lambda: self._read_or_make(frame), warn_once)
 
     def _read_or_make(self, frame: VdbFrame) -> Voxels:
         name = f"{self.capture.name(frame)}/voxels.npz"
-        path = self.folder.fetch(name, _MOST)
+        path = self.folder.fetch_file(name, _MOST)
         if not path.is_file():
             made = Voxels.of(self.capture.medium(frame))
             try:
-                self.folder.put(name, made.write)
+                self.folder.write_file(name, made.write)
             except OSError as error:
                 raise DataError(f"cannot write the voxels of {frame.path} to {path}: {error}") from error
             return made

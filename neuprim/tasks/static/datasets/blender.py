@@ -23,7 +23,7 @@ from neuprim.core.data.settings import FolderSettings, HoldOut, SplitName, data_
 from neuprim.core.data.transforms import Layout, read_frames, read_splits
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import DataError
-from neuprim.core.io.records import read_json
+from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
 
 __all__ = ["BlenderSettings", "load"]
@@ -54,7 +54,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     folder = data_folder(asked.path)
 
     def read(split: str) -> list[ImageFrame]:
-        document = read_json(folder / f"transforms_{split}.json")
+        document = JsonReader.open(folder / f"transforms_{split}.json")
         _, frames = read_frames(folder, document, list(document.objects("frames")), asked, Layout())
         for frame in frames:
             info, first = frame.info, frames[0].info

@@ -23,7 +23,7 @@ from neuprim.core.data.common import missing_files, posed_images
 from neuprim.core.data.points_file import read_points
 from neuprim.core.data.settings import EveryNth, FolderSettings, data_folder
 from neuprim.core.data.transforms import Layout, read_frames, split_frames
-from neuprim.core.io.records import Record, read_json
+from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
 
 __all__ = ["NerfstudioSettings", "load"]
@@ -53,7 +53,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     asked = checked(NerfstudioSettings, settings, "scene")
     folder = data_folder(asked.path)
     path = folder / "transforms.json"
-    document = read_json(path)
+    document = JsonReader.open(path)
     records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
     layout = Layout(keys=("ply_file_path", "train_filenames", "val_filenames", "test_filenames"), masks=True)
     records, frames = read_frames(folder, document, records, asked, layout, asked.skip_missing)
@@ -62,7 +62,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     return posed_images(str(path), folder.resolve().name, train, test, asked, context, points=points)
 
 
-def _read_points(folder: Path, document: Record) -> PointCloud:
+def _read_points(folder: Path, document: JsonReader) -> PointCloud:
     """Points of ``ply_file_path``, in the frame of the poses."""
     path = folder / document.text("ply_file_path")
     if not path.is_file():

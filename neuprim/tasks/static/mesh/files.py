@@ -54,7 +54,7 @@ MAX_PARTS = 20_000
 """Pieces with a material or place of their own."""
 
 MAX_TEXELS = 128 * 2**20
-"""Pixels of all textures together; one image has at most :data:`neuprim.core.io.images.MAX_PIXELS`."""
+"""Pixels of all textures together; one image has at most :data:`neuprim.core.io.exr.MAX_PIXELS`."""
 
 Up = Literal["y", "z"]
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from neuprim.core.cameras.world import World
 from neuprim.core.checked import checked, text
 from neuprim.core.data import Dataset
-from neuprim.core.io.records import read_json
+from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
 from neuprim.scenes.image_set import Progress
 from neuprim.scenes.raycast import Scene
@@ -89,7 +89,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     folder = generate(asked, context.cache_dir, context.progress)
     from neuprim.tasks.static.datasets import blender
 
-    known = read_json(folder / "transforms_train.json")
+    known = JsonReader.open(folder / "transforms_train.json")
     facts = {name: known.values[name] for name in ("rendered_from", "scene_from_file")}
     world = World(torch.tensor(facts["scene_from_file"], dtype=torch.float64)).validate(f"{folder}: scene_from_file")
     dataset = blender.load({"path": str(folder)}, replace(context, world=None))  # the images are of the scene itself

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.images import MAX_PIXELS, srgb_to_linear
+from neuprim.core.io.exr import MAX_PIXELS
+from neuprim.core.io.images import srgb_to_linear
 from neuprim.tasks.static.mesh.files import MAX_TEXELS
 
 __all__ = ["Texture", "decode"]

@@ -88,13 +88,6 @@ def test_all_values_stored(tmp_path: Path, flags: int) -> None:
     assert grid.active_voxels == MASK.sum() and len(grid.tiles) == 0
 
 
-def test_values_that_did_not_shrink_are_stored_plain(tmp_path: Path) -> None:
-    raw = VALUES[MASK].tobytes()
-    body = b"\0" + struct.pack("<q", -len(raw)) + raw
-    grid = read_grid(one_grid(tmp_path / "a.vdb", *one_leaf(MASK, body, floats(0.0), nothing(6)), flags=6), "density")
-    np.testing.assert_array_equal(grid.values.ravel(), np.where(MASK, VALUES, np.float32(0)))
-
-
 def test_half_floats_and_their_missing_lengths(tmp_path: Path) -> None:
     """Inactive values stay 32-bit floats; no active half floats have no length at all."""
     half = VALUES.astype("<f2")
@@ -138,15 +131,12 @@ def test_tiles_of_all_levels(tmp_path: Path) -> None:
 LEAF = one_leaf(MASK, b"\0" + VALUES[MASK].tobytes(), floats(0.0))
 
 
-@pytest.mark.parametrize("version", [222, 223, 224])
+@pytest.mark.parametrize("version", [0, 221, 222, 223, 224, 225, 2**32 - 1])
 def test_versions(tmp_path: Path, version: int) -> None:
     path = one_grid(tmp_path / "a.vdb", *LEAF, version=version)
-    assert read_header(path).version == version and read_grid(path, "density").active_voxels == MASK.sum()
-
-
-@pytest.mark.parametrize("version", [0, 221, 225, 2**32 - 1])
-def test_other_versions_are_refused(tmp_path: Path, version: int) -> None:
-    path = one_grid(tmp_path / "a.vdb", *LEAF, version=version)
+    if 222 <= version <= 224:
+        assert read_header(path).version == version and read_grid(path, "density").active_voxels == MASK.sum()
+        return
     refused(lambda: read_header(path), "a.vdb", str(version), "222 to 224")
 
 

@@ -25,28 +25,6 @@ def test_sorted_by_number_with_gaps(tmp_path: Path) -> None:
     found = sequence(tmp_path)
     assert [f.number for f in found.frames] == [0, 1, 9, 10, 14] and len(found) == 5
     assert found.gaps == ((2, 8), (11, 13))
-    assert [len(h.grids) for h in found.headers()] == [1] * 5
-
-
-def test_what_changes_from_frame_to_frame(tmp_path: Path) -> None:
-    frame(tmp_path / "f_0.vdb", 0)  # no active voxel, and the inverted box OpenVDB writes then
-    frame(tmp_path / "f_1.vdb", 4, 0.5)
-    frame(tmp_path / "f_2.vdb", 3, 1.0, value=float("nan"))
-    frame(tmp_path / "f_3.vdb", 8, 1.0, name="flames")
-    frame(tmp_path / "f_4.vdb", 6, 1.0, value=2.0)
-    found = sequence(tmp_path)
-    assert found.gaps == () and found.read(3, "density") is None
-    empty = found.read(0, "density")
-    assert empty is not None and empty.bounds is None and empty.to_dense(((0, 0, 0), (2, 2, 2))).sum() == 0
-    survey = found.survey("density")
-    assert survey.empty == (0,) and survey.absent == (3,)
-    assert survey.voxel_sizes == ((1.0,) * 3, (0.5,) * 3)
-    assert survey.range == (1.0, 2.0)
-    assert [f.non_finite for f in survey.frames] == [0, 0, 27, 0, 0]
-    assert [f.active_voxels for f in survey.frames] == [0, 64, 27, 0, 216]
-    np.testing.assert_array_equal(survey.world_bounds, [[-0.5] * 3, [5.5] * 3])
-    np.testing.assert_array_equal(survey.frames[1].world_bounds, [[-0.25] * 3, [1.75] * 3])
-    refused(lambda: found.survey("denisty"), tmp_path.name, "none of 5 frames", "did you mean 'density'")
 
 
 def test_folders_that_are_no_sequence(tmp_path: Path) -> None:
@@ -66,14 +44,6 @@ def test_folders_that_are_no_sequence(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- neuprim vdb info
-
-
-def test_info_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = frame(tmp_path / "a.vdb", 4, 0.5)
-    assert main(["vdb", "info", str(path)]) == 0
-    out = capsys.readouterr().out
-    for word in ("a.vdb", "density", "float", "fog", "blosc", "0.5", "0:4", "64", "256 B"):
-        assert word in out, out
 
 
 def test_info_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

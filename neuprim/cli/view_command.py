@@ -56,7 +56,7 @@ def run_viewed(config: RunConfig, events: RunProgress, settings: ViewerSettings)
     """Run a training with a live viewer; raise as :func:`neuprim.runs.run.run`."""
     from neuprim.runs.events import Note
     from neuprim.runs.run import run
-    from neuprim.viewer.training import LiveTraining
+    from neuprim.viewer.live_training import LiveTraining
 
     _warn_of_open_host(settings)
     with LiveTraining(settings, config, lambda address: events(Note(f"the viewer is at {address}")), events) as live:

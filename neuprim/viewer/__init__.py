@@ -1,7 +1,5 @@
-"""A model to look at in a browser, finished or while it is trained: pictures drawn here, sent to a page that turns,
-plays and asks.
+"""Live viewer: shows a model in a browser, after or during its training.
 
-What is drawn, and when, knows nothing of the page: ``frame``, ``levels``, ``desk``, ``subject``, ``primitives``,
-``path``. The page is viser's:
-``gate`` and ``server`` let it in, ``session`` and the ``…_controls`` are what one open page shows.
+The server draws images and sends them to a page made with viser. ``view`` starts a viewer, ``server`` and ``auth`` let
+pages in, ``messages`` checks what they send, ``session`` is one open page.
 """

@@ -1,4 +1,4 @@
-"""The page's server: viser, on one address of this machine, behind the gate, and quiet."""
+"""The viewer's web server: viser behind the access and message checks."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from typing import Any
 
 from neuprim.config.viewer import ViewerSettings
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.viewer.gate import Gate
 
 __all__ = ["PageServer", "is_loopback", "require_viser"]
 
 
 def require_viser() -> Any:
-    """The package viser.
+    """Import viser.
 
     Raises:
-        BackendUnavailable: it is missing.
+        BackendUnavailable: it is not installed.
     """
     try:
         import viser
@@ -33,7 +32,7 @@ def require_viser() -> Any:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host is this machine, as seen from itself."""
+    """Whether only this machine reaches a server on this host."""
     if host == "localhost":
         return True
     try:
@@ -43,91 +42,85 @@ def is_loopback(host: str) -> bool:
 
 
 class PageServer:
-    """viser, started; ``close`` ends it.
+    """A running viser server.
 
     Attributes:
         viser: the ``ViserServer``.
-        address: with the token.
+        address: of the page, with the token.
+
+    Raises:
+        ConfigError: host or port are unavailable.
+        BackendUnavailable: viser is missing, or a version that cannot be checked.
     """
 
     def __init__(self, settings: ViewerSettings, title: str) -> None:
-        """Raises :class:`ConfigError` where host or port are not to be had, :class:`BackendUnavailable` without
-        viser."""
         viser = require_viser()
-        self._refused_to: Callable[[int, str], None] = lambda client, reason: None
-        gate = Gate(settings.host)
-        # A page that is closed while something is sent to it is nothing that anybody must be told.
+        from neuprim.viewer.auth import TokenAuth
+        from neuprim.viewer.messages import refuse_message
+
+        self._on_refusal: Callable[[int, str], None] = lambda client, reason: None
+        auth = TokenAuth(settings.host)
+        # Pages may be closed while something is sent to them.
         warnings.filterwarnings("ignore", message=r"Queued a \w+ on a closed connection")
         port = _free_port(settings.host, settings.port)
-        with contextlib.redirect_stdout(io.StringIO()), gate.before_viser(self._refusal, self._refused):
+        guarded = auth.guard_server(lambda message: refuse_message(message, self._find_control), self._report_refusal)
+        with contextlib.redirect_stdout(io.StringIO()), guarded:
             self.viser = viser.ViserServer(host=settings.host, port=port, label=title, verbose=False)
-        if not (gate.stands and self.viser.get_port() == port and self._tunnels_off() and self._messages_known()):
+        if not (auth.installed and self.viser.get_port() == port and self._restrict_messages()):
             self.close()
             raise BackendUnavailable(
                 f"viser {viser.__version__} did not start behind the check of its visitors, or not on port {port}; "
                 "pip install -c constraints.txt 'neuprim[viewer]' has a version that does"
             )
         self.viser.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="large")
-        self.viser.scene.configure_environment_map(
-            hdri=None
-        )  # ellipsoids nearly in their own colours, and not darker below
+        # Even light, so that ellipsoids keep nearly their own colours.
+        self.viser.scene.configure_environment_map(hdri=None)
         self.viser.scene.configure_default_lights(cast_shadow=False)
         self.viser.scene.add_light_ambient("/light", intensity=1.0)
-        self.viser.gui.main_panel.dock_right()  # beside the picture, not over it
-        self.address = gate.address(settings.host, port)
+        self.viser.gui.main_panel.dock_right()
+        self.address = auth.page_address(settings.host, port)
 
-    def _tunnels_off(self) -> bool:
-        """viser can be asked by a page to pass itself on through a server elsewhere; afterwards it cannot. Whether that
-        is certain."""
+    def _restrict_messages(self) -> bool:
+        """Turn off viser's tunnels, which a page could ask for; return whether this version's messages are known."""
         try:
             from viser import _messages
 
+            from neuprim.viewer.messages import is_known_protocol
+
             for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
                 self.viser._websock_server.unregister_handler(kind)
-        except (ImportError, AttributeError, AssertionError):  # another viser than those that are known
+        except (ImportError, AttributeError, AssertionError):  # another version of viser
             return False
-        return True
+        return is_known_protocol(_messages)
 
-    def _messages_known(self) -> bool:
-        from viser import _messages
-
-        from neuprim.viewer.incoming import known
-
-        return known(_messages)
-
-    def on_visit(
-        self, come: Callable[[Any], None], gone: Callable[[Any], None], refused: Callable[[int, str], None]
+    def on_client(
+        self,
+        connect: Callable[[Any], None],
+        disconnect: Callable[[Any], None],
+        refuse: Callable[[int, str], None],
     ) -> None:
-        """Be told of every page that is opened and closed, as a ``viser.ClientHandle``, and why a message was refused,
-        with a page's number."""
-        self._refused_to = refused
-        self.viser.on_client_connect(come)
-        self.viser.on_client_disconnect(gone)
+        """Set callbacks for pages opened and closed (``viser.ClientHandle``) and refused messages (client id, reason)."""
+        self._on_refusal = refuse
+        self.viser.on_client_connect(connect)
+        self.viser.on_client_disconnect(disconnect)
 
-    def _refusal(self, message: Any) -> str | None:
-        from neuprim.viewer.incoming import refusal
+    def _find_control(self, uuid: str) -> Any:
+        handles = (client.gui._gui_input_handle_from_uuid for client in self.viser.get_clients().values())
+        return next((known[uuid] for known in handles if uuid in known), None)
 
-        return refusal(message, self._control)
-
-    def _control(self, uuid: str) -> Any:
-        guis = (client.gui for client in self.viser.get_clients().values())
-        return next(
-            (gui._gui_input_handle_from_uuid[uuid] for gui in guis if uuid in gui._gui_input_handle_from_uuid), None
-        )
-
-    def _refused(self, connection: Any, reason: str) -> None:
+    def _report_refusal(self, connection: Any, reason: str) -> None:
         for number, own in self.viser._websock_server._live_connections.items():
             if own is connection:
-                self._refused_to(number, reason)
+                self._on_refusal(number, reason)
 
     def close(self) -> None:
-        """Let everybody go, and the port."""
+        """Disconnect all pages and free the port."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.viser.stop()
 
 
 def _free_port(host: str, port: int) -> int:
-    """A port that can be listened on; 0 is any.
+    """Return a free port: this one, or any for 0.
 
     Raises:
         ConfigError: the host is not an address of this machine, or the port is taken.

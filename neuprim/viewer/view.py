@@ -1,4 +1,4 @@
-"""``neuprim view``: a finished run in the browser."""
+"""Viewer of a finished run, ``neuprim view``, and the sessions of its open pages."""
 
 from __future__ import annotations
 
@@ -14,100 +14,165 @@ from neuprim.config import suspects_of
 from neuprim.config.viewer import ViewerSettings
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import stored_channels
-from neuprim.core.data import Dataset
+from neuprim.core.data import Dataset, View
 from neuprim.core.errors import NeuprimError
 from neuprim.core.io.json_reader import JsonReader
-from neuprim.core.model.primitives import Primitives
 from neuprim.runs.open import LOGS, load_dataset, load_run
 from neuprim.runs.render_config import RenderConfig
-from neuprim.viewer.desk import Desk
-from neuprim.viewer.frame import Look
-from neuprim.viewer.levels import read_front
-from neuprim.viewer.page import Page
+from neuprim.viewer.controls import ConditionControls, RenderControls, ViewControls
+from neuprim.viewer.ellipsoids import PrimitiveControls
+from neuprim.viewer.quality import read_front
+from neuprim.viewer.render_queue import RenderQueue
 from neuprim.viewer.server import PageServer, require_viser
-from neuprim.viewer.subject import Subject
+from neuprim.viewer.session import Session
+from neuprim.viewer.viewer_scene import ViewerScene, Viewpoint
 
-__all__ = ["open_subject", "view_run"]
+__all__ = ["SessionManager", "open_scene", "view_run"]
 
-_PATIENCE = 0.25
-"""Seconds after which the thread that draws looks whether it is to end."""
+_POLL_SECONDS = 0.25  # between checks whether the viewer is to end
 
 
-def open_subject(
+class SessionManager:
+    """Create a session for each opened page, and drop it when the page closes.
+
+    Attributes:
+        sessions: client id -> session of the open pages.
+    """
+
+    def __init__(
+        self,
+        server: PageServer,
+        scene: ViewerScene,
+        queue: RenderQueue,
+        add_training: Callable[[Session], None] | None = None,
+    ) -> None:
+        """Start accepting pages; ``add_training`` adds the controls of a training's tab."""
+        self.server, self.scene, self.queue, self._add_training = server, scene, queue, add_training
+        self.sessions: dict[int, Session] = {}
+        self._lock = threading.Lock()
+        self._start: View | None = None
+        server.viser.scene.set_up_direction(scene.up)
+        server.on_client(self._connect, self._disconnect, self._report_refusal)
+
+    def _connect(self, client: Any) -> None:
+        def report(error: Exception) -> None:
+            client.add_notification("neuprim", str(error), color="red")
+            if not isinstance(error, NeuprimError):
+                raise error
+
+        self.queue.submit((client.client_id, "open"), lambda: self._open(client), report)
+
+    def _disconnect(self, client: Any) -> None:
+        with self._lock:
+            session = self.sessions.pop(client.client_id, None)
+        if session is not None:
+            session.close()
+        self.queue.drop_client(client.client_id)
+
+    def _report_refusal(self, client: int, reason: str) -> None:
+        if (session := self.sessions.get(client)) is not None:
+            session.set_status(f"refused: {reason}")
+
+    def _open(self, client: Any) -> None:
+        if client.client_id not in self.server.viser.get_clients():
+            return  # closed before its turn
+        if self._start is None:
+            self._start = self.scene.start_view()
+        training = self._add_training is not None
+        session = Session(client, self.scene, self.queue, self._start, training)
+        with self._lock:
+            self.sessions[client.client_id] = session
+        session.open(self._start)
+        tabs = client.gui.add_tab_group()
+        if self._add_training is not None:
+            with tabs.add_tab("Training"):
+                self._add_training(session)
+        with tabs.add_tab("View"):
+            conditions = ConditionControls(session)
+            RenderControls(session, overrides=not training)
+            ViewControls(session, conditions.refresh)
+        with tabs.add_tab("Primitives"):
+            PrimitiveControls(session)
+
+
+def open_scene(
     run_dir: Path,
-    tell: Callable[[str], None] = lambda text: None,
+    warn: Callable[[str], None] = lambda text: None,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
-) -> Subject:
-    """A finished run, to be looked at. Without its data there are no held-out views, which is told.
+) -> ViewerScene:
+    """Open a finished run. If its data cannot be read there are no held-out views, with a warning.
 
     Raises:
         CheckpointError, ConfigError: naming the file that is missing or damaged.
     """
     config, task, model, header = load_run(run_dir)
-    channels = stored_channels(run_dir, header, task, model.colour.channels)
     dataset: Dataset | None = None
     try:
         with suspects_of(config).watch(run_dir / LOGS):
             dataset = load_dataset(config, task, progress, run_dir)
     except NeuprimError as error:
-        tell(f"no held-out views: {error}")
-    background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
-
-    def now() -> Primitives:
-        return model
-
-    middle = torch.from_numpy(Subject.middle_of(model))
-    up, center = _fact(header, "up", torch.tensor([0.0, 0.0, 1.0])), _fact(header, "center", middle)
+        warn(f"no held-out views: {error}")
+    means = model.params["means"].detach().double().cpu()
+    up = _read_vector(header, "up", torch.tensor([0.0, 0.0, 1.0]))
+    center = _read_vector(header, "center", means.median(0).values if len(means) else torch.zeros(3))
     if dataset is not None:
         up, center = dataset.up, dataset.center
     x, y, z = (float(value) for value in up)
-    own = (task, now, channels, config.renderer, background, (x, y, z), np.asarray(center.double().numpy()))
-    return Subject(
-        run_dir.resolve().name, *own, World.of(header, str(run_dir)), dataset=dataset, front=read_front(run_dir, tell)
+    return ViewerScene(
+        name=run_dir.resolve().name,
+        task=task,
+        model=lambda: model,
+        channels=stored_channels(run_dir, header, task, model.colour.channels),
+        settings=config.renderer,
+        background=torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)]),
+        up=(x, y, z),
+        center=np.asarray(center.double().numpy()),
+        world=World.of(header, str(run_dir)),
+        dataset=dataset,
+        front=read_front(run_dir, warn),
     )
 
 
-def _fact(header: Mapping[str, Any], name: str, otherwise: torch.Tensor) -> torch.Tensor:
-    """(3,) what the model's header says of its scene, where it does.
+def _read_vector(header: Mapping[str, Any], name: str, default: torch.Tensor) -> torch.Tensor:
+    """Read (3,) numbers about the scene from a model's header.
 
     Raises:
-        DataError: it is something else than three numbers.
+        DataError: it holds something else.
     """
     facts = header.get("data")
     if not isinstance(facts, dict) or name not in facts:
-        return otherwise
+        return default
     return JsonReader(facts, "the model's header: data").array(name, (3,), "3 numbers")
 
 
 def view_run(
     run_dir: Path,
     settings: ViewerSettings,
-    opened: Callable[[str], None],
-    tell: Callable[[str], None] = lambda text: None,
+    on_open: Callable[[str], None],
+    warn: Callable[[str], None] = lambda text: None,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
     end: threading.Event | None = None,
 ) -> None:
     """Show a finished run in the browser until ``end`` is set, or Ctrl-C.
 
     Args:
-        opened: told the address, with the token that it takes.
-        tell: told what the user should know.
+        on_open: called with the address of the page, with its token.
 
     Raises:
-        CheckpointError, ConfigError: naming the file that is missing or damaged, or what the settings ask for.
+        CheckpointError, ConfigError: naming the file that is missing or damaged, or the wrong setting.
         BackendUnavailable: viser is missing.
     """
     require_viser()  # before the data are read
     end = end or threading.Event()
-    desk, subject = Desk(), open_subject(run_dir, tell, progress)
-    progress("preparing the renderer", 0.0)  # the first picture compiles kernels, once per installation
-    start = subject.start()
-    subject.draw(Look(start.camera.resized(32, 32), start.conditions), RenderConfig(subject.settings))
-    server = PageServer(settings, subject.name)
+    queue, scene = RenderQueue(), open_scene(run_dir, warn, progress)
+    progress("preparing the renderer", 0.0)  # the first image compiles kernels, once per installation
+    start = scene.start_view()
+    scene.draw(Viewpoint(start.camera.resized(32, 32), start.conditions), RenderConfig(scene.settings))
+    server = PageServer(settings, scene.name)
     try:
-        Page(server, subject, desk, run_dir)
-        opened(server.address)
+        SessionManager(server, scene, queue)
+        on_open(server.address)
         while not end.is_set():
-            desk.work(_PATIENCE)
+            queue.work(_POLL_SECONDS)
     finally:
         server.close()

@@ -413,7 +413,7 @@ def _read_records(folder: Path) -> None:
     from neuprim.search.target.record import read_record as read_target
     from neuprim.search.tradeoff.record import read_record
     from neuprim.search.tradeoff.record import write_csv as write_points
-    from neuprim.viewer.levels import read_front
+    from neuprim.viewer.quality import read_front
 
     _read_run(folder)
     curve.read_curve(folder / "run/metrics.jsonl", TrainSettings())

@@ -20,10 +20,9 @@ pytest.importorskip("viser", reason="the package viser is not installed")
 
 from neuprim.config import compose
 from neuprim.config.viewer import ViewerSettings
-from neuprim.core.cameras.file import read_cameras
 from neuprim.runs.events import Event
 from neuprim.runs.run import run
-from neuprim.viewer.training import LiveTraining
+from neuprim.viewer.live_training import LiveTraining
 from neuprim.viewer.view import view_run
 from tests.browsers import browser
 from tests.core import tiny
@@ -168,32 +167,6 @@ def test_a_person_looks_at_a_run(address: str, chromium: Any) -> None:
         tab.until(described, "its parameters")
         assert page.evaluate("document.body.innerText").count(HOSTILE) == 1, "the run's name is text"
         assert tab.faults == [] and tab.elsewhere == []
-
-
-def test_a_path_is_set_written_and_filmed(finished: Path, address: str, chromium: Any) -> None:
-    with open_tab(chromium, address) as tab:
-        page = tab.page
-        tab.until(lambda: tab.picture().std() > 15, "a picture of the model")
-        page.get_by_role("tab", name="Camera path").click()
-        for _ in range(2):
-            page.get_by_text("add", exact=True).click()
-            seen = tab.settled()
-            page.mouse.move(200, 300)
-            page.mouse.down()
-            page.mouse.move(300, 300, steps=5)
-            page.mouse.up()
-            tab.moved(seen)
-        for label, value in (("seconds", "0.5"), ("frames per second", "8")):
-            page.get_by_label(label, exact=True).fill(value)
-            page.keyboard.press("Enter")
-        page.wait_for_timeout(500)
-        page.get_by_text("film", exact=True).last.click()
-        tab.until((finished / "renders" / "path.webp").exists, "the film")
-        cameras = read_cameras(finished / "cameras" / "path.json")
-        assert len(cameras) == 4 and (cameras[0][1].width, cameras[0][1].height) == (640, 360)
-        with Image.open(finished / "renders" / "path.webp") as film:
-            assert film.n_frames == 4 and film.size == (640, 360)  # type: ignore[attr-defined]
-        assert tab.faults == []
 
 
 def test_a_person_looks_at_a_training(tmp_path: Path, chromium: Any) -> None:

@@ -22,7 +22,7 @@ from neuprim.core import checkpoint
 from neuprim.runs.events import Event, Note, Step
 from neuprim.runs.fit import Fitted
 from neuprim.runs.run import run
-from neuprim.viewer.training import LiveTraining
+from neuprim.viewer.live_training import LiveTraining
 from tests.core import tiny
 from tests.short_runs import words
 from tests.viewer_client import Visitor, visit
@@ -104,8 +104,8 @@ def test_a_training_that_is_looked_at_ends_with_the_same_bits(
 ) -> None:
     """Somebody turns the model, looks at a held-out view and at ellipsoids, pauses and steps; the checkpoint is the
     same to the bit."""
-    monkeypatch.setattr(sessions, "_AGAIN", 0.0)
-    monkeypatch.setattr(sessions, "_SHARE", 0.0)  # draws after every step
+    monkeypatch.setattr(sessions, "_REDRAW_SECONDS", 0.0)
+    monkeypatch.setattr(sessions, "_REDRAW_SHARE", 0.0)  # draws after every step
     alone, looked_at = (compose(words(scene, tmp_path / name, STEPS)) for name in ("alone", "looked_at"))
     trained(alone)
     seen: dict[str, int] = {}
@@ -114,7 +114,7 @@ def test_a_training_that_is_looked_at_ends_with_the_same_bits(
         until(page, lambda: len(page.pictures()) > 1)
         assert live.progress.step == 0
         for i in range(3):
-            live.one_step()
+            live.step_once()
             until(page, lambda wanted=i + 1: live.progress.step == wanted)  # type: ignore[misc]
         page.hear(0.5)
         assert live.progress.step == 3
@@ -178,7 +178,7 @@ def test_a_checkpoint_now_and_a_stop_that_can_be_resumed(scene: Path, tmp_path: 
 
     def look(live: LiveTraining, page: Visitor) -> None:
         until(page, lambda: len(page.pictures()) > 0)
-        live.one_step()
+        live.step_once()
         until(page, lambda: live.progress.step == 1)
         live.checkpoint()
         file = stopped.output_dir / "checkpoint.safetensors"
@@ -200,7 +200,7 @@ def test_a_picture_that_fails_ends_no_training(
     def broken(*args: Any) -> None:
         raise RuntimeError("no such picture")
 
-    monkeypatch.setattr("neuprim.viewer.subject.draw_look", broken)
+    monkeypatch.setattr("neuprim.viewer.viewer_scene.draw_viewpoint", broken)
 
     def look(live: LiveTraining, page: Visitor) -> None:
         until(page, lambda: any("no such picture" in str(m) for m in page.messages))
@@ -213,6 +213,6 @@ def test_nobody_who_looks_costs_one_question(scene: Path, tmp_path: Path, monkey
     """Without visitors nothing is drawn, and the desk is not asked for work."""
     config, events = compose(words(scene, tmp_path / "out", 20)), list[Event]()
     with LiveTraining(ViewerSettings(port=0), config, lambda address: None, events.append) as live:
-        monkeypatch.setattr(live.desk, "work", lambda patience: pytest.fail("asked for work"))
+        monkeypatch.setattr(live.queue, "work", lambda patience: pytest.fail("asked for work"))
         trained(config, live)
     assert live.progress.step == 20 and [e.text[:13] for e in events if isinstance(e, Note)] == ["PSNR of 2 vie"]

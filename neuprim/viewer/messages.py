@@ -1,8 +1,7 @@
-"""Messages of pages, checked before anything acts on them.
+"""Checks of the messages that pages send; viser itself checks nothing.
 
-Rule: a message is handed on only if it is one that the page's own code sends, and the value of a control only if the
-control, as it was made, takes it. Every message of every page passes :class:`CheckedConnection`; viser itself checks
-nothing.
+A message passes only if the page's own code sends such messages, and a control's value only if the control, as it was
+created, can take it. Every message goes through :class:`CheckedConnection`.
 """
 
 from __future__ import annotations
@@ -20,13 +19,11 @@ from websockets.asyncio.server import ServerConnection
 
 from neuprim.core.checked import Range
 
-__all__ = ["LARGEST", "CheckedConnection", "known", "refusal", "value_refusal"]
+__all__ = ["MAX_MESSAGE_BYTES", "CheckedConnection", "is_known_protocol", "refuse_message", "refuse_value"]
 
-LARGEST = 2**16
-"""Bytes of a message; a page sends some hundred."""
+MAX_MESSAGE_BYTES = 2**16  # a page sends some hundred
 
-_LONGEST = 4096
-"""Characters of a text control."""
+_MAX_TEXT = 4096
 
 _Finite = Annotated[float, Meta(ge=-1e12, le=1e12)]  # NaN is refused, too
 _Vector = tuple[_Finite, _Finite, _Finite]
@@ -35,7 +32,7 @@ _Name = Annotated[str, Meta(max_length=1024)]
 
 
 class _Message(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
-    """What the page's code sends, of all that viser takes: no uploads, shares, commands or requested pictures."""
+    """The messages that the page needs. viser knows more: uploads, shares, commands."""
 
 
 class ViewerCameraMessage(_Message):
@@ -95,8 +92,8 @@ _KINDS = (
 _DECODER = msgspec.msgpack.Decoder(functools.reduce(operator.or_, _KINDS))  # type: ignore[arg-type]
 
 
-def known(messages: Any) -> bool:
-    """Whether the module of viser's messages has these kinds with these fields; another version of viser may not."""
+def is_known_protocol(messages: Any) -> bool:
+    """Whether viser's messages module defines these messages with these fields; other versions may not."""
     kinds = ((kind, getattr(messages, kind.__name__, None)) for kind in _KINDS)
     return all(
         own is not None and {f.name for f in dataclasses.fields(own)} == set(kind.__struct_fields__)
@@ -105,32 +102,32 @@ def known(messages: Any) -> bool:
 
 
 class CheckedConnection(ServerConnection):
-    """A connection that receives messages only if ``refusal`` (of the message's bytes) has no reason against them.
+    """A connection that drops every message for which ``check_message`` (of its bytes) returns a reason.
 
-    ``refused`` is told the connection and the reason otherwise.
+    ``on_refusal`` is called with the connection and the reason.
     """
 
     def __init__(
         self,
         *args: Any,
-        refusal: Callable[[Any], str | None],
-        refused: Callable[[ServerConnection, str], None],
-        **more: Any,
+        check_message: Callable[[Any], str | None],
+        on_refusal: Callable[[ServerConnection, str], None],
+        **options: Any,
     ) -> None:
-        super().__init__(*args, **more)
-        self._refusal, self._refused = refusal, refused
+        super().__init__(*args, **options)
+        self._check, self._on_refusal = check_message, on_refusal
 
     async def recv(self, decode: bool | None = None) -> Any:
-        while (reason := self._refusal(message := await super().recv(decode))) is not None:
-            self._refused(self, reason)
+        while (reason := self._check(message := await super().recv(decode))) is not None:
+            self._on_refusal(self, reason)
         return message
 
 
-def refusal(message: bytes | str, control: Callable[[str], Any]) -> str | None:
-    """Why a message is not handed on; None for one that is.
+def refuse_message(message: bytes | str, find_control: Callable[[str], Any]) -> str | None:
+    """Return why a message is dropped, None if it passes.
 
     Args:
-        control: viser's handle of a control by its number; None where there is none.
+        find_control: viser's handle of a control by its id; None if there is none.
     """
     if not isinstance(message, bytes):
         return "a message in text; expected msgpack"
@@ -145,15 +142,15 @@ def refusal(message: bytes | str, control: Callable[[str], Any]) -> str | None:
         return "a message that this page does not send: expected a unit quaternion - at `$.wxyz`"
     if not isinstance(decoded, GuiUpdateMessage):
         return None
-    handle = control(decoded.uuid)
+    handle = find_control(decoded.uuid)
     if handle is None:
         return "a control that is not there"
-    reason = value_refusal(handle, decoded.updates.value)
+    reason = refuse_value(handle, decoded.updates.value)
     return None if reason is None else f"{getattr(handle, 'label', 'a control')}: {reason}"
 
 
-def value_refusal(handle: Any, value: Any) -> str | None:
-    """Why a control does not take a value, by what it was made with: its kind of value, choices and bounds."""
+def refuse_value(handle: Any, value: Any) -> str | None:
+    """Return why a control cannot take a value, by the type, choices and bounds that it was created with."""
     now, props = handle._impl.value, handle._impl.props
     options, low, high = (getattr(props, name, None) for name in ("options", "min", "max"))
     if getattr(props, "disabled", False):
@@ -163,29 +160,23 @@ def value_refusal(handle: Any, value: Any) -> str | None:
     if isinstance(now, bool):
         return None if isinstance(value, bool) else "expected true or false"
     if isinstance(now, str):
-        if not isinstance(value, str) or len(value) > _LONGEST:
-            return f"expected a text of at most {_LONGEST} characters"
+        if not isinstance(value, str) or len(value) > _MAX_TEXT:
+            return f"expected a text of at most {_MAX_TEXT} characters"
         return None
     if isinstance(now, int | float):
-        return _number_refusal(now, value, low, high, getattr(props, "step", None))
-    if isinstance(now, tuple):
-        if not isinstance(value, list) or len(value) != len(now):
-            return f"expected {len(now)} numbers"
-        lows, highs = (side or (None,) * len(now) for side in (low, high))
-        reasons = (_number_refusal(*one) for one in zip(now, value, lows, highs, strict=True))
-        return next((reason for reason in reasons if reason is not None), None)
+        return _refuse_number(now, value, low, high, getattr(props, "step", None))
     return "takes no value"
 
 
-def _number_refusal(
+def _refuse_number(
     now: float, value: Any, low: float | None, high: float | None, step: float | None = None
 ) -> str | None:
     kind = "a whole number" if isinstance(now, int) else "a number"
     slack = step / 2 if isinstance(now, float) and step is not None else 0.0  # a page rounds to the digits of its steps
     bounds = Range(None if low is None else low - slack, None if high is None else high + slack)
-    whole = isinstance(value, int) or (
+    fits = isinstance(value, int) or (
         isinstance(value, float) and math.isfinite(value) and (isinstance(now, float) or value.is_integer())
     )
-    if whole and not isinstance(value, bool) and abs(value) <= 1e15 and bounds.accepts(value):
+    if fits and not isinstance(value, bool) and abs(value) <= 1e15 and bounds.accepts(value):
         return None
     return f"expected {Range(low, high).words(kind)}"

@@ -1,0 +1,268 @@
+"""Viewer of a running training: draws between two steps, on the training's own thread.
+
+The model keeps every bit that it has without a viewer. Time spent here does not count towards the budget. Without open
+pages a step costs one check of the queue.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from neuprim.config import RunConfig
+from neuprim.config.viewer import ViewerSettings
+from neuprim.runs.events import Evaluated, Event, Events, Finishing, Note, Preparing, Step
+from neuprim.runs.fit import Fitted
+from neuprim.runs.training import save
+from neuprim.viewer.render_queue import RenderQueue
+from neuprim.viewer.server import PageServer
+from neuprim.viewer.session import Session
+from neuprim.viewer.view import SessionManager
+from neuprim.viewer.viewer_scene import ViewerScene
+
+__all__ = ["Curve", "LiveTraining", "TrainingControls", "TrainingProgress"]
+
+_UPDATE_SECONDS = 0.5  # between updates of a page's numbers
+_PAUSE_SECONDS = 0.1  # between checks of a paused training
+_PLOT_HEIGHT = 150  # pixels
+_SMOOTHING = 0.98
+
+
+class Curve:
+    """A curve of at most ``limit`` points. When it is full, every other point is dropped and half as many are added."""
+
+    def __init__(self, limit: int = 1000) -> None:
+        self._limit, self._every, self._count = limit, 1, 0
+        self.x: list[float] = []
+        self.y: list[float] = []
+
+    def add(self, x: float, y: float) -> None:
+        """Add a point, unless it is not finite."""
+        if not math.isfinite(y):
+            return
+        if self._count % self._every == 0:
+            self.x.append(x)
+            self.y.append(y)
+            if len(self.x) >= self._limit:
+                self.x, self.y, self._every = self.x[::2], self.y[::2], 2 * self._every
+        self._count += 1
+
+    def to_arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Copy x and y, (P,) float64."""
+        count = min(len(self.x), len(self.y))
+        return np.array(self.x[:count]), np.array(self.y[:count])
+
+
+class TrainingProgress:
+    """Collect what a page shows from a run's events.
+
+    Attributes:
+        step: steps done.
+        fraction: used part of the budget, 0..1.
+        text: what the run does now.
+        train_psnr: of the training views, smoothed, dB over steps; held_out_psnr: of the held-out views.
+    """
+
+    def __init__(self) -> None:
+        self.step, self.fraction, self.text = 0, 0.0, ""
+        self.train_psnr, self.held_out_psnr = Curve(), Curve()
+        self._mean: float | None = None
+
+    def __call__(self, event: Event) -> None:
+        match event:
+            case Step():
+                report = event.report
+                self.step, self.fraction = report.step, event.progress
+                if math.isfinite(report.psnr):
+                    mean = report.psnr if self._mean is None else self._mean
+                    self._mean = _SMOOTHING * mean + (1 - _SMOOTHING) * report.psnr
+                    self.train_psnr.add(report.step, self._mean)
+                self.text = f"step {report.step}, {report.primitives:,} primitives, {report.seconds:.0f} s of training"
+            case Evaluated():
+                self.held_out_psnr.add(self.step, event.psnr)
+            case Preparing() | Finishing() as work:
+                self.text = work.text
+
+
+class TrainingControls:
+    """Progress, buttons and PSNR curves of one page."""
+
+    def __init__(self, session: Session, training: LiveTraining) -> None:
+        self.session, self.training = session, training
+        gui, progress = session.client.gui, training.progress
+        self._text = gui.add_text("training", progress.text, disabled=True)
+        self._bar = gui.add_progress_bar(100 * progress.fraction)
+        self._pause = gui.add_checkbox("pause", training.paused)
+        self._pause.on_update(lambda _: training.pause(bool(self._pause.value)))
+        hint = "stop ends it as Ctrl-C does: it can be resumed"
+        buttons = gui.add_button_group("", ["one step", "checkpoint", "stop"], hint=hint)
+        calls = {"one step": training.step_once, "checkpoint": training.checkpoint, "stop": self._stop}
+        buttons.on_click(lambda _: calls[buttons.value]())
+        self._curves = {"training views": progress.train_psnr, "held-out views": progress.held_out_psnr}
+        self._plots: dict[str, Any] = {}
+        self._sent: dict[str, int] = dict.fromkeys(self._curves, -1)
+        self._folder = gui.add_folder("PSNR, dB")
+
+    def refresh(self) -> None:
+        """Show the current numbers."""
+        progress = self.training.progress
+        self._text.value, self._bar.value = progress.text, 100 * progress.fraction
+        if self._pause.value != self.training.paused:
+            self._pause.value = self.training.paused
+        for name, curve in self._curves.items():
+            if len(curve.x) > 1 and len(curve.x) != self._sent[name]:
+                self._sent[name] = len(curve.x)
+                self._plot(name, curve)
+
+    def _plot(self, name: str, curve: Curve) -> None:
+        data: tuple[np.ndarray, ...] = curve.to_arrays()
+        if name in self._plots:
+            self._plots[name].data = data
+            return
+        from viser import uplot
+
+        lines = (uplot.Series(label="step"), uplot.Series(label=name, stroke="#ff8a3d", width=2))
+        axes = (uplot.Axis(stroke="#aaaaaa"), uplot.Axis(stroke="#aaaaaa"))
+        scales = {"x": uplot.Scale(time=False)}
+        gui = self.session.client.gui
+        with self._folder:
+            self._plots[name] = gui.add_uplot(data, lines, scales=scales, axes=axes, height=_PLOT_HEIGHT)
+
+    def _stop(self) -> None:
+        self.training.stop()
+        self.session.set_status("the training ends after this step")
+
+
+class LiveTraining:
+    """Context manager around a run: an event listener whose :meth:`between` is called between steps.
+
+    Attributes:
+        progress: of the training.
+        paused: whether it is paused.
+        address: of the page, with its token.
+    """
+
+    def __init__(
+        self, settings: ViewerSettings, config: RunConfig, on_open: Callable[[str], None], events: Events
+    ) -> None:
+        """Start the server; raise as :class:`~neuprim.viewer.server.PageServer`.
+
+        Args:
+            on_open: called with the address.
+            events: receives every event, too.
+        """
+        self.config, self.events = config, events
+        self.queue, self.progress, self.paused = RenderQueue(), TrainingProgress(), False
+        self._steps, self._save, self._stop = 0, False, False
+        self._controls: list[TrainingControls] = []
+        self._sessions: SessionManager | None = None
+        self._updated = 0.0
+        self._server = PageServer(settings, config.output_dir.name)
+        self.address = self._server.address
+        on_open(self.address)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._server.close()
+
+    def __call__(self, event: Event) -> None:
+        self.progress(event)
+        self.events(event)
+        if isinstance(event, Finishing):
+            later = f"afterwards `neuprim view {self.config.output_dir}` shows it"
+            self._notify_all(f"the training has ended, {event.text}; {later}")
+
+    # Orders of pages, from any thread.
+
+    def pause(self, paused: bool) -> None:
+        """Pause or continue the training."""
+        if paused != self.paused:
+            self.events(Note("paused by its viewer" if paused else "goes on"))
+        self.paused = paused
+
+    def step_once(self) -> None:
+        """Run one step of a paused training."""
+        self.pause(True)
+        self._steps += 1
+
+    def checkpoint(self) -> None:
+        """Write checkpoint and model before the next step."""
+        self._save = True
+
+    def stop(self) -> None:
+        """End the training as Ctrl-C does: evaluated, reported and resumable."""
+        self._stop = True
+
+    # Called by the training.
+
+    def between(self, fitted: Fitted, stop: threading.Event) -> None:
+        """Serve the pages; see :data:`~neuprim.runs.training.Between`."""
+        if self._sessions is None:
+            scene = self._make_scene(fitted)
+            self._sessions = SessionManager(self._server, scene, self.queue, self._add_controls)
+        if not (self.queue.pending or self.paused or self._save or self._stop):
+            return
+        self.queue.work(0.0)
+        self._update_pages()
+        while self._obey(fitted, stop):
+            self.queue.work(_PAUSE_SECONDS)
+            self._update_pages()
+
+    def _obey(self, fitted: Fitted, stop: threading.Event) -> bool:
+        """Carry out orders; return whether the training stays paused."""
+        if self._stop:
+            stop.set()
+        if self._save:
+            self._save = False
+            save(fitted)
+            self._notify_all(f"step {fitted.trainer.step} is saved in {self.config.output_dir}")
+        if stop.is_set() or not self.paused:
+            return False
+        if self._steps:
+            self._steps -= 1
+            return False
+        return True
+
+    def _notify_all(self, text: str) -> None:
+        for controls in self._controls:
+            controls.session.notify(text)
+
+    def _update_pages(self) -> None:
+        now = time.monotonic()
+        if now < self._updated + _UPDATE_SECONDS:
+            return
+        self._updated = now
+        self._controls = [controls for controls in self._controls if not controls.session.closed]
+        for controls in self._controls:
+            controls.refresh()
+
+    def _add_controls(self, session: Session) -> None:
+        self._controls.append(TrainingControls(session, self))
+
+    def _make_scene(self, fitted: Fitted) -> ViewerScene:
+        dataset = fitted.dataset
+        x, y, z = (float(value) for value in dataset.up)
+        conditions = tuple(spec.within(dataset.world) for spec in fitted.task.conditions)
+        return ViewerScene(
+            name=self.config.output_dir.name,
+            task=replace(fitted.task, conditions=conditions),
+            model=lambda: fitted.trainer.model,
+            channels=fitted.channels,
+            settings=fitted.trainer.renderer,
+            background=dataset.background,
+            up=(x, y, z),
+            center=np.asarray(dataset.center.numpy()),
+            world=dataset.world,
+            dataset=dataset,
+        )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neuprim.config import RunSettings, preset_settings, task_choices
 from neuprim.conformance.example import example
-from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import ColourField, Conditions, DensityField, LoweredDensity, Shading

@@ -15,7 +15,7 @@ from neuprim.core import checkpoint
 from neuprim.core.channels import channels_of
 from neuprim.core.compression import LEVELS, canonicalize
 from neuprim.core.data import Dataset
-from neuprim.core.data import check as data_check
+from neuprim.core.data import dataset_check as data_check
 from neuprim.core.errors import CheckpointError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render

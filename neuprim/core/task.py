@@ -10,8 +10,7 @@ from torch import Tensor
 
 from neuprim.core.checked import Option
 from neuprim.core.data import Clip, Dataset, View
-from neuprim.core.data.context import SceneContext
-from neuprim.core.data.ground_truth import GroundTruth
+from neuprim.core.data.dataset import GroundTruth, SceneContext
 from neuprim.core.environment import Environment, Illumination
 from neuprim.core.layers import LayerSpec
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField, Field
@@ -104,7 +103,7 @@ class SceneSpec:
         truth: for scenes whose images are rendered frame by frame: (scene settings, context, what another process knows
         of them or None) ->
             that work, which ``load`` does where nobody has done it before; see
-            :class:`~neuprim.core.data.ground_truth.GroundTruth`.
+            :class:`~neuprim.core.data.dataset.GroundTruth`.
         chunks: for scenes that can be fitted in chunks, which their setting ``chunks`` asks for: (the run's
         configuration in the layout of the
             command line's keys, context) -> how, or None where one run is better.

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from neuprim.core.data.check import DatasetFault
+from neuprim.core.data.dataset_check import DatasetFault
 from neuprim.core.errors import DISK, DataError, NeuprimError
 from neuprim.plugins import crashes
 from neuprim.plugins.judging import TaskFault
@@ -173,7 +173,7 @@ class Suspects:
         """Around neuprim's own code that calls plugins here and there: whose code a crash is in is read off the
         traceback.
 
-        A :class:`~neuprim.core.data.check.DatasetFault` becomes a DataError that names the scene's package, and a
+        A :class:`~neuprim.core.data.dataset_check.DatasetFault` becomes a DataError that names the scene's package, and a
         :class:`~neuprim.plugins.judging.TaskFault` a PluginError that names the task's.
         """
         return _Watch(self, folder)

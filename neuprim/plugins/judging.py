@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from neuprim.core.data import Clip, Dataset, View
-from neuprim.core.data.check import DatasetFault, check_mask
+from neuprim.core.data.dataset_check import DatasetFault, check_mask
 from neuprim.core.errors import NeuprimError
 from neuprim.core.layers import LayerFrame, LayerSpec
 from neuprim.core.model.primitives import Primitives

@@ -10,7 +10,8 @@ from typing import Any
 import torch
 
 from neuprim.config import RunConfig, suspects_of, task_of
-from neuprim.core.cameras.file import CameraViews, read_camera_file
+from neuprim.core.cameras.camera_files import read_camera_file
+from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels, stored_channels
 from neuprim.core.conditions import flag, in_step, read_conditions
@@ -66,7 +67,7 @@ def render_run(
     space: str = WORLD,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Draw a run's model: ``camera`` is "orbit", "test" or a file of cameras (see :mod:`neuprim.core.cameras.file`).
+    """Draw a run's model: ``camera`` is "orbit", "test" or a file of cameras (see :mod:`neuprim.core.cameras.camera_files`).
 
     Writes one file per view, or one animation for the formats of :data:`ANIMATIONS` with more than one view; returns
     the files.

@@ -13,8 +13,8 @@ import torch
 from neuprim.config import RunConfig, made_now, suspects_of, task_of
 from neuprim.core.channels import Channels, channels_of
 from neuprim.core.data import Dataset
-from neuprim.core.data.check import check_dataset
-from neuprim.core.data.held_out import held_out
+from neuprim.core.data.dataset import held_out
+from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.reduction import reduce_fields

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.attributes import exr_attributes
+from neuprim.core.cameras.pinhole import exr_attributes
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
 from neuprim.core.data import View

@@ -27,8 +27,8 @@ from neuprim.config import RunConfig, suspects_of
 from neuprim.core.channels import Channels, channels_of
 from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
-from neuprim.core.data.check import check_dataset, check_pixels
-from neuprim.core.data.rays import NOT_SEEN
+from neuprim.core.data.dataset_check import check_dataset, check_pixels
+from neuprim.core.data.ray_points import NOT_SEEN
 from neuprim.core.io import images
 from neuprim.core.metrics import means, psnr, psnr_gain, ssim, ssim_3dgs, to_json
 from neuprim.core.metrics.lpips import Lpips

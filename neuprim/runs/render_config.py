@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from neuprim.config.overrides import assigned, parse
-from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.checked import Range, checked, converted
 from neuprim.core.checkpoint import read_header
 from neuprim.core.compression import is_compressed

@@ -11,7 +11,7 @@ from neuprim.config import RunConfig, suspects_of
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.data import Dataset
-from neuprim.core.data.check import check_dataset
+from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.primitives import Primitives

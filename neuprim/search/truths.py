@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import Dataset, View
-from neuprim.core.data.check import check_pixels
+from neuprim.core.data.dataset_check import check_pixels
 
 __all__ = ["Truth", "masked", "truths_of"]
 

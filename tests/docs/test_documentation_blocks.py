@@ -21,9 +21,9 @@ from neuprim.config.launcher import launcher_words
 from neuprim.config.overrides import without_place
 from neuprim.config.target import target_words
 from neuprim.config.viewer import viewer_words
-from neuprim.core.cameras.file import read_cameras
+from neuprim.core.cameras.camera_files import read_cameras
 from neuprim.core.conditions import read_conditions, split_words
-from neuprim.core.data.check import check_dataset
+from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import NeuprimError
 from neuprim.core.io.images import write_png
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb

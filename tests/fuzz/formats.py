@@ -315,7 +315,7 @@ def _usdc(folder: Path) -> None:
 
 
 def _read_cameras(name: str) -> Callable[[Path], Any]:
-    from neuprim.core.cameras.file import read_camera_file
+    from neuprim.core.cameras.camera_files import read_camera_file
 
     return lambda folder: read_camera_file(folder / name, (32, 24))
 

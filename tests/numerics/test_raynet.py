@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.rays import RayCamera
+from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import BackendUnavailable, NonFiniteError
 from neuprim.core.model.fields import Constant, CustomColour, CustomDensity, RayNet
 from neuprim.core.render import RenderSettings, choose, render_lowered

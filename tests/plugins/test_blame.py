@@ -482,7 +482,7 @@ def test_suspects() -> None:
     assert {p.origin.distribution for p in (suspects.task, suspects.scene, suspects.loss)} == {"neuprim"}
     assert origin_of(TASKS, "nobody", "some.module").origin == "some"
     with pytest.raises(DataError, match=r"^scene 'solids' of neuprim \S+: view x: wrong$"), suspects.watch():
-        from neuprim.core.data.check import DatasetFault
+        from neuprim.core.data.dataset_check import DatasetFault
 
         raise DatasetFault("view x: wrong")
     with pytest.raises(ValueError, match=r"^ours$"), suspects.watch():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neuprim.conformance import CHECKS, ConformanceError, named_checks
 from neuprim.conformance.example import example
-from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.data import Clip, Dataset, Pixels
 from neuprim.core.errors import ConfigError
 from neuprim.core.layers import LayerSpec

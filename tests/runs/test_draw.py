@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neuprim.core.cameras.file import CameraViews
+from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import ConditionSpec

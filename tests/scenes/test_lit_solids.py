@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from neuprim.core.data import Dataset
-from neuprim.core.data.views import ImageViews
+from neuprim.core.data.image_views import ImageViews
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import read_image
 from neuprim.core.task import SceneContext

@@ -4,13 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuprim.core.errors import DataError
 
-__all__ = ["Camera", "check_viewmat", "look_at", "opengl_to_viewmat", "orbit"]
+__all__ = [
+    "CameraViews",
+    "LARGEST",
+    "MOST",
+    "RATES",
+    "Camera",
+    "check_viewmat",
+    "exr_attributes",
+    "look_at",
+    "opengl_to_viewmat",
+    "orbit",
+]
 
 
 @dataclass(frozen=True)
@@ -140,3 +153,61 @@ def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation
         )
         views.append(replace(template, viewmat=look_at(eye, center, up)))
     return views
+
+
+MOST = 100_000
+"""Cameras of one file."""
+
+LARGEST = 32768
+"""Pixels of an image's side."""
+
+RATES = (0.1, 240.0)
+"""Least and most frames per second of a film, as ``--fps`` takes them."""
+
+
+@dataclass(frozen=True)
+class CameraViews:
+    """Cameras in their order, one or more.
+
+    Attributes:
+        named: name and camera of each.
+        times: what the file says as the time of each, in its own unit; None where it does not.
+        fps: frames per second of the film that they are; None where the file does not say.
+        notes: one line each, for the user: conventions that were met, and what of the file cannot be drawn.
+    """
+
+    named: tuple[tuple[str, Camera], ...]
+    times: tuple[float, ...] | None = None
+    fps: float | None = None
+    notes: tuple[str, ...] = ()
+
+
+def exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
+    """Attribute name -> value: ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth`` as
+    the standard has them, and in float64, for cameras far from the origin, ``neuprim:worldToCamera``, and
+    in plain numbers ``neuprim:focalLength`` and ``neuprim:principalPoint`` (x, y, pixels), ``neuprim:near`` (camera z,
+    units of the camera's position).
+    """
+    view = camera.viewmat.detach().double().cpu().numpy()
+    up = np.diag([1.0, -1.0, 1.0, 1.0])
+    width, height = float(camera.width), float(camera.height)
+    project = np.array(
+        [
+            [camera.fx / width, 0.0, camera.cx / width, 0.0],
+            [0.0, camera.fy / height, camera.cy / height, 0.0],
+            [0.0, 0.0, 1.0, -near],  # after the division: 0 at the near plane, 1 far away
+            [0.0, 0.0, 1.0, 0.0],
+        ]
+    )
+    return {
+        "worldToCamera": np.ascontiguousarray((up @ view).T, dtype=np.float32),
+        "neuprim:worldToCamera": np.ascontiguousarray((up @ view).T),
+        "worldToNDC": np.ascontiguousarray((project @ view).T, dtype=np.float32),
+        "screenWindowCenter": np.array(
+            [(width / 2 - camera.cx) / camera.fx, (camera.cy - height / 2) / camera.fy], np.float32
+        ),
+        "screenWindowWidth": width / camera.fx,
+        "neuprim:focalLength": np.array([camera.fx, camera.fy], np.float32),
+        "neuprim:principalPoint": np.array([camera.cx, camera.cy], np.float32),
+        "neuprim:near": float(near),
+    }

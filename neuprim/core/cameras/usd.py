@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import usd_stage
-from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
-from neuprim.core.cameras.views import LARGEST, MOST, RATES, CameraViews
+from neuprim.core.cameras.pinhole import LARGEST, MOST, RATES, Camera, CameraViews, opengl_to_viewmat
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.io.json_reader import JsonReader
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras.pinhole import Camera
-from neuprim.core.cameras.rays import RayCamera
+from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import DataError
 
 __all__ = ["World"]

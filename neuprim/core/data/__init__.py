@@ -6,12 +6,13 @@ from neuprim.core.data.dataset import (
     DataSource,
     Pixels,
     PointCloud,
+    PointSamples,
+    PointSupervision,
     StartingPoints,
     View,
     ViewSet,
-    camera_extent,
 )
-from neuprim.core.data.points import PointSamples, PointSupervision
+from neuprim.core.data.scene_frame import camera_extent
 
 __all__ = [
     "Clip",

@@ -10,7 +10,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, final
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -19,24 +20,29 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at, orbit
 from neuprim.core.cameras.world import World
 from neuprim.core.compute import device as hardware
+from neuprim.core.compute.device import HOST
+from neuprim.core.data.scene_frame import outlying
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions
 
 if TYPE_CHECKING:
-    from neuprim.core.data.points import PointSupervision
     from neuprim.core.volumes.source import Placement
 
 __all__ = [
     "Clip",
     "DataSource",
     "Dataset",
+    "GroundTruth",
     "Pixels",
     "PointCloud",
+    "PointSamples",
+    "PointSupervision",
+    "SceneContext",
+    "SomeViews",
     "StartingPoints",
     "View",
     "ViewSet",
-    "camera_extent",
-    "outlying",
+    "held_out",
 ]
 
 DataSource = Literal["real", "generated", "simulated"]
@@ -96,6 +102,27 @@ class ViewSet(ABC):
 
     @abstractmethod
     def pixels(self, index: int) -> Pixels: ...
+
+
+class SomeViews(ViewSet):
+    """Some views of another set, which keeps their pixels; e.g. those of one moment.
+
+    Args:
+        views: the whole set.
+        indices: of the chosen views, in the order they get here.
+    """
+
+    def __init__(self, views: ViewSet, indices: Sequence[int]) -> None:
+        self._views, self._indices = views, list(indices)
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def view(self, index: int) -> View:
+        return self._views.view(self._indices[index])
+
+    def pixels(self, index: int) -> Pixels:
+        return self._views.pixels(self._indices[index])
 
 
 @dataclass(frozen=True)
@@ -298,28 +325,125 @@ class Dataset:
         }
 
 
-def camera_extent(cameras: Sequence[Camera]) -> float:
-    """Radius of the bounding sphere of the cameras about their mean x 1.1 (the convention of 3D Gaussian splatting);
-    1.0 if zero.
+@dataclass(frozen=True)
+class PointSamples:
+    """What is true at M points of one frame.
 
-    Cameras that are :func:`outlying` do not count.
+    Attributes:
+        name: of the frame, for logs.
+        conditions: of the frame, the same for all points.
+        points: (M, 3) float32, scene units.
+        sigma: (M,) float32 extinction, 1/scene unit.
+        source: (M, C) float32 extinction times source radiance in the data set's colour space, where it is the same
+        towards all directions;
+            None where it is not, or not known: then the extinction alone is learned from points.
+        sigma_scale, source_scale: typical sizes of both where there is matter, what errors are divided by.
+        components: name -> (M,) float32, the part of ``sigma`` that comes from the source grid of that name, and its
+        typical size.
     """
-    positions = torch.stack([c.position.detach().double() for c in cameras])
-    positions = positions[~outlying(positions)]
-    radius = (positions - positions.mean(0)).norm(dim=-1).max().item() * 1.1
-    return radius if radius > 0 else 1.0
+
+    name: str
+    conditions: Conditions
+    points: Tensor
+    sigma: Tensor
+    source: Tensor | None
+    sigma_scale: float
+    source_scale: float = 1.0
+    components: Mapping[str, tuple[Tensor, float]] = field(default_factory=dict)
 
 
-_OUTLYING = 100.0
-_OUTLYING_SHARE = 0.05
+class PointSupervision(ABC):
+    """Points to learn from; a data set's ``points``.
 
-
-def outlying(positions: Tensor) -> Tensor:
-    """(N,) bool of the (N, 3) camera centres that say nothing about place and scale of a scene.
-
-    Rule: a few cameras (one, or 5 %) farther from the median centre than 100 times the median distance are mistakes of
-    a reconstruction.
+    Attributes:
+        components: names of the source grids whose part of the extinction is known (:attr:`PointSamples.components`).
     """
-    distance = (positions - positions.median(0).values).norm(dim=-1)
-    far = (distance > _OUTLYING * distance.median()) & (distance.median() > 0)
-    return far if int(far.sum()) <= max(1, _OUTLYING_SHARE * len(far)) else torch.zeros_like(far)
+
+    components: tuple[str, ...] = ()
+
+    @abstractmethod
+    def draw(self, count: int, generator: torch.Generator) -> PointSamples:
+        """``count`` points of one frame, both drawn by ``generator`` alone, so that a resumed run draws the same."""
+
+
+def held_out(dataset: Dataset, every: int) -> Dataset:
+    """The same without its test views: one of every ``every`` training views takes their place, and is not learned
+    from.
+
+    Which one moves on by one from each group to the next: of cameras with as many frames as a multiple of ``every``, it
+    is not always the same moment that nobody learns from.
+
+    Args:
+        every: 2 or more.
+
+    Raises:
+        ConfigError: that leaves nothing to learn from, or nothing to judge by.
+    """
+    count = len(dataset.train)
+    if every < 2 or count < 2:
+        raise ConfigError(
+            f"{dataset.name}: every {every}. of {count} training views held out; expected 2 or more of 2 views or more"
+        )
+    test = [i for i in range(count) if i % every == i // every % every]
+    train = [i for i in range(count) if i % every != i // every % every]
+    return replace(dataset, train=SomeViews(dataset.train, train), test=SomeViews(dataset.train, test))
+
+
+class GroundTruth(ABC):
+    """The images of a scene, as they will be when all frames are made. Any process that has the scene's settings can
+    make any frame.
+
+    Attributes:
+        frames: their names, in order.
+        key: of everything that the images depend on; another process must come to the same one, or it sees other files.
+        place: folder or URL where they are kept.
+        known: plain values that spare another process work that was done here; given to the scene's ``truth`` there.
+    """
+
+    frames: Sequence[str]
+    key: str
+    place: str
+    known: Mapping[str, Any]
+
+    @abstractmethod
+    def missing(self) -> list[int]:
+        """Places in ``frames`` of those that are not there, in order."""
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Make the place ready; before the first frame is made, by whoever hands them out."""
+
+    @abstractmethod
+    def make(self, frame: int, tell: Callable[[str], None]) -> None:
+        """Make a frame, unless it is there by now. Whole or not at all; two that make the same one do no harm.
+
+        Args:
+            tell: told that the place is gone and waited for.
+
+        Raises:
+            DataError: its file cannot be read, or the place cannot be written.
+        """
+
+    @abstractmethod
+    def complete(self) -> None:
+        """What is to be written when all frames are there, if anything."""
+
+
+@dataclass(frozen=True)
+class SceneContext:
+    """What a scene's loader gets beside its own settings.
+
+    Attributes:
+        seed: for generated scenes.
+        cache_dir: where generated data may be kept between runs (keyed by everything that matters).
+        progress: called with (text, fraction 0..1) during long work.
+        device: what may compute the ground truth where a loader has to; data sets are on the processor either way.
+        world: of the model that the scene is loaded for again, whose coordinates it keeps; None: the scene's own
+        choice.
+    """
+
+    seed: int
+    cache_dir: Path
+    progress: Callable[[str, float], None] = lambda text, fraction: None
+    device: torch.device = HOST
+    world: World | None = None

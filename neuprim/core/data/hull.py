@@ -17,7 +17,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.data import ViewSet
-from neuprim.core.data.focus import focus_point
+from neuprim.core.data.scene_frame import focus_point
 from neuprim.core.errors import DataError
 
 __all__ = ["EmptyHull", "hull_surface"]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.rays import AnyCamera, RayCamera
+from neuprim.core.cameras.projections import AnyCamera, RayCamera
 from neuprim.core.compute import device as hardware
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.forms import Constant, Cosine, RayNet

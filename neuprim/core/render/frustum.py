@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.model.geometry import Geometry
 
 __all__ = ["in_sight"]

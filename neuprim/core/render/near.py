@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.settings import RenderSettings
 
 __all__ = ["decided", "scene_extent", "seen_depths"]

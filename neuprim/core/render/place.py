@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.backends import run_device

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.rays import AnyCamera, RayCamera
+from neuprim.core.cameras.projections import AnyCamera, RayCamera
 from neuprim.core.compute import device
 from neuprim.core.model.checks import check_result
 from neuprim.core.model.primitives import Lowered

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from neuprim.core.data import Pixels, View
-from neuprim.core.data.reduction import averaged, whole
+from neuprim.core.data.image_views import averaged, whole
 
 __all__ = ["reduced", "reduction"]
 

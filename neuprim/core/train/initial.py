@@ -8,11 +8,10 @@ import torch
 from scipy.spatial import cKDTree
 
 from neuprim.core.data import Dataset, PointCloud
-from neuprim.core.data.check import check_points
-from neuprim.core.data.initial import subset
+from neuprim.core.data.dataset_check import check_points
+from neuprim.core.data.initial import subset, surrounding_points
 from neuprim.core.data.points_file import COMPRESSED, read_points
-from neuprim.core.data.rays import NOT_SEEN, views_that_see
-from neuprim.core.data.surroundings import surrounding_points
+from neuprim.core.data.ray_points import NOT_SEEN, views_that_see
 from neuprim.core.errors import ConfigError, DataError, nearest
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives

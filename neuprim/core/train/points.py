@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.data import Dataset, PointSamples
-from neuprim.core.data.check import check_samples
+from neuprim.core.data.dataset_check import check_samples
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Tally
 from neuprim.core.train.settings import TrainSettings

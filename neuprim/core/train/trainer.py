@@ -20,7 +20,7 @@ from torch import Tensor
 from neuprim.core.compute import device
 from neuprim.core.compute.threads import limit_threads
 from neuprim.core.data import Dataset, Pixels, PointSamples
-from neuprim.core.data.check import check_pixels
+from neuprim.core.data.dataset_check import check_pixels
 from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, RankError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render

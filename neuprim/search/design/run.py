@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from neuprim.config import suspects_of, task_of
-from neuprim.core.data.check import check_dataset
+from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.render import backends
 from neuprim.report.tradeoff_models import write_models
 from neuprim.runs.fit import one_torch_thread

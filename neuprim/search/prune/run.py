@@ -13,8 +13,8 @@ import numpy as np
 from neuprim.config import RunConfig, suspects_of
 from neuprim.core.channels import channels_of
 from neuprim.core.data import Dataset
-from neuprim.core.data.check import check_dataset
-from neuprim.core.data.held_out import held_out
+from neuprim.core.data.dataset import held_out
+from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import refuse_existing, write_json, write_text
 from neuprim.core.model.primitives import Primitives
@@ -46,7 +46,7 @@ class Request:
         same model again. out: the new run directory; None: beside the run, its name with "-pruned".
         overwrite: whether files there may be replaced.
         hold_out: n > 1: one of n training views neither decides nor is trained on, as in
-        :func:`~neuprim.core.data.held_out.held_out`; 0: all do.
+        :func:`~neuprim.core.data.dataset.held_out`; 0: all do.
     """
 
     run_dir: Path

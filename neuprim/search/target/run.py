@@ -11,7 +11,7 @@ from neuprim.config import RunConfig, suspects_of, task_of
 from neuprim.config.launcher import LauncherSettings
 from neuprim.config.target import Target
 from neuprim.core.data import Dataset
-from neuprim.core.data.check import check_dataset
+from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.runs.events import Events, Preparing, silent
 from neuprim.runs.ground_truth import before_training

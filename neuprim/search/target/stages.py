@@ -16,7 +16,7 @@ from neuprim.config import suspects_of, task_of
 from neuprim.config.target import Target
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
 from neuprim.core.compression import Quantizers
-from neuprim.core.data.held_out import held_out
+from neuprim.core.data.dataset import held_out
 from neuprim.core.io.files import atomic_path, write_text
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.model.primitives import Primitives

@@ -7,7 +7,7 @@ from typing import Any
 
 from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
-from neuprim.core.data.ground_truth import GroundTruth
+from neuprim.core.data.dataset import GroundTruth
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from neuprim.core.data import Clip, Dataset
-from neuprim.core.data.check import extra_of
+from neuprim.core.data.dataset_check import extra_of
 from neuprim.core.model.primitives import Primitives
 
 if TYPE_CHECKING:

@@ -20,11 +20,11 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import PointCloud, ViewSet
-from neuprim.core.data.focus import axes_meet
+from neuprim.core.data.dataset import SomeViews
 from neuprim.core.data.hull import EmptyHull, hull_surface
 from neuprim.core.data.initial import box_points, check_count, distinct, farthest_points, has_silhouettes, median_colors
-from neuprim.core.data.rays import ray_points
-from neuprim.core.data.views import SomeViews
+from neuprim.core.data.ray_points import ray_points
+from neuprim.core.data.scene_frame import axes_meet
 
 __all__ = ["moving_points"]
 
@@ -43,7 +43,7 @@ _MATTER = 0.1
 def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
     """At most ``count`` distinct starting points of a moving scene, in scene units and the images' colour space.
 
-    Where the cameras do not look at one point they begin along rays, see :func:`~neuprim.core.data.rays.ray_points`.
+    Where the cameras do not look at one point they begin along rays, see :func:`~neuprim.core.data.ray_points.ray_points`.
     With alpha they are spread evenly over the surfaces of all moments' hulls, each with the "time" and the colour of a
     moment
     in which it was found (one of them at random); moments without matter give none. Without alpha, or where every image

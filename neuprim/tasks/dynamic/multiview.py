@@ -2,7 +2,7 @@
 
 Either ``transforms_SPLIT.json`` per split, whose scenes have z upwards, or one ``transforms.json``, of which every n-th
 frame by name is a test view unless it lists ``train_filenames``, ``val_filenames`` or ``test_filenames``; where both
-are there the splits count. Cameras, lenses and masks are those of :mod:`neuprim.core.data.transforms`; images are PNG,
+are there the splits count. Cameras, lenses and masks are those of :mod:`neuprim.core.data.transforms_json`; images are PNG,
 JPEG or OpenEXR.
 
 Each view has the condition "time", a float32 tensor without dimensions, 0..1.
@@ -25,10 +25,9 @@ import torch
 
 from neuprim.core.checked import Accepts, checked
 from neuprim.core.data import Dataset
-from neuprim.core.data.common import posed_images
-from neuprim.core.data.settings import EveryNth, FolderSettings, SplitName, data_folder
-from neuprim.core.data.transforms import Layout, read_frames, split_frames
-from neuprim.core.data.views import ImageFrame
+from neuprim.core.data.image_views import ImageFrame
+from neuprim.core.data.posed_images import EveryNth, FolderSettings, SplitName, data_folder, posed_images
+from neuprim.core.data.transforms_json import Layout, read_frames, split_frames
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext

@@ -19,7 +19,7 @@ from typing import Any
 
 from torch import Tensor
 
-from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.compute import device
 from neuprim.core.model.canonical import canonicalize_cosines
 from neuprim.core.model.densities.fewer import smaller_neuron_counts

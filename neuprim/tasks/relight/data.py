@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import Clip, Dataset
-from neuprim.core.data.check import extra_of
+from neuprim.core.data.dataset_check import extra_of
 from neuprim.core.errors import DataError
 
 if TYPE_CHECKING:
-    from neuprim.core.data.views import ImageViews
+    from neuprim.core.data.image_views import ImageViews
 
 __all__ = ["EXPOSURE_PERCENTILE", "Falloff", "Lighting", "bright", "lighting_of"]
 

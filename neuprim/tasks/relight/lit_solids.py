@@ -16,9 +16,8 @@ from torch import Tensor
 
 from neuprim.core.checked import Accepts, checked
 from neuprim.core.data import Clip, Dataset
-from neuprim.core.data.common import in_scene
-from neuprim.core.data.settings import HoldOut
-from neuprim.core.data.views import ImageViews
+from neuprim.core.data.image_views import ImageViews
+from neuprim.core.data.posed_images import HoldOut, in_scene
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import read_image
 from neuprim.core.task import SceneContext

@@ -46,10 +46,18 @@ from torch import Tensor
 from neuprim.core.cameras import opengl_to_viewmat
 from neuprim.core.checked import Range, checked
 from neuprim.core.data import Dataset
-from neuprim.core.data.common import IMAGE_SUFFIXES, find_image, posed_images
-from neuprim.core.data.settings import Background, FolderSettings, HoldOut, SplitName, data_folder
-from neuprim.core.data.transforms import Layout, read_frames, read_splits
-from neuprim.core.data.views import ImageFrame
+from neuprim.core.data.image_views import ImageFrame
+from neuprim.core.data.posed_images import (
+    IMAGE_SUFFIXES,
+    Background,
+    FolderSettings,
+    HoldOut,
+    SplitName,
+    data_folder,
+    find_image,
+    posed_images,
+)
+from neuprim.core.data.transforms_json import Layout, read_frames, read_splits
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import Conditions

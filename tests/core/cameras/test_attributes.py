@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from neuprim.core.cameras.attributes import exr_attributes
+from neuprim.core.cameras.pinhole import exr_attributes
 from tests import scenes
 
 CAMERA = scenes.camera(64, 48, shift=(5.0, -3.0))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neuprim.core.cameras.file import read_camera_file
+from neuprim.core.cameras.camera_files import read_camera_file
 from tests.docs.pages import ROOT, blocks
 
 PAGE = ROOT / "docs" / "data_formats.md"

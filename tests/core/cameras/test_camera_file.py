@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from neuprim.core.cameras.file import read_camera_file, read_cameras
+from neuprim.core.cameras.camera_files import read_camera_file, read_cameras
 from neuprim.core.errors import DataError
 
 POSE = [
@@ -254,7 +254,7 @@ def test_bad_camera_paths_are_refused_by_name_and_field(tmp_path: Path, change: 
 
 
 def test_too_many_cameras_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neuprim.core.cameras.json_files.MOST", 1)
+    monkeypatch.setattr("neuprim.core.cameras.camera_files.MOST", 1)
     for data, key in ((GOOD, "frames"), (PATH, "camera_path")):
         with pytest.raises(DataError, match=f"{key} has 2 cameras; expected at most 1"):
             read_camera_file(write(tmp_path / "c.json", data))

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from neuprim.core.cameras.file import read_camera_file
+from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.errors import BackendUnavailable, DataError
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'neuprim[colmap]'")

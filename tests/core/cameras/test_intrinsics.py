@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from neuprim.core.cameras.intrinsics import Target, camera_of, is_fisheye, lens_of
-from neuprim.core.cameras.keys import check_keys, unknown_keys
+from neuprim.core.cameras.intrinsics import Target, camera_of, check_keys, is_fisheye, lens_of, unknown_keys
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.file import read_camera_file
+from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.cameras.usd import is_usd, read_usd_cameras
 from neuprim.core.errors import BackendUnavailable, DataError
 

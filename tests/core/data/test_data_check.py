@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.rays import RayCamera
+from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.data import Dataset, Pixels, PointCloud, PointSamples
-from neuprim.core.data.check import (
+from neuprim.core.data.dataset_check import (
     DatasetFault,
     check_dataset,
     check_mask,

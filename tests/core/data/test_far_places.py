@@ -11,9 +11,8 @@ import torch
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.world import World
 from neuprim.core.data import PointCloud, camera_extent
-from neuprim.core.data.focus import focus_point
-from neuprim.core.data.place import world_around
 from neuprim.core.data.points_file import read_points
+from neuprim.core.data.scene_frame import focus_point, world_around
 from neuprim.core.io.ply import write_ply
 from neuprim.core.notices import NeuprimWarning
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from neuprim.core.data.held_out import held_out
+from neuprim.core.data.dataset import held_out
 from neuprim.core.errors import ConfigError
 from tests.core import tiny
 

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Pixels, PointCloud, View, ViewSet
-from neuprim.core.data.focus import focus_point
 from neuprim.core.data.hull import hull_surface
 from neuprim.core.data.initial import _thinned, box_points, farthest_points, hull_points, initial_points
+from neuprim.core.data.scene_frame import focus_point
 from neuprim.core.errors import ConfigError, DataError
 
 CENTER = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Pixels, View, ViewSet
-from neuprim.core.data.focus import axes_meet
 from neuprim.core.data.initial import initial_points
-from neuprim.core.data.rays import ray_points, views_that_see
+from neuprim.core.data.ray_points import ray_points, views_that_see
+from neuprim.core.data.scene_frame import axes_meet
 from neuprim.core.errors import DataError
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

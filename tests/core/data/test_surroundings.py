@@ -10,7 +10,7 @@ import torch
 from neuprim.config import compose, task_of
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Pixels, PointCloud, View, ViewSet
-from neuprim.core.data.surroundings import surrounding_points
+from neuprim.core.data.initial import surrounding_points
 from neuprim.core.errors import ConfigError
 from neuprim.runs.fit import make_trainer
 from neuprim.runs.open import load_dataset

@@ -21,7 +21,7 @@ from rich.console import Console
 import neuprim
 from neuprim.cli import doctor_command, main
 from neuprim.config import RunConfig, compose
-from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.fields import Constant, CustomDensity
 from neuprim.core.model.primitives import Lowered

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neuprim.core.cameras.rays import RayCamera
+from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.shading import points_seen

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.cameras.rays import RayCamera
+from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.cameras.rays import RayCamera
+from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import ConfigError
 from neuprim.core.render.near import decided, scene_extent, seen_depths
 from neuprim.core.settings import RenderSettings

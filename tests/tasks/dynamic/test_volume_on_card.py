@@ -13,7 +13,7 @@ pytest.importorskip("warp", reason="the kernels of a card are written in Warp: p
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute import device
-from neuprim.core.data.context import SceneContext
+from neuprim.core.data.dataset import SceneContext
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from neuprim.config import compose
-from neuprim.core.data.points import PointSamples
+from neuprim.core.data.dataset import PointSamples
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.train.trainer import Trainer

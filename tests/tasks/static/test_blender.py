@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from neuprim.core.data.views import ImageViews
+from neuprim.core.data.image_views import ImageViews
 from neuprim.core.errors import DataError
 from neuprim.core.io.exr import write_exr
 from neuprim.core.notices import NeuprimWarning

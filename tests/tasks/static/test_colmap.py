@@ -13,8 +13,8 @@ import pytest
 import torch
 from PIL import Image
 
-from neuprim.core.cameras.colmap_files import check_binary_model
-from neuprim.core.cameras.file import read_camera_file
+from neuprim.core.cameras.camera_files import read_camera_file
+from neuprim.core.cameras.colmap import check_binary_model
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.static.datasets.colmap import load

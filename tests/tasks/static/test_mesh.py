@@ -29,13 +29,12 @@ from neuprim.scenes.shapes import Solid, plain
 from neuprim.scenes.solids.generate import SolidsSettings
 from neuprim.scenes.solids.shading import encode_srgb
 from neuprim.tasks.static.mesh import generate as generator
-from neuprim.tasks.static.mesh.files import Folder
 from neuprim.tasks.static.mesh.generate import MeshSettings, generate, load
 from neuprim.tasks.static.mesh.gltf import read_gltf
+from neuprim.tasks.static.mesh.materials import GREY, Texture, decode_texture, read_surfaces
+from neuprim.tasks.static.mesh.model import ModelFolder
 from neuprim.tasks.static.mesh.obj import read_obj
-from neuprim.tasks.static.mesh.parts import GREY, read_parts
 from neuprim.tasks.static.mesh.surface import FARTHEST, Surface
-from neuprim.tasks.static.mesh.textures import Texture, decode
 from tests.models import BLUE, GREEN, RED, YELLOW, cube, gltf, quarters, textured, write_glb, write_obj, write_ply
 
 SMALL = {"size": 48, "train_views": 4, "test_views": 2, "supersampling": 2}
@@ -47,8 +46,8 @@ def read(path: Path, cache: Path, **settings: object) -> Dataset:
 
 def surface(path: Path, upward: str | None = None) -> Surface:
     """The model as rays meet it, sharp."""
-    model = generator._READERS[path.suffix](Folder(path))
-    return Surface(model, read_parts(model), upward or model.upward, 1e-6)
+    model = generator._READERS[path.suffix](ModelFolder(path))
+    return Surface(model, read_surfaces(model), upward or model.upward, 1e-6)
 
 
 def colours(scene: Surface, points: list[list[float]], directions: list[list[float]]) -> np.ndarray:
@@ -136,7 +135,7 @@ def test_names_of_textures_in_libraries(tmp_path: Path, line: str, name: str) ->
         quarters().save(tmp_path / file)
     (tmp_path / "m.mtl").write_text(f"newmtl m\n{line}\n")
     (tmp_path / "m.obj").write_text("mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
-    model = read_obj(Folder(tmp_path / "m.obj"))
+    model = read_obj(ModelFolder(tmp_path / "m.obj"))
     assert list(model.images) == [name] and model.materials["m"].texture == name
 
 
@@ -197,7 +196,7 @@ def test_base_colours_are_linear_and_multiply_texture_and_vertices(tmp_path: Pat
     document["buffers"] = [{"uri": "triangle.bin", "byteLength": len(data)}]
     (tmp_path / "triangle.bin").write_bytes(data)
     (tmp_path / "t.gltf").write_text(json.dumps(document))
-    (part,) = read_parts(read_gltf(Folder(tmp_path / "t.gltf")))
+    (part,) = read_surfaces(read_gltf(ModelFolder(tmp_path / "t.gltf")))
     np.testing.assert_allclose(part.colour, np.broadcast_to([0.00065, 0.125, 0.5], (1, 3, 3)), rtol=1e-4)
 
 
@@ -227,7 +226,7 @@ def test_texture_coordinates_of_the_materials_own_set_are_moved_and_wrapped(tmp_
     quarters().save(tmp_path / "the skin.png")
     (tmp_path / "triangle.bin").write_bytes(data)
     (tmp_path / "t.gltf").write_text(json.dumps(document))
-    (part,) = read_parts(read_gltf(Folder(tmp_path / "t.gltf")))
+    (part,) = read_surfaces(read_gltf(ModelFolder(tmp_path / "t.gltf")))
     assert part.material.wrap == ("clamp", "mirror") and part.uv is not None
     np.testing.assert_allclose(
         part.uv[0], [[0.5, 1.0], [0.5, 1.0], [2.5, 0.0]], atol=1e-6
@@ -247,7 +246,7 @@ def test_parts_stand_where_the_graph_puts_them(tmp_path: Path) -> None:
     (tmp_path / "triangle.bin").write_bytes(data)
     (tmp_path / "t.gltf").write_text(json.dumps(document))
     first, second = sorted(
-        read_parts(read_gltf(Folder(tmp_path / "t.gltf"))), key=lambda part: float(part.corners.max())
+        read_surfaces(read_gltf(ModelFolder(tmp_path / "t.gltf"))), key=lambda part: float(part.corners.max())
     )
     np.testing.assert_allclose(first.corners[0], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     np.testing.assert_allclose(second.corners[0], [[20, 0, -2], [20, 2, -2], [18, 0, -2]], atol=1e-12)
@@ -269,7 +268,7 @@ def test_triangles_strips_and_fans(tmp_path: Path, mode: int, indices: list[int]
     document["meshes"][0]["primitives"][0]["mode"] = mode
     (tmp_path / "triangle.bin").write_bytes(data)
     (tmp_path / "t.gltf").write_text(json.dumps(document))
-    (part,) = read_parts(read_gltf(Folder(tmp_path / "t.gltf")))
+    (part,) = read_surfaces(read_gltf(ModelFolder(tmp_path / "t.gltf")))
     area = (
         np.linalg.norm(
             np.cross(part.corners[:, 1] - part.corners[:, 0], part.corners[:, 2] - part.corners[:, 0]), axis=1
@@ -341,7 +340,7 @@ def test_images_of_every_depth_are_decoded(tmp_path: Path, mode: str) -> None:
     grey = np.full((4, 4), 128, np.uint8)
     image = Image.fromarray(grey.astype(np.uint16) * 257) if mode == "I;16" else Image.fromarray(grey).convert(mode)
     image.save(tmp_path / "a.png")
-    pixels = decode(tmp_path, "a.png", (tmp_path / "a.png").read_bytes())
+    pixels = decode_texture(tmp_path, "a.png", (tmp_path / "a.png").read_bytes())
     assert pixels.shape == (4, 4, 4) and pixels.dtype == np.uint8
     if mode != "1":
         np.testing.assert_array_equal(pixels[0, 0], [128, 128, 128, 255])
@@ -457,7 +456,7 @@ def test_images_are_kept_by_contents_and_settings(tmp_path: Path, monkeypatch: p
     path, cache = write_obj(tmp_path / "square.obj"), tmp_path / "cache"
     settings = MeshSettings(path=path, **SMALL)
     first = generate(settings, cache)
-    monkeypatch.setattr(generator, "read_parts", None)  # a second time nothing is parsed
+    monkeypatch.setattr(generator, "read_surfaces", None)  # a second time nothing is parsed
     assert generate(settings, cache) == first
     monkeypatch.undo()
     (tmp_path / "copy").mkdir()

@@ -21,7 +21,8 @@ from PIL import Image
 from neuprim.core import notices
 from neuprim.core.errors import DataError
 from neuprim.core.notices import NeuprimWarning
-from neuprim.tasks.static.mesh import files, parts, textures
+from neuprim.tasks.static.mesh import gltf as gltf_reader
+from neuprim.tasks.static.mesh import materials, model
 from neuprim.tasks.static.mesh.generate import MeshSettings, generate
 from tests.models import cube, gltf, quarters, write_glb, write_gltf, write_obj, write_ply
 
@@ -79,7 +80,7 @@ def test_a_suffix_in_capitals_is_known(tmp_path: Path) -> None:
     assert notes(tmp_path / "CUBE.GLB") == []
 
 
-@pytest.mark.parametrize("suffix", files.SUFFIXES)
+@pytest.mark.parametrize("suffix", model.SUFFIXES)
 def test_an_empty_file_and_one_of_noise(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     path.touch()
@@ -91,9 +92,9 @@ def test_an_empty_file_and_one_of_noise(tmp_path: Path, suffix: str) -> None:
 def test_more_bytes_than_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_obj(tmp_path / "a.obj")
     size = path.stat().st_size + path.with_suffix(".mtl").stat().st_size
-    monkeypatch.setattr(files.Folder.__init__, "__defaults__", (False, size))
+    monkeypatch.setattr(model.ModelFolder.__init__, "__defaults__", (False, size))
     assert "the model with what it names, up to skin.png, is larger than 512 MiB" in refusal(path)
-    monkeypatch.setattr(files.Folder.__init__, "__defaults__", (False, 10))
+    monkeypatch.setattr(model.ModelFolder.__init__, "__defaults__", (False, 10))
     assert "the model is larger than 512 MiB" in refusal(path)
 
 
@@ -209,8 +210,8 @@ def test_empty_lines_are_no_vertices(tmp_path: Path) -> None:
 
 def test_every_use_of_a_part_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_gltf(tmp_path / "a.gltf", nodes=[{"mesh": 0}] * 50, scenes=[{"nodes": list(range(50))}])
-    monkeypatch.setattr(parts, "MAX_FACES", 49)
-    assert "50 faces, each use of a part counting; expected at most 49" in refusal(path)
+    monkeypatch.setattr(gltf_reader, "MAX_FACES", 49)
+    assert "50 faces; expected at most 49" in refusal(path)
 
 
 @pytest.mark.parametrize(
@@ -225,12 +226,10 @@ def test_more_than_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suff
     else:
         data = trimesh.Scene(trimesh.Trimesh(*cube()[:2], process=False)).export(file_type=suffix[1:])
         path.write_bytes(data.encode() if isinstance(data, str) else data)
-    for module in ("gltf", "obj", "scans", "parts"):
+    for module in ("gltf", "obj", "ply_stl", "materials"):
         monkeypatch.setattr(f"neuprim.tasks.static.mesh.{module}.{limit}", 11)
     found = refusal(path)
-    assert text in found or (
-        suffix == ".stl" and "36 vertices, each use of a part counting; expected at most 11" in found
-    )
+    assert text in found or (suffix == ".stl" and "36 vertices; expected at most 11" in found)
 
 
 def test_nodes_in_circles_and_nested_without_end(tmp_path: Path) -> None:
@@ -248,7 +247,7 @@ def test_nodes_in_circles_and_nested_without_end(tmp_path: Path) -> None:
 
 def test_textures_are_bounded_before_they_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_obj(tmp_path / "a.obj")
-    monkeypatch.setattr(textures, "MAX_PIXELS", 16 * 16 - 1)
+    monkeypatch.setattr(materials, "MAX_PIXELS", 16 * 16 - 1)
     assert "texture 'skin.png' has 16x16 pixels; at most 255 are accepted" in refusal(path)
     monkeypatch.undo()
     header = struct.pack(">4sIIBBBBB", b"IHDR", 60_000, 60_000, 8, 2, 0, 0, 0)
@@ -266,7 +265,7 @@ def test_textures_are_bounded_together(tmp_path: Path, monkeypatch: pytest.Monke
     path.with_suffix(".mtl").write_text("newmtl skin\nmap_Kd skin.png\nnewmtl back\nmap_Kd other.png\n")
     path.write_text(path.read_text().replace("f 1 4 6 5", "f 1/1 4/2 6/3 5/4"))
     monkeypatch.setattr("neuprim.tasks.static.mesh.surface.MAX_TEXELS", 300)
-    monkeypatch.setattr(textures, "MAX_TEXELS", 300)
+    monkeypatch.setattr(materials, "MAX_TEXELS", 300)
     assert "has 16x16 pixels; at most 300 of all textures are accepted" in refusal(path)
 
 
@@ -412,7 +411,7 @@ def test_texture_coordinates_beyond_all_measure(tmp_path: Path) -> None:
         ({"nodes": [{"mesh": 0, "scale": [1, 2, "x"]}]}, "could not convert"),
         ({"nodes": [{"mesh": 0, "scale": [1, 2, 1e999]}]}, "a number is inf"),
         ({"scenes": [{"nodes": [7]}]}, "list index out of range"),
-        ({"meshes": 5}, "not iterable"),
+        ({"meshes": 5}, "not subscriptable"),
         ({"meshes": [{"primitives": [{"attributes": {}}]}]}, "nothing called 'POSITION'"),
         ({"meshes": [{"primitives": [{"attributes": {"POSITION": 1}}]}]}, "accessors[1] is SCALAR, not VEC3"),
         ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 9}]}]}, "a primitive of mode 9"),

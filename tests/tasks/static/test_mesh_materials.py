@@ -17,8 +17,8 @@ from neuprim.core import notices
 from neuprim.core.errors import DataError
 from neuprim.scenes.solids.shading import encode_srgb, radiance
 from neuprim.tasks.static.mesh import generate as generator
-from neuprim.tasks.static.mesh.files import Folder
-from neuprim.tasks.static.mesh.parts import GREY, Part, read_parts
+from neuprim.tasks.static.mesh.materials import GREY, SurfacePart, read_surfaces
+from neuprim.tasks.static.mesh.model import ModelFolder
 from neuprim.tasks.static.mesh.surface import Surface
 from tests.models import BLUE, GREEN, RED, YELLOW, cube, gltf, quarters
 
@@ -30,13 +30,13 @@ def every_note(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(notices, "_said", set())
 
 
-def parts_of(path: Path) -> list[Part]:
-    return read_parts(generator._READERS[path.suffix](Folder(path)))
+def parts_of(path: Path) -> list[SurfacePart]:
+    return read_surfaces(generator._READERS[path.suffix](ModelFolder(path)))
 
 
 def surface(path: Path, upward: str = "z") -> Surface:
-    model = generator._READERS[path.suffix](Folder(path))
-    return Surface(model, read_parts(model), upward, 1e-6)  # type: ignore[arg-type]
+    model = generator._READERS[path.suffix](ModelFolder(path))
+    return Surface(model, read_surfaces(model), upward, 1e-6)  # type: ignore[arg-type]
 
 
 class Document:
@@ -363,9 +363,9 @@ def test_instances_are_expanded_below_their_node(tmp_path: Path, kind: str) -> N
 def test_more_instances_than_parts_are_refused(tmp_path: Path) -> None:
     document = Document(tmp_path)
     document.json["nodes"][0]["extensions"] = {
-        "EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": document.add(np.zeros((20_000, 3), np.float32))}}
+        "EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": document.add(np.zeros((20_001, 3), np.float32))}}
     }
-    with pytest.raises(DataError, match="20001 nodes; expected at most 20000"):
+    with pytest.raises(DataError, match="20001 instances; expected at most 20000"):
         parts_of(document.write())
 
 
@@ -401,7 +401,7 @@ def test_a_skin_is_where_its_joints_are(tmp_path: Path) -> None:
     (found,) = placed(document.write())
     np.testing.assert_allclose(found[0], [[-2, -2, 0], [2, -2, 6], [2, 2, 6]], atol=1e-5)
     document.json["nodes"][3]["children"] = [1]
-    with pytest.raises(DataError, match="own ancestor"):
+    with pytest.raises(DataError, match="joint 2 is outside of the scene"):
         parts_of(document.write())
 
 

@@ -11,9 +11,9 @@ import pytest
 from neuprim.core.errors import DataError
 from neuprim.tasks.static.mesh import generate as generator
 from neuprim.tasks.static.mesh import polygons
-from neuprim.tasks.static.mesh.files import Folder
-from neuprim.tasks.static.mesh.parts import read_parts
-from neuprim.tasks.static.mesh.polygons import divided
+from neuprim.tasks.static.mesh.materials import read_surfaces
+from neuprim.tasks.static.mesh.model import ModelFolder
+from neuprim.tasks.static.mesh.polygons import triangulate_polygons
 
 U = [(3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3), (0, 0), (3, 0)]
 ANGLES = 2 * np.pi * np.arange(12) / 12
@@ -52,7 +52,7 @@ def test_a_simple_polygon_is_covered_once(name: str) -> None:
     flat = np.pad(np.array(SIMPLE[name], np.float64), ((0, 0), (0, 1)))
     turned = flat @ np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     for polygon in (flat, flat[::-1], np.roll(flat, 3, axis=0), turned, 1e-6 * flat, 1e9 * turned, turned + 1e5):
-        triangles, owner = divided(PATH, np.ascontiguousarray(polygon), np.array([len(polygon)]))
+        triangles, owner = triangulate_polygons(PATH, np.ascontiguousarray(polygon), np.array([len(polygon)]))
         assert area(polygon[triangles]) == pytest.approx(own_area(polygon), rel=1e-9) and not owner.any()
 
 
@@ -63,22 +63,22 @@ def test_polygons_of_many_sizes_keep_their_order_and_their_corners() -> None:
     ]
     corners = np.pad(np.concatenate(polygons_), ((0, 0), (0, 1)))
     sizes = np.array([len(p) for p in polygons_])
-    triangles, owner = divided(PATH, corners, sizes)
+    triangles, owner = triangulate_polygons(PATH, corners, sizes)
     assert (np.diff(owner) >= 0).all()
     for i, end in enumerate(np.cumsum(sizes)):
         mine = triangles[owner == i]
         assert mine.min() >= end - sizes[i] and mine.max() < end
         assert area(corners[mine]) == pytest.approx(own_area(corners[end - sizes[i] : end]))
-    convex, _ = divided(PATH, np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), np.array([4]))
+    convex, _ = triangulate_polygons(PATH, np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), np.array([4]))
     assert convex.tolist() == [[0, 1, 2], [0, 2, 3]]  # as other programs divide them
 
 
 def test_what_is_bent_is_covered_and_what_has_no_area_is_left_to_be_counted() -> None:
     bent = np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0.3], [1, 1, 0], [1, 2, 0.2], [0, 2, 0]])
-    triangles, _ = divided(PATH, bent, np.array([6]))
+    triangles, _ = triangulate_polygons(PATH, bent, np.array([6]))
     assert 3 < area(bent[triangles]) < 3.3 and len(triangles) == 4
     line = np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2], [3, 3, 3], [0, 0, 0], [0, 0, 0]])
-    triangles, owner = divided(PATH, line, np.array([4, 2]))
+    triangles, owner = triangulate_polygons(PATH, line, np.array([4, 2]))
     assert len(triangles) == 2 and area(line[triangles]) < 1e-12 and owner.tolist() == [0, 0]
 
 
@@ -88,10 +88,10 @@ def test_polygons_that_cross_themselves_are_refused_with_a_count(monkeypatch: py
     with pytest.raises(
         DataError, match=r"a\.obj: 2 of 3 faces cross themselves, as face 1 of 4 corners; expected simple polygons"
     ):
-        divided(PATH, corners, np.array([8, 4, 4]))
+        triangulate_polygons(PATH, corners, np.array([8, 4, 4]))
     monkeypatch.setattr(polygons, "_MOST_TESTS", 5)
     with pytest.raises(DataError, match="1 of 1 faces"):  # no file takes more than some seconds
-        divided(PATH, np.pad(np.array(COMB, np.float64), ((0, 0), (0, 1))), np.array([len(COMB)]))
+        triangulate_polygons(PATH, np.pad(np.array(COMB, np.float64), ((0, 0), (0, 1))), np.array([len(COMB)]))
 
 
 def prism(relative: bool, texture: bool) -> str:
@@ -113,7 +113,7 @@ def prism(relative: bool, texture: bool) -> str:
 def test_an_obj_with_concave_faces_and_relative_indices(tmp_path: Path, relative: bool, texture: bool) -> None:
     text = prism(relative, texture).replace("f ", "f \\\n ", 1).replace("v 0 0 3", "v 0 0 3 # a corner")
     (tmp_path / "a.obj").write_text(text.replace("\n", "\r\n") if relative else text)
-    parts = read_parts(generator._READERS[".obj"](Folder(tmp_path / "a.obj")))
+    parts = read_surfaces(generator._READERS[".obj"](ModelFolder(tmp_path / "a.obj")))
     assert sum(area(part.corners) for part in parts) == pytest.approx(2 * 7 + 3 * 16)
 
 
@@ -134,7 +134,7 @@ def test_an_obj_with_concave_faces_and_relative_indices(tmp_path: Path, relative
 def test_damaged_lines_are_named(tmp_path: Path, line: str, text: str) -> None:
     (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\n{line}\n")
     with pytest.raises(DataError) as caught:
-        read_parts(generator._READERS[".obj"](Folder(tmp_path / "a.obj")))
+        read_surfaces(generator._READERS[".obj"](ModelFolder(tmp_path / "a.obj")))
     assert text in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -153,7 +153,7 @@ def test_a_ply_with_concave_faces(tmp_path: Path, order: str, mixed: bool) -> No
         body = "".join(f"{x} {y} 0\n" for x, y in U).encode()
         body += "".join(f"255 0 {51 * i} {len(f)} {' '.join(map(str, f))}\n" for i, f in enumerate(faces)).encode()
     (tmp_path / "a.ply").write_bytes(head.encode() + body)
-    (part,) = read_parts(generator._READERS[".ply"](Folder(tmp_path / "a.ply")))
+    (part,) = read_surfaces(generator._READERS[".ply"](ModelFolder(tmp_path / "a.ply")))
     first = part.colour[:, 0, 2] == 0
     assert area(part.corners[first]) == pytest.approx(7) and (part.colour[..., 0] == 1).all()
     if mixed:

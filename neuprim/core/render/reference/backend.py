@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered

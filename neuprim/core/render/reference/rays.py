@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.rays import AnyCamera, RayCamera
+from neuprim.core.cameras.projections import AnyCamera, RayCamera
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.render.reference.projection import screen_boxes
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 
-from neuprim.core.data.ground_truth import GroundTruth
+from neuprim.core.data.dataset import GroundTruth
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import write_json
 from neuprim.core.io.store import Store

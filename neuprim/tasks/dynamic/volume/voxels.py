@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.data.points import PointSamples, PointSupervision
+from neuprim.core.data.dataset import PointSamples, PointSupervision
 from neuprim.core.errors import DataError
 from neuprim.core.io.arrays import read_arrays
 from neuprim.core.io.store import Store

@@ -1,6 +1,6 @@
 """NeRF-synthetic ("Blender") scenes: ``transforms_SPLIT.json`` with a field of view, OpenGL poses and RGBA images.
 
-Frames are read by :mod:`neuprim.core.data.transforms`, so that focal lengths, principal points, lenses and masks count,
+Frames are read by :mod:`neuprim.core.data.transforms_json`, so that focal lengths, principal points, lenses and masks count,
 too (BlenderNeRF).
 
 Settings beside the common ones: ``train_split`` and ``test_split`` (names in the files' names, default train and test);
@@ -18,10 +18,9 @@ import torch
 
 from neuprim.core.checked import checked
 from neuprim.core.data import Dataset
-from neuprim.core.data.common import posed_images, turned
-from neuprim.core.data.settings import FolderSettings, HoldOut, SplitName, data_folder
-from neuprim.core.data.transforms import Layout, read_frames, read_splits
-from neuprim.core.data.views import ImageFrame
+from neuprim.core.data.image_views import ImageFrame
+from neuprim.core.data.posed_images import FolderSettings, HoldOut, SplitName, data_folder, posed_images, turned
+from neuprim.core.data.transforms_json import Layout, read_frames, read_splits
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext

@@ -26,9 +26,14 @@ from neuprim.core.cameras.intrinsics import same_shape
 from neuprim.core.cameras.pinhole import check_viewmat
 from neuprim.core.checked import checked, text
 from neuprim.core.data import Dataset, PointCloud
-from neuprim.core.data.bad_views import BadViews
-from neuprim.core.data.common import (
+from neuprim.core.data.distortion import Distortion
+from neuprim.core.data.image_views import ImageFrame, masks_beside
+from neuprim.core.data.posed_images import (
     IMAGE_SUFFIXES,
+    BadViews,
+    EveryNth,
+    FolderSettings,
+    data_folder,
     every_nth,
     find_image,
     missing_files,
@@ -36,10 +41,6 @@ from neuprim.core.data.common import (
     turned,
     unique_names,
 )
-from neuprim.core.data.distortion import Distortion
-from neuprim.core.data.masks import masks_beside
-from neuprim.core.data.settings import EveryNth, FolderSettings, data_folder
-from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.notices import warn_once

@@ -1,7 +1,7 @@
 """nerfstudio and instant-ngp captures: one ``transforms.json`` with intrinsics, lens distortion, OpenGL poses and
 masks.
 
-Frames are read by :mod:`neuprim.core.data.transforms`. Images are undistorted; what a photograph does not show is
+Frames are read by :mod:`neuprim.core.data.transforms_json`. Images are undistorted; what a photograph does not show is
 masked out, as is what ``mask_path`` blackens, or an image in ``masks/`` where no frame names one.
 
 Settings beside the common ones: ``skip_missing`` (default false: absent images are an error that lists them) and
@@ -19,10 +19,9 @@ from typing import Any
 
 from neuprim.core.checked import checked
 from neuprim.core.data import Dataset, PointCloud
-from neuprim.core.data.common import missing_files, posed_images
 from neuprim.core.data.points_file import read_points
-from neuprim.core.data.settings import EveryNth, FolderSettings, data_folder
-from neuprim.core.data.transforms import Layout, read_frames, split_frames
+from neuprim.core.data.posed_images import EveryNth, FolderSettings, data_folder, missing_files, posed_images
+from neuprim.core.data.transforms_json import Layout, read_frames, split_frames
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
 

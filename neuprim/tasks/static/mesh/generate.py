@@ -28,11 +28,11 @@ from neuprim.scenes.raycast import Scene
 from neuprim.scenes.settings import settings_key
 from neuprim.scenes.solids.generate import FIELD_OF_VIEW, Seen, SolidsSettings, image_set
 from neuprim.scenes.solids.shading import DAYLIGHT, Daylight, radiance
-from neuprim.tasks.static.mesh.files import Folder, Model, Up, model_file
 from neuprim.tasks.static.mesh.gltf import read_gltf
+from neuprim.tasks.static.mesh.materials import read_surfaces
+from neuprim.tasks.static.mesh.model import Model, ModelFolder, Up, find_model_file
 from neuprim.tasks.static.mesh.obj import read_obj
-from neuprim.tasks.static.mesh.parts import read_parts
-from neuprim.tasks.static.mesh.scans import read_ply, read_stl
+from neuprim.tasks.static.mesh.ply_stl import read_ply_mesh, read_stl
 from neuprim.tasks.static.mesh.surface import Surface
 
 __all__ = ["GENERATOR_VERSION", "LIGHT", "MeshSettings", "generate", "load"]
@@ -40,11 +40,11 @@ __all__ = ["GENERATOR_VERSION", "LIGHT", "MeshSettings", "generate", "load"]
 GENERATOR_VERSION = 2
 """Part of the cache's key: to be raised with every change to how models are read, placed, lit or looked at."""
 
-_READERS: dict[str, Callable[[Folder], Model]] = {
+_READERS: dict[str, Callable[[ModelFolder], Model]] = {
     ".glb": read_gltf,
     ".gltf": read_gltf,
     ".obj": read_obj,
-    ".ply": read_ply,
+    ".ply": read_ply_mesh,
     ".stl": read_stl,
 }
 
@@ -102,15 +102,15 @@ def generate(settings: MeshSettings, cache_dir: Path, progress: Progress = lambd
     Raises:
         DataError: as :func:`load`.
     """
-    path = model_file(settings.path)
+    path = find_model_file(settings.path)
     progress(f"mesh: reading {path.name}", 0.0)
-    model = _READERS[path.suffix.lower()](Folder(path, settings.skip_missing))
+    model = _READERS[path.suffix.lower()](ModelFolder(path, settings.skip_missing))
     upward: Up = model.upward if settings.up == "auto" else settings.up
     key = settings_key(replace(settings, path=Path(f"{path.name} {model.digest}"), up=upward), GENERATOR_VERSION)
     spacing = 2 * math.tan(FIELD_OF_VIEW / 2) / (settings.size * settings.supersampling)
 
     def build() -> Scene:
-        return Surface(model, read_parts(model), upward, spacing)
+        return Surface(model, read_surfaces(model), upward, spacing)
 
     def facts(scene: Surface) -> dict[str, Any]:
         return {"rendered_from": path.name, "scene_from_file": scene.scene_from_file.tolist()}

@@ -1,443 +1,357 @@
-"""glTF 2 (.gltf, .glb): what a document says, checked and written anew with nothing in it but surfaces, for trimesh to
-read.
+"""glTF 2 (.gltf, .glb): materials, and triangles in their places.
 
-Accessors are unpacked, quantized ones too. Materials and images are not passed on, so no decoder runs before its turn.
-Morph targets have their default weights, and skins the pose of their joints' nodes; animations, lights and cameras are
-left out.
-
-Extensions: those in ``_READ`` are honoured, those in ``_HARMLESS`` change nothing that is drawn, and beside those of
-``_COMPRESSION`` a file may hold what is read, or is refused. Any other is named in one line, and refused where the file
-requires it.
-"""
+Morph targets get their default weights, and skins the pose of their joints' nodes. Animations, lights and cameras are
+ignored."""
 
 from __future__ import annotations
 
-import json
 import math
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.plain import load_json
 from neuprim.core.notices import warn_once
-from neuprim.tasks.static.mesh.accessors import PLAIN, Accessors, count_of, file_name, finite, index_of
-from neuprim.tasks.static.mesh.files import MAX_FACES, MAX_PARTS, MAX_VERTICES, Folder, Material, Model, check_counts
+from neuprim.tasks.static.mesh.gltf_document import (
+    DRACO,
+    GltfDocument,
+    finite_number,
+    parse_uri,
+    refuse_damaged_gltf,
+    to_index,
+)
+from neuprim.tasks.static.mesh.model import (
+    MAX_FACES,
+    MAX_PARTS,
+    MAX_VERTICES,
+    Faces,
+    Material,
+    Model,
+    ModelFolder,
+    check_limits,
+    check_vertices,
+)
 
-__all__ = ["GLOW_UV", "read_gltf"]
+__all__ = ["read_gltf"]
 
-_GLB, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _WRAPS = {33071: "clamp", 33648: "mirror"}
-_READ = {
-    "EXT_mesh_gpu_instancing",
-    "EXT_texture_webp",
-    "KHR_materials_emissive_strength",
-    "KHR_materials_pbrSpecularGlossiness",
-    "KHR_materials_unlit",
-    "KHR_mesh_quantization",
-    "KHR_texture_transform",
-}
-_HARMLESS = {
-    "EXT_instance_features",
-    "EXT_lights_ies",
-    "EXT_lights_image_based",
-    "EXT_mesh_features",
-    "EXT_structural_metadata",
-    "KHR_animation_pointer",
-    "KHR_audio_emitter",
-    "KHR_lights_punctual",
-    "KHR_materials_variants",  # the default is drawn
-    "KHR_xmp_json_ld",
-    "MSFT_lod",  # the finest is drawn
-}
-_COMPRESSION = {
-    "EXT_meshopt_compression",
-    "EXT_texture_avif",
-    "KHR_draco_mesh_compression",
-    "KHR_meshopt_compression",
-    "KHR_texture_basisu",
-    "MSFT_texture_dds",
-}
-GLOW_UV = "_GLOW_UV"
-"""The attribute with coordinates in the texture of emitted light."""
-
-_POINTS_AND_LINES, _TRIANGLES, _FAN = (0, 1, 2, 3), (4, 5, 6), 6
+_POINTS_AND_LINES, _TRIANGLES, _STRIP, _FAN = (0, 1, 2, 3), 4, 5, 6
 _MAX_DEPTH = 200
-_MOST_JOINTS = 32
-"""That a vertex hangs on."""
+_MAX_JOINTS = 32
+"""Joints per vertex."""
 _ROWS = 50_000
-"""Vertices that are posed at once."""
-
-_WHITE = (1.0, 1.0, 1.0)
+"""Vertices that are skinned at once, which bounds the memory."""
 
 
-def read_gltf(folder: Folder) -> Model:
-    """The model of a .gltf or .glb file.
+class _Primitive(NamedTuple):
+    """Indexed triangles in the space of their mesh: faces (F, 3), and values per vertex."""
+
+    material: str
+    faces: NDArray[np.int64]
+    positions: NDArray[np.float64]
+    normals: NDArray[np.float64] | None
+    colour: NDArray[np.float32] | None
+    uv: NDArray[np.float32] | None
+    glow_uv: NDArray[np.float32] | None
+
+
+def read_gltf(folder: ModelFolder) -> Model:
+    """Read a .gltf or .glb file.
 
     Raises:
         DataError: damaged, of another version, compressed, or with references that lead nowhere.
     """
-    path, data = folder.file, folder.own()
-    try:
-        text, binary = _chunks(data) if path.suffix.lower() == ".glb" else (data, None)
-        document = load_json(text.decode("utf-8-sig"), infinite=True)  # said of the value that has it, below
-        if not isinstance(document, dict):
-            raise ValueError(f"top level is a {type(document).__name__}, no object")
-        return _Document(folder, document, binary).model()
-    except (
-        AttributeError,
-        IndexError,
-        KeyError,
-        OverflowError,
-        RecursionError,
-        TypeError,
-        ValueError,
-        struct.error,
-    ) as error:
-        said = f"nothing called {error}" if isinstance(error, KeyError) else str(error)
-        raise DataError(f"{path}: damaged glTF ({' '.join(said.split())[:160]}); expected glTF 2") from None
 
-
-def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
-    """The JSON and the binary chunk of a .glb file."""
-    magic, version, length, size, kind = struct.unpack_from("<5I", data)
-    if magic != _GLB:
-        raise ValueError(f"starts with {data[:4]!r}, not with b'glTF'")
-    if version != 2:
-        raise ValueError(f"version {version}")
-    if length > len(data) or kind != _JSON or 20 + size > len(data):
-        raise ValueError(
-            f"{len(data)} bytes are there, {max(length, 20 + size)} announced" if kind == _JSON else "no JSON chunk"
-        )
-    text, place = data[20 : 20 + size], 20 + size
-    while place + 8 <= length:
-        size, kind = struct.unpack_from("<2I", data, place)
-        if place + 8 + size > len(data):
-            raise ValueError(f"a chunk of {size} bytes is cut off")
-        if kind == _BIN:
-            return text, data[place + 8 : place + 8 + size]
-        place += 8 + size
-    return text, None
-
-
-class _Document:
-    """One document while it is written anew."""
-
-    def __init__(self, folder: Folder, document: dict[str, Any], binary: bytes | None) -> None:
-        self.folder, self.document, self.path = folder, document, folder.file
-        version = str(document["asset"]["version"])
-        if version.split(".")[0] != "2":
-            raise ValueError(f"version {version[:20]}")
-        required, used = set(document.get("extensionsRequired", [])), set(document.get("extensionsUsed", []))
-        unread = sorted(required - _READ - _HARMLESS)
-        if unread:
-            raise DataError(
-                f"{self.path}: needs the glTF extension {unread[0][:60]}, which is not read; {PLAIN}, not compressed"
-            )
-        ignored = sorted(
-            used.union(*(m.get("extensions", {}) for m in document.get("materials", [])))
-            - _READ
-            - _HARMLESS
-            - _COMPRESSION
-        )
-        if ignored:
-            shown = ", ".join(ignored[:6]) + ", ..." * (len(ignored) > 6)
-            warn_once(f"{self.path}: uses the glTF extension{'s' * (len(ignored) > 1)} {shown[:300]}; drawn without")
-        self.data = Accessors(folder, document, binary)
-        self.images: dict[str, bytes] = {}
-        self.arrays: list[bytes] = []
-        self.accessors: list[dict[str, Any]] = []
-        self.vertices = self.corners = self.primitives = self.skipped = 0
-        self.meshes: list[list[dict[str, Any]]] = []
-
-    def model(self) -> Model:
-        materials = {str(i): self._material(m) for i, m in enumerate(self.document.get("materials", []))}
+    def read() -> Model:
+        reader = _Reader(GltfDocument(folder))
+        materials = {str(i): reader.read_material(m) for i, m in enumerate(reader.document.entries("materials"))}
         materials["none"] = Material()
-        order = {name: i for i, name in enumerate(materials)}
-        self.materials, self.order = materials, order
-        self.meshes = [self._mesh(m, m.get("weights", [])) for m in self.document.get("meshes", [])]
-        nodes, roots = self._nodes()
-        if self.skipped:
-            warn_once(f"{self.path}: {self.skipped} parts are points or lines; only triangles are drawn")
-        views, offset = [], 0
-        for part in self.arrays:
-            views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(part)})
-            offset += len(part)
-        plain = {
-            "asset": {"version": "2.0"},
-            "scene": 0,
-            "scenes": [{"nodes": roots}],
-            "nodes": nodes,
-            "meshes": [{"name": f"mesh {i}", "primitives": p} for i, p in enumerate(self.meshes)],
-            "accessors": self.accessors,
-            "bufferViews": views,
-            "buffers": [{"uri": "arrays", "byteLength": offset}],
-            "materials": [{"name": name} for name in materials],
-        }
-        parts = {"arrays": b"".join(self.arrays)}
-        text = json.dumps(plain, allow_nan=False).encode()
-        return Model(self.path, "gltf", text, parts, materials, self.images, "y", True, self.folder.digest)
+        faces = partial(refuse_damaged_gltf, folder.file, partial(reader.read_faces, materials))
+        return Model(folder.file, faces, folder.digest, materials, reader.images, "y", True)
 
-    def _kept(self, values: NDArray, kind: str) -> int:
-        """The index of an accessor with these values in the new document."""
-        dtype = "<f4" if kind != "SCALAR" else "<u4"
-        view = len(self.arrays)
-        self.arrays.append(np.ascontiguousarray(values, dtype=dtype).tobytes())
-        component = 5126 if kind != "SCALAR" else 5125
-        self.accessors.append({"bufferView": view, "componentType": component, "count": len(values), "type": kind})
-        return view
+    return refuse_damaged_gltf(folder.file, read)
+
+
+class _Reader:
+    """Reads materials and surfaces of one document."""
+
+    def __init__(self, document: GltfDocument) -> None:
+        self.document, self.path = document, document.path
+        self.images: dict[str, bytes] = {}
+        self.vertices = self.triangles = self.parts = self.skipped = 0
 
     # ------------------------------------------------------------ surfaces
 
-    def _mesh(
-        self, mesh: Mapping[str, Any], weights: Sequence[float], pose: NDArray | None = None
-    ) -> list[dict[str, Any]]:
-        """The primitives of a mesh.
+    def read_faces(self, materials: Mapping[str, Material]) -> tuple[list[Faces], int]:
+        """Read all triangles of the scene that is shown, in place, and count their vertices."""
+        nodes = self.document.entries("nodes")
+        check_limits(self.path, {"nodes": (len(nodes), MAX_PARTS)})
+        matrices = self._world_matrices(nodes)
+        found: list[Faces] = []
+        plain: dict[int, list[_Primitive]] = {}
+        for i, matrix in matrices.items():
+            node = nodes[i]
+            if "mesh" not in node:
+                continue
+            number = to_index(node["mesh"])
+            mesh = self.document.content["meshes"][number]
+            weights = node.get("weights", mesh.get("weights", []))
+            if "skin" in node:  # the surface is where its joints are, wherever its node is
+                pose = self._joint_matrices(self.document.content["skins"][to_index(node["skin"])], matrices)
+                primitives, places = self._read_mesh(mesh, materials, weights, pose), [np.eye(4)]
+            elif "weights" in node:
+                primitives, places = self._read_mesh(mesh, materials, weights), self._places(node, matrix)
+            else:
+                if number not in plain:
+                    plain[number] = self._read_mesh(mesh, materials, weights)
+                primitives, places = plain[number], self._places(node, matrix)
+            for place in places:
+                for primitive in primitives:
+                    self._count(primitive)
+                    if len(primitive.faces):
+                        found.append(self._place(primitive, place))
+        if self.skipped:
+            warn_once(f"{self.path}: {self.skipped} parts are points or lines; only triangles are drawn")
+        return found, self.vertices
+
+    def _count(self, primitive: _Primitive) -> None:
+        """Count one use of a primitive against the limits."""
+        self.vertices += len(primitive.positions)
+        self.triangles += len(primitive.faces)
+        self.parts += 1
+        vertices, faces, parts = (self.vertices, MAX_VERTICES), (self.triangles, MAX_FACES), (self.parts, MAX_PARTS)
+        check_limits(self.path, {"vertices": vertices, "faces": faces, "parts": parts})
+
+    def _read_mesh(
+        self,
+        mesh: Mapping[str, Any],
+        materials: Mapping[str, Material],
+        weights: Sequence[float],
+        pose: NDArray | None = None,
+    ) -> list[_Primitive]:
+        """Read the triangles of a mesh.
 
         Args:
             weights: of its morph targets.
-            pose: (J, 4, 4) of the joints that its vertices hang on; None: of none.
+            pose: (J, 4, 4) transforms of the joints of a skin.
         """
         found = []
         for primitive in mesh["primitives"]:
-            mode = primitive.get("mode", 4)
+            mode = primitive.get("mode", _TRIANGLES)
             if mode in _POINTS_AND_LINES:
                 self.skipped += 1
                 continue
-            if mode not in _TRIANGLES:
+            if mode not in (_TRIANGLES, _STRIP, _FAN):
                 raise ValueError(f"a primitive of mode {mode}")
-            position = self.document["accessors"][index_of(primitive["attributes"]["POSITION"])]
-            draco = "KHR_draco_mesh_compression"
-            if draco in primitive.get("extensions", {}) and "bufferView" not in position:
-                raise DataError(f"{self.path}: needs the glTF extension {draco}, which is not read; {PLAIN}")
-            found.append(self._primitive(primitive, mode, [finite(w) for w in weights], pose))
-            self.primitives += 1
-            check_counts(self.folder, {"parts": (self.primitives, MAX_PARTS)})
+            position = self.document.content["accessors"][to_index(primitive["attributes"]["POSITION"])]
+            if DRACO in primitive.get("extensions", {}) and "bufferView" not in position:
+                raise self.document.unsupported(DRACO)
+            found.append(self._read_primitive(primitive, mode, materials, [finite_number(w) for w in weights], pose))
         return found
 
-    def _primitive(
-        self, primitive: Mapping[str, Any], mode: int, weights: Sequence[float], pose: NDArray | None
-    ) -> dict[str, Any]:
+    def _read_primitive(
+        self,
+        primitive: Mapping[str, Any],
+        mode: int,
+        materials: Mapping[str, Material],
+        weights: Sequence[float],
+        pose: NDArray | None,
+    ) -> _Primitive:
         attributes: Mapping[str, int] = primitive["attributes"]
-        positions = self.data.array(attributes["POSITION"], ["VEC3"])
-        flat = (
-            self.data.array(primitive["indices"], ["SCALAR"])[:, 0]
-            if "indices" in primitive
-            else np.arange(len(positions))
-        )
-        self.vertices, self.corners = self.vertices + len(positions), self.corners + len(flat)
-        check_counts(self.folder, {"vertices": (self.vertices, MAX_VERTICES), "faces": (self.corners // 3, MAX_FACES)})
-        if flat.dtype.kind == "f" or (len(flat) and flat.max() >= len(positions)):
-            raise ValueError(f"an index of {flat.max()}, with {len(positions)} vertices")
-        if mode == _FAN:
-            flat = np.stack([np.repeat(flat[:1], max(len(flat) - 2, 0)), flat[1:-1], flat[2:]], axis=1).ravel()
-            mode = 4
-        flat = flat if mode != 4 else flat[: len(flat) // 3 * 3]
-        name = str(index_of(primitive["material"])) if "material" in primitive else "none"
-        kept = {"POSITION": self._kept(self._posed(primitive, "POSITION", positions, weights, pose), "VEC3")}
-        for attribute, source, kinds in (
-            ("NORMAL", "NORMAL", ["VEC3"]),
-            ("TEXCOORD_0", f"TEXCOORD_{self._texcoord(name, 'baseColorTexture')}", ["VEC2"]),
-            (GLOW_UV, f"TEXCOORD_{self._texcoord(name, 'emissiveTexture')}", ["VEC2"]),
-            ("COLOR_0", "COLOR_0", ["VEC3", "VEC4"]),
-        ):
-            glow = self.materials[name].glow
-            if source not in attributes or (attribute == GLOW_UV and (glow is None or glow.texture is None)):
-                continue
-            values = self.data.array(attributes[source], kinds)
-            if len(values) != len(positions):
-                raise ValueError(f"{len(values)} values of {source}, {len(positions)} vertices")
-            if attribute == "COLOR_0" and values.dtype.kind != "f":
-                values = values / np.float32(np.iinfo(values.dtype).max)
-            if attribute == "NORMAL":
-                values = self._posed(primitive, "NORMAL", values, weights, pose)
-            kept[attribute] = self._kept(values, kinds[values.shape[1] == 4])
-        return {
-            "attributes": kept,
-            "indices": self._kept(flat[:, None], "SCALAR"),
-            "mode": mode,
-            "material": self.order[name],
-        }
+        positions = self.document.array(attributes["POSITION"], ["VEC3"])
+        count = len(positions)
+        index = np.arange(count)
+        if "indices" in primitive:
+            index = self.document.array(primitive["indices"], ["SCALAR"])[:, 0]
+        check_limits(self.path, {"vertices": (count, MAX_VERTICES), "faces": (len(index) // 3, MAX_FACES)})
+        if index.dtype.kind == "f" or (len(index) and index.max() >= count):
+            raise ValueError(f"an index of {index.max()}, with {count} vertices")
+        name = str(to_index(primitive["material"])) if "material" in primitive else "none"
+        material = materials[name]
+        normals, colour = None, None
+        if "NORMAL" in attributes:
+            normals = self._posed(
+                primitive, "NORMAL", self.document.array(attributes["NORMAL"], ["VEC3"], count), weights, pose
+            )
+        if "COLOR_0" in attributes:
+            colour = self.document.array(attributes["COLOR_0"], ["VEC3", "VEC4"], count)
+            colour = (colour / np.float32(1 if colour.dtype.kind == "f" else np.iinfo(colour.dtype).max)).astype("f4")
+        uv, glow_uv = None, None
+        if material.texture is not None:
+            uv = self._texture_coordinates(primitive, name, "baseColorTexture")
+        if material.glow is not None and material.glow.texture is not None:
+            glow_uv = self._texture_coordinates(primitive, name, "emissiveTexture")
+        positions = self._posed(primitive, "POSITION", positions, weights, pose)
+        faces = _triangles(index.astype(np.int64), mode)
+        return _Primitive(name, faces, positions, normals, colour, uv, glow_uv)
+
+    def _texture_coordinates(self, primitive: Mapping[str, Any], name: str, key: str) -> NDArray[np.float32] | None:
+        """(V, 2) coordinates, v upward, of the set that a texture of a material reads."""
+        material = self.document.content["materials"][int(name)]
+        texture = {**_base_colour(material), "emissiveTexture": material.get("emissiveTexture", {})}.get(key, {})
+        moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
+        attribute = f"TEXCOORD_{to_index(moved.get('texCoord', texture.get('texCoord', 0)))}"
+        attributes = primitive["attributes"]
+        if attribute not in attributes:
+            return None
+        count = to_index(self.document.content["accessors"][attributes["POSITION"]]["count"])
+        uv = self.document.array(attributes[attribute], ["VEC2"], count).astype(np.float32)
+        uv[:, 1] = 1 - uv[:, 1]
+        return uv
 
     def _posed(
         self, primitive: Mapping[str, Any], name: str, values: NDArray, weights: Sequence[float], pose: NDArray | None
-    ) -> NDArray:
-        """(N, 3) positions or normals with morph targets added, and where the joints of the vertices are."""
+    ) -> NDArray[np.float64]:
+        """(V, 3) positions or normals with morph targets added and joints applied."""
+        count = len(values)
         for weight, target in zip(weights, primitive.get("targets", []), strict=False):
             if weight and name in target:
-                values = values + weight * self._per_vertex(target[name], ["VEC3"], len(values))
+                values = values + weight * self.document.array(target[name], ["VEC3"], count)
         if pose is None:
-            return values
-        attributes, count = primitive["attributes"], len(values)
-        pairs = [i for i in range(_MOST_JOINTS // 4) if f"JOINTS_{i}" in attributes]
-        joints = np.concatenate(
-            [self._per_vertex(attributes[f"JOINTS_{i}"], ["VEC4"], count) for i in pairs], axis=1
-        ).astype(np.int64)
-        shares = np.concatenate([self._per_vertex(attributes[f"WEIGHTS_{i}"], ["VEC4"], count) for i in pairs], axis=1)
-        moved, total = np.zeros((count, 3)), np.maximum(shares.sum(axis=1, keepdims=True), 1e-9)
-        whole = np.concatenate([values, np.full((count, 1), name == "POSITION")], axis=1)  # normals do not move
+            return values.astype(np.float64)
+        attributes = primitive["attributes"]
+        sets = [i for i in range(_MAX_JOINTS // 4) if f"JOINTS_{i}" in attributes]
+        joints, shares = (
+            np.concatenate([self.document.array(attributes[f"{key}_{i}"], ["VEC4"], count) for i in sets], axis=1)
+            for key in ("JOINTS", "WEIGHTS")
+        )
+        joints = joints.astype(np.int64)
+        shares = shares / np.maximum(shares.sum(axis=1, keepdims=True), 1e-9)
+        # the last coordinate is 0 for normals, which do not move
+        homogeneous = np.concatenate([values, np.full((count, 1), name == "POSITION")], axis=1)
+        moved = np.zeros((count, 3))
         for first in range(0, count, _ROWS):
             rows = slice(first, first + _ROWS)
             for k in range(joints.shape[1]):
-                at = np.einsum("nij,nj->ni", pose[joints[rows, k], :3], whole[rows])
-                moved[rows] += shares[rows, k, None] / total[rows] * at
+                at = np.einsum("nij,nj->ni", pose[joints[rows, k], :3], homogeneous[rows])
+                moved[rows] += shares[rows, k, None] * at
         return moved
 
-    def _per_vertex(self, index: int, kinds: Sequence[str], count: int) -> NDArray:
-        values = self.data.array(index, kinds)
-        if len(values) != count:
-            raise ValueError(f"accessors[{index}] has {len(values)} values, {count} vertices")
-        return values
-
-    def _texcoord(self, name: str, key: str) -> int:
-        """Which set of texture coordinates a material reads for its ``baseColorTexture`` or ``emissiveTexture``."""
-        if name == "none":
-            return 0
-        material = self.document["materials"][int(name)]
-        texture = {**_base(material), "emissiveTexture": material.get("emissiveTexture", {})}.get(key, {})
-        return count_of(
-            texture.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", texture.get("texCoord", 0))
+    def _place(self, primitive: _Primitive, matrix: NDArray[np.float64]) -> Faces:
+        """Move a primitive to its place in the scene."""
+        faces = primitive.faces
+        with np.errstate(all="ignore"):
+            positions = primitive.positions @ matrix[:3, :3].T + matrix[:3, 3]
+            normals = None if primitive.normals is None else primitive.normals @ np.linalg.pinv(matrix[:3, :3])
+        check_vertices(self.path, positions, faces)
+        normals, colour, uv, glow_uv = (
+            None if values is None else values[faces]
+            for values in (normals, primitive.colour, primitive.uv, primitive.glow_uv)
         )
+        return Faces(positions[faces], primitive.material, normals, colour, uv, glow_uv)
 
-    def _nodes(self) -> tuple[list[dict[str, Any]], list[int]]:
-        """Nodes with nothing but places and meshes, and the roots of the scene that is shown."""
-        given = self.document.get("nodes", [])
-        check_counts(self.folder, {"nodes": (len(given), MAX_PARTS)})
-        below = [[index_of(child) for child in node.get("children", [])] for node in given]
-        scenes = self.document.get("scenes", [])
+    # ------------------------------------------------------------ places
+
+    def _world_matrices(self, nodes: Sequence[Mapping[str, Any]]) -> dict[int, NDArray[np.float64]]:
+        """(4, 4) scene from node, of the nodes of the scene that is shown."""
+        children = [[to_index(child) for child in node.get("children", [])] for node in nodes]
+        scenes = self.document.entries("scenes")
         if scenes:
-            roots = [index_of(node) for node in scenes[index_of(self.document.get("scene", 0))].get("nodes", [])]
+            roots = [
+                to_index(node) for node in scenes[to_index(self.document.content.get("scene", 0))].get("nodes", [])
+            ]
         else:
-            roots = sorted(set(range(len(given))) - {child for children in below for child in children})
-        seen, level, depth = set[int](), roots, 0
-        while level:
-            if seen & set(level) or len(set(level)) < len(level):
+            roots = sorted(set(range(len(nodes))) - {child for below in children for child in below})
+        found: dict[int, NDArray[np.float64]] = {}
+        stack = [(root, np.eye(4), 1) for root in roots]
+        while stack:
+            node, parent, depth = stack.pop()
+            if node in found:
                 raise ValueError("a node is its own ancestor or has two parents")
-            if depth >= _MAX_DEPTH:
+            if depth > _MAX_DEPTH:
                 raise DataError(f"{self.path}: nodes are nested deeper than {_MAX_DEPTH}; expected fewer levels")
-            seen |= set(level)
-            level, depth = [child for node in level for child in below[node]], depth + 1
-        nodes = []
-        for i, node in enumerate(given):
-            plain: dict[str, Any] = {
-                k: [finite(x) for x in node[k]] for k in ("matrix", "translation", "rotation", "scale") if k in node
-            }
-            if [len(plain[k]) for k in plain] != [{"matrix": 16, "rotation": 4}.get(k, 3) for k in plain]:
-                raise ValueError(f"nodes[{i}] has a transform of another length")
-            plain |= {"name": f"node {i}", "children": below[i]}
-            nodes.append(plain)
-        parents = {child: node for node, children in enumerate(below) for child in children}
-        for i, node in enumerate(given):
-            if "mesh" not in node or i not in seen:
-                continue
-            mesh, pose = index_of(node["mesh"]), None
-            if "skin" in node:
-                pose = self._pose(self.document["skins"][index_of(node["skin"])], nodes, parents)
-            if pose is not None or "weights" in node:
-                one = self.document["meshes"][mesh]
-                self.meshes.append(self._mesh(one, node.get("weights", one.get("weights", [])), pose))
-                mesh = len(self.meshes) - 1
-            if not self.meshes[mesh]:
-                continue
-            copies = self._instances(node.get("extensions", {}).get("EXT_mesh_gpu_instancing"))
-            if pose is not None:  # a skin is where its joints are
-                roots, copies = [*roots, len(nodes)], []
-                nodes.append({"name": f"skin {i}", "mesh": mesh})
-            elif copies is None:
-                nodes[i]["mesh"] = mesh
-            else:
-                check_counts(self.folder, {"nodes": (len(nodes) + len(copies), MAX_PARTS)})
-                nodes[i]["children"] = [*below[i], *range(len(nodes), len(nodes) + len(copies))]
-                nodes += [{**copy, "name": f"node {i} instance {k}", "mesh": mesh} for k, copy in enumerate(copies)]
-        return nodes, roots
+            found[node] = parent @ _local_matrix(nodes[node], f"nodes[{node}]")
+            stack += [(child, found[node], depth + 1) for child in children[node]]
+        return found
 
-    def _instances(self, instancing: Mapping[str, Any] | None) -> list[dict[str, list[float]]] | None:
-        """The places of the copies of a mesh below its node; None for the mesh itself."""
+    def _places(self, node: Mapping[str, Any], matrix: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """The transforms of a node's mesh: one, or one for each instance."""
+        instancing = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
         if instancing is None:
-            return None
-        found: dict[str, NDArray] = {}
-        for name, kind in (("TRANSLATION", "VEC3"), ("ROTATION", "VEC4"), ("SCALE", "VEC3")):
-            if name in instancing["attributes"]:
-                values = self.data.array(instancing["attributes"][name], [kind]).astype(np.float64)
-                if not np.isfinite(values).all():
-                    raise ValueError(f"{name} of an instance is no number")
-                found[name.lower()] = values
-        lengths = {len(values) for values in found.values()}
+            return [matrix]
+        columns = {
+            name.lower(): self.document.array(instancing["attributes"][name], [kind]).astype(np.float64).tolist()
+            for name, kind in (("TRANSLATION", "VEC3"), ("ROTATION", "VEC4"), ("SCALE", "VEC3"))
+            if name in instancing["attributes"]
+        }
+        lengths = {len(values) for values in columns.values()}
         if len(lengths) != 1:
             raise ValueError(f"instances have {sorted(lengths) or 'no'} places")
-        return [{name: values[k].tolist() for name, values in found.items()} for k in range(lengths.pop())]
+        count = lengths.pop()
+        check_limits(self.path, {"instances": (count, MAX_PARTS)})
+        places = [{name: values[k] for name, values in columns.items()} for k in range(count)]
+        return [matrix @ _local_matrix(place, "an instance") for place in places]
 
-    def _pose(
-        self, skin: Mapping[str, Any], nodes: Sequence[Mapping[str, Any]], parents: Mapping[int, int]
-    ) -> NDArray[np.float64]:
+    def _joint_matrices(self, skin: Mapping[str, Any], matrices: Mapping[int, NDArray]) -> NDArray[np.float64]:
         """(J, 4, 4) from the place where a vertex was bound to each joint to where the joint is."""
-        joints = [index_of(joint) for joint in skin["joints"]]
+        joints = [to_index(joint) for joint in skin["joints"]]
+        outside = [joint for joint in joints if joint not in matrices]
+        if outside:
+            raise ValueError(f"joint {outside[0]} is outside of the scene")
         inverse = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
         if "inverseBindMatrices" in skin:
-            inverse = (
-                self.data.array(skin["inverseBindMatrices"], ["MAT4"])
-                .reshape(-1, 4, 4)
-                .transpose(0, 2, 1)[: len(joints)]
-            )
-        return np.stack([_world(joint, nodes, parents) for joint in joints]) @ inverse
+            columns = self.document.array(skin["inverseBindMatrices"], ["MAT4"]).reshape(-1, 4, 4)
+            inverse = columns.transpose(0, 2, 1)[: len(joints)]
+        return np.stack([matrices[joint] for joint in joints]) @ inverse
 
     # ------------------------------------------------------------ colours
 
-    def _material(self, material: Mapping[str, Any]) -> Material:
-        base, extensions = _base(material), material.get("extensions", {})
-        factor = [finite(x) for x in base.get("baseColorFactor", _WHITE)]
+    def read_material(self, material: Mapping[str, Any]) -> Material:
+        """Read a material and its textures."""
+        base, extensions = _base_colour(material), material.get("extensions", {})
+        factor = [finite_number(x) for x in base.get("baseColorFactor", (1.0, 1.0, 1.0))]
         mode = material.get("alphaMode", "OPAQUE")
-        cutoff = None if mode == "OPAQUE" else finite(material.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
+        cutoff = (
+            None if mode == "OPAQUE" else finite_number(material.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
+        )
         opacity = factor[3] if len(factor) > 3 and mode != "OPAQUE" else 1.0
-        strength = finite(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
-        light = [strength * finite(x) for x in material.get("emissiveFactor", (0.0, 0.0, 0.0))]
+        strength = finite_number(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
+        light = [strength * finite_number(x) for x in material.get("emissiveFactor", (0.0, 0.0, 0.0))]
         glow = self._textured(light, material.get("emissiveTexture")) if any(light) else None
-        look = self._textured(factor, base.get("baseColorTexture"))
+        found = self._textured(factor, base.get("baseColorTexture"))
         unlit = "KHR_materials_unlit" in extensions
-        return replace(look, opacity=opacity, cutoff=cutoff, blend=mode == "BLEND", glow=glow, unlit=unlit)
+        return replace(found, opacity=opacity, cutoff=cutoff, blend=mode == "BLEND", glow=glow, unlit=unlit)
 
-    def _textured(self, factor: Sequence[float], place: Mapping[str, Any] | None) -> Material:
-        """A colour and the texture that it goes with."""
+    def _textured(self, factor: Sequence[float], texture_info: Mapping[str, Any] | None) -> Material:
+        """A colour factor with the texture that it multiplies."""
         colour = (factor[0], factor[1], factor[2])
-        if place is None:
+        if texture_info is None:
             return Material(colour)
-        texture = self.document["textures"][index_of(place["index"])]
+        texture = self.document.content["textures"][to_index(texture_info["index"])]
         source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
         if source is None:
             found = ", ".join(texture.get("extensions", {})) or "no image"
             raise DataError(f"{self.path}: a texture has {found[:60]}, which is not read; expected PNG, JPEG or WebP")
-        name = self._image(index_of(source))
-        sampler: Mapping[str, int] = (
-            self.document["samplers"][index_of(texture["sampler"])] if "sampler" in texture else {}
-        )
+        sampler: Mapping[str, int] = {}
+        if "sampler" in texture:
+            sampler = self.document.content["samplers"][to_index(texture["sampler"])]
         wrap = _WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat")
-        moved = place.get("extensions", {}).get("KHR_texture_transform")
-        return Material(colour, name, wrap, None if moved is None else _moved(moved))
+        moved = texture_info.get("extensions", {}).get("KHR_texture_transform")
+        transform = None if moved is None else _texture_transform(moved)
+        return Material(colour, self._read_image(to_index(source)), wrap, transform)
 
-    def _image(self, index: int) -> str | None:
-        """The image's name among the model's; None where it is missing and that is allowed."""
+    def _read_image(self, index: int) -> str | None:
+        """Read an image and return its key in :attr:`images`; None where it is missing and that is allowed."""
         name = f"image {index}"
         if name not in self.images:
-            image = self.document["images"][index]
-            data = (
-                self.folder.optional([file_name(image["uri"])], "texture")
-                if "uri" in image
-                else self.data.view(image["bufferView"])[0]
-            )
+            image = self.document.content["images"][index]
+            if "uri" in image:
+                data = self.document.folder.read_optional([parse_uri(image["uri"])], "texture")
+            else:
+                data = self.document.view(image["bufferView"])[0]
             if data is None:
                 return None
             self.images[name] = data
         return name
 
 
-def _base(material: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Base colour and its texture, of either of the two ways to say it; where a material has both, the extension
-    wins."""
+def _base_colour(material: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Base colour and its texture in either notation; where a material has both, specular-glossiness wins."""
     glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
     if glossy is None:
         return material.get("pbrMetallicRoughness", {})
@@ -445,26 +359,40 @@ def _base(material: Mapping[str, Any]) -> Mapping[str, Any]:
     return {renamed[k]: v for k, v in glossy.items() if k in renamed}
 
 
-def _world(node: int, nodes: Sequence[Mapping[str, Any]], parents: Mapping[int, int]) -> NDArray[np.float64]:
-    """(4, 4) of a node in the scene."""
-    found = np.eye(4)
-    for _ in range(_MAX_DEPTH):
-        place, own = nodes[node], np.eye(4)
-        x, y, z, w = place.get("rotation", (0.0, 0.0, 0.0, 1.0))
-        own[:3, :3] = trimesh.transformations.quaternion_matrix([w, x, y, z])[:3, :3] * place.get(
-            "scale", (1.0, 1.0, 1.0)
-        )
-        own[:3, 3] = place.get("translation", (0.0, 0.0, 0.0))
-        found = np.reshape(place.get("matrix", np.eye(4)), (4, 4)).T @ own @ found
-        if node not in parents:
-            return found
-        node = parents[node]
-    raise ValueError("a joint is its own ancestor")
+def _local_matrix(place: Mapping[str, Any], where: str) -> NDArray[np.float64]:
+    """(4, 4) parent from node, of a matrix or of translation, rotation and scale."""
+    matrix = np.eye(4)
+    lengths = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
+    numbers = {key: [finite_number(x) for x in place[key]] for key in lengths if key in place}
+    if any(len(values) != lengths[key] for key, values in numbers.items()):
+        raise ValueError(f"{where} has a transform of another length")
+    if "matrix" in numbers:
+        matrix = np.reshape(numbers["matrix"], (4, 4)).T
+    if "translation" in numbers:
+        matrix = matrix @ trimesh.transformations.translation_matrix(numbers["translation"])
+    if "rotation" in numbers:
+        x, y, z, w = numbers["rotation"]
+        matrix = matrix @ trimesh.transformations.quaternion_matrix([w, x, y, z])
+    if "scale" in numbers:
+        matrix = matrix @ np.diag([*numbers["scale"], 1.0])
+    return matrix
 
 
-def _moved(transform: Mapping[str, Any]) -> tuple[tuple[float, ...], ...]:
+def _triangles(index: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
+    """(F, 3) triangles of a list, strip or fan of vertices."""
+    if mode == _TRIANGLES:
+        return index[: len(index) // 3 * 3].reshape(-1, 3)
+    count = max(len(index) - 2, 0)
+    if mode == _FAN:
+        return np.stack([np.repeat(index[:1], count), index[1:-1][:count], index[2:]], axis=1)
+    strip = np.stack([index[:count], index[1 : count + 1], index[2:]], axis=1)
+    strip[1::2] = strip[1::2, ::-1]  # every other triangle of a strip turns the other way
+    return strip
+
+
+def _texture_transform(transform: Mapping[str, Any]) -> tuple[tuple[float, ...], ...]:
     """(2, 3) of KHR_texture_transform: scale, then rotation, then offset."""
     (x, y), (u, v) = transform.get("offset", (0.0, 0.0)), transform.get("scale", (1.0, 1.0))
     c, s = math.cos(transform.get("rotation", 0.0)), math.sin(transform.get("rotation", 0.0))
     rows = ((c * u, s * v, x), (-s * u, c * v, y))
-    return tuple(tuple(finite(value) for value in row) for row in rows)
+    return tuple(tuple(finite_number(value) for value in row) for row in rows)

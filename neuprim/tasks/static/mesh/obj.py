@@ -10,7 +10,8 @@ from __future__ import annotations
 import re
 from array import array
 from dataclasses import replace
-from pathlib import PurePosixPath
+from functools import partial
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
@@ -19,20 +20,20 @@ from numpy.typing import NDArray
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import srgb_to_linear
 from neuprim.core.notices import warn_once
-from neuprim.tasks.static.mesh.files import (
+from neuprim.tasks.static.mesh.model import (
     MAX_FACES,
     MAX_PARTS,
     MAX_VERTICES,
     Faces,
-    Folder,
     Material,
     Model,
-    check_counts,
+    ModelFolder,
+    check_limits,
     check_vertices,
 )
-from neuprim.tasks.static.mesh.polygons import divided
+from neuprim.tasks.static.mesh.polygons import triangulate_polygons
 
-__all__ = ["obj_faces", "read_obj"]
+__all__ = ["read_obj"]
 
 _NUMBERS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}
 """Options of a texture that are followed by this many numbers, at most."""
@@ -48,17 +49,16 @@ _NONE = -1
 """The index of texture coordinates or a normal that a corner does without."""
 
 
-def read_obj(folder: Folder) -> Model:
-    """The model of an .obj file.
+def read_obj(folder: ModelFolder) -> Model:
+    """Read an .obj file and its material libraries.
 
     Raises:
         DataError: too large, or with references that lead nowhere.
     """
-    data = (
-        folder.own().decode("utf-8", "replace").encode()
-    )  # names of materials are compared with the library's, decoded alike
+    # names of materials are compared with those of the library, so both are decoded alike
+    data = folder.read_model().decode("utf-8", "replace").encode()
     found = {"vertices": (data.count(b"\nv "), MAX_VERTICES), "faces": (data.count(b"\nf "), MAX_FACES)}
-    check_counts(folder, {**found, "changes of material": (data.count(b"usemtl "), MAX_PARTS)})
+    check_limits(folder.file, {**found, "changes of material": (data.count(b"usemtl "), MAX_PARTS)})
     materials: dict[str, Material] = {}
     images: dict[str, bytes] = {}
     wanted = [line.decode("utf-8", "replace") for line in re.findall(rb"(?m)^\s*mtllib[ \t]+(.+?)\s*$", data)]
@@ -66,19 +66,20 @@ def read_obj(folder: Folder) -> Model:
         name.strip() for line in wanted for name in re.findall(r"(?i).+?\.mtl(?=\s|$)", line) or [line]
     ]  # names may hold blanks
     for library in dict.fromkeys(libraries):
-        text = folder.optional([library, PurePosixPath(library.replace("\\", "/")).name], "material file")
+        text = folder.read_optional([library, PurePosixPath(library.replace("\\", "/")).name], "material file")
         if text is not None:
             materials |= _library(text.decode("utf-8", "replace"), folder, images)
-    return Model(folder.file, "obj", data, {}, materials, images, "y", False, folder.digest)
+    faces = partial(_read_faces, folder.file, data)
+    return Model(folder.file, faces, folder.digest, materials, images, "y")
 
 
-def obj_faces(model: Model) -> tuple[list[Faces], int]:
-    """All triangles, by material, and the number of vertices.
+def _read_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
+    """Read all triangles, by material, and count the vertices.
 
     Raises:
         DataError: a line that is damaged, a face with a vertex that is not there, or polygons that cross themselves.
     """
-    text = re.sub(r"\\\r?\n", " ", model.data.decode("utf-8", "replace"))
+    text = re.sub(r"\\\r?\n", " ", data.decode("utf-8", "replace"))
     numbers, lengths = {key: array("d") for key in _WIDTHS}, {key: array("q") for key in _WIDTHS}
     indices, sizes, owners = array("q"), array("q"), array("q")
     names = {"": 0}
@@ -110,20 +111,22 @@ def obj_faces(model: Model) -> tuple[list[Faces], int]:
         except (ValueError, OverflowError) as error:
             said = f"{' '.join(line.split())[:60]!r} ({' '.join(str(error).split())[:80]})"
             raise DataError(
-                f"{model.path}: line {number} is {said}; expected numbers, or f v/vt/vn ... with vertices that are there"
+                f"{path}: line {number} is {said}; expected numbers, or f v/vt/vn ... with vertices that are there"
             ) from None
     v, vt, vn = (_table(key, np.array(numbers.pop(key)), np.array(lengths.pop(key))) for key in _WIDTHS)
     used = np.frombuffer(indices, np.int64).reshape(-1, 3) if indices else np.zeros((0, 3), np.int64)
-    check_vertices(model.path, v[:, :3], used[:, 0])
+    check_vertices(path, v[:, :3], used[:, 0])
     for column, table, what in ((1, vt, "texture coordinates"), (2, vn, "normal")):
         if len(used) and used[:, column].max() >= len(table):
             raise DataError(
-                f"{model.path}: a face has the {what} {used[:, column].max() + 1} of {len(table)}; expected one that is there"
+                f"{path}: a face has the {what} {used[:, column].max() + 1} of {len(table)}; expected one that is there"
             )
     corners = v[used[:, 0], :3]
-    faces, polygon = divided(model.path, corners, np.frombuffer(sizes, np.int64) if sizes else np.zeros(0, np.int64))
+    faces, polygon = triangulate_polygons(
+        path, corners, np.frombuffer(sizes, np.int64) if sizes else np.zeros(0, np.int64)
+    )
     owner = np.frombuffer(owners, np.int64)[polygon] if owners else polygon
-    colours = _colours(model, v)
+    colours = _vertex_colours(path, v)
     found = []
     for name, index in names.items():
         mine = used[faces[owner == index]]
@@ -151,20 +154,20 @@ def _table(key: str, numbers: NDArray[np.float64], lengths: NDArray[np.integer])
     return table
 
 
-def _colours(model: Model, v: NDArray[np.float64]) -> NDArray[np.float32] | None:
+def _vertex_colours(path: Path, v: NDArray[np.float64]) -> NDArray[np.float32] | None:
     """(V, 3) colours of vertices, which stand after x y z; None without."""
     if v.shape[1] < 6:
         return None
     found = v[:, 3:6]
     without = int(np.isnan(found).any(axis=1).sum())
     if without:
-        warn_once(f"{model.path}: {without} of {len(v)} vertices have no colour; the colours of the others are ignored")
+        warn_once(f"{path}: {without} of {len(v)} vertices have no colour; the colours of the others are ignored")
         return None
     scale = 255.0 if found.max(initial=0.0) > 2 else 1.0
     return np.clip(found / scale, 0, 1).astype(np.float32)
 
 
-def _library(text: str, folder: Folder, images: dict[str, bytes]) -> dict[str, Material]:
+def _library(text: str, folder: ModelFolder, images: dict[str, bytes]) -> dict[str, Material]:
     found: dict[str, Material] = {}
     name = ""
     told = set[str]()  # of what d is known, which wins over Tr
@@ -212,12 +215,12 @@ def _textured(material: Material) -> Material:
     return replace(material, colour=white if material.texture is not None else material.colour, glow=glow)
 
 
-def _texture(words: list[str], rest: str, folder: Folder, images: dict[str, bytes]) -> Material | None:
+def _texture(words: list[str], rest: str, folder: ModelFolder, images: dict[str, bytes]) -> Material | None:
     """The texture that a line names, with its place; None where it is missing and that is allowed."""
     image, options = _file_name(words, rest)
     spellings = [image, PurePosixPath(image.replace("\\", "/")).name]
     if image not in images:
-        data = folder.optional(spellings[:1] if spellings[0] == spellings[1] else spellings, "texture")
+        data = folder.read_optional(spellings[:1] if spellings[0] == spellings[1] else spellings, "texture")
         if data is None:
             return None
         images[image] = data
@@ -252,7 +255,7 @@ def _number(word: str) -> bool:
     return re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", word) is not None
 
 
-def _number_of(word: str, folder: Folder, name: str) -> float:
+def _number_of(word: str, folder: ModelFolder, name: str) -> float:
     if not _number(word):
         raise DataError(
             f"{folder.file}: material {name[:40]!r} has the opacity {word[:20]!r}; expected a number from 0 to 1"
@@ -260,7 +263,7 @@ def _number_of(word: str, folder: Folder, name: str) -> float:
     return min(max(float(word), 0.0), 1.0)
 
 
-def _colour(words: list[str], folder: Folder, name: str) -> tuple[float, float, float]:
+def _colour(words: list[str], folder: ModelFolder, name: str) -> tuple[float, float, float]:
     try:
         values = torch.tensor([float(word) for word in words[:3]])
         if not values.isfinite().all():

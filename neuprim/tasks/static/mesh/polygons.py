@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from neuprim.core.errors import DataError
 
-__all__ = ["divided"]
+__all__ = ["triangulate_polygons"]
 
 _FANS = 8
 """Corners that fans of all polygons are tried from, before ears of one are looked for."""
@@ -29,7 +29,7 @@ _FLAT = 1e-10
 """Twice an area, over the square of the polygon's size, that counts as none."""
 
 
-def divided(
+def triangulate_polygons(
     path: Path, corners: NDArray[np.float64], sizes: NDArray[np.integer]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Triangles of polygons: (T, 3) rows of ``corners``, and (T,) which polygon each is of, ascending.

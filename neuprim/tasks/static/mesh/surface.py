@@ -16,9 +16,8 @@ from neuprim.scenes.meshes import corner_normals
 from neuprim.scenes.raycast import LIFT, Engine, Hits, Scene
 from neuprim.scenes.reflectance import dot
 from neuprim.scenes.shapes import Solid, plain
-from neuprim.tasks.static.mesh.files import MAX_TEXELS, Model, Up
-from neuprim.tasks.static.mesh.parts import Part
-from neuprim.tasks.static.mesh.textures import Texture, decode
+from neuprim.tasks.static.mesh.materials import SurfacePart, Texture, decode_texture
+from neuprim.tasks.static.mesh.model import MAX_TEXELS, Model, Up
 
 __all__ = ["FARTHEST", "Surface", "scene_from_file"]
 
@@ -42,7 +41,7 @@ _Pool = dict[tuple[str, tuple[str, str]], Texture]
 _Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
-def scene_from_file(parts: Sequence[Part], upward: Up) -> NDArray[np.float64] | None:
+def scene_from_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np.float64] | None:
     """(4, 4) that turns z up, centres the box and scales it into [-1, 1]^3, and into view; None for what has no size.
 
     Args:
@@ -67,7 +66,7 @@ class Surface(Scene):
 
     Args:
         model: where the images are.
-        parts: see :func:`~neuprim.tasks.static.mesh.parts.read_parts`.
+        parts: see :func:`~neuprim.tasks.static.mesh.materials.read_surfaces`.
         upward: "y" or "z".
         spacing: of neighbouring rays at distance 1, for how much of a texture one stands.
 
@@ -79,7 +78,7 @@ class Surface(Scene):
     """
 
     def __init__(
-        self, model: Model, parts: Sequence[Part], upward: Up, spacing: float, engine: Engine = "auto"
+        self, model: Model, parts: Sequence[SurfacePart], upward: Up, spacing: float, engine: Engine = "auto"
     ) -> None:
         matrix = scene_from_file(parts, upward)
         if matrix is None:
@@ -176,7 +175,12 @@ class _Layer:
     """
 
     def __init__(
-        self, model: Model, parts: Sequence[Part], kept: NDArray[np.bool_], area: NDArray[np.float64], pool: _Pool
+        self,
+        model: Model,
+        parts: Sequence[SurfacePart],
+        kept: NDArray[np.bool_],
+        area: NDArray[np.float64],
+        pool: _Pool,
     ) -> None:
         owner = np.full(len(parts), -1, dtype=np.intp)
         for i, part in enumerate(parts):
@@ -185,7 +189,7 @@ class _Layer:
                 continue
             if (name, wrap) not in pool:
                 left = MAX_TEXELS - sum(texture.texels for texture in pool.values())
-                pool[name, wrap] = Texture(decode(model.path, name, model.images[name], left), wrap)
+                pool[name, wrap] = Texture(decode_texture(model.path, name, model.images[name], left), wrap)
             owner[i] = list(pool).index((name, wrap))
         self._textures = list(pool.values())
         self._texture = np.repeat(owner, [len(part.colour) for part in parts])[kept]
@@ -215,7 +219,7 @@ class _Layer:
         return found
 
 
-def _faint(part: Part) -> NDArray[np.bool_]:
+def _faint(part: SurfacePart) -> NDArray[np.bool_]:
     """(F,) faces that are holes all over."""
     if part.alpha is None or part.material.cutoff is None:
         return np.zeros(len(part.colour), dtype=np.bool_)
@@ -223,7 +227,7 @@ def _faint(part: Part) -> NDArray[np.bool_]:
     return clear
 
 
-def _say_translucent(model: Model, parts: Sequence[Part], pool: _Pool) -> None:
+def _say_translucent(model: Model, parts: Sequence[SurfacePart], pool: _Pool) -> None:
     """One line for what should show what is behind it: nothing is translucent here."""
     soft = {
         key
@@ -252,7 +256,7 @@ def _mesh(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trim
     return trimesh.Trimesh(np.concatenate([points, points[alone]]), own, process=False)
 
 
-def _file_normals(parts: Sequence[Part], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+def _file_normals(parts: Sequence[SurfacePart], turn: NDArray[np.float64]) -> NDArray[np.float64]:
     """(F, 3, 3) normals of the file on the scene's axes, of any length; zero where it has none."""
     return np.concatenate(
         [np.zeros_like(part.corners) if part.normals is None else part.normals @ turn.T for part in parts]

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neuprim.core.cameras.file import read_cameras
+from neuprim.core.cameras.camera_files import read_cameras
 from neuprim.core.data import Dataset, Pixels, View, ViewSet, camera_extent
 from neuprim.core.data.initial import initial_points
-from neuprim.core.data.settings import data_folder
+from neuprim.core.data.posed_images import data_folder
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import read_image, read_mask
 from neuprim_spectral.bands import BANDS

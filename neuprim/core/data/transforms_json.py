@@ -1,7 +1,7 @@
 """The frames of ``transforms.json`` files (instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints, GS³):
 cameras, lenses, masks, splits.
 
-Intrinsics and lenses are read by :mod:`neuprim.core.cameras.intrinsics`; :mod:`neuprim.core.cameras.keys` knows all
+Intrinsics and lenses are read by :mod:`neuprim.core.cameras.intrinsics`; :mod:`neuprim.core.cameras.intrinsics` knows all
 other keys. Poses are camera to world with OpenGL axes.
 """
 
@@ -15,15 +15,20 @@ from pathlib import Path
 from torch import Tensor
 
 from neuprim.core.cameras import opengl_to_viewmat
-from neuprim.core.cameras.intrinsics import Target, camera_of, is_fisheye, lens_of
-from neuprim.core.cameras.keys import check_keys, unknown_keys
+from neuprim.core.cameras.intrinsics import Target, camera_of, check_keys, is_fisheye, lens_of, unknown_keys
 from neuprim.core.cameras.pinhole import check_viewmat
-from neuprim.core.data.bad_views import BadViews
-from neuprim.core.data.common import MissingFiles, every_nth, find_image, missing_files, turned, unique_names
 from neuprim.core.data.distortion import Distortion, Fisheye, Radial
-from neuprim.core.data.masks import Mask, masks_beside
-from neuprim.core.data.settings import FolderSettings
-from neuprim.core.data.views import ImageFrame
+from neuprim.core.data.image_views import ImageFrame, Mask, masks_beside
+from neuprim.core.data.posed_images import (
+    BadViews,
+    FolderSettings,
+    MissingFiles,
+    every_nth,
+    find_image,
+    missing_files,
+    turned,
+    unique_names,
+)
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import image_info
 from neuprim.core.io.json_reader import JsonReader
@@ -43,7 +48,7 @@ class Layout:
     """What a format has of its own.
 
     Attributes:
-        keys: that its loader reads beside those of :data:`neuprim.core.cameras.keys.READ`.
+        keys: that its loader reads beside those of :data:`neuprim.core.cameras.intrinsics.READ`.
         name: the path of a frame's image, as the file has it.
         image: a frame's image file in the data set's folder, or None.
         viewmat: (4, 4) world to camera, OpenCV axes.

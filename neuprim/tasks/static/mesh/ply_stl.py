@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import io
 import re
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,20 +14,20 @@ from numpy.typing import NDArray
 from neuprim.core.errors import DataError
 from neuprim.core.io.ply import PlyElement, read_elements
 from neuprim.core.notices import warn_once
-from neuprim.tasks.static.mesh.files import (
+from neuprim.tasks.static.mesh.model import (
     MAX_FACES,
     MAX_PARTS,
     MAX_VERTICES,
     Faces,
-    Folder,
     Material,
     Model,
-    check_counts,
+    ModelFolder,
+    check_limits,
     check_vertices,
 )
-from neuprim.tasks.static.mesh.polygons import divided
+from neuprim.tasks.static.mesh.polygons import triangulate_polygons
 
-__all__ = ["ply_faces", "read_ply", "read_stl", "stl_faces"]
+__all__ = ["read_ply_mesh", "read_stl"]
 
 _HEADER = 2**16
 _RGB = ("red", "green", "blue")
@@ -33,13 +35,13 @@ _UV = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-def read_ply(folder: Folder) -> Model:
-    """The model of a .ply file, with the texture that a comment ``TextureFile`` names.
+def read_ply_mesh(folder: ModelFolder) -> Model:
+    """Read a .ply file with its faces, and the texture that a comment ``TextureFile`` names.
 
     Raises:
         DataError: too large, no PLY file, or with a texture that leads nowhere.
     """
-    data = folder.own()
+    data = folder.read_model()
     end = data.find(b"end_header", 0, _HEADER)
     if not data.startswith(b"ply") or end < 0:
         found = (
@@ -50,30 +52,30 @@ def read_ply(folder: Folder) -> Model:
         raise DataError(f"{folder.file}: {found}; expected a PLY file")
     header = data[:end].decode("utf-8", "replace")
     counts = {name: int(count) for name, count in re.findall(r"(?m)^element[ \t]+(\S+)[ \t]+(\d{1,18})\s*$", header)}
-    check_counts(
-        folder, {"vertices": (counts.get("vertex", 0), MAX_VERTICES), "faces": (counts.get("face", 0), MAX_FACES)}
+    check_limits(
+        folder.file, {"vertices": (counts.get("vertex", 0), MAX_VERTICES), "faces": (counts.get("face", 0), MAX_FACES)}
     )
     materials: dict[str, Material] = {}
     images: dict[str, bytes] = {}
     texture = re.search(r"(?mi)^comment[ \t]+TextureFile[ \t]+(.+?)\s*$", header)
     if texture:
-        image = folder.optional([texture[1]], "texture")
+        image = folder.read_optional([texture[1]], "texture")
         if image is not None:
             images[texture[1]] = image
             materials[""] = Material((1.0, 1.0, 1.0), texture[1], cutoff=0.5, blend=True)
-    return Model(folder.file, "ply", data, {}, materials, images, "z", False, folder.digest)
+    return Model(folder.file, partial(_read_ply_faces, folder.file, data), folder.digest, materials, images)
 
 
-def ply_faces(model: Model) -> tuple[list[Faces], int]:
-    """All triangles, and the number of vertices.
+def _read_ply_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
+    """Read all triangles and count the vertices.
 
     Raises:
         DataError: a damaged file, a face with a vertex that is not there, or polygons that cross themselves.
     """
-    elements = read_elements(io.BytesIO(model.data), len(model.data), model.path, ("vertex", "face", "tristrips"))
+    elements = read_elements(io.BytesIO(data), len(data), path, ("vertex", "face", "tristrips"))
     vertices = elements["vertex"]
     if not {"x", "y", "z"} <= set(vertices.names):
-        raise DataError(f"{model.path}: vertices have no x, y, z but {', '.join(vertices.names)[:80]}; expected a mesh")
+        raise DataError(f"{path}: vertices have no x, y, z but {', '.join(vertices.names)[:80]}; expected a mesh")
     count = len(vertices.rows)
     face = elements.get("face")
     lists = face.lists if face is not None else {}
@@ -82,18 +84,18 @@ def ply_faces(model: Model) -> tuple[list[Faces], int]:
         strips = elements["tristrips"].lists if "tristrips" in elements else {}
         if strips or lists:
             raise DataError(
-                f"{model.path}: faces are {', '.join([*strips, *lists])[:60]}; expected a list vertex_indices of every face"
+                f"{path}: faces are {', '.join([*strips, *lists])[:60]}; expected a list vertex_indices of every face"
             )
         return [], count
     index = corners.values.astype(np.int64)
     xyz = vertices.columns(("x", "y", "z"))
-    check_vertices(model.path, xyz, index)
-    triangles, polygon = divided(model.path, xyz[index], corners.sizes)
+    check_vertices(path, xyz, index)
+    triangles, polygon = triangulate_polygons(path, xyz[index], corners.sizes)
     used = index[triangles]
     normals = vertices.columns(("nx", "ny", "nz"))[used] if {"nx", "ny", "nz"} <= set(vertices.names) else None
-    colour = _colours(vertices, model)
+    colour = _colours(vertices, path)
     colour = None if colour is None else colour[used]
-    if colour is None and (of_faces := _colours(face, model)) is not None:
+    if colour is None and (of_faces := _colours(face, path)) is not None:
         colour = np.repeat(of_faces[polygon][:, None], 3, axis=1)
     uv: NDArray[np.float64] | None = None
     coordinates = lists.get("texcoord")
@@ -102,30 +104,30 @@ def ply_faces(model: Model) -> tuple[list[Faces], int]:
     elif (pair := next((pair for pair in _UV if set(pair) <= set(vertices.names)), None)) is not None:
         uv = vertices.columns(pair)[used]
     if "texnumber" in face.names and face.rows["texnumber"].any():
-        raise DataError(f"{model.path}: has several textures (texnumber); expected one, or a glTF or OBJ file")
+        raise DataError(f"{path}: has several textures (texnumber); expected one, or a glTF or OBJ file")
     return [Faces(xyz[used], "", normals, colour, uv)], count
 
 
-def _colours(element: PlyElement, model: Model) -> NDArray[np.float32] | None:
+def _colours(element: PlyElement, path: Path) -> NDArray[np.float32] | None:
     """(N, 3) 0..1 of vertices or faces; None without."""
     if not set(_RGB) <= set(element.names):
         return None
     kind = element.rows.dtype["red"]
     most = np.iinfo(kind).max if kind.kind in "iu" else 1.0
     if "alpha" in element.names and (element.rows["alpha"] < most).any():
-        warn_once(f"{model.path}: colours have an alpha, which is not read; drawn opaque")
+        warn_once(f"{path}: colours have an alpha, which is not read; drawn opaque")
     return np.clip(np.nan_to_num(element.columns(_RGB) / most), 0, 1).astype(np.float32)
 
 
-def read_stl(folder: Folder) -> Model:
-    """The model of an .stl file.
+def read_stl(folder: ModelFolder) -> Model:
+    """Read an .stl file.
 
     A file is binary where its length is what byte 80 announces, whatever it starts with, else text.
 
     Raises:
         DataError: too large, or cut off.
     """
-    data = folder.own()
+    data = folder.read_model()
     count = int.from_bytes(data[80:84], "little")
     text = len(data) != 84 + 50 * count or len(data) < 84
     if text:
@@ -133,28 +135,40 @@ def read_stl(folder: Folder) -> Model:
             raise DataError(
                 f"{folder.file}: {count} faces announced; expected {84 + 50 * count} bytes for them, found {len(data)}"
             )
-        check_counts(folder, {"solids": (data.lower().count(b"endsolid"), MAX_PARTS)})
+        check_limits(folder.file, {"solids": (data.lower().count(b"endsolid"), MAX_PARTS)})
         count = data.lower().count(b"endfacet")
-    check_counts(folder, {"faces": (count, MAX_FACES)})
-    return Model(folder.file, "stl_ascii" if text else "stl", data, {}, {}, {}, "z", False, folder.digest)
+    check_limits(folder.file, {"faces": (count, MAX_FACES)})
+    read_faces = _read_stl_text if text else _read_stl_binary
+    return Model(folder.file, partial(read_faces, folder.file, data), folder.digest)
 
 
-def stl_faces(model: Model) -> tuple[list[Faces], int]:
-    """All triangles of a binary file, and the number of their corners.
+def _read_stl_text(path: Path, data: bytes) -> tuple[list[Faces], int]:
+    """Read all triangles of a text file and count their corners."""
+    words = re.findall(rb"(?i)^\s*vertex\s+(\S+)[ \t]+(\S+)[ \t]+(\S+)", data, re.MULTILINE)
+    try:
+        corners = np.array(words, dtype=np.float64).reshape(-1, 3, 3)
+    except ValueError as error:
+        raise DataError(f"{path}: cannot be read as STL ({error}); expected a complete file") from None
+    check_vertices(path, corners.reshape(-1, 3), np.arange(len(words)))
+    return [Faces(corners)] if len(corners) else [], len(words)
+
+
+def _read_stl_binary(path: Path, data: bytes) -> tuple[list[Faces], int]:
+    """Read all triangles of a binary file and count their corners.
 
     The two bytes after each may be its colour: with bit 15 set red, green and blue from bit 10 down; in files whose
     header says COLOR= (Materialise Magics) red, green and blue from bit 0 up where bit 15 is clear, else the header's.
     """
-    rows = np.frombuffer(model.data, _STL, offset=84)
+    rows = np.frombuffer(data, _STL, offset=84)
     bits = rows["attribute"].astype(np.int64)
     fives = np.stack([(bits >> shift & 31) / 31 for shift in (10, 5, 0)], axis=-1)
     own = bits >> 15 == 1
-    place = model.data.find(b"COLOR=", 0, 80 - 9)
+    place = data.find(b"COLOR=", 0, 80 - 9)
     if place >= 0:
-        whole = np.frombuffer(model.data, np.uint8, 3, place + 6) / 255
+        whole = np.frombuffer(data, np.uint8, 3, place + 6) / 255
         fives, own = np.where(own[:, None], whole, fives[:, ::-1]), np.ones_like(own)
     corners = rows["corners"].astype(np.float64)
-    check_vertices(model.path, corners.reshape(-1, 3), np.arange(3 * len(rows)))
+    check_vertices(path, corners.reshape(-1, 3), np.arange(3 * len(rows)))
     found = []
     for mine, colour in ((own, np.repeat(fives[own][:, None], 3, axis=1).astype(np.float32)), (~own, None)):
         if mine.any():

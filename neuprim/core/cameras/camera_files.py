@@ -1,5 +1,4 @@
-"""Cameras in JSON: frames as NeRF-synthetic, instant-ngp, nerfstudio and Blender's script have them, and camera paths
-of nerfstudio's viewer."""
+"""Cameras of files: JSON with frames or a camera path, USD stages and COLMAP models."""
 
 from __future__ import annotations
 
@@ -8,14 +7,14 @@ from pathlib import Path
 
 from torch import Tensor
 
-from neuprim.core.cameras.intrinsics import MODELS, Target, camera_of, is_fisheye, lens_of
-from neuprim.core.cameras.keys import check_keys
-from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
-from neuprim.core.cameras.views import LARGEST, MOST, RATES, CameraViews
+from neuprim.core.cameras.colmap import is_model, posed_cameras
+from neuprim.core.cameras.intrinsics import MODELS, Target, camera_of, check_keys, is_fisheye, lens_of
+from neuprim.core.cameras.pinhole import LARGEST, MOST, RATES, Camera, CameraViews, opengl_to_viewmat
+from neuprim.core.cameras.usd import is_usd, read_usd_cameras
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 
-__all__ = ["read_json_cameras"]
+__all__ = ["read_camera_file", "read_cameras", "read_json_cameras"]
 
 _MAX_BYTES = 64 * 1024 * 1024
 
@@ -34,17 +33,17 @@ def read_json_cameras(path: Path, size: tuple[int, int] | None = None) -> Camera
         return _camera_path(document, size)
     if not document.has("frames"):
         raise document.fail("frames", "a non-empty list of objects (or camera_path, as nerfstudio's viewer writes it)")
-    return _frames(document, size)
+    return _read_frames(document, size)
 
 
-def _checked(document: JsonReader, key: str) -> list[JsonReader]:
+def _listed_cameras(document: JsonReader, key: str) -> list[JsonReader]:
     records = list(document.objects(key))
     if len(records) > MOST:
         raise DataError(f"{document.where}: {key} has {len(records)} cameras; expected at most {MOST}")
     return records
 
 
-def _size(record: JsonReader, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
+def _stated_size(record: JsonReader, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
     found = [
         record.count(key) if record.has(key) or size is None else fallback
         for key, fallback in zip(keys, size or (0, 0), strict=True)
@@ -74,10 +73,10 @@ def _rate(document: JsonReader, count: int) -> float | None:
 # ---------------------------------------------------------------- frames
 
 
-def _frames(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
+def _read_frames(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
     """``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``; a frame may override
     every intrinsic."""
-    records, found, bent = _checked(document, "frames"), [], 0
+    records, found, bent = _listed_cameras(document, "frames"), [], 0
     notes: dict[str, None] = {}
     check_keys(document)
     for i, record in enumerate(records):
@@ -90,7 +89,7 @@ def _frames(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
         stated = JsonReader(
             {key: r.values[key] for r in (document, record) for key in ("w", "h") if r.has(key)}, record.where
         )
-        target = Target(*_size(stated, ("w", "h"), size))
+        target = Target(*_stated_size(stated, ("w", "h"), size))
         own = record.has("transform_matrix") or not document.has("transform_matrix")
         view = None if own else opengl_to_viewmat(document.matrix("transform_matrix"))
         camera = camera_of(record, document, target, view, lambda text: notes.update({text: None}))
@@ -110,8 +109,8 @@ def _camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraVi
     kind = document.values.get("camera_type", "perspective")
     if kind != "perspective":
         raise document.fail("camera_type", "perspective; others are not drawn")
-    records = _checked(document, "camera_path")
-    width, height = _size(document, ("render_width", "render_height"), size)
+    records = _listed_cameras(document, "camera_path")
+    width, height = _stated_size(document, ("render_width", "render_height"), size)
     found = []
     for i, record in enumerate(records):
         fov = record.number("fov", "a vertical field of view in degrees, between 0 and 180", 0.0, 180.0)
@@ -132,3 +131,44 @@ def _flat_matrix(record: JsonReader, key: str) -> Tensor:
     if not isinstance(value, list) or len(value) not in (3, 4):
         raise record.fail(key, "16 numbers, row by row")
     return record.matrix(key)
+
+
+def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
+    """Read the cameras of a file or folder, whose format follows from its content.
+
+    * JSON with ``frames``, or with ``camera_path`` as nerfstudio's viewer writes it;
+    * .usd, .usda, .usdc, .usdz (:mod:`~neuprim.core.cameras.usd`); ``FILE#/PRIM`` chooses one of several cameras;
+    * a COLMAP model: its folder, one of its files, or a project (:mod:`~neuprim.core.cameras.colmap`).
+
+    Args:
+        size: (width, height) where the file names none.
+
+    Raises:
+        DataError: names the file and the field that is missing or wrong.
+        BackendUnavailable: the package that reads the format is missing.
+    """
+    path, prim = split_prim(path)
+    model = is_model(path)
+    if model is not None:
+        named, notes = posed_cameras(model)
+        if len(named) > MOST:
+            raise DataError(f"{path}: {len(named)} cameras; expected at most {MOST}")
+        return CameraViews(tuple(named), notes=tuple(notes))
+    if path.is_dir():
+        raise DataError(
+            f"{path}: is a folder without cameras.txt or cameras.bin; expected a COLMAP model, or a file of cameras"
+        )
+    if is_usd(path):
+        return read_usd_cameras(path, prim, size)
+    return read_json_cameras(path, size)
+
+
+def split_prim(path: Path) -> tuple[Path, str]:
+    """``FILE#/World/Camera`` as a file and what stands after it; a file of that very name comes first."""
+    text, hash_, prim = str(path).partition("#")
+    return (Path(text), prim) if hash_ and not path.exists() else (path, "")
+
+
+def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[tuple[str, Camera]]:
+    """Names and cameras of :func:`read_camera_file`."""
+    return list(read_camera_file(path, size).named)

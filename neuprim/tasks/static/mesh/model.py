@@ -1,8 +1,4 @@
-"""A model's file and the files that it names, read under limits and from its own folder alone.
-
-What a file refers to is read here, before any parser sees it: trimesh gets bytes, and has no way to the disk or the
-network.
-"""
+"""A mesh file with its materials, read together with the files it names: under size limits, from its own folder only."""
 
 from __future__ import annotations
 
@@ -11,7 +7,7 @@ import binascii
 import hashlib
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -24,57 +20,56 @@ from neuprim.core.errors import DataError, nearest
 from neuprim.core.notices import warn_once
 
 __all__ = [
-    "MAX_BYTES",
     "MAX_FACES",
     "MAX_PARTS",
     "MAX_TEXELS",
     "MAX_VERTICES",
-    "SUFFIXES",
     "Faces",
-    "Folder",
     "Material",
     "Model",
+    "ModelFolder",
     "Up",
-    "check_counts",
+    "check_limits",
     "check_vertices",
-    "model_file",
+    "find_model_file",
 ]
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 
 MAX_BYTES = 512 * 2**20
-"""Of the file and all that it names together."""
+"""Size limit of the file and all files it names together."""
 
 MAX_FACES = 2_000_000
-"""Triangles, each use of a part counting."""
+"""Triangles; each instance of a mesh counts."""
 
 MAX_VERTICES = 3 * MAX_FACES
 
 MAX_PARTS = 20_000
-"""Pieces with a material or place of their own."""
+"""Pieces with a material or transform of their own."""
 
 MAX_TEXELS = 128 * 2**20
-"""Pixels of all textures together; one image has at most :data:`neuprim.core.io.exr.MAX_PIXELS`."""
+"""Pixels of all textures together. A single image has at most :data:`neuprim.core.io.exr.MAX_PIXELS`."""
 
 Up = Literal["y", "z"]
+"""The axis of the file that points up."""
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
 
 
 @dataclass(frozen=True)
 class Material:
-    """How a part of the surface is coloured.
+    """Colour of a part of the surface.
 
     Attributes:
-        colour: (3,) linear RGB that the texture and the vertices' colours are multiplied with; None: the file says
-        none. texture: name of the image among :attr:`Model.images`.
-        wrap: what happens to texture coordinates beyond 0..1 along u and v: "repeat", "clamp" or "mirror".
-        transform: (2, 3) of texture coordinates whose v runs down; None leaves them.
-        opacity: what the alpha of the texture and of the vertices is multiplied with.
-        cutoff: alpha below which there is a hole; None: alpha means nothing.
-        blend: whether the file means alpha as translucency, which is not drawn.
-        glow: the light that is emitted, of any strength: its ``colour``, ``texture``, ``wrap`` and ``transform``.
-        unlit: whether the colours are emitted instead of reflected.
+        colour: (3,) linear RGB factor of the texture and the vertex colours; None where the file has no colour.
+        texture: key of the image in :attr:`Model.images`.
+        wrap: behaviour of texture coordinates outside 0..1 along u and v: "repeat", "clamp" or "mirror".
+        transform: (2, 3) transform of texture coordinates whose v points down; None for the identity.
+        opacity: factor of the alpha of texture and vertices.
+        cutoff: alpha below which there is a hole; None where alpha is ignored.
+        blend: whether the file asks for translucency, which is not drawn.
+        glow: emitted light: its ``colour``, ``texture``, ``wrap`` and ``transform``.
+        unlit: whether colours are emitted instead of reflected.
     """
 
     colour: tuple[float, float, float] | None = None
@@ -90,14 +85,14 @@ class Material:
 
 @dataclass(frozen=True)
 class Faces:
-    """Triangles of one material as a file has them.
+    """Triangles of one material.
 
     Attributes:
-        corners: (F, 3, 3) float64 positions in the file's units and axes.
-        material: its name.
-        normals: (F, 3, 3) of any length, 0 where there is none; None without.
-        colour: (F, 3, 3) or, with alpha, (F, 3, 4), 0..1; None without.
-        uv, glow_uv: (F, 3, 2) coordinates in the texture and in that of the light emitted, v upward; None without.
+        corners: (F, 3, 3) float64 positions in the units and axes of the file.
+        material: name of the material.
+        normals: (F, 3, 3) of any length, 0 where the file has none.
+        colour: (F, 3, 3) or, with alpha, (F, 3, 4), values 0..1.
+        uv, glow_uv: (F, 3, 2) coordinates in the colour and the emission texture, v upward.
     """
 
     corners: NDArray[np.float64]
@@ -110,36 +105,32 @@ class Faces:
 
 @dataclass(frozen=True)
 class Model:
-    """What is known of a model before its geometry is parsed.
+    """A mesh file whose references are read and whose geometry is not parsed yet.
 
     Attributes:
-        path: for messages.
-        kind: the format of ``data``, as trimesh calls it.
-        data: what is parsed.
-        parts: further bytes that trimesh may ask for, by name.
-        materials: name -> material. "" is that of surfaces without one.
-        images: name -> encoded bytes of the textures.
-        upward: "y" or "z", the axis that points up by the format's custom.
-        linear: whether the vertices' colours are linear light, else sRGB.
-        digest: of everything that was read, and of what was missing.
+        path: used in messages.
+        read_faces: parses the geometry: all triangles, and the number of vertices. Raises DataError for damaged data.
+        digest: hash of all bytes read and of the names of missing files.
+        materials: name -> material; "" is the material of surfaces without one.
+        images: name -> encoded bytes of a texture.
+        upward: the axis that points up by the convention of the format.
+        linear: whether vertex colours are linear light; sRGB otherwise.
     """
 
     path: Path
-    kind: str
-    data: bytes
-    parts: dict[str, bytes] = field(default_factory=dict)
+    read_faces: Callable[[], tuple[list[Faces], int]]
+    digest: str
     materials: dict[str, Material] = field(default_factory=dict)
     images: dict[str, bytes] = field(default_factory=dict)
     upward: Up = "z"
     linear: bool = False
-    digest: str = ""
 
 
-def model_file(path: Path) -> Path:
-    """The existing file of ``scene.path``, of a format that is read, ``~`` expanded.
+def find_model_file(path: Path) -> Path:
+    """Return the existing mesh file of ``scene.path`` with ``~`` expanded.
 
     Raises:
-        DataError: there is no such file, or its name ends in something else.
+        DataError: the file does not exist or has an unsupported suffix.
     """
     try:
         file = path.expanduser()
@@ -148,27 +139,26 @@ def model_file(path: Path) -> Path:
         raise DataError(f"{path}: {error}; expected a model's file (scene.path)") from None
     if not usable:
         raise DataError(
-            f"{file}: {'is no file' if there else 'does not exist'}; expected a model's file (scene.path), {_listed()}"
+            f"{file}: {'is no file' if there else 'does not exist'}; expected a model's file (scene.path), {_list_suffixes()}"
         )
     if file.suffix.lower() not in SUFFIXES:
         found = f"ends in {file.suffix!r}" if file.suffix else "has no suffix"
         raise DataError(
-            f"{file}: {found}; expected {_listed()}" + (nearest(file.suffix, SUFFIXES) if file.suffix else "")
+            f"{file}: {found}; expected {_list_suffixes()}" + (nearest(file.suffix, SUFFIXES) if file.suffix else "")
         )
     return file
 
 
-def _listed() -> str:
+def _list_suffixes() -> str:
     return ", ".join(SUFFIXES[:-1]) + " or " + SUFFIXES[-1]
 
 
-class Folder:
-    """Reads a model's file and the files beside and below it, as long as the budget lasts, and digests all that it
-    reads.
+class ModelFolder:
+    """Reads a mesh file and the files beside and below it within a byte budget, and hashes everything it reads.
 
     Args:
-        file: the model.
-        skip_missing: textures and material files that are absent or refused are warned about instead.
+        file: the mesh file.
+        skip_missing: warn about missing or refused textures and material files instead of raising.
     """
 
     def __init__(self, file: Path, skip_missing: bool = False, budget: int = MAX_BYTES) -> None:
@@ -180,34 +170,33 @@ class Folder:
     def digest(self) -> str:
         return self._hash.hexdigest()
 
-    def own(self) -> bytes:
-        """The model's file itself."""
+    def read_model(self) -> bytes:
+        """Read the mesh file itself."""
         data = self._read(self.file, self.file.suffix.lower())
         if not data:
-            raise DataError(f"{self.file}: file is empty; expected a model, {_listed()}")
+            raise DataError(f"{self.file}: file is empty; expected a model, {_list_suffixes()}")
         return data
 
-    def required(self, reference: str, what: str) -> bytes:
-        """The bytes of what a model cannot do without.
+    def read_required(self, reference: str, what: str) -> bytes:
+        """Read a file that the model cannot do without.
 
         Raises:
-            DataError: the reference leads out of the model's folder or nowhere, or there is too much of it.
+            DataError: the reference leaves the model's folder, does not exist or exceeds the budget.
         """
-        found, fault = self._found(reference, what)
+        found, fault = self._resolve(reference, what)
         if found is None:
             raise DataError(fault)
         return found
 
-    def optional(self, references: Sequence[str], what: str) -> bytes | None:
-        """The bytes of the first of several spellings of a name that is there; None, with a warning, where
-        ``skip_missing`` allows that.
+    def read_optional(self, references: Sequence[str], what: str) -> bytes | None:
+        """Read the first existing spelling of a name; None, with a warning, if ``skip_missing`` allows it.
 
         Raises:
-            DataError: as :meth:`required`.
+            DataError: as :meth:`read_required`.
         """
         faults = []
         for reference in references:
-            found, fault = self._found(reference, what)
+            found, fault = self._resolve(reference, what)
             if found is not None:
                 return found
             faults.append(fault)
@@ -217,11 +206,11 @@ class Folder:
         warn_once(f"{faults[0]}; drawn without it")
         return None
 
-    def _found(self, reference: str, what: str) -> tuple[bytes | None, str]:
-        """The bytes, or None and what is wrong with the reference."""
+    def _resolve(self, reference: str, what: str) -> tuple[bytes | None, str]:
+        """Return the bytes, or None and the reason why the reference is refused."""
         shown = reference if len(reference) <= 80 else reference[:77] + "..."
         if reference.startswith("data:"):
-            return self._embedded(reference, what), ""
+            return self._decode_data_uri(reference, what), ""
         where = f"{self.file}: {what} {shown!r}"
         name = reference.replace("\\", "/")
         if _SCHEME.match(name) or name.startswith("/"):
@@ -238,7 +227,7 @@ class Folder:
             return None, f"{where} not found; expected it in the model's folder"
         return self._read(target, name), ""
 
-    def _embedded(self, uri: str, what: str) -> bytes:
+    def _decode_data_uri(self, uri: str, what: str) -> bytes:
         head, comma, body = uri.partition(",")
         try:
             if not comma or not head.endswith(";base64"):
@@ -266,30 +255,23 @@ class Folder:
         return data
 
 
-def check_counts(folder: Folder, found: Mapping[str, tuple[int, int]]) -> None:
-    """Refuse what a file announces or holds more of than is read: what -> (count, most).
-
-    Raises:
-        DataError: naming the first of them.
-    """
-    for what, (count, most) in found.items():
-        if count > most:
-            raise DataError(f"{folder.file}: {count} {what}; expected at most {most}")
+def check_limits(path: Path, counts: Mapping[str, tuple[int, int]]) -> None:
+    """Raise DataError for the first count above its limit, given as name -> (count, limit)."""
+    for name, (count, limit) in counts.items():
+        if count > limit:
+            raise DataError(f"{path}: {count} {name}; expected at most {limit} (each use of a part counts)")
 
 
-def check_vertices(path: Path, places: NDArray[np.float64], faces: NDArray[np.integer]) -> None:
-    """Refuse faces, of any shape, with vertices that are not among ``places`` (V, 3), or are no finite numbers there.
-
-    Raises:
-        DataError: naming the first of them.
-    """
+def check_vertices(path: Path, positions: NDArray[np.float64], faces: NDArray[np.integer]) -> None:
+    """Raise DataError if a face of ``faces`` (any shape) refers to a row of ``positions`` (V, 3) that is missing or
+    not finite."""
     if not faces.size:
         return
     low, high = int(faces.min()), int(faces.max())
-    if low < 0 or high >= len(places):
+    if low < 0 or high >= len(positions):
         raise DataError(
-            f"{path}: a face has the vertex {high if low >= 0 else low} of {len(places)}; expected one that is there"
+            f"{path}: a face has the vertex {high if low >= 0 else low} of {len(positions)}; expected one that is there"
         )
-    bad = np.flatnonzero(~np.isfinite(places).all(axis=1) & np.isin(np.arange(len(places)), faces))
+    bad = np.flatnonzero(~np.isfinite(positions).all(axis=1) & np.isin(np.arange(len(positions)), faces))
     if len(bad):
-        raise DataError(f"{path}: vertex {bad[0]} is at {places[bad[0]].tolist()}; expected finite numbers")
+        raise DataError(f"{path}: vertex {bad[0]} is at {positions[bad[0]].tolist()}; expected finite numbers")

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.data.dataset import PointCloud, ViewSet, camera_extent
+from neuprim.core.data.dataset import PointCloud, ViewSet
+from neuprim.core.data.scene_frame import camera_extent
 from neuprim.core.errors import DataError
 
 __all__ = ["NOT_SEEN", "ray_points", "views_that_see"]

@@ -1,4 +1,4 @@
-"""Posed image files as a ViewSet: decoded on demand, undistorted, down-sampled, and kept as compact copies."""
+"""Posed image files as a view set: decoded on demand, masked, undistorted, reduced and cached."""
 
 from __future__ import annotations
 
@@ -10,19 +10,83 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.data import Pixels, View, ViewSet
 from neuprim.core.data.distortion import Distortion, resample, source_grid
-from neuprim.core.data.masks import Mask
-from neuprim.core.data.reduction import averaged, whole
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo, read_image, read_mask, srgb_to_linear
 from neuprim.core.model.fields import Conditions
+from neuprim.core.notices import warn_once
 
-__all__ = ["ImageFrame", "ImageViews", "SomeViews"]
+__all__ = ["ImageFrame", "ImageViews", "Mask", "averaged", "masks_beside", "whole"]
+
+
+@dataclass(frozen=True)
+class Mask:
+    """A mask's file.
+
+    Attributes:
+        path: image whose zero pixels do not count.
+        inverted: all others do not count instead.
+    """
+
+    path: Path
+    inverted: bool = False
+
+
+def masks_beside(folder: Path, files: Sequence[Path], images: Path | None = None) -> list[Mask | None]:
+    """The mask of every image file, or None; a line says how many there are.
+
+    ``images/a/b.jpg`` has ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg``; ``images_4`` has ``masks_4``
+    before ``masks``. instant-ngp has ``dynamic_mask_b.png`` beside the image, which is black where pixels count.
+
+    Args:
+        folder: the data set's.
+        images: the images' own folder; None for the first part of their paths where it begins with "images", else
+        ``folder``.
+    """
+    masks = [_mask(folder, file, images) for file in files]
+    found = [m for m in masks if m is not None]
+    if found:
+        black = "not black" if found[0].inverted else "black"
+        warn_once(
+            f"{found[0].path.parent}: masks of {len(found)} of {len(files)} images are read; what is {black} there does not count"
+        )
+    return masks
+
+
+def _mask(folder: Path, file: Path, images: Path | None) -> Mask | None:
+    try:
+        if images is None:
+            first = file.relative_to(folder).parts[0]
+            images = folder / first if first.startswith("images") and first != file.name else folder
+        name = file.relative_to(images)
+    except ValueError:  # an image outside of the folder
+        return None
+    places = dict.fromkeys(
+        (images.name.replace("images", "masks", 1) if images.name.startswith("images") else "masks", "masks")
+    )
+    for place in places:
+        for candidate in (name.with_suffix(".png"), name.with_name(name.name + ".png"), name):
+            if (folder / place / candidate).is_file():
+                return Mask(folder / place / candidate)
+    dynamic = file.with_name(f"dynamic_mask_{file.stem}.png")
+    return Mask(dynamic, inverted=True) if dynamic.is_file() else None
+
+
+def averaged(values: Tensor, factor: int) -> Tensor:
+    """(H // factor, W // factor, C) means of (H, W, C); what is left over at the right and at the bottom is cut off."""
+    return F.avg_pool2d(values.permute(2, 0, 1), factor).permute(1, 2, 0).contiguous()
+
+
+def whole(mask: Tensor, factor: int) -> Tensor:
+    """(H // factor, W // factor) bool of the large pixels all of whose parts count in (H, W) ``mask``."""
+    return F.avg_pool2d(mask[None].float(), factor)[0] > 0.999
+
 
 _CACHE_BYTES = 2 * 2**30
 _GRIDS = 4
@@ -254,27 +318,6 @@ class ImageViews(ViewSet):
                     self._grids.pop(next(iter(self._grids)))
                 self._grids[key] = source_grid(camera, distortion)
             return self._grids[key]
-
-
-class SomeViews(ViewSet):
-    """Some views of another set, which keeps their pixels; e.g. those of one moment.
-
-    Args:
-        views: the whole set.
-        indices: of the chosen views, in the order they get here.
-    """
-
-    def __init__(self, views: ViewSet, indices: Sequence[int]) -> None:
-        self._views, self._indices = views, list(indices)
-
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    def view(self, index: int) -> View:
-        return self._views.view(self._indices[index])
-
-    def pixels(self, index: int) -> Pixels:
-        return self._views.pixels(self._indices[index])
 
 
 def _reduced(frame: ImageFrame, factor: int) -> Camera:

@@ -1,32 +1,38 @@
-"""What the loaders share: file checks, and the Dataset made of posed image files."""
+"""Data sets of posed image files: common settings, splits, and views that are left out."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Literal, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.world import World
+from neuprim.core.checked import Range, text, verify
 from neuprim.core.data import Dataset, PointCloud, StartingPoints, camera_extent
-from neuprim.core.data.bad_views import BadViews
-from neuprim.core.data.context import SceneContext
-from neuprim.core.data.focus import focus_point
+from neuprim.core.data.dataset import SceneContext
+from neuprim.core.data.image_views import ImageFrame, ImageViews
 from neuprim.core.data.initial import initial_points
-from neuprim.core.data.place import world_around
-from neuprim.core.data.settings import FolderSettings
-from neuprim.core.data.views import ImageFrame, ImageViews
+from neuprim.core.data.scene_frame import focus_point, world_around
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo
 from neuprim.core.notices import warn_once
 
 __all__ = [
+    "Background",
+    "BadViews",
+    "EveryNth",
+    "FolderSettings",
+    "HoldOut",
     "IMAGE_SUFFIXES",
     "MissingFiles",
+    "SplitName",
+    "data_folder",
     "every_nth",
     "find_image",
     "in_scene",
@@ -35,6 +41,112 @@ __all__ = [
     "turned",
     "unique_names",
 ]
+
+Background = Literal["auto", "white", "black", "random"]
+
+EveryNth = Annotated[int, Range(at_least=2)]
+"""Every n-th image is held out."""
+
+HoldOut = Annotated[int, Range(at_least=2, also=(0,))]
+"""The same, or 0 where a split of its own is there to test on."""
+
+SplitName = Annotated[str, text("the name in transforms_NAME.json")]
+
+
+@dataclass(frozen=True)
+class FolderSettings:
+    """What every loader of a folder with posed images is told; a loader derives a class with its own settings beside
+    these.
+
+    Attributes:
+        path: the data set's folder, ``~`` allowed.
+        background: "auto" (white for data with alpha, else black), "white", "black", or "random" (training composites
+        random colours,
+            evaluation white).
+        downsample: whole factor, area filter on premultiplied values.
+        preload: decode all images at once, so that damaged files are found before training.
+        strict: refuse a damaged view; otherwise it is left out with a warning.
+    """
+
+    path: Annotated[Path, text("the data set's folder")]
+    background: Background = "auto"
+    downsample: Annotated[int, Range(at_least=1)] = 1
+    preload: bool = True
+    strict: bool = False
+
+    def __post_init__(self) -> None:
+        verify(self, "scene")
+
+
+def data_folder(path: str | Path) -> Path:
+    """The existing folder of the ``path`` setting, ``~`` expanded.
+
+    Raises:
+        DataError: there is no such folder.
+    """
+    try:
+        folder = Path(path).expanduser()
+        usable = folder.is_dir()
+    except (OSError, RuntimeError) as error:  # a name that is too long, a home folder that nobody has
+        raise DataError(f"{path}: {error}; expected the data set's folder (scene.path)") from None
+    if not usable:
+        found = "is a file" if folder.exists() else "does not exist"
+        raise DataError(f"{folder}: {found}; expected the data set's folder (scene.path)")
+    return folder
+
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+class BadViews:
+    """The bad views of a data set: images that cannot be read, poses that are none, masks that leave nothing.
+
+    One bad view is left out; keys that contradict each other are none of this, and are refused.
+
+    Args:
+        where: what messages name where most views are bad.
+        strict: refuse the first bad view.
+    """
+
+    def __init__(self, where: str, strict: bool) -> None:
+        self._where, self._strict = where, strict
+        self._faults: list[str] = []
+
+    def read(self, name: str, function: Callable[_P, _T], *args: _P.args, **more: _P.kwargs) -> _T | None:
+        """What ``function`` returns; None for a view that it refuses."""
+        try:
+            return function(*args, **more)
+        except DataError as error:
+            self.add(name, error)
+            return None
+
+    def add(self, name: str, error: DataError) -> None:
+        """Note a bad view, or raise where none may be left out."""
+        if self._strict:
+            raise error
+        self._faults.append(f"{error}; view {name} is left out (scene.strict=true refuses it)")
+        if len(self._faults) == 1:
+            self._first = error
+
+    def settle(self, count: int) -> None:
+        """Name the bad ones of ``count`` views.
+
+        Raises:
+            DataError: most views are bad.
+        """
+        bad = len(self._faults)
+        if 2 * bad > count:
+            raise (
+                self._first
+                if count == 1
+                else DataError(f"{self._first}; {bad} of {count} views of {self._where} are like this")
+            )
+        for fault in self._faults[:_LISTED]:
+            warn_once(fault)
+        if bad > _LISTED:
+            warn_once(f"{self._where}: {bad - _LISTED} more views are left out")
+
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".PNG", ".JPG", ".JPEG", ".WEBP", ".EXR")
 _LISTED = 10
@@ -140,7 +252,7 @@ def posed_images(
     places: Sequence[str] = (),
     home: Path | None = None,
 ) -> Dataset:
-    """The data set of two splits, whose view sets are :class:`~neuprim.core.data.views.ImageViews`.
+    """The data set of two splits, whose view sets are :class:`~neuprim.core.data.image_views.ImageViews`.
 
     Args:
         where: file or folder that errors name.

@@ -1,10 +1,10 @@
-"""Textures as surfaces show them: decoded to linear light, filtered bilinearly, from a smaller copy where a pixel
-covers many texels."""
+"""What surfaces look like: triangles with colours, opacity and texture coordinates, and filtered textures."""
 
 from __future__ import annotations
 
 import io
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,122 @@ from PIL import Image
 from neuprim.core.errors import DataError
 from neuprim.core.io.exr import MAX_PIXELS
 from neuprim.core.io.images import srgb_to_linear
-from neuprim.tasks.static.mesh.files import MAX_TEXELS
+from neuprim.core.notices import warn_once
+from neuprim.scenes.shapes import srgb
+from neuprim.tasks.static.mesh.model import (
+    MAX_FACES,
+    MAX_PARTS,
+    MAX_TEXELS,
+    MAX_VERTICES,
+    Faces,
+    Material,
+    Model,
+    check_limits,
+)
 
-__all__ = ["Texture", "decode"]
+__all__ = ["GREY", "SurfacePart", "Texture", "decode_texture", "read_surfaces"]
+
+GREY = srgb("#b4b4b4")
+"""Of what the file says no colour of."""
+
+_FARTHEST_UV = 1e6
+"""Of texture coordinates: single precision has no fraction left there. What is beyond, or no number, is taken for 0."""
+
+
+@dataclass(frozen=True)
+class SurfacePart:
+    """One piece of the surface.
+
+    Attributes:
+        corners: (F, 3, 3) float64 positions in the file's units and axes, all finite.
+        normals: (F, 3, 3) normals of the file; None where it has none.
+        colour: (F, 3, 3) float32 linear RGB.
+        uv: (F, 3, 2) float32, v upward; None without a texture.
+        material: whose texture it is.
+        bare: whether the file says nothing of its colour.
+        alpha: (F, 3) float32 0..1; None: opaque.
+        glow: the light that it emits, ``colour``, ``uv`` and ``material`` in a part of its own; None: none.
+    """
+
+    corners: NDArray[np.float64]
+    normals: NDArray[np.float64] | None
+    colour: NDArray[np.float32]
+    uv: NDArray[np.float32] | None
+    material: Material
+    bare: bool
+    alpha: NDArray[np.float32] | None = None
+    glow: SurfacePart | None = None
+
+
+def read_surfaces(model: Model) -> list[SurfacePart]:
+    """Parse the geometry of a model and resolve its colours.
+
+    Raises:
+        DataError: damaged geometry, no triangles, or more than the limits allow.
+    """
+    faces, vertices = model.read_faces()
+    count = sum(len(part.corners) for part in faces)
+    if not count:
+        found = f"{vertices} points and no faces" if vertices else "no faces"
+        raise DataError(f"{model.path}: has {found}; expected a mesh with triangles")
+    parts = (len(faces), MAX_PARTS)
+    check_limits(model.path, {"faces": (count, MAX_FACES), "vertices": (vertices, MAX_VERTICES), "parts": parts})
+    surfaces = [_make_surface(model, part) for part in faces]
+    bare = sum(len(part.colour) for part in surfaces if part.bare)
+    if bare:
+        warn_once(f"{model.path}: {bare} of {count} faces have no colour; drawn grey")
+    return surfaces
+
+
+def _make_surface(model: Model, faces: Faces) -> SurfacePart:
+    material = model.materials.get(faces.material, model.materials.get("", Material()))
+    uv = _coordinates(model, faces.uv, material, len(faces.corners))
+    shape, own = faces.corners.shape, faces.colour
+    bare = own is None and material.colour is None
+    colour = np.broadcast_to(GREY if bare else np.array(material.colour or (1.0, 1.0, 1.0), np.float32), shape)
+    alpha = np.full(shape[:2], material.opacity, np.float32) if material.opacity < 1 else None
+    if own is not None:
+        rgb = np.clip(np.nan_to_num(own[..., :3]), 0, 1)
+        # exporters of formats other than glTF write some colour of a material beside those of the vertices
+        colour = rgb * colour if model.linear else srgb_to_linear(torch.from_numpy(rgb)).numpy()
+        if own.shape[2] == 4:
+            alpha = (np.float32(material.opacity) * np.clip(np.nan_to_num(own[..., 3]), 0, 1)).astype(np.float32)
+    glow = None
+    if material.unlit:
+        glow, colour = SurfacePart(faces.corners, None, colour, uv, material, False), np.zeros(shape, np.float32)
+    elif material.glow is not None:
+        light = np.broadcast_to(np.array(material.glow.colour or (0.0, 0.0, 0.0), np.float32), shape)
+        places = _coordinates(model, faces.glow_uv, material.glow, len(faces.corners))
+        glow = SurfacePart(faces.corners, None, light, places, material.glow, False)
+    return SurfacePart(faces.corners, faces.normals, colour, uv, material, bare, alpha, glow)
+
+
+def _coordinates(
+    model: Model, uv: NDArray[np.floating] | None, material: Material, faces: int
+) -> NDArray[np.float32] | None:
+    """(F, 3, 2) places of the corners in the material's texture; None without one."""
+    if material.texture is None:
+        return None
+    if uv is None:
+        warn_once(
+            f"{model.path}: texture {material.texture[:80]!r} has no coordinates on a part of {faces} faces; drawn without it"
+        )
+        return None
+    with np.errstate(all="ignore"):
+        moved = _moved(np.asarray(uv, np.float32), material)
+    return np.where(np.abs(moved) < _FARTHEST_UV, moved, np.float32(0))
+
+
+def _moved(uv: NDArray[np.float32], material: Material) -> NDArray[np.float32]:
+    """Texture coordinates after the material's transform, which is written for a v that runs down."""
+    if material.transform is None:
+        return uv
+    matrix = np.array(material.transform, np.float32)
+    down = np.stack([uv[..., 0], 1 - uv[..., 1]], axis=-1) @ matrix[:, :2].T + matrix[:, 2]
+    return np.stack([down[..., 0], 1 - down[..., 1]], axis=-1)
+
+
+# ---------------------------------------------------------------- textures
 
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")
 """What Pillow may decode: it knows formats that run other programs."""
@@ -103,13 +216,12 @@ def _halved(image: NDArray) -> NDArray[np.float16]:
     return half
 
 
-def decode(path: Path, name: str, data: bytes, left: int = MAX_TEXELS) -> NDArray[np.uint8]:
-    """(H, W, 4) sRGB with straight alpha, of the encoded bytes of an image.
+def decode_texture(path: Path, name: str, data: bytes, left: int = MAX_TEXELS) -> NDArray[np.uint8]:
+    """Decode an image to (H, W, 4) uint8, sRGB with straight alpha.
 
     Args:
-        path: of the model, for messages.
-        name: of the image.
-        left: how many pixels it may have, of those of all textures.
+        path, name: model and image, for messages.
+        left: pixels that the limit for all textures leaves.
 
     Raises:
         DataError: damaged, of another format, or too large.

@@ -1,0 +1,110 @@
+"""Place and size of the scene that cameras see: extent, focus, and an origin near the cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.cameras.world import World
+from neuprim.core.notices import warn_once
+
+__all__ = ["FAR", "axes_meet", "camera_extent", "focus_point", "outlying", "world_around"]
+
+
+def camera_extent(cameras: Sequence[Camera]) -> float:
+    """Radius of the bounding sphere of the cameras about their mean x 1.1 (the convention of 3D Gaussian splatting);
+    1.0 if zero.
+
+    Cameras that are :func:`outlying` do not count.
+    """
+    positions = torch.stack([c.position.detach().double() for c in cameras])
+    positions = positions[~outlying(positions)]
+    radius = (positions - positions.mean(0)).norm(dim=-1).max().item() * 1.1
+    return radius if radius > 0 else 1.0
+
+
+_OUTLYING = 100.0
+_OUTLYING_SHARE = 0.05
+
+
+def outlying(positions: Tensor) -> Tensor:
+    """(N,) bool of the (N, 3) camera centres that say nothing about place and scale of a scene.
+
+    Rule: a few cameras (one, or 5 %) farther from the median centre than 100 times the median distance are mistakes of
+    a reconstruction.
+    """
+    distance = (positions - positions.median(0).values).norm(dim=-1)
+    far = (distance > _OUTLYING * distance.median()) & (distance.median() > 0)
+    return far if int(far.sum()) <= max(1, _OUTLYING_SHARE * len(far)) else torch.zeros_like(far)
+
+
+def focus_point(cameras: Sequence[Camera]) -> Tensor:
+    """(3,) float64 point nearest to all optical axes in the least-squares sense, scene units.
+
+    A weak pull towards one extent in front of the mean camera decides what (nearly) parallel axes leave open.
+    """
+    positions, forward = _axes(cameras)
+    eye = torch.eye(3, dtype=torch.float64)
+    planes = eye - forward[:, :, None] * forward[:, None, :]
+    pull = 1e-4 * len(positions)
+    target = positions.mean(0) + forward.mean(0) * camera_extent(cameras)
+    right = (planes @ positions[:, :, None]).sum(0)[:, 0] + pull * target
+    return torch.linalg.solve(planes.sum(0) + pull * eye, right)
+
+
+def axes_meet(cameras: Sequence[Camera]) -> bool:
+    """Whether the optical axes determine a point in front of the cameras.
+
+    They do if they pass it closer than half the spread of the camera centres, and nine cameras of ten look towards it.
+    Parallel axes, cameras that look outward from their centre, and cameras that share one centre do not.
+    """
+    positions, forward = _axes(cameras)
+    offsets = focus_point(cameras) - positions
+    depths = (offsets * forward).sum(-1)
+    miss = (offsets - depths[:, None] * forward).square().sum(-1).mean()
+    spread = (positions - positions.mean(0)).square().sum(-1).mean()
+    turned = 1.0 - torch.linalg.eigvalsh(forward.T @ forward / len(forward))[-1]  # 0 where all axes are parallel
+    return bool((miss < 0.25 * spread) & (turned > 1e-3) & ((depths > 0).double().mean() >= 0.9))
+
+
+def _axes(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
+    """(N, 3) centres and (N, 3) viewing directions, float64, of the cameras that count for a scene's place."""
+    positions = torch.stack([c.position.detach().double() for c in cameras])
+    forward = torch.stack([c.viewmat[2, :3].detach().double() for c in cameras])
+    usual = ~outlying(positions)
+    return positions[usual], forward[usual]
+
+
+FAR = 100.0
+"""Distance of the cameras from the origin, in extents of theirs, from which a scene is moved: float32 holds five digits
+of it there."""
+
+
+def world_around(cameras: Sequence[Camera], where: str = "cameras") -> World:
+    """Where the scene that cameras see lies in the world of their file.
+
+    Rule: where the mean of the camera centres is farther than :data:`FAR` extents from the origin, that mean, rounded
+    to the power of ten from one to ten extents, becomes the scene's origin; all other scenes keep the coordinates of
+    their files, bit for bit. ``where`` names the file in warnings.
+    """
+    views = [c.viewmat.detach().double() for c in cameras]
+    # solved, not transposed: far from the origin a transpose turns the rounding of a file's rotations into metres
+    centers = torch.stack([-torch.linalg.solve(v[:3, :3], v[:3, 3]) for v in views])
+    far = outlying(centers)
+    if far.any():
+        row = int(far.nonzero()[0])
+        place = ", ".join(f"{x + 0.0:.6g}" for x in centers[row].tolist())
+        warn_once(
+            f"{where}: {int(far.sum())} of {len(views)} cameras lie far from all others, the first at {place}; they do not count for the scene's size"
+        )
+    center = centers[~far].mean(0)
+    there = World.at(center.tolist())
+    extent = camera_extent([there.scene_camera(c) for c in cameras])
+    if float(center.norm()) <= FAR * extent:
+        return World()
+    digits = -math.ceil(math.log10(extent))
+    return World.at([round(x, digits) + 0.0 for x in center.tolist()])

@@ -239,10 +239,10 @@ class _Reader:
             positions = primitive.positions @ matrix[:3, :3].T + matrix[:3, 3]
             normals = None if primitive.normals is None else primitive.normals @ np.linalg.pinv(matrix[:3, :3])
         check_vertices(self.path, positions, faces)
-        normals, colour, uv, glow_uv = (
-            None if values is None else values[faces]
-            for values in (normals, primitive.colour, primitive.uv, primitive.glow_uv)
+        colour, uv, glow_uv = (
+            None if values is None else values[faces] for values in (primitive.colour, primitive.uv, primitive.glow_uv)
         )
+        normals = None if normals is None else normals[faces]
         return Faces(positions[faces], primitive.material, normals, colour, uv, glow_uv)
 
     # ------------------------------------------------------------ places

@@ -2,15 +2,12 @@
 
 from typing import TYPE_CHECKING, Any
 
-from neuprim.moved import install as _install
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
     from neuprim.functional import rasterize as rasterize
 
 __all__ = ["__version__", "rasterize"]
-
-_install()
 
 
 def __getattr__(name: str) -> Any:

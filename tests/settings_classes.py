@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import neuprim
-from neuprim.core.checked import Range, Unbounded, hints_of
+from neuprim.core.validation import Range, Unbounded, field_types
 
 REQUIRED: dict[str, Any] = {
     "path": Path("folder"),
@@ -47,7 +47,7 @@ def _verifies(cls: type) -> bool:
 
 def required(cls: type) -> dict[str, Any]:
     """The fewest values that make one."""
-    return {name: REQUIRED[name] for name in hints_of(cls) if name in REQUIRED}
+    return {name: REQUIRED[name] for name in field_types(cls) if name in REQUIRED}
 
 
 def leaves(hint: Any) -> Iterator[tuple[Any, tuple[Any, ...]]]:

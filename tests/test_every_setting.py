@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from neuprim.core.checked import checked, hints_of, joined
 from neuprim.core.errors import ConfigError
+from neuprim.core.validation import field_types, join_key, validate
 from tests.settings_classes import bad_values, required, settings_classes, unbounded_numbers
 
 CLASSES = settings_classes()
-FIELDS = [(cls, name) for cls in CLASSES for name in hints_of(cls)]
+FIELDS = [(cls, name) for cls in CLASSES for name in field_types(cls)]
 
 GROUPS = {
     "RunSettings": "",
@@ -41,7 +41,7 @@ def named(value: object) -> str:
 
 def refusal(cls: type, values: dict[str, Any]) -> str:
     with pytest.raises(ConfigError) as caught:
-        checked(cls, values, group(cls))
+        validate(cls, values, group(cls))
     return str(caught.value)
 
 
@@ -61,31 +61,31 @@ def test_they_are_found() -> None:
 
 @pytest.mark.parametrize("cls", CLASSES, ids=named)
 def test_defaults_are_what_they_accept(cls: type) -> None:
-    made = checked(cls, required(cls), group(cls))
-    assert checked(cls, {f.name: getattr(made, f.name) for f in dataclasses.fields(cls)}, group(cls)) == made
+    made = validate(cls, required(cls), group(cls))
+    assert validate(cls, {f.name: getattr(made, f.name) for f in dataclasses.fields(cls)}, group(cls)) == made
 
 
 @pytest.mark.parametrize(("cls", "field"), FIELDS, ids=named)
 def test_a_number_has_bounds_or_says_why_not(cls: type, field: str) -> None:
-    assert unbounded_numbers(hints_of(cls)[field]) == []
+    assert unbounded_numbers(field_types(cls)[field]) == []
 
 
 @pytest.mark.parametrize(("cls", "field"), FIELDS, ids=named)
 def test_what_a_field_does_not_take_is_refused_in_one_line_with_its_key(cls: type, field: str) -> None:
-    values = bad_values(hints_of(cls)[field])
-    key = joined(group(cls), field)
+    values = bad_values(field_types(cls)[field])
+    key = join_key(group(cls), field)
     for value in values:
         text = refusal(cls, {**required(cls), field: value})
         assert text.startswith(key) and "\n" not in text, (value, text)
         assert "expected " in text or "no such setting" in text, (value, text)
-    assert values or "Any" in str(hints_of(cls)[field])
+    assert values or "Any" in str(field_types(cls)[field])
 
 
 @pytest.mark.parametrize(("cls", "field"), FIELDS, ids=named)
 def test_python_code_is_told_the_same(cls: type, field: str) -> None:
     """The dataclass itself, and ``dataclasses.replace``, refuse what users may not type."""
     made = cls(**required(cls))
-    for value in bad_values(hints_of(cls)[field]):
+    for value in bad_values(field_types(cls)[field]):
         for make in (
             lambda v=value: cls(**{**required(cls), field: v}),
             lambda v=value: dataclasses.replace(made, **{field: v}),
@@ -99,5 +99,5 @@ def test_python_code_is_told_the_same(cls: type, field: str) -> None:
 def test_a_name_that_is_nearly_a_field_is_told_the_field(cls: type, field: str) -> None:
     wrong = f"{field}s"
     text = refusal(cls, {**required(cls), wrong: 1})
-    assert text.startswith(f"{joined(group(cls), wrong)}: no such setting; did you mean ") and "\n" not in text
-    assert repr(joined(group(cls), field)) in text
+    assert text.startswith(f"{join_key(group(cls), wrong)}: no such setting; did you mean ") and "\n" not in text
+    assert repr(join_key(group(cls), field)) in text

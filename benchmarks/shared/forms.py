@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 from neuprim.config import compose, task_of
-from neuprim.core.uses import build_settings
+from neuprim.core.used_settings import build_settings
 from neuprim.runs.open import load_dataset
 
 __all__ = ["AS_RECORDED", "PAPER", "SCENES", "Form", "Scene", "parameters"]

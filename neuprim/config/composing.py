@@ -33,10 +33,10 @@ from neuprim.config.resuming import (
 )
 from neuprim.config.schema import REQUIRED, defaults, is_free, like, setting_names
 from neuprim.config.trust import check_stored, refuse_links
-from neuprim.core.checked import checked, shown
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
-from neuprim.core.uses import build_settings
+from neuprim.core.used_settings import build_settings
+from neuprim.core.validation import format_value, validate
 from neuprim.plugins.blame import blamed
 from neuprim.plugins.provenance import MadeBy, Maker
 from neuprim.plugins.registry import LOSSES, TASKS, UnknownPlugin, find_scene, load_loss
@@ -383,7 +383,7 @@ def _plain(node: Any, resolve: bool = True, place: str = "configuration") -> dic
 
 
 def _settings(full: Mapping[str, Any]) -> RunSettings:
-    return checked(RunSettings, {k: v for k, v in full.items() if k not in ("scene", "task")})
+    return validate(RunSettings, {k: v for k, v in full.items() if k not in ("scene", "task")})
 
 
 def _check_key(assignment: Assignment, base: Mapping[str, Any], scene_name: str) -> None:
@@ -428,7 +428,7 @@ def _scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths: Sequence
         where = f"scene.{key}"
         if key in paths and value is not None and value != REQUIRED:
             if not isinstance(value, (str, int)) or isinstance(value, bool) or not str(value).strip():
-                raise ConfigError(f"{where}={shown(value)}: expected a path (quote it: {where}='...')")
+                raise ConfigError(f"{where}={format_value(value)}: expected a path (quote it: {where}='...')")
             value = str(value) if "://" in str(value) else str(Path(str(value)).expanduser().absolute())
         if declared[key] == REQUIRED and (value is None or value == REQUIRED):
             expected = f"expected a directory or file, as {where}=PATH" if key in paths else f"expected {where}=VALUE"

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 from neuprim.config.overrides import Assignment
 from neuprim.config.record import RunSettings
 from neuprim.config.schema import setting_names
-from neuprim.core.checked import Option, converted, option_type, refuse_unknown, shown
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.model.geometry import GEOMETRY_SPECS
-from neuprim.core.uses import OPTIONAL
+from neuprim.core.used_settings import OPTIONAL
+from neuprim.core.validation import Option, coerce, format_value, option_type, refuse_unknown
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension
@@ -52,12 +52,12 @@ def complete_options(declared: Options, given: Any, owner: str, where: str = "ta
         ConfigError: no such option, or a value that it does not take.
     """
     if not isinstance(given, Mapping):
-        raise ConfigError(f"{where}={shown(given)}: expected entries, each as {where}.KEY=VALUE")
+        raise ConfigError(f"{where}={format_value(given)}: expected entries, each as {where}.KEY=VALUE")
     for key in given:
         if key not in declared:
             raise ConfigError(f"{where}.{key}: {owner} has no such option{_hint(str(key), declared)}")
     return {
-        key: converted(given.get(key, option[0]), option_type(option), f"{where}.{key}")
+        key: coerce(given.get(key, option[0]), option_type(option), f"{where}.{key}")
         for key, option in declared.items()
     }
 

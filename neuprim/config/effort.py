@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 from neuprim.config.groups import package_root, read_yaml
 from neuprim.config.overrides import Assignment, word
-from neuprim.core.checked import shown
 from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.validation import format_value
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
@@ -86,9 +86,9 @@ def levels_of(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, Level] | N
             raise ConfigError(f"{who}: {key!s}: no such setting{nearest(str(key), _KNOWN)}")
     preset, levels = node.get("preset"), node.get("levels")
     if not isinstance(preset, str) or preset not in presets:
-        raise ConfigError(f"{who}: preset={shown(preset)}: no such preset{nearest(str(preset), presets)}")
+        raise ConfigError(f"{who}: preset={format_value(preset)}: no such preset{nearest(str(preset), presets)}")
     if not isinstance(levels, Mapping) or list(levels) != list(LEVELS):
-        found = shown(list(levels)) if isinstance(levels, Mapping) else shown(levels)
+        found = format_value(list(levels)) if isinstance(levels, Mapping) else format_value(levels)
         raise ConfigError(f"{who}: levels: found {found}; expected {LEVELS[0]} to {LEVELS[-1]}, in this order")
     return {number: Level(preset, _settings(given, f"{who}: levels.{number}")) for number, given in levels.items()}
 
@@ -96,6 +96,6 @@ def levels_of(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, Level] | N
 def _settings(given: Any, who: str) -> tuple[Assignment, ...]:
     if not isinstance(given, Mapping) or not all(isinstance(key, str) and key.startswith(_GROUPS) for key in given):
         raise ConfigError(
-            f"{who}: found {shown(given)}; expected settings of model, train and renderer by their dotted keys"
+            f"{who}: found {format_value(given)}; expected settings of model, train and renderer by their dotted keys"
         )
     return tuple(Assignment(key, value, word(key, value)) for key, value in given.items())

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, get_args
 
 from neuprim.config.overrides import key_of, parse, swept_keys
-from neuprim.core.checked import Range, checked, verify
 from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.validation import Range, validate, validate_fields
 
 __all__ = ["LAUNCHERS", "LauncherSettings", "launcher_words"]
 
@@ -46,7 +46,7 @@ class LauncherSettings:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        verify(self, "launcher")
+        validate_fields(self, "launcher")
 
     def given(self) -> dict[str, Any]:
         """Name -> value of what differs from the defaults; JSON-able."""
@@ -81,7 +81,7 @@ def launcher_words(words: Sequence[str]) -> tuple[LauncherSettings, list[str]]:
             raise ConfigError(f"{said.text}: no such setting{nearest(said.key, [f'launcher.{n}' for n in _NAMES])}")
         else:
             given[name] = said.value
-    settings = checked(LauncherSettings, {**given, "options": options}, "launcher")
+    settings = validate(LauncherSettings, {**given, "options": options}, "launcher")
     _check(settings)
     return settings, [word for word in words if not _is_own(word)]
 

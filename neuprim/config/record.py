@@ -10,14 +10,14 @@ from typing import Annotated, Any
 
 import yaml
 
-from neuprim.core.checked import Range, checked, refuse_unknown, verify
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.io.plain import load_yaml
 from neuprim.core.render import backends
 from neuprim.core.settings import MetricsSettings, RenderSettings
 from neuprim.core.train import population
 from neuprim.core.train.settings import ModelSettings, TrainSettings
-from neuprim.core.uses import OPTIONAL
+from neuprim.core.used_settings import OPTIONAL
+from neuprim.core.validation import Range, refuse_unknown, validate, validate_fields
 from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy
 
@@ -40,7 +40,7 @@ class RunSettings:
     resume: bool = False
 
     def __post_init__(self) -> None:
-        verify(self, "")
+        validate_fields(self, "")
         backends.check_name(self.renderer.backend)
         backends.check_pair(self.renderer)
         population.check_name(self.train.population.strategy)
@@ -145,7 +145,9 @@ class RunConfig:
         ]
         refuse_unknown(data, known, "")
         task, scene = _node(data, "task"), _node(data, "scene")
-        common = checked(RunSettings, {f.name: data[f.name] for f in dataclasses.fields(RunSettings) if f.name in data})
+        common = validate(
+            RunSettings, {f.name: data[f.name] for f in dataclasses.fields(RunSettings) if f.name in data}
+        )
         if common.output_dir is None:
             raise ConfigError("output_dir: missing; expected a directory")
         overrides, non_default = data.get("overrides", []), data.get("non_default", {})

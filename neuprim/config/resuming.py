@@ -14,10 +14,10 @@ from neuprim.config.groups import task_choices
 from neuprim.config.outputs import DEFAULT_TASK, ROOT, output_directory, run_name
 from neuprim.config.overrides import NOT_SWEPT, Assignment, key_of, without_place
 from neuprim.config.record import RunConfig
-from neuprim.core.checked import shown
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.notices import warn_once
 from neuprim.core.train.distributed.place import place_of
+from neuprim.core.validation import format_value
 from neuprim.plugins.mechanism import Group, UnknownPlugin
 from neuprim.plugins.names import qualified, split
 from neuprim.plugins.provenance import Maker, missing
@@ -187,7 +187,7 @@ _SEARCH, _SWEEP = "target.json", "sweep.json"
 
 def _contradiction(begun: RunConfig, key: str, typed: Any, was: Any) -> ConfigError:
     return ConfigError(
-        f"{key}={shown(typed)}: the run to resume was begun with {key}={shown(was)} ({begun.source}); expected that, no {key}, or another output_dir"
+        f"{key}={format_value(typed)}: the run to resume was begun with {key}={format_value(was)} ({begun.source}); expected that, no {key}, or another output_dir"
     )
 
 
@@ -207,7 +207,7 @@ def _directory(asked: Any, chosen: Mapping[str, str | None]) -> Path:
             return Path(str(OmegaConf.to_container(OmegaConf.create({"at": asked}), resolve=True)["at"])).expanduser()  # type: ignore[index, call-overload]
         except OmegaConfBaseException as error:
             raise ConfigError(
-                f"output_dir={shown(asked)}: {' '.join(str(error).split())}; expected a directory, to resume its run"
+                f"output_dir={format_value(asked)}: {' '.join(str(error).split())}; expected a directory, to resume its run"
             ) from error
     task = chosen["task"] or DEFAULT_TASK
     scene = chosen["scene"] or task_choices(TASKS.loaded(task)[1]).scene

@@ -1,5 +1,5 @@
 """What the settings dataclasses say about names and defaults, for composing; their values are checked by
-``neuprim.core.checked``."""
+``neuprim.core.validation``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any, get_origin
 
-from neuprim.core.checked import converted, hints_of, joined, kind_of
+from neuprim.core.validation import coerce, field_types, infer_type, join_key
 
 __all__ = ["REQUIRED", "defaults", "is_free", "like", "setting_names"]
 
@@ -17,7 +17,7 @@ REQUIRED = "???"
 
 def like(value: Any, default: Any, where: str) -> Any:
     """``value`` as the type of a scene's ``default``; a null or required default accepts anything."""
-    return value if default == REQUIRED else converted(value, kind_of(default), where)
+    return value if default == REQUIRED else coerce(value, infer_type(default), where)
 
 
 def defaults(cls: type) -> dict[str, Any]:
@@ -27,8 +27,8 @@ def defaults(cls: type) -> dict[str, Any]:
 
 def setting_names(cls: type, where: str = "") -> Iterator[str]:
     """Dotted names of all settings of a dataclass, nested ones included; free dictionaries by their own name."""
-    for own, hint in hints_of(cls).items():
-        name = joined(where, own)
+    for own, hint in field_types(cls).items():
+        name = join_key(where, own)
         if dataclasses.is_dataclass(hint) and isinstance(hint, type):
             yield from setting_names(hint, name)
         else:
@@ -43,7 +43,7 @@ def is_free(cls: type, path: list[str]) -> bool:
             return True
         if not (dataclasses.is_dataclass(hint) and isinstance(hint, type)):
             return False
-        hints = hints_of(hint)
+        hints = field_types(hint)
         if part not in hints:
             return False
         hint = hints[part]

@@ -13,8 +13,8 @@ from typing import Annotated, Any
 
 from neuprim.config.duration import seconds_of
 from neuprim.config.overrides import Assignment, key_of, parse, swept_keys
-from neuprim.core.checked import Range, checked, shown
 from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.validation import Range, format_value, validate
 
 __all__ = ["Target", "target_words"]
 
@@ -71,7 +71,7 @@ def target_words(words: Sequence[str]) -> tuple[tuple[Target, float] | None, lis
             f"{budget.text}: no target; expected one of {_choices()} beside it, or train.max_seconds=S for a run without a target"
         )
     given = {_name(a): a.value for a in said.values()}
-    target = checked(Target, given, "target")
+    target = validate(Target, given, "target")
     if not target.given():
         raise ConfigError(f"{next(iter(said.values())).text}: expected one of {_choices()}")
     if budget is None:
@@ -79,7 +79,7 @@ def target_words(words: Sequence[str]) -> tuple[tuple[Target, float] | None, lis
             f"{target}: expected a budget beside it, the time for search and training together, such as budget=10m"
         )
     if not isinstance(budget.value, str):
-        raise ConfigError(f"budget={shown(budget.value)}: expected a time such as 90s, 5m or 1h")
+        raise ConfigError(f"budget={format_value(budget.value)}: expected a time such as 90s, 5m or 1h")
     return (target, seconds_of(budget.value, budget.text)), [word for word in words if not _is_own(word)]
 
 

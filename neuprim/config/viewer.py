@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from neuprim.config.overrides import key_of, parse, swept_keys
-from neuprim.core.checked import Range, checked, converted, text, verify
 from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.validation import Range, coerce, nonempty_text, validate, validate_fields
 
 __all__ = ["LOOPBACK", "ViewerSettings", "viewer_words"]
 
@@ -29,11 +29,11 @@ class ViewerSettings:
         port: 0 for any that is free.
     """
 
-    host: Annotated[str, text("an address of this machine")] = LOOPBACK
+    host: Annotated[str, nonempty_text("an address of this machine")] = LOOPBACK
     port: Annotated[int, Range(0, 65535, says="a port, 1 to 65535, or 0 for any")] = 8080
 
     def __post_init__(self) -> None:
-        verify(self, "viewer")
+        validate_fields(self, "viewer")
 
 
 def viewer_words(words: Sequence[str]) -> tuple[ViewerSettings | None, list[str]]:
@@ -49,13 +49,13 @@ def viewer_words(words: Sequence[str]) -> tuple[ViewerSettings | None, list[str]
     for assignment in parse(own):
         head, dot, name = assignment.key.partition(".")
         if not dot:
-            wanted = converted(assignment.value, bool, "viewer")
+            wanted = coerce(assignment.value, bool, "viewer")
         else:
             names = [field.name for field in dataclasses.fields(ViewerSettings)]
             if name not in names:
                 raise ConfigError(f"{assignment.key}: no such setting{nearest(name, names, prefix=f'{head}.')}")
             given[name] = assignment.value
-    settings = checked(ViewerSettings, given, "viewer")
+    settings = validate(ViewerSettings, given, "viewer")
     return (settings if wanted else None), [word for word in words if not _is_own(word)]
 
 

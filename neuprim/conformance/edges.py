@@ -16,7 +16,7 @@ from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
-from neuprim.core.uses import build_settings
+from neuprim.core.used_settings import build_settings
 
 __all__ = ["check_clear_errors", "check_conditions", "check_extremes", "check_missing_conditions"]
 
@@ -187,4 +187,4 @@ def check_clear_errors(t: Subject) -> None:
             t.require("no_such_setting" in text, where, repr(text), "a message that names the setting")
             t.require("\n" not in text, where, repr(text), "a message of one line")
             continue
-        t.require(False, where, "it was taken", "ConfigError (neuprim.core.checked.choose does it)")
+        t.require(False, where, "it was taken", "ConfigError (neuprim.core.validation.choose does it)")

@@ -13,13 +13,13 @@ from neuprim.config import check_groups, preset_settings, presets, task_choices
 from neuprim.config.declared import complete_options
 from neuprim.config.effort import Level, levels_of
 from neuprim.conformance.subject import Subject
-from neuprim.core.checked import checked
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.task import API_VERSION
 from neuprim.core.train.settings import ModelSettings
-from neuprim.core.uses import build_settings
+from neuprim.core.used_settings import build_settings
+from neuprim.core.validation import validate
 from neuprim.plugins.members import fault
 from neuprim.plugins.trading import traded
 
@@ -81,7 +81,7 @@ def check_trade(t: Subject) -> None:
             node[last] = value
             try:
                 options = complete_options(t.task.options, tree["task"]["options"], f"task {t.task.name!r}")
-                t.task.check(build_settings(t.task, checked(ModelSettings, tree["model"], "model"), options))
+                t.task.check(build_settings(t.task, validate(ModelSettings, tree["model"], "model"), options))
             except ConfigError as error:
                 t.require(
                     False,

@@ -26,7 +26,7 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.train.initial import initial_model
 from neuprim.core.train.settings import PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
-from neuprim.core.uses import build_settings, loss_settings
+from neuprim.core.used_settings import build_settings, loss_settings
 
 __all__ = ["EXACT", "PRIMITIVES", "ConformanceError", "Frozen", "Subject", "watched"]
 

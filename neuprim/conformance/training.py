@@ -21,7 +21,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.task import Supervision
 from neuprim.core.train.trainer import Trainer
-from neuprim.core.uses import loss_settings
+from neuprim.core.used_settings import loss_settings
 from neuprim.plugins.judging import TaskFault, clips_of, diagnosed, facts_of, judged, mask_of, orbit_of
 
 __all__ = [

@@ -18,12 +18,12 @@ from torch import Tensor
 
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels, stored_channels
-from neuprim.core.checked import Option, Range, converted
 from neuprim.core.conditions import export_frames
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
 from neuprim.core.task import Loss, SceneSpec, TaskSpec
+from neuprim.core.validation import Option, Range, coerce
 from neuprim.core.volumes.source import VolumeSource
 
 __all__ = [
@@ -115,21 +115,21 @@ class ExportJob:
         Raises:
             ConfigError: it is something else.
         """
-        value: float | None = converted(self.options[name], Annotated[float, Range(low, high)] | None, name)
+        value: float | None = coerce(self.options[name], Annotated[float, Range(low, high)] | None, name)
         return value
 
     def count(self, name: str, low: int, high: int) -> int | None:
         """As :meth:`number`, a whole one."""
-        value: int | None = converted(self.options[name], Annotated[int, Range(low, high)] | None, name)
+        value: int | None = coerce(self.options[name], Annotated[int, Range(low, high)] | None, name)
         return value
 
     def choice(self, name: str, *offered: str) -> str:
         """An option that is one of those offered; raises as :meth:`number`."""
-        return str(converted(self.options[name], Literal[offered], name))
+        return str(coerce(self.options[name], Literal[offered], name))
 
     def flag(self, name: str) -> bool:
         """An option that is true or false; raises as :meth:`number`."""
-        return bool(converted(self.options[name], bool, name))
+        return bool(coerce(self.options[name], bool, name))
 
 
 @dataclass(frozen=True)
@@ -238,7 +238,7 @@ class LossExtension:
         options: name -> (default, one line of help), perhaps with a type, set as ``task.options.NAME`` while the loss
         is chosen; as
             :attr:`~neuprim.core.task.TaskSpec.options`.
-        uses: the settings of :data:`neuprim.core.uses.OPTIONAL` under ``train`` that ``make`` reads.
+        uses: the settings of :data:`neuprim.core.used_settings.OPTIONAL` under ``train`` that ``make`` reads.
     """
 
     api: int

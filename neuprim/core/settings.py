@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from neuprim.core.checked import Range, text, verify
 from neuprim.core.errors import ConfigError
+from neuprim.core.validation import Range, nonempty_text, validate_fields
 
 __all__ = ["DeviceChoice", "MetricsSettings", "RenderSettings", "SortOrder"]
 
@@ -49,7 +49,7 @@ class RenderSettings:
         threads: worker threads of the cpu backend, 0 for all cores; results are bit-identical for any count.
     """
 
-    backend: Annotated[str, text("auto or the name of a backend")] = "auto"
+    backend: Annotated[str, nonempty_text("auto or the name of a backend")] = "auto"
     device: DeviceChoice = "auto"
     sort: SortOrder = "center"
     samples: Annotated[int, Range(1, 16, says="a whole number of rays per pixel side, 1 to 16")] = 1
@@ -62,7 +62,7 @@ class RenderSettings:
     threads: Annotated[int, Range(at_least=0, says="0 (all cores) or a positive count")] = 0
 
     def __post_init__(self) -> None:
-        verify(self, "renderer")
+        validate_fields(self, "renderer")
 
     @property
     def near_plane(self) -> float:
@@ -86,7 +86,7 @@ class MetricsSettings:
             neuprim has no weights and downloads none.
     """
 
-    lpips: Annotated[str, text("a file or folder with the weights of LPIPS")] | None = None
+    lpips: Annotated[str, nonempty_text("a file or folder with the weights of LPIPS")] | None = None
 
     def __post_init__(self) -> None:
-        verify(self, "metrics")
+        validate_fields(self, "metrics")

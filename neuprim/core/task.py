@@ -8,13 +8,13 @@ from typing import Any
 
 from torch import Tensor
 
-from neuprim.core.checked import Option
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.dataset import GroundTruth, SceneContext
 from neuprim.core.environment import Environment, Illumination
 from neuprim.core.layers import LayerSpec
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField, Field
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.validation import Option
 from neuprim.core.volumes.source import VolumeSource
 
 __all__ = [
@@ -127,7 +127,7 @@ class TaskSpec:
         config_package: importable package holding its Hydra groups ``task/NAME.yaml``, ``scene/NAME/*.yaml`` and
             ``preset/NAME/*.yaml``.
         build: (model settings, dataset) -> the density and colour fields. Of the settings in
-        :data:`neuprim.core.uses.OPTIONAL` it
+        :data:`neuprim.core.used_settings.OPTIONAL` it
             gets those that ``uses`` lists, and the task's options as "options".
         loss: loss settings -> the training loss, which ``train.loss`` may replace. Gets ``train`` and "options", as
         ``build``. check: (what ``build`` gets) raises :class:`~neuprim.core.errors.ConfigError` for choices the task
@@ -136,8 +136,8 @@ class TaskSpec:
         options: name -> (default, one line of help) of the task's own settings, the only ones under ``task.options``;
         values are
             converted to the default's type, or to what stands third: ``Annotated[float, Range(0, 1)]``, ``("soft",
-            "hard")`` (:mod:`neuprim.core.checked`). ``task/NAME.yaml`` may say other defaults.
-        uses: the shared settings of :data:`neuprim.core.uses.OPTIONAL` that ``build`` (``model.…``) and ``loss``
+            "hard")`` (:mod:`neuprim.core.validation`). ``task/NAME.yaml`` may say other defaults.
+        uses: the shared settings of :data:`neuprim.core.used_settings.OPTIONAL` that ``build`` (``model.…``) and ``loss``
         (``train.…``) read.
             Others are refused when somebody sets them.
         environment: what an image of the light all around means to the task (``neuprim render --environment``); None

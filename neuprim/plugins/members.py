@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
-from neuprim.core.checked import converted, option_type
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension
 from neuprim.core.io.exr import channel_name_error
 from neuprim.core.layers import layer_fault
 from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.task import SceneSpec, TaskSpec
-from neuprim.core.uses import OPTIONAL
+from neuprim.core.used_settings import OPTIONAL
+from neuprim.core.validation import coerce, option_type
 
 __all__ = ["fault"]
 
@@ -160,7 +160,7 @@ def _declared(spec: TaskSpec | LossExtension, *groups: str) -> str | None:
                 f"options[{name!r}] has a default of type {type(entry[0]).__name__}; expected what a YAML file can hold"
             )
         try:
-            converted(entry[0], option_type(tuple(entry)), f"options[{name!r}]")
+            coerce(entry[0], option_type(tuple(entry)), f"options[{name!r}]")
         except ConfigError as error:
             return f"the default of {error}"
     known = [name for name in OPTIONAL if name.startswith(groups)]

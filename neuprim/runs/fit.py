@@ -24,7 +24,7 @@ from neuprim.core.train.distributed.refusals import refuse_parts
 from neuprim.core.train.initial import initial_model
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer
-from neuprim.core.uses import build_settings, loss_settings
+from neuprim.core.used_settings import build_settings, loss_settings
 from neuprim.plugins.blame import Suspects, blamed
 from neuprim.plugins.checked import check_fields, checked_loss
 from neuprim.plugins.judging import clips_of, facts_of

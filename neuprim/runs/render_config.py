@@ -22,7 +22,6 @@ from torch.nn.functional import interpolate
 
 from neuprim.config.overrides import assigned, parse
 from neuprim.core.cameras.projections import AnyCamera
-from neuprim.core.checked import Range, checked, converted
 from neuprim.core.checkpoint import read_header
 from neuprim.core.compression import is_compressed
 from neuprim.core.compression.quantizers import fit_columns
@@ -32,6 +31,7 @@ from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.reduction import KINDS, reduce_model, reduction_names, validate_reduction
 from neuprim.core.render import RenderSettings, backends, render
+from neuprim.core.validation import Range, coerce, validate
 
 __all__ = [
     "ALL_GROUPS",
@@ -223,7 +223,7 @@ def parse_render_config(overrides: Sequence[str], defaults: RenderSettings, mode
     for assignment in parse(overrides):
         head, dot, name = assignment.key.partition(".")
         if head == "resolution" and not dot:
-            resolution = converted(assignment.value, _Resolution, "resolution")
+            resolution = coerce(assignment.value, _Resolution, "resolution")
         elif head == "renderer" and dot:
             values[name] = assignment.value
         elif head in KINDS and dot:
@@ -238,7 +238,7 @@ def parse_render_config(overrides: Sequence[str], defaults: RenderSettings, mode
                 *reduction_names(model.density, model.colour),
             ]
             raise ConfigError(f"{assignment.key}: no setting of rendering{nearest(assignment.key, known)}")
-    settings = checked(RenderSettings, values, "renderer")
+    settings = validate(RenderSettings, values, "renderer")
     if settings.near == "auto":
         settings = dataclasses.replace(settings, near=defaults.near)  # resolved by the run's training
     backends.check_name(settings.backend)

@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict
 from typing import Annotated, Any
 
-from neuprim.core.checked import Range
+from neuprim.core.validation import Range
 
 __all__ = ["ImageSize", "Supersampling", "settings_key"]
 

@@ -17,7 +17,7 @@ import msgspec
 from msgspec import Meta
 from websockets.asyncio.server import ServerConnection
 
-from neuprim.core.checked import Range
+from neuprim.core.validation import Range
 
 __all__ = ["MAX_MESSAGE_BYTES", "CheckedConnection", "is_known_protocol", "refuse_message", "refuse_value"]
 

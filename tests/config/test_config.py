@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from neuprim.config import RunConfig, compose, compose_all, expand_sweep
-from neuprim.core.checked import checked
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.task import SceneContext
+from neuprim.core.validation import validate
 from neuprim.plugins.registry import load_task
 from tests.plugins.fakes import install, site, toy
 
@@ -492,4 +492,4 @@ def test_static_loaders_know_every_key_of_their_yaml(tmp_path: Path, scene: str)
 def test_solids_knows_every_key_of_its_yaml(tmp_path: Path) -> None:
     from neuprim.scenes.solids.generate import SolidsSettings
 
-    assert checked(SolidsSettings, compose([f"output_dir='{tmp_path}/out'"]).scene) == SolidsSettings()
+    assert validate(SolidsSettings, compose([f"output_dir='{tmp_path}/out'"]).scene) == SolidsSettings()

@@ -15,13 +15,13 @@ from torch import Tensor
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
 from neuprim.conformance import ConformanceError, named_checks
-from neuprim.core.checked import Range
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import Supervision
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, TrainSettings
-from neuprim.core.uses import OPTIONAL, build_settings, loss_settings
+from neuprim.core.used_settings import OPTIONAL, build_settings, loss_settings
+from neuprim.core.validation import Range
 from neuprim.plugins.members import fault
 from neuprim.plugins.registry import list_losses, load_loss, load_task
 from neuprim.runs.fit import make_loss
@@ -113,7 +113,7 @@ def check(model):
 
 def test_an_option_may_say_its_bounds_and_choices(toy: Path) -> None:
     source = (toy / "__init__.py").read_text()
-    imports = "from typing import Annotated\nfrom neuprim.core.checked import Range\n"
+    imports = "from typing import Annotated\nfrom neuprim.core.validation import Range\n"
     more = '"gain": (1.0, "of the amplifier", Annotated[float, Range(above=0, at_most=5)]), "form": ("soft", "of the knee", ("soft", "hard"))'
     (toy / "__init__.py").write_text(imports + source.replace('"gain": (1.0, "of the amplifier")', more))
     assert toys("task.options.gain=5", "task.options.form=hard").options == {"gain": 5.0, "form": "hard"}

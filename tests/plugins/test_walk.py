@@ -244,7 +244,13 @@ def test_conformance_finds_it(module: str, old: str, new: str, check: str, text:
 
 def test_a_package_that_raises_on_import_breaks_itself_alone(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     install_spectral(
-        site, {"__init__": ("from neuprim.core.checked", 'raise RuntimeError("no licence")\nfrom neuprim.core.checked')}
+        site,
+        {
+            "__init__": (
+                "from neuprim.core.validation",
+                'raise RuntimeError("no licence")\nfrom neuprim.core.validation',
+            )
+        },
     )
     assert call("tasks") == 0
     said = capsys.readouterr().out

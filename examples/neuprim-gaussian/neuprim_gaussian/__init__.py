@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.losses import photometric
+from neuprim.core.validation import validate_choices
 from neuprim_gaussian.colour import ViewDependentColour
 from neuprim_gaussian.density import BellDensity
 from neuprim_gaussian.scenes import SCENES
@@ -24,8 +24,8 @@ def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, Co
 
 def _check(model: Mapping[str, Any]) -> None:
     """Called before any data are loaded: a typo must not cost a user minutes."""
-    choose(model["density"], "model.density", {"deviations": float})
-    choose(model["colour"], "model.colour", {})
+    validate_choices(model["density"], "model.density", {"deviations": float})
+    validate_choices(model["colour"], "model.colour", {})
     try:
         BellDensity(**model["density"])
     except ValueError as error:

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.world import World
-from neuprim.core.checked import Range, text, verify
 from neuprim.core.data import Dataset, PointCloud, StartingPoints, camera_extent
 from neuprim.core.data.dataset import SceneContext
 from neuprim.core.data.image_views import ImageFrame, ImageViews
@@ -22,6 +21,7 @@ from neuprim.core.data.scene_frame import focus_point, world_around
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo
 from neuprim.core.notices import warn_once
+from neuprim.core.validation import Range, nonempty_text, validate_fields
 
 __all__ = [
     "Background",
@@ -50,7 +50,7 @@ EveryNth = Annotated[int, Range(at_least=2)]
 HoldOut = Annotated[int, Range(at_least=2, also=(0,))]
 """The same, or 0 where a split of its own is there to test on."""
 
-SplitName = Annotated[str, text("the name in transforms_NAME.json")]
+SplitName = Annotated[str, nonempty_text("the name in transforms_NAME.json")]
 
 
 @dataclass(frozen=True)
@@ -68,14 +68,14 @@ class FolderSettings:
         strict: refuse a damaged view; otherwise it is left out with a warning.
     """
 
-    path: Annotated[Path, text("the data set's folder")]
+    path: Annotated[Path, nonempty_text("the data set's folder")]
     background: Background = "auto"
     downsample: Annotated[int, Range(at_least=1)] = 1
     preload: bool = True
     strict: bool = False
 
     def __post_init__(self) -> None:
-        verify(self, "scene")
+        validate_fields(self, "scene")
 
 
 def data_folder(path: str | Path) -> Path:
@@ -156,13 +156,15 @@ class MissingFiles(DataError):
     """Files that a data set names are not there."""
 
 
-def find_image(folder: Path, text: str) -> Path | None:
+def find_image(folder: Path, nonempty_text: str) -> Path | None:
     """The image that ``text`` names below ``folder``: as written, else with the usual suffixes added, else in another
     case; None if there is none."""
-    text = str(folder / text.replace("\\", "/"))
+    nonempty_text = str(folder / nonempty_text.replace("\\", "/"))
     try:
-        found = next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
-        return found or _other_case(folder, Path(text))
+        found = next(
+            (Path(nonempty_text + s) for s in ("", *IMAGE_SUFFIXES) if Path(nonempty_text + s).is_file()), None
+        )
+        return found or _other_case(folder, Path(nonempty_text))
     except OSError:  # a name longer than the file system can hold
         return None
 
@@ -226,8 +228,8 @@ def unique_names(paths: Iterable[str], where: str) -> list[str]:
 
 
 def _stem(path: str, whole: bool = False) -> str:
-    text = path.strip("/") if whole else path.rstrip("/").rsplit("/", 1)[-1]
-    return next((text[: -len(s)] for s in IMAGE_SUFFIXES if text.endswith(s)), text)
+    nonempty_text = path.strip("/") if whole else path.rstrip("/").rsplit("/", 1)[-1]
+    return next((nonempty_text[: -len(s)] for s in IMAGE_SUFFIXES if nonempty_text.endswith(s)), nonempty_text)
 
 
 def every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFrame], list[ImageFrame]]:

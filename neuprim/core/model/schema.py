@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from neuprim.core.checked import Range, converted
+from neuprim.core.validation import Range, coerce
 
 __all__ = ["InitContext", "ParameterSpec", "Params", "RateUnit"]
 
@@ -81,7 +81,7 @@ class InitContext:
             ConfigError: it is something else.
         """
         bounds = Range(above=low, below=high)
-        return float(converted(self.settings.get(name, default), Annotated[float, bounds], f"model.init.{name}"))
+        return float(coerce(self.settings.get(name, default), Annotated[float, bounds], f"model.init.{name}"))
 
     def choice(self, name: str, *offered: str) -> str:
         """``settings[name]``, one of those offered; the first by default.
@@ -89,7 +89,7 @@ class InitContext:
         Raises:
             ConfigError: it is something else.
         """
-        return str(converted(self.settings.get(name, offered[0]), Literal[offered], f"model.init.{name}"))
+        return str(coerce(self.settings.get(name, offered[0]), Literal[offered], f"model.init.{name}"))
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ import re
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from neuprim.core.checked import Accepts, Range, text, verify
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.schema import RateUnit
+from neuprim.core.validation import Accepts, Range, nonempty_text, validate_fields
 
 __all__ = ["ModelSettings", "PopulationSettings", "TrainSettings"]
 
@@ -49,7 +49,7 @@ class ModelSettings:
     )
 
     def __post_init__(self) -> None:
-        verify(self, "model")
+        validate_fields(self, "model")
 
 
 @dataclass
@@ -93,7 +93,7 @@ class PopulationSettings:
     max_primitives: Annotated[int, Range(at_least=1)] = 1_000_000
 
     def __post_init__(self) -> None:
-        verify(self, "train.population")
+        validate_fields(self, "train.population")
         if self.grow_from < 1 and self.strategy != "relocate":
             raise ConfigError(
                 f"train.population.grow_from={self.grow_from:g}: {self.strategy} does not grow that way; expected train.population.strategy=relocate"
@@ -161,7 +161,7 @@ class TrainSettings:
     voxels_every: Annotated[int, Range(at_least=1)] = 1
     voxel_weight: NotNegative = 0.1
     voxel_colour: NotNegative = 0.1
-    loss: Annotated[str, text("the name of a loss")] | None = None
+    loss: Annotated[str, nonempty_text("the name of a loss")] | None = None
     ssim_weight: Annotated[float, Range(0, 1)] = 0.2
     anisotropy_weight: NotNegative = 0.0
     anisotropy_from: Annotated[int, Range(at_least=0)] = 100
@@ -172,7 +172,7 @@ class TrainSettings:
     population: PopulationSettings = field(default_factory=PopulationSettings)
 
     def __post_init__(self) -> None:
-        verify(self, "train")
+        validate_fields(self, "train")
         if self.iterations is None and self.max_seconds is None:
             raise ConfigError(
                 "train.iterations and train.max_seconds are both null; expected a budget, in steps, in seconds or both"

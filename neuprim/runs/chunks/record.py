@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neuprim.core.checked import checked, converted
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.files import read_json, write_json
+from neuprim.core.validation import coerce, validate
 from neuprim.runs.chunks.plan import Plan
 from neuprim.runs.launch.jobs import Result
 
@@ -102,7 +102,7 @@ def read_record(folder: Path) -> ChunkRecord | None:
             raise DataError(f"{file}: format {data['format']!r}; this neuprim reads {FORMAT}; {_INSTEAD}")
         steps = data["joined_steps"]
         return ChunkRecord(
-            tuple(checked(Row, row, "chunks") for row in data["chunks"]), converted(steps, int | None, "joined_steps")
+            tuple(validate(Row, row, "chunks") for row in data["chunks"]), coerce(steps, int | None, "joined_steps")
         )
     except (KeyError, TypeError, ValueError, AttributeError, ConfigError) as error:
         raise DataError(f"{file}: not {_WHAT} ({type(error).__name__}: {error}); {_INSTEAD}") from error

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from neuprim.core.checked import checked
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.plain import load_json
+from neuprim.core.validation import validate
 from neuprim.runs.events import Evaluated, Event, Finishing, Preparing, Step
 
 __all__ = ["ENDED", "Listener", "Status", "read_status", "write_status"]
@@ -76,6 +76,6 @@ def read_status(file: Path) -> Status | None:
     """None where there is none yet, or none that can be read."""
     try:
         data: Any = load_json(file.read_text(encoding="utf-8"))
-        return checked(Status, {f.name: data[f.name] for f in fields(Status)})
+        return validate(Status, {f.name: data[f.name] for f in fields(Status)})
     except (OSError, ValueError, KeyError, TypeError, RecursionError, ConfigError):
         return None

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config.overrides import parse
-from neuprim.core.checked import checked, converted
 from neuprim.core.errors import ConfigError, DataError, cut
 from neuprim.core.io.files import read_json, write_json
+from neuprim.core.validation import coerce, validate
 
 __all__ = ["FILE", "Row", "SweepRecord", "begun_words", "read_sweep"]
 
@@ -97,7 +97,7 @@ def read_sweep(folder: Path) -> SweepRecord | None:
     try:
         if data["format"] != FORMAT:
             raise DataError(f"{file}: format {data['format']!r}; this neuprim reads {FORMAT}; {_INSTEAD}")
-        return SweepRecord(converted(data["words"], tuple[str, ...], "words"), tuple(_row(run) for run in data["runs"]))
+        return SweepRecord(coerce(data["words"], tuple[str, ...], "words"), tuple(_row(run) for run in data["runs"]))
     except (KeyError, TypeError, ValueError, AttributeError, ConfigError) as error:
         raise DataError(f"{file}: not {_WHAT} ({type(error).__name__}: {error}); {_INSTEAD}") from error
 
@@ -125,7 +125,7 @@ def begun_words(words: Sequence[str]) -> list[str]:
 
 
 def _row(run: Mapping[str, Any]) -> Row:
-    row = checked(Row, run, "runs")
+    row = validate(Row, run, "runs")
     if Path(row.name).name != row.name or row.name in ("", ".", ".."):
         raise ValueError(f"name {row.name!r} is no folder's")
     return row

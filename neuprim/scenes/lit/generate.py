@@ -25,8 +25,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from neuprim.core.checked import Range, verify
 from neuprim.core.io.exr import write_exr
+from neuprim.core.validation import Range, validate_fields
 from neuprim.scenes.image_set import ImageSet, Progress
 from neuprim.scenes.lit import CLASSES
 from neuprim.scenes.lit.rig import DISTANCE, LitView, splits
@@ -66,7 +66,7 @@ class LitSettings:
     supersampling: Supersampling = 2
 
     def __post_init__(self) -> None:
-        verify(self, "scene")
+        validate_fields(self, "scene")
 
     def key(self) -> str:
         """A short hash of every setting and the generator's version."""

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from neuprim.core.checked import Range, verify
 from neuprim.core.data.distortion import Radial
 from neuprim.core.io.files import write_json
 from neuprim.core.io.ply import write_ply
+from neuprim.core.validation import Range, validate_fields
 from neuprim.scenes.cached import cached_folder
 from neuprim.scenes.image_set import Progress
 from neuprim.scenes.rays import pixel_means
@@ -70,7 +70,7 @@ class RoomSettings:
     distortion: bool = True
 
     def __post_init__(self) -> None:
-        verify(self, "scene")
+        validate_fields(self, "scene")
 
     def key(self) -> str:
         """A short hash of every setting and the generator's version."""

@@ -25,9 +25,9 @@ from typing import Annotated
 import numpy as np
 import torch
 
-from neuprim.core.checked import Range, converted
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.validation import Range, coerce
 from neuprim.scenes.cached import cached_folder
 from neuprim.scenes.smoke.projection import Box
 from neuprim.scenes.smoke.scenes import SCENES, Scene, Stage
@@ -75,11 +75,11 @@ def simulate(
         DataError: the cache directory cannot be written.
     """
     scene = _scene(name)
-    count: int = converted(
+    count: int = coerce(
         scene.timesteps if frames is None else frames, Annotated[int, Range(*TIMESTEPS)], "scene.timesteps"
     )
-    resolution = converted(resolution, Resolution, "scene.resolution")
-    seed = converted(seed, Annotated[int, Range(0, 2**63 - 1)], "seed")
+    resolution = coerce(resolution, Resolution, "scene.resolution")
+    seed = coerce(seed, Annotated[int, Range(0, 2**63 - 1)], "seed")
     final = Path(cache_dir) / f"sim-{name}-{cache_key(scene, count, resolution, seed)}"
     files = [f"{name}_{i}.vdb" for i in range(count)]
 

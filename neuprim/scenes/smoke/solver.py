@@ -15,7 +15,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from neuprim.core.checked import Range, verify
+from neuprim.core.validation import Range, validate_fields
 from neuprim.scenes.smoke.advection import advect
 from neuprim.scenes.smoke.projection import Box, Faces, expansion_flow, project, to_centres, to_faces
 
@@ -62,7 +62,7 @@ class SolverSettings:
     most_steps: Annotated[int, Range(at_least=1)] = 2
 
     def __post_init__(self) -> None:
-        verify(self, "solver")
+        validate_fields(self, "solver")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from neuprim.core.checked import Range, verify
+from neuprim.core.validation import Range, validate_fields
 from neuprim.scenes.image_set import ImageSet, Progress
 from neuprim.scenes.poses import camera_to_world, direction
 from neuprim.scenes.raycast import Scene
@@ -65,7 +65,7 @@ class SolidsSettings:
     supersampling: Supersampling = 3
 
     def __post_init__(self) -> None:
-        verify(self, "scene")
+        validate_fields(self, "scene")
 
     def key(self) -> str:
         """A short hash of every setting and the generator's version."""

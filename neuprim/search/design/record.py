@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
-from neuprim.core.checked import converted, hints_of
+from neuprim.core.validation import coerce, field_types
 from neuprim.search.design.variants import Variant
 from neuprim.search.tradeoff.record import Measured
 
@@ -77,10 +77,10 @@ class Model(Measured):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        hints = hints_of(cls)
+        hints = field_types(cls)
         return replace(
             super().from_dict(data),
-            **{name: converted(data[name], hints[name], f"points.{name}") for name in (*_OWN, *_LISTS)},
+            **{name: coerce(data[name], hints[name], f"points.{name}") for name in (*_OWN, *_LISTS)},
         )
 
 

@@ -11,7 +11,7 @@ from neuprim.config import RunConfig
 from neuprim.config.overrides import parse, word
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.task import TaskSpec
-from neuprim.core.uses import build_settings
+from neuprim.core.used_settings import build_settings
 from neuprim.plugins.trading import traded
 from neuprim.search.changed import value_of
 

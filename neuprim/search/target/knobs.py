@@ -8,7 +8,7 @@ from neuprim.config import RunConfig
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import TaskSpec
-from neuprim.core.uses import build_settings
+from neuprim.core.used_settings import build_settings
 from neuprim.plugins.trading import traded
 from neuprim.search.changed import changed, value_of
 from neuprim.search.target.record import Setting, Turn

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from neuprim.core.checked import checked
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.files import read_json, write_json
+from neuprim.core.validation import validate
 
 __all__ = ["FILE", "Attempt", "Purpose", "Record", "Setting", "Turn", "read_record"]
 
@@ -165,7 +165,7 @@ def read_record(folder: Path) -> Record | None:
 def _record(data: Mapping[str, Any]) -> Record:
     data = {"before": 0, **data}  # records of the first versions did not say
     own = {f.name: data[f.name] for f in dataclasses.fields(Record)}
-    made = checked(Record, own)
+    made = validate(Record, own)
     for attempt in made.attempts:
         if not (attempt.primitives > 0 and attempt.steps > 0 and Path(attempt.folder).name == attempt.folder):
             raise ValueError(

@@ -13,10 +13,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Self
 
-from neuprim.core.checked import Range, checked, converted
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.files import read_json, write_json, write_text
 from neuprim.core.metrics import from_json, to_json
+from neuprim.core.validation import Range, coerce, validate
 from neuprim.search.tradeoff.knobs import LeftOut
 
 __all__ = ["COLUMNS", "Measured", "Record", "command", "read_record", "write_csv"]
@@ -106,7 +106,7 @@ class Measured:
         quality = {name: value for name in names if (value := from_json(data["quality"], name)) is not None}
         own = {name: data[name] for name in ("bytes", "peak_bytes", "ms", "ratios", "rounds")}
         return replace(
-            checked(cls, {"knob": data["knob"], "words": data["words"], "quality": {}, **own}, "points"),
+            validate(cls, {"knob": data["knob"], "words": data["words"], "quality": {}, **own}, "points"),
             quality=quality,
         )
 
@@ -183,8 +183,8 @@ def read_record(path: Path, kind: type[Measured] = Measured) -> Record | None:
                 f"{path}: format {data['format']!r}; this neuprim reads {FORMAT}; delete it to measure anew"
             )
         points = [kind.from_dict(entry) for entry in data["points"]]
-        out = [checked(LeftOut, entry, "left_out") for entry in data["left_out"]]
-        speed, size = (converted(data["front"][name], list[int], f"front.{name}") for name in ("speed", "size"))
+        out = [validate(LeftOut, entry, "left_out") for entry in data["left_out"]]
+        speed, size = (coerce(data["front"][name], list[int], f"front.{name}") for name in ("speed", "size"))
         if not points or not all(0 <= number < len(points) for number in (*speed, *size)):
             raise ValueError(f"front: expected numbers of the {len(points)} points")
         known = ("format", "same", "points", "left_out", "front", "marching")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import GroundTruth
 from neuprim.core.errors import ConfigError
@@ -13,9 +12,10 @@ from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, Chunks, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
+from neuprim.core.validation import validate_choices
 from neuprim.core.volumes.source import VolumeSource
 from neuprim.tasks.dynamic import judging
-from neuprim.tasks.dynamic.colour import FREQUENCIES, RENAMED, TimeHarmonics
+from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.dynamic.layers import LAYERS
 from neuprim.tasks.dynamic.time import parse_times
@@ -24,11 +24,8 @@ __all__ = ["TASK"]
 
 
 def _check(model: Mapping[str, Any]) -> None:
-    choose(model["density"], "model.density", {"time": str, "divide_above": float, **DENSITY_OPTIONS})
-    colour = {
-        key: RENAMED.get(value, value) if key == "frequencies" else value for key, value in model["colour"].items()
-    }
-    choose(colour, "model.colour", {"frequencies": tuple(FREQUENCIES), "powers": int, "waves": int})
+    validate_choices(model["density"], "model.density", {"time": str, "divide_above": float, **DENSITY_OPTIONS})
+    validate_choices(model["colour"], "model.colour", {"frequencies": tuple(FREQUENCIES), "powers": int, "waves": int})
     try:
         _density(model)
     except ValueError as error:

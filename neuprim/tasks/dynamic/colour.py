@@ -34,9 +34,6 @@ _CONDITION = 1e-7
 """Directions of the terms that are weaker than this are left out of a fit: their coefficients would not survive
 float32."""
 
-RENAMED = {"turns": "periods"}
-"""Words of before, which configurations and models on disk still hold."""
-
 
 class TimeHarmonics(ColourField):
     """c = max(0, C0 S(xi) + sum of higher bands + 1/2), S(xi) = S0 + sum_i a_i xi^i + sum_i b_i cos(w i xi) + c_i sin(w
@@ -62,7 +59,6 @@ class TimeHarmonics(ColourField):
             raise ValueError(f"{channels!r} colour channels; expected at least 1")
         if not all(isinstance(n, int) and 0 <= n <= 16 for n in (powers, waves)):
             raise ValueError(f"{powers!r} powers and {waves!r} waves; expected 0..16")
-        frequencies = RENAMED.get(frequencies, frequencies)
         if frequencies not in FREQUENCIES:
             raise ValueError(f"frequencies {frequencies!r}; expected {' or '.join(FREQUENCIES)}")
         self.degree, self.channels, self.sh_every = degree, channels, sh_every

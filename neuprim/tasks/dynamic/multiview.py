@@ -23,7 +23,6 @@ from typing import Annotated, Any
 
 import torch
 
-from neuprim.core.checked import Accepts, checked
 from neuprim.core.data import Dataset
 from neuprim.core.data.image_views import ImageFrame
 from neuprim.core.data.posed_images import EveryNth, FolderSettings, SplitName, data_folder, posed_images
@@ -31,6 +30,7 @@ from neuprim.core.data.transforms_json import Layout, read_frames, split_frames
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
+from neuprim.core.validation import Accepts, validate
 from neuprim.tasks.dynamic.moving import moving_points
 
 __all__ = ["MultiviewSettings", "load"]
@@ -49,7 +49,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: missing or damaged files, wrong or missing fields, times that are missing or out of range, impossible
             cameras, empty splits.
     """
-    asked = checked(MultiviewSettings, settings, "scene")
+    asked = validate(MultiviewSettings, settings, "scene")
     folder = data_folder(asked.path)
     name, single = folder.resolve().name, folder / "transforms.json"
     files = {split: folder / f"transforms_{split}.json" for split in (asked.train_split, asked.test_split)}

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
+from neuprim.core.validation import validate_choices
 from neuprim.tasks.relight import judging
 from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightNetwork
 from neuprim.tasks.relight.data import lighting_of
@@ -40,8 +40,8 @@ def _colour(model: Mapping[str, Any], channels: int = 3, falloff: bool = False, 
 
 
 def _check(model: Mapping[str, Any]) -> None:
-    choose(model["density"], "model.density", DENSITY_OPTIONS)
-    choose(model["colour"], "model.colour", _SETTINGS)
+    validate_choices(model["density"], "model.density", DENSITY_OPTIONS)
+    validate_choices(model["colour"], "model.colour", _SETTINGS)
     try:
         _colour(model)
     except ValueError as error:

@@ -14,13 +14,13 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from neuprim.core.checked import Accepts, checked
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.data.image_views import ImageViews
 from neuprim.core.data.posed_images import HoldOut, in_scene
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import read_image
 from neuprim.core.task import SceneContext
+from neuprim.core.validation import Accepts, validate
 from neuprim.scenes.lit.generate import LitSettings, generate
 from neuprim.scenes.lit.rig import NEAR_LIGHTS, PARTS
 from neuprim.tasks.relight import olat
@@ -53,7 +53,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown setting or impossible value.
         DataError: the cache directory cannot be written.
     """
-    asked = checked(LitSolidsSettings, settings, "scene")  # before a minute of drawing
+    asked = validate(LitSolidsSettings, settings, "scene")  # before a minute of drawing
     drawn = LitSettings(**{f.name: getattr(asked, f.name) for f in fields(LitSettings)})
     reading = {"background": asked.background, "hold_out": asked.hold_out}
     folder = generate(drawn, context.cache_dir, context.progress)

@@ -44,7 +44,6 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import opengl_to_viewmat
-from neuprim.core.checked import Range, checked
 from neuprim.core.data import Dataset
 from neuprim.core.data.image_views import ImageFrame
 from neuprim.core.data.posed_images import (
@@ -62,6 +61,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import SceneContext
+from neuprim.core.validation import Range, validate
 from neuprim.tasks.relight.data import Lighting, bright
 
 __all__ = ["OlatSettings", "load", "read_split"]
@@ -77,7 +77,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: missing or damaged files, wrong or missing fields, impossible cameras, empty splits, black images
         with exposure=auto.
     """
-    asked = checked(OlatSettings, settings, "scene")
+    asked = validate(OlatSettings, settings, "scene")
     folder = data_folder(asked.path)
     train, test = read_splits(
         folder, asked.train_split, asked.test_split, asked.hold_out, lambda split: read_split(folder, split, asked)

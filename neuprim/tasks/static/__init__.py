@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
@@ -13,6 +12,7 @@ from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
+from neuprim.core.validation import validate_choices
 from neuprim.tasks.static.fields import SphericalHarmonics
 
 __all__ = ["TASK"]
@@ -26,13 +26,13 @@ def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, Co
 
 
 def _check(model: Mapping[str, Any]) -> None:
-    choose(model["density"], "model.density", {"form": ("cosine", "gaussian"), **DENSITY_OPTIONS})
+    validate_choices(model["density"], "model.density", {"form": ("cosine", "gaussian"), **DENSITY_OPTIONS})
     others = [key for key in model["density"] if key != "form"]
     if model["density"].get("form") == "gaussian" and others:
         raise ConfigError(
             f"model.density.{others[0]}: of densities of the form cosine; expected none with model.density.form=gaussian"
         )
-    choose(model["colour"], "model.colour", {})
+    validate_choices(model["colour"], "model.colour", {})
 
 
 def _trade(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from neuprim.core.checked import checked
 from neuprim.core.data import Dataset
 from neuprim.core.task import SceneContext
+from neuprim.core.validation import validate
 from neuprim.scenes.room.generate import RoomSettings
 from neuprim.scenes.room.generate import generate as generate_room
 from neuprim.scenes.solids.generate import SolidsSettings
@@ -27,7 +27,7 @@ def load_solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown setting or impossible value.
         DataError: the cache directory cannot be written.
     """
-    folder = generate_solids(checked(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
+    folder = generate_solids(validate(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
     return replace(blender.load({"path": str(folder)}, context), name="solids", data_source="generated")
 
 
@@ -38,6 +38,6 @@ def load_room(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown setting or impossible value, or too few views for the points.
         DataError: the cache directory cannot be written.
     """
-    folder = generate_room(checked(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
+    folder = generate_room(validate(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
     dataset = nerfstudio.load({"path": str(folder)}, context)
     return replace(dataset, name="room", data_source="generated", up=torch.tensor([0.0, 0.0, 1.0]))

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.config import compose
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity
 from neuprim.core.model.geometry import Geometry
@@ -172,14 +171,6 @@ def test_a_frame_without_a_time_is_an_error() -> None:
 
 
 # ---------------------------------------------------------------- colour
-
-
-def test_the_word_of_before_for_whole_periods_still_works() -> None:
-    assert TimeHarmonics(frequencies="turns").settings() == TimeHarmonics(frequencies="periods").settings()
-    assert (
-        compose(["task=dynamic", "model.colour.frequencies=turns"], check_output=False).model.colour["frequencies"]
-        == "turns"
-    )
 
 
 def test_colour_follows_equations_10_to_12() -> None:

@@ -15,7 +15,6 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from neuprim.core.checked import Range
 from neuprim.core.model.canonical import canonicalize_cosines, canonicalize_gain
 from neuprim.core.model.densities.fewer import prune_neurons, smaller_neuron_counts
 from neuprim.core.model.edge import EDGES, NORMS, fade
@@ -26,6 +25,7 @@ from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.scripts import read_script
 from neuprim.core.model.tensors import number_fault
+from neuprim.core.validation import Range
 
 __all__ = [
     "DENSITY_OPTIONS",
@@ -47,7 +47,7 @@ so far apart, and products with the other weights stay far from the ends of floa
 
 
 DENSITY_OPTIONS: dict[str, Any] = {"edge": EDGES, "gain": bool, "omega0": Annotated[float, Range(above=0)]}
-"""What ``model.density`` may say for it, in every task (:func:`neuprim.core.checked.choose`)."""
+"""What ``model.density`` may say for it, in every task (:func:`neuprim.core.validation.choose`)."""
 
 
 DENSITY_TRADE: dict[str, tuple[int, ...]] = {"model.neurons": (0, 2, 4, 8), "model.density.edge": EDGES}

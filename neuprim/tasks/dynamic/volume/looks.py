@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from neuprim.core.checked import hints_of, refuse_unknown
 from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.validation import field_types, refuse_unknown
 from neuprim.tasks.dynamic.volume.optics import Light, Look
 from neuprim.tasks.dynamic.volume.settings import Axis
 
@@ -89,7 +89,7 @@ def changed(look: Look, changes: Mapping[str, Any]) -> Look:
     Raises:
         ConfigError: no such setting, a value of another form, or an impossible one.
     """
-    refuse_unknown(changes, hints_of(Look), "scene.optics")
+    refuse_unknown(changes, field_types(Look), "scene.optics")
     light = changes.get("light")
     if look.light is not None and isinstance(light, Mapping):
         changes = {**changes, "light": {**vars(look.light), **light}}

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from neuprim.core.checked import Accepts, Range, Unbounded, verify
 from neuprim.core.compute import device
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, Grid
+from neuprim.core.validation import Accepts, Range, Unbounded, validate_fields
 from neuprim.tasks.dynamic.volume.blackbody import black_body_rgb
 from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
@@ -61,7 +61,7 @@ class Light:
     irradiance: RGB
 
     def __post_init__(self) -> None:
-        verify(self, "scene.optics.light")
+        validate_fields(self, "scene.optics.light")
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Look:
     up: Axis = "z"
 
     def __post_init__(self) -> None:
-        verify(self, "scene.optics")
+        validate_fields(self, "scene.optics")
 
     @property
     def grids(self) -> tuple[str, ...]:

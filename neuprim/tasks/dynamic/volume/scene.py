@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuprim.core.checked import checked
 from neuprim.core.data import Dataset, DataSource
 from neuprim.core.errors import DataError
 from neuprim.core.io.store import Store, open_store
 from neuprim.core.io.vdb import VdbFrame, sequence
 from neuprim.core.notices import warn_once
 from neuprim.core.task import Chunks, SceneContext
+from neuprim.core.validation import validate
 from neuprim.core.volumes.source import Extent
 from neuprim.scenes.smoke import simulate
 from neuprim.tasks.dynamic.volume.capture import Capture
@@ -110,7 +110,7 @@ def _prepare(
 ) -> tuple[VolumeSettings, str, DataSource, Capture, range]:
     """All that is known before anything is rendered: settings, name, origin, what to render, and the cameras held
     out."""
-    asked = checked(VolumeSettings, settings, "scene")
+    asked = validate(VolumeSettings, settings, "scene")
     _look(asked, AUTO[0])  # a typing error shows before anything is simulated
     folder, name, source = _files(asked, context)
     frames = _frames(folder, asked)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from neuprim.core.checked import Accepts, Range, converted, text, verify
 from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.validation import Accepts, Range, coerce, nonempty_text, validate_fields
 from neuprim.scenes.smoke.generate import TIMESTEPS, Resolution
 
 __all__ = ["GRIDS", "Axis", "Meaning", "VolumeSettings", "choose_frames"]
@@ -65,14 +65,14 @@ class VolumeSettings:
         read again when needed.
     """
 
-    vdb: Annotated[Path, text("a folder of .vdb files")] | None = None
+    vdb: Annotated[Path, nonempty_text("a folder of .vdb files")] | None = None
     simulation: str | None = None
     resolution: Resolution = 64
     timesteps: Annotated[int, Range(2, TIMESTEPS[1])] | None = None
     frames: Frames = "all"
     span: Span | None = None
     chunks: Annotated[int, Range(1, 1000)] | Literal["auto"] | None = None
-    grids: Mapping[Meaning, Annotated[str, text("the name of a grid")]] = field(default_factory=dict)
+    grids: Mapping[Meaning, Annotated[str, nonempty_text("the name of a grid")]] = field(default_factory=dict)
     look: str = "auto"
     optics: Mapping[str, Any] = field(default_factory=dict)
     size: Annotated[int, Range(8, 4096)] = 160
@@ -81,11 +81,11 @@ class VolumeSettings:
     samples: Annotated[int, Range(1, 16)] = 2
     train_every: Annotated[int, Range(1, 1000)] = 1
     up: Axis = "z"
-    cache: Annotated[str, text("a folder, or a URL as s3://BUCKET/FOLDER")] | None = None
+    cache: Annotated[str, nonempty_text("a folder, or a URL as s3://BUCKET/FOLDER")] | None = None
     memory: Annotated[int, Range(1, 2**20)] = 1408
 
     def __post_init__(self) -> None:
-        verify(self, "scene")
+        validate_fields(self, "scene")
         if self.vdb is None and self.simulation is None:
             raise ConfigError("scene.vdb: required and not given; expected a folder of .vdb files")
         if self.span is not None and self.chunks is not None:
@@ -108,7 +108,7 @@ def choose_frames(frames: str, numbers: Sequence[int], where: str = "the sequenc
         ConfigError: another form than "all", "FIRST:LAST" or "FIRST:LAST:STEP".
         DataError: none of the frames exists.
     """
-    span = _span(converted(frames, Frames, "scene.frames"))
+    span = _span(coerce(frames, Frames, "scene.frames"))
     if span is None:
         return list(numbers)
     chosen = [n for n in numbers if n in span]

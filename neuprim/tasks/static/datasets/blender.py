@@ -16,7 +16,6 @@ from typing import Any
 
 import torch
 
-from neuprim.core.checked import checked
 from neuprim.core.data import Dataset
 from neuprim.core.data.image_views import ImageFrame
 from neuprim.core.data.posed_images import FolderSettings, HoldOut, SplitName, data_folder, posed_images, turned
@@ -24,6 +23,7 @@ from neuprim.core.data.transforms_json import Layout, read_frames, read_splits
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
+from neuprim.core.validation import validate
 
 __all__ = ["BlenderSettings", "load"]
 
@@ -49,7 +49,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown or impossible settings.
         DataError: missing or damaged files, wrong or missing fields, mixed image sizes, impossible cameras.
     """
-    asked = checked(BlenderSettings, settings, "scene")
+    asked = validate(BlenderSettings, settings, "scene")
     folder = data_folder(asked.path)
 
     def read(split: str) -> list[ImageFrame]:

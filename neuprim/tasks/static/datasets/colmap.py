@@ -24,7 +24,6 @@ from neuprim.core.cameras import Camera
 from neuprim.core.cameras.colmap import PINHOLES, largest_model, pinhole_of, pycolmap_package, read_model, viewmat_of
 from neuprim.core.cameras.intrinsics import same_shape
 from neuprim.core.cameras.pinhole import check_viewmat
-from neuprim.core.checked import checked, text
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.distortion import Distortion
 from neuprim.core.data.image_views import ImageFrame, masks_beside
@@ -45,6 +44,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.notices import warn_once
 from neuprim.core.task import SceneContext
+from neuprim.core.validation import nonempty_text, validate
 
 __all__ = ["ColmapSettings", "load"]
 
@@ -59,8 +59,8 @@ class ColmapSettings(FolderSettings):
         skip_missing: leave out images that are missing; otherwise they are an error.
     """
 
-    images: Annotated[str, text("the image folder's name, e.g. images_4")] = "images"
-    model: Annotated[str, text("the model's folder, or auto")] = "auto"
+    images: Annotated[str, nonempty_text("the image folder's name, e.g. images_4")] = "images"
+    model: Annotated[str, nonempty_text("the model's folder, or auto")] = "auto"
     test_every: EveryNth = 8
     skip_missing: bool = False
 
@@ -74,7 +74,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: missing or damaged files, unsupported or impossible cameras, image sizes that are no reduction of the
             model's, no posed images, empty splits.
     """
-    asked = checked(ColmapSettings, settings, "scene")
+    asked = validate(ColmapSettings, settings, "scene")
     folder = data_folder(asked.path)
     model = folder / asked.model
     if asked.model == "auto":

@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neuprim.core.checked import checked
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.points_file import read_points
 from neuprim.core.data.posed_images import EveryNth, FolderSettings, data_folder, missing_files, posed_images
 from neuprim.core.data.transforms_json import Layout, read_frames, split_frames
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
+from neuprim.core.validation import validate
 
 __all__ = ["NerfstudioSettings", "load"]
 
@@ -49,7 +49,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: missing or damaged files, wrong or missing fields, impossible cameras, an unknown camera model, empty
         splits.
     """
-    asked = checked(NerfstudioSettings, settings, "scene")
+    asked = validate(NerfstudioSettings, settings, "scene")
     folder = data_folder(asked.path)
     path = folder / "transforms.json"
     document = JsonReader.open(path)

@@ -19,10 +19,10 @@ import torch
 from numpy.typing import NDArray
 
 from neuprim.core.cameras.world import World
-from neuprim.core.checked import checked, text
 from neuprim.core.data import Dataset
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
+from neuprim.core.validation import nonempty_text, validate
 from neuprim.scenes.image_set import Progress
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.settings import settings_key
@@ -70,7 +70,7 @@ class MeshSettings(SolidsSettings):
         otherwise.
     """
 
-    path: Annotated[Path, text("the model's file")] = field(kw_only=True)
+    path: Annotated[Path, nonempty_text("the model's file")] = field(kw_only=True)
     up: Literal["auto", "y", "z"] = "auto"
     shading: Literal["daylight", "flat"] = "daylight"
     skip_missing: bool = False
@@ -85,7 +85,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: the model is missing, damaged, too large or refers to files outside its folder; the cache cannot be
         written.
     """
-    asked = checked(MeshSettings, settings, "scene")
+    asked = validate(MeshSettings, settings, "scene")
     folder = generate(asked, context.cache_dir, context.progress)
     from neuprim.tasks.static.datasets import blender
 

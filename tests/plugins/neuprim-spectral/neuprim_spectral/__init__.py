@@ -2,10 +2,10 @@
 
 from typing import Annotated
 
-from neuprim.core.checked import Range, choose
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import LossExtension
 from neuprim.core.task import SceneSpec, TaskSpec
+from neuprim.core.validation import Range, validate_choices
 from neuprim_spectral.bands import BANDS, SHIFT, display
 from neuprim_spectral.fields import ShiftedSpectrum, TwoScales
 from neuprim_spectral.files import files
@@ -21,8 +21,8 @@ def _build(model, dataset):
 
 
 def _check(model):
-    choose(model["density"], "model.density", {"coarse": int, "fine": int})
-    choose(model["colour"], "model.colour", {})
+    validate_choices(model["density"], "model.density", {"coarse": int, "fine": int})
+    validate_choices(model["colour"], "model.colour", {})
     try:
         TwoScales(**model["density"])
     except ValueError as error:

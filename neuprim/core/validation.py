@@ -6,8 +6,8 @@ what does not fit.
         count: Annotated[int, Range(1, 16)] = 3
         form: Literal["sine", "cosine"] = "sine"
 
-    checked(Waves, {"cuont": 4}, "model.density")  # model.density.cuont: no such setting; did you mean
-    'model.density.count'? checked(Waves, {"count": 99}, "model.density")  # model.density.count=99: expected a whole
+    validate(Waves, {"cuont": 4}, "model.density")  # model.density.cuont: no such setting; did you mean
+    'model.density.count'? validate(Waves, {"count": 99}, "model.density")  # model.density.count=99: expected a whole
     number from 1 to 16
 
 Types are ``bool``, ``int``, ``float``, ``str``, ``Path``, ``list``, ``Literal``, ``tuple``, ``dict``, other settings
@@ -32,17 +32,17 @@ __all__ = [
     "Option",
     "Range",
     "Unbounded",
-    "checked",
-    "choose",
-    "converted",
-    "hints_of",
-    "joined",
-    "kind_of",
+    "validate",
+    "validate_choices",
+    "coerce",
+    "field_types",
+    "join_key",
+    "infer_type",
     "option_type",
     "refuse_unknown",
-    "shown",
-    "text",
-    "verify",
+    "format_value",
+    "nonempty_text",
+    "validate_fields",
 ]
 
 T = TypeVar("T")
@@ -135,7 +135,7 @@ class Unbounded:
     why: str
 
 
-def text(says: str) -> Accepts:
+def nonempty_text(says: str) -> Accepts:
     """Text or a path that is not empty, without the character that no file name can hold."""
     return Accepts(_is_text, says)
 
@@ -147,7 +147,7 @@ def _is_text(value: Any) -> bool:
 # ---------------------------------------------------------------- settings from plain values
 
 
-def checked(cls: type[T], values: object, where: str = "") -> T:
+def validate(cls: type[T], values: object, where: str = "") -> T:
     """An instance of the settings dataclass ``cls``.
 
     Args:
@@ -161,19 +161,19 @@ def checked(cls: type[T], values: object, where: str = "") -> T:
     if isinstance(values, cls):
         return values
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{where}={shown(values)}: expected settings, each as {where}.KEY=VALUE")
-    hints = hints_of(cls)
+        raise ConfigError(f"{where}={format_value(values)}: expected settings, each as {where}.KEY=VALUE")
+    hints = field_types(cls)
     refuse_unknown(values, hints, where)
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
-            name = joined(where, field.name)
+            name = join_key(where, field.name)
             raise ConfigError(f"{name}: required and not given; expected {_words(hints[field.name], name)}")
     return cls(
-        **{name: converted(values[name], hint, joined(where, name)) for name, hint in hints.items() if name in values}
+        **{name: coerce(values[name], hint, join_key(where, name)) for name, hint in hints.items() if name in values}
     )
 
 
-def choose(found: Mapping[str, Any], where: str, offered: Mapping[str, Any]) -> None:
+def validate_choices(found: Mapping[str, Any], where: str, offered: Mapping[str, Any]) -> None:
     """Refuse what a group of free settings must not hold; the values that pass are of the types offered as they are.
 
     Args:
@@ -189,28 +189,28 @@ def choose(found: Mapping[str, Any], where: str, offered: Mapping[str, Any]) -> 
     refuse_unknown(found, offered, where)
     for key, value in found.items():
         hint = _offered(offered[key])
-        made = converted(value, hint, joined(where, key))
+        made = coerce(value, hint, join_key(where, key))
         if made != value or (isinstance(made, int) and isinstance(value, float)):
             # "1e-3" for a number, 3 for text, 4.0 for a whole number: a field that gets the value itself would not read
             # them so
-            raise _Unfit(joined(where, key), value, _words(hint, joined(where, key)))
+            raise _Unfit(join_key(where, key), value, _words(hint, join_key(where, key)))
 
 
-def verify(settings: Any, where: str) -> None:
+def validate_fields(settings: Any, where: str) -> None:
     """For ``__post_init__`` of a settings dataclass: what Python code passes is checked, and converted, as what users
     type.
 
     Raises:
-        ConfigError: as :func:`checked`.
+        ConfigError: as :func:`validate`.
     """
-    for name, hint in hints_of(type(settings)).items():
+    for name, hint in field_types(type(settings)).items():
         value = getattr(settings, name)
-        made = converted(value, hint, joined(where, name))
+        made = coerce(value, hint, join_key(where, name))
         if made is not value:
             object.__setattr__(settings, name, made)  # frozen ones too, before anybody has seen them
 
 
-def converted(value: Any, hint: Any, where: str) -> Any:
+def coerce(value: Any, hint: Any, where: str) -> Any:
     """``value`` as the annotated type ``hint``, within its bounds.
 
     Raises:
@@ -226,7 +226,7 @@ def converted(value: Any, hint: Any, where: str) -> Any:
     return made
 
 
-def kind_of(default: Any) -> Any:
+def infer_type(default: Any) -> Any:
     """The type of an option that is declared by its default alone; null accepts anything."""
     if default is None:
         return Any
@@ -239,7 +239,7 @@ def kind_of(default: Any) -> Any:
 
 def option_type(option: Option) -> Any:
     """What an option's values are converted to."""
-    return _offered(option[2]) if len(option) == 3 else kind_of(option[0])
+    return _offered(option[2]) if len(option) == 3 else infer_type(option[0])
 
 
 def _offered(kind: Any) -> Any:
@@ -253,7 +253,7 @@ class _Unfit(ConfigError):
     """A value that is not what its field expects."""
 
     def __init__(self, where: str, value: object, expected: str) -> None:
-        super().__init__(f"{where}={shown(value)}: expected {expected}")
+        super().__init__(f"{where}={format_value(value)}: expected {expected}")
         self.where, self.expected = where, expected
 
 
@@ -262,16 +262,16 @@ def refuse_unknown(values: Iterable[object], names: Iterable[str], where: str) -
     known = list(names)
     for key in values:
         if key not in known:
-            hint = nearest(str(key), known, prefix=joined(where, "")) or "; there is none"
-            raise ConfigError(f"{cut(joined(where, str(key)))}: no such setting{hint}")
+            hint = nearest(str(key), known, prefix=join_key(where, "")) or "; there is none"
+            raise ConfigError(f"{cut(join_key(where, str(key)))}: no such setting{hint}")
 
 
-def joined(where: str, name: str) -> str:
+def join_key(where: str, name: str) -> str:
     """The dotted key of a setting in a group, which is empty at the root."""
     return f"{where}.{name}" if where else name
 
 
-def shown(value: object) -> str:
+def format_value(value: object) -> str:
     """A value as users type it, cut where it is long; text that reads as something else is quoted, and so is what would
     break the line."""
     return cut(_whole(value))
@@ -327,7 +327,7 @@ def _either(values: tuple[object, ...]) -> str:
 # ---------------------------------------------------------------- types
 
 
-def hints_of(cls: type) -> Mapping[str, Any]:
+def field_types(cls: type) -> Mapping[str, Any]:
     """Field name -> annotated type, of a settings dataclass."""
     if cls not in _HINTS:
         hints = get_type_hints(cls, include_extras=True)
@@ -351,7 +351,7 @@ def _one_of(value: Any, options: tuple[Any, ...], where: str) -> Any:
     for option in options:
         if option is not type(None):
             try:
-                return converted(value, option, where)
+                return coerce(value, option, where)
             except _Unfit as error:
                 if error.where != where:  # inside of a group that is the right one
                     raise
@@ -366,21 +366,21 @@ def _plain(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
     if kind is Any:
         return value
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        return checked(kind, value, where)
+        return validate(kind, value, where)
     if origin is Literal:
         if any(value == a and type(value) is type(a) for a in args):
             return value
     elif isinstance(origin, type) and issubclass(origin, Mapping):
         if isinstance(value, Mapping):
             return _entries(value, args, where)
-        raise ConfigError(f"{where}={shown(value)}: expected entries, each as {where}.KEY=VALUE")
+        raise ConfigError(f"{where}={format_value(value)}: expected entries, each as {where}.KEY=VALUE")
     elif origin in (tuple, list):
         items = (
             args[:1] * len(value) if isinstance(value, list | tuple) and (origin is list or args[-1] is ...) else args
         )
         if isinstance(value, list | tuple) and len(items) == len(value):
             try:
-                return origin(converted(v, item, where) for v, item in zip(value, items, strict=True))
+                return origin(coerce(v, item, where) for v, item in zip(value, items, strict=True))
             except _Unfit:  # said of the whole list, below
                 pass
     elif (made := _scalar(value, kind)) is not None:
@@ -393,7 +393,7 @@ def _entries(value: Mapping[Any, Any], args: tuple[Any, ...], where: str) -> dic
     names, kind = args
     if get_origin(names) is Literal:
         refuse_unknown(value, get_args(names), where)
-    return {str(k): converted(v, kind, joined(where, str(k))) for k, v in value.items()}
+    return {str(k): coerce(v, kind, join_key(where, str(k))) for k, v in value.items()}
 
 
 def _scalar(value: Any, kind: Any) -> Any:

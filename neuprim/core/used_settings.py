@@ -11,21 +11,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from neuprim.core.checked import Option
 from neuprim.core.errors import ConfigError
 from neuprim.core.train.settings import ModelSettings, TrainSettings
+from neuprim.core.validation import Option
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension
     from neuprim.core.task import TaskSpec
 
-__all__ = ["OPTIONAL", "Declared", "build_settings", "loss_settings"]
+__all__ = ["OPTIONAL", "TrackedMapping", "build_settings", "loss_settings"]
 
 OPTIONAL = ("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight")
 """Shared settings that a task or loss uses only if it says so."""
 
 
-class Declared(dict[str, Any]):
+class TrackedMapping(dict[str, Any]):
     """A group of settings as a plugin's function gets it; a setting that it forgot to declare is an error that says so.
 
     Args:
@@ -73,7 +73,9 @@ def _group(
     declared: Mapping[str, Option],
     options: Mapping[str, Any],
     owner: str,
-) -> Declared:
+) -> TrackedMapping:
     used = {k: v for k, v in values.items() if f"{name}.{k}" not in OPTIONAL or f"{name}.{k}" in uses}
     own = {key: options.get(key, option[0]) for key, option in declared.items()}
-    return Declared({**used, "options": Declared(own, owner, "task.options", "options")}, owner, name, "uses")
+    return TrackedMapping(
+        {**used, "options": TrackedMapping(own, owner, "task.options", "options")}, owner, name, "uses"
+    )

@@ -11,21 +11,32 @@ from typing import Annotated, Any, Literal
 
 import pytest
 
-from neuprim.core.checked import Accepts, Range, checked, choose, converted, kind_of, option_type, shown, text, verify
 from neuprim.core.errors import ConfigError
+from neuprim.core.validation import (
+    Accepts,
+    Range,
+    coerce,
+    format_value,
+    infer_type,
+    nonempty_text,
+    option_type,
+    validate,
+    validate_choices,
+    validate_fields,
+)
 
 
 @dataclass(frozen=True)
 class Inner:
     size: Annotated[int, Range(8, 64)] = 16
-    name: Annotated[str, text("the name of a file")] = "a"
+    name: Annotated[str, nonempty_text("the name of a file")] = "a"
 
 
 @dataclass
 class Outer:
     """What a plugin may declare: some fields without defaults, and nothing that checks when Python code makes one."""
 
-    path: Annotated[Path, text("a folder")]
+    path: Annotated[Path, nonempty_text("a folder")]
     inner: Inner = field(default_factory=Inner)
     every: Annotated[int, Range(at_least=2, also=(0,))] = 0
     form: Literal["sharp", "soft"] = "soft"
@@ -45,7 +56,7 @@ def test_what_loses_nothing_is_converted() -> None:
         "range": [0, 1],
         "free": object,
     }
-    made = checked(Outer, values, "scene")
+    made = validate(Outer, values, "scene")
     assert made.path == Path("123") and made.inner == Inner(size=32) and isinstance(made.inner.size, int)
     assert (
         made.exposure == 1e-3
@@ -53,8 +64,8 @@ def test_what_loses_nothing_is_converted() -> None:
         and made.range == (0.0, 1.0)
         and made.free is object
     )
-    assert checked(Outer, {"path": "x", "exposure": "auto", "inner": Inner(9)}).inner.size == 9
-    assert checked(Outer, made) is made
+    assert validate(Outer, {"path": "x", "exposure": "auto", "inner": Inner(9)}).inner.size == 9
+    assert validate(Outer, made) is made
 
 
 @pytest.mark.parametrize(
@@ -88,7 +99,7 @@ def test_what_loses_nothing_is_converted() -> None:
 )
 def test_one_line_with_key_value_and_what_is_expected(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        checked(Outer, values, "scene")
+        validate(Outer, values, "scene")
     assert str(caught.value) == message
 
 
@@ -130,7 +141,7 @@ def test_bounds_include_what_they_say() -> None:
     ],
 )
 def test_values_are_shown_as_they_are_typed(value: object, text: str) -> None:
-    assert shown(value) == text
+    assert format_value(value) == text
 
 
 @dataclass(frozen=True)
@@ -139,7 +150,7 @@ class Verified:
     high: Annotated[float, Range(at_least=0)] = 1.0
 
     def __post_init__(self) -> None:
-        verify(self, "scene")
+        validate_fields(self, "scene")
         if self.low > self.high:
             raise ConfigError(f"scene.low={self.low:g}: expected at most scene.high, {self.high:g}")
 
@@ -149,12 +160,12 @@ def test_python_code_is_checked_too_and_rules_between_fields_see_converted_value
     with pytest.raises(ConfigError, match=r"^scene\.low=-1: expected a number of at least 0$"):
         replace(Verified(), low=-1)
     with pytest.raises(ConfigError, match=r"^scene\.low=2: expected at most scene\.high, 1$"):
-        checked(Verified, {"low": "2"}, "scene")
+        validate(Verified, {"low": "2"}, "scene")
 
 
 def test_free_settings_take_hints_types_and_tuples() -> None:
     offered = {"count": Annotated[int, Range(1, 4)], "form": ("a", "b"), "scale": float, "name": str}
-    choose({"count": 4, "form": "b", "scale": 3, "name": "x"}, "model.density", offered)
+    validate_choices({"count": 4, "form": "b", "scale": 3, "name": "x"}, "model.density", offered)
     for found, message in (
         ({"count": 5}, "model.density.count=5: expected a whole number from 1 to 4"),
         ({"count": 4.0}, "model.density.count=4.0: expected a whole number from 1 to 4"),
@@ -164,29 +175,29 @@ def test_free_settings_take_hints_types_and_tuples() -> None:
         ({"cuont": 3}, "model.density.cuont: no such setting; did you mean 'model.density.count'?"),
     ):
         with pytest.raises(ConfigError) as caught:
-            choose(found, "model.density", offered)
+            validate_choices(found, "model.density", offered)
         assert str(caught.value) == message
     with pytest.raises(ConfigError, match=r"^model\.colour\.x: no such setting; there is none$"):
-        choose({"x": 1}, "model.colour", {})
+        validate_choices({"x": 1}, "model.colour", {})
 
 
 def test_options_have_the_type_of_their_default_or_their_own() -> None:
     assert option_type((1.0, "help")) is float and option_type((None, "help")) is Any
     assert option_type(("a", "help", ("a", "b"))) == Literal["a", "b"]
-    assert converted([3], kind_of([1, 2]), "x") == [3]
+    assert coerce([3], infer_type([1, 2]), "x") == [3]
     with pytest.raises(ConfigError, match=r"^x=3: expected a list such as \[1, 2\]$"):
-        converted(3, kind_of([1, 2]), "x")
+        coerce(3, infer_type([1, 2]), "x")
 
 
 def test_a_test_of_ones_own_says_what_it_expects() -> None:
     even = Annotated[int, Accepts(lambda v: v % 2 == 0, "an even number")]
-    assert converted(4, even, "x") == 4
+    assert coerce(4, even, "x") == 4
     for value in (3, "x", None):
         with pytest.raises(ConfigError, match=r"expected an even number$"):
-            converted(value, even, "x")
+            coerce(value, even, "x")
 
 
 def test_the_module_of_before_still_imports() -> None:
     with pytest.warns(DeprecationWarning, match=r"neuprim\.core\.choices is now neuprim\.core\.checked"):
         old = importlib.import_module("neuprim.core.choices")
-    assert old.choose is choose
+    assert old.choose is validate_choices

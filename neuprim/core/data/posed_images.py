@@ -156,15 +156,15 @@ class MissingFiles(DataError):
     """Files that a data set names are not there."""
 
 
-def find_image(folder: Path, nonempty_text: str) -> Path | None:
-    """The image that ``text`` names below ``folder``: as written, else with the usual suffixes added, else in another
+def find_image(folder: Path, name: str) -> Path | None:
+    """The image that ``name`` names below ``folder``: as written, else with the usual suffixes added, else in another
     case; None if there is none."""
-    nonempty_text = str(folder / nonempty_text.replace("\\", "/"))
+    name = str(folder / name.replace("\\", "/"))
     try:
         found = next(
-            (Path(nonempty_text + s) for s in ("", *IMAGE_SUFFIXES) if Path(nonempty_text + s).is_file()), None
+            (Path(name + s) for s in ("", *IMAGE_SUFFIXES) if Path(name + s).is_file()), None
         )
-        return found or _other_case(folder, Path(nonempty_text))
+        return found or _other_case(folder, Path(name))
     except OSError:  # a name longer than the file system can hold
         return None
 
@@ -228,8 +228,8 @@ def unique_names(paths: Iterable[str], where: str) -> list[str]:
 
 
 def _stem(path: str, whole: bool = False) -> str:
-    nonempty_text = path.strip("/") if whole else path.rstrip("/").rsplit("/", 1)[-1]
-    return next((nonempty_text[: -len(s)] for s in IMAGE_SUFFIXES if nonempty_text.endswith(s)), nonempty_text)
+    name = path.strip("/") if whole else path.rstrip("/").rsplit("/", 1)[-1]
+    return next((name[: -len(s)] for s in IMAGE_SUFFIXES if name.endswith(s)), name)
 
 
 def every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFrame], list[ImageFrame]]:

@@ -161,9 +161,7 @@ def find_image(folder: Path, name: str) -> Path | None:
     case; None if there is none."""
     name = str(folder / name.replace("\\", "/"))
     try:
-        found = next(
-            (Path(name + s) for s in ("", *IMAGE_SUFFIXES) if Path(name + s).is_file()), None
-        )
+        found = next((Path(name + s) for s in ("", *IMAGE_SUFFIXES) if Path(name + s).is_file()), None)
         return found or _other_case(folder, Path(name))
     except OSError:  # a name longer than the file system can hold
         return None

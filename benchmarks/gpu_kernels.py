@@ -33,10 +33,10 @@ from shared.tables import ROOT, Table, between_markers
 
 from neuprim.core.compute.warp import BLOCK
 from neuprim.core.model.colours import sh_warp
-from neuprim.core.render.cuda import binning, delicate, forward, net, passes, prepare, prepare_backward
+from neuprim.core.render.cuda import binning, colour_net, float64, forward, passes, prepare, prepare_backward
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.forms import Form
-from neuprim.core.render.cuda.placement import PER_BLOCK
+from neuprim.core.render.cuda.layout import Form
+from neuprim.core.render.cuda.projection import PER_BLOCK
 from neuprim.core.train import adam_warp, ssim_warp
 from neuprim.core.volumes import grid_warp
 from neuprim.tasks.dynamic.volume import traverse_warp
@@ -60,12 +60,12 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         yield "prepare", prepare.prepare_kernel(False), PER_BLOCK
         yield "prepare, backward", prepare_backward._kernel(False), PER_BLOCK
         yield "rows in float64", prepare.wide_kernel(False), PER_BLOCK
-        yield "network units", net._kernels(False)[0], PER_BLOCK
+        yield "network units", colour_net._kernels(False)[0], PER_BLOCK
         yield "emit", binning._kernels()[0], PER_BLOCK
         yield "list", binning._kernels()[1], BLOCK
         yield "spans", passes.row_spans, BLOCK
         yield "sums", passes.sum_pairs, BLOCK
-        yield "float64 pairs", delicate.delicate_kernel(False), L.WARP
+        yield "float64 pairs", float64.float64_opacity_kernel(False), L.WARP
         return
     if name == BESIDE:
         for title, made in (
@@ -88,7 +88,7 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
     yield "pairs", passes.pairs_kernel(form, False), L.WARP
     yield "composite by entry", passes.composite_kernel(form, False), BLOCK
     yield "uncomposite by entry", passes.uncomposite_kernel(form, False), BLOCK
-    yield "float64 pairs, backward", passes.delicate_pairs_kernel(form, False), L.WARP
+    yield "float64 pairs, backward", passes.float64_pairs_kernel(form, False), L.WARP
 
 
 def measure(archs: list[int], forms: list[str], names: list[str] | None = None) -> list[Row]:

@@ -27,9 +27,8 @@ from neuprim.core.compute.machine import cpu_name
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.model.schema import ParameterSpec
-from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.cpu import layout
-from neuprim.core.render.cpu.layout import SPAN_WIDTH, gradient_width, row_width
+from neuprim.core.render import RenderSettings, layout, render_lowered
+from neuprim.core.render.cpu.layout import gradient_width, row_width
 from neuprim.core.train.optimizer import RowAdam
 
 RESULTS = Path(__file__).parent / "results" / "render.json"
@@ -61,9 +60,9 @@ def true_hits(lowered: Lowered, camera: Camera) -> int:
         assert node is not None, "the backend keeps its frame in the graph"
         node = node.next_functions[0][0]
     frame = node.frame
-    rows = frame.rows.astype(np.float64)
+    rows = frame.projected.rows.astype(np.float64)
     parts = [rows[:, c : c + 3] for c in (layout.E0, layout.EX, layout.EY, layout.XA)]
-    return int(_count_hits(*parts, rows[:, layout.TC], rows[:, [layout.UX, layout.UY]], frame.boxes))
+    return int(_count_hits(*parts, rows[:, layout.TC], rows[:, [layout.UX, layout.UY]], frame.projected.boxes))
 
 
 def make_passes(lowered: Lowered, camera: Camera, threads: int) -> tuple[Passes, dict[str, int]]:
@@ -116,7 +115,7 @@ def main() -> None:
     torch.set_num_threads(1)
     rows = []
     memory = (
-        f"Per primitive {4 * row_width(8) + 4 * SPAN_WIDTH} bytes of rows and spans and per pair 8 bytes of "
+        f"Per primitive {4 * row_width(8) + 4 * layout.SPAN_WIDTH} bytes of rows and spans and per pair 8 bytes of "
         f"lists; a backward pass takes "
         f"{4 * gradient_width(8, 3)} bytes more for each (K = 8, three colours), and what the forward pass keeps "
         f"for it: 6 bytes a pair and 4 a lane."

@@ -16,7 +16,7 @@ from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.model.tensors import Sizes, tensor_fault
-from neuprim.core.render import RenderSettings, RenderStats, Tally, backends, render_lowered
+from neuprim.core.render import Contributions, RenderSettings, RenderStats, backends, render_lowered
 
 __all__ = ["Rasterized", "rasterize"]
 
@@ -38,7 +38,7 @@ class Rasterized:
     depth: Tensor | None
     stats: tuple[RenderStats, ...]
 
-    def watch(self, error: Tensor) -> tuple[Tally, ...]:
+    def request_contributions(self, error: Tensor) -> tuple[Contributions, ...]:
         """Let the backward pass tell which primitives each camera saw, and which had a part in an error; call it before
         ``backward()``.
 
@@ -47,15 +47,19 @@ class Rasterized:
 
         Returns:
             for each camera the (N,) sums ``weight`` and ``error_weight``, which the backward pass fills: see
-            :class:`neuprim.core.render.Tally`.
+            :class:`neuprim.core.render.Contributions`.
 
         Raises:
             DataError: ``error`` is not of the frames' size.
         """
-        _check_tensor("watch: error", error)
+        _check_tensor("request_contributions: error", error)
         if error.shape != self.alpha.shape:
-            raise _wrong("watch: error", f"shape {tuple(error.shape)}", f"{tuple(self.alpha.shape)}, that of alpha")
-        return tuple(stats.watch(part) for stats, part in zip(self.stats, error, strict=True))
+            raise _wrong(
+                "request_contributions: error",
+                f"shape {tuple(error.shape)}",
+                f"{tuple(self.alpha.shape)}, that of alpha",
+            )
+        return tuple(stats.request_contributions(part) for stats, part in zip(self.stats, error, strict=True))
 
 
 def rasterize(
@@ -154,9 +158,9 @@ def rasterize(
         )
     backdrop = _check_backgrounds(backgrounds, views, channels)
     if Ks.requires_grad and not all(
-        backend.differentiates_intrinsics for backend in backends.candidates(knobs, means.device.type)
+        backend.differentiates_intrinsics for backend in backends.candidate_backends(knobs, means.device.type)
     ):
-        able = " or ".join(f'backend="{b.name}"' for b in backends.available() if b.differentiates_intrinsics)
+        able = " or ".join(f'backend="{b.name}"' for b in backends.available_backends() if b.differentiates_intrinsics)
         raise BackendUnavailable(
             f'rasterize: Ks requires a gradient, which backend="{knobs.backend}" does not compute; pass {able} or Ks.detach()'
         )
@@ -194,7 +198,7 @@ def _settings(settings: dict[str, Any]) -> RenderSettings:
         if name not in names:
             raise ConfigError(f"rasterize: unknown setting {name!r}{nearest(name, names)}")
     knobs = RenderSettings(**settings)
-    backends.check_name(knobs.backend)
+    backends.check_backend_name(knobs.backend)
     return knobs
 
 

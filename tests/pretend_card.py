@@ -23,8 +23,8 @@ from neuprim.core.compute import device
 from neuprim.core.render import backends
 from neuprim.core.render.backends import Backend
 from neuprim.core.render.cpu.backend import render as draw_on_processor
+from neuprim.core.render.draw import Draw, on_device
 from neuprim.core.render.output import RenderOutput
-from neuprim.core.render.shading import Draw, elsewhere
 
 __all__ = ["CARD", "Card", "pretended"]
 
@@ -151,14 +151,14 @@ def pretended(monkeypatch: pytest.MonkeyPatch, memory: int = 1 << 30) -> Iterato
         def load() -> Draw:
             def draw(*frame: Any) -> RenderOutput:
                 before = card.waits.copy()
-                output = elsewhere(draw_on_processor, torch.device("cpu"))(*frame)
+                output = on_device(draw_on_processor, torch.device("cpu"))(*frame)
                 card.waits = before  # for the numbers that the pretended backend moves
                 return output
 
             return draw
 
         row = Backend(
-            "card", load, backends.kernels_refuse, lambda: "a pretended card", checks=True, devices=(CARD.type,)
+            "card", load, backends.unsupported_by_kernels, lambda: "a pretended card", checks=True, devices=(CARD.type,)
         )
         patch.setattr(backends, "TABLE", (row, *backends.TABLE))
         with _Written(), card:

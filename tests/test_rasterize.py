@@ -178,7 +178,7 @@ def test_population_statistics_come_back_per_camera() -> None:
     out = neuprim.rasterize(**a)
     error = torch.ones(3, HEIGHT, WIDTH)
     error[1] = 0.5
-    tallies = out.watch(error)
+    tallies = out.request_contributions(error)
     out.rgb.sum().backward()
     for c, tally in enumerate(tallies):
         assert tally.weight.sum().item() == pytest.approx(out.alpha[c].sum().item(), rel=1e-4)
@@ -187,7 +187,7 @@ def test_population_statistics_come_back_per_camera() -> None:
         DataError,
         match=rf"^rasterize: watch: error has shape \(2, 3\); expected \(3, {HEIGHT}, {WIDTH}\), that of alpha$",
     ):
-        out.watch(torch.ones(2, 3))
+        out.request_contributions(torch.ones(2, 3))
 
 
 # ---------------------------------------------------------------- bad input

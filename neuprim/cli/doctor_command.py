@@ -152,9 +152,9 @@ def _version_or(name: str, otherwise: str) -> str:
 def _cuda() -> Rows:
     import torch
 
-    from neuprim.core.render.backends import no_card
+    from neuprim.core.render.backends import gpu_unavailable
 
-    missing = no_card()
+    missing = gpu_unavailable()
     used = ("used by runs", "yes" if missing is None else f"no: {missing}")
     if torch.version.cuda is None:
         return [("none", f"torch {torch.__version__} is a CPU build"), used]
@@ -178,7 +178,7 @@ def _backends() -> tuple[Rows, bool]:
 
     rows: Rows = []
     working = False
-    for name in backends.names():
+    for name in backends.backend_names():
         reason = _probe(name)
         working = working or reason is None
         rows.append((name, "works" if reason is None else f"does not work: {reason}"))
@@ -188,9 +188,9 @@ def _backends() -> tuple[Rows, bool]:
 def _probe(name: str) -> str | None:
     """None if a backend draws a picture here, else the reason it does not."""
     try:
-        from neuprim.core.render import probe
+        from neuprim.core.render import probe_backend
 
-        return probe(name)
+        return probe_backend(name)
     except Exception as error:  # a diagnosis must show a broken backend, not die of it
         return f"{type(error).__name__}: {' '.join(str(error).split())}"
 

@@ -41,8 +41,8 @@ class RunSettings:
 
     def __post_init__(self) -> None:
         validate_fields(self, "")
-        backends.check_name(self.renderer.backend)
-        backends.check_pair(self.renderer)
+        backends.check_backend_name(self.renderer.backend)
+        backends.check_backend_device(self.renderer)
         population.check_name(self.train.population.strategy)
 
 

@@ -14,7 +14,7 @@ from neuprim.core.model.fields import ConditionSpec, Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.backends import ORACLE
+from neuprim.core.render.backends import REFERENCE
 
 __all__ = ["between", "example", "ring_camera", "sample"]
 
@@ -56,7 +56,7 @@ class _Views(ViewSet):
         self.views = [
             View(f"{split}{i}", c, {s.name: sample(s, generator) for s in conditions}) for i, c in enumerate(cameras)
         ]
-        settings = RenderSettings(backend=ORACLE)
+        settings = RenderSettings(backend=REFERENCE)
         frames = [render_lowered(_truth(channels), c, settings) for c in cameras]
         self.images = [Pixels(f.rgb, f.alpha) for f in frames]
 

@@ -21,7 +21,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.render.backends import ORACLE
+from neuprim.core.render.backends import REFERENCE
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.initial import initial_model
 from neuprim.core.train.settings import PopulationSettings, TrainSettings
@@ -31,7 +31,7 @@ from neuprim.core.used_settings import build_settings, loss_settings
 __all__ = ["EXACT", "PRIMITIVES", "ConformanceError", "Frozen", "Subject", "watched"]
 
 PRIMITIVES = 12
-EXACT = RenderSettings(backend=ORACLE, alpha_max=0.9999, alpha_min=0.0, transmittance_min=0.0, depth_floor=1e-12)
+EXACT = RenderSettings(backend=REFERENCE, alpha_max=0.9999, alpha_min=0.0, transmittance_min=0.0, depth_floor=1e-12)
 """Nothing skipped and nothing clamped that could be left alone: what the mathematics says."""
 
 
@@ -93,7 +93,7 @@ class Subject:
         choice = task_choices(self.task)
         found = preset_settings(self.task, self.preset or choice.preset, choice.scene)
         model = replace(found.model, **{"primitives": PRIMITIVES, **self.changes})
-        return replace(found, model=model, renderer=RenderSettings(backend=ORACLE))
+        return replace(found, model=model, renderer=RenderSettings(backend=REFERENCE))
 
     @cached_property
     def options(self) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def main(backend: str, edge: int = 0) -> None:
     output = render_lowered(
         Lowered(geometry, density.lower(params, geometry, {}), colour), camera, RenderSettings(backend=backend)
     )
-    output.watch(torch.ones(output.rgb.shape[:2]))
+    output.request_contributions(torch.ones(output.rgb.shape[:2]))
     loss, _ = photometric({"ssim_weight": 0.2})(
         output.rgb, torch.zeros_like(output.rgb), Supervision(View("warm", camera))
     )

@@ -22,7 +22,7 @@ from neuprim.core.io.images import srgb_to_linear
 from neuprim.core.layers import LIGHTS, LayerFrame, LayerSpec, chosen_layers
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.near import decided
+from neuprim.core.render.near_plane import resolve_near
 from neuprim.core.render.output import mean_depth
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import layer_of
@@ -189,7 +189,7 @@ class Layers:
     def _attributes(self, model: Primitives, view: View) -> dict[str, Any]:
         """What the file says about itself: camera, conditions, where it comes from and what its numbers are."""
         linear = self.channels.color_space == "linear"
-        near = decided(self.point.settings, model.params["means"], [view.camera]).near_plane
+        near = resolve_near(self.point.settings, model.params["means"], [view.camera]).near_plane
         found = {
             **exr_attributes(self.world.world_camera(view.camera), near / self.world.scale),
             "software": f"neuprim {__version__}",

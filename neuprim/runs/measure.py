@@ -35,7 +35,7 @@ from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.notices import warn_once
-from neuprim.core.render import RenderSettings, choose, render
+from neuprim.core.render import RenderSettings, choose_backend, render
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import clips_of, diagnosed, judged, mask_of
 from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, placed
@@ -235,7 +235,7 @@ def summary(
     """
     worst, camera = min(views, key=lambda v: v.psnr), dataset.test.view(0).camera
     lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions, config.renderer)
-    backend = choose(lowered, config.renderer)
+    backend = choose_backend(lowered, config.renderer)
     seconds = sorted(v.seconds for v in views)
     return {
         "task": config.task,
@@ -260,7 +260,7 @@ def summary(
         **training,
         "render_fps": 1.0 / max(seconds[len(seconds) // 2], 1e-9),
         "backend": backend.name,
-        "device": backend.computer(config.renderer),
+        "device": backend.computing_on(config.renderer),
         "checkpoint": "last",
         "downsampling": dataset.downsampling,
         "image_size": [camera.width, camera.height],

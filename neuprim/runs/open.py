@@ -18,8 +18,7 @@ from neuprim.core.io.files import cache_directory
 from neuprim.core.io.plain import finite, load_json
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.backends import at_hand, computing_device
-from neuprim.core.render.place import device_of
+from neuprim.core.render.backends import computing_device, device_of, with_available_device
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.core.volumes.source import VolumeSource
 from neuprim.plugins.blame import blamed
@@ -106,7 +105,7 @@ def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Pr
     world = World.of(header, str(model_file(run_dir)))
     if any(spec.place for spec in task.conditions) and not world.identity:
         task = replace(task, conditions=tuple(spec.within(world) for spec in task.conditions))
-    return replace(config, renderer=at_hand(config.renderer)), task, model, header
+    return replace(config, renderer=with_available_device(config.renderer)), task, model, header
 
 
 def placed(model: Primitives, settings: RenderSettings, view: View) -> Primitives:

@@ -241,8 +241,8 @@ def parse_render_config(overrides: Sequence[str], defaults: RenderSettings, mode
     settings = validate(RenderSettings, values, "renderer")
     if settings.near == "auto":
         settings = dataclasses.replace(settings, near=defaults.near)  # resolved by the run's training
-    backends.check_name(settings.backend)
-    backends.check_pair(settings)
+    backends.check_backend_name(settings.backend)
+    backends.check_backend_device(settings)
     return RenderConfig(settings, resolution, dict(sorted(reduced.items())), dict(sorted(storage.items())))
 
 

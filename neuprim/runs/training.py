@@ -20,7 +20,7 @@ from neuprim.core.errors import CheckpointError, RankError
 from neuprim.core.io.files import write_text
 from neuprim.core.model.edge import EDGES
 from neuprim.core.notices import warn_once
-from neuprim.core.render.backends import choose, compiled_ahead
+from neuprim.core.render.backends import choose_backend, precompiled_backend
 from neuprim.core.train.distributed import ALONE, Alone
 from neuprim.core.train.restoring import part
 from neuprim.core.train.trainer import Trainer
@@ -78,7 +78,7 @@ def train(
     """
     ranks = in_parts(config, ranks)
     ahead = (
-        compiled_ahead(config.renderer) if dataset is None else None
+        precompiled_backend(config.renderer) if dataset is None else None
     )  # beside loading; of data that are there nothing is waited for
     edge = config.model.density.get("edge", 0)  # of a density of ours; of another's, whatever the word means there
     with ranks.in_turn(), compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
@@ -110,7 +110,7 @@ def make_ready(trainer: Trainer, events: Events = silent) -> None:
     view = trainer.dataset.train.view(0)
     lowered = trainer.model.lower(view.camera, view.conditions, trainer.renderer)
     form = variant(type(lowered.colour).__name__, lowered.density.edge)
-    backend = choose(lowered, trainer.renderer, view.camera)
+    backend = choose_backend(lowered, trainer.renderer, view.camera)
     if backend.compiles and not compiled(backend.name, form):
         events(Preparing(COMPILING))
     compile_kernels(trainer)

@@ -23,7 +23,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.edge import EDGES
 from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.near import decided
+from neuprim.core.render.near_plane import resolve_near
 from neuprim.core.settings import RenderSettings
 from neuprim.webpage.constants import shader_constants
 from neuprim.webpage.numbers import pack_model
@@ -126,7 +126,7 @@ def web_page(
         "background": [float(background[c]) for c in rgb],
         "linear": linear,
         "renderer": {key: getattr(settings, key) for key in ("alpha_min", "alpha_max")},
-        "near": decided(settings, packed.model.params["means"], [home]).near_plane,
+        "near": resolve_near(settings, packed.model.params["means"], [home]).near_plane,
         "constants": [shader_constants(edge) for edge in EDGES],
         "up": [float(x) for x in up],
         "center": middle,

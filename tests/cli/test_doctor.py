@@ -100,7 +100,7 @@ def test_the_oracle_works_here() -> None:
     assert doctor._probe("reference") is None
 
 
-@pytest.mark.parametrize("backend", [backend.name for backend in backends.available()])
+@pytest.mark.parametrize("backend", [backend.name for backend in backends.available_backends()])
 def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor._probe(backend) is None
     genuine = rendering.render_lowered

@@ -11,9 +11,9 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.model.fields import CustomColour
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
-from neuprim.core.render.backends import ORACLE
-from neuprim.core.render.output import Tally
-from neuprim.core.render.reference.backend import pixel_directions
+from neuprim.core.render.backends import REFERENCE
+from neuprim.core.render.output import Contributions
+from neuprim.core.render.reference.rays import pixel_directions
 from tests import scenes
 from tests.backends import by
 
@@ -24,7 +24,7 @@ class Frame:
 
     output: RenderOutput
     grads: dict[str, Tensor]
-    tally: Tally
+    tally: Contributions
 
 
 def weights(shape: tuple[int, ...], seed: int) -> Tensor:
@@ -125,7 +125,7 @@ def draw(
     )
     h, w, C = output.rgb.shape
     keep = torch.ones(h, w, dtype=torch.float64) if skip is None else (~skip).double()
-    tally = output.watch((weights((h, w), 3).abs() * keep).float())
+    tally = output.request_contributions((weights((h, w), 3).abs() * keep).float())
     total = (output.rgb * (weights((h, w, C), 0) * keep[..., None]).to(dtype)).sum() + (
         output.alpha * (weights((h, w), 1) * keep).to(dtype)
     ).sum()
@@ -165,7 +165,7 @@ def assert_same_frame(
     assert skip.float().mean() < 0.05, (
         f"{int(skip.sum())} pixels are undecided: too many for the comparison to mean much"
     )
-    fast, slow = (draw(b, t, camera, settings, skip) for b in (backend, ORACLE))
+    fast, slow = (draw(b, t, camera, settings, skip) for b in (backend, REFERENCE))
     keep = ~skip
     report: dict[str, Any] = {}
     report["rgb"] = (fast.output.rgb.double() - slow.output.rgb).abs().amax(-1)[keep].max().item()

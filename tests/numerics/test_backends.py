@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.errors import BackendUnavailable, NonFiniteError
 from neuprim.core.model.fields import Constant, CustomColour, CustomDensity
-from neuprim.core.render import RenderSettings, choose, render_lowered
+from neuprim.core.render import RenderSettings, choose_backend, render_lowered
 from tests import scenes
 from tests.backends import BACKENDS, FAST, LEFT_OUT, by
 from tests.numerics.cases import CASES, DEFAULT, case
@@ -87,7 +87,7 @@ def test_no_primitives_at_all(backend: str) -> None:
     assert torch.equal(out.rgb, torch.tensor([0.5, 0.25, 1.0]).expand(17, 20, 3))
     assert out.alpha.abs().max() == 0
     if out.rgb.requires_grad:
-        out.watch(torch.ones(17, 20))
+        out.request_contributions(torch.ones(17, 20))
         out.rgb.sum().backward()
 
 
@@ -215,11 +215,11 @@ def test_scales_beyond_the_range_are_named(value: float) -> None:
 
 def test_forms_without_a_kernel_go_to_the_reference() -> None:
     low = scenes.lowered(scenes.tensors(3))
-    assert choose(low, RenderSettings()).name == "cpu"
+    assert choose_backend(low, RenderSettings()).name == "cpu"
     opaque = CustomDensity(lambda prim, o, d, t0, t1: t1 - t0)
-    assert choose(replace(low, density=opaque), RenderSettings()).name == "reference"
+    assert choose_backend(replace(low, density=opaque), RenderSettings()).name == "reference"
     colour = CustomColour(lambda prim, x, d: x, 3)
-    assert choose(replace(low, colour=colour), RenderSettings()).name == "reference"
+    assert choose_backend(replace(low, colour=colour), RenderSettings()).name == "reference"
     with pytest.raises(BackendUnavailable, match="CustomDensity density"):
         render_lowered(replace(low, density=opaque), scenes.camera(8, 8), RenderSettings(backend="cpu"))
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.backends import ORACLE
+from neuprim.core.render.backends import REFERENCE
 from tests import scenes
 from tests.backends import BACKENDS, by
 
@@ -103,7 +103,7 @@ def test_against_the_loop(name: str) -> None:
     expected = loop(t, camera, settings)
     assert expected[1].max() > 0.3
     for backend in BACKENDS:
-        bound = 1e-11 if backend == ORACLE else 1e-5
+        bound = 1e-11 if backend == REFERENCE else 1e-5
         dtype = torch.float64 if backend == "reference" else torch.float32
         model = {k: v.to(dtype) for k, v in t.items()}
         out = render_lowered(

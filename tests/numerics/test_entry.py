@@ -14,7 +14,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
-from neuprim.core.render.backends import ORACLE
+from neuprim.core.render.backends import REFERENCE
 from tests import scenes
 from tests.backends import BACKENDS, FAST, by
 from tests.numerics.cases import CASES, along_z, case, needle_and_sphere, spheres
@@ -134,7 +134,7 @@ def test_against_the_order_by_hand(distance: float, extra: float, knobs: dict[st
     settings = replace(ENTRY, **knobs)  # type: ignore[arg-type]
     rgb, alpha = by_hand(t, camera, settings)
     for backend in BACKENDS:
-        bound = 1e-11 if backend == ORACLE else 1e-5
+        bound = 1e-11 if backend == REFERENCE else 1e-5
         out = render(t, camera, settings, backend)
         assert (out.rgb.double() - rgb).abs().max() < bound and (out.alpha.double() - alpha).abs().max() < bound, (
             backend
@@ -206,7 +206,7 @@ def test_coincident_primitives_keep_their_index_order(sort: str) -> None:
     t = {k: torch.cat([v, v]) for k, v in t.items()}
     t["colors"][12:] = 1 - t["colors"][12:]
     camera, settings = scenes.camera(33, 25), replace(ENTRY, sort=sort)
-    truth = render(t, camera, settings, ORACLE, alpha_min=0.0).rgb
+    truth = render(t, camera, settings, REFERENCE, alpha_min=0.0).rgb
     for backend in FAST:
         assert (render(t, camera, settings, backend, alpha_min=0.0).rgb - truth).abs().max() < 1e-5, backend
 

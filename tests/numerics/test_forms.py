@@ -22,7 +22,7 @@ from neuprim.core.model.fields import Constant, Cosine, CustomColour, CustomDens
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.model.tensors import MOST_UNITS
 from neuprim.core.render import RenderSettings, render, render_lowered
-from neuprim.core.render.joint import joint_volume
+from neuprim.core.render.unsorted_volume import render_unsorted_volume
 from neuprim.core.volumes.grid import density_at, density_grid
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
@@ -181,7 +181,7 @@ def test_a_wrong_opaque_density_is_named_wherever_it_is_asked() -> None:
     with pytest.raises(FormError, match=message):
         render(wrong, CAMERA)
     with pytest.raises(FormError, match=message):
-        joint_volume(wrong.lower(CAMERA, {}), CAMERA)
+        render_unsorted_volume(wrong.lower(CAMERA, {}), CAMERA)
     both = model(waves(lower=lambda *a: CustomDensity(column), density=lambda self, p, g, prim, x, c: x))
     for ask in (
         lambda: density_grid(both, {}, torch.eye(4, dtype=torch.float64) * 0.1, (4, 4, 4)),
@@ -274,7 +274,7 @@ def test_backgrounds_rows_and_cameras(backend: str, samples: int) -> None:
     with pytest.raises(FormError, match=r"^geometry has type NoneType; expected Geometry"):
         render_lowered(replace(lowered, geometry=None), CAMERA, s)  # type: ignore[arg-type]
     with pytest.raises(FormError, match=r"^background has shape \(2,\)"):
-        joint_volume(lowered, CAMERA, background=torch.ones(2))
+        render_unsorted_volume(lowered, CAMERA, background=torch.ones(2))
 
 
 @pytest.mark.parametrize("samples", [1, 2])
@@ -284,9 +284,9 @@ def test_an_error_map_of_another_size(backend: str, samples: int) -> None:
     t = {k: v.requires_grad_() for k, v in scenes.tensors(N).items()}
     out = render_lowered(scenes.lowered(t), CAMERA, settings(backend, samples=samples))
     with pytest.raises(FormError, match=r"^watch: error has shape \(3, 4\); expected \(16, 20\), that of the frame$"):
-        out.watch(torch.ones(3, 4))
+        out.request_contributions(torch.ones(3, 4))
     with pytest.raises(FormError, match=r"^watch: error has type ndarray; expected a torch tensor$"):
-        out.watch(np.ones((16, 20)))  # type: ignore[arg-type]
+        out.request_contributions(np.ones((16, 20)))  # type: ignore[arg-type]
     assert out.stats.watched is None
 
 

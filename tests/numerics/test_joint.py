@@ -12,7 +12,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.fields import Constant, Cosine, CustomColour, CustomDensity
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.joint import joint_volume, sorting_errors
+from neuprim.core.render.unsorted_volume import measure_sorting_errors, render_unsorted_volume
 from tests import scenes
 from tests.numerics.cases import along_z, needle_and_sphere, spheres
 from tests.numerics.compare import entries
@@ -40,12 +40,12 @@ def test_without_overlap_all_three_agree(neurons: int) -> None:
     t["log_scales"] = torch.tensor([[0.25, 0.2, 0.25]], dtype=torch.float64).log().repeat(3, 1)
     t["b2"] += 1.0  # no negative density
     low, camera = scenes.lowered(t), along_z()
-    joint = joint_volume(low, camera, EXACT, SKY, steps=1)
+    joint = render_unsorted_volume(low, camera, EXACT, SKY, steps=1)
     for sort in ("center", "entry"):
         out = render_lowered(low, camera, replace(EXACT, sort=sort), SKY)
         assert (out.rgb - joint.rgb).abs().max() < 1e-12 and (out.alpha - joint.alpha).abs().max() < 1e-12
     assert joint.alpha.max() > 0.8
-    assert (joint_volume(low, camera, EXACT, SKY, keep="density").rgb - joint.rgb).abs().max() < 1e-12
+    assert (render_unsorted_volume(low, camera, EXACT, SKY, keep="density").rgb - joint.rgb).abs().max() < 1e-12
 
 
 def test_coincident_spheres() -> None:
@@ -56,17 +56,17 @@ def test_coincident_spheres() -> None:
     one = 1 - chord_depths(t, 0)[0].neg().exp()
     both = 1 - (1 - one) ** 2
     assert both.max() > 0.8
-    joint = joint_volume(scenes.lowered(t), camera, EXACT, steps=3).rgb
+    joint = render_unsorted_volume(scenes.lowered(t), camera, EXACT, steps=3).rgb
     assert torch.allclose(joint[..., 0], both / 2, atol=1e-12) and torch.allclose(joint[..., 1], both / 2, atol=1e-12)
     first = torch.stack([one, (1 - one) * one], -1)
     for sort in ("center", "entry"):
         out = render_lowered(scenes.lowered(t), camera, replace(EXACT, sort=sort)).rgb
         assert torch.allclose(out[..., :2], first, atol=1e-12)
-    errors = sorting_errors(scenes.lowered(t), camera, EXACT, steps=3)
+    errors = measure_sorting_errors(scenes.lowered(t), camera, EXACT, steps=3)
     assert errors["center"].max_abs == pytest.approx((first[..., 0] - both / 2).max().item(), abs=1e-10)
     assert errors["center"] == errors["entry"]
     t["colors"][1] = t["colors"][0]
-    same = sorting_errors(scenes.lowered(t), camera, EXACT, steps=3)
+    same = measure_sorting_errors(scenes.lowered(t), camera, EXACT, steps=3)
     assert max(e.max_abs for e in same.values()) < 1e-12 and min(e.psnr for e in same.values()) > 200
 
 
@@ -86,7 +86,7 @@ def test_two_overlapping_spheres() -> None:
     red = 1 - (-front).exp() + mixed * both0 / both
     green = mixed * both1 / both + (-front - both).exp() * (1 - (-back).exp())
     for steps in (1, 7):
-        joint = joint_volume(scenes.lowered(t), camera, EXACT, steps=steps)
+        joint = render_unsorted_volume(scenes.lowered(t), camera, EXACT, steps=steps)
         found = joint.rgb[layered]
         assert torch.allclose(found[:, 0], red[layered], atol=1e-10) and torch.allclose(
             found[:, 1], green[layered], atol=1e-10
@@ -123,14 +123,14 @@ def test_against_a_plain_march_of_the_density() -> None:
             mixed = (t["colors"].T @ tau) / total.clamp_min(1e-30)
             expected[y, x] = (mixed * weight).sum(1)
     errors = [
-        (joint_volume(low, camera, EXACT, steps=s, keep="density").rgb - expected).abs().max().item()
+        (render_unsorted_volume(low, camera, EXACT, steps=s, keep="density").rgb - expected).abs().max().item()
         for s in (4, 16, 256)
     ]
     assert expected.max() > 0.3
     assert errors[2] < 5e-4, errors  # the march misplaces a chord's ends by half a step
     assert errors[0] > errors[2]
-    fine = joint_volume(low, camera, EXACT, steps=512).rgb
-    coarse = [(joint_volume(low, camera, EXACT, steps=s).rgb - fine).abs().max().item() for s in (8, 32)]
+    fine = render_unsorted_volume(low, camera, EXACT, steps=512).rgb
+    coarse = [(render_unsorted_volume(low, camera, EXACT, steps=s).rgb - fine).abs().max().item() for s in (8, 32)]
     assert coarse[1] < coarse[0] / 8, coarse
 
 
@@ -139,12 +139,12 @@ def test_every_ray_keeps_the_transmittance_of_the_renderer(settings: RenderSetti
     """Negative densities, clamps and cuts included: what differs is the order, nothing else."""
     t = scenes.tensors(40, 4, seed=9, dtype=torch.float64)
     low, camera = scenes.lowered(t), scenes.camera(20, 15)
-    joint, plain = joint_volume(low, camera, settings, SKY), render_lowered(low, camera, settings, SKY)
+    joint, plain = render_unsorted_volume(low, camera, settings, SKY), render_lowered(low, camera, settings, SKY)
     assert (joint.alpha - plain.alpha).abs().max() < 1e-12 and joint.alpha.max() > 0.5
     assert joint.depth is not None and plain.depth is not None
     seen = plain.alpha > 0.05
     assert (joint.depth - plain.depth)[seen].abs().max() < 0.5
-    assert (joint_volume(low, camera, settings, SKY, keep="density").alpha - plain.alpha).abs().max() > 1e-3
+    assert (render_unsorted_volume(low, camera, settings, SKY, keep="density").alpha - plain.alpha).abs().max() > 1e-3
 
 
 def test_inside_the_near_plane_and_several_samples() -> None:
@@ -153,18 +153,18 @@ def test_inside_the_near_plane_and_several_samples() -> None:
     low = scenes.lowered(t)
     for camera in (scenes.camera(12, 9, distance=0.2, fov=80.0), scenes.camera(12, 9)):
         for settings in (EXACT, replace(EXACT, samples=2), replace(EXACT, near=2.9)):
-            joint, plain = joint_volume(low, camera, settings, steps=2), render_lowered(low, camera, settings)
+            joint, plain = render_unsorted_volume(low, camera, settings, steps=2), render_lowered(low, camera, settings)
             assert (joint.rgb - plain.rgb).abs().max() < 1e-12, "one colour: no order matters"
 
 
 def test_entry_is_the_volume_where_nothing_overlaps() -> None:
     """And the order of centres is not. Where primitives overlap, neither order is, and neither is always the nearer
     one."""
-    errors = sorting_errors(scenes.lowered(needle_and_sphere()), along_z(41, 30.0), EXACT, SKY)
+    errors = measure_sorting_errors(scenes.lowered(needle_and_sphere()), along_z(41, 30.0), EXACT, SKY)
     assert errors["entry"].max_abs < 1e-12 and errors["center"].max_abs > 0.3
     assert errors["entry"].psnr > 100 + errors["center"].psnr
     t = scenes.tensors(150, 0, seed=12, radius=0.2, dtype=torch.float64)
-    errors = sorting_errors(scenes.lowered(t), scenes.camera(24, 18), EXACT, SKY)
+    errors = measure_sorting_errors(scenes.lowered(t), scenes.camera(24, 18), EXACT, SKY)
     for error in errors.values():
         assert 25 < error.psnr < 50 and 0 < error.mean_abs < error.max_abs < 0.3
 
@@ -176,15 +176,15 @@ def test_other_forms_of_density_and_colour() -> None:
     opaque = CustomDensity(lambda prim, o, d, t0, t1: (t1 - t0) * t["b2"][prim, 0] / m[prim])
     colour = CustomColour(lambda prim, x, d: t["colors"][prim], 3)
     assert isinstance(low.colour, Constant)
-    first = joint_volume(low, camera, EXACT, steps=2).rgb
-    other = joint_volume(replace(low, density=opaque, colour=colour), camera, EXACT, steps=2).rgb
+    first = render_unsorted_volume(low, camera, EXACT, steps=2).rgb
+    other = render_unsorted_volume(replace(low, density=opaque, colour=colour), camera, EXACT, steps=2).rgb
     assert (first - other).abs().max() < 1e-12 and first.max() > 0.2
 
 
 def test_nothing_and_wrong_arguments() -> None:
     low, camera = scenes.lowered({k: v[:0] for k, v in scenes.tensors(2).items()}), scenes.camera(9, 7)
-    assert torch.allclose(joint_volume(low, camera, background=SKY).rgb, SKY.expand(7, 9, 3))
+    assert torch.allclose(render_unsorted_volume(low, camera, background=SKY).rgb, SKY.expand(7, 9, 3))
     with pytest.raises(ConfigError, match="steps=0"):
-        joint_volume(low, camera, steps=0)
+        render_unsorted_volume(low, camera, steps=0)
     with pytest.raises(ConfigError, match="keep='mass'"):
-        joint_volume(low, camera, keep="mass")  # type: ignore[arg-type]
+        render_unsorted_volume(low, camera, keep="mass")  # type: ignore[arg-type]

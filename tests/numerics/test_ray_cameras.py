@@ -12,7 +12,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
-from neuprim.core.render import RenderSettings, choose, render, render_lowered
+from neuprim.core.render import RenderSettings, choose_backend, render, render_lowered
 from neuprim.core.render.reference.backend import _Prepared
 from neuprim.core.render.reference.rays import frame_rays, pixel_directions
 from tests import scenes
@@ -182,7 +182,7 @@ def test_gradients_are_finite_differences() -> None:
 
 def test_only_the_reference_draws_them() -> None:
     low, camera = scenes.lowered(scenes.tensors(3)), RayCamera.fisheye(8, 8, EYE)
-    assert choose(low, RenderSettings(), camera).name == "reference"
+    assert choose_backend(low, RenderSettings(), camera).name == "reference"
     assert render_lowered(low, camera, RenderSettings()).stats.backend == "reference"
     with pytest.raises(BackendUnavailable, match=r"backend=cpu cannot draw a RayCamera.*backend=reference"):
         render_lowered(low, camera, RenderSettings(backend="cpu"))

@@ -15,9 +15,9 @@ from neuprim.core.cameras import Camera
 from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import BackendUnavailable, NonFiniteError
 from neuprim.core.model.fields import Constant, CustomColour, CustomDensity, RayNet
-from neuprim.core.render import RenderSettings, choose, render_lowered
-from neuprim.core.render.joint import joint_volume
+from neuprim.core.render import RenderSettings, choose_backend, render_lowered
 from neuprim.core.render.reference.rays import pixel_directions
+from neuprim.core.render.unsorted_volume import render_unsorted_volume
 from tests import scenes
 from tests.backends import BACKENDS, FAST, by
 from tests.numerics.compare import assert_same_frame, draw
@@ -228,14 +228,16 @@ def test_the_formula_in_the_scene(sort: str) -> None:
     for settings in (s, replace(s, near=2.9), replace(s, samples=2)):
         a, b = (render_lowered(x, camera, settings).rgb for x in (low, other))
         assert a.max() > 0.2 and (a - b).abs().max() < 1e-12
-    assert (joint_volume(low, camera, s, steps=4).rgb - joint_volume(other, camera, s, steps=4).rgb).abs().max() < 1e-12
+    assert (
+        render_unsorted_volume(low, camera, s, steps=4).rgb - render_unsorted_volume(other, camera, s, steps=4).rgb
+    ).abs().max() < 1e-12
 
 
 def test_a_ray_camera_sees_the_same() -> None:
     t, camera = scenes.tensors(30, 3, seed=5, dtype=torch.float64, hidden=4), scenes.camera(30, 22)
     rays = RayCamera(camera.viewmat, pixel_directions(camera))
     low = scenes.lowered(t)
-    assert choose(low, RenderSettings(), rays).name == "reference"
+    assert choose_backend(low, RenderSettings(), rays).name == "reference"
     s = RenderSettings(backend="reference", sort="entry", near=1e-6)
     a, b = render_lowered(low, rays, s).rgb, render_lowered(low, camera, s).rgb
     # entries are ordered by distance here and by depth there, which few pixels tell apart
@@ -247,9 +249,11 @@ def test_a_ray_camera_sees_the_same() -> None:
 
 def test_the_kernels_know_the_form() -> None:
     low = scenes.lowered(scenes.tensors(3, hidden=2))
-    assert choose(low, RenderSettings()).name == "cpu"
+    assert choose_backend(low, RenderSettings()).name == "cpu"
     with pytest.raises(BackendUnavailable, match="CustomDensity density, RayNet colour"):
-        choose(replace(low, density=CustomDensity(lambda prim, o, d, t0, t1: t1 - t0)), RenderSettings(backend="cpu"))
+        choose_backend(
+            replace(low, density=CustomDensity(lambda prim, o, d, t0, t1: t1 - t0)), RenderSettings(backend="cpu")
+        )
     assert isinstance(scenes.lowered(scenes.tensors(3)).colour, Constant)
 
 

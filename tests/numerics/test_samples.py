@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.render import RenderOutput, RenderSettings, find, render_lowered
+from neuprim.core.render import RenderOutput, RenderSettings, find_backend, render_lowered
 from tests import scenes
 from tests.backends import BACKENDS, by
 
@@ -52,7 +52,10 @@ def test_means_of_a_finer_image(backend: str, sort: str, n: int) -> None:
     assert (plain.rgb - out.rgb).abs().max() > 0.02, "edges must be smoother than with one ray"
     weight = torch.randn(15, 20, 3, generator=torch.Generator().manual_seed(0))
     error = torch.rand(15, 20, generator=torch.Generator().manual_seed(1))
-    a, b = out.watch(error), fine.watch(error.repeat_interleave(n, 0).repeat_interleave(n, 1))
+    a, b = (
+        out.request_contributions(error),
+        fine.request_contributions(error.repeat_interleave(n, 0).repeat_interleave(n, 1)),
+    )
     (out.rgb * weight).sum().backward()
     (rgb * weight).sum().backward()
     for k in first:
@@ -66,7 +69,7 @@ def test_statistics_compare_with_one_ray_per_pixel() -> None:
     sums = []
     for n in (1, 3):
         out = frame(leaves(), replace(SETTINGS, samples=n))
-        tally = out.watch(torch.full((15, 20), 0.5))
+        tally = out.request_contributions(torch.full((15, 20), 0.5))
         out.rgb.sum().backward()
         assert torch.allclose(tally.error_weight, 0.5 * tally.weight, rtol=1e-5)
         sums.append(tally.weight)
@@ -78,7 +81,10 @@ def test_statistics_compare_with_one_ray_per_pixel() -> None:
 def test_only_what_is_watched_is_summed(backend: str) -> None:
     """A tally is zeros until the backward pass; a second one takes the place of the first."""
     out = frame(leaves(), replace(SETTINGS, **by(backend), samples=2))
-    first, second = out.watch(torch.ones(15, 20)), out.watch(torch.full((15, 20), 0.25, requires_grad=True))
+    first, second = (
+        out.request_contributions(torch.ones(15, 20)),
+        out.request_contributions(torch.full((15, 20), 0.25, requires_grad=True)),
+    )
     assert second.weight.shape == second.error_weight.shape == (40,) and second.weight.abs().max() == 0
     out.rgb.sum().backward()
     assert first.weight.abs().max() == 0 and second.weight.max() > 1
@@ -93,7 +99,7 @@ def test_counts_out_of_range_are_named(value: int) -> None:
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_one_sample_is_the_backend_itself(backend: str) -> None:
-    draw = find(backend).load()
+    draw = find_backend(backend).load()
     t = scenes.tensors(40, 4, seed=6)
     settings = replace(SETTINGS, **by(backend), samples=1)
     out, direct = frame(t, settings), draw(scenes.lowered(t), CAMERA, SKY, settings)

@@ -161,7 +161,7 @@ def test_a_lower_resolution_keeps_means_at_silhouettes(tmp_path: Path) -> None:
 
 def test_layers_of_others_in_any_channels(tmp_path: Path) -> None:
     def twice(frame: Any) -> Tensor:
-        return frame.seen(Constant(2 * frame.lowered.colour.flat))
+        return frame.composite(Constant(2 * frame.lowered.colour.flat))
 
     own = (
         LayerSpec("twice", "twice the light", twice),

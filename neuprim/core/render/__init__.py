@@ -16,24 +16,23 @@ from neuprim.core.compute.threads import limit_threads
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.primitives import Lowered, Primitives
-from neuprim.core.render.backends import Backend, available, choose, find
-from neuprim.core.render.near import decided
-from neuprim.core.render.output import RenderOutput, RenderStats, Tally
-from neuprim.core.render.refusals import refuse_non_finite
-from neuprim.core.render.samples import render_samples
-from neuprim.core.render.shading import Draw, elsewhere, with_shade
+from neuprim.core.render.backends import Backend, available_backends, choose_backend, find_backend
+from neuprim.core.render.draw import draw_samples, on_device, with_shade
+from neuprim.core.render.near_plane import resolve_near
+from neuprim.core.render.non_finite import refuse_non_finite
+from neuprim.core.render.output import Contributions, RenderOutput, RenderStats
 from neuprim.core.settings import RenderSettings
 
 __all__ = [
     "Backend",
+    "Contributions",
     "RenderOutput",
     "RenderSettings",
     "RenderStats",
-    "Tally",
-    "available",
-    "choose",
-    "find",
-    "probe",
+    "available_backends",
+    "choose_backend",
+    "find_backend",
+    "probe_backend",
     "render",
     "render_lowered",
 ]
@@ -50,31 +49,29 @@ def render(
 ) -> RenderOutput:
     """Draw one frame; differentiable in every parameter, in ``camera.viewmat`` and in ``background``.
 
-    Tensors may be on the processor or on a card, all of a model on one of them; the image is where they are.
+    Tensors may be on the CPU or on a GPU, all of a model on one of them; the image is where they are.
 
     Args:
         model: the primitives; each field lowers under ``conditions`` first.
         camera: the view; rgb is (camera.height, camera.width, C). A :class:`RayCamera` (any central projection) is
-        drawn
-            by the reference backend alone.
+            drawn by the reference backend alone.
         conditions: e.g. ``{"time": tensor(0.5)}``.
-        settings: every speed/accuracy knob; None: the defaults, with ``near="auto"``.
+        settings: every speed/accuracy setting; None: the defaults, with ``near="auto"``.
         background: (C,) colour behind everything; None is black.
 
     Raises:
         FormError: a field, the camera or the background has a tensor that does not fit (field, tensor, found and
-        expected).
+            expected).
         NonFiniteError: a parameter is NaN or infinite (named, with the primitive).
-        BackendUnavailable: the backend asked for cannot draw this model or this camera, or cannot run here.
-        ConfigError: there is no backend of the name asked for.
+        BackendUnavailable: the named backend cannot draw this model or this camera, or cannot run here.
+        ConfigError: there is no backend of the name.
     """
     settings = settings or RenderSettings(near="auto")
-    with (
-        limit_threads(settings.threads) if settings.threads else nullcontext()
-    ):  # fields are lowered by as many threads as pixels
+    # fields are lowered by as many threads as pixels
+    with limit_threads(settings.threads) if settings.threads else nullcontext():
         lowered = model.lower(camera, conditions or {}, settings)
         lowered.check_frame(camera.viewmat, background)
-        return _drawn(lowered, camera, settings, background)
+        return _draw_checked(lowered, camera, settings, background)
 
 
 def render_lowered(
@@ -83,41 +80,44 @@ def render_lowered(
     """Draw a model whose conditions are already folded in; refuses what does not fit or is not finite, see
     :func:`render`."""
     lowered.check(camera.viewmat, background)
-    return _drawn(lowered, camera, settings, background)
+    return _draw_checked(lowered, camera, settings, background)
 
 
-def _drawn(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None) -> RenderOutput:
-    """Of what is checked."""
-    settings = decided(settings, lowered.geometry.means, [camera])
-    backend = choose(lowered, settings, camera)
+def _draw_checked(
+    lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None
+) -> RenderOutput:
+    settings = resolve_near(settings, lowered.geometry.means, [camera])
+    backend = choose_backend(lowered, settings, camera)
     if not backend.checks:
         refuse_non_finite(lowered)
     draw = backend.load()
-    if backend.place(settings) != lowered.kind:
-        draw = elsewhere(draw, device.current_device(backend.place(settings)))
+    place = backend.drawing_device(settings)
+    if place != lowered.kind:
+        draw = on_device(draw, device.current_device(place))
     if background is not None:
         background = background.to(lowered.geometry.means.device, non_blocking=background.is_cpu)
-    paint: Draw = draw if lowered.shade is None else with_shade(draw)
-    if settings.samples > 1:
-        if isinstance(camera, RayCamera):
-            raise ConfigError(
-                f"renderer.samples={settings.samples}: only pinhole cameras are sampled; give a RayCamera more directions"
-            )
-        output = render_samples(paint, lowered, camera, background, settings)
+    if lowered.shade is not None:
+        draw = with_shade(draw)
+    if settings.samples == 1:
+        output = draw(lowered, camera, background, settings)
+    elif isinstance(camera, RayCamera):
+        raise ConfigError(
+            f"renderer.samples={settings.samples}: only pinhole cameras are sampled; give a RayCamera more directions"
+        )
     else:
-        output = paint(lowered, camera, background, settings)
+        output = draw_samples(draw, lowered, camera, background, settings)
     output.stats.rows = lowered.rows
     return output
 
 
-def probe(name: str) -> str | None:
-    """None if backend ``name`` works here, else why not: draws one small sphere and looks at the middle pixel."""
+def probe_backend(name: str) -> str | None:
+    """Return None if backend ``name`` works here, else why not: draw one small sphere and check the middle pixel."""
     from neuprim.core.model.geometry import Geometry
 
     try:
-        missing = find(name).lacking
-        if missing is not None:
-            return missing
+        reason = find_backend(name).unavailable()
+        if reason is not None:
+            return reason
         view = torch.eye(4, dtype=torch.float64)
         view[2, 3] = 3.0
         camera = Camera(view, 16.0, 16.0, 8.0, 8.0, 16, 16)

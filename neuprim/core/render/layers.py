@@ -14,7 +14,7 @@ from neuprim.core.errors import FormError
 from neuprim.core.model.fields import Conditions, Constant, LoweredColour
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
-from neuprim.core.render.shading import points_seen
+from neuprim.core.render.draw import unproject_depth
 
 __all__ = ["LayerFrame"]
 
@@ -85,15 +85,15 @@ class LayerFrame:
             return None
         factor = torch.ones_like(self.drawn.alpha)
         if found.primitives is not None:
-            seen = self.seen(Constant(found.primitives.to(geometry.means)[:, None]))[..., 0]
+            seen = self.composite(Constant(found.primitives.to(geometry.means)[:, None]))[..., 0]
             factor = seen / torch.where(self.drawn.alpha > 0, self.drawn.alpha, 1.0)
         if found.pixels is not None:
             assert self.drawn.depth is not None
             hit = self.drawn.alpha > 0
-            factor[hit] = factor[hit] * found.pixels(points_seen(self.drawn.depth, self.camera)[hit]).to(factor)
+            factor[hit] = factor[hit] * found.pixels(unproject_depth(self.drawn.depth, self.camera)[hit]).to(factor)
         return torch.where(self.drawn.alpha > 0, factor, 0.0)
 
-    def seen(self, colour: LoweredColour) -> Tensor:
+    def composite(self, colour: LoweredColour) -> Tensor:
         """(H, W, C') the frame over black with other colours: the sum along each ray of a primitive's weight alpha_i
         T_i times its colour.
 

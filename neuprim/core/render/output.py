@@ -11,15 +11,15 @@ from torch import Tensor
 
 from neuprim.core.model.checks import check_shape
 
-__all__ = ["RenderOutput", "RenderStats", "Tally", "Watch", "mean_depth", "together"]
+__all__ = ["ContributionRequest", "Contributions", "RenderOutput", "RenderStats", "mean_depth", "sum_contributions"]
 
 
 @dataclass
-class Tally:
-    """What each of the N primitives of a frame had a part in; zeros until the frame's backward pass fills them.
+class Contributions:
+    """What each of the N primitives of a frame contributed to it; zeros until the frame's backward pass fills them.
 
     Attributes:
-        weight: (N,) sum over pixels of alpha_i T_i; positive exactly for primitives the view saw.
+        weight: (N,) sum over pixels of alpha_i T_i; positive exactly for primitives that the view shows.
         error_weight: (N,) sum over pixels of alpha_i T_i x error.
         rows: which primitives of the model the sums belong to where some were left out of the frame; None for all.
     """
@@ -29,7 +29,7 @@ class Tally:
     rows: Tensor | None = None
 
     def of_all(self, count: int) -> tuple[Tensor, Tensor]:
-        """(count,) weight and error_weight of all primitives of the model, zero for those that were left out of the
+        """Return (count,) weight and error_weight of all primitives of the model, zero for those left out of the
         frame."""
         if self.rows is None:
             return self.weight, self.error_weight
@@ -39,44 +39,46 @@ class Tally:
         return weight, error_weight
 
 
-def together(tallies: Sequence[Tally], count: int) -> Tally:
-    """The sums over several frames of a model with ``count`` primitives, one after the other, as several processes add
-    them up, too."""
-    weight, error = tallies[0].of_all(count)
-    for tally in tallies[1:]:
-        more = tally.of_all(count)
+def sum_contributions(frames: Sequence[Contributions], count: int) -> Contributions:
+    """Return the sums over several frames of a model with ``count`` primitives, one after the other: in the order in
+    which several processes add them up."""
+    weight, error = frames[0].of_all(count)
+    for contributions in frames[1:]:
+        more = contributions.of_all(count)
         weight, error = weight + more[0], error + more[1]
-    return Tally(weight, error)
+    return Contributions(weight, error)
 
 
 @dataclass
-class Watch:
-    """What a backend's backward pass looks for and fills: sums over the rays that it drew.
+class ContributionRequest:
+    """What a backend's backward pass reads and fills: sums over the rays that it drew.
 
     Attributes:
         error: of each ray, in the shape of the frame as the backend drew it.
-        rays: how many of a pixel; sums are divided by their number, so that frames of any compare.
+        rays: of a pixel; sums are divided by their number, so that frames of any number compare.
     """
 
     error: Tensor
-    tally: Tally
+    result: Contributions
     rays: int = 1
     sums: tuple[Tensor, Tensor] | None = None
 
     def add(self, rows: Tensor, weight: Tensor, error_weight: Tensor) -> None:
-        """Sums of some primitives ``rows`` (R,) over some of the rays, for backends that draw in blocks."""
+        """Add the sums of primitives ``rows`` (R,) over some of the rays, for backends that draw in blocks."""
         if self.sums is None:
-            blank = torch.zeros_like(self.tally.weight, device=rows.device)
+            blank = torch.zeros_like(self.result.weight, device=rows.device)
             self.sums = blank, blank.clone()
         for total, part in zip(self.sums, (weight, error_weight), strict=True):
             total.index_add_(0, rows, part.to(total))
         self.fill(*self.sums)
 
     def fill(self, weight: Tensor, error_weight: Tensor) -> None:
-        """Sums (N,) over all rays."""
-        tally, n = self.tally, self.rays
-        weight, error_weight = (sums.to(tally.weight.device) for sums in (weight, error_weight))
-        tally.weight, tally.error_weight = (weight, error_weight) if n == 1 else (weight / n, error_weight / n)
+        """Set the sums (N,) over all rays."""
+        n = self.rays
+        weight, error_weight = (sums.to(self.result.weight.device) for sums in (weight, error_weight))
+        self.result.weight, self.result.error_weight = (
+            (weight, error_weight) if n == 1 else (weight / n, error_weight / n)
+        )
 
 
 @dataclass
@@ -86,11 +88,11 @@ class RenderStats:
     Attributes:
         backend: the backend that drew it.
         count: primitives of the frame.
-        pairs: tile-primitive pairs (cpu) or ray-primitive pairs (reference) that were evaluated.
+        pairs: tile-primitive pairs (cpu, cuda) or ray-primitive pairs (reference) that were evaluated.
         rows: which primitives of the model they are where some were left out of the frame; None for all.
         samples: rays per pixel side.
         drawn_on: the device that it was drawn on, where that is not the one its tensors are on.
-        watched: what :meth:`RenderOutput.watch` left for the backward pass.
+        contributions: what :meth:`RenderOutput.request_contributions` asks of the backward pass.
     """
 
     backend: str
@@ -99,17 +101,18 @@ class RenderStats:
     rows: Tensor | None = None
     samples: int = 1
     drawn_on: torch.device | None = None
-    watched: Watch | None = None
+    contributions: ContributionRequest | None = None
     extra: dict[str, Any] = field(default_factory=dict)
 
-    def watch(self, error: Tensor) -> Tally:
-        """See :meth:`RenderOutput.watch`; ``error`` fits."""
+    def request_contributions(self, error: Tensor) -> Contributions:
+        """As :meth:`RenderOutput.request_contributions`, without its check of the shape."""
         n, error = self.samples, error.detach()
         blank = torch.zeros(self.count, device=error.device)
-        tally = Tally(blank, blank.clone(), self.rows)
+        result = Contributions(blank, blank.clone(), self.rows)
         rays = error if n == 1 else error.repeat_interleave(n, 0).repeat_interleave(n, 1)
-        self.watched = Watch(rays if self.drawn_on is None else rays.to(self.drawn_on), tally, n * n)
-        return tally
+        rays = rays if self.drawn_on is None else rays.to(self.drawn_on)
+        self.contributions = ContributionRequest(rays, result, n * n)
+        return result
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,8 @@ class RenderOutput:
         rgb: (H, W, C) in the model's colour space, composited over the background.
         alpha: (H, W) accumulated opacity 1 - T.
         depth: (H, W) weighted mean camera-z (ray distance for a ``RayCamera``) of the chord middles, 0 where nothing is
-        hit; None unless asked for. stats: see :class:`RenderStats`.
+            hit; None unless the settings ask for it.
+        stats: see :class:`RenderStats`.
     """
 
     rgb: Tensor
@@ -128,8 +132,8 @@ class RenderOutput:
     depth: Tensor | None
     stats: RenderStats
 
-    def watch(self, error: Tensor) -> Tally:
-        """Let the backward pass tell which primitives were seen, and which had a part in an error; call it before
+    def request_contributions(self, error: Tensor) -> Contributions:
+        """Have the backward pass sum what each primitive contributed to the frame and to an error; call it before
         ``backward()``.
 
         Args:
@@ -141,12 +145,12 @@ class RenderOutput:
         Raises:
             FormError: ``error`` is not of the frame's size.
         """
-        check_shape("watch: error", error, tuple(self.alpha.shape), ", that of the frame")
-        return self.stats.watch(error)
+        check_shape("request_contributions: error", error, tuple(self.alpha.shape), ", that of the frame")
+        return self.stats.request_contributions(error)
 
 
 def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
-    """(H, W) sum of w z over sum of w; 0 where nothing is hit. The weights of a ray telescope: their sum is its
+    """Return (H, W) sum of w z over sum of w; 0 where nothing is hit. The weights of a ray telescope: their sum is its
     alpha."""
     hit = alpha > 0
     if not (torch.is_grad_enabled() and (weighted.requires_grad or alpha.requires_grad)):

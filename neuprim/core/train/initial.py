@@ -16,7 +16,7 @@ from neuprim.core.errors import ConfigError, DataError, nearest
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.core.render.near import scene_extent
+from neuprim.core.render.near_plane import scene_extent
 from neuprim.core.train.settings import ModelSettings
 
 __all__ = ["initial_model"]

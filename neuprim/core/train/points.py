@@ -11,7 +11,7 @@ from neuprim.core.compute import device
 from neuprim.core.data import Dataset, PointSamples
 from neuprim.core.data.dataset_check import check_samples
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.volumes.points import Shares, values_at
 
@@ -40,9 +40,9 @@ class PointStep:
     rows: Tensor | None
     shares: Shares
 
-    def tally(self) -> Tally:
+    def tally(self) -> Contributions:
         """What each primitive had a part in; call it after the backward pass."""
-        return Tally(self.shares.weight, self.shares.error_weight, self.rows)
+        return Contributions(self.shares.weight, self.shares.error_weight, self.rows)
 
 
 def point_step(

@@ -99,7 +99,7 @@ def sensitivity(
         seen = Primitives(model.density, model.colour, params)
         output = render(seen, view.camera, view.conditions, settings, background.to(model.device))
         signs = (2 * torch.randint(0, 2, output.rgb.shape, generator=generator) - 1).to(output.rgb)
-        tally = output.watch(signs[..., 0])
+        tally = output.request_contributions(signs[..., 0])
         (output.rgb * signs).sum().backward()
         sums.add(params)
         weight, signed = tally.of_all(model.count)

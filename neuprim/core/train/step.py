@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 from neuprim.core.train.distributed import Seen
 
 __all__ = ["ImageStep", "StepReport", "of_views"]
@@ -37,7 +37,7 @@ class ImageStep:
     psnr: float
     name: str
     truth: Tensor
-    tally: Tally
+    tally: Contributions
 
 
 def of_views(seen: Sequence[Seen]) -> tuple[float, dict[str, float], float, str]:

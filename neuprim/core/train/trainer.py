@@ -24,8 +24,8 @@ from neuprim.core.data.dataset_check import check_pixels
 from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, RankError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.render.near import decided, scene_extent
-from neuprim.core.render.place import device_of
+from neuprim.core.render.backends import device_of
+from neuprim.core.render.near_plane import resolve_near, scene_extent
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.ahead import Ahead
 from neuprim.core.train.angle import AngularSize
@@ -55,7 +55,7 @@ class Trainer:
 
     Attributes:
         device: where the training's tensors are.
-        extent: the unit of position rates and size limits, see :func:`~neuprim.core.render.near.scene_extent`.
+        extent: the unit of position rates and size limits, see :func:`~neuprim.core.render.near_plane.scene_extent`.
         step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
         stored: parameters -> what will be kept of them, with the gradients of the parameters: images are drawn of that.
         None: of themselves. zeros: parameter -> (N, ...) bool of the numbers that stay zero; empty for none.
@@ -86,7 +86,10 @@ class Trainer:
             )
         self.model, self.dataset, self.loss = model, dataset, loss
         cameras = [dataset.train.view(i).camera for i in range(len(dataset.train))]
-        self.settings, self.renderer = settings, replace(decided(renderer, model.params["means"], cameras), depth=False)
+        self.settings, self.renderer = (
+            settings,
+            replace(resolve_near(renderer, model.params["means"], cameras), depth=False),
+        )
         self.extent = scene_extent(dataset.extent, model.params["means"], cameras)
         first = dataset.train.view(0)
         self.device = device_of(model, self.renderer, first.camera, first.conditions)
@@ -332,7 +335,9 @@ class Trainer:
         with torch.no_grad():
             difference = rgb - truth
             channels = difference.shape[-1]
-            tally = output.watch(difference.abs() @ torch.full((channels,), 1.0 / channels, device=self.device))
+            tally = output.request_contributions(
+                difference.abs() @ torch.full((channels,), 1.0 / channels, device=self.device)
+            )
             flat = difference.reshape(-1)
             counted = flat.numel() if pixels.mask is None else int(pixels.mask.sum()) * channels
             mse = torch.dot(flat, flat).item() / counted

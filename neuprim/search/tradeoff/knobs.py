@@ -54,7 +54,7 @@ def _resolution(reference: RenderConfig, model: Primitives) -> Iterator[RenderCo
 
 
 def _backends(reference: RenderConfig, model: Primitives) -> Iterator[RenderConfig]:
-    for name in backends.names():
+    for name in backends.backend_names():
         yield replace(reference, settings=replace(reference.settings, backend=name))
 
 

@@ -21,7 +21,7 @@ from neuprim.core.compute.machine import cpu_name
 from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.render import backends
-from neuprim.core.render.marched import compare_sampling
+from neuprim.core.render.quadrature import compare_quadrature
 from neuprim.report.tradeoff import write_tradeoff
 from neuprim.runs.fit import one_torch_thread
 from neuprim.runs.open import LOGS
@@ -143,9 +143,9 @@ class _Work:
 
     def too_slow(self, candidate: Candidate) -> str | None:
         """Why a point is not drawn at all: images of the oracle may take a thousand times as long as the run's own."""
-        if self.subject.backend(candidate.point).name != backends.ORACLE or candidate.knob == "reference":
+        if self.subject.backend(candidate.point).name != backends.REFERENCE or candidate.knob == "reference":
             return None
-        if self.subject.backend(self.subject.reference).name == backends.ORACLE:
+        if self.subject.backend(self.subject.reference).name == backends.REFERENCE:
             return None
         known = self.record.facts.get("exact")
         seconds = (known["oracle_seconds"] if known else self.exact.oracle_seconds) * len(self.subject.truths)
@@ -249,7 +249,7 @@ def _same(subject: Subject) -> dict[str, Any]:
         "machine": {
             "cpu": cpu_name(),
             "cores": core_count(),
-            "device": subject.backend(subject.reference).computer(subject.reference.settings),
+            "device": subject.backend(subject.reference).computing_on(subject.reference.settings),
         },
         "versions": {
             "neuprim": __version__,
@@ -296,7 +296,7 @@ def _marching(subject: Subject) -> dict[str, Any]:
     camera = view.camera
     lowered = subject.double.lower(camera, view.conditions, subject.reference.settings)
     try:
-        found = compare_sampling(lowered, camera, subject.reference.settings)
+        found = compare_quadrature(lowered, camera, subject.reference.settings)
     except NeuprimError as error:
         return {"not_measured": str(error)}
     rows = [

@@ -85,9 +85,9 @@ class Subject:
         """Why a point cannot be drawn here; None if it can."""
         view = point.scale_view(self.truths[0].view)
         try:
-            backends.check_pair(point.settings)
+            backends.check_backend_device(point.settings)
             model = self.prepared(point)
-            backends.choose(model.lower_unchecked(view.camera, view.conditions), point.settings, view.camera)
+            backends.choose_backend(model.lower_unchecked(view.camera, view.conditions), point.settings, view.camera)
         except (BackendUnavailable, ConfigError) as error:
             return str(error)
         return None
@@ -95,7 +95,7 @@ class Subject:
     def backend(self, point: RenderConfig) -> backends.Backend:
         """Which one draws it."""
         model, view = self.prepared(point), self.truths[0].view
-        return backends.choose(model.lower_unchecked(view.camera, view.conditions), point.settings, view.camera)
+        return backends.choose_backend(model.lower_unchecked(view.camera, view.conditions), point.settings, view.camera)
 
     def differs(self, candidate: Candidate) -> bool:
         """Whether a backend's point is drawn by another one than the reference."""
@@ -180,7 +180,7 @@ def exact_images(subject: Subject, allowed: float, float64: bool | None = None) 
     """
     settings = replace(subject.reference.settings, alpha_min=0.0, transmittance_min=0.0)
     uncut = RenderConfig(settings)
-    oracle = RenderConfig(replace(settings, backend=backends.ORACLE, device="auto"))
+    oracle = RenderConfig(replace(settings, backend=backends.REFERENCE, device="auto"))
     double, small = subject.double, subject.small(_SMALL)
     background = subject.background.double()
     size = (small.camera.width, small.camera.height)

@@ -29,7 +29,7 @@ from neuprim.core.compute.threads import parallel_for
 from neuprim.core.model.fields import LoweredDensity, Shade
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.parts import render_parts
+from neuprim.core.render.slabs import render_slabs
 from neuprim.tasks.relight.visibility_torch import arriving
 
 __all__ = ["BIAS", "SIZE", "SOFTNESS", "light_visibility"]
@@ -90,7 +90,7 @@ def light_visibility(
         low, high = torch.stack([depths.min(), depths.max()]).tolist()
         edges = torch.linspace(low, high, LAYERS + 1, dtype=torch.float64)
         slabs = torch.bucketize(depths, device.to_like(edges[1:-1], means))
-        opacities, distances = render_parts(geometry, density, slabs, LAYERS, camera, own)
+        opacities, distances = render_slabs(geometry, density, slabs, LAYERS, camera, own)
         view, diameter = camera.viewmat[:3].contiguous(), 2.0 * radius
 
     def visibility(points: Tensor) -> Tensor:

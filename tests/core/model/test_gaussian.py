@@ -231,7 +231,7 @@ def test_every_strategy_of_population() -> None:
         Gradient(PopulationSettings(grow_threshold=0.0, clone_scale=0.1)),
     ):
         output = render(m, camera, {}, RenderSettings())
-        tally = output.watch(torch.ones(24, 32))
+        tally = output.request_contributions(torch.ones(24, 32))
         output.rgb.square().mean().backward()
         strategy.observe(m, tally)
         change = strategy.intervene(m, 1.0)

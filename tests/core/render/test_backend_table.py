@@ -19,16 +19,16 @@ import torch
 from rich.console import Console
 
 import neuprim
-from neuprim.cli import doctor_command, main
+from neuprim.cli import doctor, main
 from neuprim.config import RunConfig, compose
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.fields import Constant, CustomDensity
 from neuprim.core.model.primitives import Lowered
-from neuprim.core.render import RenderOutput, RenderSettings, backends, probe, render_lowered
+from neuprim.core.render import RenderOutput, RenderSettings, backends, probe_backend, render_lowered
 from neuprim.core.render.backends import Backend
+from neuprim.core.render.draw import Draw
 from neuprim.core.render.reference.backend import render as reference
-from neuprim.core.render.shading import Draw
 from tests import scenes
 from tests.core import tiny
 from tests.short_runs import words
@@ -52,7 +52,7 @@ class Fake:
 
         return render
 
-    def refuses(self, lowered: Lowered, camera: AnyCamera | None) -> str | None:
+    def unsupported(self, lowered: Lowered, camera: AnyCamera | None) -> str | None:
         return None if isinstance(lowered.colour, Constant) else f"{type(lowered.colour).__name__} colour"
 
     def missing(self) -> str | None:
@@ -63,7 +63,7 @@ class Fake:
 def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[Fake]:
     """Registered in the table, first, and nowhere else."""
     made = Fake()
-    row = Backend("fake", made.load, made.refuses, lambda: "fake device", made.missing)
+    row = Backend("fake", made.load, made.unsupported, lambda: "fake device", made.missing)
     monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE))
     yield made
 
@@ -113,19 +113,24 @@ def test_a_wrong_name_is_told_the_table(fake: Fake, scene: Path, tmp_path: Path)
 def test_auto_is_the_first_that_does_not_refuse(fake: Fake) -> None:
     low, camera = scenes.lowered(scenes.tensors(3)), scenes.camera(8, 8)
     net = scenes.lowered(scenes.tensors(3, hidden=2))
-    assert backends.choose(low, RenderSettings(), camera).name == "fake"
+    assert backends.choose_backend(low, RenderSettings(), camera).name == "fake"
     assert render_lowered(low, camera, RenderSettings()).stats.backend == "fake" and fake.frames == 1
-    assert backends.choose(net, RenderSettings(), camera).name == "cpu"
+    assert backends.choose_backend(net, RenderSettings(), camera).name == "cpu"
     assert (
-        backends.choose(
+        backends.choose_backend(
             replace(net, density=CustomDensity(lambda prim, o, d, t0, t1: t1 - t0)), RenderSettings(), camera
         ).name
         == "reference"
     )
     fake.broken = "no such device"
-    assert backends.choose(low, RenderSettings(), camera).name == "cpu"
-    here = ["cpu", "reference"] if backends.no_card() else ["cuda", "cpu", "reference"]
-    assert [b.name for b in backends.available()] == here and backends.names() == ("fake", "cuda", "cpu", "reference")
+    assert backends.choose_backend(low, RenderSettings(), camera).name == "cpu"
+    here = ["cpu", "reference"] if backends.gpu_unavailable() else ["cuda", "cpu", "reference"]
+    assert [b.name for b in backends.available_backends()] == here and backends.backend_names() == (
+        "fake",
+        "cuda",
+        "cpu",
+        "reference",
+    )
 
 
 def test_a_refusal_names_it_and_one_that_can(fake: Fake) -> None:
@@ -152,7 +157,7 @@ def test_numbers_that_are_not_finite_are_refused_for_it(fake: Fake) -> None:
 
 def diagnosis() -> dict[str, str]:
     console = Console(file=io.StringIO(), width=200)
-    doctor_command.print_report(console)
+    doctor.doctor(console)
     text = console.file.getvalue()  # type: ignore[attr-defined]
     return dict(re.findall(r"^\W*(fake|cpu|reference)\W+((?:works|does not work)[^\n│]*?)\W*$", text, re.M))
 
@@ -167,7 +172,7 @@ def test_doctor_asks_every_row(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> N
     assert "does not work: drew 0.43" in diagnosis()["fake"]
     fake.broken = "no such device"
     assert diagnosis()["fake"] == "does not work: no such device"
-    assert probe("reference") is None
+    assert probe_backend("reference") is None
 
 
 def test_gradients_of_intrinsics_are_asked_of_the_row(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,7 +197,7 @@ def test_gradients_of_intrinsics_are_asked_of_the_row(fake: Fake, monkeypatch: p
 
 
 def test_what_compiles_is_compiled_ahead(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
-    ahead = backends.compiled_ahead
+    ahead = backends.precompiled_backend
     assert ahead(RenderSettings(backend="fake")) is None and ahead(RenderSettings(backend="reference")) is None
     assert ahead(RenderSettings()).name == "cpu"  # type: ignore[union-attr]
     monkeypatch.setattr(backends, "TABLE", (replace(backends.TABLE[0], compiles=True), *backends.TABLE[1:]))
@@ -201,7 +206,7 @@ def test_what_compiles_is_compiled_ahead(fake: Fake, monkeypatch: pytest.MonkeyP
 
 def test_a_table_costs_no_backend() -> None:
     """Numba alone takes a second to import."""
-    program = "import sys, neuprim.core.render as r; r.backends.names(); r.backends.available(); print('numba' in sys.modules)"
+    program = "import sys, neuprim.core.render as r; r.backends.backend_names(); r.backends.available_backends(); print('numba' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "False"
 
@@ -216,7 +221,7 @@ def named(file: Path) -> Iterator[int]:
         else:
             continue
         constants = (n for value in values for n in ast.walk(value) if isinstance(n, ast.Constant))
-        yield from (n.lineno for n in constants if isinstance(n.value, str) and n.value in backends.names())
+        yield from (n.lineno for n in constants if isinstance(n.value, str) and n.value in backends.backend_names())
 
 
 def test_nothing_else_names_a_backend(tmp_path: Path) -> None:

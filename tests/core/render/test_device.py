@@ -17,8 +17,7 @@ from neuprim.core.compute.device import HOST
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, FormError
 from neuprim.core.model.fields import CustomDensity
 from neuprim.core.render import RenderSettings, backends, render_lowered
-from neuprim.core.render.backends import Backend
-from neuprim.core.render.place import device_of
+from neuprim.core.render.backends import Backend, device_of
 from neuprim.runs.fit import start
 from tests import scenes
 from tests.core import tiny
@@ -72,13 +71,13 @@ def test_so_is_a_backend_of_a_card(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_a_card_that_nothing_draws_on_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "cuda_unavailable", lambda: None)
     monkeypatch.setattr(backends, "TABLE", tuple(b for b in backends.TABLE if b.devices[0] == "cpu"))
-    assert backends.no_card() == "no backend draws there"
+    assert backends.gpu_unavailable() == "no backend draws there"
     assert tiny.trainer(tiny.two_primitives(), 1).device == torch.device("cpu")
     broken = Backend(
         "card", lambda: pytest.fail("loaded"), missing=lambda: "its package is not installed", devices=("cuda",)
     )
     monkeypatch.setattr(backends, "TABLE", (broken, *backends.TABLE))
-    assert backends.no_card() == "its package is not installed"
+    assert backends.gpu_unavailable() == "its package is not installed"
     assert tiny.trainer(tiny.two_primitives(), 1).device == torch.device("cpu")
     with pytest.raises(
         BackendUnavailable, match=r"^renderer\.device=cuda: its package is not installed; expected cpu or auto$"
@@ -114,11 +113,11 @@ def test_a_backend_and_a_device_that_do_not_go_together_are_refused(tmp_path: Pa
 
 def test_a_run_of_a_card_is_opened_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
-    assert backends.at_hand(RenderSettings(device="cuda", near=0.5)) == RenderSettings(near=0.5)
+    assert backends.with_available_device(RenderSettings(device="cuda", near=0.5)) == RenderSettings(near=0.5)
     monkeypatch.setattr(device, "cuda_unavailable", lambda: None)
     row = Backend("card", lambda: pytest.fail("loaded"), devices=("cuda",))
     monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE))
-    assert backends.at_hand(RenderSettings(device="cuda")) == RenderSettings(device="cuda")
+    assert backends.with_available_device(RenderSettings(device="cuda")) == RenderSettings(device="cuda")
 
 
 def test_tensors_say_where_a_frame_is_drawn(card: Card) -> None:
@@ -127,8 +126,8 @@ def test_tensors_say_where_a_frame_is_drawn(card: Card) -> None:
     found = render_lowered(low.to(CARD), camera, RenderSettings(depth=True), torch.ones(3))
     assert wanted.stats.backend == found.stats.backend == "cpu" and found.rgb.device == found.depth.device == CARD  # type: ignore[union-attr]
     assert (
-        backends.choose(low, RenderSettings(), camera).name == "cpu"
-        and backends.choose(low.to(CARD), RenderSettings(), camera).name == "card"
+        backends.choose_backend(low, RenderSettings(), camera).name == "cpu"
+        and backends.choose_backend(low.to(CARD), RenderSettings(), camera).name == "card"
     )
     assert torch.equal(found.alpha.cpu(), wanted.alpha)
 
@@ -144,9 +143,9 @@ def test_the_setting_says_it_too(card: Card) -> None:
         low, camera = frame()
         low = low.to(torch.device(own))
         low.geometry.means.requires_grad_()
-        assert backends.choose(low, setting(kind), camera).name == name
+        assert backends.choose_backend(low, setting(kind), camera).name == name
         output = render_lowered(low, camera, setting(kind))
-        tally = output.watch(torch.ones_like(output.alpha))
+        tally = output.request_contributions(torch.ones_like(output.alpha))
         output.rgb.sum().backward()
         grad = low.geometry.means.grad
         assert grad is not None and output.rgb.device.type == grad.device.type == tally.weight.device.type == own
@@ -186,8 +185,8 @@ def test_a_run_keeps_a_model_where_it_is_drawn(card: Card, monkeypatch: pytest.M
         == device_of(model, setting(CARD.type), camera, {})
         == CARD
     )
-    monkeypatch.setattr(backends.TABLE[0].__class__, "refuses", lambda self, low, camera: "this", raising=False)
-    object.__setattr__(backends.TABLE[0], "refuses", lambda low, camera: "this model")
+    row = replace(backends.TABLE[0], unsupported=lambda low, camera: "this model")
+    monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE[1:]))
     assert device_of(model, RenderSettings(), camera, {}) == torch.device("cpu")
 
 

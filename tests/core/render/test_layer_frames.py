@@ -73,7 +73,7 @@ def test_other_colours_depth_and_alpha() -> None:
     found = chords(one.lowered, CAMERA)
     colours = torch.rand(COUNT, 5, generator=torch.Generator().manual_seed(3))
     seen = torch.einsum("nhw,nc->hwc", found.weight, colours.double())
-    assert off(one.seen(Constant(colours)), seen) < 1e-5
+    assert off(one.composite(Constant(colours)), seen) < 1e-5
     alpha = found.weight.sum(0)
     assert off(one.drawn.alpha, alpha) < 1e-5 and one.shading is None
     assert one.drawn.depth is not None

@@ -15,7 +15,7 @@ from neuprim.core.model.fields import Constant, Cosine, CustomDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.marched import compare_sampling
+from neuprim.core.render.quadrature import compare_quadrature
 
 EXACT = RenderSettings(backend="reference", alpha_min=0.0, transmittance_min=0.0)
 
@@ -45,7 +45,7 @@ def camera(size: int = 20) -> Camera:
 
 @pytest.mark.parametrize(("edge", "order"), [(0, 2), (1, 2), (2, 4)])
 def test_sampling_converges_to_the_closed_form(edge: int, order: int) -> None:
-    found = compare_sampling(scene(edge), camera(), EXACT, rounds=2)
+    found = compare_quadrature(scene(edge), camera(), EXACT, rounds=2)
     assert [way.samples for way in found] == [0, 1, 2, 4, 8, 16, 32, 64]
     assert math.isinf(found[0].psnr) and found[0].max_abs == 0 and found[1].max_abs > 1e-3
     assert len({way.chords for way in found}) == 1 and found[0].chords > 200 and all(way.seconds > 0 for way in found)
@@ -56,7 +56,7 @@ def test_sampling_converges_to_the_closed_form(edge: int, order: int) -> None:
 
 def test_the_near_plane_cuts_chords_of_both_alike() -> None:
     cut = replace(EXACT, near=2.8)
-    found = compare_sampling(scene(2), camera(), cut, samples=(64, 256), rounds=1)
+    found = compare_quadrature(scene(2), camera(), cut, samples=(64, 256), rounds=1)
     assert found[2].max_abs < 1e-5 and found[2].max_abs < 0.2 * found[1].max_abs
 
 
@@ -64,11 +64,11 @@ def test_the_closed_form_is_the_oracle_itself() -> None:
     """Both images that are compared come out of the reference backend; many samples are its image."""
     lowered = scene(0)
     oracle = render_lowered(lowered, camera(), EXACT).rgb
-    (closed, fine) = compare_sampling(lowered, camera(), EXACT, samples=(512,), rounds=1)
+    (closed, fine) = compare_quadrature(lowered, camera(), EXACT, samples=(512,), rounds=1)
     assert closed.samples == 0 and fine.max_abs < 1e-6 and oracle.abs().max() > 0.1
 
 
 def test_a_density_without_a_closed_form_is_refused() -> None:
     opaque = replace(scene(), density=CustomDensity(lambda prim, *ray: torch.zeros(len(prim))))
     with pytest.raises(ConfigError, match="density CustomDensity has no closed form"):
-        compare_sampling(opaque, camera(), EXACT)
+        compare_quadrature(opaque, camera(), EXACT)

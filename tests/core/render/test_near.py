@@ -8,7 +8,7 @@ import torch
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import ConfigError
-from neuprim.core.render.near import decided, scene_extent, seen_depths
+from neuprim.core.render.near_plane import nearest_and_median_depth, resolve_near, scene_extent
 from neuprim.core.settings import RenderSettings
 
 AUTO = RenderSettings(near="auto")
@@ -26,26 +26,26 @@ def points(scale: float) -> torch.Tensor:
 @pytest.mark.parametrize("power", [-13, 0, 13])
 def test_auto_is_a_part_of_the_depth_in_any_unit(power: int) -> None:
     scale = 2.0**power
-    near = decided(AUTO, points(scale), cameras(4 * scale)).near_plane
-    assert near == decided(AUTO, points(1.0), cameras(4.0)).near_plane * scale
+    near = resolve_near(AUTO, points(scale), cameras(4 * scale)).near_plane
+    assert near == resolve_near(AUTO, points(1.0), cameras(4.0)).near_plane * scale
     assert near == pytest.approx(0.01 * scale, rel=0.05)
 
 
 def test_what_is_near_is_not_cut() -> None:
     close = torch.cat([points(1.0), torch.tensor([[3.99, 0.0, 0.797]])])
-    nearest, typical = seen_depths(close, cameras(4.0))
-    assert nearest < 0.1 and decided(AUTO, close, cameras(4.0)).near_plane == pytest.approx(0.1 * nearest)
+    nearest, typical = nearest_and_median_depth(close, cameras(4.0))
+    assert nearest < 0.1 and resolve_near(AUTO, close, cameras(4.0)).near_plane == pytest.approx(0.1 * nearest)
     behind = torch.cat([points(1.0), torch.tensor([[4.1, 0.0, 0.9]])])  # seen by others, from afar
-    assert decided(AUTO, behind, cameras(4.0)).near_plane == pytest.approx(typical / 400, rel=0.1)
+    assert resolve_near(AUTO, behind, cameras(4.0)).near_plane == pytest.approx(typical / 400, rel=0.1)
 
 
 def test_a_number_wins_and_auto_is_no_number() -> None:
-    assert decided(RenderSettings(near=0.3), points(1.0), cameras(4.0)).near_plane == 0.3
+    assert resolve_near(RenderSettings(near=0.3), points(1.0), cameras(4.0)).near_plane == 0.3
     with pytest.raises(ConfigError, match=r"renderer\.near=auto: nothing has decided it"):
         _ = AUTO.near_plane
-    assert decided(AUTO, points(1.0)[:0], cameras(4.0)).near_plane > 0
+    assert resolve_near(AUTO, points(1.0)[:0], cameras(4.0)).near_plane > 0
     fisheye = RayCamera.fisheye(8, 8, cameras(4.0)[0].viewmat)
-    assert decided(AUTO, points(1.0), [fisheye]).near_plane == pytest.approx(0.01, rel=0.1)
+    assert resolve_near(AUTO, points(1.0), [fisheye]).near_plane == pytest.approx(0.01, rel=0.1)
 
 
 def test_cameras_on_a_tripod_take_their_extent_from_the_depth() -> None:

@@ -12,7 +12,7 @@ from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.parts import render_parts
+from neuprim.core.render.slabs import render_slabs
 from tests import scenes
 
 COUNT = 4
@@ -45,8 +45,8 @@ def test_each_is_what_it_is_alone(backend: str, sort: Any, kind: str, monkeypatc
     wanted = [alone(low, parts, part, camera, settings) for part in (0, 1, 3)]
     frames = []
     genuine = render_lowered
-    monkeypatch.setattr("neuprim.core.render.parts.render_lowered", lambda *a: frames.append(1) or genuine(*a))
-    alphas, depths = render_parts(low.geometry, low.density, parts, COUNT, camera, settings)
+    monkeypatch.setattr("neuprim.core.render.slabs.render_lowered", lambda *a: frames.append(1) or genuine(*a))
+    alphas, depths = render_slabs(low.geometry, low.density, parts, COUNT, camera, settings)
     together = backend != "reference" and sort == "center"
     assert len(frames) == (0 if together else 3) and len(alphas) == len(depths) == (4 if together else 3)
     if together:
@@ -65,7 +65,7 @@ def test_one_frame_launches_its_kernels_once(monkeypatch: pytest.MonkeyPatch) ->
     names: list[str] = []
     genuine = passes.launch
     monkeypatch.setattr(passes, "launch", lambda kernel, *rest: names.append(kernel.key) or genuine(kernel, *rest))
-    render_parts(
+    render_slabs(
         low.geometry, low.density, parts, COUNT, camera, RenderSettings(backend="cuda", device="cpu", depth=True)
     )
     assert sum("forward" in name for name in names) == 1 and len(names) <= 3
@@ -80,6 +80,6 @@ def test_what_is_not_finite_has_its_number_among_all(backend: str) -> None:
     with torch.no_grad():
         low.geometry.means[41, 0] = torch.nan
     with pytest.raises(NonFiniteError, match=r"^means of primitive 41 is not finite"):
-        render_parts(
+        render_slabs(
             low.geometry, low.density, parts, COUNT, camera, RenderSettings(backend=backend, device="cpu", depth=True)
         )

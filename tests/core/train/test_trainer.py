@@ -17,7 +17,7 @@ from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, DeviceMemoryError, NonFiniteError
 from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render import Tally
+from neuprim.core.render import Contributions
 from neuprim.core.task import Supervision
 from neuprim.core.train.initial import initial_model
 from neuprim.core.train.population.fixed import Fixed
@@ -231,7 +231,7 @@ class _Seen(Fixed):
         super().__init__(PopulationSettings(strategy="fixed"))
         self.weights: list[Tensor] = []
 
-    def observe(self, model: Primitives, tally: Tally) -> None:
+    def observe(self, model: Primitives, tally: Contributions) -> None:
         self.weights.append(tally.of_all(model.count)[0].clone())
 
 

@@ -6,14 +6,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from neuprim.core.model.edge import EDGES
-from neuprim.core.render.backends import ORACLE
+from neuprim.core.render.backends import REFERENCE
 from tests import backends
 from tests.numerics.extremes.measure import OPAQUE, RIM, SOLID, Errors, compare, integrals
 from tests.numerics.extremes.regions import COLOUR, REGIONS, THIN, Region
 
 __all__ = ["BACKENDS", "Result", "document", "line", "measure", "sweep", "table"]
 
-BACKENDS = (*((name, "float32") for name in backends.BACKENDS), (ORACLE, "float64"))
+BACKENDS = (*((name, "float32") for name in backends.BACKENDS), (REFERENCE, "float64"))
 _HEADER = (
     "| region | backend | error/S | thin | gradient | drawn in float64 | bounds | |",
     "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -59,7 +59,7 @@ def measure(region: Region, edge: int, cases: int) -> list[Result]:
         exact = None if region.whole else integrals(case)
         for result in found:
             result.errors.absorb(
-                compare(case, result.backend, result.precision, region.whole, result.backend != ORACLE, exact),
+                compare(case, result.backend, result.precision, region.whole, result.backend != REFERENCE, exact),
                 case.name,
             )
     return found
@@ -88,14 +88,16 @@ def line(row: Sequence[Result]) -> str:
         )
 
     thin = "" if region.whole else beside([f"{r.errors.thin:.1e}" for r in row])
-    gradient = "" if first.backend == ORACLE else beside([f"{r.errors.gradient:.1e}" for r in row])
+    gradient = "" if first.backend == REFERENCE else beside([f"{r.errors.gradient:.1e}" for r in row])
     wide = (
-        beside([f"{r.errors.wide}" for r in row]) + f" of {first.errors.primitives}" if first.backend != ORACLE else ""
+        beside([f"{r.errors.wide}" for r in row]) + f" of {first.errors.primitives}"
+        if first.backend != REFERENCE
+        else ""
     )
     bounds = [f"{region.forward:.0e}"]
     if not region.whole:
         bounds.append(_once([f"{region.thin_at(r.edge):.0e}" for r in row]))
-    if first.backend != ORACLE:
+    if first.backend != REFERENCE:
         bounds.append(_once([f"{region.gradient_at(r.edge):.0e}" for r in row]))
     state = "**broken**" if any(r.broken for r in row) else "ok"
     forward = beside([f"{r.errors.forward:.1e}" for r in row])

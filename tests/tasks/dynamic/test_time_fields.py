@@ -16,7 +16,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 from neuprim.core.train.population import Relocate, split
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.tasks.dynamic import TASK
@@ -126,7 +126,7 @@ def test_primitives_outside_their_window_are_left_out_and_nothing_changes() -> N
 def test_gradients_reach_living_primitives_and_no_others(backend: str) -> None:
     m = model("phase+offset+window+motion", dtype=torch.float32)
     output = render(m, scenes.camera(), at(0.5), RenderSettings(**by(backend)))
-    tally = output.watch(torch.ones(output.rgb.shape[:2]))
+    tally = output.request_contributions(torch.ones(output.rgb.shape[:2]))
     (output.rgb * torch.rand(output.rgb.shape, generator=torch.Generator().manual_seed(1))).sum().backward()
     rows = m.density.active_rows(m.of(m.density), at(0.5))
     assert rows is not None and len(tally.weight) == len(rows)
@@ -243,7 +243,7 @@ def test_relocation_counts_frames_in_which_a_primitive_lives() -> None:
     m = model("window", dtype=torch.float32)
     population = Relocate(PopulationSettings(fraction=0.1))
     rows = torch.tensor([2, 5, 7])
-    population.observe(m, Tally(torch.ones(3), torch.tensor([1.0, 9.0, 1.0]), rows))
+    population.observe(m, Contributions(torch.ones(3), torch.tensor([1.0, 9.0, 1.0]), rows))
     change = population.intervene(m, 1.0)
     assert change is not None and int(change.origin[0]) == 5  # the first of the idle ones moved to the busiest
 

@@ -210,7 +210,7 @@ def test_depth_images_are_drawn_as_the_frame_is(monkeypatch: pytest.MonkeyPatch)
         seen.append(settings)
         return render_lowered(lowered, camera, settings)
 
-    monkeypatch.setattr("neuprim.core.render.parts.render_lowered", spy)
+    monkeypatch.setattr("neuprim.core.render.slabs.render_lowered", spy)
     m = model(LightNetwork(2, visibility="pixel"), torch.float32)
     own = RenderSettings(backend="reference", threads=1, alpha_max=0.98, samples=2)
     render(m, scenes.camera(), light(), own)

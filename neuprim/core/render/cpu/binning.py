@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.prepare import VISIBLE
+from neuprim.core.render import layout as P
+from neuprim.core.render.cpu.prepare import Projected
+from neuprim.core.render.limits import VISIBLE
 
 __all__ = ["TileLists", "bin_primitives", "depth_order"]
+
+Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
@@ -53,31 +56,28 @@ def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 @exact_kernel
-def _reached(start, stop, rows, spans, boxes, status, across, first):  # type: ignore[no-untyped-def]
-    """Tiles that the silhouettes of primitives ``start:stop`` reach, row by row (exact for ellipses, up to a 1e-3 pixel
-    margin).
+def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-untyped-def]
+    """Tiles that the silhouettes of primitives ``start:stop`` reach, row by row (exact for ellipses, up to a margin of
+    1e-3 pixels); ``first[i + 1]`` is how many primitive i has.
 
-    Returns them; ``first[i + 1]`` is how many primitive i has. In the order of the primitives, not of their depths:
-    what they read lies side by side.
+    In the order of the primitives, not of their depths: what they read lies side by side.
     """
+    rows, spans, boxes, status = projected.rows, projected.spans, projected.boxes, projected.status
     tiles, n = np.empty(4096, np.int32), 0
     for i in range(start, stop):
         before = n
         if status[i] == VISIBLE:
             box = boxes[i]
-            lo, hi = box[0] // L.TILE, (box[2] - 1) // L.TILE + 1
-            hx, hy, skew = np.float64(spans[i, L.HX]), np.float64(spans[i, L.HY]), np.float64(spans[i, L.SKEW])
-            ellipse = spans[i, L.HY] < L.UNBOUNDED
-            over, base, middle = (
-                1.0 / hy,
-                0.5 - np.float64(rows[i, L.UY]) - spans[i, L.YC],
-                spans[i, L.XC] + np.float64(rows[i, L.UX]),
-            )
+            lo, hi = box[0] // P.TILE, (box[2] - 1) // P.TILE + 1
+            hx, hy, skew = np.float64(spans[i, P.HX]), np.float64(spans[i, P.HY]), np.float64(spans[i, P.SKEW])
+            ellipse = spans[i, P.HY] < P.UNBOUNDED
+            over, base = 1.0 / hy, 0.5 - np.float64(rows[i, P.UY]) - spans[i, P.YC]
+            middle = spans[i, P.XC] + np.float64(rows[i, P.UX])
             peak = skew * hy * hy / np.sqrt(hx * hx + skew * skew * hy * hy)  # where the ellipse is furthest right
-            for ty in range(box[1] // L.TILE, (box[3] - 1) // L.TILE + 1):
+            for ty in range(box[1] // P.TILE, (box[3] - 1) // P.TILE + 1):
                 if ellipse:
-                    d0 = max(max(ty * L.TILE, box[1]) + base, -hy)
-                    d1 = min(min(ty * L.TILE + L.TILE, box[3]) - 1 + base, hy)
+                    d0 = max(max(ty * P.TILE, box[1]) + base, -hy)
+                    d1 = min(min(ty * P.TILE + P.TILE, box[3]) - 1 + base, hy)
                     if d1 < d0:
                         continue
                     a, b = min(max(peak, d0), d1), min(max(-peak, d0), d1)
@@ -87,7 +87,7 @@ def _reached(start, stop, rows, spans, boxes, status, across, first):  # type: i
                     x1 = min(np.floor(right - 0.499), np.float64(box[2] - 1))
                     if x1 < x0:
                         continue
-                    lo, hi = int(x0) // L.TILE, int(x1) // L.TILE + 1
+                    lo, hi = int(x0) // P.TILE, int(x1) // P.TILE + 1
                 if n + hi - lo > tiles.shape[0]:
                     grown = np.empty(2 * (n + hi - lo), np.int32)
                     grown[:n] = tiles[:n]
@@ -117,30 +117,22 @@ def _scatter(order, first, tiles, starts, ids, slots):  # type: ignore[no-untype
 
 
 def bin_primitives(
-    rows: Any,
-    spans: Any,
-    boxes: Any,
-    depth: Any,
-    status: Any,
-    width: int,
-    height: int,
-    threads: int,
-    images: tuple[Any, int] | None = None,
+    projected: Projected, width: int, height: int, threads: int, images: tuple[Array, int] | None = None
 ) -> TileLists:
-    """Tile lists of one frame; every argument as :func:`~neuprim.core.render.cpu.prepare.prepare` filled it.
+    """Return the tile lists of one frame.
 
     With ``images``, (N,) numbers and how many there are, each primitive is in one of several images, whose tiles follow
     each other.
     """
-    count = depth.shape[0]
-    across, down = -(-width // L.TILE), -(-height // L.TILE)
+    count = projected.depth.shape[0]
+    across, down = -(-width // P.TILE), -(-height // P.TILE)
     first = np.zeros(count + 1, np.int64)
-    parts = parallel_for(_reached, count, 512, threads, rows, spans, boxes, status, across, first)
+    parts = parallel_for(_reached_tiles, count, 512, threads, projected, across, first)
     np.cumsum(first, out=first)
     tiles = np.concatenate(parts) if parts else np.empty(0, np.int32)
     starts = np.zeros((1 if images is None else images[1]) * across * down + 1, np.int64)
     if images is not None:
         tiles += np.repeat(images[0].astype(np.int32) * np.int32(across * down), np.diff(first))
     ids, slots = np.empty(len(tiles), np.int32), np.empty(len(tiles), np.int32)
-    _scatter(depth_order(depth), first, tiles, starts, ids, slots)
+    _scatter(depth_order(projected.depth), first, tiles, starts, ids, slots)
     return TileLists(starts, ids, first, slots)

@@ -9,7 +9,7 @@ import numpy as np
 
 from neuprim.core.compute.kernels import inline, inline_source
 from neuprim.core.model.edge import NORMS
-from neuprim.core.render.cpu import layout as L
+from neuprim.core.render import layout as P
 
 __all__ = ["add_ray", "by_depth", "chord", "put_ray", "ray", "through_chord", "weight", "zero_ray"]
 
@@ -21,9 +21,9 @@ _MEANS = tuple(f(n / 2) for n in NORMS)  # of (1 - u^2)^p over [-1, 1]
 def ray(p):  # type: ignore[no-untyped-def]
     """What :func:`chord` reads of a primitive's row, read once for all lanes."""
     return (
-        p[L.E0], p[L.E0 + 1], p[L.E0 + 2], p[L.EX], p[L.EX + 1], p[L.EX + 2], p[L.EY], p[L.EY + 1], p[L.EY + 2],
-        p[L.XA], p[L.XA + 1], p[L.XA + 2], p[L.XU], p[L.XU + 1], p[L.XU + 2], p[L.XV], p[L.XV + 1], p[L.XV + 2],
-        p[L.TU], p[L.TV], p[L.NEAR],
+        p[P.E0], p[P.E0 + 1], p[P.E0 + 2], p[P.EX], p[P.EX + 1], p[P.EX + 2], p[P.EY], p[P.EY + 1], p[P.EY + 2],
+        p[P.XA], p[P.XA + 1], p[P.XA + 2], p[P.XU], p[P.XU + 1], p[P.XU + 2], p[P.XV], p[P.XV + 1], p[P.XV + 2],
+        p[P.TU], p[P.TV], p[P.NEAR],
     )  # fmt: skip
 
 
@@ -35,8 +35,8 @@ def chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
     fx0, fy0: the tile corner's pixel centre from the anchor; row: from :func:`ray`. ``half`` is 0 where the ray misses.
     """
     e0, e1, e2, x0, x1, x2, y0, y1, y2, a0, a1, a2, u0, u1, u2, v0, v1, v2, tu, tv, near = row
-    y = np.floor(pixel * f(1 / L.TILE))
-    du, dv = fx0 + (pixel - y * f(L.TILE)), fy0 + y
+    y = np.floor(pixel * f(1 / P.TILE))
+    du, dv = fx0 + (pixel - y * f(P.TILE)), fy0 + y
     slide = du * tu + dv * tv
     gx, gy, gz = du * x0 + dv * y0, du * x1 + dv * y1, du * x2 + dv * y2
     ex, ey, ez = e0 + gx, e1 + gy, e2 + gz
@@ -125,7 +125,7 @@ def add_ray(sums, du, dv, slide, reach, gmx, gmy, gmz, gex, gey, gez):  # type: 
 def put_ray(sums, out):  # type: ignore[no-untyped-def]
     """Write the sums into a gradient row."""
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, b0, b1 = sums
-    out[L.E0], out[L.E0 + 1], out[L.E0 + 2] = a0, a1, a2
-    out[L.EX], out[L.EX + 1], out[L.EX + 2] = a3, a4, a5
-    out[L.EY], out[L.EY + 1], out[L.EY + 2] = a6, a7, a8
-    out[L.XA], out[L.XA + 1], out[L.XA + 2] = a9, b0, b1
+    out[P.E0], out[P.E0 + 1], out[P.E0 + 2] = a0, a1, a2
+    out[P.EX], out[P.EX + 1], out[P.EX + 2] = a3, a4, a5
+    out[P.EY], out[P.EY + 1], out[P.EY + 2] = a6, a7, a8
+    out[P.XA], out[P.XA + 1], out[P.XA + 2] = a9, b0, b1

@@ -1,8 +1,12 @@
-"""The per-primitive stage of a :class:`~neuprim.core.model.forms.RayNet`, in float64, and its hand-written backward.
+"""Colour networks of the primitives (:class:`~neuprim.core.model.forms.RayNet`): the per-primitive stage in float64
+with its hand-written backward pass, and the colours of lanes.
 
 The network sees the chord's middle, x~_m = local (axes q) with q the middle in whitened space, which the density's
 pixel stage leaves in the lanes anyway. So its first layer goes to whitened axes and turns once per primitive, exactly
-as the density's neurons do, and nothing here depends on the camera. The pixel stage is in ``ray_colours``.
+as the density's neurons do, and nothing here depends on the camera.
+
+RAY_COLOUR of the lanes holds colours before max(0, .), so that forward and backward clamp alike. Three channels have
+fused loops over constant offsets; other counts, and primitives drawn in float64, go unit by unit through ``V``.
 """
 
 from __future__ import annotations
@@ -11,26 +15,31 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.kernels import exact_kernel, inline
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.model.rotation import rotation, rotation_backward
+from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.prepare import FLOAT64_TURNS
+from neuprim.core.render.cpu.float64 import phase_float64
+from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns
+from neuprim.core.render.limits import FLOAT64_TURNS
 
-__all__ = ["Net", "net_backward", "net_rows", "prepare_net"]
+__all__ = ["Net", "net_backward", "prepare_net", "ray_colour_gradient", "ray_colours"]
 
+f = np.float32
 _TURNS = 1.0 / (2.0 * np.pi)
 _PRIMITIVES_PER_CHUNK = 512
+_RGB_GRADIENT = L.RAY_COLOUR + 3 * L.LANES  # dL/d RAY_COLOUR of three channels, behind the C arrays of RAY_COLOUR
 Array = np.ndarray[Any, Any]
 
 
 class Net(NamedTuple):
-    """The networks of one frame, as the pixel kernels take them; ``None`` in its place compiles a kernel for constant
-    colours.
+    """The networks of one frame, as the pixel kernels take them.
 
     Attributes:
-        rows: (N, width) float32: per unit its first layer (WX, WY, WZ, PHASE: whitened axes, turns), then C output
-        weights. wide: the same in float64 of the primitives that are drawn so, by slot.
+        rows: (N, net_row_width) float32: per unit its first layer (WX, WY, WZ, PHASE: whitened axes, turns), then C
+            output weights.
+        wide: the same in float64 of the primitives that are drawn so, by slot.
         hidden: units per primitive, padded to a whole number of pairs by units without output.
     """
 
@@ -39,8 +48,11 @@ class Net(NamedTuple):
     hidden: int
 
 
+# ---- Per primitive
+
+
 @exact_kernel
-def prepare_net(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast):  # type: ignore[no-untyped-def]
+def _fill_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast):  # type: ignore[no-untyped-def]
     """Rows ``out[n]`` (float32 or float64) of primitives ``which[n]``; ``fast[n]`` where a unit turns too fast for
     float32 pixels."""
     H, C = Wx.shape[1], Wout.shape[1]
@@ -55,41 +67,29 @@ def prepare_net(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast
         for a in range(3):
             axes[a] = np.exp(np.float64(log_scales[i, a]) - top)
         for j in range(H):
-            o, square = (L.NET_OUT + C) * j, 0.0
+            o, square = (P.NET_OUT + C) * j, 0.0
             for a in range(3):
                 w = (
                     _TURNS
                     * axes[a]
                     * (Wx[i, j, 0] * local[0, a] + Wx[i, j, 1] * local[1, a] + Wx[i, j, 2] * local[2, a])
                 )
-                row[o + L.WX + a] = w
+                row[o + P.WX + a] = w
                 square += w * w
             phase = _TURNS * np.float64(bias[i, j])
-            row[o + L.PHASE] = phase - np.rint(phase)
+            row[o + P.PHASE] = phase - np.rint(phase)
             for c in range(C):
-                row[o + L.NET_OUT + c] = Wout[i, c, j]
+                row[o + P.NET_OUT + c] = Wout[i, c, j]
             fast[n] |= square > FLOAT64_TURNS**2
 
 
-def net_rows(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
-    """Network rows of primitives ``which``, float64 if ``wide``, and which of them have a fast unit."""
+def prepare_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
+    """Return the network rows of primitives ``which``, float64 if ``wide``, and which of them have a fast unit."""
     H, C = t["Wx"].shape[1], t["Wout"].shape[1]
     out = np.empty((len(which), L.net_row_width(H + H % 2, C)), np.float64 if wide else np.float32)
     fast = np.empty(len(which), np.bool_)
-    parallel_for(
-        prepare_net,
-        len(which),
-        _PRIMITIVES_PER_CHUNK,
-        threads,
-        which,
-        t["log_scales"],
-        t["quats"],
-        t["Wx"],
-        t["bias"],
-        t["Wout"],
-        out,
-        fast,
-    )
+    tensors = (t[name] for name in ("log_scales", "quats", "Wx", "bias", "Wout"))
+    parallel_for(_fill_rows, len(which), _PRIMITIVES_PER_CHUNK, threads, which, *tensors, out, fast)
     return out, fast
 
 
@@ -120,23 +120,23 @@ def net_backward(  # type: ignore[no-untyped-def]
             for b in range(3):
                 gL[a, b] = 0.0
         for j in range(H):
-            o = (L.NET_OUT + C) * j
+            o = (P.NET_OUT + C) * j
             og = first + o
             for b in range(3):
                 g_Wx[i, j, b] = _TURNS * (
-                    g[og + L.WX] * axes[0] * local[b, 0]
-                    + g[og + L.WX + 1] * axes[1] * local[b, 1]
-                    + g[og + L.WX + 2] * axes[2] * local[b, 2]
+                    g[og + P.WX] * axes[0] * local[b, 0]
+                    + g[og + P.WY] * axes[1] * local[b, 1]
+                    + g[og + P.WZ] * axes[2] * local[b, 2]
                 )
             for a in range(3):
-                gw = np.float64(g[og + L.WX + a])
-                gl[a] += gw * rows[i, o + L.WX + a]  # scales with s_a/m
-                gl[longest] -= gw * rows[i, o + L.WX + a]
+                gw = np.float64(g[og + P.WX + a])
+                gl[a] += gw * rows[i, o + P.WX + a]  # scales with s_a/m
+                gl[longest] -= gw * rows[i, o + P.WX + a]
                 for b in range(3):
                     gL[b, a] += _TURNS * axes[a] * Wx[i, j, b] * gw
-            g_bias[i, j] = _TURNS * g[og + L.PHASE]
+            g_bias[i, j] = _TURNS * g[og + P.PHASE]
             for c in range(C):
-                g_Wout[i, c, j] = g[og + L.NET_OUT + c]
+                g_Wout[i, c, j] = g[og + P.NET_OUT + c]
         for a in range(4):
             q[a] = quats[i, a]
         rotation_backward(q, inverse, gL, gq)
@@ -144,3 +144,176 @@ def net_backward(  # type: ignore[no-untyped-def]
             g_log_scales[i, a] += gl[a]
         for a in range(4):
             g_quats[i, a] += gq[a]
+
+
+# ---- Per lane, after the density's chord stage
+
+
+@inline
+def _rgb_unit(p, o):  # type: ignore[no-untyped-def]
+    return (
+        p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE], p[o + P.NET_OUT], p[o + P.NET_OUT + 1],
+        p[o + P.NET_OUT + 2],
+    )  # fmt: skip
+
+
+@inline
+def _rgb(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyped-def]
+    """RAY_COLOUR += output of the two units at ``o`` and ``o2``, three channels; with ``slopes`` both units' cos and
+    d cos/d turn for the backward pass."""
+    ax, ay, az, ab, a0, a1, a2 = _rgb_unit(p, o)
+    bx, by, bz, bb, b0, b1, b2 = _rgb_unit(p, o2)
+    for k in range(n):
+        qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
+        u = qx * ax + qy * ay + qz * az + ab
+        r = u - np.rint(u)
+        u1 = qx * bx + qy * by + qz * bz + bb
+        r1 = u1 - np.rint(u1)
+        z, z1 = r * r, r1 * r1
+        c, c1 = cos_turns(z), cos_turns(z1)
+        if slopes:
+            V0[L.NET_COS + k] = c
+            V0[L.NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
+            V1[L.NET_COS + k] = c1
+            V1[L.NET_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1)
+        S[L.RAY_COLOUR + k] += c * a0 + c1 * b0
+        S[L.RAY_COLOUR + L.LANES + k] += c * a1 + c1 * b1
+        S[L.RAY_COLOUR + 2 * L.LANES + k] += c * a2 + c1 * b2
+
+
+@inline
+def _waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
+    """cos and d cos/d turn of one unit."""
+    wx, wy, wz, b = p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE]
+    for k in range(n):
+        u = S[L.QX + k] * wx + S[L.QY + k] * wy + S[L.QZ + k] * wz + b
+        r = u - np.rint(u)
+        z = r * r
+        V0[L.NET_COS + k] = cos_turns(z)
+        V0[L.NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
+
+
+@inline
+def _waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
+    """The same from a float64 row and float64 chord middles."""
+    for k in range(n):
+        r = phase_float64(D, k, p, o)
+        z = r * r
+        V0[L.NET_COS + k] = cos_turns(z)
+        V0[L.NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
+
+
+@inline
+def _mix(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
+    """RAY_COLOUR += output of all units, any channels, from their cos in ``V``."""
+    for c in range(C):
+        colour = S[L.RAY_COLOUR + c * L.LANES :]
+        for j in range(hidden):
+            cosine, weight = V[j, L.NET_COS :], p[(P.NET_OUT + C) * j + P.NET_OUT + c]
+            for k in range(n):
+                colour[k] += cosine[k] * weight
+
+
+@inline
+def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-untyped-def]
+    """RAY_COLOUR of ``n`` lanes of primitive ``i``; with ``slopes`` also what :func:`ray_colour_gradient` needs, in
+    ``V``."""
+    C, p = base.shape[0], net.rows[i]
+    for c in range(C):
+        colour = S[L.RAY_COLOUR + c * L.LANES :]
+        for k in range(n):
+            colour[k] = base[c]
+    if slots[i] >= 0:
+        for j in range(net.hidden):
+            _waves_float64(D, V[j], n, net.wide[slots[i]], (P.NET_OUT + C) * j)
+        _mix(S, V, n, p, net.hidden, C)
+    elif C == 3:
+        for j in range(0, net.hidden, 2):
+            o = (P.NET_OUT + 3) * j
+            _rgb(S, V[j], V[j + 1], n, p, o, o + P.NET_OUT + 3, slopes)
+    else:
+        for j in range(net.hidden):
+            _waves(S, V[j], n, p, (P.NET_OUT + C) * j)
+        _mix(S, V, n, p, net.hidden, C)
+
+
+@inline
+def _rgb_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
+    """Gradients of two units, three channels, and their share of dL/dQ."""
+    ax, ay, az, _, a0, a1, a2 = _rgb_unit(p, o)
+    bx, by, bz, _, b0, b1, b2 = _rgb_unit(p, o2)
+    s0, s1, s2, s3, s4, s5, s6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
+    r0, r1, r2, r3, r4, r5, r6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
+    for k in range(n):
+        g0, g1, g2 = S[_RGB_GRADIENT + k], S[_RGB_GRADIENT + L.LANES + k], S[_RGB_GRADIENT + 2 * L.LANES + k]
+        qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
+        c, c1 = V0[L.NET_COS + k], V1[L.NET_COS + k]
+        u = (g0 * a0 + g1 * a1 + g2 * a2) * V0[L.NET_SIN + k]
+        u1 = (g0 * b0 + g1 * b1 + g2 * b2) * V1[L.NET_SIN + k]
+        s0 += u * qx
+        s1 += u * qy
+        s2 += u * qz
+        s3 += u
+        s4 += g0 * c
+        s5 += g1 * c
+        s6 += g2 * c
+        r0 += u1 * qx
+        r1 += u1 * qy
+        r2 += u1 * qz
+        r3 += u1
+        r4 += g0 * c1
+        r5 += g1 * c1
+        r6 += g2 * c1
+        S[L.GQX + k] += u * ax + u1 * bx
+        S[L.GQY + k] += u * ay + u1 * by
+        S[L.GQZ + k] += u * az + u1 * bz
+    out[o + P.WX], out[o + P.WY], out[o + P.WZ], out[o + P.PHASE] = s0, s1, s2, s3
+    out[o + P.NET_OUT], out[o + P.NET_OUT + 1], out[o + P.NET_OUT + 2] = s4, s5, s6
+    out[o2 + P.WX], out[o2 + P.WY], out[o2 + P.WZ], out[o2 + P.PHASE] = r0, r1, r2, r3
+    out[o2 + P.NET_OUT], out[o2 + P.NET_OUT + 1], out[o2 + P.NET_OUT + 2] = r4, r5, r6
+
+
+@inline
+def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
+    """Gradients of one unit, any channels, and its share of dL/dQ. Uses up the unit's cos in ``V0``."""
+    wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
+    for c in range(C):
+        gradient, total = S[L.RAY_COLOUR + (C + c) * L.LANES :], f(0)
+        for k in range(n):
+            total += gradient[k] * V0[L.NET_COS + k]
+        out[o + P.NET_OUT + c] = total
+    for k in range(n):
+        V0[L.NET_COS + k] = f(0)
+    for c in range(C):
+        gradient, weight = S[L.RAY_COLOUR + (C + c) * L.LANES :], p[o + P.NET_OUT + c]
+        for k in range(n):
+            V0[L.NET_COS + k] += gradient[k] * weight
+    s0, s1, s2, s3 = f(0), f(0), f(0), f(0)
+    for k in range(n):
+        u = V0[L.NET_COS + k] * V0[L.NET_SIN + k]
+        s0 += u * S[L.QX + k]
+        s1 += u * S[L.QY + k]
+        s2 += u * S[L.QZ + k]
+        s3 += u
+        S[L.GQX + k] += u * wx
+        S[L.GQY + k] += u * wy
+        S[L.GQZ + k] += u * wz
+    out[o + P.WX], out[o + P.WY], out[o + P.WZ], out[o + P.PHASE] = s0, s1, s2, s3
+
+
+@inline
+def ray_colour_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-untyped-def]
+    """From dL/d RAY_COLOUR of every lane to the gradient row: base at ``base_at``, then the units; adds to dL/dQ."""
+    p, row = net.rows[i], out[base_at + C :]
+    for c in range(C):
+        gradient, total = S[L.RAY_COLOUR + (C + c) * L.LANES :], f(0)
+        for k in range(n):
+            total += gradient[k]
+        out[base_at + c] = total
+    if C == 3:
+        for j in range(0, net.hidden, 2):
+            o = (P.NET_OUT + 3) * j
+            _rgb_gradient(S, V[j], V[j + 1], n, p, o, o + P.NET_OUT + 3, row)
+    else:
+        for j in range(net.hidden):
+            _unit_gradient(S, V[j], n, p, (P.NET_OUT + C) * j, C, row)

@@ -1,57 +1,65 @@
 """The float64 pixel stage, for the few primitives that float32 cannot follow: needles and discs near the camera, fast
-neurons.
+neurons, and soft edges that the near plane may cut.
 
-Same interface as the float32 building blocks: what they leave in the lanes is rounded to float32 at the end, so
+Same interface as the float32 building blocks. What they leave in the lanes is rounded to float32 at the end, so that
 compositing and the gradient sums are shared.
+
+Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the closest approach, a = e.e and shift from
+there to the chord's middle. Its p-th power is a polynomial q, and the mean of q cos(phase + z u) follows from the
+moments
+
+    C_n = 1/2 integral of u^n cos(z u) du (n even),   S_n = 1/2 integral of u^n sin(z u) du (n odd),
+    dC_n/dz = -S_(n+1), dS_n/dz = C_(n+1)
+
+which are sums of spherical Bessel functions j_0 to j_5 (:mod:`neuprim.core.model.edge`). FADE is the mean of q, FIELD
+the mean of the density weighted by q over that of q, so that gradients of weights read alike for every edge.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from neuprim.core.compute.kernels import inline
+from neuprim.core.compute.kernels import dispatch_by_length, inline
+from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, dsinc_turns, sinc_turns
 
-__all__ = [
-    "FLOAT64_SCRATCH", "HALF64", "INNER", "SHIFT", "SQUARE", "chords_float64", "hard_neurons_float64", "hard_slopes_float64", "phase_float64", "reduced_float64",
-]  # fmt: skip
+__all__ = ["FLOAT64_SCRATCH", "chords_float64", "neurons_float64", "phase_float64", "slopes_float64"]
 
 f = np.float32
+_PI2 = 2.0 * np.pi
+_TERMS = 14
 # float64 lanes: chord middle and half chord vector in whitened space, then 1 - |y|^2 at the closest approach, how far
-# the middle is from it
-# and the half chord (units of m along e), and e.e
-_Q, _V = (L.lane(0), L.lane(1), L.lane(2)), (L.lane(3), L.lane(4), L.lane(5))
-_Q0, _Q1, _Q2 = _Q
-_V0, _V1, _V2 = _V
-INNER, SHIFT, SQUARE, HALF64 = L.lane(6), L.lane(7), L.lane(8), L.lane(9)
-FLOAT64_SCRATCH = L.lane(10)
+# the middle is from it and the half chord (units of m along e), and e.e
+_Q0, _Q1, _Q2 = _Q = L.lane_array(0), L.lane_array(1), L.lane_array(2)
+_V0, _V1, _V2 = _V = L.lane_array(3), L.lane_array(4), L.lane_array(5)
+_INNER, _SHIFT, _SQUARE, _HALF = L.lane_array(6), L.lane_array(7), L.lane_array(8), L.lane_array(9)
+FLOAT64_SCRATCH = L.lane_array(10)
 
 
 @inline
-def chords_float64(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, backward):  # type: ignore[no-untyped-def]
-    """As :func:`~neuprim.core.render.cpu.tiles.chords` from a float64 row ``p``, for the pixels of ``bounds``; lanes n:
-    are padding."""
+def chords_float64(S, X, n, bounds, frame, pair, with_mid, backward):  # type: ignore[no-untyped-def]
+    """As :func:`~neuprim.core.render.cpu.tiles.chords` from the float64 row, for the pixels of ``bounds``; the lanes
+    beyond them are padding."""
+    p, depth_floor = frame.wide[frame.slots[pair.i]], frame.depth_floor
     at = 0
-    for y in range(y0, y1):
-        dv = ty + y + 0.5 - p[L.UY]
-        for x in range(bounds[y], bounds[y + L.TILE]):
-            du = tx + x + 0.5 - p[L.UX]
-            gx, gy, gz = (
-                du * p[L.EX] + dv * p[L.EY],
-                du * p[L.EX + 1] + dv * p[L.EY + 1],
-                du * p[L.EX + 2] + dv * p[L.EY + 2],
-            )
-            ex, ey, ez = p[L.E0] + gx, p[L.E0 + 1] + gy, p[L.E0 + 2] + gz
-            mx, my, mz = p[L.XA] + p[L.TC] * gx, p[L.XA + 1] + p[L.TC] * gy, p[L.XA + 2] + p[L.TC] * gz
+    for y in range(pair.y0, pair.y1):
+        dv = pair.ty + y + 0.5 - p[P.UY]
+        for x in range(bounds[y], bounds[y + P.TILE]):
+            du = pair.tx + x + 0.5 - p[P.UX]
+            gx = du * p[P.EX] + dv * p[P.EY]
+            gy = du * p[P.EX + 1] + dv * p[P.EY + 1]
+            gz = du * p[P.EX + 2] + dv * p[P.EY + 2]
+            ex, ey, ez = p[P.E0] + gx, p[P.E0 + 1] + gy, p[P.E0 + 2] + gz
+            mx, my, mz = p[P.XA] + p[P.TC] * gx, p[P.XA + 1] + p[P.TC] * gy, p[P.XA + 2] + p[P.TC] * gz
             ia = 1.0 / (ex * ex + ey * ey + ez * ez)
             tm = -(mx * ex + my * ey + mz * ez) * ia
             px, py, pz = mx + tm * ex, my + tm * ey, mz + tm * ez
             D = 1.0 - (px * px + py * py + pz * pz)
             h = np.sqrt(max(D, 0.0) * ia)
             t0, t1 = tm - h, tm + h
-            uncut = f(1) if t0 > p[L.NEAR] else f(0)
-            t0 = max(t0, p[L.NEAR])
+            uncut = f(1) if t0 > p[P.NEAR] else f(0)
+            t0 = max(t0, p[P.NEAR])
             mid = 0.5 * (t0 + t1)
             half = max(0.5 * (t1 - t0), 0.0)
             shift = mid - tm
@@ -60,9 +68,9 @@ def chords_float64(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, ba
             X[at + _V0], X[at + _V1], X[at + _V2] = ex * half, ey * half, ez * half
             S[L.QX + at], S[L.QY + at], S[L.QZ + at] = f(qx), f(qy), f(qz)
             S[L.EXL + at], S[L.EYL + at], S[L.EZL + at] = f(ex), f(ey), f(ez)
-            X[at + INNER], X[at + SHIFT], X[at + SQUARE], X[at + HALF64] = D, shift, 1.0 / ia, half
+            X[at + _INNER], X[at + _SHIFT], X[at + _SQUARE], X[at + _HALF] = D, shift, 1.0 / ia, half
             S[L.HALF + at] = f(half)
-            S[L.FIELD + at] = f(p[L.OFFSET])
+            S[L.FIELD + at] = f(p[P.OFFSET])
             if with_mid:
                 S[L.MID + at] = f(mid)
             if backward:
@@ -76,7 +84,7 @@ def chords_float64(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, ba
             S[a + k] = f(0)
         for a in _Q + _V:
             X[a + k] = 0.0
-        X[INNER + k], X[SHIFT + k], X[SQUARE + k], X[HALF64 + k] = 0.0, 0.0, 0.0, 0.0
+        X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k] = 0.0, 0.0, 0.0, 0.0
         if with_mid or backward:
             S[L.MID + k] = f(0)
         if backward:
@@ -87,39 +95,39 @@ def chords_float64(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, ba
 @inline
 def phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
     """Phase at the chord's middle of the unit at ``o`` of a float64 row, reduced to half a turn."""
-    u = X[k + _Q0] * p[o + L.WX] + X[k + _Q1] * p[o + L.WY] + X[k + _Q2] * p[o + L.WZ] + p[o + L.PHASE]
+    u = X[k + _Q0] * p[o + P.WX] + X[k + _Q1] * p[o + P.WY] + X[k + _Q2] * p[o + P.WZ] + p[o + P.PHASE]
     return f(u - np.rint(u))
 
 
 @inline
-def reduced_float64(X, k, p, o):  # type: ignore[no-untyped-def]
+def _reduced(X, k, p, o):  # type: ignore[no-untyped-def]
     """Phase at the chord's middle and half its change, in turns: both reduced to half a turn, and the second whole."""
-    wx, wy, wz = p[o + L.WX], p[o + L.WY], p[o + L.WZ]
-    u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + L.PHASE]
+    wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
+    u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + P.PHASE]
     v = X[k + _V0] * wx + X[k + _V1] * wy + X[k + _V2] * wz
     return f(u - np.rint(u)), f(v - np.rint(v)), v
 
 
 @inline
-def hard_neurons_float64(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
+def _hard_neurons_float64(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
     """FIELD += w2 cos(phase at the middle) sinc(half its change) of every neuron of a float64 row."""
     for m in range(neurons):
-        o = L.NEURONS + L.PER_NEURON * m
+        o = P.NEURONS + P.PER_NEURON * m
         for k in range(n):
-            r, s, v = reduced_float64(X, k, p, o)
+            r, s, v = _reduced(X, k, p, o)
             sinc = sinc_turns(s * s)
             if abs(v) > 0.5:
                 sinc *= f(s / v)
-            S[L.FIELD + k] += f(p[o + L.AMPLITUDE]) * cos_turns(r * r) * sinc
+            S[L.FIELD + k] += f(p[o + P.AMPLITUDE]) * cos_turns(r * r) * sinc
 
 
 @inline
-def hard_slopes_float64(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
+def _hard_slopes_float64(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
     """The same, and the three products per neuron that the gradients need."""
     for m in range(neurons):
-        o = L.NEURONS + L.PER_NEURON * m
+        o = P.NEURONS + P.PER_NEURON * m
         for k in range(n):
-            r, s, v = reduced_float64(X, k, p, o)
+            r, s, v = _reduced(X, k, p, o)
             sinc, slope = sinc_turns(s * s), dsinc_turns(s * s) * f(2) * s
             if abs(v) > 0.5:
                 sinc *= f(s / v)
@@ -128,4 +136,130 @@ def hard_slopes_float64(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
             V[m, L.N_COS + k] = c * sinc
             V[m, L.N_SIN + k] = -TAU * TAU * r * sinc_turns(r * r) * sinc
             V[m, L.N_DSINC + k] = c * slope
-            S[L.FIELD + k] += f(p[o + L.AMPLITUDE]) * c * sinc
+            S[L.FIELD + k] += f(p[o + P.AMPLITUDE]) * c * sinc
+
+
+@inline
+def _bessel(z, j):  # type: ignore[no-untyped-def]
+    """j_0 to j_5 of any z: a series below 2, where upward recursion loses digits."""
+    if abs(z) < 2.0:
+        square, power = 0.5 * z * z, 1.0
+        for n in range(6):
+            term, total = power, power
+            for k in range(1, _TERMS):
+                term *= -square / (k * (2 * n + 2 * k + 1))
+                total += term
+            j[n] = total
+            power *= z / (2 * n + 3)
+    else:
+        j[0] = np.sin(z) / z
+        j[1] = (j[0] - np.cos(z)) / z
+        for n in range(1, 5):
+            j[n + 1] = (2 * n + 1) / z * j[n] - j[n - 1]
+
+
+@inline
+def _moments(z, j, M):  # type: ignore[no-untyped-def]
+    """M[n] = C_n for even n, S_n for odd n, n = 0..5."""
+    _bessel(z, j)
+    M[0], M[1] = j[0], j[1]
+    M[2], M[3] = (j[0] - 2.0 * j[2]) / 3.0, (3.0 * j[1] - 2.0 * j[3]) / 5.0
+    M[4] = (7.0 * j[0] - 20.0 * j[2] + 8.0 * j[4]) / 35.0
+    M[5] = (27.0 * j[1] - 28.0 * j[3] + 8.0 * j[5]) / 63.0
+
+
+@inline
+def _weight(D, shift, square, half, soft, q):  # type: ignore[no-untyped-def]
+    """Coefficients q[0..4] of (D - a (shift + half u)^2)^p, and their mean over the chord."""
+    c0, c1, c2 = D - square * shift * shift, -2.0 * square * shift * half, -square * half * half
+    q[0], q[1], q[2], q[3], q[4] = c0, c1, c2, 0.0, 0.0
+    if soft == 2:
+        q[0], q[1], q[2], q[3], q[4] = c0 * c0, 2.0 * c0 * c1, c1 * c1 + 2.0 * c0 * c2, 2.0 * c1 * c2, c2 * c2
+    return q[0] + q[2] / 3.0 + q[4] / 5.0
+
+
+@inline
+def _soft_neurons(S, X, n, p, neurons, soft):  # type: ignore[no-untyped-def]
+    q, j, M = np.zeros(5), np.zeros(6), np.zeros(6)
+    for k in range(n):
+        mean = _weight(X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k], soft, q)
+        visible = mean > 0.0 and X[_HALF + k] > 0.0
+        S[L.FADE + k] = f(mean) if visible else f(0)
+        if not visible:
+            continue
+        total = 0.0
+        for m in range(neurons):
+            o = P.NEURONS + P.PER_NEURON * m
+            r, _, v = _reduced(X, k, p, o)
+            _moments(_PI2 * v, j, M)
+            even, odd = q[0] * M[0] + q[2] * M[2] + q[4] * M[4], q[1] * M[1] + q[3] * M[3]
+            total += p[o + P.AMPLITUDE] * (cos_turns(r * r) * even - TAU * r * sinc_turns(r * r) * odd)
+        S[L.FIELD + k] += f(total / mean)
+
+
+@inline
+def _soft_slopes(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
+    q, j, M, rest = np.zeros(5), np.zeros(6), np.zeros(6), np.zeros(3)
+    for k in range(n):
+        D, shift, square, half = X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k]
+        mean = _weight(D, shift, square, half, soft, q)
+        visible = mean > 0.0 and half > 0.0
+        S[L.FADE + k] = f(mean) if visible else f(0)
+        # of p q^(p - 1), whose moments with 1, u and u^2 the weight's own derivatives need
+        c0, c1, c2 = 1.0, 0.0, 0.0
+        if soft == 2:
+            c0, c1, c2 = 2.0 * (D - square * shift * shift), -4.0 * square * shift * half, -2.0 * square * half * half
+        offset = p[P.OFFSET]
+        rest[0] = offset * (c0 + c2 / 3.0)
+        rest[1] = offset * c1 / 3.0
+        rest[2] = offset * (c0 / 3.0 + c2 / 5.0)
+        total = 0.0
+        for m in range(neurons):
+            o = P.NEURONS + P.PER_NEURON * m
+            V[m, L.N_COS + k], V[m, L.N_SIN + k], V[m, L.N_DSINC + k] = f(0), f(0), f(0)
+            if not visible:
+                continue
+            r, _, v = _reduced(X, k, p, o)
+            _moments(_PI2 * v, j, M)
+            c, s, a = np.float64(cos_turns(r * r)), np.float64(TAU * r * sinc_turns(r * r)), p[o + P.AMPLITUDE]
+            even, odd = q[0] * M[0] + q[2] * M[2] + q[4] * M[4], q[1] * M[1] + q[3] * M[3]
+            d_even, d_odd = -(q[0] * M[1] + q[2] * M[3] + q[4] * M[5]), q[1] * M[2] + q[3] * M[4]
+            V[m, L.N_COS + k] = f((c * even - s * odd) / mean)
+            V[m, L.N_SIN + k] = f(-_PI2 * (s * even + c * odd) / mean)
+            V[m, L.N_DSINC + k] = f(_PI2 * (c * d_even - s * d_odd) / mean)
+            total += a * (c * even - s * odd)
+            rest[0] += a * (c * (c0 * M[0] + c2 * M[2]) - s * c1 * M[1])
+            rest[1] += a * (c * c1 * M[2] - s * (c0 * M[1] + c2 * M[3]))
+            rest[2] += a * (c * (c0 * M[2] + c2 * M[4]) - s * c1 * M[3])
+        S[L.BY_D + k], S[L.BY_A + k], S[L.BY_TM + k] = f(0), f(0), f(0)
+        if visible:
+            S[L.FIELD + k] += f(total / mean)
+            S[L.BY_D + k] = f(rest[0])
+            S[L.BY_A + k] = f(-(shift * shift * rest[0] + 2.0 * shift * half * rest[1] + half * half * rest[2]))
+            S[L.BY_TM + k] = f(2.0 * square * (shift * rest[0] + half * rest[1]))
+
+
+@inline
+def _soft_neurons_1(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
+    _soft_neurons(S, X, n, p, neurons, 1)
+
+
+@inline
+def _soft_neurons_2(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
+    _soft_neurons(S, X, n, p, neurons, 2)
+
+
+@inline
+def _soft_slopes_1(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
+    _soft_slopes(S, X, V, n, p, neurons, 1)
+
+
+@inline
+def _soft_slopes_2(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
+    _soft_slopes(S, X, V, n, p, neurons, 2)
+
+
+neurons_float64 = dispatch_by_length(_hard_neurons_float64, _soft_neurons_1, _soft_neurons_2)
+"""(edge, S, X, n, p, neurons): FADE, and FIELD += the weighted mean of every neuron of a float64 row."""
+slopes_float64 = dispatch_by_length(_hard_slopes_float64, _soft_slopes_1, _soft_slopes_2)
+"""(edge, S, X, V, n, p, neurons): the same, and what the gradients need."""

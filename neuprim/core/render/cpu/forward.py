@@ -1,33 +1,114 @@
-"""Tile-wise compositing, forward."""
+"""Tile-wise compositing, forward, and what it saves for the backward pass.
+
+Saved is the optical depth of every evaluated lane, 4 bytes each. With them the backward pass composites before it has
+evaluated a single neuron. Its lanes have to be the forward pass's own, which depend on the tile rows that were live:
+2 bytes per pair say which, and 4 where the pair's lanes begin among those of its chunk of tiles.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.compute.views import borrow_array, release_array
+from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
+from neuprim.core.render.cpu.colour_net import ray_colours
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
-from neuprim.core.render.cpu.kept import alive, most_lanes, room
-from neuprim.core.render.cpu.neurons import field_values
-from neuprim.core.render.cpu.ray_colours import add_ray_colours, composite_rgb_ray_colours, ray_colours
-from neuprim.core.render.cpu.tiles import aligned, compact, fetch_ahead, row_spans
+from neuprim.core.render.cpu.tiles import (
+    aligned,
+    box_pixels,
+    compact,
+    fetch_ahead,
+    field_values,
+    lend_frame,
+    pair_window,
+    row_spans,
+)
 from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
-__all__ = ["composite_tiles"]
+__all__ = ["Image", "SavedForBackward", "composite_tiles"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
-_STEPS = np.arange(L.TILE).astype(np.float32)
-_LIVE_EVERY = (
-    4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count costs a reduction per row
-)
+_STEPS = np.arange(P.TILE).astype(np.float32)
+_LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count a reduction per row
+Array = np.ndarray[Any, Any]
+
+
+class Image(NamedTuple):
+    """Arrays that the forward kernels fill, and the (C,) background behind them.
+
+    Attributes:
+        rgb, transmittance: (H, W, C) and (H, W).
+        zsum: (H, W) sum of w z, filled if ``with_depth``.
+        last: (H, W) rank + 1 of each pixel's last contributor; sorted by entry, the number of its hits.
+    """
+
+    rgb: Array
+    transmittance: Array
+    zsum: Array
+    last: Array
+    background: Array
+    with_depth: bool
+
+
+@dataclass
+class SavedForBackward:
+    """What the forward pass of one frame saves.
+
+    Attributes:
+        live: (pairs,) bit y is set where row y of the tile was live when the pair was drawn; no pairs if nothing is
+            saved.
+        first_lane: (pairs,) first lane of each pair in the depths of its chunk.
+        depths: per chunk of tiles (lanes,) optical depth of each evaluated lane.
+    """
+
+    live: Array
+    first_lane: Array
+    depths: list[Array] = field(default_factory=list)
+
+    @classmethod
+    def allocate(cls, pairs: int) -> SavedForBackward:
+        """Room for this many pairs; 0 saves nothing."""
+        return cls(np.empty(pairs, np.uint16), np.empty(pairs, np.int32))
 
 
 @inline
-def _opacity(S, n, amin, amax, edge, keep, depths, at):  # type: ignore[no-untyped-def]
+def _live_bits(rows_live):  # type: ignore[no-untyped-def]
+    bits = np.int64(0)
+    for y in range(P.TILE):
+        bits |= np.int64(rows_live[y] > f(0)) << y
+    return np.uint16(bits)
+
+
+@inline
+def _depth_array(floats):  # type: ignore[no-untyped-def]
+    """Floats that begin a cache line, uninitialised: memory is taken where it is written."""
+    block = np.empty(floats + 16, np.float32)
+    shift = -(np.int64(block.ctypes.data) // 4) % 16
+    return block[shift : shift + floats]
+
+
+@inline
+def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
+    """An upper bound of the lanes of tiles ``start:stop``, in whole vectors."""
+    lanes = 0
+    for t in range(start, stop):
+        tx, ty = (t % across) * P.TILE, (t // across) * P.TILE
+        for q in range(frame.starts[t], frame.starts[t + 1]):
+            lanes += (box_pixels(frame, frame.ids[q], tx, ty) + 15) // 16 * 16
+    return lanes
+
+
+@inline
+def _opacity(S, n, frame, edge, keep, depths, at):  # type: ignore[no-untyped-def]
     """ALPHA of every lane: 0 below alpha_min and where the integral is not positive, at most alpha_max; its depth to
     ``depths[at + k]``."""
+    amin, amax = frame.alpha_min, frame.alpha_max
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
         if len(edge) > 0:
@@ -39,27 +120,37 @@ def _opacity(S, n, amin, amax, edge, keep, depths, at):  # type: ignore[no-untyp
         S[L.ALPHA + k] = alpha if depth > f(0) else f(0)
 
 
+# ---- One pixel row; ``at`` is the lane of the row's pixel 0. A pixel is live while T >= T_min. A ``net`` has left the
+# lanes' own colours in RAY_COLOUR, before max(0, .).
+
+
 @inline
-def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, c0, c1, c2):  # type: ignore[no-untyped-def]
-    """One pixel row of three channels: colour += alpha T c, then T; a pixel is live while T >= T_min."""
+def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # type: ignore[no-untyped-def]
+    """Three channels: colour += alpha T c, then T."""
     a, b = f(a), f(b)
-    for k in range(L.TILE):
+    c0, c1, c2 = color[0], color[1], color[2]
+    for k in range(P.TILE):
         step, T = _STEPS[k], state[index(base + k + L.T_)]
         use = (step >= a) & (step < b) & (T >= tmin)
-        alpha = S[index(at + k)] if use else f(0)
+        alpha = S[index(at + k + L.ALPHA)] if use else f(0)
         weight = alpha * T
         state[index(base + k + L.T_)] = T - weight
         state[index(base + k + L.LAST)] = rank if alpha > f(0) else state[index(base + k + L.LAST)]
+        if net is not None:
+            c0 = max(S[index(at + k + L.RAY_COLOUR)], f(0))
+            c1 = max(S[index(at + k + L.RAY_COLOUR + L.LANES)], f(0))
+            c2 = max(S[index(at + k + L.RAY_COLOUR + 2 * L.LANES)], f(0))
         state[index(base + k + L.COLOR)] += weight * c0
-        state[index(base + k + L.COLOR + L.PIXELS)] += weight * c1
-        state[index(base + k + L.COLOR + 2 * L.PIXELS)] += weight * c2
+        state[index(base + k + L.COLOR + P.PIXELS)] += weight * c1
+        state[index(base + k + L.COLOR + 2 * P.PIXELS)] += weight * c2
 
 
 @inline
-def _composite_row(st, lanes, w, a, b, tmin, rank):  # type: ignore[no-untyped-def]
-    """The same for any channels and depth: leaves the weights in ``w``."""
+def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-untyped-def]
+    """Any channels and depth: T alone; leaves the weights in ``w``."""
     a, b = f(a), f(b)
-    for k in range(L.TILE):
+    st, lanes = state[base:], S[L.ALPHA + at :]
+    for k in range(P.TILE):
         step, T = _STEPS[k], st[k + L.T_]
         use = (step >= a) & (step < b) & (T >= tmin)
         alpha = lanes[k] if use else f(0)
@@ -70,190 +161,152 @@ def _composite_row(st, lanes, w, a, b, tmin, rank):  # type: ignore[no-untyped-d
 
 
 @inline
-def _empty_tile(tx, ty, down, wide_row, background, with_depth, rgb, transmittance, zsum, last):  # type: ignore[no-untyped-def]
-    """A tile that nothing reaches: the background."""
+def _add_colours(state, S, base, at, w, color, net):  # type: ignore[no-untyped-def]
+    """Any channels: colour += w c."""
+    for c in range(color.shape[0]):
+        st = state[L.COLOR + c * P.PIXELS + base :]
+        if net is None:
+            own = color[c]
+            for k in range(P.TILE):
+                st[k] += w[k] * own
+        else:
+            lanes = S[L.RAY_COLOUR + c * L.LANES + at :]
+            for k in range(P.TILE):
+                st[k] += w[k] * max(lanes[k], f(0))
+
+
+@inline
+def _fill_background(tx, ty, down, wide_row, image):  # type: ignore[no-untyped-def]
+    """A tile that no primitive reaches."""
     for y in range(down):
         Y = index(ty + y)
         for x in range(wide_row):
             X = index(tx + x)
-            transmittance[Y, X], last[Y, X] = f(1), 0
-            for c in range(background.shape[0]):
-                rgb[Y, X, index(c)] = background[c]
-            if with_depth:
-                zsum[Y, X] = f(0)
+            image.transmittance[Y, X], image.last[Y, X] = f(1), 0
+            for c in range(image.background.shape[0]):
+                image.rgb[Y, X, index(c)] = image.background[c]
+            if image.with_depth:
+                image.zsum[Y, X] = f(0)
+
+
+@inline
+def _store_tile(state, tx, ty, down, wide_row, image):  # type: ignore[no-untyped-def]
+    """Write a tile's pixels, over the background."""
+    rgb, transmittance, zsum, last, background, with_depth = image
+    for y in range(down):
+        Y, j = index(ty + y), y * P.TILE
+        for x in range(wide_row):
+            transmittance[Y, index(tx + x)] = state[index(j + x + L.T_)]
+            last[Y, index(tx + x)] = np.int32(state[index(j + x + L.LAST)])
+        for c in range(background.shape[0]):
+            behind = background[c]
+            for x in range(wide_row):
+                rgb[Y, index(tx + x), index(c)] = (
+                    state[index(j + x + L.COLOR + c * P.PIXELS)] + state[index(j + x + L.T_)] * behind
+                )
+        if with_depth:
+            for x in range(wide_row):
+                zsum[Y, index(tx + x)] = state[index(j + x + L.ZSUM)]
 
 
 @kernel
-def composite_tiles(  # type: ignore[no-untyped-def]
-    start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, background, limits, with_depth, neurons,
-    rgb, transmittance, zsum, last, live, found, net, edge,
-):  # fmt: skip
+def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, edge):  # type: ignore[no-untyped-def]
     """Draw tiles ``start:stop``; returns the number of evaluated lanes, and their optical depths if ``live`` and
-    ``found`` have room for them.
+    ``first_lane`` (see :class:`SavedForBackward`) have room for them.
 
-    limits = (alpha_min, alpha_max, transmittance_min, depth_floor), all float32. ``norms`` (H, W) is the length of the
-    pixel's ray direction whose camera-z is 1. Where ``slots[i]`` is not -1, primitive i is drawn in float64 from that
-    row of
-    ``wide``. ``last`` receives the rank + 1 of each pixel's last contributor. ``net`` is None where ``colors`` is all
-    there is to a colour, which leaves no trace of it in the compiled kernel, or the
-    :class:`~neuprim.core.render.cpu.colour_net.Net` on that base.
+    Args:
+        frame: :class:`~neuprim.core.render.cpu.tiles.FrameArrays`.
+        colors: (N, C) colours, or the bases of the networks' colours.
+        image: what is filled.
+        net: :class:`~neuprim.core.render.cpu.colour_net.Net`; None leaves no trace of it in the compiled kernel.
+        edge: one of :data:`~neuprim.core.render.cpu.trigonometry.EDGE_TYPES`.
     """
-    rows, wide, slots, spans, kinds, boxes = (
-        borrow_array(rows),
-        borrow_array(wide),
-        borrow_array(slots),
-        borrow_array(spans),
-        borrow_array(kinds),
-        borrow_array(boxes),
-    )
-    starts, ids, colors, live, found = (
-        borrow_array(starts),
-        borrow_array(ids),
+    frame, colors, live, first_lane = (
+        lend_frame(frame),
         borrow_array(colors),
         borrow_array(live),
-        borrow_array(found),
+        borrow_array(first_lane),
     )
+    rows, starts, ids, norms = frame.rows, frame.starts, frame.ids, frame.norms
     height, width = norms.shape
+    with_depth, tmin = image.with_depth, frame.transmittance_min
     keep = live.shape[0] > 0
-    across = (width + L.TILE - 1) // L.TILE
-    found_depths = room(most_lanes(start, stop, across, boxes, starts, ids) if keep else 0)
-    depths = borrow_array(found_depths)
+    across = (width + P.TILE - 1) // P.TILE
+    saved_depths = _depth_array(_max_lanes(start, stop, across, frame) if keep else 0)
+    depths = borrow_array(saved_depths)
     C = colors.shape[1]
-    amin, amax, tmin, floor = limits[0], limits[1], limits[2], limits[3]
     scratch = L.FORWARD_SCRATCH
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
         waves = aligned(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
-    lanes, wide_lanes, pixels, weights = (
-        aligned(scratch + 1024),
-        np.zeros(FLOAT64_SCRATCH, np.float64),
-        aligned((4 + C) * L.PIXELS + 2 * L.TILE),
-        aligned(L.TILE),
-    )
-    ends, begins, lives = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32), aligned(L.TILE)
+    lanes, wide_lanes = aligned(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
+    pixels, weights, lives = aligned((4 + C) * P.PIXELS + 2 * P.TILE), aligned(P.TILE), aligned(P.TILE)
+    ends, begins = np.zeros(2 * P.TILE, np.int32), np.zeros(P.TILE, np.int32)
     S, D, state, w = borrow_array(lanes), borrow_array(wide_lanes), borrow_array(pixels), borrow_array(weights)
     bounds, offset, rows_live = borrow_array(ends), borrow_array(begins), borrow_array(lives)
     evaluated = 0
     for t in range(start, stop):
-        tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
-        down, wide_row = min(L.TILE, height - ty), min(L.TILE, width - tx)
+        tx, ty = (t % across) * P.TILE, (t // across) * P.TILE
+        down, wide_row = min(P.TILE, height - ty), min(P.TILE, width - tx)
         if starts[t] == starts[t + 1]:
-            _empty_tile(tx, ty, down, wide_row, background, with_depth, rgb, transmittance, zsum, last)
+            _fill_background(tx, ty, down, wide_row, image)
             continue
         state[:] = f(0)
-        for y in range(L.TILE):
+        for y in range(P.TILE):
             rows_live[y] = f(1) if y < down else f(0)
-            for x in range(L.TILE):
-                state[index(y * L.TILE + x + L.T_)] = f(-1)  # outside the image: never live
+            for x in range(P.TILE):
+                state[index(y * P.TILE + x + L.T_)] = f(-1)  # outside the image: never live
         for y in range(down):
             for x in range(wide_row):
-                j = y * L.TILE + x
+                j = y * P.TILE + x
                 state[index(j + L.T_)], state[index(j + L.NORM)] = f(1), norms[index(ty + y), index(tx + x)]
         for q in range(starts[t], starts[t + 1]):
             if q + 1 < starts[t + 1]:
-                fetch_ahead(np.int64(ids[q + 1]), rows, spans, boxes)
+                fetch_ahead(np.int64(ids[q + 1]), frame)
             i = ids[q]
             p = rows[i]
-            y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, L.TILE)
-            x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, L.TILE)
-            fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
-            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, rows_live, bounds)
-            n = compact(S, state, offset, bounds, y0, y1)
+            pair = pair_window(frame, i, tx, ty)
+            row_spans(frame.spans[i], pair, rows_live, bounds)
+            n = compact(S, state, offset, bounds, pair.y0, pair.y1)
             if keep:
-                live[q], found[q] = alive(rows_live), evaluated
+                live[q], first_lane[q] = _live_bits(rows_live), evaluated
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
-                field_values(
-                    S,
-                    D,
-                    n16,
-                    bounds,
-                    y0,
-                    y1,
-                    tx,
-                    ty,
-                    fx0,
-                    fy0,
-                    i,
-                    rows,
-                    wide,
-                    slots,
-                    kinds,
-                    neurons,
-                    floor,
-                    with_depth,
-                    False,
-                    edge,
-                )
-                _opacity(S, n16, amin, amax, edge, keep, depths, evaluated)
+                field_values(S, D, n16, bounds, frame, pair, with_depth, False, edge)
+                _opacity(S, n16, frame, edge, keep, depths, evaluated)
                 evaluated += n16
                 if net is not None:
-                    ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)
+                    ray_colours(S, D, waves, n16, i, net, frame.slots, colors[i], False)
                 rank = f(q - starts[t] + 1)
-                for y in range(y0, y1):
-                    a, b = bounds[y], bounds[y + L.TILE]
+                for y in range(pair.y0, pair.y1):
+                    a, b = bounds[y], bounds[y + P.TILE]
                     if b > a:
-                        at = (
-                            offset[y] - a
-                        )  # the row's lanes start at offset[y], its pixels at a: shift so that both run with k
+                        # the row's lanes start at offset[y], its pixels at a: shift so that both run with k
+                        at, base = offset[y] - a, y * P.TILE
                         if C == 3 and not with_depth:
-                            if net is None:
-                                _composite_rgb_row(
-                                    state,
-                                    S,
-                                    y * L.TILE,
-                                    L.ALPHA + at,
-                                    a,
-                                    b,
-                                    tmin,
-                                    rank,
-                                    colors[i, 0],
-                                    colors[i, 1],
-                                    colors[i, 2],
-                                )
-                            else:
-                                composite_rgb_ray_colours(state, S, y * L.TILE, at, a, b, tmin, rank)
+                            _composite_rgb_row(state, S, base, at, a, b, tmin, rank, colors[i], net)
                         else:
-                            _composite_row(state[y * L.TILE :], S[L.ALPHA + at :], w, a, b, tmin, rank)
-                            if net is None:
-                                for c in range(C):
-                                    st, color = state[L.COLOR + c * L.PIXELS + y * L.TILE :], colors[i, c]
-                                    for k in range(L.TILE):
-                                        st[k] += w[k] * color
-                            else:
-                                add_ray_colours(state, S, y * L.TILE, at, w, C)
+                            _composite_row(state, S, base, at, a, b, tmin, rank, w)
+                            _add_colours(state, S, base, at, w, colors[i], net)
                             if with_depth:
-                                st = state[L.ZSUM + y * L.TILE :]
+                                st = state[L.ZSUM + base :]
                                 for k in range(a, b):
-                                    st[k] += w[k] * (p[L.ANCHOR_Z] + p[L.UNIT] * S[L.MID + at + k])
+                                    st[k] += w[k] * (p[P.ANCHOR_Z] + p[P.UNIT] * S[L.MID + at + k])
             if (q - starts[t]) % _LIVE_EVERY == _LIVE_EVERY - 1:
                 any_live = f(0)
-                for y in range(L.TILE):
+                for y in range(P.TILE):
                     if rows_live[y] > f(0):
                         top = f(-1)
-                        for k in range(L.TILE):
-                            top = max(top, state[L.T_ + y * L.TILE + k])
+                        for k in range(P.TILE):
+                            top = max(top, state[L.T_ + y * P.TILE + k])
                         rows_live[y] = f(1) if top >= tmin else f(0)
                         any_live += rows_live[y]
                 if any_live == f(0):
                     break
-        for y in range(down):
-            Y, j = index(ty + y), y * L.TILE
-            for x in range(wide_row):
-                transmittance[Y, index(tx + x)] = state[index(j + x + L.T_)]
-                last[Y, index(tx + x)] = np.int32(state[index(j + x + L.LAST)])
-            for c in range(C):
-                behind = background[c]
-                for x in range(wide_row):
-                    rgb[Y, index(tx + x), index(c)] = (
-                        state[index(j + x + L.COLOR + c * L.PIXELS)] + state[index(j + x + L.T_)] * behind
-                    )
-            if with_depth:
-                for x in range(wide_row):
-                    zsum[Y, index(tx + x)] = state[index(j + x + L.ZSUM)]
-    for mine in (lanes, pixels, weights, lives):
-        release_array(mine)
+        _store_tile(state, tx, ty, down, wide_row, image)
+    for own in (lanes, pixels, weights, lives):
+        release_array(own)
     release_array(wide_lanes)
     for numbers in (ends, begins):
         release_array(numbers)
-    return evaluated, found_depths
+    return evaluated, saved_depths

@@ -12,13 +12,12 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline
+from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.chord import add_ray, by_depth, chord, put_ray, ray, through_chord, weight, zero_ray
-from neuprim.core.render.cpu.float64 import chords_float64
-from neuprim.core.render.cpu.float64_edge import slopes_float64
-from neuprim.core.render.cpu.profiles import slopes_fast, slopes_medium, slopes_slow
+from neuprim.core.render.cpu.float64 import chords_float64, slopes_float64
 from neuprim.core.render.cpu.tiles import chords
-from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns
+from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns, slopes_fast, slopes_medium, slopes_slow
 
 __all__ = ["AT_ONCE", "chord_gradient", "gradients_at_once", "lanes_with_slopes", "neuron_gradients"]
 
@@ -29,7 +28,7 @@ _TINY = f(1e-30)
 
 @inline
 def _neuron(p, o):  # type: ignore[no-untyped-def]
-    return p[o + L.WX], p[o + L.WY], p[o + L.WZ], p[o + L.PHASE], p[o + L.AMPLITUDE]
+    return p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE], p[o + P.AMPLITUDE]
 
 
 def _products(slopes):  # type: ignore[no-untyped-def]
@@ -66,17 +65,18 @@ def _add_neuron(sums, cosine, u, v, qx, qy, qz, vx, vy, vz):  # type: ignore[no-
 @inline
 def _put_neuron(sums, amplitude, m, out):  # type: ignore[no-untyped-def]
     s0, s1, s2, s3, s4 = sums
-    o = L.G_NEURONS + L.PER_NEURON * m
-    out[o + L.AMPLITUDE], out[o + L.PHASE] = s0, amplitude * s1
-    out[o + L.WX], out[o + L.WY], out[o + L.WZ] = amplitude * s2, amplitude * s3, amplitude * s4
+    o = P.G_NEURONS + P.PER_NEURON * m
+    out[o + P.AMPLITUDE], out[o + P.PHASE] = s0, amplitude * s1
+    out[o + P.WX], out[o + P.WY], out[o + P.WZ] = amplitude * s2, amplitude * s3, amplitude * s4
 
 
 # ---------------------------------------------------------------- a chord in registers from end to end
 
 
 @inline
-def _without_neurons(S, n, p, fx0, fy0, depth_floor, edge, out):  # type: ignore[no-untyped-def]
-    row, tc, field = ray(p), p[L.TC], p[L.OFFSET]
+def _without_neurons(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
+    p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
+    row, tc, field = ray(p), p[P.TC], p[P.OFFSET]
     total, rays = f(0), zero_ray()
     for k in range(n):
         du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = chord(S[L.PIXEL + k], fx0, fy0, row)
@@ -88,15 +88,16 @@ def _without_neurons(S, n, p, fx0, fy0, depth_floor, edge, out):  # type: ignore
             by_depth(D, ia, depth_floor, edge), f(0), f(0), f(0), f(0), f(0), f(0),
         )  # fmt: skip
         rays = add_ray(rays, du, dv, slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
-    out[L.G_OFFSET], out[L.G_LOG_M] = total, total * field
+    out[P.G_OFFSET], out[P.G_LOG_M] = total, total * field
     put_ray(rays, out)
 
 
 def _with_two(products):  # type: ignore[no-untyped-def]
     @inline
-    def gradients(S, n, p, fx0, fy0, depth_floor, edge, out):  # type: ignore[no-untyped-def]
-        row, tc, offset = ray(p), p[L.TC], p[L.OFFSET]
-        first, second = _neuron(p, L.NEURONS), _neuron(p, L.NEURONS + L.PER_NEURON)
+    def gradients(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
+        p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
+        row, tc, offset = ray(p), p[P.TC], p[P.OFFSET]
+        first, second = _neuron(p, P.NEURONS), _neuron(p, P.NEURONS + P.PER_NEURON)
         ax, ay, az, _, aa = first
         bx, by, bz, _, ba = second
         ax1, ay1, az1, bx1, by1, bz1 = ax * aa, ay * aa, az * aa, bx * ba, by * ba, bz * ba
@@ -123,7 +124,7 @@ def _with_two(products):  # type: ignore[no-untyped-def]
                 half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, by_depth(D, ia, depth_floor, edge), gqx, gqy, gqz, gvx, gvy, gvz,
             )  # fmt: skip
             rays = add_ray(rays, du, dv, slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
-        out[L.G_OFFSET], out[L.G_LOG_M] = total, total * offset + aa * sums[0] + ba * sums1[0]
+        out[P.G_OFFSET], out[P.G_LOG_M] = total, total * offset + aa * sums[0] + ba * sums1[0]
         _put_neuron(sums, aa, 0, out)
         _put_neuron(sums1, ba, 1, out)
         put_ray(rays, out)
@@ -135,30 +136,33 @@ _with_two_slow, _with_two_medium, _with_two_fast = _with_two(_slow), _with_two(_
 
 
 @inline
-def gradients_at_once(S, n, p, kinds, fx0, fy0, depth_floor, neurons, edge, out):  # type: ignore[no-untyped-def]
+def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
     """The gradient row of a pair with at most :data:`AT_ONCE` neurons from PIXEL and GRAD of its lanes."""
-    if neurons == 0:
-        _without_neurons(S, n, p, fx0, fy0, depth_floor, edge, out)
-    elif kinds[0] == L.MEDIUM:
-        _with_two_medium(S, n, p, fx0, fy0, depth_floor, edge, out)
-    elif kinds[0] == L.SLOW:
-        _with_two_slow(S, n, p, fx0, fy0, depth_floor, edge, out)
+    if frame.neurons == 0:
+        _without_neurons(S, n, frame, pair, edge, out)
+        return
+    kind = frame.kinds[pair.i, 0]
+    if kind == L.MEDIUM:
+        _with_two_medium(S, n, frame, pair, edge, out)
+    elif kind == L.SLOW:
+        _with_two_slow(S, n, frame, pair, edge, out)
     else:
-        _with_two_fast(S, n, p, fx0, fy0, depth_floor, edge, out)
+        _with_two_fast(S, n, frame, pair, edge, out)
 
 
 # ---------------------------------------------------------------- a chord in the lanes
 
 
 @inline
-def lanes_with_slopes(S, D, V, n, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, neurons, floor, edge):  # type: ignore[no-untyped-def]
-    """Chords of ``n`` lanes of primitive ``i``; in float64, where float32 is too coarse, also the three products per
-    neuron, in ``V``."""
-    if slots[i] >= 0:
-        chords_float64(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, False, True)
-        slopes_float64(edge, S, D, V, n, wide[slots[i]], neurons)
+def lanes_with_slopes(S, D, V, n, bounds, frame, pair, edge):  # type: ignore[no-untyped-def]
+    """Chords of ``n`` lanes of a pair; in float64, where float32 is too coarse, also the three products per neuron, in
+    ``V``."""
+    slot = frame.slots[pair.i]
+    if slot >= 0:
+        chords_float64(S, D, n, bounds, frame, pair, False, True)
+        slopes_float64(edge, S, D, V, n, frame.wide[slot], frame.neurons)
     else:
-        chords(S, n, rows[i], fx0, fy0, floor, False, True, edge)
+        chords(S, n, frame, pair, False, True, edge)
 
 
 @inline
@@ -176,7 +180,7 @@ def _field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyped-def
         log_m += gf * field
         S[L.GQX + k], S[L.GQY + k], S[L.GQZ + k] = f(0), f(0), f(0)
         S[L.GEX + k], S[L.GEY + k], S[L.GEZ + k] = f(0), f(0), f(0)
-    out[L.G_OFFSET], out[L.G_LOG_M] = offset, log_m
+    out[P.G_OFFSET], out[P.G_LOG_M] = offset, log_m
 
 
 def _two_neurons(products):  # type: ignore[no-untyped-def]
@@ -185,8 +189,8 @@ def _two_neurons(products):  # type: ignore[no-untyped-def]
 
     @inline
     def add(S, V0, V1, n, p, m, edge, out):  # type: ignore[no-untyped-def]
-        o = L.NEURONS + L.PER_NEURON * m
-        first, second = _neuron(p, o), _neuron(p, o + L.PER_NEURON)
+        o = P.NEURONS + P.PER_NEURON * m
+        first, second = _neuron(p, o), _neuron(p, o + P.PER_NEURON)
         ax, ay, az, _, aa = first
         bx, by, bz, _, ba = second
         # amplitudes once per neuron, not per lane: in the weights here, in the sums below
@@ -216,12 +220,8 @@ def _two_neurons(products):  # type: ignore[no-untyped-def]
     return add
 
 
-_two_slow, _two_medium, _two_fast, _two_float64 = (
-    _two_neurons(_slow),
-    _two_neurons(_medium),
-    _two_neurons(_fast),
-    _two_neurons(None),
-)
+_two_slow, _two_medium, _two_fast = _two_neurons(_slow), _two_neurons(_medium), _two_neurons(_fast)
+_two_float64 = _two_neurons(None)
 
 
 @inline
@@ -254,7 +254,7 @@ def chord_gradient(S, n, p, out, edge, in_float64):  # type: ignore[no-untyped-d
     form: BY_D is d FADE/dD. In float64 the ends are left out, and BY_D, BY_A and BY_TM are derivatives of the whole
     mean FADE FIELD.
     """
-    tc, soft = p[L.TC], len(edge)
+    tc, soft = p[P.TC], len(edge)
     rays = zero_ray()
     for k in range(n):
         half, ex, ey, ez = S[L.HALF + k], S[L.EXL + k], S[L.EYL + k], S[L.EZL + k]

@@ -1,4 +1,4 @@
-"""Building blocks shared by the forward and the backward pass of one (tile, primitive) pair.
+"""Building blocks of the pixel stage of one (tile, primitive) pair, which both passes and both orders share.
 
 Per pair: solve the silhouette for each pixel row, gather only the pixels inside it into a compact list of lanes, run
 chord and neurons over that list, scatter back row by row. Evaluated lanes then nearly equal true hits.
@@ -6,7 +6,7 @@ chord and neurons over that list, scatter back row by row. Evaluated lanes then 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -14,17 +14,107 @@ from numba import types
 from numba.extending import intrinsic
 
 from neuprim.core.compute.kernels import inline
-from neuprim.core.compute.views import copy16
+from neuprim.core.compute.views import borrow_array, copy16
+from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.chord import by_depth, chord, ray, weight
+from neuprim.core.render.cpu.float64 import chords_float64, neurons_float64
+from neuprim.core.render.cpu.trigonometry import cos_turns, profiles_fast, profiles_medium, profiles_slow
 
-__all__ = ["aligned", "chords", "compact", "fetch_ahead", "lanes_ahead", "row_spans"]
+__all__ = [
+    "FrameArrays",
+    "aligned",
+    "box_pixels",
+    "chords",
+    "compact",
+    "fetch_ahead",
+    "field_values",
+    "lend_frame",
+    "pair_window",
+    "prefetch_depths",
+    "row_spans",
+]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
-_STEPS = np.arange(L.TILE).astype(np.float32)
-_NUMBERS = np.arange(L.PIXELS + L.TILE).astype(np.float32)  # of the tile's pixels, and a vector beyond
+_STEPS = np.arange(P.TILE).astype(np.float32)
+_NUMBERS = np.arange(P.PIXELS + P.TILE).astype(np.float32)  # of the tile's pixels, and a vector beyond
 _MARGIN, _ROUNDING = f(2e-3), f(4e-7)  # pixels, and per pixel of the ellipse; a lane too many is rejected by its own D
+Array = np.ndarray[Any, Any]
+
+
+class FrameArrays(NamedTuple):
+    """One frame as the pixel kernels read it.
+
+    Attributes:
+        rows: (N, row_width) float32, one row per primitive (:mod:`neuprim.core.render.layout`).
+        wide: (M, row_width) float64 rows of the primitives that are drawn in float64.
+        slots: (N,) row of each primitive in ``wide``, or -1.
+        spans, boxes: (N, SPAN_WIDTH) silhouettes and (N, 4) pixel boxes.
+        kinds: (N, K/2) range of rates of each pair of neurons.
+        starts, ids: first pair of each tile, primitive of each pair.
+        norms: (H, W) length of each pixel's ray direction whose camera-z is 1.
+        alpha_min, alpha_max, transmittance_min, depth_floor: of the settings, float32.
+        neurons: K, padded to a whole number of pairs.
+    """
+
+    rows: Array
+    wide: Array
+    slots: Array
+    spans: Array
+    boxes: Array
+    kinds: Array
+    starts: Array
+    ids: Array
+    norms: Array
+    alpha_min: Any
+    alpha_max: Any
+    transmittance_min: Any
+    depth_floor: Any
+    neurons: int
+
+
+class PairWindow(NamedTuple):
+    """Where primitive ``i`` meets the tile at pixel (tx, ty): pixels x0:x1 of its rows y0:y1, relative to the tile, and
+    the tile corner's pixel centre relative to the anchor."""
+
+    i: int
+    tx: int
+    ty: int
+    x0: int
+    x1: int
+    y0: int
+    y1: int
+    fx0: float
+    fy0: float
+
+
+@inline
+def lend_frame(frame):  # type: ignore[no-untyped-def]
+    """The same arrays without reference counts."""
+    return FrameArrays(
+        borrow_array(frame.rows), borrow_array(frame.wide), borrow_array(frame.slots), borrow_array(frame.spans), borrow_array(frame.boxes), borrow_array(frame.kinds),
+        borrow_array(frame.starts), borrow_array(frame.ids), borrow_array(frame.norms), frame.alpha_min, frame.alpha_max,
+        frame.transmittance_min, frame.depth_floor, frame.neurons,
+    )  # fmt: skip
+
+
+@inline
+def pair_window(frame, i, tx, ty):  # type: ignore[no-untyped-def]
+    box, p = frame.boxes[i], frame.rows[i]
+    return PairWindow(
+        i, tx, ty, max(box[0] - tx, 0), min(box[2] - tx, P.TILE), max(box[1] - ty, 0), min(box[3] - ty, P.TILE),
+        f(tx) + f(0.5) - p[P.UX], f(ty) + f(0.5) - p[P.UY],
+    )  # fmt: skip
+
+
+@inline
+def box_pixels(frame, i, tx, ty):  # type: ignore[no-untyped-def]
+    """Pixels of a tile that lie in the box of primitive ``i``: an upper bound of the pair's lanes."""
+    box = frame.boxes[i]
+    wide = min(box[2] - tx, P.TILE) - max(box[0] - tx, 0)
+    high = min(box[3] - ty, P.TILE) - max(box[1] - ty, 0)
+    return max(wide, 0) * max(high, 0)
 
 
 @inline
@@ -36,7 +126,7 @@ def aligned(floats):  # type: ignore[no-untyped-def]
     return room[shift : shift + floats]
 
 
-def _prefetch(context, address):  # type: ignore[no-untyped-def]
+def _emit_prefetch(context, address):  # type: ignore[no-untyped-def]
     """Ask memory for the cache line at an address. Nothing is read, so that no address is wrong."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -50,38 +140,38 @@ def _prefetch(context, address):  # type: ignore[no-untyped-def]
     return types.void(types.intp), code
 
 
-_ask: Any = intrinsic(_prefetch)
+_prefetch: Any = intrinsic(_emit_prefetch)
 
 
 @inline
-def fetch_ahead(i, rows, spans, boxes):  # type: ignore[no-untyped-def]
-    """Ask memory for what the pair after this one, of primitive ``i``, reads first: tiles meet primitives in no order
-    that it could guess."""
+def fetch_ahead(i, frame):  # type: ignore[no-untyped-def]
+    """Ask memory for what the next pair, of primitive ``i``, reads first: tiles meet primitives in no order that it
+    could guess."""
+    rows, spans, boxes = frame.rows, frame.spans, frame.boxes
     row = rows.ctypes.data + i * rows.strides[0]
     for at in range(0, rows.strides[0], 64):
-        _ask(row + at)
-    _ask(spans.ctypes.data + i * spans.strides[0])
-    _ask(boxes.ctypes.data + i * boxes.strides[0])
+        _prefetch(row + at)
+    _prefetch(spans.ctypes.data + i * spans.strides[0])
+    _prefetch(boxes.ctypes.data + i * boxes.strides[0])
 
 
 @inline
-def lanes_ahead(depths, first, stop):  # type: ignore[no-untyped-def]
-    """The same for the optical depths of a pair's lanes ``first:stop``."""
+def prefetch_depths(depths, first, stop):  # type: ignore[no-untyped-def]
+    """Ask memory for the optical depths of a pair's lanes ``first:stop``."""
     for at in range(first, stop, 16):
-        _ask(depths.ctypes.data + 4 * at)
+        _prefetch(depths.ctypes.data + 4 * at)
 
 
 @inline
-def row_spans(span, fx0, fy0, y0, y1, x0, x1, rows_live, bounds):  # type: ignore[no-untyped-def]
-    """Pixels [bounds[y], bounds[y + 16]) of each live tile row inside the silhouette, equal in the others and outside
-    rows y0:y1.
+def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
+    """Pixels [bounds[y], bounds[y + 16]) of each live tile row inside the silhouette; equal in the other rows.
 
-    fx0, fy0: the tile corner's pixel centre from the anchor. All 16 rows at once: one vector.
+    All 16 rows at once: one vector.
     """
-    skew, xc, yc, hx = span[L.SKEW], span[L.XC] - fx0, span[L.YC] - fy0, span[L.HX]
-    ihy = f(1) / span[L.HY]
-    low, high, top, bottom = f(x0), f(x1), f(y0), f(y1)
-    for y in range(L.TILE):
+    skew, xc, yc, hx = span[P.SKEW], span[P.XC] - pair.fx0, span[P.YC] - pair.fy0, span[P.HX]
+    ihy = f(1) / span[P.HY]
+    low, high, top, bottom = f(pair.x0), f(pair.x1), f(pair.y0), f(pair.y1)
+    for y in range(P.TILE):
         row = _STEPS[y]
         dv = row - yc
         k = dv * ihy
@@ -93,7 +183,7 @@ def row_spans(span, fx0, fy0, y0, y1, x0, x1, rows_live, bounds):  # type: ignor
         hi = min(np.floor(mid + half) + f(1), high)
         inside = (s > f(-1e-2)) & (row >= top) & (row < bottom) & (rows_live[y] > f(0)) & (hi > lo)
         bounds[y] = np.int32(lo if inside else f(0))
-        bounds[y + L.TILE] = np.int32(hi if inside else f(0))
+        bounds[y + P.TILE] = np.int32(hi if inside else f(0))
 
 
 @inline
@@ -107,23 +197,24 @@ def compact(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
     for y in range(y0, y1):
         offset[y] = n
         a = bounds[y]
-        j = y * L.TILE + a
+        j = y * P.TILE + a
         copy16(S, L.PIXEL + n, _NUMBERS, j)
         copy16(S, L.NORM_L + n, state, L.NORM + j)
-        n += bounds[y + L.TILE] - a
-    for k in range(L.TILE):
-        S[index(L.PIXEL + n + k)] = f(y0 * L.TILE)
+        n += bounds[y + P.TILE] - a
+    for k in range(P.TILE):
+        S[index(L.PIXEL + n + k)] = f(y0 * P.TILE)
         S[index(L.NORM_L + n + k)] = f(0)
     return n
 
 
 @inline
-def chords(S, n, p, fx0, fy0, depth_floor, with_mid, backward, edge):  # type: ignore[no-untyped-def]
+def chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
     """Chord middle Q, direction E and half length of n lanes (:func:`~chord.chord`); HALF = 0 where the ray misses.
 
     Where the edge is soft, no chord may be cut: such primitives are drawn in float64.
     """
-    row, offset = ray(p), p[L.OFFSET]
+    p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
+    row, offset = ray(p), p[P.OFFSET]
     for k in range(n):
         du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = chord(S[L.PIXEL + k], fx0, fy0, row)
         # from the closest point, not from the ray's origin: the shift is zero unless the near plane cuts
@@ -144,3 +235,51 @@ def chords(S, n, p, fx0, fy0, depth_floor, with_mid, backward, edge):  # type: i
             S[L.MID + k], S[L.TM + k], S[L.IA + k], S[L.UNCUT + k] = mid, tm, ia, uncut
             S[L.HEIGHT + k], S[L.SLIDE + k] = h, slide
             S[L.DH + k] = by_depth(D, ia, depth_floor, edge)
+
+
+def _values(profiles):  # type: ignore[no-untyped-def]
+    """FIELD += w2 cos(phase at the middle) B_p(rate x half chord) of two neurons, with the profiles of their range of
+    rates."""
+
+    @inline
+    def add(S, n, p, o, edge):  # type: ignore[no-untyped-def]
+        ax, ay, az, ab, aa = p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE], p[o + P.AMPLITUDE]
+        o2 = o + P.PER_NEURON
+        bx, by, bz, bb, ba = p[o2 + P.WX], p[o2 + P.WY], p[o2 + P.WZ], p[o2 + P.PHASE], p[o2 + P.AMPLITUDE]
+        for k in range(n):
+            half = S[L.HALF + k]
+            ex, ey, ez = S[L.EXL + k], S[L.EYL + k], S[L.EZL + k]
+            qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
+            v = (ex * ax + ey * ay + ez * az) * half
+            u = qx * ax + qy * ay + qz * az + ab
+            r = u - np.rint(u)
+            v1 = (ex * bx + ey * by + ez * bz) * half
+            u1 = qx * bx + qy * by + qz * bz + bb
+            r1 = u1 - np.rint(u1)
+            b, b1 = profiles(edge, v, v1)
+            S[L.FIELD + k] += cos_turns(r * r) * b * aa + cos_turns(r1 * r1) * b1 * ba
+
+    return add
+
+
+_values_slow, _values_medium, _values_fast = _values(profiles_slow), _values(profiles_medium), _values(profiles_fast)
+
+
+@inline
+def field_values(S, D, n, bounds, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
+    """Chords and FIELD of ``n`` lanes of a pair, in float64 where float32 is too coarse; see :func:`chords`."""
+    i = pair.i
+    if frame.slots[i] >= 0:
+        chords_float64(S, D, n, bounds, frame, pair, with_mid, backward)
+        neurons_float64(edge, S, D, n, frame.wide[frame.slots[i]], frame.neurons)
+    else:
+        p = frame.rows[i]
+        chords(S, n, frame, pair, with_mid, backward, edge)
+        for m in range(0, frame.neurons, 2):
+            o = P.NEURONS + P.PER_NEURON * m
+            if frame.kinds[i, m // 2] == L.MEDIUM:
+                _values_medium(S, n, p, o, edge)
+            elif frame.kinds[i, m // 2] == L.SLOW:
+                _values_slow(S, n, p, o, edge)
+            else:
+                _values_fast(S, n, p, o, edge)

@@ -1,91 +1,134 @@
-"""Trigonometry: cos and sinc of a phase in turns, and the exponential, as polynomials (coefficients:
+"""cos, sinc and B_p of a phase in turns, and the exponential, as polynomials (coefficients:
 benchmarks/fit_polynomials.py).
 
-With W1 and b1 divided by 2 pi beforehand, reducing a phase to |r| <= 1/2 turn is ``r = u - rint(u)``, which is exact.
-float32 Horner errors: cos 4.3e-7, sinc 2.6e-7, dsinc/dz 9.3e-7; up to 1.5 turns sinc 4.4e-7, dsinc/dv 1.9e-6.
+W1 and b1 are divided by 2 pi beforehand, so that reducing a phase to |r| <= 1/2 turn is ``r = u - rint(u)``, which is
+exact. B_p is for a soft edge of exponent p what sinc is for a hard one (:mod:`neuprim.core.model.edge`). Rates v are in
+turns over half a chord: B_p(2 pi v). Up to half a turn one polynomial serves, up to 1.5 turns a longer one, which saves
+the range reduction and its division. Beyond, the recursions B_1 = 3 (B_0 - cos z)/z^2 and B_2 = 15 (B_1 - B_0)/z^2
+take over, with dB_1/dz = -3 (B_1 - B_0)/z and dB_2/dz = -5 (B_2 - B_1)/z.
 
-Between half a turn and 1.5 turns a longer polynomial takes the place of the range reduction and its division.
+float32 Horner errors: cos 4.3e-7, sinc 2.6e-7, dsinc/dz 9.3e-7; up to 1.5 turns sinc 4.4e-7, dsinc/dv 1.9e-6. B_1 and
+B_2 1.3e-7 and 9e-8 up to half a turn, 4.8e-7 and 3.2e-7 up to 1.5; derivatives 4.4e-7 and 2.6e-7, 5.8e-7 and 4.1e-7.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
-from neuprim.core.compute.kernels import inline
+from neuprim.core.compute.kernels import dispatch_by_length, inline
 
 __all__ = [
+    "EDGE_TYPES",
     "TAU",
     "cos_turns",
+    "dsinc_turns",
     "one_minus_exp",
-    "reduced",
+    "profiles_fast",
+    "profiles_medium",
+    "profiles_slow",
     "sinc_turns",
-    "sincs_fast",
-    "sincs_medium",
-    "sincs_slow",
     "slopes_fast",
     "slopes_medium",
     "slopes_slow",
 ]
 
+EDGE_TYPES: tuple[tuple[int, ...], ...] = ((), (0,), (0, 0))
+"""The exponents p = 0, 1, 2 as kernels take them: as many zeros. A tuple's length belongs to its type, so that numba
+compiles a kernel for each p that is drawn, and none that is not."""
+
+Kernel = Callable[..., Any]
 f = np.float32
 TAU = f(2 * np.pi)
 
-_C = tuple(
-    f(c)
-    for c in (
-        1.0,
-        -19.73920440673828,
-        64.93911743164062,
-        -85.45016479492188,
-        60.16783142089844,
-        -25.968313217163086,
+_C0, _C1, _C2, _C3, _C4, _C5, _C6 = (
+    f(c) for c in (
+        1.0, -19.73920440673828, 64.93911743164062, -85.45016479492188, 60.16783142089844, -25.968313217163086,
         6.529610633850098,
     )
-)
-_S = tuple(
-    f(c)
-    for c in (
-        0.9999999403953552,
-        -6.579718589782715,
-        12.987038612365723,
-        -12.193624496459961,
-        6.580165386199951,
+)  # fmt: skip
+_S0, _S1, _S2, _S3, _S4, _S5 = (
+    f(c) for c in (
+        0.9999999403953552, -6.579718589782715, 12.987038612365723, -12.193624496459961, 6.580165386199951,
         -1.9852460622787476,
     )
-)
-_D = tuple(
-    f(c)
-    for c in (
-        -6.579736232757568,
-        25.975732803344727,
-        -36.623226165771484,
-        26.756011962890625,
-        -11.860190391540527,
+)  # fmt: skip
+_D0, _D1, _D2, _D3, _D4, _D5 = (
+    f(c) for c in (
+        -6.579736232757568, 25.975732803344727, -36.623226165771484, 26.756011962890625, -11.860190391540527,
         3.093101978302002,
     )
-)
-_M = tuple(
-    f(c)
-    for c in (
-        0.05581631940701254, 0.4362123752771363, -0.6370321672800427, -0.27636890430229927, 0.8312559868298691, -0.5947233435367446,
-        0.2374873217981118, -0.06324641573684713, 0.012253660547389418, -0.0018736913572860911, 0.00021887869764285634,
+)  # fmt: skip
+_M0, _M1, _M2, _M3, _M4, _M5, _M6, _M7, _M8, _M9, _M10 = (
+    f(c) for c in (
+        0.05581631940701254, 0.4362123752771363, -0.6370321672800427, -0.27636890430229927, 0.8312559868298691,
+        -0.5947233435367446, 0.2374873217981118, -0.06324641573684713, 0.012253660547389418, -0.0018736913572860911,
+        0.00021887869764285634,
     )
 )  # fmt: skip
-_N = tuple(
-    f(c)
-    for c in (
-        0.3877441347416979, -1.132501461406376, -0.7369757903376593, 2.9555745464283736, -2.6432625907720526, 1.2666074512059946,
-        -0.3934441512729933, 0.08712575631466417, -0.015040448572156936, 0.0019507300281688589,
+_N0, _N1, _N2, _N3, _N4, _N5, _N6, _N7, _N8, _N9 = (
+    f(c) for c in (
+        0.3877441347416979, -1.132501461406376, -0.7369757903376593, 2.9555745464283736, -2.6432625907720526,
+        1.2666074512059946, -0.3934441512729933, 0.08712575631466417, -0.015040448572156936, 0.0019507300281688589,
     )
 )  # fmt: skip
-_C0, _C1, _C2, _C3, _C4, _C5, _C6 = _C
-_S0, _S1, _S2, _S3, _S4, _S5 = _S
-_D0, _D1, _D2, _D3, _D4, _D5 = _D
-_M0, _M1, _M2, _M3, _M4, _M5, _M6, _M7, _M8, _M9, _M10 = _M
-_N0, _N1, _N2, _N3, _N4, _N5, _N6, _N7, _N8, _N9 = _N
 _TO_UNIT = f(2 / 1.5**2)  # v^2 on [0, 1.5^2] to [-1, 1]: small coefficients, nothing cancels
 _E2, _E3, _E4, _E5, _E6 = f(1 / 2), f(1 / 6), f(1 / 24), f(1 / 120), f(1 / 720)
 _ONE, _TWO, _SIXTEENTH, _CEIL = f(1), f(2), f(-1 / 16), f(9.4)
+
+_SLOW = {
+    1: (
+        1.0, -3.947838068008423, 5.566062927246094, -4.0664262771606445, 1.8025330305099487, -0.4700953960418701,
+    ),
+    2: (
+        1.0, -2.8198859691619873, 3.0923011302948, -1.8488370180130005, 0.695292592048645, -0.15979965031147003,
+    ),
+}  # fmt: skip
+_SLOW_SLOPE = {
+    1: (
+        -3.9478418827056885, 11.132474899291992, -12.208269119262695, 7.302683353424072, -2.7615163326263428,
+        0.6567270755767822,
+    ),
+    2: (
+        -2.8198869228363037, 6.184709548950195, -5.549287796020508, 2.8098440170288086, -0.9264959692955017,
+        0.20373320579528809,
+    ),
+}  # fmt: skip
+_MEDIUM = {
+    1: (
+        -0.05893004313111305, 0.17211958765983582, 0.11200688779354095, -0.44919347763061523, 0.40172773599624634,
+        -0.1925012469291687, 0.05979634076356888, -0.013241526670753956, 0.002285874215885997, -0.00029647554038092494,
+    ),
+    2: (
+        -0.03875413164496422, -0.05043990537524223, 0.30341872572898865, -0.3617872893810272, 0.2167164385318756,
+        -0.08087369054555893, 0.0208695400506258, -0.003977504093199968, 0.0006010864744894207, -6.996675801929086e-05,
+    ),
+}  # fmt: skip
+_MEDIUM_SLOPE = {
+    1: (
+        0.15299518406391144, 0.19912876188755035, -1.1978490352630615, 1.428278923034668, -0.8555622100830078,
+        0.31927651166915894, -0.08238963782787323, 0.01570255681872368, -0.0023729943204671144, 0.00027621767367236316,
+    ),
+    2: (
+        -0.044835470616817474, 0.5394122004508972, -0.9647660255432129, 0.7705288529396057, -0.35943883657455444,
+        0.11138193309307098, -0.024748504161834717, 0.004155985079705715, -0.0005599680007435381,
+        5.919351679040119e-05,
+    ),
+}  # fmt: skip
+
+
+@inline
+def one_minus_exp(x):  # type: ignore[no-untyped-def]
+    """1 - exp(-x) for x clamped to [0, 9.4] (alpha is clamped to at most 0.9999): expm1 of x/16, doubled four times."""
+    r = min(max(x, f(0)), _CEIL) * _SIXTEENTH
+    q = (((((_E6 * r + _E5) * r + _E4) * r + _E3) * r + _E2) * r + _ONE) * r
+    q = q * (q + _TWO)
+    q = q * (q + _TWO)
+    q = q * (q + _TWO)
+    q = q * (q + _TWO)
+    return -q
 
 
 @inline
@@ -125,31 +168,31 @@ def _dsinc_medium(t):  # type: ignore[no-untyped-def]
 
 
 @inline
-def sincs_slow(v, w):  # type: ignore[no-untyped-def]
+def _hard_sincs_slow(v, w):  # type: ignore[no-untyped-def]
     """|v|, |w| <= 1/2."""
     return sinc_turns(v * v), sinc_turns(w * w)
 
 
 @inline
-def slopes_slow(v, w):  # type: ignore[no-untyped-def]
+def _hard_slopes_slow(v, w):  # type: ignore[no-untyped-def]
     y, z = v * v, w * w
     return sinc_turns(y), dsinc_turns(y) * _TWO * v, sinc_turns(z), dsinc_turns(z) * _TWO * w
 
 
 @inline
-def sincs_medium(v, w):  # type: ignore[no-untyped-def]
+def _hard_sincs_medium(v, w):  # type: ignore[no-untyped-def]
     """|v|, |w| <= 3/2."""
     return _sinc_medium(v * v * _TO_UNIT - _ONE), _sinc_medium(w * w * _TO_UNIT - _ONE)
 
 
 @inline
-def slopes_medium(v, w):  # type: ignore[no-untyped-def]
+def _hard_slopes_medium(v, w):  # type: ignore[no-untyped-def]
     y, z = v * v * _TO_UNIT - _ONE, w * w * _TO_UNIT - _ONE
     return _sinc_medium(y), _dsinc_medium(y) * _TWO * v, _sinc_medium(z), _dsinc_medium(z) * _TWO * w
 
 
 @inline
-def reduced(v, w):  # type: ignore[no-untyped-def]
+def _reduced(v, w):  # type: ignore[no-untyped-def]
     """v and w reduced to half a turn, whether they were within, and their reciprocals (1 where within) from one
     division."""
     k, j = np.rint(v), np.rint(w)
@@ -160,17 +203,17 @@ def reduced(v, w):  # type: ignore[no-untyped-def]
 
 
 @inline
-def sincs_fast(v, w):  # type: ignore[no-untyped-def]
+def _hard_sincs_fast(v, w):  # type: ignore[no-untyped-def]
     """Any v and w: sinc(2 pi v) = sinc(2 pi r) r/v with r = v - rint(v), exactly reduced."""
-    r, s, a, b, iv, iw = reduced(v, w)
+    r, s, a, b, iv, iw = _reduced(v, w)
     x, y = sinc_turns(r * r), sinc_turns(s * s)
     return x if a else x * r * iv, y if b else y * s * iw
 
 
 @inline
-def slopes_fast(v, w):  # type: ignore[no-untyped-def]
+def _hard_slopes_fast(v, w):  # type: ignore[no-untyped-def]
     """d sinc/dv = (cos - sinc)/v beyond half a turn."""
-    r, s, a, b, iv, iw = reduced(v, w)
+    r, s, a, b, iv, iw = _reduced(v, w)
     y, z = r * r, s * s
     x, u = sinc_turns(y), sinc_turns(z)
     sx, su = x if a else x * r * iv, u if b else u * s * iw
@@ -179,13 +222,104 @@ def slopes_fast(v, w):  # type: ignore[no-untyped-def]
     return sx, dx, su, du
 
 
-@inline
-def one_minus_exp(x):  # type: ignore[no-untyped-def]
-    """1 - exp(-x) for x clamped to [0, 9.4] (alpha is clamped to at most 0.9999): expm1 of x/16, doubled four times."""
-    r = min(max(x, f(0)), _CEIL) * _SIXTEENTH
-    q = (((((_E6 * r + _E5) * r + _E4) * r + _E3) * r + _E2) * r + _ONE) * r
-    q = q * (q + _TWO)
-    q = q * (q + _TWO)
-    q = q * (q + _TWO)
-    q = q * (q + _TWO)
-    return -q
+def _horner(coefficients: tuple[float, ...]) -> Kernel:
+    """The polynomial with these coefficients, lowest first, unrolled."""
+    first = f(coefficients[0])
+    if len(coefficients) == 1:
+
+        @inline
+        def last(z):  # type: ignore[no-untyped-def]
+            return first
+
+        return last
+    rest = _horner(coefficients[1:])
+
+    @inline
+    def polynomial(z):  # type: ignore[no-untyped-def]
+        return rest(z) * z + first
+
+    return polynomial
+
+
+def _halves(coefficients: tuple[float, ...]) -> Kernel:
+    """The same as two shorter chains, whose latencies overlap; ten coefficients."""
+    low, high = _horner(coefficients[:5]), _horner(coefficients[5:])
+
+    @inline
+    def polynomial(t):  # type: ignore[no-untyped-def]
+        t2 = t * t
+        return high(t) * (t2 * t2 * t) + low(t)
+
+    return polynomial
+
+
+def _slow(p: int) -> tuple[Kernel, Kernel]:
+    value, slope = _horner(_SLOW[p]), _horner(_SLOW_SLOPE[p])
+
+    @inline
+    def profiles(v, w):  # type: ignore[no-untyped-def]
+        return value(v * v), value(w * w)
+
+    @inline
+    def slopes(v, w):  # type: ignore[no-untyped-def]
+        y, z = v * v, w * w
+        return value(y), slope(y) * f(2) * v, value(z), slope(z) * f(2) * w
+
+    return profiles, slopes
+
+
+def _medium(p: int) -> tuple[Kernel, Kernel]:
+    value, slope = _halves(_MEDIUM[p]), _halves(_MEDIUM_SLOPE[p])
+
+    @inline
+    def profiles(v, w):  # type: ignore[no-untyped-def]
+        return value(v * v * _TO_UNIT - f(1)), value(w * w * _TO_UNIT - f(1))
+
+    @inline
+    def slopes(v, w):  # type: ignore[no-untyped-def]
+        y, z = v * v * _TO_UNIT - f(1), w * w * _TO_UNIT - f(1)
+        return value(y), slope(y) * f(2) * v, value(z), slope(z) * f(2) * w
+
+    return profiles, slopes
+
+
+def _fast(p: int) -> tuple[Kernel, Kernel]:
+    value, slope = _horner(_SLOW[p]), _horner(_SLOW_SLOPE[p])
+    first = p == 1
+
+    @inline
+    def one(v, near, r, iv):  # type: ignore[no-untyped-def]
+        """(B_p, dB_p/dv) of v = whole + r, iv = 1/v; the polynomial where ``near``."""
+        z, iz = r * r, iv * f(1 / TAU)  # iz = 1/(2 pi v)
+        b0, cosine = sinc_turns(z) * r * iv, cos_turns(z)
+        b1 = f(3) * (b0 - cosine) * iz * iz
+        if first:
+            b, db = b1, f(-3) * (b1 - b0) * iv
+        else:
+            b2 = f(15) * (b1 - b0) * iz * iz
+            b, db = b2, f(-5) * (b2 - b1) * iv
+        y = v * v if near else f(0)
+        return value(y) if near else b, slope(y) * f(2) * v if near else db
+
+    @inline
+    def profiles(v, w):  # type: ignore[no-untyped-def]
+        r, s, a, b, iv, iw = _reduced(v, w)
+        return one(v, a, r, iv)[0], one(w, b, s, iw)[0]
+
+    @inline
+    def slopes(v, w):  # type: ignore[no-untyped-def]
+        r, s, a, b, iv, iw = _reduced(v, w)
+        x, dx = one(v, a, r, iv)
+        y, dy = one(w, b, s, iw)
+        return x, dx, y, dy
+
+    return profiles, slopes
+
+
+_soft_slow, _soft_medium, _soft_fast = ((kind(1), kind(2)) for kind in (_slow, _medium, _fast))
+profiles_slow = dispatch_by_length(_hard_sincs_slow, _soft_slow[0][0], _soft_slow[1][0])
+profiles_medium = dispatch_by_length(_hard_sincs_medium, _soft_medium[0][0], _soft_medium[1][0])
+profiles_fast = dispatch_by_length(_hard_sincs_fast, _soft_fast[0][0], _soft_fast[1][0])
+slopes_slow = dispatch_by_length(_hard_slopes_slow, _soft_slow[0][1], _soft_slow[1][1])
+slopes_medium = dispatch_by_length(_hard_slopes_medium, _soft_medium[0][1], _soft_medium[1][1])
+slopes_fast = dispatch_by_length(_hard_slopes_fast, _soft_fast[0][1], _soft_fast[1][1])

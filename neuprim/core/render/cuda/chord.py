@@ -13,7 +13,18 @@ from typing import Any
 from neuprim.core.compute.warp import wp
 from neuprim.core.render.cuda import layout as L
 
-__all__ = ["Chord", "Ray", "chord", "phase", "place", "pixel", "ray_of", "through", "through_chord", "xyz"]
+__all__ = [
+    "Chord",
+    "Ray",
+    "chord",
+    "phase",
+    "pixel_of_lane",
+    "pixel_of_slot",
+    "ray_of",
+    "slot_of_pixel",
+    "through_chord",
+    "xyz",
+]
 
 
 @wp.struct
@@ -130,16 +141,28 @@ def through_chord(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: fl
 
 
 @wp.func
-def pixel(lane: int):
+def pixel_of_lane(lane: int):
     """(x, y) in the tile of a block's thread: a warp covers 8 x 4 pixels, which small primitives fill better than
     rows."""
     return wp.vec2i((lane & 7) | ((lane >> 2) & 8), ((lane >> 3) & 3) | ((lane >> 4) & 12))
 
 
 @wp.func
-def place(span: int, offset: int, x: int):
+def slot_of_pixel(span: int, offset: int, x: int):
     """Slot of pixel x of a tile row, -1 outside its span (start << 8 | last << 4 | first)."""
     slot = int(-1)
     if x >= (span & 15) and x <= ((span >> 4) & 15):
         slot = offset + (span >> 8) + x - (span & 15)
     return slot
+
+
+@wp.func
+def pixel_of_slot(spans: Any, n: int, s: int):
+    """(x, y) in the tile of pixel ``s`` of pair ``n``, a row of ``spans``: the last row of pixels that starts at or
+    before it."""
+    y = int(0)
+    for b in range(4):
+        if int(spans[n, y + (8 >> b)]) >> 8 <= s:
+            y += 8 >> b
+    row = int(spans[n, y])
+    return wp.vec2i((row & 15) + s - (row >> 8), y)

@@ -2,9 +2,9 @@
 """Compositing, forward: a block a tile, a thread a pixel.
 
 Rows of primitives come to shared memory in batches; a tile ends when no pixel sees light through it any more. What the
-backward pass needs goes to the pixels' slots (:mod:`~neuprim.core.render.cuda.spans`): (alpha, transmittance before) of
-every hit. Pairs of primitives that float32 cannot follow have their opacities there beforehand
-(:mod:`~neuprim.core.render.cuda.delicate`).
+backward pass needs goes to the pixels' slots (:func:`~neuprim.core.render.cuda.binning.row_spans`): (alpha,
+transmittance before) of every hit. Pairs of primitives that float32 cannot follow have their opacities there beforehand
+(:mod:`~neuprim.core.render.cuda.float64`).
 """
 
 from __future__ import annotations
@@ -15,16 +15,12 @@ from typing import Any
 from neuprim.core.compute.warp import FAST, wp
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.chord import chord, phase, pixel, place, ray_of, xyz
-from neuprim.core.render.cuda.forms import Form
-from neuprim.core.render.cuda.functions import band_of, cos_turns, opacity
-from neuprim.core.render.cuda.memory import hit_at, leave_hit, span_of, whole
-from neuprim.core.render.cuda.together import any_thread
+from neuprim.core.render.cuda.block_ops import any_thread, hit_at, int_at, set_hit, span_of
+from neuprim.core.render.cuda.chord import chord, phase, pixel_of_lane, ray_of, slot_of_pixel, xyz
+from neuprim.core.render.cuda.layout import CUT_AT, Form
+from neuprim.core.render.cuda.trigonometry import band_of, cos_turns, opacity
 
-__all__ = ["BATCH", "CUT_AT", "forward_kernel"]
-
-CUT_AT = -1e30
-"""Entry of every chord that the near plane cuts: in front of all others, and equal."""
+__all__ = ["BATCH", "forward_kernel"]
 
 
 @wp.func
@@ -44,9 +40,9 @@ BATCH = 16
 
 @functools.cache
 def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, several: bool = False) -> Any:
-    """Of a form; ``keep``: fill the slots, and take delicate primitives from there; ``depth``: also the sum of w z.
+    """Of a form; ``keep``: fill the slots, and take primitives in float64 from there; ``depth``: also the sum of w z.
 
-    ``listing``: composite nothing, but list every hit for :mod:`~neuprim.core.render.cuda.by_entry`, with its sorting
+    ``listing``: composite nothing, but list every hit for :mod:`~neuprim.core.render.cuda.entry`, with its sorting
     key and its pair.
     ``several``: images of one size, one after the other.
     """
@@ -87,7 +83,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
         ``reached[tile]``: the pairs before it were composited."""
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
-        at = pixel(lane)
+        at = pixel_of_lane(lane)
         place_of = int(tile)
         if wp.static(several):
             place_of = tile % (across * ((size[1] + L.TILE - 1) // L.TILE))
@@ -111,7 +107,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
                 units = wp.tile_load_indexed(net, indices=which, shape=(BATCH, net_width), axis=0, storage="shared")
             count = wp.min(BATCH, end - base)
             for j in range(count):
-                slot = place(span_of(spans, base + j, at[1]), whole(offsets, base + j), at[0])
+                slot = slot_of_pixel(span_of(spans, base + j, at[1]), int_at(offsets, base + j), at[0])
                 if slot >= 0:
                     alpha = float(0.0)
                     before = float(T)
@@ -198,7 +194,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
                                 depths[slot] = mid
                         T -= weight
                     if wp.static(keep):
-                        leave_hit(hits, slot, wp.vec2(alpha, before))
+                        set_hit(hits, slot, wp.vec2(alpha, before))
             done = base + count
             if any_thread(int(T >= limits[2])) == 0:
                 break

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,17 +11,15 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.warp import array, launch, wp
-from neuprim.core.render.cpu.layout import SPAN_WIDTH
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.binning import TileLists, bin_primitives, count
-from neuprim.core.render.cuda.placement import PER_BLOCK
+from neuprim.core.render.cuda.binning import TileLists, bin_primitives, count_tiles
 from neuprim.core.render.cuda.prepare import prepare_kernel, wide_kernel
+from neuprim.core.render.cuda.projection import PER_BLOCK
+from neuprim.core.render.layout import SPAN_WIDTH
+from neuprim.core.render.limits import min_visible_depth
+from neuprim.core.render.rasterize import Request
 
-__all__ = ["NAMES", "Frame", "NotFinite", "Projection", "as_arrays", "prepared"]
-
-NAMES = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
-"""Parameters of the per-primitive stage, in the order in which its kernels and :mod:`prepare_backward` take and return
-them."""
+__all__ = ["Frame", "NotFinite", "Projection", "as_arrays", "prepare_frame"]
 
 
 class NotFinite(ValueError):
@@ -41,14 +39,12 @@ class Projection:
         camera: focal lengths and centre in pixels, size.
         near: of the near plane, in scene units.
         turns: omega0 / 2 pi.
-        edge: p of the density's soft edge.
     """
 
     matrix: Tensor
     camera: Camera
     near: float
     turns: float
-    edge: int
 
     @property
     def intrinsics(self) -> Any:
@@ -61,12 +57,11 @@ class Frame:
 
     Attributes:
         projection: the view.
-        parameters: tensors of :data:`NAMES`, contiguous, all float32 or all float64.
-        neurons: K.
-        channels: C of the palette.
+        parameters: tensors of :data:`~neuprim.core.render.rasterize.PARAMETERS`, contiguous, all float32 or all float64.
         rows: (N, columns(K, C), 4) float32.
-        wide: (M, wide_width(K)) float64, rows of the delicate primitives, columns of
-        :mod:`neuprim.core.render.cpu.layout`. slots: (N,) int32, row in ``wide``, or -1.
+        wide: (M, wide_width(K)) float64, rows of the primitives in float64, columns of
+            :mod:`neuprim.core.render.layout`.
+        slots: (N,) int32, row in ``wide``, or -1.
         which: (M,) int32, primitive of each row of ``wide``, rising.
         spans: (N, 8) float32, silhouettes.
         boxes: (N, 4) int32, pixel boxes x0, y0, x1, y1.
@@ -77,8 +72,6 @@ class Frame:
 
     projection: Projection
     parameters: tuple[Tensor, ...]
-    neurons: int
-    channels: int
     rows: Tensor
     wide: Tensor
     slots: Tensor
@@ -94,6 +87,10 @@ class Frame:
         return self.rows.device
 
     @property
+    def neurons(self) -> int:
+        return int(self.parameters[3].shape[1])
+
+    @property
     def double(self) -> bool:
         return self.parameters[0].dtype == torch.float64
 
@@ -104,57 +101,41 @@ class Frame:
 
 
 def as_arrays(parameters: Sequence[Tensor]) -> tuple[Any, ...]:
-    """Tensors of :data:`NAMES`, or of their gradients, as Warp arrays of numbers and vectors."""
+    """Return parameters, or their gradients, as Warp arrays of numbers and vectors."""
     double = parameters[0].dtype == torch.float64
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
     return tuple(array(x, kind) for x, kind in zip(parameters, (vec3, vec3, vec4, vec3, real, real, real), strict=True))
 
 
-def _alike(tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Contiguous, and of one dtype: float64 where any is, else float32; the kernels compute in float64 in any case."""
-    dtype = torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32
-    return tuple(x.detach().to(dtype).contiguous() for x in tensors)
-
-
-def prepared(
-    tensors: Mapping[str, Tensor],
+def prepare_frame(
+    request: Request,
+    viewmat: Tensor,
     palette: Tensor,
-    camera: Camera,
-    view: Tensor,
-    near: float,
-    turns: float,
-    edge: int,
-    least: float,
+    tensors: Sequence[Tensor],
     forced: Tensor | None = None,
     images: tuple[Tensor, int] | None = None,
 ) -> Frame:
-    """Everything that the pixel kernels read of one view; the host waits for the device once.
+    """Return everything that the pixel kernels read of one view; the host waits for the device once.
 
     Args:
-        tensors: those of :data:`NAMES`, all on one device: means (N, 3), log_scales (N, 3), quats (N, 4), W1 (N, K, 3),
-        b1 (N, K), w2 (N, K),
-            b2 (N,).
+        viewmat: (4, 4) world to camera, on any device.
         palette: (N, C) colours.
-        camera: focal lengths, centre and size in pixels.
-        view: (4, 4) world to camera, on any device.
-        near: near plane, in scene units.
-        turns: omega0 / 2 pi.
-        edge: p of the density's soft edge.
-        least: optical depth below which nothing is drawn, see :mod:`neuprim.core.render.cpu.seen`.
+        tensors: those of :data:`~neuprim.core.render.rasterize.PARAMETERS`, all on one device.
         forced: (N,) bool, primitives to draw in float64 whatever this stage finds.
-        images: (N,) int32, which of several images each primitive is drawn in, and how many there are; None for one.
+        images: (N,) int32, which of several images each primitive is drawn in, and their number; None for one.
 
     Raises:
         NotFinite: a primitive is not finite, or leaves the range of float32.
         BackendUnavailable: primitives reach 2^31 tiles or more, all of them together.
     """
-    parameters = _alike([tensors[name] for name in NAMES])
+    # float64 where any is, else float32; the kernels compute in float64 in any case
+    dtype = torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32
+    parameters = tuple(x.detach().to(dtype).contiguous() for x in tensors)
     device, (N, K, _), C = parameters[0].device, parameters[3].shape, palette.shape[1]
-    double = parameters[0].dtype == torch.float64
-    matrix = (
-        view.detach().to(device, torch.float64, non_blocking=device.type == "cuda").reshape(16).contiguous()
-    )  # a plain copy would wait
-    projection = Projection(matrix, camera, near, turns, edge)
+    double, camera, settings = dtype == torch.float64, request.camera, request.settings
+    # a plain copy would wait
+    matrix = viewmat.detach().to(device, torch.float64, non_blocking=device.type == "cuda").reshape(16).contiguous()
+    projection = Projection(matrix, camera, settings.near_plane, request.turns)
 
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.empty(shape, dtype=dtype, device=device)
@@ -164,23 +145,44 @@ def prepared(
     bad = torch.full((1,), N, dtype=torch.int32, device=device)
     inputs, world = as_arrays(parameters), array(matrix, wp.float64)
     launch(
-        prepare_kernel(double), N,
+        prepare_kernel(double),
+        N,
         (
-            *inputs, array(palette.detach().float().contiguous(), wp.float32), None if forced is None else array(forced.contiguous(), wp.bool),
-            world, projection.intrinsics, camera.width, camera.height, near, turns, edge, least, K, C,
-            array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(depth, wp.float64),
-            array(status, wp.uint8), array(counts, wp.int32), array(bad, wp.int32),
-        ), device, PER_BLOCK,
-    )  # fmt: skip
-    counted = count(counts, bad)
+            *inputs,
+            array(palette.detach().float().contiguous(), wp.float32),
+            None if forced is None else array(forced.contiguous(), wp.bool),
+            world,
+            projection.intrinsics,
+            camera.width,
+            camera.height,
+            projection.near,
+            projection.turns,
+            request.edge,
+            min_visible_depth(settings.alpha_min),
+            K,
+            C,
+            array(rows, wp.vec4),
+            array(spans.view(N, 2, 4), wp.vec4),
+            array(boxes, wp.vec4i),
+            array(depth, wp.float64),
+            array(status, wp.uint8),
+            array(counts, wp.int32),
+            array(bad, wp.int32),
+        ),
+        device,
+        PER_BLOCK,
+    )
+    counted = count_tiles(counts, bad)
     if counted.bad >= 0:
         raise NotFinite(counted.bad)
-    lists, slots, which = bin_primitives(
-        rows, spans, boxes, depth, counts, counted, camera.width, camera.height, images
-    )
-    wide = empty(counted.delicate, L.wide_width(K), dtype=torch.float64)
+    lists, slots, which = bin_primitives(rows, spans, boxes, depth, counts, counted, camera, images)
+    wide = empty(counted.in_float64, L.wide_width(K), dtype=torch.float64)
+    view = (world, projection.intrinsics, projection.near, projection.turns)
     launch(
-        wide_kernel(double), counted.delicate,
-        (array(which, wp.int32), *inputs, world, projection.intrinsics, near, turns, K, array(wide, wp.float64)), device, PER_BLOCK,
-    )  # fmt: skip
-    return Frame(projection, parameters, K, C, rows, wide, slots, which, spans, boxes, depth, status, lists)
+        wide_kernel(double),
+        counted.in_float64,
+        (array(which, wp.int32), *inputs, *view, K, array(wide, wp.float64)),
+        device,
+        PER_BLOCK,
+    )
+    return Frame(projection, parameters, rows, wide, slots, which, spans, boxes, depth, status, lists)

@@ -1,13 +1,16 @@
 """Names for the columns of the kernels' arrays on the device.
 
 A primitive's row is a whole number of float4, so that one load of 16 bytes brings a vector and a scalar. The numbers
-are those of :mod:`neuprim.core.render.cpu.layout`, which says what they mean; only their places differ. Gradient rows
-are the CPU's, column for column.
+are those of :mod:`neuprim.core.render.layout`, which says what they mean; only their places differ. Gradient rows have
+the same columns.
 """
 
 from __future__ import annotations
 
-from neuprim.core.render.cpu.layout import (
+from dataclasses import dataclass
+
+from neuprim.core.render import layout
+from neuprim.core.render.layout import (
     ANCHOR_Z,
     G_ERROR,
     G_LOG_M,
@@ -21,8 +24,9 @@ from neuprim.core.render.cpu.layout import (
 )
 
 __all__ = [
-    "AMPLITUDE", "ANCHOR_Z", "E0", "EX", "EY", "G_ERROR", "G_LOG_M", "G_NEURONS", "G_OFFSET", "G_WEIGHT", "NEURONS", "PER_NEURON", "PIXELS", "REST",
-    "SCALARS", "TILE", "UNIT", "WARP", "XA", "XU", "XV", "amplitudes", "colours", "columns", "gradient_width", "net_columns", "wide_width",
+    "AMPLITUDE", "ANCHOR_Z", "CUT_AT", "E0", "EX", "EY", "Form", "G_ERROR", "G_LOG_M", "G_NEURONS", "G_OFFSET",
+    "G_WEIGHT", "NEURONS", "PER_NEURON", "PIXELS", "REST", "SCALARS", "TILE", "UNIT", "WARP", "XA", "XU", "XV",
+    "amplitudes", "colours", "columns", "gradient_width", "net_columns", "wide_width",
 ]  # fmt: skip
 
 E0, EX, EY, XA, XU, XV, REST, NEURONS = 0, 1, 2, 3, 4, 5, 6, 7
@@ -37,6 +41,20 @@ AMPLITUDE = 4
 """Place of the amplitude among the five numbers of a neuron in a gradient row."""
 
 WARP = 32
+
+CUT_AT = -1e30
+"""Entry of every chord that the near plane cuts: in front of all others, and equal."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """What a kernel is compiled for: neurons K, exponent p of the edge, channels C, and hidden units H of the colour
+    network, -1 where colours are constant."""
+
+    neurons: int
+    edge: int
+    channels: int
+    hidden: int = -1
 
 
 def amplitudes(neurons: int) -> int:
@@ -56,9 +74,7 @@ def columns(neurons: int, channels: int) -> int:
 
 def wide_width(neurons: int) -> int:
     """Numbers in the float64 row of a primitive: the CPU's columns without padding."""
-    from neuprim.core.render.cpu.layout import NEURONS as FIRST
-
-    return FIRST + PER_NEURON * neurons
+    return layout.NEURONS + PER_NEURON * neurons
 
 
 def net_columns(channels: int) -> int:

@@ -12,8 +12,21 @@ import functools
 from typing import Any
 
 from neuprim.core.compute.warp import wp
-from neuprim.core.render.cpu import layout as wide_layout
-from neuprim.core.render.cpu.limits import (
+from neuprim.core.model.edge import NORMS
+from neuprim.core.render import layout as W
+from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.binning import ellipse, tile_range
+from neuprim.core.render.cuda.projection import (
+    EXACT,
+    ProjectedPrimitive,
+    Ray,
+    View,
+    project_primitive,
+    rounded,
+    view_of,
+    whiten,
+)
+from neuprim.core.render.limits import (
     CULLED,
     CUT,
     FLOAT32_MAX,
@@ -23,13 +36,11 @@ from neuprim.core.render.cpu.limits import (
     FLOAT64_RATIO,
     FLOAT64_RATIO_NEAR,
     FLOAT64_TURNS,
+    MIN_RIM_SHARES,
     NON_FINITE,
+    RIM_POWERS,
     VISIBLE,
 )
-from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.placement import EXACT, Placed, Ray, View, place, rounded, view_of, whiten
-from neuprim.core.render.cuda.seen import longest, seen_square, too_faint
-from neuprim.core.render.cuda.silhouette import ellipse, tile_range
 
 __all__ = ["prepare_kernel", "wide_kernel"]
 
@@ -43,9 +54,12 @@ _FLOAT32_MAX, _CUT = wp.constant(d(FLOAT32_MAX)), wp.constant(d(CUT))
 _RADII, _TURNS = wp.constant(d(FLOAT64_RADII)), wp.constant(d(FLOAT64_TURNS))
 _ANCHOR, _PIXELS = wp.constant(d(FLOAT64_ANCHOR**2)), wp.constant(d(FLOAT64_PIXELS))
 _RATIO, _RATIO_NEAR = wp.constant(d(FLOAT64_RATIO)), wp.constant(d(FLOAT64_RATIO_NEAR))
-_UNBOUNDED = wp.constant(d(wide_layout.UNBOUNDED))
+_UNBOUNDED = wp.constant(d(W.UNBOUNDED))
 _E0, _EX, _EY, _XA, _XU, _XV, _REST, _NEURONS = L.E0, L.EX, L.EY, L.XA, L.XU, L.XV, L.REST, L.NEURONS
 _TILE = L.TILE
+(_N0, _N1, _N2), (_P0, _P1, _P2), (_W0, _W1, _W2) = (
+    [wp.constant(d(number)) for number in numbers] for numbers in (NORMS, RIM_POWERS, MIN_RIM_SHARES)
+)
 
 _STORE = """
 #if defined(__CUDA_ARCH__)
@@ -72,13 +86,13 @@ def _largest(v: wp.vec3d):
 
 
 @wp.func
-def _spread(p: Placed, i: int, j: int):
+def _spread(p: ProjectedPrimitive, i: int, j: int):
     """Entry (i, j) of the covariance in camera axes, in units of m^2."""
     return wp.dot(wp.cw_mul(p.B[i], p.B[j]), wp.cw_mul(p.axes, p.axes))
 
 
 @wp.func
-def _extent(p: Placed, v: View, axis: int, s22: wp.float64, square: wp.float64):
+def _extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
     """Where the silhouette of the ellipsoid that is ``square`` ** 0.5 times as large begins and ends on the screen
     along one axis, in pixels."""
     z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
@@ -100,11 +114,11 @@ class Outline:
     yc: wp.float64
     hx: wp.float64
     hy: wp.float64
-    delicate: wp.int32
+    in_float64: wp.int32
 
 
 @wp.func
-def _outline(p: Placed, r: Ray, width: int, height: int, square: wp.float64):
+def _outline(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
     """|r e|^2 - |x x e|^2 > 0, r^2 = ``square``, is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half
     width from (HX, HY)."""
     o = Outline()
@@ -136,19 +150,68 @@ def _outline(p: Placed, r: Ray, width: int, height: int, square: wp.float64):
             # of its thin axis, and they cancel
             slide = wp.abs(r.tu) * broad + wp.abs(r.tv) * tall
             if slide * (wp.sqrt(wp.dot(r.ex, r.ex)) * broad + wp.sqrt(wp.dot(r.ey, r.ey)) * tall) > _RADII:
-                o.delicate = 1
+                o.in_float64 = 1
             xu, xv = r.tc * r.ex + r.tu * r.e0, r.tc * r.ey + r.tv * r.e0
             for a in range(3):
                 if wp.abs(xu[a]) * broad + wp.abs(xv[a]) * tall > _RADII:
-                    o.delicate = 1
+                    o.in_float64 = 1
     return o
 
 
 @wp.func
-def _wave(w: wp.vec3d, p: Placed, turns: wp.float64):
+def _wave(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
     """A neuron's frequencies on whitened axes, in turns."""
     t = wp.transpose(p.local) * w
     return wp.vec3d(turns * p.axes[0] * t[0], turns * p.axes[1] * t[1], turns * p.axes[2] * t[2])
+
+
+@wp.func
+def _longest(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64):
+    """A bound of the half chords of all rays that meet the ellipsoid, in units of its longest semi-axis; ``reach`` of
+    it along the view."""
+    bound, one = d(1.0), d(1.0)
+    if r.tc != d(0.0):
+        z = p.centre[2]
+        slope_x, slope_y, wide = wp.abs(p.centre[0] / z), wp.abs(p.centre[1] / z), p.m / (z - reach)
+        du, dv = wide * (one + slope_x), wide * (one + slope_y)
+        least = (
+            wp.sqrt(wp.dot(r.e0, r.e0))
+            - v.focal[0] * du * wp.sqrt(wp.dot(r.ex, r.ex))
+            - v.focal[1] * dv * wp.sqrt(wp.dot(r.ey, r.ey))
+        )
+        most = wp.sqrt(one + (slope_x + du) * (slope_x + du) + (slope_y + dv) * (slope_y + dv))
+        if least > most:
+            bound = most / least
+    return bound
+
+
+@wp.func
+def _choose(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
+    """An array would be a stack: its index is not known to the compiler."""
+    number = hard
+    if edge == 1:
+        number = one
+    if edge == 2:
+        number = two
+    return number
+
+
+@wp.func
+def _is_too_faint(most: wp.float64, edge: int, least: wp.float64):
+    """Whether no chord can reach the depth ``least``, however long."""
+    return most <= d(0.0) or most * _choose(edge, _N0, _N1, _N2) <= least
+
+
+@wp.func
+def _visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
+    """r^2 of the visible extent: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive; ``bound``:
+    from :func:`_longest`."""
+    square, share = d(0.0), least / (most * _choose(edge, _N0, _N1, _N2) * bound)
+    if share <= _choose(edge, _W0, _W1, _W2):
+        square = d(1.0)
+    elif share < d(1.0):
+        square = rounded(d(1.0) - wp.exp(wp.log(share) * _choose(edge, _P0, _P1, _P2)))
+    return square
 
 
 @functools.cache
@@ -177,7 +240,7 @@ def prepare_kernel(double: bool) -> Any:
         most = d(b2[i])
         for k in range(neurons):
             most += d(wp.abs(w2[i, k]))
-        if too_faint(most, edge, least):  # whatever its place
+        if _is_too_faint(most, edge, least):  # whatever its place
             state = int(_CULLED)
             given, turn = wp.vec3d(means[i]) + wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
             given_sum = most + given[0] + given[1] + given[2] + d(1.0) / wp.dot(turn, turn)
@@ -195,7 +258,7 @@ def prepare_kernel(double: bool) -> Any:
             counts[1, i] = 0
             return
         v = view_of(matrix, intrinsics, near)
-        p = place(wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), v)
+        p = project_primitive(wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), v)
         r = whiten(p, v)
         m, z, ux, uy = p.m, p.centre[2], p.anchor[1], p.anchor[2]
         offset = d(b2[i])
@@ -229,7 +292,7 @@ def prepare_kernel(double: bool) -> Any:
                     total += d(four[j])
             store(rows, i, column + q, four[0], four[1], four[2], four[3])
 
-        delicate = wp.int32(0)
+        in_float64 = wp.int32(0)
         thinnest, ratio = wp.min(wp.min(p.axes[0], p.axes[1]), p.axes[2]), _RATIO
         if r.tc == d(0.0):
             ratio = _RATIO_NEAR
@@ -240,14 +303,14 @@ def prepare_kernel(double: bool) -> Any:
             or wp.dot(r.xa, r.xa) > _ANCHOR
             or thinnest * ratio < d(1.0)
         ):
-            delicate = 1
+            in_float64 = 1
         if forced:
             if forced[i]:
-                delicate = 1
+                in_float64 = 1
         s22 = _spread(p, 2, 2)
         reach = wp.sqrt(m * m * s22)
         if edge > 0 and z - reach < near + _CUT * reach:  # only there are integrals of cut chords with a soft edge
-            delicate = 1
+            in_float64 = 1
 
         state, box, tiles = int(_CULLED), wp.vec4i(), wp.int32(0)
         o = Outline()
@@ -264,7 +327,7 @@ def prepare_kernel(double: bool) -> Any:
                 o.hx = _UNBOUNDED
                 o.hy = _UNBOUNDED
                 if z - reach > d(1e-3) * reach:  # wholly in front of the camera plane: the silhouette is an ellipse
-                    half, one, square = d(0.5), d(1.0), seen_square(most, longest(p, r, v, reach), edge, least)
+                    half, one, square = d(0.5), d(1.0), _visible_square(most, _longest(p, r, v, reach), edge, least)
                     if square == d(0.0):
                         x1 = x0  # nothing can be seen of it
                     else:
@@ -272,24 +335,24 @@ def prepare_kernel(double: bool) -> Any:
                         x0, x1 = wp.max(x0, wp.ceil(across[0] - half)), wp.min(x1, wp.floor(across[1] - half) + one)
                         y0, y1 = wp.max(y0, wp.ceil(down[0] - half)), wp.min(y1, wp.floor(down[1] - half) + one)
                         o = _outline(p, r, width, height, square)
-                        if o.delicate > 0:
-                            delicate = 1
+                        if o.in_float64 > 0:
+                            in_float64 = 1
                 if x1 > x0 and y1 > y0:
                     box = wp.vec4i(int(x0), int(y0), int(x1), int(y1))
                     state = int(_VISIBLE)
 
         xu, xv, tu, tv = r.tc * r.ex, r.tc * r.ey, d(0.0), d(0.0)
-        if delicate == 0:  # float64 does not slide
+        if in_float64 == 0:  # float64 does not slide
             xu, xv, tu, tv = xu + r.tu * r.e0, xv + r.tv * r.e0, d(r.tu), d(r.tv)
         if state != int(_VISIBLE):
-            delicate = 0
+            in_float64 = 0
         _put(rows, i, _E0, r.e0, ux)
         _put(rows, i, _EX, r.ex, uy)
         _put(rows, i, _EY, r.ey, r.near)
         _put(rows, i, _XA, r.xa, offset)
         _put(rows, i, _XU, xu, tu)
         _put(rows, i, _XV, xv, tv)
-        store(rows, i, _REST, f(r.tc), f(m), f(p.anchor[0]), f(delicate))
+        store(rows, i, _REST, f(r.tc), f(m), f(p.anchor[0]), f(in_float64))
         store(spans, i, 0, f(o.skew), f(o.xc), f(o.yc), f(o.hx))
         store(spans, i, 1, f(o.hy), f(0.0), f(0.0), f(0.0))
         boxes[i] = box
@@ -303,7 +366,7 @@ def prepare_kernel(double: bool) -> Any:
         if state == int(_NON_FINITE):
             wp.atomic_min(bad, 0, i)
         counts[0, i] = tiles
-        counts[1, i] = delicate
+        counts[1, i] = in_float64
 
     return prepare
 
@@ -329,27 +392,27 @@ def wide_kernel(double: bool) -> Any:
         n = wp.tid()
         i = which[n]
         v = view_of(matrix, intrinsics, near)
-        p = place(wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), v)
+        p = project_primitive(wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), v)
         r = whiten(p, v)
-        _put_wide(wide, n, wide_layout.E0, r.e0)
-        _put_wide(wide, n, wide_layout.EX, r.ex)
-        _put_wide(wide, n, wide_layout.EY, r.ey)
-        _put_wide(wide, n, wide_layout.XA, r.xa)
-        _put_wide(wide, n, wide_layout.XU, r.tc * r.ex + r.tu * r.e0)
-        _put_wide(wide, n, wide_layout.XV, r.tc * r.ey + r.tv * r.e0)
-        wide[n, wide_layout.TC] = r.tc
-        wide[n, wide_layout.TU] = r.tu
-        wide[n, wide_layout.TV] = r.tv
-        wide[n, wide_layout.UX] = p.anchor[1]
-        wide[n, wide_layout.UY] = p.anchor[2]
-        wide[n, wide_layout.NEAR] = r.near
-        wide[n, wide_layout.OFFSET] = d(b2[i])
-        wide[n, wide_layout.UNIT] = p.m
-        wide[n, wide_layout.ANCHOR_Z] = p.anchor[0]
+        _put_wide(wide, n, W.E0, r.e0)
+        _put_wide(wide, n, W.EX, r.ex)
+        _put_wide(wide, n, W.EY, r.ey)
+        _put_wide(wide, n, W.XA, r.xa)
+        _put_wide(wide, n, W.XU, r.tc * r.ex + r.tu * r.e0)
+        _put_wide(wide, n, W.XV, r.tc * r.ey + r.tv * r.e0)
+        wide[n, W.TC] = r.tc
+        wide[n, W.TU] = r.tu
+        wide[n, W.TV] = r.tv
+        wide[n, W.UX] = p.anchor[1]
+        wide[n, W.UY] = p.anchor[2]
+        wide[n, W.NEAR] = r.near
+        wide[n, W.OFFSET] = d(b2[i])
+        wide[n, W.UNIT] = p.m
+        wide[n, W.ANCHOR_Z] = p.anchor[0]
         for k in range(neurons):
-            column, phase = wide_layout.NEURONS + wide_layout.PER_NEURON * k, turns * d(b1[i, k])
+            column, phase = W.NEURONS + W.PER_NEURON * k, turns * d(b1[i, k])
             _put_wide(wide, n, column, _wave(wp.vec3d(W1[i, k]), p, turns))
-            wide[n, column + wide_layout.PHASE] = phase - wp.rint(phase)
-            wide[n, column + wide_layout.AMPLITUDE] = d(w2[i, k])
+            wide[n, column + W.PHASE] = phase - wp.rint(phase)
+            wide[n, column + W.AMPLITUDE] = d(w2[i, k])
 
     return prepare_wide

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute.warp import array, launch, wp
-from neuprim.core.render.cpu.layout import E0, EX, EY, XA
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.frame import Frame, as_arrays
-from neuprim.core.render.cuda.placement import EXACT, PER_BLOCK, place, view_of, whiten
+from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, project_primitive, view_of, whiten
+from neuprim.core.render.layout import E0, EX, EY, XA
 
 __all__ = ["prepare_backward", "quaternion_gradient"]
 
@@ -63,7 +63,7 @@ def _kernel(double: bool) -> Any:
         if grads[i, _G_WEIGHT] > f(0.0):
             v = view_of(matrix, intrinsics, near)
             mean, logs, quat = wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
-            p = place(mean, logs, quat, v)
+            p = project_primitive(mean, logs, quat, v)
             r = whiten(p, v)
             gx = _three(grads, i, _XA)
             gA = wp.outer(_three(grads, i, _E0), r.ref) + wp.outer(gx, r.w)
@@ -120,7 +120,7 @@ def _kernel(double: bool) -> Any:
 
 
 def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tuple[tuple[Tensor, ...], Tensor | None]:
-    """Gradients of :data:`~neuprim.core.render.cuda.frame.NAMES` in float32, and of the upper three rows of the view.
+    """Gradients of :data:`~neuprim.core.render.rasterize.PARAMETERS` in float32, and of the upper three rows of the view.
 
     Args:
         frame: of the forward pass.

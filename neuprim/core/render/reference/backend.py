@@ -17,10 +17,10 @@ from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
-from neuprim.core.render.reference.rays import Rays, frame_rays, pixel_directions
+from neuprim.core.render.reference.rays import Rays, frame_rays
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["pixel_directions", "render"]
+__all__ = ["render"]
 
 _BLOCK = 32  # pixels on a side; bounds memory, changes nothing
 
@@ -41,7 +41,7 @@ class _FlooredSqrt(torch.autograd.Function):
         return grad * 0.5 * D.clamp_min(ctx.floor).rsqrt(), None
 
 
-class _Tally(torch.autograd.Function):
+class _Contributions(torch.autograd.Function):
     """Identity on the weights of one block; its backward adds them up per primitive for the population statistics."""
 
     @staticmethod
@@ -54,9 +54,9 @@ class _Tally(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
         weights, rows, pixels = ctx.saved_tensors
         stats: RenderStats = ctx.stats
-        if stats.watched is not None:
-            error = stats.watched.error.reshape(-1)[pixels].to(weights)
-            stats.watched.add(rows, weights.sum(1), weights @ error)
+        if stats.contributions is not None:
+            error = stats.contributions.error.reshape(-1)[pixels].to(weights)
+            stats.contributions.add(rows, weights.sum(1), weights @ error)
         return grad, None, None, None
 
 
@@ -191,7 +191,7 @@ def _trace(
     if settings.sort == "entry":
         weights = weights.gather(0, by_entry.argsort(0))
     if weights.requires_grad:
-        weights = _Tally.apply(weights, rows, pixels, stats)
+        weights = _Contributions.apply(weights, rows, pixels, stats)
 
     flat = lowered.colour.flat
     if flat is not None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from neuprim.core.data import View
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.output import Tally, together
+from neuprim.core.render.output import Contributions, sum_contributions
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -66,21 +66,21 @@ class StepViews:
     def __init__(self, model: Primitives) -> None:
         self.model = model
         self.seen: list[Seen] = []
-        self._tallies: list[Tally] = []
+        self._tallies: list[Contributions] = []
 
     def drawn(self, looks: Callable[[], Sequence[Look]]) -> Primitives:
         """What this rank draws next, when ``looks`` says what each of them does, by rank; gradients are to end in its
         parameters."""
         return self.model
 
-    def add(self, seen: Seen, tally: Tally) -> None:
+    def add(self, seen: Seen, tally: Contributions) -> None:
         """Called after the backward pass of each view."""
         self.seen.append(seen)
         self._tallies.append(tally)
 
-    def close(self) -> Tally:
+    def close(self) -> Contributions:
         """After the last one: gradients are those of all views, and so is the tally that is returned."""
-        return self._tallies[0] if len(self._tallies) == 1 else together(self._tallies, self.model.count)
+        return self._tallies[0] if len(self._tallies) == 1 else sum_contributions(self._tallies, self.model.count)
 
 
 class Alone:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 
 __all__ = ["Bucket", "Pair", "Swap"]
 
@@ -72,7 +72,7 @@ class Bucket:
         start, numbers = self._places[name]
         return self._flat.reshape(-1)[start : start + numbers]
 
-    def take(self, params: Mapping[str, Tensor], tally: Tally) -> list[bool]:
+    def take(self, params: Mapping[str, Tensor], tally: Contributions) -> list[bool]:
         """Fill it with a view's gradients, which the parameters lose, and its tally; of each parameter, whether there
         was a gradient."""
         there = []
@@ -110,13 +110,13 @@ class Bucket:
         self._flat.copy_(self._all[:, : self.width])
         return [part.numpy().tobytes() for part in self._all[:, self.width :].cpu()]
 
-    def give(self, params: Mapping[str, Tensor], there: Sequence[bool]) -> Tally:
+    def give(self, params: Mapping[str, Tensor], there: Sequence[bool]) -> Contributions:
         """Hand the sums out: gradients to the parameters that have one, and the tally that is returned; good until the
         next :meth:`take`."""
         for (name, value), has in zip(params.items(), there, strict=True):
             if has:
                 value.grad = self._part(name).view(value.shape)
-        return Tally(self._part(_WEIGHT), self._part(_ERROR))
+        return Contributions(self._part(_WEIGHT), self._part(_ERROR))
 
 
 class Pair(Bucket):

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from neuprim.core.errors import RankError
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 from neuprim.core.train.distributed import pulse
 from neuprim.core.train.distributed.alone import Alone, Seen, StepViews
 from neuprim.core.train.distributed.bucket import Bucket, Pair
@@ -232,12 +232,12 @@ class _GroupViews(StepViews):
         # of all bits of all positions: a rank that computes otherwise is found before its gradients count
         self._mark = int(model.params["means"].detach().view(torch.int32).sum())
 
-    def add(self, seen: Seen, tally: Tally) -> None:
+    def add(self, seen: Seen, tally: Contributions) -> None:
         self.seen.append(seen)
         self._there.append(self._bucket.take(self.model.params, tally))
         self._bucket.add(self._group.swap)
 
-    def close(self) -> Tally:
+    def close(self) -> Contributions:
         group, bucket = self._group, self._bucket
         letter = {
             "mark": self._mark,

@@ -21,7 +21,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import ColourField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.frustum import in_sight
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 from neuprim.core.train.distributed.alone import Alone, Look, Seen, StepViews
 from neuprim.core.train.distributed.blocks import Blocks, regrouped
 from neuprim.core.train.distributed.group import Group
@@ -239,7 +239,7 @@ class _ShardViews(StepViews):
         self._drawn, self._sent = self._shards.gather(self.model, looks())
         return self._drawn
 
-    def add(self, seen: Seen, tally: Tally) -> None:
+    def add(self, seen: Seen, tally: Contributions) -> None:
         drawn, sent = self._drawn, self._sent
         assert drawn is not None and sent is not None
         self.seen.append(seen)
@@ -257,7 +257,7 @@ class _ShardViews(StepViews):
         for rows, part in zip(sent.rows.split(sent.give), found.split(sent.give), strict=True):
             sums.index_add_(0, rows, part)
 
-    def close(self) -> Tally:
+    def close(self) -> Contributions:
         group = self._group
         letter = {
             "clock": group.time(*self._when),
@@ -276,4 +276,4 @@ class _ShardViews(StepViews):
         for name, value in self.model.params.items():
             value.grad = self._sums[name] if name in there else None
         weight, error = self._tally.unbind(1)
-        return Tally(weight.contiguous(), error.contiguous())
+        return Contributions(weight.contiguous(), error.contiguous())

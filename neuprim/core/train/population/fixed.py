@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 from neuprim.core.train.population.interface import Change, Population
 
 __all__ = ["Fixed"]
@@ -14,7 +14,7 @@ class Fixed(Population):
 
     plans = True
 
-    def observe(self, model: Primitives, tally: Tally) -> None:
+    def observe(self, model: Primitives, tally: Contributions) -> None:
         pass
 
     def intervene(self, model: Primitives, extent: float) -> Change | None:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neuprim.core.model.checks import check_tensors, method
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 from neuprim.core.train.population.interface import Change, Population
 from neuprim.core.train.population.splitting import SPLIT_GAUSSIAN, SPLIT_SHIFT, split
 from neuprim.core.train.settings import PopulationSettings
@@ -28,7 +28,7 @@ class Gradient(Population):
         self.total: Tensor | None = None
         self.seen: Tensor | None = None
 
-    def observe(self, model: Primitives, tally: Tally) -> None:
+    def observe(self, model: Primitives, tally: Contributions) -> None:
         if self.total is None or self.seen is None:
             self.total, self.seen = (torch.zeros(model.count, device=model.device) for _ in range(2))
         saw = tally.of_all(model.count)[0] > 0

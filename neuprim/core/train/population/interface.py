@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 from neuprim.core.train.settings import PopulationSettings
 
 __all__ = ["Change", "Plan", "Population"]
@@ -79,7 +79,7 @@ class Population(ABC):
         return s.start <= progress < s.stop and step % s.every == 0
 
     @abstractmethod
-    def observe(self, model: Primitives, tally: Tally) -> None:
+    def observe(self, model: Primitives, tally: Contributions) -> None:
         """Called after each backward pass of one view, while ``.grad`` is fresh."""
 
     @abstractmethod

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 from neuprim.core.train.population.interface import Change, Plan, Population
 from neuprim.core.train.population.splitting import carried_out
 from neuprim.core.train.settings import PopulationSettings
@@ -65,7 +65,7 @@ class Relocate(Population):
             self._left = math.inf if math.isinf(further) else max(math.ceil(further - 1e-6) - 1, 0)
         return due
 
-    def observe(self, model: Primitives, tally: Tally) -> None:
+    def observe(self, model: Primitives, tally: Contributions) -> None:
         if self.weight is None or self.error is None:
             self.weight, self.error = (torch.zeros(model.count, device=model.device) for _ in range(2))
         weight, error = tally.of_all(model.count)

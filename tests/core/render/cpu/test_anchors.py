@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.cpu import layout as L
+from neuprim.core.render import layout as L
 from tests import scenes
 from tests.core.render.cpu.frames import frame_of
 from tests.numerics.cases import along_z
@@ -35,8 +35,8 @@ def needle(thin: float = 0.03, slant: float = 0.0) -> dict[str, Tensor]:
 def test_the_anchor_is_the_centre_from_one_and_a_half_radii(radii: float, at_centre: bool) -> None:
     camera = along_z(40, 50.0, distance=radii * RADIUS)
     frame = frame_of(needle(), camera)
-    assert (frame.rows[0, L.TC] > 0) == at_centre
-    assert frame.stats.extra["float64"] == (0 if at_centre else 1), (
+    assert (frame.projected.rows[0, L.TC] > 0) == at_centre
+    assert frame.request.stats.extra["float64"] == (0 if at_centre else 1), (
         "thin primitives that are anchored at the camera are drawn in float64"
     )
 

@@ -4,11 +4,9 @@ back."""
 from __future__ import annotations
 
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.cpu import layout as L
+from neuprim.core.render.layout import TILE
 from tests import scenes
 from tests.core.render.cpu.frames import frame_of
-
-TILE = L.TILE
 
 
 def test_lists_hold_every_hit_once_and_front_to_back() -> None:

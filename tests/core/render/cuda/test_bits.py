@@ -13,7 +13,7 @@ from torch import Tensor
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
 from neuprim.core.compute import warp
-from neuprim.core.render.cuda import backend, binning, forward, frame, net, passes, prepare_backward
+from neuprim.core.render.cuda import backend, binning, colour_net, forward, frame, passes, prepare_backward
 from neuprim.core.render.cuda import layout as L
 from tests.core.render.cuda.frames import SCENES, Args, Launch, assert_same_bits, everything, intercept
 
@@ -126,7 +126,7 @@ def test_blocks_may_be_of_any_size(
         (together if one else changed).add(called)
         warp.launch(kernel, dim, inputs, device, block if one else threads)
 
-    for module in (binning, frame, net, passes, prepare_backward):
+    for module in (binning, frame, colour_net, passes, prepare_backward):
         monkeypatch.setattr(module, "launch", through)
     assert_same_bits(plain[name], everything(name))
     assert {"row_spans", "sum_pairs", "_kernels", "_kernel"} <= changed  # of those made in a function, its name
@@ -153,7 +153,7 @@ def test_what_is_read_was_written(
         def __getattr__(self, name: str) -> Any:
             return getattr(torch, name)
 
-    for module in (backend, binning, frame, net, passes):
+    for module in (backend, binning, frame, colour_net, passes):
         monkeypatch.setattr(module, "torch", Torch())
     assert_same_bits(plain[name], everything(name))
     assert sum(filled) > 10000
@@ -168,15 +168,15 @@ def test_the_scenes_have_pairs_of_every_kind(monkeypatch: pytest.MonkeyPatch) ->
     def looked(*args: Any) -> Any:
         drawn, lists = genuine(*args), args[0].lists
         ended, most = (drawn.reached < lists.starts[1:]).sum(), (lists.starts[1:] - lists.starts[:-1]).max()
-        found[name] = [(lists.pairs, len(drawn.delicate), int(ended), len(drawn.reached), int(most))]
+        found[name] = [(lists.pairs, len(drawn.in_float64), int(ended), len(drawn.reached), int(most))]
         return drawn
 
     monkeypatch.setattr(backend, "forward", looked)
     for name in SCENES:
         everything(name)
-    for name, ((pairs, delicate, ended, tiles, most),) in found.items():
-        assert pairs - delicate > 20 and most > forward.BATCH, name
-        assert (delicate > 20) == (name in ("inside", "colour networks", "entry")), (name, delicate)
+    for name, ((pairs, few, ended, tiles, most),) in found.items():
+        assert pairs - few > 20 and most > forward.BATCH, name
+        assert (few > 20) == (name in ("inside", "colour networks", "entry")), (name, few)
         assert ended < tiles
     assert any(ended for ((_, _, ended, _, _),) in found.values())
 

@@ -17,7 +17,7 @@ pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip ins
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.cuda import backend
-from neuprim.core.render.cuda.backend import render, render_parts
+from neuprim.core.render.cuda.backend import render, render_slabs
 from tests import scenes
 
 SETTINGS = RenderSettings(backend="cuda", device="cpu", depth=True)
@@ -83,7 +83,7 @@ def test_parts_in_one_frame_wait_once(monkeypatch: pytest.MonkeyPatch) -> None:
     low, camera = scene()
     parts = torch.arange(60) % 4
     with torch.no_grad(), counted(monkeypatch) as waits:
-        render_parts(low, parts, 4, camera, SETTINGS)
+        render_slabs(low, parts, 4, camera, SETTINGS)
     assert len(waits) == 1, waits
 
 

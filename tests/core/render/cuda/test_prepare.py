@@ -11,11 +11,12 @@ import torch
 
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
-from neuprim.core.render.cpu import layout as P
-from neuprim.core.render.cpu.limits import CULLED
+from neuprim.core.render import layout as P
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.frame import NAMES, Frame, NotFinite
+from neuprim.core.render.cuda.frame import Frame, NotFinite
 from neuprim.core.render.cuda.prepare_backward import prepare_backward
+from neuprim.core.render.limits import CULLED
+from neuprim.core.render.rasterize import PARAMETERS
 from tests.core.render.cuda.twin import CASES, DEVICES, Array, Case, both, frame_of, numba_frame, numpy, ulps
 
 PLACES = {
@@ -55,16 +56,18 @@ def test_rows_are_numbas(name: str, device: str) -> None:
     numba, frame = both(name, device)
     seen = numba.visible
     assert seen.sum() > 10
-    assert (numpy(frame.status) == numba.status).all()
-    assert (numpy(frame.boxes) == numba.boxes).all()
-    assert np.abs(numpy(frame.depth) - numba.depth).max() < 1e-12 * np.abs(numba.depth).max()
-    assert ulps(numpy(frame.spans)[seen], numba.spans[seen]).max() <= 1
-    assert ulps(geometry(frame)[seen], numba.rows[seen, : P.NEURONS]).max() <= 1
-    assert ulps(neurons(frame)[seen], numba.neurons(numba.rows, np.arange(len(seen)))[seen]).max(initial=0) <= 1
+    assert (numpy(frame.status) == numba.projected.status).all()
+    assert (numpy(frame.boxes) == numba.projected.boxes).all()
+    assert np.abs(numpy(frame.depth) - numba.projected.depth).max() < 1e-12 * np.abs(numba.projected.depth).max()
+    assert ulps(numpy(frame.spans)[seen], numba.projected.spans[seen]).max() <= 1
+    assert ulps(geometry(frame)[seen], numba.projected.rows[seen, : P.NEURONS]).max() <= 1
+    assert (
+        ulps(neurons(frame)[seen], numba.neurons(numba.projected.rows, np.arange(len(seen)))[seen]).max(initial=0) <= 1
+    )
     painted = numpy(frame.rows)[seen, L.colours(frame.neurons) :].reshape(seen.sum(), -1)
     palette = CASES[name].tensors()["colors"].float().numpy()
-    assert (painted[:, : frame.channels] == palette[seen]).all()
-    assert (painted[:, frame.channels :] == 0).all()
+    assert (painted[:, : CASES[name].channels] == palette[seen]).all()
+    assert (painted[:, CASES[name].channels :] == 0).all()
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -72,7 +75,7 @@ def test_rows_are_numbas(name: str, device: str) -> None:
 def test_delicate_primitives_are_numbas(name: str, device: str) -> None:
     numba, frame = both(name, device)
     assert numpy(frame.which).tolist() == numba.which.tolist()
-    slots = np.full(len(numba.status), -1)
+    slots = np.full(len(numba.projected.status), -1)
     slots[numba.which] = np.arange(len(numba.which))
     assert (numpy(frame.slots) == slots).all()
     assert (numpy(frame.rows)[numba.visible, L.REST, 3] == (slots >= 0)[numba.visible]).all()
@@ -96,9 +99,11 @@ def test_the_cases_have_delicate_primitives_and_others() -> None:
     found = np.zeros((2, 2), np.int64)
     for name in CASES:
         numba, _ = both(name, "cpu")
-        for delicate in (False, True):
-            bounded = numba.spans[numba.visible & (numba.delicate == delicate), P.HY] < P.UNBOUNDED
-            found[int(delicate)] += bounded.sum(), (~bounded).sum()
+        for in_float64 in (False, True):
+            bounded = (
+                numba.projected.spans[numba.visible & (numba.projected.in_float64 == in_float64), P.HY] < P.UNBOUNDED
+            )
+            found[int(in_float64)] += bounded.sum(), (~bounded).sum()
     assert (found[1] > 100).all() and found[0, 0] > 100
 
 
@@ -119,7 +124,7 @@ def test_forced_primitives_are_drawn_in_float64(device: str) -> None:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     ("name", "value"),
-    [(n, math.nan) for n in (*NAMES, "colors")]
+    [(n, math.nan) for n in (*PARAMETERS, "colors")]
     + [("log_scales", 95.0), ("w2", -math.inf), ("b2", -math.inf), ("quats", 0.0)],
 )
 def test_the_first_primitive_that_is_not_finite_is_named(name: str, value: float, device: str) -> None:
@@ -139,8 +144,8 @@ def test_small_discs_beyond_float32_are_not_seen(device: str) -> None:
     t["log_scales"][::2] = torch.tensor([-129.5, -40.0, -40.0])
     numba, frame = numba_frame(case, t), frame_of(case, t, device)
     assert (
-        (numpy(frame.status) == numba.status).all()
-        and (numba.status[::2] == CULLED).all()
+        (numpy(frame.status) == numba.projected.status).all()
+        and (numba.projected.status[::2] == CULLED).all()
         and not numpy(frame.boxes)[::2].any()
     )
 
@@ -151,18 +156,18 @@ def test_gradients_are_numbas(name: str, device: str) -> None:
     numba, frame = both(name, device)
     seen = numba.visible
     g = torch.Generator().manual_seed(5)
-    grads = torch.randn(len(seen), L.gradient_width(frame.neurons, frame.channels), generator=g)
+    grads = torch.randn(len(seen), L.gradient_width(frame.neurons, CASES[name].channels), generator=g)
     grads[:, L.G_WEIGHT] = (torch.rand(len(seen), generator=g) - 0.3).clamp(min=0)
     grads[torch.from_numpy(~seen)] = 0.0
     expected, view = numba.backward(grads.numpy())
     found, found_view = prepare_backward(frame, grads.to(device), True)
-    for parameter, own, theirs in zip(NAMES, found, expected, strict=True):
+    for parameter, own, theirs in zip(PARAMETERS, found, expected, strict=True):
         assert own.dtype == torch.float32 and own.shape == theirs.shape
         a, b = numpy(own).reshape(len(seen), -1).astype(np.float64), theirs.reshape(len(seen), -1).astype(np.float64)
         if (
             parameter == "log_scales"
         ):  # numba takes its frequencies from the float32 row, and the longest axis is a sum that cancels
-            W = numba.neurons(numba.rows, np.arange(len(seen)))[:, :, :3]
+            W = numba.neurons(numba.projected.rows, np.arange(len(seen)))[:, :, :3]
             gw = grads.numpy()[:, L.G_NEURONS : L.G_NEURONS + L.PER_NEURON * frame.neurons].reshape(
                 len(seen), frame.neurons, L.PER_NEURON
             )
@@ -213,7 +218,7 @@ def test_float64_parameters_are_not_rounded(device: str) -> None:
     mixed = t | {"means": t["means"].double() + 1e-9}
     numba = numba_frame(case, {key: value.double() for key, value in mixed.items()})
     frame = frame_of(case, mixed, device)
-    assert frame.double and np.abs(numpy(frame.depth) - numba.depth).max() < 1e-13
+    assert frame.double and np.abs(numpy(frame.depth) - numba.projected.depth).max() < 1e-13
 
 
 @pytest.mark.parametrize("device", DEVICES)

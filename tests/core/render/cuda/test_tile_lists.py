@@ -67,7 +67,7 @@ def test_nothing_is_seen(device: str) -> None:
 def test_more_pairs_than_their_index_can_count_are_refused() -> None:
     counts = torch.tensor([[2**30, 2**30], [0, 0]], dtype=torch.int32)
     with pytest.raises(BackendUnavailable, match=r"reach 2147483648 tiles"):
-        binning.count(counts, torch.tensor([2], dtype=torch.int32))
+        binning.count_tiles(counts, torch.tensor([2], dtype=torch.int32))
 
 
 @pytest.mark.skipif("cuda" not in DEVICES, reason="whether the host waits shows on a card alone")

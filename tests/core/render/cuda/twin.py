@@ -12,13 +12,17 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.render.cpu import layout as P
+from neuprim.core.render import layout as P
+from neuprim.core.render.cpu.backend import _view
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
-from neuprim.core.render.cpu.limits import NON_FINITE, VISIBLE
-from neuprim.core.render.cpu.prepare import prepare, prepare_backward, prepare_wide
-from neuprim.core.render.cpu.seen import depth_that_counts
+from neuprim.core.render.cpu.layout import gradient_width
+from neuprim.core.render.cpu.prepare import Parameters, Projected, View, prepare, prepare_backward, prepare_wide
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.frame import NAMES, Frame, prepared
+from neuprim.core.render.cuda.frame import Frame, prepare_frame
+from neuprim.core.render.limits import NON_FINITE, VISIBLE, min_visible_depth
+from neuprim.core.render.output import RenderStats
+from neuprim.core.render.rasterize import PARAMETERS, Request
+from neuprim.core.settings import RenderSettings
 from tests import scenes
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -87,7 +91,7 @@ CASES = {
 }
 
 
-LEAST = depth_that_counts(1 / 255)
+LEAST = min_visible_depth(1 / 255)
 
 
 @dataclass
@@ -95,86 +99,66 @@ class Numba:
     """What the numba backend makes of a frame; neurons by ``order``."""
 
     case: Case
-    parameters: list[Array]
-    rows: Array
-    spans: Array
-    order: Array
-    boxes: Array
-    depth: Array
-    status: Array
-    delicate: Array
+    parameters: Parameters
+    view: View
+    projected: Projected
     which: Array
     wide: Array
     lists: TileLists
-    R: Array
-    t: Array
 
     @property
     def visible(self) -> Array:
-        return self.status == VISIBLE
+        return self.projected.status == VISIBLE
 
     def neurons(self, rows: Array, which: Array) -> Array:
         """(n, K, 5) neurons in the model's order, from rows of primitives ``which``."""
-        K = self.order.shape[1]
+        order = self.projected.order
+        K = order.shape[1]
         given = rows[:, P.NEURONS : P.NEURONS + P.PER_NEURON * K].reshape(len(rows), K, P.PER_NEURON)
         out = np.empty_like(given)
-        np.put_along_axis(out, np.repeat(self.order[which].astype(np.int64)[:, :, None], P.PER_NEURON, 2), given, 1)
+        np.put_along_axis(out, np.repeat(order[which].astype(np.int64)[:, :, None], P.PER_NEURON, 2), given, 1)
         return out
 
-    def backward(self, grads: Array) -> tuple[list[Array], Array]:
+    def backward(self, grads: Array) -> tuple[Parameters, Array]:
         """Gradients of the parameters, and (N, 3, 4) of the view, from the cuda backend's gradient rows."""
-        count, K = self.order.shape
-        own = np.zeros((count, P.gradient_width(K + K % 2, self.case.channels)), np.float32)
+        count, K = self.projected.order.shape
+        own = np.zeros((count, gradient_width(K + K % 2, self.case.channels)), np.float32)
         own[:, : P.G_NEURONS] = grads[:, : L.G_NEURONS]
         given = grads[:, L.G_NEURONS : L.G_NEURONS + L.PER_NEURON * K].reshape(count, K, L.PER_NEURON)
-        ordered = np.take_along_axis(given, np.repeat(self.order.astype(np.int64)[:, :, None], L.PER_NEURON, 2), 1)
-        own[:, P.G_NEURONS : P.G_NEURONS + P.PER_NEURON * K] = ordered.reshape(count, -1)
-        out, view = [np.zeros(x.shape, np.float32) for x in self.parameters], np.zeros((count, 3, 4))
-        prepare_backward(
-            0, count, *self.parameters[:4], self.R, self.t, _intrinsics(self.case), self.case.near, self.case.turns, self.rows, self.order,
-            own, own[:, P.G_WEIGHT] > 0, *out, view, True,
-        )  # fmt: skip
+        order = np.repeat(self.projected.order.astype(np.int64)[:, :, None], L.PER_NEURON, 2)
+        own[:, P.G_NEURONS : P.G_NEURONS + P.PER_NEURON * K] = np.take_along_axis(given, order, 1).reshape(count, -1)
+        out, view = Parameters(*(np.zeros(x.shape, np.float32) for x in self.parameters)), np.zeros((count, 3, 4))
+        touched = own[:, P.G_WEIGHT] > 0
+        prepare_backward(0, count, self.parameters, self.view, self.projected, own, touched, out, view)
         return out, view
 
 
-def _intrinsics(case: Case) -> Array:
-    c = case.camera
-    return np.array([c.fx, c.fy, c.cx, c.cy])
-
-
 def numba_frame(case: Case, t: dict[str, Tensor]) -> Numba:
-    given = [t[name].numpy() for name in NAMES]
-    count, K = given[3].shape[:2]
-    neurons = K + K % 2
-    rows, spans = np.empty((count, P.row_width(neurons)), np.float32), np.zeros((count, P.SPAN_WIDTH), np.float32)
-    kinds, order = np.empty((count, neurons // 2), np.uint8), np.zeros((count, K), np.uint8)
-    boxes, depth, status = np.empty((count, 4), np.int32), np.empty(count), np.empty(count, np.uint8)
-    delicate = np.empty(count, np.bool_)
-    camera, cam, view = case.camera, _intrinsics(case), case.camera.viewmat.double().numpy()
-    R, origin = np.ascontiguousarray(view[:3, :3]), np.ascontiguousarray(view[:3, 3])
-    prepare(
-        0, count, *given, R, origin, cam, np.array([camera.width, camera.height]), case.near, case.turns, case.edge, LEAST,
-        rows, spans, kinds, order, boxes, depth, status, delicate,
-    )  # fmt: skip
-    which = np.flatnonzero(delicate & (status == VISIBLE))
-    wide = np.empty((len(which), rows.shape[1]))
-    prepare_wide(0, len(which), which, *given, R, origin, cam, case.near, case.turns, order, wide)
-    lists = bin_primitives(rows, spans, boxes, depth, status, camera.width, camera.height, 1)
-    return Numba(case, given, rows, spans, order, boxes, depth, status, delicate, which, wide, lists, R, origin)
+    parameters = Parameters(*(t[name].numpy() for name in PARAMETERS))
+    count, K = parameters.W1.shape[:2]
+    projected, view = Projected.allocate(count, K), _view(case.camera, case.camera.viewmat, case.near, case.turns)
+    prepare(0, count, parameters, view, case.edge, LEAST, projected)
+    which = np.flatnonzero(projected.in_float64 & (projected.status == VISIBLE))
+    wide = np.empty((len(which), projected.rows.shape[1]))
+    prepare_wide(0, len(which), which, parameters, view, projected.order, wide)
+    lists = bin_primitives(projected, case.camera.width, case.camera.height, 1)
+    return Numba(case, parameters, view, projected, which, wide, lists)
 
 
 def both(name: str, device: str) -> tuple[Numba, Frame]:
     """The same frame of both backends, of those primitives of a case that are finite."""
     case = CASES[name]
     t = case.tensors()
-    finite = torch.from_numpy(numba_frame(case, t).status != NON_FINITE)
+    finite = torch.from_numpy(numba_frame(case, t).projected.status != NON_FINITE)
     t = {key: value[finite] for key, value in t.items()}
     return numba_frame(case, t), frame_of(case, t, device)
 
 
 def frame_of(case: Case, t: dict[str, Tensor], device: str, forced: Tensor | None = None) -> Frame:
     t = {key: value.to(device) for key, value in t.items()}
-    return prepared(t, t["colors"], case.camera, case.camera.viewmat, case.near, case.turns, case.edge, LEAST, forced)
+    settings = RenderSettings(near=case.near, alpha_min=1 / 255)
+    request = Request(case.camera, case.turns, case.edge, settings, RenderStats("cuda", case.count))
+    return prepare_frame(request, case.camera.viewmat, t["colors"], [t[name] for name in PARAMETERS], forced)
 
 
 def numpy(tensor: Tensor) -> Array:

@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from neuprim.core.render import Tally
-from neuprim.core.render.output import together as added
+from neuprim.core.render import Contributions
+from neuprim.core.render.output import sum_contributions as added
 from neuprim.core.train.distributed.bucket import Bucket, Pair
 from neuprim.core.train.distributed.group import Group
 from tests.core import tiny
@@ -28,11 +28,11 @@ def gradients(place: int) -> dict[str, torch.Tensor]:
     }
 
 
-def tally(place: int) -> Tally:
+def tally(place: int) -> Contributions:
     generator = torch.Generator().manual_seed(100 + place)
     rows = torch.tensor([0, 2, 5]) if place % 2 else None
     numbers = 3 if place % 2 else COUNT
-    return Tally(
+    return Contributions(
         torch.rand(numbers, generator=generator) * 10.0 ** (place % 3), torch.rand(numbers, generator=generator), rows
     )
 

@@ -12,7 +12,7 @@ from neuprim.core.errors import FormError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 from neuprim.core.train.population import (
     SPLIT_GAUSSIAN,
     SPLIT_LONG,
@@ -39,8 +39,8 @@ def model(count: int = COUNT, neurons: int = 4) -> Primitives:
     return Primitives(CosineDensity(neurons), SphericalHarmonics(0), {**params, "sh_dc": t["colors"].requires_grad_()})
 
 
-def stats(weight: Tensor, error: Tensor | None = None) -> Tally:
-    return Tally(weight, weight if error is None else error)
+def stats(weight: Tensor, error: Tensor | None = None) -> Contributions:
+    return Contributions(weight, weight if error is None else error)
 
 
 def give_grads(m: Primitives, size: Tensor) -> None:

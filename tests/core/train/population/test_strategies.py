@@ -13,7 +13,7 @@ from neuprim.cli import main
 from neuprim.config import RunConfig, compose
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Contributions
 from neuprim.core.train import population
 from neuprim.core.train.population import Change, Population, make_population
 from neuprim.core.train.settings import PopulationSettings
@@ -25,7 +25,7 @@ class Decimate(Population):
 
     asked = 0
 
-    def observe(self, model: Primitives, tally: Tally) -> None:
+    def observe(self, model: Primitives, tally: Contributions) -> None:
         pass
 
     def intervene(self, model: Primitives, extent: float) -> Change | None:

@@ -1,4 +1,4 @@
-"""Silhouettes of what can be seen: nothing that is drawn is lost by them, and what cannot be seen is not evaluated."""
+"""Silhouettes of the visible extent: nothing that is drawn is lost by them, and what is invisible is not evaluated."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.edge import NORMS
 from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.cpu.seen import ROUNDING, WORTH, depth_that_counts, seen_square, too_faint
+from neuprim.core.render.cpu.prepare import _is_too_faint, _visible_square
+from neuprim.core.render.limits import MIN_RIM, VISIBLE_SHARE, min_visible_depth
 from tests import scenes
 from tests.numerics.compare import assert_same_frame
 
@@ -24,16 +25,8 @@ SETTINGS = RenderSettings(backend="cpu")
 ALPHA_MIN = SETTINGS.alpha_min
 
 
-@njit
-def square(most: float, longest: float, edge: int, least: float) -> float:
-    result: float = seen_square(most, longest, edge, least)
-    return result
-
-
-@njit
-def faint(most: float, edge: int, least: float) -> bool:
-    result: bool = too_faint(most, edge, least)
-    return result
+square = njit(lambda most, longest, edge, least: _visible_square(most, longest, edge, least))
+faint = njit(lambda most, edge, least: _is_too_faint(most, edge, least))
 
 
 def half_chords(t: dict[str, Tensor], camera: Camera) -> Tensor:
@@ -45,7 +38,7 @@ def half_chords(t: dict[str, Tensor], camera: Camera) -> Tensor:
     return 1.0 / (whitened.norm(dim=-1) * scales.amax(-1))
 
 
-def barely_seen(
+def barely_visible(
     camera: Camera, edge: int, neurons: int, seed: int, alpha_min: float, spread: float
 ) -> dict[str, Tensor]:
     """Needles, discs and balls whose deepest rays have 1.03 to 4 times the optical depth of ``alpha_min``, so that some
@@ -80,8 +73,8 @@ def test_rays_that_count_are_drawn(
 ) -> None:
     camera = scenes.camera(96, 72, **view)  # type: ignore[arg-type]
     settings = RenderSettings(backend="cpu", alpha_min=alpha_min, sort=sort)
-    for seed in range(3):
-        t = barely_seen(camera, edge, neurons, seed, alpha_min, spread)
+    for seed in range(2):
+        t = barely_visible(camera, edge, neurons, seed, alpha_min, spread)
         with scenes.soft(edge):
             fast, _ = assert_same_frame(t, camera, settings, grad_bound=5e-3 if edge == 0 else 1e-3)
             whole = render_lowered(scenes.lowered(t), camera, RenderSettings(backend="cpu", alpha_min=0.0, sort=sort))
@@ -92,7 +85,7 @@ def test_rays_that_count_are_drawn(
 @pytest.mark.parametrize("edge", [0, 1, 2])
 def test_what_cannot_be_seen_costs_nothing(edge: int) -> None:
     camera = scenes.camera()
-    t = barely_seen(camera, edge, 2, 0, ALPHA_MIN, 1.0)
+    t = barely_visible(camera, edge, 2, 0, ALPHA_MIN, 1.0)
     t["b2"], t["w2"] = t["b2"] * 0.05, t["w2"] * 0.05
     leaves = {name: value.requires_grad_() for name, value in t.items()}
     with scenes.soft(edge):
@@ -110,7 +103,7 @@ def test_discs_that_are_thin_along_every_ray_cost_nothing(edge: int) -> None:
         0.3 * t["means"],
         torch.tensor([-2.0, -2.0, -2.0 - math.log(50.0)]).expand(9, 3).contiguous(),
     )
-    t["b2"] = torch.full_like(t["b2"], 10.0 * depth_that_counts(ALPHA_MIN) / NORMS[edge])
+    t["b2"] = torch.full_like(t["b2"], 10.0 * min_visible_depth(ALPHA_MIN) / NORMS[edge])
     camera, pairs = scenes.camera(1280, 960), {}
     axes = camera.viewmat[
         :3, :3
@@ -131,11 +124,11 @@ def test_no_density_is_nothing_to_see() -> None:
 
 @pytest.mark.parametrize("edge", [0, 1, 2])
 def test_the_radius_is_where_the_bound_meets_the_depth(edge: int) -> None:
-    for inner in np.linspace(1.5 * WORTH, 0.99, 20):
+    for inner in np.linspace(1.5 * MIN_RIM, 0.99, 20):
         least = 0.7 * NORMS[edge] * 0.3 * inner ** (edge + 0.5)
         assert square(0.7, 0.3, edge, least) == pytest.approx(1.0 - inner, abs=1e-6)
     assert square(0.7, 0.3, edge, 0.7 * NORMS[edge] * 0.3 * 1.0001) == 0.0
-    assert square(0.7, 0.3, edge, 0.7 * NORMS[edge] * 0.3 * (0.9 * WORTH) ** (edge + 0.5)) == 1.0
+    assert square(0.7, 0.3, edge, 0.7 * NORMS[edge] * 0.3 * (0.9 * MIN_RIM) ** (edge + 0.5)) == 1.0
     assert square(0.7, 0.3, edge, 0.0) == 1.0
 
 
@@ -159,5 +152,5 @@ def test_faint_primitives_are_checked_as_others(name: str) -> None:
 
 
 def test_the_depth_of_alpha_min() -> None:
-    assert 1.0 - math.exp(-depth_that_counts(0.25) / ROUNDING) == pytest.approx(0.25)
-    assert depth_that_counts(0.0) == 0.0
+    assert 1.0 - math.exp(-min_visible_depth(0.25) / VISIBLE_SHARE) == pytest.approx(0.25)
+    assert min_visible_depth(0.0) == 0.0

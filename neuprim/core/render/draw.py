@@ -1,4 +1,4 @@
-"""Deferred shading: a factor per pixel, found at the point in space that the pixel shows."""
+"""A backend's draw function, and what can be put around it: several rays per pixel, deferred shading, another device."""
 
 from __future__ import annotations
 
@@ -8,21 +8,44 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from neuprim.core.cameras import Camera
 from neuprim.core.cameras.projections import AnyCamera, RayCamera
 from neuprim.core.compute import device
 from neuprim.core.model.checks import check_result
 from neuprim.core.model.primitives import Lowered
-from neuprim.core.render.output import RenderOutput
+from neuprim.core.render.output import RenderOutput, mean_depth
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["Draw", "elsewhere", "points_seen", "with_shade"]
+__all__ = ["Draw", "draw_samples", "on_device", "unproject_depth", "with_shade"]
 
 Draw = Callable[..., RenderOutput]
 """A backend's ``render(lowered, camera, background, settings)``; which cameras it takes differs."""
 
 
-def points_seen(depth: Tensor, camera: AnyCamera) -> Tensor:
-    """(H, W, 3) float64 scene points at a depth image (H, W): camera-z, or distance for a ``RayCamera``; no
+def draw_samples(
+    draw: Draw, lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings
+) -> RenderOutput:
+    """Draw ``settings.samples`` squared rays per pixel; memory and time grow with their number.
+
+    rgb and alpha are means over the rays; depth is their mean weighted by alpha, the mean over everything the pixel
+    shows.
+    """
+    n = settings.samples
+    fine = draw(lowered, camera.resized(camera.width * n, camera.height * n), background, replace(settings, samples=1))
+    alpha = _pool(fine.alpha, n)
+    depth = None if fine.depth is None else mean_depth(_pool(fine.depth * fine.alpha, n), alpha)
+    fine.stats.samples = n  # contributions are per pixel; pairs and extra count the work really done
+    return RenderOutput(_pool(fine.rgb, n), alpha, depth, fine.stats)
+
+
+def _pool(image: Tensor, n: int) -> Tensor:
+    """Means over n x n pixels of (n H, n W) or (n H, n W, C)."""
+    h, w = image.shape[0] // n, image.shape[1] // n
+    return image.reshape(h, n, w, n, *image.shape[2:]).mean((1, 3))
+
+
+def unproject_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
+    """Return the (H, W, 3) float64 scene points at a depth image (H, W): camera-z, or distance for a ``RayCamera``; no
     gradient."""
     depth = depth.detach().double()
     view = device.to_like(camera.viewmat.detach(), depth)
@@ -36,7 +59,8 @@ def points_seen(depth: Tensor, camera: AnyCamera) -> Tensor:
 
 
 def with_shade(draw: Draw) -> Draw:
-    """The same, with the frame's matter, not its background, times ``lowered.shade`` at each pixel's mean depth."""
+    """Return a draw function that multiplies the frame's matter, not its background, by ``lowered.shade`` at each
+    pixel's mean depth."""
 
     def shaded(
         lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings
@@ -46,9 +70,9 @@ def with_shade(draw: Draw) -> Draw:
         assert output.depth is not None
         hit = output.alpha.detach() > 0
         factor = torch.ones_like(output.alpha, requires_grad=False)
-        points = points_seen(output.depth, camera)[hit]
-        found = lowered.shade(points)
-        factor[hit] = check_result(found, (len(points),), f"{lowered.owner('colour')}: shade").to(factor)
+        points = unproject_depth(output.depth, camera)[hit]
+        values = lowered.shade(points)
+        factor[hit] = check_result(values, (len(points),), f"{lowered.owner('colour')}: shade").to(factor)
         rgb = output.rgb * factor[..., None]
         if background is not None:
             rgb = rgb + ((1 - factor) * (1 - output.alpha))[..., None] * background.to(rgb)
@@ -57,8 +81,9 @@ def with_shade(draw: Draw) -> Draw:
     return shaded
 
 
-def elsewhere(draw: Draw, place: torch.device) -> Draw:
-    """The same, drawn on another device than the frame's tensors are on, and moved back; differentiable."""
+def on_device(draw: Draw, place: torch.device) -> Draw:
+    """Return a draw function that draws on another device than the frame's tensors are on, and moves the frame back;
+    differentiable."""
 
     def moved(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
         own = lowered.geometry.means.device

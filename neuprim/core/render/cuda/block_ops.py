@@ -1,9 +1,12 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""What the threads of a block do together, on the device and, in the same words, on Warp's CPU blocks.
+"""Native functions of the kernels: operations of a whole block, and numbers of arrays in one instruction each.
 
-Every thread of the block has to call them. On the CPU a static buffer takes the place of the hardware: its threads take
-turns between two
-``WP_TILE_SYNC``.
+Every thread of a block has to call the block's operations. On Warp's CPU blocks a static buffer takes the place of the
+hardware: threads take turns between two ``WP_TILE_SYNC``.
+
+An index of Warp's may be negative and its strides are read from the launch, in 64 bits: nine instructions for a row's
+span, of which two are needed. In the loops over hits indices are whole numbers from zero, and arrays are contiguous, as
+:func:`neuprim.core.compute.warp.array` asserts.
 """
 
 # annotations are values here: Warp reads them, and cannot find what a function's own scope names in a text
@@ -12,9 +15,20 @@ from collections.abc import Callable
 from typing import Any
 
 from neuprim.core.compute.warp import wp
-from neuprim.core.render.cuda.layout import WARP
+from neuprim.core.render.cuda.layout import TILE, WARP
 
-__all__ = ["any_thread", "row_sums", "row_type"]
+__all__ = [
+    "any_thread",
+    "column_of",
+    "hit_at",
+    "int_at",
+    "number_at",
+    "number_of_row",
+    "row_sums",
+    "row_type",
+    "set_hit",
+    "span_of",
+]
 
 _ANY = """
 #if defined(__CUDA_ARCH__)
@@ -94,3 +108,34 @@ def row_sums(width: int) -> Callable[..., Any]:
     def sums(x: row, lane: int, out: wp.array(dtype=wp.float32), pair: int): ...
 
     return sums
+
+
+@wp.func_native("return numbers.data[at];")
+def number_at(numbers: wp.array(dtype=wp.float32), at: int) -> float: ...
+
+
+@wp.func_native("return numbers.data[at];")
+def int_at(numbers: wp.array(dtype=wp.int32), at: int) -> int: ...
+
+
+@wp.func_native("return numbers.data[size_t(row) * size_t(width) + column];")
+def number_of_row(numbers: wp.array(dtype=wp.float32), row: int, width: int, column: int) -> float:
+    """Of rows of ``width`` numbers."""
+
+
+@wp.func_native(f"return spans.data[size_t(pair) * {TILE} + y];")
+def span_of(spans: wp.array2d(dtype=wp.uint16), pair: int, y: int) -> int:
+    """Of a pair's row of pixels (:mod:`~neuprim.core.render.cuda.spans`)."""
+
+
+@wp.func_native("return rows.data[size_t(row) * size_t(width) + column];")
+def column_of(rows: wp.array2d(dtype=wp.vec4), row: int, width: int, column: int) -> wp.vec4:
+    """Of primitives' rows of ``width`` columns."""
+
+
+@wp.func_native("return hits.data[slot];")
+def hit_at(hits: wp.array(dtype=wp.vec2), slot: int) -> wp.vec2: ...
+
+
+@wp.func_native("hits.data[slot] = hit;")
+def set_hit(hits: wp.array(dtype=wp.vec2), slot: int, hit: wp.vec2): ...

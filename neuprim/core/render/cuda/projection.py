@@ -1,14 +1,24 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Where a primitive lies before the camera, in float64: what the per-primitive kernels and their backward pass share.
+"""Projection of a primitive, in float64, which the per-primitive kernels and their backward pass share.
 
 The twin of ``_frame`` and of the geometry in ``_wide_row`` of :mod:`neuprim.core.render.cpu.prepare`, which say what
 the numbers are.
 """
 
 from neuprim.core.compute.warp import OPTIONS, wp
-from neuprim.core.render.cpu.limits import ANCHOR_RADII
+from neuprim.core.render.limits import ANCHOR_RADII
 
-__all__ = ["EXACT", "PER_BLOCK", "Placed", "Ray", "View", "place", "rounded", "view_of", "whiten"]
+__all__ = [
+    "EXACT",
+    "PER_BLOCK",
+    "ProjectedPrimitive",
+    "Ray",
+    "View",
+    "project_primitive",
+    "rounded",
+    "view_of",
+    "whiten",
+]
 
 EXACT = {**OPTIONS, "fuse_fp": False}
 """Options of the per-primitive kernels: every product is rounded, so that two kernels that count the same tiles, and
@@ -34,7 +44,7 @@ class View:
 
 
 @wp.struct
-class Placed:
+class ProjectedPrimitive:
     """Orientation in camera axes, rotation, axes s/m, centre in camera axes, anchor (depth, pixel x, pixel y), m and
     1/|q|."""
 
@@ -84,11 +94,11 @@ def view_of(matrix: wp.array(dtype=wp.float64), intrinsics: wp.vec4d, near: wp.f
 
 
 @wp.func
-def place(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
+def project_primitive(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
     """The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same
     number."""
     one, two = d(1.0), d(2.0)
-    p = Placed()
+    p = ProjectedPrimitive()
     n = one / wp.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
     w, x, y, z = quat[0] * n, quat[1] * n, quat[2] * n, quat[3] * n
     p.local = wp.mat33d(
@@ -117,7 +127,7 @@ def place(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
 
 
 @wp.func
-def whiten(p: Placed, v: View):
+def whiten(p: ProjectedPrimitive, v: View):
     r = Ray()
     r.tc = p.anchor[0] / p.m
     r.ref = wp.vec3d((p.anchor[1] - v.centre[0]) / v.focal[0], (p.anchor[2] - v.centre[1]) / v.focal[1], d(1.0))

@@ -1,13 +1,14 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Backward, second pass: a warp a (tile, primitive) pair over its hits: chord and neurons again, sums in registers, one
-row for the pair.
+"""Compositing, backward, in two passes over what the forward pass left in the pixels' slots.
 
+First a block a tile, a thread a pixel: it walks its hits back to front and leaves dL/dI and the weight in each slot. No
+neurons, no sums.
+
+Then a warp a (tile, primitive) pair over its hits: chord and neurons again, sums in registers, one row for the pair.
 The rows of a primitive are then added in the order of its pairs: no sum depends on which block came first, and reruns
-are the same bits.
-
-With 8 neurons the sums alone are 59 registers of a lane's 128. So over the neurons nothing is kept that a few
-operations give again: of the chord its middle, depth and closest point; of the tile both corners but in one number; of
-the pair its spans, which are in shared memory.
+give the same bits. With 8 neurons the sums alone are 59 registers of a lane's 128. So over the neurons nothing is kept
+that a few operations give again: of the chord its middle, depth and closest point; of the tile both corners but in one
+number; of the pair its spans, which are in shared memory.
 """
 
 from __future__ import annotations
@@ -18,25 +19,102 @@ from typing import Any
 from neuprim.core.compute.warp import FAST, wp
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.chord import chord, phase, ray_of, through_chord, xyz
-from neuprim.core.render.cuda.forms import Form
-from neuprim.core.render.cuda.functions import TAU, band_of, cos_turns, sin_turns
-from neuprim.core.render.cuda.memory import element, hit_at, number
-from neuprim.core.render.cuda.together import row_sums, row_type
+from neuprim.core.render.cuda.block_ops import (
+    column_of,
+    hit_at,
+    int_at,
+    number_at,
+    number_of_row,
+    row_sums,
+    row_type,
+    set_hit,
+    span_of,
+)
+from neuprim.core.render.cuda.chord import (
+    chord,
+    phase,
+    pixel_of_lane,
+    pixel_of_slot,
+    ray_of,
+    slot_of_pixel,
+    through_chord,
+    xyz,
+)
+from neuprim.core.render.cuda.layout import Form
+from neuprim.core.render.cuda.trigonometry import TAU, band_of, cos_turns, sin_turns
 
-__all__ = ["pairs_kernel", "pixel_of_slot", "sum_pairs"]
+__all__ = ["pairs_kernel", "pixels_kernel", "sum_pairs"]
 
 
-@wp.func
-def pixel_of_slot(spans: Any, n: int, s: int):
-    """(x, y) in the tile of pixel ``s`` of pair ``n``, a row of ``spans``: the last row of pixels that starts at or
-    before it."""
-    y = int(0)
-    for b in range(4):
-        if int(spans[n, y + (8 >> b)]) >> 8 <= s:
-            y += 8 >> b
-    row = int(spans[n, y])
-    return wp.vec2i((row & 15) + s - (row >> 8), y)
+@functools.cache
+def pixels_kernel(form: Form, depth: bool) -> Any:
+    """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
+    C, H = form.channels, form.hidden
+    colours, width = L.colours(form.neurons), L.columns(form.neurons, C)
+    vecC = wp.types.vector(length=C, dtype=wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
+    def backward_pixels(
+        rows: wp.array2d(dtype=wp.vec4),
+        starts: wp.array(dtype=wp.int32),
+        ids: wp.array(dtype=wp.int32),
+        spans: wp.array2d(dtype=wp.uint16),
+        offsets: wp.array(dtype=wp.int32),
+        limits: wp.vec4,
+        size: wp.vec2i,
+        transmittance: wp.array(dtype=wp.float32),
+        reached: wp.array(dtype=wp.int32),
+        g_rgb: wp.array2d(dtype=wp.float32),
+        g_transmittance: wp.array(dtype=wp.float32),
+        g_z: wp.array(dtype=wp.float32),
+        depths: wp.array(dtype=wp.float32),
+        hues: wp.array2d(dtype=wp.float32),
+        hits: wp.array(dtype=wp.vec2),
+    ):
+        """``g_transmittance`` already holds the background's share. With b what lies behind a hit, sum of w (dL/dw) and
+        the rest of the light: dL/dI = (1 - alpha) T dL/dw - b, and 0 where the opacity was clamped."""
+        tile, lane = wp.tid()
+        across = (size[0] + L.TILE - 1) // L.TILE
+        at = pixel_of_lane(lane)
+        X = (tile % across) * L.TILE + at[0]
+        Y = (tile // across) * L.TILE + at[1]
+        if X < size[0] and Y < size[1]:
+            n = Y * size[0] + X
+            behind = transmittance[n] * g_transmittance[n]
+            own = vecC()
+            for k in range(wp.static(C)):
+                own[k] = g_rgb[n, k]
+            first = starts[tile]
+            count = reached[tile] - first
+            for back in range(count):
+                p = first + count - 1 - back
+                slot = slot_of_pixel(span_of(spans, p, at[1]), int_at(offsets, p), at[0])
+                if slot >= 0:
+                    hit = hit_at(hits, slot)
+                    alpha = hit[0]
+                    out = wp.vec2()
+                    if alpha > 0.0:
+                        i = int_at(ids, p)
+                        weight = alpha * hit[1]
+                        by_weight = float(0.0)
+                        hue = wp.vec4()
+                        for k in range(wp.static(C)):
+                            if wp.static(H >= 0):
+                                by_weight += wp.max(hues[slot, k], 0.0) * own[k]
+                            else:
+                                if wp.static(k % 4 == 0):
+                                    hue = column_of(rows, i, wp.static(width), wp.static(colours + k // 4))
+                                by_weight += hue[wp.static(k % 4)] * own[k]
+                        if wp.static(depth):
+                            by_weight += g_z[n] * depths[slot]
+                        slope = float(0.0)
+                        if alpha < limits[1]:
+                            slope = (1.0 - alpha) * hit[1] * by_weight - behind
+                        behind += weight * by_weight
+                        out = wp.vec2(slope, weight)
+                    set_hit(hits, slot, out)
+
+    return backward_pixels
 
 
 @functools.cache
@@ -112,9 +190,9 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                         py = float(Y) + 0.5
                         norm = mean * wp.length(wp.vec3((px - lens[2]) / lens[0], (py - lens[3]) / lens[1], 1.0))
                         g_weight += hit[1]
-                        g_error += hit[1] * number(error, pixel)
+                        g_error += hit[1] * number_at(error, pixel)
                         for k in range(wp.static(C)):
-                            g_colour[k] += hit[1] * element(g_rgb, pixel, wp.static(C), k)
+                            g_colour[k] += hit[1] * number_of_row(g_rgb, pixel, wp.static(C), k)
                         c = chord(ray_of(row, 0), px, py)
                         q = c.x + (c.h - c.half) * c.e
                         scale = float(norm)  # I = scale half field
@@ -160,7 +238,7 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                         g_half = wp.dot(gv, c.e) + gs * field
                         g_mid = wp.dot(gq, c.e)
                         if wp.static(depth):
-                            g_mid += hit[1] * number(g_z, pixel) * row[0, L.REST][1]
+                            g_mid += hit[1] * number_at(g_z, pixel) * row[0, L.REST][1]
                         gD = float(0.0)
                         by_depth = 0.5 * c.h / D
                         if wp.static(P == 0):

@@ -1,5 +1,5 @@
-"""Diagnostic: what the closed form is worth. The same model with the density of every chord sampled, as a splatter
-without the closed form would.
+"""Diagnostic: the value of the closed form. The same model with the density of every chord sampled, as a splatter
+without the closed form would do it.
 
 A chord's optical depth is 2 half times the mean of f over it. The closed form gives that mean by one (cos, sinc) pair
 per neuron; sampling gives it by n cosines per neuron, at the middles of n equal parts. All else is the same, in float64
@@ -25,11 +25,11 @@ from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.reference.backend import render
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["Sampling", "compare_sampling", "sampled_depth"]
+__all__ = ["Quadrature", "compare_quadrature", "sampled_depth"]
 
 
 @dataclass(frozen=True)
-class Sampling:
+class Quadrature:
     """One way to integrate.
 
     Attributes:
@@ -37,7 +37,7 @@ class Sampling:
         psnr: of the image against that of the closed form, dB; infinite for the closed form itself.
         max_abs: largest difference of a colour.
         seconds: that the integrals of all chords of the image take, median of all rounds.
-        chords: how many these are.
+        chords: number of chords.
     """
 
     samples: int
@@ -48,7 +48,7 @@ class Sampling:
 
 
 def sampled_depth(form: Cosine, pairs: Pairs, samples: int) -> Tensor:
-    """(M,) float64 integrals of sigma along chords by the midpoint rule."""
+    """Return (M,) float64 integrals of sigma along chords by the midpoint rule."""
     prim = pairs.prim
     W1, w2, b2 = form.W1.double()[prim], form.w2.double()[prim], form.b2.double().reshape(-1)[prim]
     phase = form.omega0 * ((W1 * pairs.local[:, None, :]).sum(-1) + form.b1.double()[prim])
@@ -66,27 +66,27 @@ def sampled_depth(form: Cosine, pairs: Pairs, samples: int) -> Tensor:
 
 @dataclass(frozen=True)
 class _Sampled(Cosine):
-    """The same density, integrated in some way; keeps the chords that it is asked for."""
+    """The same density, integrated with ``samples``; adds the chords of each call to ``chords``."""
 
     samples: int = 0
-    asked: tuple[list[Pairs], ...] = ()
+    chords: list[Pairs] | None = None
 
     def optical_depth(self, pairs: Pairs) -> Tensor:
-        for asked in self.asked:
-            asked.append(pairs)
+        if self.chords is not None:
+            self.chords.append(pairs)
         return sampled_depth(self, pairs, self.samples) if self.samples else super().optical_depth(pairs)
 
 
 @torch.no_grad()
-def compare_sampling(
+def compare_quadrature(
     lowered: Lowered,
     camera: Camera,
     settings: RenderSettings,
     samples: Sequence[int] = (1, 2, 4, 8, 16, 32, 64),
     rounds: int = 5,
-) -> list[Sampling]:
-    """The closed form first, then each number of samples: an image of each, and the time of its integrals, in turns, on
-    the same chords.
+) -> list[Quadrature]:
+    """Compare the closed form, which comes first, with each number of samples: an image of each, and the time of its
+    integrals, in turns, on the same chords.
 
     Raises:
         ConfigError: the model's density is no sum of cosines, which alone can be done both ways.
@@ -96,26 +96,29 @@ def compare_sampling(
         raise ConfigError(
             f"density {type(form).__name__} has no closed form that sampling could be compared with; expected Cosine"
         )
-    asked: list[Pairs] = []
-    ways, images = [], []
+    chords: list[Pairs] = []
+    densities, images = [], []
     for count in (0, *samples):
-        kept = () if count else (asked,)
-        own = _Sampled(form.W1, form.b1, form.w2, form.b2, form.omega0, form.edge, count, kept)
-        images.append(render(replace(lowered, density=own, shade=None), camera, None, settings).rgb.double())
-        ways.append(replace(own, asked=()))
+        density = _Sampled(form.W1, form.b1, form.w2, form.b2, form.omega0, form.edge, count, None if count else chords)
+        images.append(render(replace(lowered, density=density, shade=None), camera, None, settings).rgb.double())
+        densities.append(replace(density, chords=None))
     names = [field.name for field in fields(Pairs) if field.name != "origin"]
-    all_at_once = Pairs(
-        **{name: torch.cat([getattr(p, name) for p in asked]) for name in names}, origin=camera.position.double()
-    )
-    seconds: list[list[float]] = [[] for _ in ways]
+    columns = {name: torch.cat([getattr(p, name) for p in chords]) for name in names}
+    all_chords = Pairs(**columns, origin=camera.position.double())
+    seconds: list[list[float]] = [[] for _ in densities]
     for number in range(rounds):
-        for i in (*range(number % len(ways), len(ways)), *range(number % len(ways))):
+        first = number % len(densities)
+        for i in (*range(first, len(densities)), *range(first)):
             start = time.perf_counter()
-            ways[i].optical_depth(all_at_once)
+            densities[i].optical_depth(all_chords)
             seconds[i].append(time.perf_counter() - start)
     return [
-        Sampling(
-            way.samples, psnr(image, images[0]), float((image - images[0]).abs().max()), median(took), len(all_at_once)
+        Quadrature(
+            density.samples,
+            psnr(image, images[0]),
+            float((image - images[0]).abs().max()),
+            median(took),
+            len(all_chords),
         )
-        for way, image, took in zip(ways, images, seconds, strict=True)
+        for density, image, took in zip(densities, images, seconds, strict=True)
     ]

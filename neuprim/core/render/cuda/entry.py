@@ -12,7 +12,7 @@ from typing import Any
 
 from neuprim.core.compute.warp import FAST, wp
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.forms import Form
+from neuprim.core.render.cuda.layout import Form
 
 __all__ = ["composite_kernel", "uncomposite_kernel"]
 
@@ -81,7 +81,7 @@ def composite_kernel(form: Form, depth: bool) -> Any:
 @functools.cache
 def uncomposite_kernel(form: Form, depth: bool) -> Any:
     """Back to front: (alpha, T) of every hit becomes (dL/dI, weight), see
-    :mod:`~neuprim.core.render.cuda.backward_pixels`."""
+    :func:`~neuprim.core.render.cuda.backward.pixels_kernel`."""
     C, H = form.channels, form.hidden
     colours = L.colours(form.neurons)
 

@@ -1,5 +1,5 @@
 """The backward pass takes the forward pass's optical depths: they are there, they are of the same lanes, and nothing
-else is kept."""
+else is saved."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from numba import njit
 
 from neuprim.core.compute import views
 from neuprim.core.compute.views import borrow_array, compress16, copy16
-from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.cpu import backend, layout
-from neuprim.core.render.cpu.kept import Kept, alive
+from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
+from neuprim.core.render.cpu import backend
+from neuprim.core.render.cpu.forward import SavedForBackward
+from neuprim.core.render.layout import TILE
 from tests import scenes
 from tests.numerics.compare import assert_same_frame, draw
 
 SETTINGS = RenderSettings(backend="cpu", threads=1, alpha_max=0.98)  # 0.99 twice would be transmittance_min itself
-_bits = njit(lambda rows: alive(rows))
 
 
 def wall(neurons: int = 2) -> dict[str, torch.Tensor]:
@@ -34,16 +34,17 @@ def wall(neurons: int = 2) -> dict[str, torch.Tensor]:
     return t
 
 
-def kept_of(t: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch) -> tuple[Kept, Any]:
-    found: list[Kept] = []
+def saved_of(t: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch) -> tuple[SavedForBackward, RenderOutput]:
+    found: list[SavedForBackward] = []
 
-    def of(pairs: int) -> Kept:
-        found.append(Kept(np.zeros(pairs, np.uint16), np.zeros(pairs, np.int32)))
+    def allocate(pairs: int) -> SavedForBackward:
+        found.append(SavedForBackward(np.zeros(pairs, np.uint16), np.zeros(pairs, np.int32)))
         return found[-1]
 
-    monkeypatch.setattr(backend.Kept, "of", of)
-    leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
-    out = render_lowered(scenes.lowered(leaves), scenes.camera(), SETTINGS)
+    with monkeypatch.context() as patch:
+        patch.setattr(backend.SavedForBackward, "allocate", allocate)
+        leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
+        out = render_lowered(scenes.lowered(leaves), scenes.camera(), SETTINGS)
     return found[0], out
 
 
@@ -51,64 +52,40 @@ def test_there_is_room_for_the_depths_of_tiles_that_are_filled(monkeypatch: pyte
     """Primitives that fill their tiles have 256 lanes a pair, as many as there is room for, and no lane is lost."""
     t = scenes.tensors(16, seed=2)
     t["log_scales"] = 0.9 + 0.3 * t["log_scales"]
-    kept, out = kept_of(t, monkeypatch)
+    saved, out = saved_of(t, monkeypatch)
     lanes = out.stats.extra["forward_lanes"]
     assert lanes > 100 * out.stats.pairs, "the scene does not fill its tiles"
-    assert sum(len(d) for d in kept.depths) >= lanes
-    monkeypatch.undo()
+    assert sum(len(d) for d in saved.depths) >= lanes
     # one ray near a hard edge decides the error of a gradient, by D^-1/2: over seeds 2 to 9 it is 2e-5 to 2e-3
     assert_same_frame(t, scenes.camera(), SETTINGS, grad_bound=3e-3)
 
 
 @pytest.mark.parametrize("neurons", [0, 1, 2, 3, 8])
 def test_gradients_where_rows_die_early(neurons: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also twice, and on any number of threads."""
     t = wall(neurons)
-    kept, _ = kept_of(t, monkeypatch)
-    monkeypatch.undo()
-    assert ((kept.live != 0) & (kept.live != 2**layout.TILE - 1)).any(), "no row dies"
-    # behind walls that let a fiftieth through, float32 is a little coarser than elsewhere: as much before depths were
-    # kept (4e-5 and 1.2e-3)
+    saved, out = saved_of(t, monkeypatch)
+    assert ((saved.live != 0) & (saved.live != 2**TILE - 1)).any(), "no row dies"
+    # behind walls that let a fiftieth through, float32 is a little coarser than elsewhere
     fast, _ = assert_same_frame(t, scenes.camera(), SETTINGS, image_bound=1e-4, grad_bound=2e-3)
     extra = fast.output.stats.extra
-    assert extra["backward_lanes"] < 0.9 * extra["forward_lanes"], "lanes of opaque pixels get no gradient"
-
-
-def test_hidden_pairs_are_not_evaluated_again() -> None:
-    extra = draw("cpu", wall(), scenes.camera(), SETTINGS).output.stats.extra
-    assert 0 < extra["backward_lanes"] < 0.9 * extra["forward_lanes"]
-
-
-def test_nothing_is_kept_where_no_gradient_can_be_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    t = scenes.tensors(8)
-    kept, _ = kept_of(t, monkeypatch)
-    assert len(kept.live) == len(kept.found) > 0 and sum(len(d) for d in kept.depths) > 0
-    with torch.no_grad():
-        kept, _ = kept_of(t, monkeypatch)
-    assert len(kept.live) == len(kept.found) == sum(len(d) for d in kept.depths) == 0
-
-
-@pytest.mark.parametrize("neurons", [0, 2, 5])
-def test_a_second_backward_pass_finds_the_same(neurons: int) -> None:
-    leaves = {k: v.clone().requires_grad_() for k, v in wall(neurons).items()}
+    assert 0 < extra["backward_lanes"] < 0.9 * extra["forward_lanes"], "lanes of opaque pixels get no gradient"
+    leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
     out = render_lowered(scenes.lowered(leaves), scenes.camera(), SETTINGS)
     wanted = [leaves[k] for k in ("means", "log_scales", "quats", "b2", "colors")]
     first, second = (torch.autograd.grad(out.rgb.sum(), wanted, retain_graph=True) for _ in range(2))
-    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
-    assert first[0].abs().sum() > 0
-
-
-@pytest.mark.parametrize("neurons", [0, 2, 8])
-def test_depths_are_found_for_any_number_of_threads(neurons: int) -> None:
-    grads = [
-        draw("cpu", wall(neurons), scenes.camera(), RenderSettings(backend="cpu", threads=n)).grads for n in (1, 2, 3)
-    ]
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True)) and first[0].abs().sum() > 0
+    grads = [draw("cpu", t, scenes.camera(), RenderSettings(backend="cpu", threads=n)).grads for n in (1, 2, 3)]
     assert all(torch.equal(grads[0][k], g[k]) for g in grads[1:] for k in g)
 
 
-def test_live_rows_as_bits() -> None:
-    rows = np.zeros(layout.TILE, np.float32)
-    rows[[0, 3, 15]] = 1
-    assert int(_bits(rows)) == 1 | 8 | 1 << 15
+def test_nothing_is_saved_where_no_gradient_can_be_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    t = scenes.tensors(8)
+    saved, _ = saved_of(t, monkeypatch)
+    assert len(saved.live) == len(saved.first_lane) > 0 and sum(len(d) for d in saved.depths) > 0
+    with torch.no_grad():
+        saved, _ = saved_of(t, monkeypatch)
+    assert len(saved.live) == len(saved.first_lane) == sum(len(d) for d in saved.depths) == 0
 
 
 def test_sixteen_floats_are_read_before_they_are_written() -> None:
@@ -136,12 +113,11 @@ def test_those_of_sixteen_floats_that_count_are_moved_together(
         return compress16(array, at, first, flags)
 
     g = np.random.default_rng(0)
+    special, zeros = [1e-40, -2.0, np.nan, np.inf], [0.0, -0.0]
     for chance in (0.0, 0.1, 0.5, 0.9, 1.0):
         for at in (0, 3, 16):
             array = g.normal(size=64).astype(np.float32)
-            array[32:48] = np.where(
-                g.random(16) < chance, g.choice([1e-40, -2.0, np.nan, np.inf], 16), g.choice([0.0, -0.0], 16)
-            )
+            array[32:48] = np.where(g.random(16) < chance, g.choice(special, 16), g.choice(zeros, 16))
             chosen = array[16:32][array[32:48] != 0]
             expected = array.copy()
             expected[at : at + 16] = [*chosen, *[0.0] * (16 - len(chosen))]

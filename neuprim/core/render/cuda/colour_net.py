@@ -1,0 +1,416 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
+"""Colour networks of the primitives (:class:`~neuprim.core.model.forms.RayNet`): per primitive in float64, and at
+pixels; the twin of :mod:`neuprim.core.render.cpu.colour_net`.
+
+The network sees the chord's middle, which the density's pixel stage has anyway in whitened space: its first layer goes
+there, in turns, once per primitive, as the density's neurons do, and nothing here depends on the camera.
+
+A slot's hue is the colour before max(0, .), which the forward pass leaves there. A network's share of the gradient of a
+ray comes through the chord's middle alone; it is linear, so that it is added to the density's row by row.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.compute.warp import FAST, OPTIONS, array, launch, wp
+from neuprim.core.render import layout as W
+from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.block_ops import row_sums, row_type
+from neuprim.core.render.cuda.chord import chord, phase, pixel_of_slot, ray_of, through_chord, xyz
+from neuprim.core.render.cuda.float64 import chord64, through64
+from neuprim.core.render.cuda.layout import Form
+from neuprim.core.render.cuda.prepare_backward import quaternion_gradient
+from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, View, project_primitive
+from neuprim.core.render.cuda.trigonometry import TAU, cos_turns, sin_turns
+from neuprim.core.render.limits import FLOAT64_TURNS
+
+__all__ = [
+    "FIRST_COLOUR",
+    "Net",
+    "fill_wide_net",
+    "float64_hues_kernel",
+    "float64_net_kernel",
+    "net_backward",
+    "net_pairs_kernel",
+    "net_width",
+    "prepare_net",
+]
+
+FIRST_COLOUR = L.G_NEURONS
+"""Column of a network's gradient row where the C bases begin, then (WX, WY, WZ, PHASE, C weights) of each unit; the
+ray's come first."""
+
+d, f = wp.float64, wp.float32
+_TURNS = wp.constant(d(1.0 / (2.0 * math.pi)))
+_TWO_PI = wp.constant(d(TAU))
+_FAST = wp.constant(d(FLOAT64_TURNS**2))
+
+
+@dataclass
+class Net:
+    """The networks of a frame.
+
+    Attributes:
+        Wx: (N, H, 3), bias: (N, H), Wout: (N, C, H): the parameters, contiguous, float32 or float64 alike.
+        rows: (N, H net_columns(C), 4) float32, columns of :func:`~neuprim.core.render.cuda.layout.net_columns`.
+        fast: (N,) bool, where a unit turns too fast for float32.
+        wide: (M, H, 4) float64 (WX, WY, WZ, PHASE) of the primitives that are drawn in float64.
+    """
+
+    Wx: Tensor
+    bias: Tensor
+    Wout: Tensor
+    rows: Tensor
+    fast: Tensor
+    wide: Tensor
+
+    @property
+    def hidden(self) -> int:
+        return int(self.Wx.shape[1])
+
+
+@wp.func
+def _unit(log_scale: wp.vec3d, quat: wp.vec4d, w: wp.vec3d, phase: wp.float64):
+    """(WX, WY, WZ, PHASE): on whitened axes and in turns."""
+    p = project_primitive(wp.vec3d(), log_scale, quat, View())
+    on_axes = _TURNS * wp.cw_mul(p.axes, wp.transpose(p.local) * w)
+    turns = _TURNS * phase
+    return wp.vec4d(on_axes[0], on_axes[1], on_axes[2], turns - wp.rint(turns))
+
+
+@functools.cache
+def _kernels(double: bool) -> tuple[Any, Any, Any]:
+    real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
+    def fill_rows(
+        log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3), bias: wp.array2d(dtype=real),
+        Wout: wp.array3d(dtype=real), channels: int, rows: wp.array2d(dtype=wp.vec4), fast: wp.array2d(dtype=wp.bool),
+    ):  # fmt: skip
+        """Thread (i, j): unit j of primitive i."""
+        i, j = wp.tid()
+        unit = _unit(wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), wp.vec3d(Wx[i, j]), d(bias[i, j]))
+        fast[i, j] = unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2] > _FAST
+        at = j * (1 + (channels + 3) // 4)
+        rows[i, at] = wp.vec4(unit)
+        for first in range(0, channels, 4):
+            out = wp.vec4()
+            for c in range(4):
+                if first + c < channels:
+                    out[c] = f(Wout[i, first + c, j])
+            rows[i, at + 1 + first // 4] = out
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
+    def prepare_wide(
+        which: wp.array(dtype=wp.int32), log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3),
+        bias: wp.array2d(dtype=real), wide: wp.array2d(dtype=wp.vec4d),
+    ):  # fmt: skip
+        """Thread (m, j): unit j of primitive ``which[m]``."""
+        m, j = wp.tid()
+        i = which[m]
+        wide[m, j] = _unit(wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), wp.vec3d(Wx[i, j]), d(bias[i, j]))
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
+    def backward(
+        log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3), hidden: int, channels: int,
+        weights: wp.array2d(dtype=wp.float32), grads: wp.array2d(dtype=wp.float32), first: int,
+        g_log_scales: wp.array(dtype=wp.vec3), g_quats: wp.array(dtype=wp.vec4), g_Wx: wp.array2d(dtype=wp.vec3),
+        g_bias: wp.array2d(dtype=wp.float32), g_Wout: wp.array3d(dtype=wp.float32),
+    ):  # fmt: skip
+        """Thread i. ``weights``: rows whose column G_WEIGHT says whether the primitive was seen. Adds to
+        ``g_log_scales`` and ``g_quats``."""
+        i = wp.tid()
+        seen = weights[i, wp.static(L.G_WEIGHT)] > f(0.0)
+        logs, quat = wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
+        p = project_primitive(wp.vec3d(), logs, quat, View())
+        gL, gl, log_m = wp.mat33d(), wp.vec3d(), d(0.0)
+        for j in range(hidden):
+            at = first + j * (4 + channels)
+            if seen:
+                w = wp.vec3d(Wx[i, j])
+                g = wp.vec3d(d(grads[i, at]), d(grads[i, at + 1]), d(grads[i, at + 2]))
+                gw = _TURNS * wp.cw_mul(g, p.axes)
+                gL += wp.outer(w, gw)
+                scaled = wp.cw_mul(gw, wp.transpose(p.local) * w)  # the first layer on whitened axes scales with s_a/m
+                gl += scaled
+                log_m -= scaled[0] + scaled[1] + scaled[2]
+                g_Wx[i, j] = wp.vec3(p.local * gw)
+                g_bias[i, j] = f(_TURNS * d(grads[i, at + 3]))
+                for c in range(channels):
+                    g_Wout[i, c, j] = grads[i, at + 4 + c]
+            else:
+                g_Wx[i, j] = wp.vec3()
+                g_bias[i, j] = f(0.0)
+                for c in range(channels):
+                    g_Wout[i, c, j] = f(0.0)
+        if seen:
+            if logs[2] > wp.max(logs[0], logs[1]):  # the first of the longest axes is m
+                gl[2] += log_m
+            elif logs[1] > logs[0]:
+                gl[1] += log_m
+            else:
+                gl[0] += log_m
+            g_log_scales[i] = g_log_scales[i] + wp.vec3(gl)
+            g_quats[i] = g_quats[i] + wp.vec4(quaternion_gradient(quat, p.inverse, gL))
+
+    return fill_rows, prepare_wide, backward
+
+
+def _types(double: bool) -> tuple[Any, Any, Any]:
+    return (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
+
+
+def prepare_net(log_scales: Tensor, quats: Tensor, Wx: Tensor, bias: Tensor, Wout: Tensor) -> Net:
+    """Rows of all primitives; ``wide`` is empty, see :func:`fill_wide_net`."""
+    tensors = (log_scales, quats, Wx, bias, Wout)
+    double = any(x.dtype == torch.float64 for x in tensors)
+    dtype = torch.float64 if double else torch.float32
+    log_scales, quats, Wx, bias, Wout = (x.detach().to(dtype).contiguous() for x in tensors)
+    (N, H, _), C, device = Wx.shape, Wout.shape[1], Wx.device
+    real, vec3, vec4 = _types(double)
+    rows = torch.empty(N, H * L.net_columns(C), 4, device=device)
+    fast = torch.empty(N, H, dtype=torch.bool, device=device)
+    launch(
+        _kernels(double)[0], (N, H),
+        (
+            array(log_scales, vec3), array(quats, vec4), array(Wx, vec3), array(bias, real), array(Wout, real), C,
+            array(rows, wp.vec4), array(fast, wp.bool),
+        ), device, PER_BLOCK,
+    )  # fmt: skip
+    return Net(Wx, bias, Wout, rows, fast.any(1), torch.empty(0, H, 4, dtype=torch.float64, device=device))
+
+
+def fill_wide_net(net: Net, which: Tensor, log_scales: Tensor, quats: Tensor) -> None:
+    """Fill ``net.wide`` for primitives ``which`` (M,) int32; parameters as the frame has them."""
+    M, H, device = len(which), net.hidden, net.Wx.device
+    double = net.Wx.dtype == torch.float64
+    real, vec3, vec4 = _types(double)
+    net.wide = torch.empty(M, H, 4, dtype=torch.float64, device=device)
+    launch(
+        _kernels(double)[1], (M, H),
+        (
+            array(which, wp.int32), array(log_scales.to(net.Wx), vec3), array(quats.to(net.Wx), vec4), array(net.Wx, vec3), array(net.bias, real),
+            array(net.wide, wp.vec4d),
+        ), device, PER_BLOCK,
+    )  # fmt: skip
+
+
+def net_backward(
+    net: Net, parameters: Sequence[Tensor], weights: Tensor, grads: Tensor, out: Sequence[Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the gradients of Wx, bias and Wout in float32; adds to those of log_scales and quats in ``out``.
+
+    Args:
+        parameters: of the frame.
+        weights: (N, .) gradient rows of the density's pass.
+        grads: (N, .) those of the networks' pass.
+        out: gradients of the parameters.
+    """
+    _, log_scales, quats, *_ = parameters
+    _, g_log_scales, g_quats, *_ = out
+    first = FIRST_COLOUR + int(net.Wout.shape[1])
+    double = net.Wx.dtype == torch.float64
+    _, vec3, vec4 = _types(double)
+    g_Wx, g_bias, g_Wout = (
+        torch.empty(x.shape, dtype=torch.float32, device=x.device) for x in (net.Wx, net.bias, net.Wout)
+    )
+    launch(
+        _kernels(double)[2], net.Wx.shape[0],
+        (
+            array(log_scales.to(net.Wx), vec3), array(quats.to(net.Wx), vec4), array(net.Wx, vec3), net.hidden, int(net.Wout.shape[1]),
+            array(weights, wp.float32), array(grads, wp.float32), first, array(g_log_scales, wp.vec3), array(g_quats, wp.vec4),
+            array(g_Wx, wp.vec3), array(g_bias, wp.float32), array(g_Wout, wp.float32),
+        ), net.Wx.device, PER_BLOCK,
+    )  # fmt: skip
+    return g_Wx, g_bias, g_Wout
+
+
+def net_width(form: Form) -> int:
+    """Columns of a network's gradient row."""
+    return L.gradient_width(0, form.channels, form.hidden)
+
+
+@functools.cache
+def net_pairs_kernel(form: Form) -> Any:
+    """A warp a pair: gradients of its network, and the ray's share through the chord's middle."""
+    C, H, P = form.channels, form.hidden, form.edge
+    each, width = L.net_columns(C), net_width(form)
+    columns, net_columns = L.columns(form.neurons, C), max(H * each, 1)
+    row_of, add_lanes = row_type(width), row_sums(width)
+    vecC = wp.types.vector(length=C, dtype=wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
+    def net_pairs(
+        rows: wp.array2d(dtype=wp.vec4), net: wp.array2d(dtype=wp.vec4), ids: wp.array(dtype=wp.int32), tiles: wp.array(dtype=wp.int32),
+        spans: wp.array2d(dtype=wp.uint16), offsets: wp.array(dtype=wp.int32), depth_floor: float, size: wp.vec2i,
+        reached: wp.array(dtype=wp.int32), hits: wp.array(dtype=wp.vec2), hues: wp.array2d(dtype=wp.float32), g_rgb: wp.array2d(dtype=wp.float32),
+        out: wp.array(dtype=wp.float32),
+    ):  # fmt: skip
+        n, lane = wp.tid()
+        tile = tiles[n]
+        across = (size[0] + L.TILE - 1) // L.TILE
+        i = ids[n]
+        if rows[i, L.REST][3] == 0.0:  # the others' rows come from a kernel in float64
+            total = row_of()
+            if n < reached[tile]:
+                which = wp.tile_load(ids, shape=1, offset=n, storage="shared")
+                row = wp.tile_load_indexed(rows, indices=which, shape=(1, columns), axis=0, storage="shared")
+                units = wp.tile_load_indexed(net, indices=which, shape=(1, net_columns), axis=0, storage="shared")
+                begin = offsets[n]
+                left = (tile % across) * L.TILE  # here, as no compiler moves a division out of a branch
+                top = (tile // across) * L.TILE
+                for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
+                    weight = hits[begin + s][1]
+                    if weight > 0.0:
+                        at = pixel_of_slot(spans, n, s)
+                        X = left + at[0]
+                        Y = top + at[1]
+                        c = chord(ray_of(row, 0), float(X) + 0.5, float(Y) + 0.5)
+                        q = c.x + (c.mid - c.tm) * c.e
+                        g = vecC()
+                        for k in range(wp.static(C)):
+                            if hues[begin + s, k] >= 0.0:
+                                g[k] = weight * g_rgb[Y * size[0] + X, k]
+                            total[wp.static(L.G_NEURONS + k)] += g[k]
+                        gq = wp.vec3()
+                        for j in range(wp.static(H)):
+                            w = units[0, wp.static(each * j)]
+                            u = phase(q, w)
+                            r = u - wp.rint(u)
+                            cosine = cos_turns(r * r)
+                            pull = float(0.0)
+                            mixed = wp.vec4()
+                            for k in range(wp.static(C)):
+                                if wp.static(k % 4 == 0):
+                                    mixed = units[0, wp.static(each * j + 1 + k // 4)]
+                                pull += mixed[wp.static(k % 4)] * g[k]
+                                total[wp.static(L.G_NEURONS + C + (4 + C) * j + 4 + k)] += g[k] * cosine
+                            gu = -TAU * sin_turns(r) * pull
+                            total[wp.static(L.G_NEURONS + C + (4 + C) * j)] += gu * q[0]
+                            total[wp.static(L.G_NEURONS + C + (4 + C) * j + 1)] += gu * q[1]
+                            total[wp.static(L.G_NEURONS + C + (4 + C) * j + 2)] += gu * q[2]
+                            total[wp.static(L.G_NEURONS + C + (4 + C) * j + 3)] += gu
+                            gq += gu * xyz(w)
+                        D = wp.max(c.D, 1.0e-12)
+                        by_depth = 0.5 * c.h / D
+                        if wp.static(P == 0):
+                            by_depth = 0.5 * c.ia / wp.sqrt(wp.max(D, depth_floor) * c.ia)
+                        pulled = through_chord(c, 0.0, wp.dot(gq, c.e), 0.0, by_depth, gq, wp.vec3())
+                        gE = pulled.e + c.slide * pulled.m
+                        gG = pulled.e + (row[0, L.REST][0] + c.slide) * pulled.m
+                        for k in range(3):
+                            total[k] += gE[k]
+                            total[3 + k] += c.du * gG[k]
+                            total[6 + k] += c.dv * gG[k]
+                            total[9 + k] += pulled.m[k]
+            add_lanes(total, lane, out, n)
+
+    return net_pairs
+
+
+@functools.cache
+def float64_hues_kernel(channels: int) -> Any:
+    """Hues of the in_float64 pairs' slots, in float64."""
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    def float64_hues(
+        pairs: wp.array(dtype=wp.int32), wide: wp.array2d(dtype=wp.float64), net: wp.array2d(dtype=wp.vec4d), mixes: wp.array2d(dtype=wp.vec4),
+        rows: wp.array2d(dtype=wp.vec4), first: int, hidden: int, slots: wp.array(dtype=wp.int32), ids: wp.array(dtype=wp.int32),
+        tiles: wp.array(dtype=wp.int32), spans: wp.array2d(dtype=wp.uint16), offsets: wp.array(dtype=wp.int32), size: wp.vec2i,
+        hues: wp.array2d(dtype=wp.float32),
+    ):  # fmt: skip
+        """``mixes``: the networks' float32 rows, for their output weights; ``rows``: the primitives', with the bases
+        from column ``first``."""
+        member, lane = wp.tid()
+        n = pairs[member]
+        i = ids[n]
+        r = slots[i]
+        across = (size[0] + L.TILE - 1) // L.TILE
+        begin = offsets[n]
+        for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
+            at = pixel_of_slot(spans, n, s)
+            c = chord64(wide, r, (tiles[n] % across) * L.TILE + at[0], (tiles[n] // across) * L.TILE + at[1])
+            for k in range(wp.static(channels)):
+                hue = d(rows[i, first + k // 4][k % 4])
+                for j in range(hidden):
+                    w = net[r, j]
+                    u = wp.dot(c.q, wp.vec3d(w[0], w[1], w[2])) + w[3]
+                    mixed = mixes[i, j * wp.static(L.net_columns(channels)) + 1 + k // 4][k % 4]
+                    hue += d(mixed) * wp.cos(_TWO_PI * (u - wp.rint(u)))
+                hues[begin + s, k] = float(hue)
+
+    return float64_hues
+
+
+@functools.cache
+def float64_net_kernel(form: Form) -> Any:
+    """:func:`net_pairs_kernel` for in_float64 pairs, in float64."""
+    C = form.channels
+    each, width = L.net_columns(C), net_width(form)
+    row_of, add_lanes = row_type(width), row_sums(width)
+    vecC = wp.types.vector(length=C, dtype=wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    def float64_net(
+        pairs: wp.array(dtype=wp.int32), wide: wp.array2d(dtype=wp.float64), net: wp.array2d(dtype=wp.vec4d), mixes: wp.array2d(dtype=wp.vec4),
+        hidden: int, slots: wp.array(dtype=wp.int32), ids: wp.array(dtype=wp.int32), tiles: wp.array(dtype=wp.int32),
+        spans: wp.array2d(dtype=wp.uint16), offsets: wp.array(dtype=wp.int32), depth_floor: float, size: wp.vec2i,
+        reached: wp.array(dtype=wp.int32), hits: wp.array(dtype=wp.vec2), hues: wp.array2d(dtype=wp.float32), g_rgb: wp.array2d(dtype=wp.float32),
+        out: wp.array(dtype=wp.float32),
+    ):  # fmt: skip
+        member, lane = wp.tid()
+        n = pairs[member]
+        i = ids[n]
+        r = slots[i]
+        tile = tiles[n]
+        total = row_of()
+        if n < reached[tile]:
+            across = (size[0] + L.TILE - 1) // L.TILE
+            begin = offsets[n]
+            for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
+                weight = hits[begin + s][1]
+                if weight > 0.0:
+                    at = pixel_of_slot(spans, n, s)
+                    X = (tile % across) * L.TILE + at[0]
+                    Y = (tile // across) * L.TILE + at[1]
+                    c = chord64(wide, r, X, Y)
+                    g = vecC()
+                    for k in range(wp.static(C)):
+                        if hues[begin + s, k] >= 0.0:
+                            g[k] = weight * g_rgb[Y * size[0] + X, k]
+                        total[wp.static(L.G_NEURONS + k)] += g[k]
+                    gq = wp.vec3d()
+                    for j in range(hidden):
+                        to = wp.static(L.G_NEURONS + C) + wp.static(4 + C) * j
+                        w = net[r, j]
+                        axes = wp.vec3d(w[0], w[1], w[2])
+                        u = wp.dot(c.q, axes) + w[3]
+                        phase = _TWO_PI * (u - wp.rint(u))
+                        pull = d(0.0)
+                        for k in range(wp.static(C)):
+                            pull += d(mixes[i, j * wp.static(each) + 1 + k // 4][k % 4] * g[k])
+                            total[to + 4 + k] += g[k] * float(wp.cos(phase))
+                        gu = -_TWO_PI * wp.sin(phase) * pull
+                        total[to] += float(gu * c.q[0])
+                        total[to + 1] += float(gu * c.q[1])
+                        total[to + 2] += float(gu * c.q[2])
+                        total[to + 3] += float(gu)
+                        gq += gu * axes
+                    zero = d(0.0)
+                    moved = through64(
+                        c, wide[r, W.TC], depth_floor, zero, wp.dot(gq, c.e), zero, zero, zero, gq, wp.vec3d()
+                    )
+                    for k in range(3):
+                        total[k] += float(moved.e[k])
+                        total[3 + k] += float(c.du * moved.G[k])
+                        total[6 + k] += float(c.dv * moved.G[k])
+                        total[9 + k] += float(moved.m[k])
+        add_lanes(total, lane, out, n)
+
+    return float64_net

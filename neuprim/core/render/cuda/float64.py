@@ -1,0 +1,422 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
+"""The pixel stage in float64, for the few primitives that float32 cannot follow: chords, opacities, gradients.
+
+Needles and discs near the camera, fast neurons, and every soft edge that the near plane may cut. The formulas are the
+CPU's (:mod:`neuprim.core.render.cpu.float64`): (1 - |y|^2)^p is a polynomial q of u in [-1, 1], and the mean of q(u)
+cos(phase + z u) follows from moments C_n (even n) and S_n (odd n) of cos and sin, sums of spherical Bessel functions
+j_0 to j_5. A hard edge is q = 1.
+
+Opacities, and where rays enter, are left in the pixels' slots before compositing. In the backward pass a hard edge has
+the gradient of its ends. A soft one has none there, the density being zero, and its weight depends on D, on a = e.e and
+on the closest approach, where the near plane may cut the chord; see
+:func:`neuprim.core.render.cpu.gradients.chord_gradient`.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+from neuprim.core.compute.warp import OPTIONS, wp
+from neuprim.core.render import layout as W
+from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.block_ops import row_sums, row_type
+from neuprim.core.render.cuda.chord import pixel_of_slot
+from neuprim.core.render.cuda.layout import CUT_AT, Form
+
+__all__ = ["chord64", "float64_opacity_kernel", "float64_pairs_kernel", "through64"]
+
+_TWO_PI = 6.283185307179586
+vec6d = wp.types.vector(length=6, dtype=wp.float64)
+vec5d = wp.types.vector(length=5, dtype=wp.float64)
+
+_TERMS = 14
+
+
+@wp.struct
+class Chord64:
+    """As :class:`~neuprim.core.render.cuda.chord.Chord`; the ray's origin does not slide."""
+
+    du: wp.float64
+    dv: wp.float64
+    e: wp.vec3d
+    x: wp.vec3d
+    D: wp.float64
+    ia: wp.float64
+    tm: wp.float64
+    h: wp.float64
+    uncut: wp.float64
+    mid: wp.float64
+    half: wp.float64
+    q: wp.vec3d  # the chord's middle
+
+
+@wp.func
+def _vector(wide: wp.array2d(dtype=wp.float64), r: int, c: int):
+    return wp.vec3d(wide[r, c], wide[r, c + 1], wide[r, c + 2])
+
+
+@wp.func
+def chord64(wide: wp.array2d(dtype=wp.float64), r: int, X: int, Y: int):
+    """Of pixel (X, Y) and row ``r``."""
+    c = Chord64()
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    c.du = wp.float64(X) + wp.float64(0.5) - wide[r, W.UX]
+    c.dv = wp.float64(Y) + wp.float64(0.5) - wide[r, W.UY]
+    G = c.du * _vector(wide, r, W.EX) + c.dv * _vector(wide, r, W.EY)
+    c.e = _vector(wide, r, W.E0) + G
+    m = _vector(wide, r, W.XA) + wide[r, W.TC] * G
+    c.ia = one / wp.dot(c.e, c.e)
+    c.tm = -wp.dot(m, c.e) * c.ia
+    c.x = m + c.tm * c.e
+    c.D = one - wp.dot(c.x, c.x)
+    c.h = wp.sqrt(wp.max(c.D, zero) * c.ia)
+    near = wide[r, W.NEAR]
+    t0 = c.tm - c.h
+    c.uncut = wp.where(t0 > near, one, zero)
+    t0 = wp.max(t0, near)
+    c.mid = wp.float64(0.5) * (t0 + c.tm + c.h)
+    c.half = wp.max(wp.float64(0.5) * (c.tm + c.h - t0), zero)
+    c.q = c.x + (c.mid - c.tm) * c.e
+    return c
+
+
+@wp.struct
+class Weight:
+    """q of u, its mean, and of d q/d(1 - |y|^2) as a polynomial b0 + b1 u + b2 u^2."""
+
+    q: vec5d
+    mean: wp.float64
+    b0: wp.float64
+    b1: wp.float64
+    b2: wp.float64
+
+
+@wp.func
+def weight_of(c: Chord64, edge: int):
+    """(D - a (shift + half u)^2)^p."""
+    w = Weight()
+    two = wp.float64(2.0)
+    a = wp.float64(1.0) / c.ia
+    shift = c.mid - c.tm
+    c0 = c.D - a * shift * shift
+    c1 = -two * a * shift * c.half
+    c2 = -a * c.half * c.half
+    w.q = vec5d()
+    if edge == 0:
+        w.q[0] = wp.float64(1.0)
+    elif edge == 1:
+        w.q[0] = c0
+        w.q[1] = c1
+        w.q[2] = c2
+        w.b0 = wp.float64(1.0)
+    else:
+        w.q[0] = c0 * c0
+        w.q[1] = two * c0 * c1
+        w.q[2] = c1 * c1 + two * c0 * c2
+        w.q[3] = two * c1 * c2
+        w.q[4] = c2 * c2
+        w.b0 = two * c0
+        w.b1 = two * c1
+        w.b2 = two * c2
+    w.mean = w.q[0] + w.q[2] / wp.float64(3.0) + w.q[4] / wp.float64(5.0)
+    return w
+
+
+@wp.func
+def _bessel(z: wp.float64):
+    """j_0 to j_5 of any z: a series below 2, where upward recursion loses digits."""
+    j = vec6d()
+    one = wp.float64(1.0)
+    if wp.abs(z) < wp.float64(2.0):
+        square = wp.float64(0.5) * z * z
+        power = wp.float64(1.0)
+        for n in range(6):
+            term = wp.float64(power)
+            total = wp.float64(power)
+            for k in range(1, _TERMS):
+                term *= -square / wp.float64(k * (2 * n + 2 * k + 1))
+                total += term
+            j[n] = total
+            power *= z / wp.float64(2 * n + 3)
+    else:
+        j[0] = wp.sin(z) / z
+        j[1] = (j[0] - wp.cos(z)) / z
+        over = one / z
+        j[2] = wp.float64(3.0) * over * j[1] - j[0]
+        j[3] = wp.float64(5.0) * over * j[2] - j[1]
+        j[4] = wp.float64(7.0) * over * j[3] - j[2]
+        j[5] = wp.float64(9.0) * over * j[4] - j[3]
+    return j
+
+
+@wp.func
+def moments(z: wp.float64):
+    """C_0, S_1, C_2, S_3, C_4, S_5."""
+    j = _bessel(z)
+    two = wp.float64(2.0)
+    three = wp.float64(3.0)
+    eight = wp.float64(8.0)
+    M = vec6d()
+    M[0] = j[0]
+    M[1] = j[1]
+    M[2] = (j[0] - two * j[2]) / three
+    M[3] = (three * j[1] - two * j[3]) / wp.float64(5.0)
+    M[4] = (wp.float64(7.0) * j[0] - wp.float64(20.0) * j[2] + eight * j[4]) / wp.float64(35.0)
+    M[5] = (wp.float64(27.0) * j[1] - wp.float64(28.0) * j[3] + eight * j[5]) / wp.float64(63.0)
+    return M
+
+
+@wp.func
+def neuron64(wide: wp.array2d(dtype=wp.float64), r: int, o: int):
+    """(WX, WY, WZ) of the unit at column ``o``."""
+    return _vector(wide, r, o)
+
+
+@wp.func
+def phase64(c: Chord64, w: wp.vec3d, phase: wp.float64):
+    """At the chord's middle, in radians, of less than half a turn."""
+    u = wp.dot(c.q, w) + phase
+    return wp.float64(6.283185307179586) * (u - wp.rint(u))
+
+
+@wp.func
+def rate64(c: Chord64, w: wp.vec3d):
+    """z, radians over half a chord."""
+    return wp.float64(6.283185307179586) * c.half * wp.dot(c.e, w)
+
+
+@wp.struct
+class Moments:
+    """Means of q(u) cos(z u) and q(u) sin(z u), and their derivatives by z."""
+
+    even: wp.float64
+    odd: wp.float64
+    d_even: wp.float64
+    d_odd: wp.float64
+
+
+@wp.func
+def dot64(w: Weight, M: vec6d):
+    """The moments of a weight."""
+    out = Moments()
+    out.even = w.q[0] * M[0] + w.q[2] * M[2] + w.q[4] * M[4]
+    out.odd = w.q[1] * M[1] + w.q[3] * M[3]
+    out.d_even = -(w.q[0] * M[1] + w.q[2] * M[3] + w.q[4] * M[5])
+    out.d_odd = w.q[1] * M[2] + w.q[3] * M[4]
+    return out
+
+
+@wp.struct
+class Pull64:
+    """dL/d(origin m, direction e) of a ray, and with respect to what grows with the pixel offset."""
+
+    m: wp.vec3d
+    e: wp.vec3d
+    G: wp.vec3d
+
+
+@wp.func
+def through64(
+    c: Chord64, tc: wp.float64, depth_floor: float, g_half: wp.float64, g_mid: wp.float64, g_tm: wp.float64, gD: wp.float64, gA: wp.float64,
+    gq: wp.vec3d, gv: wp.vec3d,
+):  # fmt: skip
+    """As :func:`~neuprim.core.render.cuda.chord.through`, with dh/dD from the floor on D; g_tm, gD, gA: on other ways
+    than the chord's ends."""
+    half = wp.float64(0.5)
+    two = wp.float64(2.0)
+    gt1 = half * (g_mid + g_half)
+    gt0 = half * (g_mid - g_half) * c.uncut
+    tm = g_tm + gt0 + gt1
+    g_h = gt1 - gt0
+    D = gD + g_h * half * c.ia / wp.sqrt(wp.max(c.D, wp.float64(depth_floor)) * c.ia)
+    a = gA - (half * g_h * c.h + tm * c.tm) * c.ia
+    b = -tm * c.ia
+    m2 = -two * D
+    out = Pull64()
+    out.m = gq + m2 * c.x + b * c.e
+    out.e = c.half * gv + c.mid * gq + (c.tm * m2 + b) * c.x + (two * a - b * c.tm) * c.e
+    out.G = out.e + tc * out.m
+    return out
+
+
+@wp.func
+def ray_norm(lens: wp.vec4, X: int, Y: int):
+    """Length of the ray direction whose camera-z is 1."""
+    x = (wp.float64(X) + wp.float64(0.5) - wp.float64(lens[2])) / wp.float64(lens[0])
+    y = (wp.float64(Y) + wp.float64(0.5) - wp.float64(lens[3])) / wp.float64(lens[1])
+    return wp.sqrt(x * x + y * y + wp.float64(1.0))
+
+
+@functools.cache
+def float64_opacity_kernel(depth: bool) -> Any:
+    """For any form; ``depth``: also camera-z of the chords' middles."""
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    def float64_opacity(
+        pairs: wp.array(dtype=wp.int32),
+        wide: wp.array2d(dtype=wp.float64),
+        slots: wp.array(dtype=wp.int32),
+        ids: wp.array(dtype=wp.int32),
+        tiles: wp.array(dtype=wp.int32),
+        spans: wp.array2d(dtype=wp.uint16),
+        offsets: wp.array(dtype=wp.int32),
+        lens: wp.vec4,
+        limits: wp.vec4,
+        size: wp.vec2i,
+        neurons: int,
+        edge: int,
+        hits: wp.array(dtype=wp.vec2),
+        depths: wp.array(dtype=wp.float32),
+    ):
+        """A warp a pair of those listed in ``pairs``; ``slots[i]``: the row of primitive i in ``wide``."""
+        member, lane = wp.tid()
+        n = pairs[member]
+        r = slots[ids[n]]
+        if r >= 0:
+            across = (size[0] + L.TILE - 1) // L.TILE
+            tx = (tiles[n] % across) * L.TILE
+            ty = (tiles[n] // across) * L.TILE
+            begin = offsets[n]
+            for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
+                at = pixel_of_slot(spans, n, s)
+                X = tx + at[0]
+                Y = ty + at[1]
+                c = chord64(wide, r, X, Y)
+                w = weight_of(c, edge)
+                alpha = float(0.0)
+                if c.half > wp.float64(0.0) and w.mean > wp.float64(0.0):
+                    total = w.mean * wide[r, W.OFFSET]
+                    for k in range(neurons):
+                        o = wp.static(W.NEURONS) + wp.static(W.PER_NEURON) * k
+                        v = neuron64(wide, r, o)
+                        phase = phase64(c, v, wide[r, o + W.PHASE])
+                        m = dot64(w, moments(rate64(c, v)))
+                        total += wide[r, o + W.AMPLITUDE] * (wp.cos(phase) * m.even - wp.sin(phase) * m.odd)
+                    I = wp.float64(2.0) * total * c.half * ray_norm(lens, X, Y)
+                    if I > wp.float64(0.0):
+                        alpha = wp.min(float(wp.float64(1.0) - wp.exp(-I)), limits[1])
+                        if alpha < limits[0]:
+                            alpha = 0.0
+                entry = float(CUT_AT)
+                if c.uncut > wp.float64(0.0):
+                    entry = float(wide[r, W.ANCHOR_Z] + wide[r, W.UNIT] * (c.mid - c.half))
+                hits[begin + s] = wp.vec2(alpha, entry)
+                if wp.static(depth):
+                    depths[begin + s] = float(wide[r, W.ANCHOR_Z] + wide[r, W.UNIT] * c.mid)
+
+    return float64_opacity
+
+
+@functools.cache
+def float64_pairs_kernel(form: Form, depth: bool) -> Any:
+    """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
+    K, P, C = form.neurons, form.edge, form.channels
+    width = L.gradient_width(K, C)
+    row_of, add_lanes = row_type(width), row_sums(width)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    def float64_pairs(
+        pairs: wp.array(dtype=wp.int32),
+        wide: wp.array2d(dtype=wp.float64),
+        slots: wp.array(dtype=wp.int32),
+        ids: wp.array(dtype=wp.int32),
+        tiles: wp.array(dtype=wp.int32),
+        spans: wp.array2d(dtype=wp.uint16),
+        offsets: wp.array(dtype=wp.int32),
+        lens: wp.vec4,
+        depth_floor: float,
+        size: wp.vec2i,
+        neurons: int,
+        reached: wp.array(dtype=wp.int32),
+        hits: wp.array(dtype=wp.vec2),
+        g_rgb: wp.array2d(dtype=wp.float32),
+        g_z: wp.array(dtype=wp.float32),
+        error: wp.array(dtype=wp.float32),
+        out: wp.array(dtype=wp.float32),
+    ):
+        member, lane = wp.tid()
+        n = pairs[member]
+        r = slots[ids[n]]
+        if r >= 0:
+            total = row_of()
+            tile = tiles[n]
+            if n < reached[tile]:
+                across = (size[0] + L.TILE - 1) // L.TILE
+                zero = wp.float64(0.0)
+                two = wp.float64(2.0)
+                turn = wp.float64(_TWO_PI)
+                begin = offsets[n]
+                for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
+                    hit = hits[begin + s]
+                    if hit[1] > 0.0:
+                        at = pixel_of_slot(spans, n, s)
+                        X = (tile % across) * L.TILE + at[0]
+                        Y = (tile // across) * L.TILE + at[1]
+                        pixel = Y * size[0] + X
+                        total[L.G_WEIGHT] += hit[1]
+                        total[L.G_ERROR] += hit[1] * error[pixel]
+                        for k in range(wp.static(C)):
+                            total[wp.static(L.G_NEURONS + 5 * K + k)] += hit[1] * g_rgb[pixel, k]
+                        c = chord64(wide, r, X, Y)
+                        w = weight_of(c, P)
+                        g = two * wp.float64(hit[0]) * ray_norm(lens, X, Y)  # dL/d(mean half)
+                        gh = g * c.half
+                        mean = w.mean * wide[r, W.OFFSET]
+                        # moments of d q/d(1 - |y|^2) with 1, u and u^2
+                        rest0 = wide[r, W.OFFSET] * (w.b0 + w.b2 / wp.float64(3.0))
+                        rest1 = wide[r, W.OFFSET] * w.b1 / wp.float64(3.0)
+                        rest2 = wide[r, W.OFFSET] * (w.b0 / wp.float64(3.0) + w.b2 / wp.float64(5.0))
+                        gq = wp.vec3d()
+                        gv = wp.vec3d()
+                        for k in range(neurons):
+                            o = wp.static(W.NEURONS) + wp.static(W.PER_NEURON) * k
+                            og = wp.static(L.G_NEURONS) + wp.static(W.PER_NEURON) * k
+                            v = neuron64(wide, r, o)
+                            phase = phase64(c, v, wide[r, o + W.PHASE])
+                            M = moments(rate64(c, v))
+                            m = dot64(w, M)
+                            cosine = wp.cos(phase)
+                            sine = wp.sin(phase)
+                            amplitude = wide[r, o + W.AMPLITUDE]
+                            one = cosine * m.even - sine * m.odd
+                            mean += amplitude * one
+                            gu = -gh * amplitude * turn * (sine * m.even + cosine * m.odd)
+                            gw = gh * amplitude * turn * (cosine * m.d_even - sine * m.d_odd)
+                            gx = gu * c.q + (gw * c.half) * c.e
+                            total[og] += float(gx[0])
+                            total[og + 1] += float(gx[1])
+                            total[og + 2] += float(gx[2])
+                            total[og + W.PHASE] += float(gu)
+                            total[og + W.AMPLITUDE] += float(gh * one)
+                            gq += gu * v
+                            gv += gw * v
+                            rest0 += amplitude * (cosine * (w.b0 * M[0] + w.b2 * M[2]) - sine * w.b1 * M[1])
+                            rest1 += amplitude * (cosine * w.b1 * M[2] - sine * (w.b0 * M[1] + w.b2 * M[3]))
+                            rest2 += amplitude * (cosine * (w.b0 * M[2] + w.b2 * M[4]) - sine * w.b1 * M[3])
+                        total[L.G_OFFSET] += float(gh * w.mean)
+                        total[L.G_LOG_M] += float(gh * mean)
+                        g_half = wp.dot(gv, c.e) + g * mean
+                        g_mid = wp.dot(gq, c.e)
+                        g_tm = wp.float64(0.0)
+                        gD = wp.float64(0.0)
+                        gA = wp.float64(0.0)
+                        if wp.static(P > 0):
+                            shift = c.mid - c.tm
+                            g_half = zero
+                            g_mid = zero
+                            g_tm = gh * two / c.ia * (shift * rest0 + c.half * rest1)
+                            gD = gh * rest0
+                            gA = -gh * (shift * shift * rest0 + two * shift * c.half * rest1 + c.half * c.half * rest2)
+                        if wp.static(depth):
+                            g_mid += wp.float64(hit[1] * g_z[pixel]) * wide[r, W.UNIT]
+                        pull = through64(c, wide[r, W.TC], depth_floor, g_half, g_mid, g_tm, gD, gA, gq, gv)
+                        for k in range(3):
+                            total[k] += float(pull.e[k])
+                            total[3 + k] += float(c.du * pull.G[k])
+                            total[6 + k] += float(c.dv * pull.G[k])
+                            total[9 + k] += float(pull.m[k])
+            add_lanes(total, lane, out, n)
+
+    return float64_pairs

@@ -1,0 +1,61 @@
+"""Distance of points from the cameras that see them, and the near plane and extent that follow: no length of a scene is
+known beforehand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.settings import RenderSettings
+
+__all__ = ["nearest_and_median_depth", "resolve_near", "scene_extent"]
+
+_MAX_CAMERAS, _MAX_POINTS = 100, 100_000  # of which depths are measured
+_SHARE, _CLEARANCE = 1.0 / 400.0, 0.1  # the near plane as a part of the typical and of the nearest depth
+_MIN_EXTENT = 0.01
+_MIN_NEAR = 1e-6  # of the typical depth: a point in a camera's centre does not put the plane there
+
+
+def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tuple[float, float]:
+    """Return (nearest, median) depth at which cameras see the points (N, 3): camera-z, or ray distance for a
+    ``RayCamera``.
+
+    Where no camera sees one, the distances of all points count.
+    """
+    means = means.detach().double().cpu()[:: max(len(means) // _MAX_POINTS, 1)]
+    cameras = [
+        replace(c, viewmat=c.viewmat.detach().double().cpu()) for c in cameras[:: max(len(cameras) // _MAX_CAMERAS, 1)]
+    ]
+    found = []
+    for camera in cameras:
+        if isinstance(camera, Camera):
+            _, z = camera.project(means)
+            found.append(z[camera.sees(means)])
+    depths = torch.cat(found) if found else means[:0, 0]
+    if not len(depths):
+        depths = torch.cat([(means - camera.position).norm(dim=-1) for camera in cameras])
+    return depths.min().item(), depths.median().item()
+
+
+def scene_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]) -> float:
+    """Return the data set's extent, or where that is below 1/100 of the median depth of points (N, 3), as on a tripod,
+    that depth."""
+    _, depth = nearest_and_median_depth(means, cameras)
+    return extent if extent >= _MIN_EXTENT * depth else depth
+
+
+def resolve_near(settings: RenderSettings, means: Tensor, cameras: Sequence[AnyCamera]) -> RenderSettings:
+    """Return the settings with a number for ``near=auto``, from points (N, 3) and the cameras that see them."""
+    if settings.near != "auto":
+        return settings
+    if not len(means):
+        return replace(settings, near=1.0)  # there is nothing to cut
+    nearest, typical = nearest_and_median_depth(means, cameras)
+    near = max(min(_SHARE * typical, _CLEARANCE * nearest), _MIN_NEAR * typical)
+    return replace(settings, near=near if math.isfinite(near) and near > 0 else 1.0)

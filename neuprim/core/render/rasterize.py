@@ -1,0 +1,111 @@
+"""What the kernel backends share around their kernels: the tensors of a lowered model, and its image.
+
+Each of them is one :class:`torch.autograd.Function` with ``forward(ctx, request, viewmat, background, palette,
+*tensors)``, where ``tensors`` are those of :data:`PARAMETERS`, then, of colour networks, those of :data:`NET`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.compute.operation import apply_autograd, needs_grad
+from neuprim.core.model.fields import Constant, Cosine, RayNet
+from neuprim.core.model.primitives import Lowered
+from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
+from neuprim.core.settings import RenderSettings
+
+__all__ = ["NET", "PARAMETERS", "Request", "gradients_like", "parameters_of", "rasterize", "remember_inputs"]
+
+PARAMETERS = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
+"""Inputs of the per-primitive stage, in the order in which its kernels take them."""
+
+NET = ("Wx", "bias", "Wout")
+
+
+@dataclass(frozen=True)
+class Request:
+    """One frame to draw: what is not a tensor.
+
+    Attributes:
+        turns: omega0 / 2 pi of the density; edge: exponent p of its edge.
+        differentiable: whether a backward pass may follow.
+    """
+
+    camera: Camera
+    turns: float
+    edge: int
+    settings: RenderSettings
+    stats: RenderStats
+    differentiable: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        lowered: Lowered,
+        camera: Camera,
+        settings: RenderSettings,
+        stats: RenderStats,
+        differentiable: bool = False,
+    ) -> Request:
+        density = lowered.density
+        assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
+        return cls(camera, density.omega0 / (2 * math.pi), density.edge, settings, stats, differentiable)
+
+
+def parameters_of(lowered: Lowered) -> tuple[Tensor, ...]:
+    """Return the tensors of :data:`PARAMETERS`."""
+    g, density = lowered.geometry, lowered.density
+    assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
+    return g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1)
+
+
+def rasterize(
+    operation: type[torch.autograd.Function],
+    name: str,
+    lowered: Lowered,
+    camera: Camera,
+    background: Tensor | None,
+    settings: RenderSettings,
+) -> RenderOutput:
+    """Render a :class:`Cosine` density with :class:`Constant` or :class:`RayNet` colours by the ``operation`` of
+    backend ``name``."""
+    colour = lowered.colour
+    assert isinstance(colour, Constant | RayNet), "the caller chooses a backend that knows the forms"
+    net: tuple[Tensor, ...] = ()
+    if isinstance(colour, RayNet):
+        palette, net = colour.base, (colour.Wx, colour.bias, colour.Wout)
+    else:
+        palette = colour.rgb
+    if background is None:
+        background = torch.zeros(palette.shape[1], device=palette.device)
+    tensors = (camera.viewmat, background, palette, *parameters_of(lowered), *net)
+    stats = RenderStats(name, lowered.geometry.count)
+    request = Request.of(lowered, camera, settings, stats, needs_grad(*tensors))
+    rgb, transmittance, zsum = apply_autograd(operation, request, *tensors)
+    dtype = lowered.geometry.means.dtype
+    alpha = 1 - transmittance
+    depth = mean_depth(zsum, alpha).to(dtype) if settings.depth else None
+    return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)
+
+
+def remember_inputs(ctx: Any, inputs: Sequence[Tensor]) -> None:
+    """Keep dtypes and devices for :func:`gradients_like`, and let gradients that nobody asks for be None."""
+    ctx.inputs_like = [(x.device, x.dtype) for x in inputs]
+    ctx.set_materialize_grads(False)  # a depth image without a gradient costs the backward pass nothing
+
+
+def gradients_like(ctx: Any, view: Tensor | None, gradients: Sequence[Tensor | None]) -> tuple[Any, ...]:
+    """Return what ``backward`` returns: a gradient for each input, from that of (R | t), (3, 4), and the others."""
+    full = None
+    if view is not None:
+        full = torch.zeros(4, 4, dtype=torch.float64, device=view.device)
+        full[:3] = view
+    found = (full, *gradients)
+    return (None, *(None if g is None else g.to(*like) for g, like in zip(found, ctx.inputs_like, strict=True)))

@@ -40,7 +40,6 @@ from neuprim.core.render.cuda.projection import PER_BLOCK
 from neuprim.core.train import adam_warp, ssim_warp
 from neuprim.core.volumes import grid_warp
 from neuprim.tasks.dynamic.volume import traverse_warp
-from neuprim.tasks.relight import visibility_warp
 
 RESULTS = Path(__file__).parent / "results" / "gpu_kernels.json"
 PAGE = ROOT / "docs" / "gpu.md"
@@ -72,7 +71,6 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
             ("harmonics", sh_warp._kernels(3)),
             ("Adam", adam_warp._kernels()),
             ("SSIM", ssim_warp._kernels()),
-            ("light", (visibility_warp._kernel(),)),
             ("grid", (grid_warp._kernel(),)),
             ("rays of volumes", (traverse_warp._radiances(), traverse_warp._depths(), traverse_warp._extinctions())),
         ):

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from neuprim.core.compute.device import CARD, cuda_unavailable
+from neuprim.core.compute.device import CUDA, cuda_unavailable
 from neuprim.core.render.backends import REFERENCE, TABLE, Backend
 
 
 def _place(backend: Backend) -> str | None:
     """The kind of device that it can draw on here, its own first; None if there is none."""
-    here = [kind for kind in backend.devices if kind != CARD or cuda_unavailable() is None]
+    here = [kind for kind in backend.devices if kind != CUDA or cuda_unavailable() is None]
     return here[0] if here and backend.missing() is None else None
 
 

@@ -21,6 +21,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
@@ -30,9 +31,8 @@ from neuprim.core.model.fields import LoweredDensity, Shade
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.slabs import render_slabs
-from neuprim.tasks.relight.visibility_torch import arriving
 
-__all__ = ["BIAS", "SIZE", "SOFTNESS", "light_visibility"]
+__all__ = ["BIAS", "SIZE", "SOFTNESS", "light_visibility", "sample_visibility"]
 
 SIZE = 192
 """Pixels of the depth images, square."""
@@ -95,14 +95,8 @@ def light_visibility(
 
     def visibility(points: Tensor) -> Tensor:
         points, limits = points.detach().double().contiguous(), (bias * diameter, softness * diameter)
-        if device.on_warp(points, opacities):
-            from neuprim.tasks.relight import visibility_warp
-
-            return visibility_warp.arriving_light(
-                points, device.to_like(view, points), near, focal, opacities, distances, *limits
-            )
         if not device.on_numba(points, opacities):
-            return arriving(points, device.to_like(view, points), near, focal, opacities, distances, *limits)
+            return sample_visibility(points, device.to_like(view, points), near, focal, opacities, distances, *limits)
         from neuprim.tasks.relight.visibility_cpu import arriving_light  # numba, loaded when first needed
 
         found = np.empty(len(points), np.float32)
@@ -113,3 +107,29 @@ def light_visibility(
         return torch.from_numpy(found)
 
     return visibility
+
+
+def sample_visibility(
+    points: Tensor,
+    view: Tensor,
+    near: float,
+    focal: float,
+    alphas: Tensor,
+    depths: Tensor,
+    bias: float,
+    softness: float,
+) -> Tensor:
+    """Return the (M,) float32 visibility of ``points`` (M, 3) float64 in torch code, for a GPU; the arguments of
+    :func:`~neuprim.tasks.relight.visibility_cpu.arriving_light`, whose twin this is."""
+    nearness = torch.where(alphas > 0, alphas.double() / depths.double().clamp_min(near), 0.0)
+    images = torch.stack([alphas.double(), nearness], 1)  # (slabs, 2, S, S)
+    x, y, z = ((view[a, :3] * points).sum(-1) + view[a, 3] for a in range(3))
+    ahead = (z > near) & x.isfinite() & y.isfinite() & z.isfinite()
+    scale = 2.0 * focal / alphas.shape[1] / torch.where(ahead, z, 1.0)
+    where = torch.where(ahead[:, None], torch.stack([x * scale, y * scale], -1), 0.0).clamp(-3.0, 3.0)
+    # outside of the images nothing absorbs
+    read = F.grid_sample(images.flatten(0, 1)[None], where[None, None], align_corners=False)[0, :, 0]
+    alpha, inverse_depth = read.unflatten(0, (-1, 2)).unbind(1)
+    behind = z - alpha / inverse_depth.clamp_min(1e-30)
+    s = (0.5 + 0.5 * (behind - bias) / softness).clamp(0.0, 1.0)
+    return torch.where(ahead, (1.0 - alpha * s * s * (3.0 - 2.0 * s)).prod(0), 1.0).float()

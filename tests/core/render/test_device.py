@@ -17,12 +17,14 @@ from neuprim.core.compute.device import HOST
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, FormError
 from neuprim.core.model.fields import CustomDensity
 from neuprim.core.render import RenderSettings, backends, render_lowered
-from neuprim.core.render.backends import Backend, device_of
+from neuprim.core.render.backends import Backend, choose_backend, computing_device, device_of
 from neuprim.runs.fit import start
 from tests import scenes
 from tests.core import tiny
 from tests.pretend_card import CARD, Card, pretended
 from tests.short_runs import words
+
+MISSING = "torch finds no CUDA device"
 
 
 @pytest.fixture
@@ -32,7 +34,7 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
 
 
 def setting(kind: str, **more: Any) -> RenderSettings:
-    """As on a machine with a card: there, what the setting calls cuda is the pretended one."""
+    """As on a machine with a GPU: there, what the setting calls cuda is the pretended one."""
     settings = RenderSettings(**more)
     object.__setattr__(settings, "device", kind)
     return settings
@@ -42,152 +44,119 @@ def frame(seed: int = 0) -> Any:
     return scenes.lowered(scenes.tensors(5, seed=seed)), scenes.camera(12, 10)
 
 
-def test_without_a_card_auto_is_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
-    trainer = tiny.trainer(tiny.two_primitives(), 1)
-    assert trainer.device == torch.device("cpu") and trainer._ahead is None
-
-
-def test_a_card_that_is_asked_for_and_not_there_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before anything is loaded, and in Python code too."""
-    monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
-    line = r"^renderer\.device=cuda: torch finds no CUDA device; expected cpu or auto$"
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("renderer.device=cuda", rf"^renderer\.device=cuda: {MISSING}; expected cpu or auto$"),
+        (
+            "renderer.backend=cuda",
+            rf"^renderer\.backend=cuda cannot run here: {MISSING}; expected auto or the name of another backend$",
+        ),
+    ],
+)
+def test_a_missing_gpu_is_refused_in_one_line_before_anything_is_loaded(
+    override: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device, "cuda_unavailable", lambda: MISSING)
     monkeypatch.setattr("neuprim.runs.fit.load_dataset", lambda *_, **__: pytest.fail("loaded"))
     with pytest.raises(BackendUnavailable, match=line):
-        start(compose(words(tmp_path, tmp_path / "run", 3, "renderer.device=cuda")))
-    low, camera = frame()
+        start(compose(words(tmp_path, tmp_path / "run", 3, override)))
+    key, value = override.removeprefix("renderer.").split("=")
     with pytest.raises(BackendUnavailable, match=line):
-        render_lowered(low, camera, RenderSettings(device="cuda"))
+        render_lowered(*frame(), RenderSettings(**{key: value}))
 
 
-def test_so_is_a_backend_of_a_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
-    monkeypatch.setattr("neuprim.runs.fit.load_dataset", lambda *_, **__: pytest.fail("loaded"))
-    line = r"^renderer\.backend=cuda cannot run here: torch finds no CUDA device; expected auto or the name of another backend$"
-    with pytest.raises(BackendUnavailable, match=line):
-        start(compose(words(tmp_path, tmp_path / "run", 3, "renderer.backend=cuda")))
+def test_without_a_gpu_everything_is_computed_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "cuda_unavailable", lambda: MISSING)
+    assert tiny.trainer(tiny.two_primitives(), 1).device == HOST
+    assert {computing_device(RenderSettings(backend=name)) for name in ("auto", "cuda", "reference")} == {HOST}
+    assert backends.with_available_device(RenderSettings(device="cuda", near=0.5)) == RenderSettings(near=0.5)
 
 
-def test_a_card_that_nothing_draws_on_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_that_nothing_draws_on_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "cuda_unavailable", lambda: None)
     monkeypatch.setattr(backends, "TABLE", tuple(b for b in backends.TABLE if b.devices[0] == "cpu"))
     assert backends.gpu_unavailable() == "no backend draws there"
-    assert tiny.trainer(tiny.two_primitives(), 1).device == torch.device("cpu")
-    broken = Backend(
-        "card", lambda: pytest.fail("loaded"), missing=lambda: "its package is not installed", devices=("cuda",)
-    )
+    assert tiny.trainer(tiny.two_primitives(), 1).device == HOST
+    broken = Backend("card", lambda: pytest.fail("loaded"), missing=lambda: "no package", devices=("cuda",))
     monkeypatch.setattr(backends, "TABLE", (broken, *backends.TABLE))
-    assert backends.gpu_unavailable() == "its package is not installed"
-    assert tiny.trainer(tiny.two_primitives(), 1).device == torch.device("cpu")
-    with pytest.raises(
-        BackendUnavailable, match=r"^renderer\.device=cuda: its package is not installed; expected cpu or auto$"
-    ):
+    assert backends.gpu_unavailable() == "no package"
+    with pytest.raises(BackendUnavailable, match=r"^renderer\.device=cuda: no package; expected cpu or auto$"):
         backends.check_device(RenderSettings(device="cuda"))
+    working = replace(broken, missing=lambda: None)
+    monkeypatch.setattr(backends, "TABLE", (working, *backends.TABLE))
+    assert backends.with_available_device(RenderSettings(device="cuda")) == RenderSettings(device="cuda")
 
 
 def test_what_is_no_frame_is_computed_where_frames_are(card: Card) -> None:
     for settings, wanted in (
-        (RenderSettings(), CARD), (RenderSettings(device="cpu"), HOST), (RenderSettings(backend="cpu"), HOST),
-        (RenderSettings(backend="card"), CARD), (setting(CARD.type), CARD), (RenderSettings(backend="cuda", device="cpu"), HOST),
-    ):  # fmt: skip
-        assert backends.computing_device(settings) == wanted, settings
-
-
-def test_without_a_card_that_is_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
-    assert {backends.computing_device(RenderSettings(backend=name)) for name in ("auto", "cuda", "reference")} == {HOST}
-    assert not device.has_warp(HOST) and not device.has_warp(CARD)
-    monkeypatch.setattr(device, "_warp", lambda: True)
-    assert device.has_warp(torch.device("cuda", 0)) and not device.has_warp(HOST)
-    monkeypatch.setattr(device, "_warp", lambda: False)
-    assert not device.has_warp(torch.device("cuda", 0))
+        (RenderSettings(), CARD),
+        (RenderSettings(device="cpu"), HOST),
+        (RenderSettings(backend="cpu"), HOST),
+        (RenderSettings(backend="card"), CARD),
+        (setting(CARD.type), CARD),
+        (RenderSettings(backend="cuda", device="cpu"), HOST),
+    ):
+        assert computing_device(settings) == wanted, settings
 
 
 def test_a_backend_and_a_device_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
     line = r"^renderer\.device=cuda: renderer\.backend=reference does not draw there; expected cpu or auto$"
     with pytest.raises(ConfigError, match=line):
         compose(words(tmp_path, tmp_path / "run", 3, "renderer.device=cuda", "renderer.backend=reference"))
-    with pytest.raises(ConfigError, match=r"^renderer\.device=gpu: expected auto, cpu or cuda$"):
-        RenderSettings(device="gpu")  # type: ignore[arg-type]
 
 
-def test_a_run_of_a_card_is_opened_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
-    assert backends.with_available_device(RenderSettings(device="cuda", near=0.5)) == RenderSettings(near=0.5)
-    monkeypatch.setattr(device, "cuda_unavailable", lambda: None)
-    row = Backend("card", lambda: pytest.fail("loaded"), devices=("cuda",))
-    monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE))
-    assert backends.with_available_device(RenderSettings(device="cuda")) == RenderSettings(device="cuda")
-
-
-def test_tensors_say_where_a_frame_is_drawn(card: Card) -> None:
+@pytest.mark.parametrize(
+    ("own", "kind", "name"),
+    [("cpu", CARD.type, "card"), (CARD.type, "cpu", "cpu"), ("cpu", "auto", "cpu"), (CARD.type, "auto", "card")],
+)
+def test_tensors_go_where_the_setting_says_and_the_frame_comes_back(own: str, kind: str, name: str, card: Card) -> None:
+    """Gradients go the same way, and so do contributions."""
     low, camera = frame()
     wanted = render_lowered(low, camera, RenderSettings())
-    found = render_lowered(low.to(CARD), camera, RenderSettings(depth=True), torch.ones(3))
-    assert wanted.stats.backend == found.stats.backend == "cpu" and found.rgb.device == found.depth.device == CARD  # type: ignore[union-attr]
-    assert (
-        backends.choose_backend(low, RenderSettings(), camera).name == "cpu"
-        and backends.choose_backend(low.to(CARD), RenderSettings(), camera).name == "card"
-    )
-    assert torch.equal(found.alpha.cpu(), wanted.alpha)
+    low = low.to(torch.device(own))
+    low.geometry.means.requires_grad_()
+    assert choose_backend(low, setting(kind), camera).name == name
+    output = render_lowered(low, camera, setting(kind))
+    found = output.request_contributions(torch.ones_like(output.alpha))
+    output.rgb.sum().backward()
+    grad = low.geometry.means.grad
+    assert grad is not None and output.rgb.device.type == grad.device.type == found.weight.device.type == own
+    assert bool((found.weight > 0).any()) and torch.allclose(found.weight, found.error_weight)
+    assert torch.equal(output.alpha.detach().cpu(), wanted.alpha)
 
 
-def test_the_setting_says_it_too(card: Card) -> None:
-    """Then tensors are moved there and the image back; gradients go the same way, and so do sums that are watched."""
-    for own, kind, name in (
-        ("cpu", CARD.type, "card"),
-        (CARD.type, "cpu", "cpu"),
-        ("cpu", "auto", "cpu"),
-        (CARD.type, "auto", "card"),
-    ):
-        low, camera = frame()
-        low = low.to(torch.device(own))
-        low.geometry.means.requires_grad_()
-        assert backends.choose_backend(low, setting(kind), camera).name == name
-        output = render_lowered(low, camera, setting(kind))
-        tally = output.request_contributions(torch.ones_like(output.alpha))
-        output.rgb.sum().backward()
-        grad = low.geometry.means.grad
-        assert grad is not None and output.rgb.device.type == grad.device.type == tally.weight.device.type == own
-        assert bool((tally.weight > 0).any()) and torch.allclose(tally.weight, tally.error_weight)
-
-
-def test_a_backend_of_the_card_by_name_takes_tensors_there(card: Card) -> None:
+def test_a_backend_by_name_takes_tensors_to_its_device(card: Card) -> None:
     low, camera = frame()
     assert render_lowered(low, camera, RenderSettings(backend="card")).rgb.device.type == "cpu"
     assert render_lowered(low.to(CARD), camera, RenderSettings(backend="reference")).rgb.device == CARD
 
 
 def test_code_of_a_model_stays_where_it_is(card: Card) -> None:
-    """What only the reference draws is not moved to it; a run keeps such a model on the processor in the first
-    place."""
+    """What only the reference draws is not moved to it; a run keeps such a model on the CPU in the first place."""
     low, camera = frame()
     own = replace(low, density=CustomDensity(lambda prim, o, d, t0, t1: t1 - t0))
     assert render_lowered(own, camera, RenderSettings()).stats.backend == "reference"
     away = replace(low.to(CARD), density=own.density)
     with pytest.raises(
-        BackendUnavailable,
-        match="reference cannot draw code of the model's own that works on the meta; it draws on the cpu",
+        BackendUnavailable, match="cannot draw code of the model's own that works on the meta; it draws"
     ):
         render_lowered(away, camera, RenderSettings())
 
 
 def test_a_run_keeps_a_model_where_it_is_drawn(card: Card, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, camera = tiny.trainer(tiny.two_primitives(), 1).model.to(torch.device("cpu")), scenes.camera(12, 10)
-    assert device_of(model, RenderSettings(), camera, {}) == CARD
-    assert (
-        device_of(model, setting("cpu"), camera, {})
-        == device_of(model, RenderSettings(backend="cpu"), camera, {})
-        == torch.device("cpu")
-    )
-    assert (
-        device_of(model, RenderSettings(backend="card"), camera, {})
-        == device_of(model, setting(CARD.type), camera, {})
-        == CARD
-    )
+    model, camera = tiny.trainer(tiny.two_primitives(), 1).model.to(HOST), scenes.camera(12, 10)
+    for settings, wanted in (
+        (RenderSettings(), CARD),
+        (setting("cpu"), HOST),
+        (RenderSettings(backend="cpu"), HOST),
+        (RenderSettings(backend="card"), CARD),
+        (setting(CARD.type), CARD),
+    ):
+        assert device_of(model, settings, camera, {}) == wanted, settings
     row = replace(backends.TABLE[0], unsupported=lambda low, camera: "this model")
     monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE[1:]))
-    assert device_of(model, RenderSettings(), camera, {}) == torch.device("cpu")
+    assert device_of(model, RenderSettings(), camera, {}) == HOST
 
 
 def test_tensors_of_two_devices_are_refused_by_name(card: Card) -> None:
@@ -199,7 +168,7 @@ def test_tensors_of_two_devices_are_refused_by_name(card: Card) -> None:
         render_lowered(low, replace(camera, viewmat=camera.viewmat.to(CARD)), RenderSettings())
 
 
-def test_rasterize_takes_tensors_of_a_card(card: Card) -> None:
+def test_rasterize_takes_tensors_of_a_gpu(card: Card) -> None:
     t = scenes.tensors(4)
     camera = scenes.camera(8, 6)
     K = torch.tensor([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], dtype=torch.float64)

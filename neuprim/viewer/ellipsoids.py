@@ -15,7 +15,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.near import decided
+from neuprim.core.render.near_plane import resolve_near
 from neuprim.inspect.field import absorbed
 from neuprim.inspect.shapes import unit_sphere
 from neuprim.viewer.session import Session
@@ -107,7 +107,7 @@ def pick_primitive(
         d = torch.as_tensor(np.asarray(direction, np.float64))
         d = d / d.norm()
         forward = viewpoint.camera.viewmat[2, :3].double()
-        near = decided(settings, g.means, [viewpoint.camera]).near_plane / max(float(forward @ d), 1e-9)
+        near = resolve_near(settings, g.means, [viewpoint.camera]).near_plane / max(float(forward @ d), 1e-9)
         offset = origin - g.means.double()
         axes = g.scales.double()
         p, v = (

@@ -208,7 +208,7 @@ def weights(model: Primitives, look: Viewpoint, x: float, y: float) -> torch.Ten
     for value in model.params.values():
         value.requires_grad_()
     output = render(model, one, look.conditions, SETTINGS)
-    tally = output.watch(torch.ones(1, 1))
+    tally = output.request_contributions(torch.ones(1, 1))
     output.rgb.sum().backward()
     return tally.of_all(model.count)[0].detach()
 

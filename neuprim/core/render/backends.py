@@ -162,12 +162,7 @@ TABLE: tuple[Backend, ...] = (
         slabs=_loader("cuda", "render_slabs"),
     ),
     Backend(
-        "cpu",
-        _loader("cpu"),
-        unsupported_by_kernels,
-        compiles=True,
-        checks=True,
-        slabs=_loader("cpu", "render_slabs"),
+        "cpu", _loader("cpu"), unsupported_by_kernels, compiles=True, checks=True, slabs=_loader("cpu", "render_slabs")
     ),
     Backend(REFERENCE, _loader("reference"), differentiates_intrinsics=True),
 )

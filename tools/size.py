@@ -12,7 +12,7 @@ from pathlib import Path
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 PACKAGE = CHECKOUT / "neuprim"
-KERNEL_DECORATORS = ("njit", "jit", "kernel", "func", "overload", "vectorize")
+KERNEL_DECORATORS = ("njit", "jit", "kernel", "inline", "strict", "func", "overload", "vectorize")
 MAX_PARAMETERS = 8
 
 

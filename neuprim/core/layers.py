@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.exr import channel_name_error
-from neuprim.core.render.layers import LayerFrame
+from neuprim.core.render.layer_frame import LayerFrame
 
 __all__ = ["COMMON", "LIGHTS", "LayerFrame", "LayerSpec", "chosen_layers", "layer_fault"]
 
@@ -25,7 +25,7 @@ class LayerSpec:
     Attributes:
         name: what the user types after ``--layers``, and the prefix of its channels in the file: letters, digits and _.
         summary: one line that says what a value is and in which unit; it is written into the file, too.
-        draw: :class:`~neuprim.core.render.layers.LayerFrame` -> (H, W, C) finite values; (H, W) where there is one
+        draw: :class:`~neuprim.core.render.layer_frame.LayerFrame` -> (H, W, C) finite values; (H, W) where there is one
         channel. None where the frame's
             model has no such thing.
         channels: their names; empty: light, with the channels of the task's images, over black, that is premultiplied

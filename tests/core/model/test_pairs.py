@@ -117,9 +117,8 @@ def test_code_that_returns_something_else_is_named() -> None:
 
 KERNELS = {
     "core/render/backends.py",
-    "core/render/cpu/backend.py",
-    "core/render/cuda/backend.py",
-    "core/render/marched.py",
+    "core/render/quadrature.py",
+    "core/render/rasterize.py",
     "core/volumes/grid.py",
     "core/volumes/points.py",
 }

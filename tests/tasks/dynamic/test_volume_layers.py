@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.layers import LayerFrame
+from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.tasks.dynamic import TASK
 from tests import scenes
 from tests.chords import chords

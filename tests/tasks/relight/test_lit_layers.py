@@ -9,7 +9,7 @@ from torch import Tensor
 from neuprim.core.model.fields import RayNet
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.draw import unproject_depth
-from neuprim.core.render.layers import LayerFrame
+from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.relight.harmonics import LightHarmonics

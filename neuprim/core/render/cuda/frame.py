@@ -143,46 +143,26 @@ def prepare_frame(
     rows, spans, boxes = empty(N, L.columns(K, C), 4), empty(N, SPAN_WIDTH), empty(N, 4, dtype=torch.int32)
     depth, status, counts = empty(N, dtype=torch.float64), empty(N, dtype=torch.uint8), empty(2, N, dtype=torch.int32)
     bad = torch.full((1,), N, dtype=torch.int32, device=device)
-    inputs, world = as_arrays(parameters), array(matrix, wp.float64)
-    launch(
-        prepare_kernel(double),
-        N,
-        (
-            *inputs,
-            array(palette.detach().float().contiguous(), wp.float32),
-            None if forced is None else array(forced.contiguous(), wp.bool),
-            world,
-            projection.intrinsics,
-            camera.width,
-            camera.height,
-            projection.near,
-            projection.turns,
-            request.edge,
-            min_visible_depth(settings.alpha_min),
-            K,
-            C,
-            array(rows, wp.vec4),
-            array(spans.view(N, 2, 4), wp.vec4),
-            array(boxes, wp.vec4i),
-            array(depth, wp.float64),
-            array(status, wp.uint8),
-            array(counts, wp.int32),
-            array(bad, wp.int32),
-        ),
-        device,
-        PER_BLOCK,
+    inputs, colours = as_arrays(parameters), array(palette.detach().float().contiguous(), wp.float32)
+    view = (array(matrix, wp.float64), projection.intrinsics)
+    least = min_visible_depth(settings.alpha_min)
+    size = (camera.width, camera.height, projection.near, projection.turns, request.edge, least, K, C)
+    filled = (
+        array(rows, wp.vec4),
+        array(spans.view(N, 2, 4), wp.vec4),
+        array(boxes, wp.vec4i),
+        array(depth, wp.float64),
+        array(status, wp.uint8),
+        array(counts, wp.int32),
+        array(bad, wp.int32),
     )
+    asked = None if forced is None else array(forced.contiguous(), wp.bool)
+    launch(prepare_kernel(double), N, (*inputs, colours, asked, *view, *size, *filled), device, PER_BLOCK)
     counted = count_tiles(counts, bad)
     if counted.bad >= 0:
         raise NotFinite(counted.bad)
     lists, slots, which = bin_primitives(rows, spans, boxes, depth, counts, counted, camera, images)
     wide = empty(counted.in_float64, L.wide_width(K), dtype=torch.float64)
-    view = (world, projection.intrinsics, projection.near, projection.turns)
-    launch(
-        wide_kernel(double),
-        counted.in_float64,
-        (array(which, wp.int32), *inputs, *view, K, array(wide, wp.float64)),
-        device,
-        PER_BLOCK,
-    )
+    wanted = (array(which, wp.int32), *inputs, *view, projection.near, projection.turns, K, array(wide, wp.float64))
+    launch(wide_kernel(double), counted.in_float64, wanted, device, PER_BLOCK)
     return Frame(projection, parameters, rows, wide, slots, which, spans, boxes, depth, status, lists)

@@ -210,52 +210,18 @@ def forward(
     keys, owners = empty(total if sorts else 0, dtype=torch.int64), empty(total if sorts else 0, dtype=torch.int32)
     drawn = Composited(rgb, T, z, spans, offsets, hits, depths, hues, reached, in_float64)
     image, slots = (_numbers(rgb), _numbers(T), _numbers(z)), (array(hits, wp.vec2), _numbers(depths), _numbers(hues))
-    launch(
-        forward_kernel(form, keep, settings.depth, sorts, images > 1),
-        (tiles, L.PIXELS),
-        (
-            a.rows,
-            a.units,
-            a.starts,
-            a.ids,
-            a.spans,
-            a.offsets,
-            a.lens,
-            a.limits,
-            _numbers(background),
-            a.size,
-            *image,
-            *slots,
-            _numbers(reached),
-            _numbers(keys),
-            _numbers(owners),
-        ),
-        device,
-        L.PIXELS,
-    )
+    tile = (a.rows, a.units, a.starts, a.ids, a.spans, a.offsets, a.lens, a.limits, _numbers(background), a.size)
+    listed = (_numbers(keys), _numbers(owners))
+    kernel = forward_kernel(form, keep, settings.depth, sorts, images > 1)
+    launch(kernel, (tiles, L.PIXELS), (*tile, *image, *slots, _numbers(reached), *listed), device, L.PIXELS)
     if not sorts:
         return drawn
     keys, order = torch.sort(keys, stable=True)
     begins = torch.empty(pixels + 1, dtype=torch.int32, device=device)
     begins[pixels] = torch.searchsorted(keys, pixels << 32)
-    launch(
-        composite_kernel(form, settings.depth),
-        pixels,
-        (
-            a.rows,
-            a.ids,
-            _numbers(keys),
-            _numbers(order),
-            total,
-            _numbers(owners),
-            a.limits,
-            _numbers(background),
-            *reversed(slots),
-            *image,
-            _numbers(begins),
-        ),
-        device,
-    )
+    sorted_hits = (a.rows, a.ids, _numbers(keys), _numbers(order), total, _numbers(owners), a.limits)
+    written = (*reversed(slots), *image, _numbers(begins))
+    launch(composite_kernel(form, settings.depth), pixels, (*sorted_hits, _numbers(background), *written), device)
     drawn.order, drawn.begins, drawn.owners = order, begins, owners
     return drawn
 
@@ -273,29 +239,9 @@ def backward(
     hits, reached, T = array(drawn.hits, wp.vec2), _numbers(drawn.reached), _numbers(drawn.transmittance)
     depths, hues, floor = _numbers(drawn.depths), _numbers(drawn.hues), settings.depth_floor
     if drawn.order is None or drawn.begins is None or drawn.owners is None:
-        launch(
-            pixels_kernel(form, depth),
-            (tiles, L.PIXELS),
-            (
-                a.rows,
-                a.starts,
-                a.ids,
-                a.spans,
-                a.offsets,
-                a.limits,
-                a.size,
-                T,
-                reached,
-                g_rgb,
-                g_T,
-                g_z,
-                depths,
-                hues,
-                hits,
-            ),
-            device,
-            L.PIXELS,
-        )
+        tile = (a.rows, a.starts, a.ids, a.spans, a.offsets, a.limits, a.size)
+        images = (T, reached, g_rgb, g_T, g_z, depths, hues, hits)
+        launch(pixels_kernel(form, depth), (tiles, L.PIXELS), (*tile, *images), device, L.PIXELS)
     else:
         sorted_hits = (_numbers(drawn.order), _numbers(drawn.begins), _numbers(drawn.owners))
         launch(

@@ -1,5 +1,4 @@
-"""How often the processor would wait for a card in a frame: whatever makes a number of Python's, or a shape, of a
-tensor."""
+"""How often the CPU waits for a GPU in a frame: whatever makes a Python number, or a shape, of a tensor."""
 
 from __future__ import annotations
 
@@ -14,7 +13,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
-from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.cuda import backend
 from neuprim.core.render.cuda.backend import render, render_slabs
@@ -44,58 +42,29 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
         yield waits
 
 
-def scene(hidden: int | None = None, distance: float = 2.0) -> tuple[Lowered, Any]:
-    """Without primitives in float64, but for cameras near them."""
-    t = scenes.tensors(60, 0, seed=5, **({} if hidden is None else {"hidden": hidden}))
-    return scenes.lowered(t), scenes.camera(32, 32, distance=distance)
-
-
-def test_a_frame_without_gradients_waits_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    low, camera = scene()
-    with torch.no_grad(), counted(monkeypatch) as waits:
-        output = render(low, camera, None, SETTINGS)
-    assert output.stats.extra["float64"] == 0 and len(waits) == 1, waits
-
-
-def test_one_with_gradients_twice_and_its_backward_pass_never(monkeypatch: pytest.MonkeyPatch) -> None:
-    low, camera = scene()
-    low.geometry.means.requires_grad_()
-    with counted(monkeypatch) as waits:
-        output = render(low, camera, None, SETTINGS)
-        assert len(waits) == 2, waits
-        output.rgb.sum().backward()
-        assert len(waits) == 2, waits
-    assert low.geometry.means.grad is not None and bool(low.geometry.means.grad.any())
-
-
-def test_primitives_in_float64_and_colour_networks_add_one_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    low, camera = scene(distance=0.15)
-    with torch.no_grad(), counted(monkeypatch) as waits:
-        output = render(low, camera, None, SETTINGS)
-    assert output.stats.extra["float64"] > 0 and len(waits) == 2, waits
-    low, camera = scene(hidden=3)
-    with torch.no_grad(), counted(monkeypatch) as waits:
-        render(low, camera, None, SETTINGS)
-    assert len(waits) == 2, waits
-
-
-def test_parts_in_one_frame_wait_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    low, camera = scene()
-    parts = torch.arange(60) % 4
-    with torch.no_grad(), counted(monkeypatch) as waits:
-        render_slabs(low, parts, 4, camera, SETTINGS)
-    assert len(waits) == 1, waits
-
-
-def test_a_wait_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    low, camera = scene()
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("plain", 1), ("float64", 2), ("network", 2), ("gradients", 2), ("slabs", 1), ("reads", 3)]
+)
+def test_a_frame_waits_this_often(kind: str, expected: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The backward pass never does. "reads" has two more of the test's own, to show that they are counted."""
+    t = scenes.tensors(60, 0, seed=5, **({"hidden": 3} if kind == "network" else {}))
+    low, camera = scenes.lowered(t), scenes.camera(32, 32, distance=0.15 if kind == "float64" else 2.0)
+    low.geometry.means.requires_grad_(kind == "gradients")
     genuine = backend.forward
 
-    def waiting(frame: Any, *rest: Any) -> Any:
+    def reading(frame: Any, *rest: Any) -> Any:
         assert float(frame.rows.sum()) != 0.5 and len(frame.rows[frame.rows > 0]) > 0
         return genuine(frame, *rest)
 
-    monkeypatch.setattr(backend, "forward", waiting)
-    with torch.no_grad(), counted(monkeypatch) as waits:
-        render(low, camera, None, SETTINGS)
-    assert len(waits) == 3, waits
+    if kind == "reads":
+        monkeypatch.setattr(backend, "forward", reading)
+    with torch.set_grad_enabled(kind == "gradients"), counted(monkeypatch) as waits:
+        if kind == "slabs":
+            render_slabs(low, torch.arange(60) % 4, 4, camera, SETTINGS)
+        else:
+            output = render(low, camera, None, SETTINGS)
+            assert (output.stats.extra["float64"] > 0) == (kind == "float64")
+        if kind == "gradients":
+            output.rgb.sum().backward()
+            assert bool(low.geometry.means.grad.any())  # type: ignore[union-attr]
+    assert len(waits) == expected, waits

@@ -7,7 +7,6 @@ import torch
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.projections import RayCamera
-from neuprim.core.errors import ConfigError
 from neuprim.core.render.near_plane import nearest_and_median_depth, resolve_near, scene_extent
 from neuprim.core.settings import RenderSettings
 
@@ -39,10 +38,8 @@ def test_what_is_near_is_not_cut() -> None:
     assert resolve_near(AUTO, behind, cameras(4.0)).near_plane == pytest.approx(typical / 400, rel=0.1)
 
 
-def test_a_number_wins_and_auto_is_no_number() -> None:
+def test_a_number_wins_and_there_is_always_a_plane() -> None:
     assert resolve_near(RenderSettings(near=0.3), points(1.0), cameras(4.0)).near_plane == 0.3
-    with pytest.raises(ConfigError, match=r"renderer\.near=auto: nothing has decided it"):
-        _ = AUTO.near_plane
     assert resolve_near(AUTO, points(1.0)[:0], cameras(4.0)).near_plane > 0
     fisheye = RayCamera.fisheye(8, 8, cameras(4.0)[0].viewmat)
     assert resolve_near(AUTO, points(1.0), [fisheye]).near_plane == pytest.approx(0.01, rel=0.1)

@@ -66,5 +66,5 @@ def test_a_frame_waits_this_often(kind: str, expected: int, monkeypatch: pytest.
             assert (output.stats.extra["float64"] > 0) == (kind == "float64")
         if kind == "gradients":
             output.rgb.sum().backward()
-            assert bool(low.geometry.means.grad.any())  # type: ignore[union-attr]
     assert len(waits) == expected, waits
+    assert kind != "gradients" or bool(low.geometry.means.grad.any())  # type: ignore[union-attr]

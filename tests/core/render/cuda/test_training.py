@@ -19,7 +19,7 @@ from tests.short_runs import words
 
 SMALL = ["model.primitives=80", "model.neurons=2", "train.max_seconds=null", "train.iterations=12"]
 SCENES = {
-    "dynamic": "scene=smoke_fire scene.size=16 scene.cameras=2 scene.timesteps=2 scene.resolution=12",
+    "dynamic": "scene=smoke_fire scene.size=16 scene.cameras=4 scene.timesteps=2 scene.resolution=16",
     "relight": "scene=lit_solids scene.size=24 scene.train_views=3 scene.test_views=1 scene.supersampling=1 "
     "model.colour.hidden=3",
 }

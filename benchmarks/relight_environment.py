@@ -35,8 +35,7 @@ from neuprim.core.io.images import write_png
 from neuprim.core.metrics import psnr
 from neuprim.runs.measure import draw_sum
 from neuprim.runs.open import load_dataset, load_run
-from neuprim.scenes.lit.generate import INTENSITY, picture
-from neuprim.scenes.lit.scene import solids
+from neuprim.scenes.lit import INTENSITY, build_lit_solids, draw_lit_solids
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight.environment import illuminate
 
@@ -81,7 +80,7 @@ def truth(scene: Scene, camera: Camera, lights: list[dict[str, Tensor]], supersa
     )
     total = np.zeros((camera.height, camera.width, 3))
     for light in lights:
-        shot = picture(scene, pose.numpy(), light["light"].double().numpy(), camera.width, supersampling)
+        shot = draw_lit_solids(scene, pose.numpy(), light["light"].double().numpy(), camera.width, supersampling)
         total += shot.rgba[..., :3].astype(np.float64) * (light["light_intensity"].double().numpy() / INTENSITY)
     return torch.from_numpy(total)
 
@@ -99,7 +98,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     config, task, model, header = load_run(args.run_dir)
-    facts, dataset, scene = header["data"], load_dataset(config, task), Scene(solids())
+    facts, dataset, scene = header["data"], load_dataset(config, task), Scene(build_lit_solids())
     far = {**facts, "lights": {**facts["lights"], "distance": DISTANT}}
     step = max(len(dataset.test) // args.views, 1)
     views = [dataset.test.view(i) for i in range(0, len(dataset.test), step)][: args.views]

@@ -64,7 +64,7 @@ def check_dataset(t: Subject) -> None:
     try:
         data_check.check_dataset(data, t.task.conditions)
         data_check.check_points(data.initial_points(8, torch.Generator().manual_seed(1)), 8, data)
-    except data_check.DatasetFault as error:
+    except data_check.DatasetError as error:
         t.require(False, "example", str(error), "what a run checks before it starts")
     a, b = (data.initial_points(8, torch.Generator().manual_seed(1)) for _ in range(2))
     t.require(1 <= len(a.means) <= 8, "example: initial_points(8)", f"{len(a.means)} points", "1 to 8")

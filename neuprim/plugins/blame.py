@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from neuprim.core.data.dataset_check import DatasetFault
+from neuprim.core.data.dataset_check import DatasetError
 from neuprim.core.errors import DISK, DataError, NeuprimError
 from neuprim.plugins import crashes
 from neuprim.plugins.judging import TaskFault
@@ -173,7 +173,7 @@ class Suspects:
         """Around neuprim's own code that calls plugins here and there: whose code a crash is in is read off the
         traceback.
 
-        A :class:`~neuprim.core.data.dataset_check.DatasetFault` becomes a DataError that names the scene's package, and a
+        A :class:`~neuprim.core.data.dataset_check.DatasetError` becomes a DataError that names the scene's package, and a
         :class:`~neuprim.plugins.judging.TaskFault` a PluginError that names the task's.
         """
         return _Watch(self, folder)
@@ -186,7 +186,7 @@ class _Watch(_Guard):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if isinstance(error, DatasetFault):
+        if isinstance(error, DatasetError):
             raise DataError(f"{self.suspects.scene.who}: {error}") from error
         if isinstance(error, TaskFault):
             raise PluginError(f"{self.suspects.task.who}: {error}") from error

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from neuprim.core.data import Clip, Dataset, View
-from neuprim.core.data.dataset_check import DatasetFault, check_mask
+from neuprim.core.data.dataset_check import DatasetError, check_mask
 from neuprim.core.errors import NeuprimError
 from neuprim.core.layers import LayerFrame, LayerSpec
 from neuprim.core.model.primitives import Primitives
@@ -38,7 +38,7 @@ def mask_of(task: TaskSpec, dataset: Dataset, index: int) -> Tensor | None:
     if found is not None:
         try:
             check_mask("test", dataset.test.view(index), found)
-        except DatasetFault as error:
+        except DatasetError as error:
             raise TaskFault(str(error)) from None
     return found
 

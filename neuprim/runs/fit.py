@@ -13,7 +13,7 @@ import torch
 from neuprim.config import RunConfig, made_now, suspects_of, task_of
 from neuprim.core.channels import Channels, channels_of
 from neuprim.core.data import Dataset
-from neuprim.core.data.dataset import held_out
+from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.primitives import Primitives
@@ -162,7 +162,7 @@ def start(
     if channels.partial:
         events(Note(f"shown: {channels.shown}; task {task.name!r} has no display that shows them all"))
     if hold_out:
-        dataset = held_out(dataset, hold_out)
+        dataset = hold_out_views(dataset, hold_out)
     if make is not None:
         trainer = make(config, task, dataset, loss)
         return Fitted(_as_drawn(config, trainer), task, dataset, channels, trainer, lpips)
@@ -190,13 +190,13 @@ def steps(trainer: Trainer, events: Events = silent) -> Iterator[tuple[StepRepor
     next_eval = next_evaluation(trainer)
     for report in trainer.run():
         events(Step(report, trainer.progress))
-        held_out = None
+        hold_out_views = None
         if trainer.progress >= next_eval:
             if trainer.ranks.first or trainer.ranks.parts:  # a view is drawn with the primitives of all
-                held_out = curve_psnr(trainer)
-                events(Evaluated(held_out))
+                hold_out_views = curve_psnr(trainer)
+                events(Evaluated(hold_out_views))
             next_eval = next_evaluation(trainer)
-        yield report, held_out
+        yield report, hold_out_views
     asked = trainer.settings.population.grow_to or 0
     if trainer.settings.population.strategy == "relocate" and trainer.count < asked:
         events(

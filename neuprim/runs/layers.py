@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.pinhole import exr_attributes
+from neuprim.core.cameras.pinhole import camera_exr_attributes
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
 from neuprim.core.data import View
@@ -191,7 +191,7 @@ class Layers:
         linear = self.channels.color_space == "linear"
         near = resolve_near(self.point.settings, model.params["means"], [view.camera]).near_plane
         found = {
-            **exr_attributes(self.world.world_camera(view.camera), near / self.world.scale),
+            **camera_exr_attributes(self.world.world_camera(view.camera), near / self.world.scale),
             "software": f"neuprim {__version__}",
             "neuprim:run": self.run_dir.resolve().name,
             "neuprim:task": self.task.name,

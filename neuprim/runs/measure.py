@@ -28,7 +28,7 @@ from neuprim.core.channels import Channels, channels_of
 from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.dataset_check import check_dataset, check_pixels
-from neuprim.core.data.ray_points import NOT_SEEN
+from neuprim.core.data.ray_points import GIVE_POINTS
 from neuprim.core.io import images
 from neuprim.core.metrics import means, psnr, psnr_gain, ssim, ssim_3dgs, to_json
 from neuprim.core.metrics.lpips import Lpips
@@ -149,7 +149,7 @@ def measure(
     if all(view.empty for view in result):
         warn_once(
             f"{dataset.name}: the model is in none of {len(result)} test views, which show the background alone; expected starting points where "
-            f"the cameras look: {NOT_SEEN}"
+            f"the cameras look: {GIVE_POINTS}"
         )
     return result
 

@@ -66,7 +66,7 @@ def train(
         suspects: of the configuration, who is watched for crashes around this call.
         dataset: the scene of the configuration, if it is loaded already.
         hold_out: n > 1: every n-th training view is a test view, and no other is; see
-        :func:`~neuprim.core.data.dataset.held_out`. between: called between steps, see :data:`Between`.
+        :func:`~neuprim.core.data.dataset.hold_out_views`. between: called between steps, see :data:`Between`.
         make: what makes the trainer of a model that is there already; None: a fresh model is trained.
 
     Returns:

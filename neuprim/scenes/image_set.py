@@ -1,24 +1,140 @@
-"""Images of a built-in scene as a data set on disk: what is the same whatever is seen, and by which light.
-
-    transforms_SPLIT.json     the lens, and for every image its pose and whatever else a loader needs
-    SPLIT/...                 one or more files per image
-
-How a view looks, and what its files are called, is the scene's own.
-"""
+"""Image sets on disk: settings, camera poses, pixel rays, and writing them once into the cache."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
 
-from neuprim.scenes.cached import cached_folder
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neuprim.core.cameras import look_at
+from neuprim.core.errors import DataError
+from neuprim.core.io.files import publish_folder
+from neuprim.core.validation import Range
 from neuprim.scenes.raycast import Scene
-from neuprim.scenes.side_by_side import side_by_side
 
-__all__ = ["ImageSet", "Progress"]
+__all__ = [
+    "ImageSet",
+    "ImageSize",
+    "Progress",
+    "Supersampling",
+    "THREADS",
+    "ray_bands",
+    "write_cached_folder",
+    "camera_pose",
+    "unit_direction",
+    "average_rays",
+    "hash_settings",
+    "draw_in_parallel",
+]
+
+ImageSize = Annotated[int, Range(8, 4096)]
+"""Width and height in pixels."""
+
+Supersampling = Annotated[int, Range(1, 16)]
+"""Rays per pixel along each axis."""
+
+
+def hash_settings(settings: Any, version: int) -> str:
+    """A short hash of every field of a settings dataclass and the generator's version."""
+    text = json.dumps({"version": version, **asdict(settings)}, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def unit_direction(cosine: float, azimuth: float) -> NDArray[np.float64]:
+    """(3,) unit vector at this cosine of the angle from the zenith, ``azimuth`` radians from x towards y."""
+    across = math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    return np.array([across * math.cos(azimuth), across * math.sin(azimuth), cosine])
+
+
+def camera_pose(eye: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) camera-to-world matrix, OpenGL axes, of a camera at ``eye`` (3,) that looks at the origin, z up."""
+    view = look_at(torch.from_numpy(np.asarray(eye, dtype=np.float64)), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    return torch.linalg.inv(view).numpy() @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+RAYS_AT_ONCE = 1 << 15
+"""Small enough for the arrays to stay in the processor's cache."""
+
+
+def ray_bands(
+    pose: NDArray[np.float64], field_of_view: float, size: int, samples: int
+) -> Iterator[NDArray[np.float64]]:
+    """(N, 3) unit directions in the scene, whole rows of pixels at a time from the top, row by row of rays.
+
+    Args:
+        pose: (4, 4) camera to world, OpenGL axes.
+        field_of_view: radians, along both axes.
+        size: width and height in pixels.
+        samples: rays per pixel along each axis, through the middles of its cells.
+    """
+    fine = size * samples
+    plane = ((np.arange(fine) + 0.5) / fine * 2 - 1) * math.tan(field_of_view / 2)  # at distance 1
+    rows = max(1, RAYS_AT_ONCE // (fine * samples)) * samples
+    for top in range(0, fine, rows):
+        x, y = np.meshgrid(plane, -plane[top : top + rows])
+        local = np.stack([x, y, -np.ones_like(x)], axis=-1).reshape(-1, 3)
+        local /= np.sqrt(np.einsum("nc,nc->n", local, local))[:, None]
+        yield local @ pose[:3, :3].T
+
+
+def average_rays(values: NDArray[np.float32], size: int, samples: int) -> NDArray[np.float32]:
+    """(rows, size, C) means over the rays of each pixel, of the (N, C) values of one of :func:`ray_bands`."""
+    channels = values.shape[1]
+    rows = len(values) // (size * samples * samples)
+    across = values.reshape(rows, samples, size, samples * channels).mean(axis=1)
+    return across.reshape(rows, size, samples, channels).mean(axis=2)
+
+
+T = TypeVar("T")
+
+THREADS = 4
+"""At most; images in work at once need memory."""
+
+
+def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: Callable[[float], None]) -> None:
+    """Do the work for every job; ``progress`` is told the fraction done after each, in their order.
+
+    What a piece of work or ``progress`` raises ends it all, once the pieces already begun are done.
+    """
+    pool = ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1))
+    try:
+        for done, _ in enumerate(pool.map(work, jobs), start=1):
+            progress(done / len(jobs))
+    finally:
+        pool.shutdown(cancel_futures=True)  # on an interrupt, wait for the running ones only
+
+
+def write_cached_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
+    """Have ``write`` fill the folder ``final`` unless all files are there; returns it.
+
+    The folder appears under its name only when complete, so an interrupted run leaves nothing that could be taken for a
+    data set.
+
+    Args:
+        files: every file that belongs there, relative to the folder.
+        write: fills the empty folder that it is given; with equal files, whoever calls it.
+        what: for messages, e.g. ``"scene solids: cannot write the generated images"``.
+
+    Raises:
+        DataError: the cache directory cannot be written.
+    """
+    names = tuple(files)
+    try:
+        publish_folder(final, write, lambda folder: all((folder / name).is_file() for name in names))
+    except OSError as error:
+        raise DataError(f"{what} to {final}: {error}") from error
+    return final
+
 
 V = TypeVar("V")
 Progress = Callable[[str, float], None]
@@ -63,7 +179,7 @@ class ImageSet(Generic[V]):
             f"{split}/{file}" for split, views in self.splits.items() for view in views for file in self.files(view)
         ]
         what = f"scene {self.name}: cannot write the generated images"
-        return cached_folder(
+        return write_cached_folder(
             Path(cache_dir) / f"{self.name}-{self.key}", files, lambda folder: self._write(folder, progress), what
         )
 
@@ -83,4 +199,4 @@ class ImageSet(Generic[V]):
             self.draw(scene, view, [place / file for file in self.files(view)])
 
         jobs = [(folder / split, view) for split, views in self.splits.items() for view in views]
-        side_by_side(draw, jobs, lambda fraction: progress(text, fraction))
+        draw_in_parallel(draw, jobs, lambda fraction: progress(text, fraction))

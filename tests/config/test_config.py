@@ -490,6 +490,6 @@ def test_static_loaders_know_every_key_of_their_yaml(tmp_path: Path, scene: str)
 
 
 def test_solids_knows_every_key_of_its_yaml(tmp_path: Path) -> None:
-    from neuprim.scenes.solids.generate import SolidsSettings
+    from neuprim.scenes.solids import SolidsSettings
 
     assert validate(SolidsSettings, compose([f"output_dir='{tmp_path}/out'"]).scene) == SolidsSettings()

@@ -485,10 +485,10 @@ def _read_checkpoint(folder: Path) -> None:
 _DATASETS = "neuprim.tasks.static.datasets"
 
 
-def _lazy(module: str, **settings: Any) -> Callable[[Path], None]:
+def _lazy(module: str, function: str = "load", **settings: Any) -> Callable[[Path], None]:
     import importlib
 
-    return lambda folder: _loaded(importlib.import_module(module).load, **settings)(folder)
+    return lambda folder: _loaded(getattr(importlib.import_module(module), function), **settings)(folder)
 
 
 _RECORDS: Files = {
@@ -501,19 +501,19 @@ _RECORDS: Files = {
 _SPLITS: Files = {"transforms_train.json": m.json_of, "transforms_test.json": m.json_of}
 
 FORMATS: dict[str, Format] = {
-    "blender": Format(_blender, _lazy(f"{_DATASETS}.blender"), _SPLITS),
+    "blender": Format(_blender, _lazy(_DATASETS, "load_blender"), _SPLITS),
     "nerfstudio": Format(
         _nerfstudio,
-        _lazy(f"{_DATASETS}.nerfstudio"),
+        _lazy(_DATASETS, "load_nerfstudio"),
         {"transforms.json": m.json_of, "points.ply": m.text_of, "mask.png": m.png},
     ),
     "multiview": Format(_multiview, _lazy("neuprim.tasks.dynamic.multiview"), _SPLITS, slow=True),
     "olat": Format(_olat, _lazy("neuprim.tasks.relight.olat"), _SPLITS),
     "colmap": Format(
-        _colmap(False), _lazy(f"{_DATASETS}.colmap"), {f"sparse/0/{part}.bin": m.lies(0, 400) for part in _PARTS}
+        _colmap(False), _lazy(_DATASETS, "load_colmap"), {f"sparse/0/{part}.bin": m.lies(0, 400) for part in _PARTS}
     ),
     "colmap-text": Format(
-        _colmap(True), _lazy(f"{_DATASETS}.colmap"), {f"sparse/0/{part}.txt": m.text_of for part in _PARTS}
+        _colmap(True), _lazy(_DATASETS, "load_colmap"), {f"sparse/0/{part}.txt": m.text_of for part in _PARTS}
     ),
     "points": Format(_points, _read_points, {"points.ply": m.text_of, "text.ply": m.text_of}),
     "gaussians": Format(_gaussians, _read_points, {"points.ply": m.text_of}),

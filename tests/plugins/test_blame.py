@@ -482,9 +482,9 @@ def test_suspects() -> None:
     assert {p.origin.distribution for p in (suspects.task, suspects.scene, suspects.loss)} == {"neuprim"}
     assert origin_of(TASKS, "nobody", "some.module").origin == "some"
     with pytest.raises(DataError, match=r"^scene 'solids' of neuprim \S+: view x: wrong$"), suspects.watch():
-        from neuprim.core.data.dataset_check import DatasetFault
+        from neuprim.core.data.dataset_check import DatasetError
 
-        raise DatasetFault("view x: wrong")
+        raise DatasetError("view x: wrong")
     with pytest.raises(ValueError, match=r"^ours$"), suspects.watch():
         _raises(ValueError("ours"))
 

@@ -12,16 +12,16 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from neuprim.core.errors import DataError
-from neuprim.scenes.cached import cached_folder
-from neuprim.scenes.image_set import ImageSet
-from neuprim.scenes.lit.generate import LitSettings
-from neuprim.scenes.poses import camera_to_world, direction
-from neuprim.scenes.side_by_side import THREADS, side_by_side
-from neuprim.scenes.solids.generate import SolidsSettings
+from neuprim.scenes.image_set import (
+    ImageSet,
+    draw_in_parallel,
+    write_cached_folder,
+)
+from neuprim.scenes.lit import LitSettings
+from neuprim.scenes.solids import SolidsSettings
 
 
 def quiet(text: str, fraction: float) -> None:
@@ -86,14 +86,6 @@ def test_what_is_complete_is_not_drawn_again_and_what_is_not_is(tmp_path: Path) 
     assert os.listdir(tmp_path) == ["numbers-abc"]
 
 
-@pytest.mark.parametrize(("engine", "more"), [("embree", ""), ("bvh", " (without embreex, which would be faster)")])
-def test_what_is_said_meanwhile(engine: str, more: str, tmp_path: Path) -> None:
-    said: list[tuple[str, float]] = []
-    numbers(engine).generate(tmp_path, lambda text, fraction: said.append((text, fraction)))
-    assert said[0] == ("numbers: building the scene", 0.0)
-    assert said[1:] == [(f"numbers: drawing 7x7 images{more}", (i + 1) / 4) for i in range(4)]
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
 def test_what_ends_early_leaves_nothing(error: type[BaseException], tmp_path: Path) -> None:
     def draw(scene: Any, view: int, paths: Sequence[Path]) -> None:
@@ -111,7 +103,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"^scene numbers: cannot write the generated images to .*numbers-abc: "):
         numbers().generate(tmp_path / "file", quiet)
     with pytest.raises(DataError, match=r"^sand to .*heap: "):
-        cached_folder(tmp_path / "file" / "heap", ["a"], lambda folder: None, "sand")
+        write_cached_folder(tmp_path / "file" / "heap", ["a"], lambda folder: None, "sand")
 
 
 def test_names_in_caches_that_exist_stay() -> None:
@@ -121,18 +113,6 @@ def test_names_in_caches_that_exist_stay() -> None:
 
 
 # ---------------------------------------------------------------- threads
-
-
-def test_pieces_run_side_by_side_and_are_counted_in_order() -> None:
-    together = threading.Barrier(2)
-    fractions: list[float] = []
-
-    def work(job: int) -> None:
-        if (os.cpu_count() or 1) > 1:
-            together.wait(20)  # breaks unless another one runs meanwhile
-
-    side_by_side(work, range(4), fractions.append)
-    assert fractions == [0.25, 0.5, 0.75, 1.0] and THREADS > 1
 
 
 def test_a_failure_cancels_what_has_not_begun() -> None:
@@ -145,27 +125,8 @@ def test_a_failure_cancels_what_has_not_begun() -> None:
         done.append(job)
 
     with pytest.raises(ValueError, match="first"):
-        side_by_side(work, range(200), lambda fraction: None)
+        draw_in_parallel(work, range(200), lambda fraction: None)
     assert len(done) < 100
 
 
 # ---------------------------------------------------------------- poses
-
-
-@pytest.mark.parametrize("eye", [(3.0, 0.0, 0.0), (1.0, -2.0, 0.5), (0.0, 0.0, 4.0), (0.0, 0.0, -4.0)])
-def test_a_camera_looks_at_the_origin_with_z_up(eye: tuple[float, float, float]) -> None:
-    pose = camera_to_world(np.array(eye))
-    right, up, back = pose[:3, :3].T
-    np.testing.assert_allclose(pose[:3, 3], eye, atol=1e-12)
-    np.testing.assert_allclose(back, np.array(eye) / np.linalg.norm(eye), atol=1e-12)
-    np.testing.assert_allclose(np.cross(right, up), back, atol=1e-12)
-    assert abs(right[2]) < 1e-12 and up[2] > -1e-12 and pose[3].tolist() == [0, 0, 0, 1]
-
-
-@pytest.mark.parametrize("cosine", [-1.0, -0.2, 0.0, 0.7, 1.0, 1.0 + 1e-15])
-def test_directions_are_unit_vectors(cosine: float) -> None:
-    for azimuth in (-1.1, 0.0, 2.0):
-        d = direction(cosine, azimuth)
-        assert d.shape == (3,) and np.linalg.norm(d) == pytest.approx(1.0) and d[2] == cosine
-        if abs(cosine) < 1:
-            assert np.arctan2(d[1], d[0]) == pytest.approx(azimuth)

@@ -13,17 +13,22 @@ import torch
 
 from neuprim.core.data import Dataset
 from neuprim.core.data.image_views import ImageViews
-from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.images import read_image
 from neuprim.core.task import SceneContext
-from neuprim.scenes.lit import CLASSES
-from neuprim.scenes.lit import generate as generator
-from neuprim.scenes.lit.generate import INTENSITY, LitSettings, camera_to_world, generate, picture
-from neuprim.scenes.lit.rig import PARTS
-from neuprim.scenes.lit.scene import RADIUS, solids
+from neuprim.scenes import PIXEL_CLASSES
+from neuprim.scenes import lit as generator
+from neuprim.scenes.image_set import camera_pose
+from neuprim.scenes.lit import (
+    INTENSITY,
+    PARTS,
+    RADIUS,
+    LitSettings,
+    build_lit_solids,
+    draw_lit_solids,
+    generate_lit_solids,
+)
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight import judging, olat
-from neuprim.tasks.relight.data import bright, lighting_of
+from neuprim.tasks.relight.data import lighting_of
 from neuprim.tasks.relight.lit_solids import classes, load
 
 SMALL = {"size": 24, "train_views": 4, "test_views": 3, "supersampling": 2}
@@ -32,7 +37,7 @@ FEW_FRAMES = 4
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return Scene(solids())
+    return Scene(build_lit_solids())
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +48,9 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def one_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Building the scene takes a second: once is enough; nor does the film need all of its frames."""
-    monkeypatch.setattr(generator, "Scene", lambda solids: scene)
-    monkeypatch.setattr(generator, "solids", list)
-    monkeypatch.setattr("neuprim.scenes.lit.rig.CIRCLE_FRAMES", FEW_FRAMES)
+    monkeypatch.setattr(generator, "Scene", lambda build_lit_solids: scene)
+    monkeypatch.setattr(generator, "build_lit_solids", list)
+    monkeypatch.setattr("neuprim.scenes.lit.CIRCLE_FRAMES", FEW_FRAMES)
     yield
 
 
@@ -53,8 +58,8 @@ def one_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def forty(cache: Path, scene: Scene) -> Dataset:
     """Enough views to mean something."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generator, "Scene", lambda solids: scene)
-        patch.setattr("neuprim.scenes.lit.rig.CIRCLE_FRAMES", FEW_FRAMES)
+        patch.setattr(generator, "Scene", lambda build_lit_solids: scene)
+        patch.setattr("neuprim.scenes.lit.CIRCLE_FRAMES", FEW_FRAMES)
         return load({"size": 48, "train_views": 40, "test_views": 12}, SceneContext(seed=0, cache_dir=cache))
 
 
@@ -70,80 +75,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_everything_is_inside_the_sphere_that_cameras_hold() -> None:
-    every = solids()
+    every = build_lit_solids()
     assert max(np.linalg.norm(s.mesh.vertices, axis=1).max() for s in every) < RADIUS
     assert len({s.name for s in every}) == len(every) and all(s.mesh.is_watertight and s.mesh.volume > 0 for s in every)
-
-
-def test_same_settings_same_bytes(tmp_path: Path, cache: Path) -> None:
-    first, second = generate(LitSettings(**SMALL), cache), generate(LitSettings(**SMALL), tmp_path)
-    assert contents(first) == contents(second)
-    assert sorted(p.name for p in (first / "train").iterdir())[:3] == [
-        "r_0000.exr",
-        "r_0000_classes.png",
-        "r_0000_unshadowed.exr",
-    ]
-
-
-def test_cache_is_reused_and_keyed_by_every_setting(cache: Path) -> None:
-    folder = generate(LitSettings(**SMALL), cache)
-    calls: list[float] = []
-    assert generate(LitSettings(**SMALL), cache, lambda text, fraction: calls.append(fraction)) == folder and not calls
-    keys = {LitSettings(**{**SMALL, name: value + 8}).key() for name, value in SMALL.items()}
-    assert len(keys | {folder.name.removeprefix("lit_solids-")}) == 5
-
-
-def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
-    def stop(text: str, fraction: float) -> None:
-        if fraction > 0.5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        generate(LitSettings(**SMALL), tmp_path, stop)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_damaged_cache_is_drawn_again(tmp_path: Path) -> None:
-    folder = generate(LitSettings(**SMALL), tmp_path)
-    complete = contents(folder)
-    (folder / "test" / "new_view_00_nearest.exr").unlink()
-    assert generate(LitSettings(**SMALL), tmp_path) == folder
-    assert contents(folder) == complete and [p.name for p in tmp_path.iterdir()] == [folder.name]
-
-
-def test_progress_runs_from_nothing_to_all(tmp_path: Path) -> None:
-    calls: list[tuple[str, float]] = []
-    generate(LitSettings(**SMALL), tmp_path, lambda text, fraction: calls.append((text, fraction)))
-    fractions = [fraction for _, fraction in calls]
-    assert (
-        fractions == sorted(fractions)
-        and fractions[0] == 0.0
-        and fractions[-1] == 1.0
-        and len(fractions) == 4 + 3 + FEW_FRAMES + 1
-    )
-    assert all(text.startswith("lit_solids: ") for text, _ in calls)
-
-
-@pytest.mark.parametrize(
-    ("settings", "text"),
-    [
-        ({"supersample": 2}, "scene.supersample: no such setting; did you mean 'scene.supersampling'"),
-        ({"size": 0}, "scene.size=0: expected a whole number from 8 to 4096"),
-        ({"train_views": True}, "scene.train_views=true: expected a whole number"),
-        ({"background": "white"}, "scene.background=white: expected black or random: nothing but the light"),
-        ({"hold_out": 1}, "scene.hold_out=1: expected 0, or a whole number of at least 2"),
-    ],
-)
-def test_impossible_settings_are_refused_before_drawing(settings: dict[str, object], text: str, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=text):
-        load(settings, SceneContext(seed=0, cache_dir=tmp_path))
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_unwritable_cache_names_the_place(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(DataError, match=r"cannot write the generated images to .*file"):
-        generate(LitSettings(**SMALL), tmp_path / "file")
 
 
 # What it reads as
@@ -152,7 +86,7 @@ def test_unwritable_cache_names_the_place(tmp_path: Path) -> None:
 
 def test_the_loader_of_the_layout_reads_the_same_pixels_and_lights(cache: Path, scene: Scene) -> None:
     context = SceneContext(seed=3, cache_dir=cache)
-    dataset, folder = load(SMALL, context), generate(LitSettings(**SMALL), cache)
+    dataset, folder = load(SMALL, context), generate_lit_solids(LitSettings(**SMALL), cache)
     plain = olat.load({"path": str(folder), "falloff": "inverse_square"}, context)
     assert len(dataset.train) == 4 and [dataset.test.view(i).name for i in range(3)] == [f"{part}_00" for part in PARTS]
     for mine, theirs in ((dataset.train, plain.train), (dataset.test, plain.test)):
@@ -163,13 +97,13 @@ def test_the_loader_of_the_layout_reads_the_same_pixels_and_lights(cache: Path, 
             assert torch.equal(mine.pixels(i).rgb, theirs.pixels(i).rgb)
     view = json.loads((folder / "transforms_train.json").read_text())["frames"][2]
     pose = np.array(view["transform_matrix"])
-    fresh = picture(scene, pose, np.array(view["pl_pos"]), 24, 2)
+    fresh = draw_lit_solids(scene, pose, np.array(view["pl_pos"]), 24, 2)
     np.testing.assert_array_equal(
         dataset.train.pixels(2).rgb.numpy(), fresh.rgba[..., :3].astype(np.float16).astype(np.float32)
     )
     assert isinstance(dataset.train, ImageViews)
     np.testing.assert_array_equal(classes(dataset.train, 2).numpy(), fresh.classes)
-    np.testing.assert_allclose(pose, camera_to_world(pose[:3, 3]), atol=1e-12)
+    np.testing.assert_allclose(pose, camera_pose(pose[:3, 3]), atol=1e-12)
 
 
 def test_the_data_set_says_what_it_is(cache: Path) -> None:
@@ -207,8 +141,8 @@ def test_held_out_training_views_are_judged_too(cache: Path) -> None:
 
 
 def test_classes_agree_with_the_images(forty: Dataset) -> None:
-    brightness: dict[str, list[torch.Tensor]] = {name: [] for name in CLASSES}
-    free_brightness: dict[str, list[torch.Tensor]] = {name: [] for name in CLASSES}
+    brightness: dict[str, list[torch.Tensor]] = {name: [] for name in PIXEL_CLASSES}
+    free_brightness: dict[str, list[torch.Tensor]] = {name: [] for name in PIXEL_CLASSES}
     for i in range(len(forty.test)):
         shown, pixels, free = (
             class_map(forty, i),
@@ -217,7 +151,7 @@ def test_classes_agree_with_the_images(forty: Dataset) -> None:
         )
         assert pixels.alpha is not None and torch.equal(shown == 0, pixels.alpha < 0.5)
         assert (pixels.rgb <= free + 1e-3).all()
-        for value, name in enumerate(CLASSES):
+        for value, name in enumerate(PIXEL_CLASSES):
             mine = shown == value
             brightness[name].append(pixels.rgb[mine].mean(-1))
             free_brightness[name].append(free[mine].mean(-1))
@@ -229,10 +163,6 @@ def test_classes_agree_with_the_images(forty: Dataset) -> None:
     assert rgb["highlight"].min() > 0.2
 
 
-def test_the_exposure_fits(forty: Dataset) -> None:
-    assert bright(forty.train, "") == pytest.approx(1.0, abs=0.15)
-
-
 def test_baselines_rank_as_they_should(forty: Dataset) -> None:
     numbers = judging.diagnose(forty, None)  # type: ignore[arg-type]  # nothing here depends on the model
     scores = {name: entry["psnr_linear_clamped"] for name, entry in numbers["baselines"].items()}
@@ -242,19 +172,9 @@ def test_baselines_rank_as_they_should(forty: Dataset) -> None:
         and scores["black"] < scores["nearest_light_of_25"] < 35
     )
     shares = numbers["class_percent"]
-    assert sum(shares.values()) == pytest.approx(100) and set(shares) == set(CLASSES[1:])
+    assert sum(shares.values()) == pytest.approx(100) and set(shares) == set(PIXEL_CLASSES[1:])
     free = numbers["baselines"]["no_cast_shadows"]
     assert free["psnr_pooled_cast_shadow"] < free["psnr_pooled_lit"] - 8
-
-
-def test_the_nearest_light_to_itself_is_perfect(cache: Path) -> None:
-    """Of at most 25 training images all lights are known, so under a seen one the baseline is the truth."""
-    dataset = load(SMALL, SceneContext(seed=0, cache_dir=cache))
-    assert dataset.test.view(0).name == "new_view_00"
-    nearest = lighting_of(dataset).baselines["nearest_light_of_25"](0)
-    assert torch.equal(nearest, dataset.test.pixels(0).rgb)
-    assert judging.judge(dataset, 0, nearest, dataset.test.pixels(0).rgb)["psnr_display"] == np.inf
-    assert judging.baselines(dataset)["nearest_light_of_25"]["psnr_display_infinite"] is True
 
 
 def test_judging_names_the_part_and_the_classes(forty: Dataset) -> None:
@@ -263,17 +183,3 @@ def test_judging_names_the_part_and_the_classes(forty: Dataset) -> None:
         found = judging.judge(forty, index, truth * 0.5, truth)
         assert f"psnr_linear_clamped_{name.rsplit('_', 1)[0]}" in found
         assert sum(v for k, v in found.items() if k.startswith("pixels_")) == truth.shape[0] * truth.shape[1]
-
-
-def test_damaged_class_map_names_the_file(tmp_path: Path) -> None:
-    dataset = load(SMALL, SceneContext(seed=0, cache_dir=tmp_path))
-    assert isinstance(dataset.test, ImageViews)
-    file = dataset.test.file(1).with_name("new_light_00_classes.png")
-    file.write_bytes(b"no png")
-    with pytest.raises(DataError, match=r"new_light_00_classes\.png"):
-        class_map(dataset, 1)
-
-
-def test_files_hold_half_floats(cache: Path) -> None:
-    folder = generate(LitSettings(**SMALL), cache)
-    assert read_image(folder / "train" / "r_0000.exr").dtype == torch.float16

@@ -7,9 +7,23 @@ from pathlib import Path
 
 from torch import Tensor
 
-from neuprim.core.cameras.colmap import is_model, posed_cameras
-from neuprim.core.cameras.intrinsics import MODELS, Target, camera_of, check_keys, is_fisheye, lens_of
-from neuprim.core.cameras.pinhole import LARGEST, MOST, RATES, Camera, CameraViews, opengl_to_viewmat
+from neuprim.core.cameras.colmap import find_colmap_model, read_colmap_cameras
+from neuprim.core.cameras.intrinsics import (
+    MODELS,
+    Target,
+    has_fisheye_lens,
+    read_camera,
+    read_lens_coefficients,
+    refuse_unsupported_keys,
+)
+from neuprim.core.cameras.pinhole import (
+    FRAME_RATES,
+    MAX_CAMERAS,
+    MAX_IMAGE_SIDE,
+    Camera,
+    CameraViews,
+    opengl_to_viewmat,
+)
 from neuprim.core.cameras.usd import is_usd, read_usd_cameras
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
@@ -38,8 +52,8 @@ def read_json_cameras(path: Path, size: tuple[int, int] | None = None) -> Camera
 
 def _listed_cameras(document: JsonReader, key: str) -> list[JsonReader]:
     records = list(document.objects(key))
-    if len(records) > MOST:
-        raise DataError(f"{document.where}: {key} has {len(records)} cameras; expected at most {MOST}")
+    if len(records) > MAX_CAMERAS:
+        raise DataError(f"{document.where}: {key} has {len(records)} cameras; expected at most {MAX_CAMERAS}")
     return records
 
 
@@ -49,8 +63,8 @@ def _stated_size(record: JsonReader, keys: tuple[str, str], size: tuple[int, int
         for key, fallback in zip(keys, size or (0, 0), strict=True)
     ]
     for key, value in zip(keys, found, strict=True):
-        if not 0 < value <= LARGEST:
-            raise DataError(f"{record.where}: {key} is {value}; expected 1 to {LARGEST} pixels")
+        if not 0 < value <= MAX_IMAGE_SIDE:
+            raise DataError(f"{record.where}: {key} is {value}; expected 1 to {MAX_IMAGE_SIDE} pixels")
     return found[0], found[1]
 
 
@@ -64,8 +78,8 @@ def _rate(document: JsonReader, count: int) -> float | None:
     for key, rate in (("fps", lambda value: value), ("seconds", lambda value: count / value)):
         if document.has(key):
             found = rate(document.number(key, "a number above 0", 0.0))
-            if not RATES[0] <= found <= RATES[1]:
-                raise document.fail(key, f"{RATES[0]:g} to {RATES[1]:g} frames per second")
+            if not FRAME_RATES[0] <= found <= FRAME_RATES[1]:
+                raise document.fail(key, f"{FRAME_RATES[0]:g} to {FRAME_RATES[1]:g} frames per second")
             return found
     return None
 
@@ -78,21 +92,21 @@ def _read_frames(document: JsonReader, size: tuple[int, int] | None) -> CameraVi
     every intrinsic."""
     records, found, bent = _listed_cameras(document, "frames"), [], 0
     notes: dict[str, None] = {}
-    check_keys(document)
+    refuse_unsupported_keys(document)
     for i, record in enumerate(records):
-        check_keys(record)
-        if is_fisheye(record, document, ()):
+        refuse_unsupported_keys(record)
+        if has_fisheye_lens(record, document, ()):
             raise DataError(
                 f"{record.where}: the camera is a fisheye (camera_model, is_fisheye); expected one of {', '.join(MODELS)}"
             )
-        bent += any(lens_of(record, document).values())
+        bent += any(read_lens_coefficients(record, document).values())
         stated = JsonReader(
             {key: r.values[key] for r in (document, record) for key in ("w", "h") if r.has(key)}, record.where
         )
         target = Target(*_stated_size(stated, ("w", "h"), size))
         own = record.has("transform_matrix") or not document.has("transform_matrix")
         view = None if own else opengl_to_viewmat(document.matrix("transform_matrix"))
-        camera = camera_of(record, document, target, view, lambda text: notes.update({text: None}))
+        camera = read_camera(record, document, target, view, lambda text: notes.update({text: None}))
         found.append((f"camera_{i:03d}", camera.validate(record.where)))
     if bent:
         notes[f"the lens distortion of {bent} of {len(found)} cameras is left out"] = None
@@ -147,12 +161,12 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
         DataError: names the file and the field that is missing or wrong.
         BackendUnavailable: the package that reads the format is missing.
     """
-    path, prim = split_prim(path)
-    model = is_model(path)
+    path, prim = split_usd_prim(path)
+    model = find_colmap_model(path)
     if model is not None:
-        named, notes = posed_cameras(model)
-        if len(named) > MOST:
-            raise DataError(f"{path}: {len(named)} cameras; expected at most {MOST}")
+        named, notes = read_colmap_cameras(model)
+        if len(named) > MAX_CAMERAS:
+            raise DataError(f"{path}: {len(named)} cameras; expected at most {MAX_CAMERAS}")
         return CameraViews(tuple(named), notes=tuple(notes))
     if path.is_dir():
         raise DataError(
@@ -163,7 +177,7 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
     return read_json_cameras(path, size)
 
 
-def split_prim(path: Path) -> tuple[Path, str]:
+def split_usd_prim(path: Path) -> tuple[Path, str]:
     """``FILE#/World/Camera`` as a file and what stands after it; a file of that very name comes first."""
     text, hash_, prim = str(path).partition("#")
     return (Path(text), prim) if hash_ and not path.exists() else (path, "")

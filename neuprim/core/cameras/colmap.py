@@ -21,13 +21,13 @@ from neuprim.core.errors import BackendUnavailable, DataError
 __all__ = [
     "PINHOLES",
     "check_binary_model",
-    "is_model",
-    "largest_model",
-    "pinhole_of",
-    "posed_cameras",
-    "pycolmap_package",
-    "read_model",
-    "viewmat_of",
+    "find_colmap_model",
+    "largest_colmap_model",
+    "pinhole_parameters",
+    "read_colmap_cameras",
+    "import_pycolmap",
+    "read_colmap_model",
+    "colmap_viewmat",
 ]
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
@@ -38,7 +38,7 @@ _DISTORTED = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")  # pinholes bu
 _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 
 
-def pycolmap_package() -> Any:
+def import_pycolmap() -> Any:
     """The package; raises :class:`BackendUnavailable` where it is missing."""
     try:
         import pycolmap
@@ -53,14 +53,14 @@ def _kind(folder: Path) -> str | None:
     return next((s for s in (".bin", ".txt") if (folder / f"cameras{s}").is_file()), None)
 
 
-def read_model(folder: Path) -> Any:
+def read_colmap_model(folder: Path) -> Any:
     """The ``pycolmap.Reconstruction`` in a folder, whose binary files are checked from end to end first.
 
     Raises:
         BackendUnavailable: pycolmap is not installed.
         DataError: a file is missing or damaged.
     """
-    pycolmap = pycolmap_package()
+    pycolmap = import_pycolmap()
     kind = _kind(folder)
     if kind is None:
         raise DataError(f"{folder}: no cameras.bin or cameras.txt; expected a COLMAP model (scene.model)")
@@ -93,14 +93,14 @@ def _restore_names(model: Any, path: Path) -> None:
 
 
 def _parameter_count(model: int) -> int:
-    pycolmap = pycolmap_package()
+    pycolmap = import_pycolmap()
     try:
         return len(pycolmap.Camera(model=pycolmap.CameraModelId(model), width=1, height=1).params_info.split(","))
     except Exception:  # unknown numbers raise different types in different versions
         return -1
 
 
-def pinhole_of(lens: Any, where: str) -> tuple[float, float, float, float]:
+def pinhole_parameters(lens: Any, where: str) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy in pixels of a ``pycolmap.Camera``, whatever its distortion.
 
     Raises:
@@ -119,7 +119,7 @@ def pinhole_of(lens: Any, where: str) -> tuple[float, float, float, float]:
     return fx, fy, cx, cy
 
 
-def viewmat_of(image: Any) -> Tensor:
+def colmap_viewmat(image: Any) -> Tensor:
     """(4, 4) float64 world-to-camera matrix, OpenCV axes, of a ``pycolmap.Image``."""
     pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
     viewmat = torch.eye(4, dtype=torch.float64)
@@ -127,7 +127,7 @@ def viewmat_of(image: Any) -> Tensor:
     return viewmat
 
 
-def largest_model(project: Path) -> tuple[Path | None, str]:
+def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
     """The model with the most images of those in a project's ``sparse``, None for none, and a line for the user, which
     may be empty.
 
@@ -160,11 +160,11 @@ def _count_images(model: Path) -> int:
 # ---------------------------------------------------------------- cameras alone
 
 
-def is_model(path: Path) -> Path | None:
+def find_colmap_model(path: Path) -> Path | None:
     """The folder of the model that a path means: itself, one of its files, or a project with ``sparse``; None for
     anything else."""
     if path.is_dir():
-        return path if _kind(path) is not None else largest_model(path)[0]
+        return path if _kind(path) is not None else largest_colmap_model(path)[0]
     return (
         path.parent
         if path.name in {f"{part}{kind}" for part in _PARTS for kind in (".txt", ".bin")} and _kind(path.parent)
@@ -172,13 +172,13 @@ def is_model(path: Path) -> Path | None:
     )
 
 
-def posed_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
+def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
     """Name, without its suffix, and camera of every image with a pose, by name, and lines for the user. Points need not
     be there.
 
     Raises:
         BackendUnavailable: pycolmap is not installed.
-        DataError: as :func:`read_model`; no poses, impossible cameras, lenses that no pinhole can stand in for.
+        DataError: as :func:`read_colmap_model`; no poses, impossible cameras, lenses that no pinhole can stand in for.
     """
     reconstruction = _without_points(folder)
     images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
@@ -199,14 +199,16 @@ def posed_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
             value for name, value in zip(names, lens.params, strict=True) if name not in ("f", "fx", "fy", "cx", "cy")
         ):
             bent[lens.model_name] += 1
-        camera = Camera(viewmat_of(image), *pinhole_of(lens, where), int(lens.width), int(lens.height))
+        camera = Camera(colmap_viewmat(image), *pinhole_parameters(lens, where), int(lens.width), int(lens.height))
         found.append((str(PurePosixPath(image.name).with_suffix("")), camera.validate(where)))
     notes = [
         f"the lens distortion of {count} of {len(found)} cameras ({model}) is left out"
         for model, count in sorted(bent.items())
     ]
     if folder.parent.name == "sparse":
-        notes += [line for line in [largest_model(folder.parent.parent)[1].replace("takes", "the largest is")] if line]
+        notes += [
+            line for line in [largest_colmap_model(folder.parent.parent)[1].replace("takes", "the largest is")] if line
+        ]
     return found, notes
 
 
@@ -214,7 +216,7 @@ def _without_points(folder: Path) -> Any:
     """The model; where its points are missing, as if there were none."""
     kind = _kind(folder)
     if kind is None or (folder / f"points3D{kind}").is_file() or not (folder / f"images{kind}").is_file():
-        return read_model(folder)
+        return read_colmap_model(folder)
     with tempfile.TemporaryDirectory() as name:
         copy = Path(name)
         for part in _PARTS:
@@ -222,7 +224,7 @@ def _without_points(folder: Path) -> Any:
                 shutil.copyfile(folder / f"{part}{kind}", copy / f"{part}{kind}")
         (copy / f"points3D{kind}").write_bytes(b"" if kind == ".txt" else bytes(8))
         try:
-            return read_model(copy)
+            return read_colmap_model(copy)
         except DataError as error:
             raise DataError(str(error).replace(name, str(folder))) from None
 

@@ -2,7 +2,7 @@
 
 Focal lengths: ``fl_x fl_y`` in pixels, ``camera_angle_x camera_angle_y`` in radians, ``x_fov y_fov`` in degrees, or
 ``camera_intrinsics`` [cx, cy, fx, fy]. Principal point: ``cx cy``. Size: ``w h``. Lens: ``camera_model``,
-``is_fisheye``, ``k1 k2 k3 k4 p1 p2``.
+``has_fisheye_lens``, ``k1 k2 k3 k4 p1 p2``.
 
 Rules:
 
@@ -28,17 +28,17 @@ from neuprim.core.io.json_reader import JsonReader
 __all__ = [
     "COEFFICIENTS",
     "FOCAL",
-    "MIDDLE",
+    "PRINCIPAL_POINT",
     "MODELS",
     "READ",
     "SIZE",
     "Target",
-    "camera_of",
-    "check_keys",
-    "is_fisheye",
-    "lens_of",
-    "same_shape",
-    "unknown_keys",
+    "read_camera",
+    "refuse_unsupported_keys",
+    "has_fisheye_lens",
+    "read_lens_coefficients",
+    "is_resized_copy",
+    "describe_unknown_keys",
 ]
 
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
@@ -46,7 +46,7 @@ MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL",
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "camera_intrinsics")
-MIDDLE = ("cx", "cy")
+PRINCIPAL_POINT = ("cx", "cy")
 SIZE = ("w", "h")
 
 _TOLERANCE = 0.01
@@ -88,7 +88,7 @@ class _Level:
 
     def scales(self, keys: str, target: Target) -> tuple[float, float]:
         """Pixels of the target per pixel of this size, horizontally and vertically."""
-        if not same_shape(self.size, target.size):
+        if not is_resized_copy(self.size, target.size):
             found = (
                 f"{keys} belong to w, h {self.size[0]}x{self.size[1]}, and the image is {target.width}x{target.height}"
             )
@@ -98,7 +98,7 @@ class _Level:
         return target.width / self.size[0], target.height / self.size[1]
 
 
-def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+def is_resized_copy(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether one size is a resized copy of the other, to within the rounding of sides to whole pixels."""
     scale = max(other[0] / size[0], other[1] / size[1])
     return abs(size[0] * scale - other[0]) <= 1.0 and abs(size[1] * scale - other[1]) <= 1.0
@@ -109,7 +109,7 @@ def _owner(group: tuple[str, ...], frame: JsonReader, file: JsonReader) -> JsonR
     return frame if any(frame.has(key) for key in group) else file
 
 
-def camera_of(
+def read_camera(
     frame: JsonReader, file: JsonReader, target: Target, viewmat: Tensor | None = None, say: Say = lambda text: None
 ) -> Camera:
     """The pinhole of a frame.
@@ -126,7 +126,7 @@ def camera_of(
     of_frame = _Level(frame, _size(frame, of_file.size))
     if target.image and of_frame.size != target.size:
         stated, (width, height) = _owner(SIZE, frame, file).where, of_frame.size
-        if not same_shape(of_frame.size, target.size):
+        if not is_resized_copy(of_frame.size, target.size):
             found = f"image is {target.width}x{target.height}; expected {width}x{height} (w, h in {stated}) or a reduction of it"
             raise DataError(f"{target.image}: {found}{target.hint}")
         say(
@@ -230,23 +230,24 @@ def _agree(a: float, b: float) -> bool:
 def _middle(frame: _Level, file: _Level, focal: _Level, target: Target) -> tuple[float, float]:
     """cx, cy in pixels of the target."""
     array = focal.record.has("camera_intrinsics")
-    level = frame if frame.has(MIDDLE) else focal if array else file
+    level = frame if frame.has(PRINCIPAL_POINT) else focal if array else file
     array = array and level is focal
-    if not array and not level.has(MIDDLE):
+    if not array and not level.has(PRINCIPAL_POINT):
         return 0.5 * target.width, 0.5 * target.height
     record, keys = level.record, "camera_intrinsics" if array else "cx, cy"
-    if level is frame and 0 < sum(record.has(key) for key in MIDDLE) < 2 and file.has(MIDDLE):
+    if level is frame and 0 < sum(record.has(key) for key in PRINCIPAL_POINT) < 2 and file.has(PRINCIPAL_POINT):
         raise DataError(
             f"{record.where}: cx or cy is missing, and the file's belong to another camera; expected both in the frame"
         )
     scale = level.scales(keys, target)
     plain = [
-        record.number(key) if record.has(key) else 0.5 * side for key, side in zip(MIDDLE, level.size, strict=True)
+        record.number(key) if record.has(key) else 0.5 * side
+        for key, side in zip(PRINCIPAL_POINT, level.size, strict=True)
     ]
     cx, cy = (value * s for value, s in zip(_intrinsics(record)[:2] if array else plain, scale, strict=True))
     if (
         array
-        and level.has(MIDDLE)
+        and level.has(PRINCIPAL_POINT)
         and any(
             abs(a - b * s) > _TOLERANCE * side
             for a, b, s, side in zip((cx, cy), plain, scale, target.size, strict=True)
@@ -288,8 +289,8 @@ def _check_one_lens(frame: _Level, file: _Level, target: Target) -> None:
     if file.record.has("camera_intrinsics") or not file.has(FOCAL):
         return
     left = []
-    if not frame.has(MIDDLE) and not frame.record.has("camera_intrinsics"):
-        sides = zip(MIDDLE, file.size, strict=True)
+    if not frame.has(PRINCIPAL_POINT) and not frame.record.has("camera_intrinsics"):
+        sides = zip(PRINCIPAL_POINT, file.size, strict=True)
         left = [key for key, side in sides if abs(file.record.number_or(key, 0.5 * side) / side - 0.5) > _TOLERANCE]
     if not frame.has(COEFFICIENTS):
         left += [key for key in COEFFICIENTS if file.record.number_or(key, 0.0) != 0.0]
@@ -303,13 +304,13 @@ def _check_one_lens(frame: _Level, file: _Level, target: Target) -> None:
         raise DataError(f"{frame.record.where}: {found}; expected {', '.join(left)} in the frame, too")
 
 
-def lens_of(frame: JsonReader, file: JsonReader) -> dict[str, float]:
+def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, float]:
     """The coefficients of the lens distortion by name, 0 where none is stated."""
     record = _owner(COEFFICIENTS, frame, file)
     return {key: record.number_or(key, 0.0) for key in COEFFICIENTS}
 
 
-def is_fisheye(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
+def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
     """Whether the lens is OpenCV's fisheye.
 
     Args:
@@ -330,11 +331,11 @@ def is_fisheye(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("
 READ = frozenset(
     {
         *FOCAL,
-        *MIDDLE,
+        *PRINCIPAL_POINT,
         *SIZE,
         *COEFFICIENTS,
         "camera_model",
-        "is_fisheye",
+        "has_fisheye_lens",
         "frames",
         "file_path",
         "transform_matrix",
@@ -387,7 +388,7 @@ _ELSEWHERE = {"time": "task=dynamic scene=multiview reads it", "pl_pos": "task=r
 _LISTED = 8
 
 
-def check_keys(record: JsonReader) -> None:
+def refuse_unsupported_keys(record: JsonReader) -> None:
     """Refuse a record with a key that changes the picture and that nothing here honours.
 
     Raises:
@@ -416,7 +417,7 @@ def _says(value: Any) -> bool:
     return bool(value)
 
 
-def unknown_keys(file: JsonReader, frames: Iterable[JsonReader], read: Iterable[str]) -> str:
+def describe_unknown_keys(file: JsonReader, frames: Iterable[JsonReader], read: Iterable[str]) -> str:
     """A line that names the keys that neither are read nor known to be harmless; "" for none."""
     known = READ | _HARMLESS | _REFUSED.keys() | {*_KINDS, *read}
     found = dict.fromkeys(k for k in file.values if k not in known)

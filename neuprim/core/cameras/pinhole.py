@@ -14,12 +14,12 @@ from neuprim.core.errors import DataError
 
 __all__ = [
     "CameraViews",
-    "LARGEST",
-    "MOST",
-    "RATES",
+    "MAX_IMAGE_SIDE",
+    "MAX_CAMERAS",
+    "FRAME_RATES",
     "Camera",
     "check_viewmat",
-    "exr_attributes",
+    "camera_exr_attributes",
     "look_at",
     "opengl_to_viewmat",
     "orbit",
@@ -155,13 +155,13 @@ def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation
     return views
 
 
-MOST = 100_000
+MAX_CAMERAS = 100_000
 """Cameras of one file."""
 
-LARGEST = 32768
+MAX_IMAGE_SIDE = 32768
 """Pixels of an image's side."""
 
-RATES = (0.1, 240.0)
+FRAME_RATES = (0.1, 240.0)
 """Least and most frames per second of a film, as ``--fps`` takes them."""
 
 
@@ -182,7 +182,7 @@ class CameraViews:
     notes: tuple[str, ...] = ()
 
 
-def exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
+def camera_exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
     """Attribute name -> value: ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth`` as
     the standard has them, and in float64, for cameras far from the origin, ``neuprim:worldToCamera``, and
     in plain numbers ``neuprim:focalLength`` and ``neuprim:principalPoint`` (x, y, pixels), ``neuprim:near`` (camera z,

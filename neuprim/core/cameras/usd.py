@@ -18,7 +18,14 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import usd_stage
-from neuprim.core.cameras.pinhole import LARGEST, MOST, RATES, Camera, CameraViews, opengl_to_viewmat
+from neuprim.core.cameras.pinhole import (
+    FRAME_RATES,
+    MAX_CAMERAS,
+    MAX_IMAGE_SIDE,
+    Camera,
+    CameraViews,
+    opengl_to_viewmat,
+)
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.io.json_reader import JsonReader
 
@@ -66,7 +73,7 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
     ]
     note = f"{stage.text('up')} is up and a unit is {stage.number('meters', 'metres per unit', 0.0):g} m in this file; taken as the axes and units of the run's data"
     fps = stage.number("fps", "time codes per second above 0", 0.0) if len(cameras) > 1 else None
-    if fps is not None and not RATES[0] <= fps <= RATES[1]:  # some tools count in ticks
+    if fps is not None and not FRAME_RATES[0] <= fps <= FRAME_RATES[1]:  # some tools count in ticks
         note, fps = f"{note}; timeCodesPerSecond {fps:g} is no rate of a film, --fps says another", None
     return CameraViews(tuple((f"camera_{i:03d}", camera) for i, camera in enumerate(cameras)), None, fps, (note,))
 
@@ -76,7 +83,7 @@ def _stage(path: Path, prim: str) -> JsonReader:
     if path.stat().st_size > _MAX_BYTES:
         raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {_MAX_BYTES}")
     # -P: modules beside the script are none of pxr's
-    words = [sys.executable, "-P", str(Path(usd_stage.__file__)), str(path.resolve()), prim, str(MOST)]
+    words = [sys.executable, "-P", str(Path(usd_stage.__file__)), str(path.resolve()), prim, str(MAX_CAMERAS)]
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=_SECONDS)
     except subprocess.TimeoutExpired:
@@ -98,8 +105,8 @@ def _resolution(stage: JsonReader, path: Path) -> tuple[int, int]:
     if not stage.has("resolution"):
         raise DataError(f"{path}: names no size of an image (renderSettingsPrimPath); give --size WxH")
     width, height = (int(x) for x in stage.array("resolution", (2,), "width and height").tolist())
-    if not (0 < width <= LARGEST and 0 < height <= LARGEST):
-        raise DataError(f"{path}: resolution {width}x{height}; expected 1 to {LARGEST} pixels a side")
+    if not (0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE):
+        raise DataError(f"{path}: resolution {width}x{height}; expected 1 to {MAX_IMAGE_SIDE} pixels a side")
     return width, height
 
 

@@ -21,7 +21,7 @@ from neuprim.core.cameras import Camera, look_at, orbit
 from neuprim.core.cameras.world import World
 from neuprim.core.compute import device as hardware
 from neuprim.core.compute.device import HOST
-from neuprim.core.data.scene_frame import outlying
+from neuprim.core.data.scene_frame import find_outliers
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions
 
@@ -38,11 +38,11 @@ __all__ = [
     "PointSamples",
     "PointSupervision",
     "SceneContext",
-    "SomeViews",
+    "ViewSubset",
     "StartingPoints",
     "View",
     "ViewSet",
-    "held_out",
+    "hold_out_views",
 ]
 
 DataSource = Literal["real", "generated", "simulated"]
@@ -104,7 +104,7 @@ class ViewSet(ABC):
     def pixels(self, index: int) -> Pixels: ...
 
 
-class SomeViews(ViewSet):
+class ViewSubset(ViewSet):
     """Some views of another set, which keeps their pixels; e.g. those of one moment.
 
     Args:
@@ -283,7 +283,7 @@ class Dataset:
         as in the first.
         """
         cameras = [self.train.view(i).camera for i in range(len(self.train))]
-        far = outlying(torch.stack([c.position for c in cameras]))
+        far = find_outliers(torch.stack([c.position for c in cameras]))
         cameras = [c for c, away in zip(cameras, far.tolist(), strict=True) if not away]
         offsets = torch.stack([c.position for c in cameras]) - self.center.double()
         radius = offsets.norm(dim=-1).mean().item()
@@ -366,7 +366,7 @@ class PointSupervision(ABC):
         """``count`` points of one frame, both drawn by ``generator`` alone, so that a resumed run draws the same."""
 
 
-def held_out(dataset: Dataset, every: int) -> Dataset:
+def hold_out_views(dataset: Dataset, every: int) -> Dataset:
     """The same without its test views: one of every ``every`` training views takes their place, and is not learned
     from.
 
@@ -386,7 +386,7 @@ def held_out(dataset: Dataset, every: int) -> Dataset:
         )
     test = [i for i in range(count) if i % every == i // every % every]
     train = [i for i in range(count) if i % every != i // every % every]
-    return replace(dataset, train=SomeViews(dataset.train, train), test=SomeViews(dataset.train, test))
+    return replace(dataset, train=ViewSubset(dataset.train, train), test=ViewSubset(dataset.train, test))
 
 
 class GroundTruth(ABC):

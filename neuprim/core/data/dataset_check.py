@@ -21,12 +21,12 @@ from neuprim.core.errors import DataError
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.volumes.source import Placement
 
-__all__ = ["DatasetFault", "check_dataset", "check_mask", "check_pixels", "check_points", "check_samples", "extra_of"]
+__all__ = ["DatasetError", "check_dataset", "check_mask", "check_pixels", "check_points", "check_samples", "get_extra"]
 
 Extra = TypeVar("Extra")
 
 
-class DatasetFault(DataError):
+class DatasetError(DataError):
     """A loader broke a promise of :class:`~neuprim.core.data.dataset.Dataset`; whoever knows the loader's package adds
     its name."""
 
@@ -43,7 +43,7 @@ def check_dataset(dataset: Dataset, conditions: Sequence[ConditionSpec]) -> None
     for split in ("train", "test"):
         views: ViewSet = getattr(dataset, split)
         if len(views) == 0:
-            raise DatasetFault(f"{dataset.name}: the {'training' if split == 'train' else split} split is empty")
+            raise DatasetError(f"{dataset.name}: the {'training' if split == 'train' else split} split is empty")
         for i in range(len(views)):
             _view(views.view(i), f"{split} view {i}", conditions)
         view, pixels = views.view(0), views.pixels(0)
@@ -65,7 +65,7 @@ def check_pixels(split: str, view: View, pixels: Pixels, channels: int) -> None:
     """
     size = (view.camera.height, view.camera.width)
     if not isinstance(pixels, Pixels):
-        raise DatasetFault(
+        raise DatasetError(
             f"{split} view {view.name}: pixels are {_described(pixels)}; expected a neuprim.core.data.Pixels"
         )
     rgb, alpha, mask = pixels.rgb, pixels.alpha, pixels.mask
@@ -92,10 +92,10 @@ def check_points(cloud: PointCloud, count: int, dataset: Dataset) -> None:
     """
     where = f"{dataset.name}: starting points"
     if not isinstance(cloud, PointCloud):
-        raise DatasetFault(f"{where}: found {_described(cloud)}; expected a neuprim.core.data.PointCloud")
+        raise DatasetError(f"{where}: found {_described(cloud)}; expected a neuprim.core.data.PointCloud")
     found = len(cloud.means) if isinstance(cloud.means, Tensor) and cloud.means.dim() else 0
     if found > count:
-        raise DatasetFault(f"{where}: found {found} points; expected at most {count}")
+        raise DatasetError(f"{where}: found {found} points; expected at most {count}")
     _floats(f"{where}: means", cloud.means, (found, 3))
     _floats(f"{where}: colors", cloud.colors, (found, dataset.channels))
     for name, columns in (("axes", (3,)), ("quats", (4,)), ("alphas", ()), ("deviations", (3,))):
@@ -113,7 +113,7 @@ def check_samples(samples: PointSamples, dataset: Dataset) -> None:
     """
     where = f"{dataset.name}: points"
     if not isinstance(samples, PointSamples):
-        raise DatasetFault(f"{where}: drew {_described(samples)}; expected a neuprim.core.data.PointSamples")
+        raise DatasetError(f"{where}: drew {_described(samples)}; expected a neuprim.core.data.PointSamples")
     count = len(samples.sigma) if isinstance(samples.sigma, Tensor) and samples.sigma.dim() else 0
     if count == 0:
         _refuse(f"{where} of {samples.name}: sigma", samples.sigma, torch.float32, ("M",), ", M at least 1")
@@ -132,10 +132,10 @@ def check_samples(samples: PointSamples, dataset: Dataset) -> None:
     scales |= {f"scale of component {name}": scale for name, (_, scale) in samples.components.items()}
     for name, number in scales.items():
         if not isinstance(number, (int, float)) or not 0 < number < float("inf"):
-            raise DatasetFault(f"{where} of {samples.name}: {name} is {number!r}; expected a positive number")
+            raise DatasetError(f"{where} of {samples.name}: {name} is {number!r}; expected a positive number")
 
 
-def extra_of(dataset: Dataset, kind: type[Extra]) -> Extra | None:
+def get_extra(dataset: Dataset, kind: type[Extra]) -> Extra | None:
     """``dataset.extra``, for the task that knows what it is.
 
     Raises:
@@ -144,7 +144,7 @@ def extra_of(dataset: Dataset, kind: type[Extra]) -> Extra | None:
     extra = dataset.extra
     if extra is None or isinstance(extra, kind):
         return extra
-    raise DatasetFault(
+    raise DatasetError(
         f"{dataset.name}: extra is {_described(extra)}; expected a {kind.__module__}.{kind.__qualname__}, or None"
     )
 
@@ -157,49 +157,49 @@ def _members(dataset: Dataset) -> None:
     for split in ("train", "test"):
         value = getattr(dataset, split)
         if not isinstance(value, ViewSet):
-            raise DatasetFault(f"{who}: {split} is {_described(value)}; expected a neuprim.core.data.ViewSet")
+            raise DatasetError(f"{who}: {split} is {_described(value)}; expected a neuprim.core.data.ViewSet")
     if not callable(dataset.start):
-        raise DatasetFault(
+        raise DatasetError(
             f"{who}: start is {_described(dataset.start)}; expected a function of (views, count, generator)"
         )
     channels, extent, bounds = dataset.channels, dataset.extent, dataset.bounds
     if not isinstance(channels, int) or channels < 1:
-        raise DatasetFault(f"{who}: channels is {channels!r}; expected a whole number, 1 or more")
+        raise DatasetError(f"{who}: channels is {channels!r}; expected a whole number, 1 or more")
     _one_of(f"{who}: color_space", dataset.color_space, ("srgb", "linear"))
     _one_of(f"{who}: data_source", dataset.data_source, get_args(DataSource))
     if not isinstance(extent, (int, float)) or not 0 < extent < float("inf"):
-        raise DatasetFault(f"{who}: extent is {extent!r}; expected a positive number of scene units")
+        raise DatasetError(f"{who}: extent is {extent!r}; expected a positive number of scene units")
     _floats(f"{who}: background", dataset.background, (channels,), f", one number for each of the {channels} channels")
     _floats(f"{who}: up", dataset.up, (3,))
     _floats(f"{who}: center", dataset.center, (3,))
     if bounds is not None:
         _floats(f"{who}: bounds", bounds, (2, 3), ", lower and upper corner, or None")
     if not isinstance(dataset.points, PointSupervision | None):
-        raise DatasetFault(
+        raise DatasetError(
             f"{who}: points is {_described(dataset.points)}; expected a neuprim.core.data.PointSupervision, or None"
         )
     if not isinstance(dataset.exposure, (int, float)) or not 0 < dataset.exposure < float("inf"):
-        raise DatasetFault(f"{who}: exposure is {dataset.exposure!r}; expected a positive number")
+        raise DatasetError(f"{who}: exposure is {dataset.exposure!r}; expected a positive number")
     if not isinstance(dataset.world, World):
-        raise DatasetFault(f"{who}: world is {_described(dataset.world)}; expected a {World.__module__}.World")
+        raise DatasetError(f"{who}: world is {_described(dataset.world)}; expected a {World.__module__}.World")
     dataset.world.validate(f"{who}: world")
     if not isinstance(dataset.placement, Placement | None):
-        raise DatasetFault(
+        raise DatasetError(
             f"{who}: placement is {_described(dataset.placement)}; expected a {Placement.__module__}.Placement, or None"
         )
 
 
 def _view(view: View, where: str, conditions: Sequence[ConditionSpec]) -> None:
     if not isinstance(view, View):
-        raise DatasetFault(f"{where}: found {_described(view)}; expected a neuprim.core.data.View")
+        raise DatasetError(f"{where}: found {_described(view)}; expected a neuprim.core.data.View")
     where = f"{where} ({view.name})" if view.name else where
     if not isinstance(view.name, str) or not view.name:
-        raise DatasetFault(f"{where}: name is {view.name!r}; expected text")
+        raise DatasetError(f"{where}: name is {view.name!r}; expected text")
     _camera(view.camera, where)
     for spec in conditions:
         if spec.name not in view.conditions:
             there = ", ".join(sorted(view.conditions)) or "none"
-            raise DatasetFault(f"{where}: condition {spec.name!r} is missing; found {there}, the task needs it")
+            raise DatasetError(f"{where}: condition {spec.name!r} is missing; found {there}, the task needs it")
         value, shape = view.conditions[spec.name], tuple(spec.shape)
         if not isinstance(value, Tensor) or tuple(value.shape) != shape:
             _refuse(f"{where}: condition {spec.name!r}", value, torch.float32, shape)
@@ -207,7 +207,7 @@ def _view(view: View, where: str, conditions: Sequence[ConditionSpec]) -> None:
         low, high = torch.tensor(spec.range, dtype=value.dtype if value.is_floating_point() else torch.float64)
         outside = (value < low) | (value > high)
         if spec.strict and bool(outside.any()):
-            raise DatasetFault(
+            raise DatasetError(
                 f"{where}: condition {spec.name!r} holds {float(value[outside].flatten()[0]):g}; expected {low:g} to {high:g}, its range"
             )
 
@@ -215,17 +215,17 @@ def _view(view: View, where: str, conditions: Sequence[ConditionSpec]) -> None:
 def _camera(camera: AnyCamera, where: str) -> None:
     if isinstance(camera, Camera):
         if not isinstance(camera.viewmat, Tensor):
-            raise DatasetFault(f"{where}: camera: viewmat is {_described(camera.viewmat)}; expected a tensor (4, 4)")
+            raise DatasetError(f"{where}: camera: viewmat is {_described(camera.viewmat)}; expected a tensor (4, 4)")
         try:
             camera.validate(f"{where}: camera")
         except DataError as error:
-            raise DatasetFault(str(error)) from error
+            raise DatasetError(str(error)) from error
         except (TypeError, ValueError, RuntimeError) as error:
-            raise DatasetFault(
+            raise DatasetError(
                 f"{where}: camera is {camera!r}; expected numbers ({error})".replace("\n", " ")
             ) from error
     elif not isinstance(camera, RayCamera):
-        raise DatasetFault(f"{where}: camera is {_described(camera)}; expected a neuprim.core.cameras.Camera")
+        raise DatasetError(f"{where}: camera is {_described(camera)}; expected a neuprim.core.cameras.Camera")
 
 
 # ---------------------------------------------------------------- comparing
@@ -247,18 +247,18 @@ def _finite(value: Tensor, where: str) -> None:
     if bool(bad.any()):
         place = bad.nonzero()[0].tolist()
         first = f", the first at {place}" if place else ""
-        raise DatasetFault(
+        raise DatasetError(
             f"{where}: found {int(bad.sum())} values that are NaN or infinite{first}; expected finite numbers"
         )
 
 
 def _one_of(where: str, value: object, choices: tuple[str, ...]) -> None:
     if value not in choices:
-        raise DatasetFault(f"{where} is {value!r}; expected {' or '.join(choices)}")
+        raise DatasetError(f"{where} is {value!r}; expected {' or '.join(choices)}")
 
 
 def _refuse(where: str, value: Any, dtype: torch.dtype, shape: tuple[int | str, ...], more: str = "") -> None:
-    raise DatasetFault(f"{where} is {_described(value)}; expected {_name(dtype)} {shape}{more}")
+    raise DatasetError(f"{where} is {_described(value)}; expected {_name(dtype)} {shape}{more}")
 
 
 def _described(value: Any) -> str:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 
-__all__ = ["Distortion", "Fisheye", "Radial", "resample", "source_grid"]
+__all__ = ["Distortion", "Fisheye", "Radial", "resample_image", "undistortion_grid"]
 
 
 class Distortion(ABC):
@@ -66,7 +66,7 @@ class Fisheye(Distortion):
         return points * scale[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
-def source_grid(camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
+def undistortion_grid(camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
     """Where the pixels of the undistorted ``camera`` lie in a photograph of the same size.
 
     Returns:
@@ -100,7 +100,7 @@ def _unfolded(camera: Camera, source: np.ndarray) -> np.ndarray:
     return (regions == regions[row, column]) & upright
 
 
-def resample(image: Tensor, source: Tensor) -> Tensor:
+def resample_image(image: Tensor, source: Tensor) -> Tensor:
     """(H', W', C) float32 bilinear samples of an (H, W, C) image at (H', W', 2) source pixels, clamped to the
     border."""
     height, width = image.shape[:2]

@@ -16,13 +16,13 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.data import Pixels, View, ViewSet
-from neuprim.core.data.distortion import Distortion, resample, source_grid
+from neuprim.core.data.distortion import Distortion, resample_image, undistortion_grid
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo, read_image, read_mask, srgb_to_linear
 from neuprim.core.model.fields import Conditions
 from neuprim.core.notices import warn_once
 
-__all__ = ["ImageFrame", "ImageViews", "Mask", "averaged", "masks_beside", "whole"]
+__all__ = ["ImageFrame", "ImageViews", "Mask", "average_pixels", "find_masks", "reduce_mask"]
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Mask:
     inverted: bool = False
 
 
-def masks_beside(folder: Path, files: Sequence[Path], images: Path | None = None) -> list[Mask | None]:
+def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) -> list[Mask | None]:
     """The mask of every image file, or None; a line says how many there are.
 
     ``images/a/b.jpg`` has ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg``; ``images_4`` has ``masks_4``
@@ -78,12 +78,12 @@ def _mask(folder: Path, file: Path, images: Path | None) -> Mask | None:
     return Mask(dynamic, inverted=True) if dynamic.is_file() else None
 
 
-def averaged(values: Tensor, factor: int) -> Tensor:
+def average_pixels(values: Tensor, factor: int) -> Tensor:
     """(H // factor, W // factor, C) means of (H, W, C); what is left over at the right and at the bottom is cut off."""
     return F.avg_pool2d(values.permute(2, 0, 1), factor).permute(1, 2, 0).contiguous()
 
 
-def whole(mask: Tensor, factor: int) -> Tensor:
+def reduce_mask(mask: Tensor, factor: int) -> Tensor:
     """(H // factor, W // factor) bool of the large pixels all of whose parts count in (H, W) ``mask``."""
     return F.avg_pool2d(mask[None].float(), factor)[0] > 0.999
 
@@ -302,12 +302,12 @@ class ImageViews(ViewSet):
             values = torch.cat([values[..., :3] * (values[..., 3:] / 255.0), values[..., 3:]], dim=-1)
         if frame.distortion is not None:
             source, valid = self._grid(frame.camera, frame.distortion)
-            values = resample(values, source)
-            mask = valid if mask is None else valid & (resample(mask[..., None].float(), source)[..., 0] > 0.999)
+            values = resample_image(values, source)
+            mask = valid if mask is None else valid & (resample_image(mask[..., None].float(), source)[..., 0] > 0.999)
         n = self._factor
         if n > 1:
-            values = averaged(values, n)
-            mask = None if mask is None else whole(mask, n)
+            values = average_pixels(values, n)
+            mask = None if mask is None else reduce_mask(mask, n)
         return (values.round().clamp(0.0, 255.0).to(torch.uint8) if eight_bit else values), mask
 
     def _grid(self, camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
@@ -316,7 +316,7 @@ class ImageViews(ViewSet):
             if key not in self._grids:
                 if len(self._grids) >= _GRIDS:  # captures with a lens per frame would otherwise keep one grid per image
                     self._grids.pop(next(iter(self._grids)))
-                self._grids[key] = source_grid(camera, distortion)
+                self._grids[key] = undistortion_grid(camera, distortion)
             return self._grids[key]
 
 

@@ -12,20 +12,20 @@ from torch import Tensor
 
 from neuprim.core.data.dataset import PointCloud, ViewSet
 from neuprim.core.data.hull import hull_surface
-from neuprim.core.data.ray_points import ray_points, views_that_see
-from neuprim.core.data.scene_frame import axes_meet, focus_point
+from neuprim.core.data.ray_points import count_seeing_views, ray_points
+from neuprim.core.data.scene_frame import focus_point, optical_axes_meet
 from neuprim.core.errors import ConfigError
 
 __all__ = [
     "box_points",
-    "check_count",
-    "distinct",
+    "check_point_count",
+    "drop_repeated_points",
     "farthest_points",
-    "has_silhouettes",
+    "views_have_alpha",
     "hull_points",
     "initial_points",
     "median_colors",
-    "subset",
+    "draw_points",
     "surrounding_points",
 ]
 
@@ -49,23 +49,23 @@ def initial_points(views: ViewSet, points: PointCloud | None, count: int, genera
         ConfigError: ``count`` is not positive.
         DataError: the alpha masks have no common volume, or an image is damaged.
     """
-    check_count(count)
+    check_point_count(count)
     if points is not None:
-        return subset(points, count, generator)
-    if not axes_meet([views.view(i).camera for i in range(len(views))]):
-        return distinct(ray_points(views, count, generator)[0])
-    if has_silhouettes(views):
+        return draw_points(points, count, generator)
+    if not optical_axes_meet([views.view(i).camera for i in range(len(views))]):
+        return drop_repeated_points(ray_points(views, count, generator)[0])
+    if views_have_alpha(views):
         return hull_points(views, count, generator)
     return box_points(views, count, generator)
 
 
-def check_count(count: int) -> None:
+def check_point_count(count: int) -> None:
     """Raises ConfigError unless ``count`` is positive."""
     if count <= 0:
         raise ConfigError(f"the number of initial points is {count}; expected at least 1")
 
 
-def has_silhouettes(views: ViewSet) -> bool:
+def views_have_alpha(views: ViewSet) -> bool:
     """Whether one of the first views has alpha that is not opaque everywhere."""
     for index in range(min(len(views), 8)):
         alpha = views.pixels(index).alpha
@@ -74,7 +74,7 @@ def has_silhouettes(views: ViewSet) -> bool:
     return False
 
 
-def subset(points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
+def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
     """At most ``count`` of the given points without repeated positions, drawn evenly, in their own order."""
     _, first = np.unique(points.means.numpy(), axis=0, return_index=True)
     rows = torch.from_numpy(np.sort(first))
@@ -102,7 +102,7 @@ def hull_points(views: ViewSet, count: int, generator: torch.Generator, resoluti
         rows = torch.arange(count) % len(centers)
     jitter = torch.rand((len(rows), 3), generator=generator) - 0.5
     means = centers[rows] + jitter * voxel
-    return distinct(PointCloud(means, median_colors(views, means)))
+    return drop_repeated_points(PointCloud(means, median_colors(views, means)))
 
 
 def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
@@ -120,15 +120,15 @@ def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointC
     found = torch.zeros(0, 3)
     for _ in range(_ROUNDS):
         means = (center + (2.0 * torch.rand((count, 3), generator=generator).double() - 1.0) * half).float()
-        found = torch.cat([found, means[views_that_see(views, means) >= min(2, len(views))]])[:count]
+        found = torch.cat([found, means[count_seeing_views(views, means) >= min(2, len(views))]])[:count]
         if len(found) == count:
             break
     if not len(found):
-        return distinct(ray_points(views, count, generator)[0])
-    return distinct(PointCloud(found, median_colors(views, found)))
+        return drop_repeated_points(ray_points(views, count, generator)[0])
+    return drop_repeated_points(PointCloud(found, median_colors(views, found)))
 
 
-def distinct(points: PointCloud) -> PointCloud:
+def drop_repeated_points(points: PointCloud) -> PointCloud:
     """The points without repeated positions, which jitter makes rare but cannot exclude."""
     _, first = np.unique(points.means.numpy(), axis=0, return_index=True)
     if len(first) == len(points.means):
@@ -242,7 +242,9 @@ def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator
     wanted = count - len(shell.means)
     if len(lifted.means) > wanted:
         lifted = lifted.rows(torch.randperm(len(lifted.means), generator=generator)[:wanted].sort().values)
-    return distinct(PointCloud(torch.cat([lifted.means, shell.means]), torch.cat([lifted.colors, shell.colors])))
+    return drop_repeated_points(
+        PointCloud(torch.cat([lifted.means, shell.means]), torch.cat([lifted.colors, shell.colors]))
+    )
 
 
 def _lifted(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:

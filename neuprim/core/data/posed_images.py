@@ -17,7 +17,7 @@ from neuprim.core.data import Dataset, PointCloud, StartingPoints, camera_extent
 from neuprim.core.data.dataset import SceneContext
 from neuprim.core.data.image_views import ImageFrame, ImageViews
 from neuprim.core.data.initial import initial_points
-from neuprim.core.data.scene_frame import focus_point, world_around
+from neuprim.core.data.scene_frame import choose_world, focus_point
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo
 from neuprim.core.notices import warn_once
@@ -32,14 +32,15 @@ __all__ = [
     "IMAGE_SUFFIXES",
     "MissingFiles",
     "SplitName",
-    "data_folder",
-    "every_nth",
+    "find_data_folder",
+    "split_every_nth",
     "find_image",
-    "in_scene",
-    "missing_files",
-    "posed_images",
-    "turned",
-    "unique_names",
+    "frame_in_scene",
+    "missing_files_error",
+    "SceneDetails",
+    "assemble_dataset",
+    "exif_hint",
+    "unique_view_names",
 ]
 
 Background = Literal["auto", "white", "black", "random"]
@@ -78,7 +79,7 @@ class FolderSettings:
         validate_fields(self, "scene")
 
 
-def data_folder(path: str | Path) -> Path:
+def find_data_folder(path: str | Path) -> Path:
     """The existing folder of the ``path`` setting, ``~`` expanded.
 
     Raises:
@@ -156,18 +157,18 @@ class MissingFiles(DataError):
     """Files that a data set names are not there."""
 
 
-def find_image(folder: Path, name: str) -> Path | None:
-    """The image that ``name`` names below ``folder``: as written, else with the usual suffixes added, else in another
+def find_image(folder: Path, text: str) -> Path | None:
+    """The image that ``text`` names below ``folder``: as written, else with the usual suffixes added, else in another
     case; None if there is none."""
-    name = str(folder / name.replace("\\", "/"))
+    text = str(folder / text.replace("\\", "/"))
     try:
-        found = next((Path(name + s) for s in ("", *IMAGE_SUFFIXES) if Path(name + s).is_file()), None)
-        return found or _other_case(folder, Path(name))
+        found = next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
+        return found or _other_case(folder, Path(text))
     except OSError:  # a name longer than the file system can hold
         return None
 
 
-def _say_outside(where: str, home: Path, paths: Iterable[Path]) -> None:
+def _warn_of_outside_images(where: str, home: Path, paths: Iterable[Path]) -> None:
     """Warn of images that lie elsewhere than the data set that names them. Rule: other tools write such paths, so that
     they are read; but whoever made the data set chose them, and not who trains on it, who is told once."""
     own = home.resolve()
@@ -191,7 +192,7 @@ def _other_case(folder: Path, path: Path) -> Path | None:
     return folder if folder.is_file() else None
 
 
-def turned(info: ImageInfo) -> str:
+def exif_hint(info: ImageInfo) -> str:
     """The end of a message about an image's size: that EXIF says to turn it, if it does."""
     if info.orientation < 5:
         return ""
@@ -201,13 +202,13 @@ def turned(info: ImageInfo) -> str:
     )
 
 
-def missing_files(where: str, names: Sequence[str], hint: str = "") -> MissingFiles:
+def missing_files_error(where: str, names: Sequence[str], hint: str = "") -> MissingFiles:
     """One error for all absent files, the first ten by name."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return MissingFiles(f"{where}: {len(names)} files not found: {', '.join(names[:_LISTED])}{more}{hint}")
 
 
-def unique_names(paths: Iterable[str], where: str) -> list[str]:
+def unique_view_names(paths: Iterable[str], where: str) -> list[str]:
     """A file-name-safe name per image path: its stem, or the whole path with ``_`` for ``/`` where stems repeat.
 
     Raises:
@@ -226,55 +227,100 @@ def unique_names(paths: Iterable[str], where: str) -> list[str]:
 
 
 def _stem(path: str, whole: bool = False) -> str:
-    name = path.strip("/") if whole else path.rstrip("/").rsplit("/", 1)[-1]
-    return next((name[: -len(s)] for s in IMAGE_SUFFIXES if name.endswith(s)), name)
+    text = path.strip("/") if whole else path.rstrip("/").rsplit("/", 1)[-1]
+    return next((text[: -len(s)] for s in IMAGE_SUFFIXES if text.endswith(s)), text)
 
 
-def every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFrame], list[ImageFrame]]:
+def split_every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFrame], list[ImageFrame]]:
     """(the others, every n-th beginning with the first)."""
     return [f for i, f in enumerate(frames) if i % n], list(frames[::n])
 
 
-def posed_images(
+@dataclass(frozen=True)
+class SceneDetails:
+    """What a format knows about a scene besides its images.
+
+    Attributes:
+        up: (3,) upward direction; None takes the mean of the cameras' own.
+        points: starting points of the format, float64 in the coordinates of the file.
+        prefix: reduction that the files already have, e.g. "images_4".
+        start: rule for starting points; None takes ``points``, else infers them from images at rest
+            (:func:`neuprim.core.data.initial.initial_points`).
+        to_linear: convert sRGB files to linear light.
+        exposure: divisor of linear values, or a function of the training views that returns it.
+        extra: see :class:`~neuprim.core.data.dataset.Dataset`.
+        positions: names of conditions that are positions, float64 in the coordinates of the file.
+        home: the data set's folder, where it is not the one that ``where`` names.
+    """
+
+    up: Tensor | None = None
+    points: PointCloud | None = None
+    prefix: str = ""
+    start: StartingPoints | None = None
+    to_linear: bool = False
+    exposure: float | Callable[[ImageViews], float] = 1.0
+    extra: object = None
+    positions: Sequence[str] = ()
+    home: Path | None = None
+
+
+def assemble_dataset(
     where: str,
     name: str,
     train: Sequence[ImageFrame],
     test: Sequence[ImageFrame],
     settings: FolderSettings,
     context: SceneContext,
-    up: Tensor | None = None,
-    points: PointCloud | None = None,
-    prefix: str = "",
-    start: StartingPoints | None = None,
-    to_linear: bool = False,
-    exposure: float | Callable[[ImageViews], float] = 1.0,
-    extra: object = None,
-    places: Sequence[str] = (),
-    home: Path | None = None,
+    details: SceneDetails = SceneDetails(),
 ) -> Dataset:
-    """The data set of two splits, whose view sets are :class:`~neuprim.core.data.image_views.ImageViews`.
+    """Make a data set of two splits of image files.
 
     Args:
         where: file or folder that errors name.
-        settings: the common settings.
-        up: (3,) upward direction; None takes the mean of the cameras' own.
-        points: starting points that the format brings, if any, in the coordinates of the file, float64.
-        prefix: reduction already in the files, e.g. "images_4".
-        start: another rule for starting points; None takes ``points``, else the visual hull of the alpha masks, else a
-        box in
-            front of the cameras, which suits scenes at rest (:func:`neuprim.core.data.initial.initial_points`).
-        to_linear: turn sRGB files into linear light.
-        exposure: what linear values are divided by, or how that number follows from the training views.
-        extra: see :class:`~neuprim.core.data.dataset.Dataset`.
-        places: conditions that are positions, in the coordinates of the file, float64.
-        home: the data set's folder, where it is not that of ``where``.
 
     Raises:
-        DataError: an empty split, an image without alpha beside one with, sRGB beside linear files, most images
-        damaged, or any with
-            ``settings.strict``.
-        ConfigError: a random background for images without alpha, or a down-sampling factor larger than an image.
+        DataError: an empty split, mixed kinds of images, most images damaged, or any with ``settings.strict``.
+        ConfigError: a random background without alpha, or a down-sampling factor larger than an image.
     """
+    _check_splits(where, train, test, settings)
+    both = [*train, *test]
+    _warn_of_outside_images(where, details.home or Path(where), [frame.path for frame in both])
+    background = _choose_background(where, settings.background, alpha=both[0].info.channels == 4)
+    world = choose_world([f.camera for f in both], where) if context.world is None else context.world
+    train, test = ([frame_in_scene(f, world, details.positions) for f in frames] for frames in (train, test))
+    points = None if details.points is None else details.points.within(world)
+    factor = settings.downsample
+    views = [ImageViews(frames, factor, to_linear=details.to_linear) for frames in (train, test)]
+    if settings.preload:
+        at_rest = details.start is None  # scenes that move may show nothing at some moments
+        _preload(where, views[0], "training", settings.strict, not at_rest, context.progress)
+        _preload(where, views[1], "test", settings.strict, True, context.progress)
+    exposure = details.exposure(views[0]) if callable(details.exposure) else details.exposure
+    for images in views:
+        images.scale = 1.0 / exposure
+    cameras = [views[0].view(i).camera for i in range(len(views[0]))]
+    reductions = [details.prefix, _describe_reduction(both, views[0].view(0).camera, factor)]
+    return Dataset(
+        name=name,
+        train=views[0],
+        test=views[1],
+        start=details.start or (lambda views, count, generator: initial_points(views, points, count, generator)),
+        extent=camera_extent(cameras),
+        color_space="linear" if details.to_linear or both[0].info.linear else "srgb",
+        background=torch.full((3,), 0.0 if background == "black" else 1.0),
+        random_background=background == "random",
+        downsampling=", then ".join(text for text in reductions if text) or "none",
+        up=_mean_up(cameras) if details.up is None else details.up,
+        center=focus_point(cameras).float(),
+        exposure=exposure,
+        world=world,
+        extra=details.extra,
+    )
+
+
+def _check_splits(
+    where: str, train: Sequence[ImageFrame], test: Sequence[ImageFrame], settings: FolderSettings
+) -> None:
     for split, frames in (("training", train), ("test", test)):
         if not frames:
             hint = ""
@@ -283,70 +329,44 @@ def posed_images(
             elif split == "test" and hasattr(settings, "hold_out"):
                 hint = "; scene.hold_out=8 holds out every 8th training view instead"
             raise DataError(f"{where}: the {split} split has no images; expected at least one{hint}")
-    both = [*train, *test]
-    for frame in both:
-        if frame.info.linear != both[0].info.linear:
+    first = train[0]
+    for frame in (*train, *test):
+        if frame.info.linear != first.info.linear:
             raise DataError(
-                f"{frame.path}: mixes OpenEXR (linear) and PNG/JPEG (sRGB) with {both[0].path}; expected one kind"
+                f"{frame.path}: mixes OpenEXR (linear) and PNG/JPEG (sRGB) with {first.path}; expected one kind"
             )
-        if frame.info.channels != both[0].info.channels:
-            raise DataError(
-                f"{frame.path}: image has {frame.info.channels} channels, {both[0].path} has {both[0].info.channels}; expected all RGB or all RGBA"
-            )
-    _say_outside(where, home or Path(where), [frame.path for frame in both])
-    alpha = both[0].info.channels == 4
-    background: str = settings.background
-    if background == "auto":
-        background = "white" if alpha else "black"
+        if frame.info.channels != first.info.channels:
+            found = f"image has {frame.info.channels} channels, {first.path} has {first.info.channels}"
+            raise DataError(f"{frame.path}: {found}; expected all RGB or all RGBA")
+
+
+def _choose_background(where: str, background: str, alpha: bool) -> str:
     if background == "random" and not alpha:
         raise ConfigError(
             f"scene.background is 'random', but the images in {where} have no alpha; expected auto, white or black"
         )
-    factor = settings.downsample
-    world = world_around([f.camera for f in both], where) if context.world is None else context.world
-    train, test = ([in_scene(f, world, places) for f in frames] for frames in (train, test))
-    points = None if points is None else points.within(world)
-    views = [ImageViews(frames, factor, to_linear=to_linear) for frames in (train, test)]
-    if settings.preload:
-        at_rest = start is None  # of what moves, some moments show nothing
-        for split, images in zip(("training", "test"), views, strict=True):
-            progress = lambda fraction, split=split: context.progress(f"reading {split} images", fraction)  # noqa: E731
-            bad = BadViews(f"{where} ({split})", settings.strict)
-            faults = images.preload(progress, empty=split == "test" or not at_rest)
-            for index, error in faults.items():
-                bad.add(images.view(index).name, error)
-            bad.settle(len(images))
-            images.drop(faults)
-    divisor = exposure(views[0]) if callable(exposure) else exposure
-    for images in views:
-        images.scale = 1.0 / divisor
-    cameras = [views[0].view(i).camera for i in range(len(views[0]))]
-    return Dataset(
-        name=name,
-        train=views[0],
-        test=views[1],
-        start=start or (lambda views, count, generator: initial_points(views, points, count, generator)),
-        extent=camera_extent(cameras),
-        color_space="linear" if to_linear or both[0].info.linear else "srgb",
-        background=torch.full((3,), 0.0 if background == "black" else 1.0),
-        random_background=background == "random",
-        downsampling=", then ".join(t for t in (prefix, _reduction(both, views[0].view(0).camera, factor)) if t)
-        or "none",
-        up=_mean_up(cameras) if up is None else up,
-        center=focus_point(cameras).float(),
-        exposure=divisor,
-        world=world,
-        extra=extra,
-    )
+    return ("white" if alpha else "black") if background == "auto" else background
 
 
-def in_scene(frame: ImageFrame, world: World, places: Sequence[str]) -> ImageFrame:
-    """The frame with its camera and its conditions ``places`` in the scene's coordinates, subtracted in float64."""
-    moved = {name: world.scene_points(frame.conditions[name]).float() for name in places}
+def _preload(
+    where: str, images: ImageViews, split: str, strict: bool, empty: bool, progress: Callable[[str, float], None]
+) -> None:
+    """Decode all images of a split and leave out the damaged ones; ``empty`` ones may show nothing."""
+    bad = BadViews(f"{where} ({split})", strict)
+    faults = images.preload(lambda fraction: progress(f"reading {split} images", fraction), empty)
+    for index, error in faults.items():
+        bad.add(images.view(index).name, error)
+    bad.settle(len(images))
+    images.drop(faults)
+
+
+def frame_in_scene(frame: ImageFrame, world: World, positions: Sequence[str]) -> ImageFrame:
+    """Return the frame with its camera and its conditions ``positions`` in the scene's coordinates, subtracted in float64."""
+    moved = {name: world.scene_points(frame.conditions[name]).float() for name in positions}
     return replace(frame, camera=world.scene_camera(frame.camera), conditions={**frame.conditions, **moved})
 
 
-def _reduction(frames: Sequence[ImageFrame], reduced: Camera, factor: int) -> str:
+def _describe_reduction(frames: Sequence[ImageFrame], reduced: Camera, factor: int) -> str:
     """E.g. "200x200 from 800x800 by area", "1/4 by area" where sizes differ, "" for none."""
     if factor == 1:
         return ""

@@ -13,9 +13,9 @@ from neuprim.core.data.dataset import PointCloud, ViewSet
 from neuprim.core.data.scene_frame import camera_extent
 from neuprim.core.errors import DataError
 
-__all__ = ["NOT_SEEN", "ray_points", "views_that_see"]
+__all__ = ["GIVE_POINTS", "ray_points", "count_seeing_views"]
 
-NOT_SEEN = "pass points with model.init.points=FILE.ply, or with ply_file_path in transforms.json"
+GIVE_POINTS = "pass points with model.init.points=FILE.ply, or with ply_file_path in transforms.json"
 """What to do where no starting point can be inferred."""
 
 _VIEWS = 100
@@ -39,7 +39,7 @@ chance."""
 _ROUNDS = 8
 
 
-def views_that_see(views: ViewSet, means: Tensor) -> Tensor:
+def count_seeing_views(views: ViewSet, means: Tensor) -> Tensor:
     """(N,) int64: how many of (at most 100 of) the views have the points (N, 3) in their images."""
     return torch.stack([views.view(i).camera.sees(means) for i in _some(len(views), _VIEWS)]).sum(0)
 
@@ -72,14 +72,14 @@ def ray_points(
             errors = torch.stack([_difference(views, t, colors, owner) for t in tried]).nan_to_num(nan=math.inf)
             tried = tried[(errors + _PRIOR * usual).argmin(0), torch.arange(len(owner))][None]
         means = tried[0].float()
-        keep = views_that_see(views, means) >= needed
+        keep = count_seeing_views(views, means) >= needed
         found.append((means[keep], colors[keep], owner[keep]))
         if sum(len(f[0]) for f in found) >= count:
             break
     means, colors, owner = (torch.cat(parts)[:count] for parts in zip(*found, strict=True))
     if not len(means):
         raise DataError(
-            f"no place is in the images of {needed} training cameras, so that no starting point can be inferred; {NOT_SEEN}"
+            f"no place is in the images of {needed} training cameras, so that no starting point can be inferred; {GIVE_POINTS}"
         )
     return PointCloud(means, colors), owner
 

@@ -12,17 +12,17 @@ from neuprim.core.cameras import Camera
 from neuprim.core.cameras.world import World
 from neuprim.core.notices import warn_once
 
-__all__ = ["FAR", "axes_meet", "camera_extent", "focus_point", "outlying", "world_around"]
+__all__ = ["FAR", "optical_axes_meet", "camera_extent", "focus_point", "find_outliers", "choose_world"]
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
     """Radius of the bounding sphere of the cameras about their mean x 1.1 (the convention of 3D Gaussian splatting);
     1.0 if zero.
 
-    Cameras that are :func:`outlying` do not count.
+    Cameras that are :func:`find_outliers` do not count.
     """
     positions = torch.stack([c.position.detach().double() for c in cameras])
-    positions = positions[~outlying(positions)]
+    positions = positions[~find_outliers(positions)]
     radius = (positions - positions.mean(0)).norm(dim=-1).max().item() * 1.1
     return radius if radius > 0 else 1.0
 
@@ -31,7 +31,7 @@ _OUTLYING = 100.0
 _OUTLYING_SHARE = 0.05
 
 
-def outlying(positions: Tensor) -> Tensor:
+def find_outliers(positions: Tensor) -> Tensor:
     """(N,) bool of the (N, 3) camera centres that say nothing about place and scale of a scene.
 
     Rule: a few cameras (one, or 5 %) farther from the median centre than 100 times the median distance are mistakes of
@@ -56,7 +56,7 @@ def focus_point(cameras: Sequence[Camera]) -> Tensor:
     return torch.linalg.solve(planes.sum(0) + pull * eye, right)
 
 
-def axes_meet(cameras: Sequence[Camera]) -> bool:
+def optical_axes_meet(cameras: Sequence[Camera]) -> bool:
     """Whether the optical axes determine a point in front of the cameras.
 
     They do if they pass it closer than half the spread of the camera centres, and nine cameras of ten look towards it.
@@ -75,7 +75,7 @@ def _axes(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
     """(N, 3) centres and (N, 3) viewing directions, float64, of the cameras that count for a scene's place."""
     positions = torch.stack([c.position.detach().double() for c in cameras])
     forward = torch.stack([c.viewmat[2, :3].detach().double() for c in cameras])
-    usual = ~outlying(positions)
+    usual = ~find_outliers(positions)
     return positions[usual], forward[usual]
 
 
@@ -84,7 +84,7 @@ FAR = 100.0
 of it there."""
 
 
-def world_around(cameras: Sequence[Camera], where: str = "cameras") -> World:
+def choose_world(cameras: Sequence[Camera], where: str = "cameras") -> World:
     """Where the scene that cameras see lies in the world of their file.
 
     Rule: where the mean of the camera centres is farther than :data:`FAR` extents from the origin, that mean, rounded
@@ -94,7 +94,7 @@ def world_around(cameras: Sequence[Camera], where: str = "cameras") -> World:
     views = [c.viewmat.detach().double() for c in cameras]
     # solved, not transposed: far from the origin a transpose turns the rounding of a file's rotations into metres
     centers = torch.stack([-torch.linalg.solve(v[:3, :3], v[:3, 3]) for v in views])
-    far = outlying(centers)
+    far = find_outliers(centers)
     if far.any():
         row = int(far.nonzero()[0])
         place = ", ".join(f"{x + 0.0:.6g}" for x in centers[row].tolist())

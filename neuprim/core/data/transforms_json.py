@@ -15,26 +15,33 @@ from pathlib import Path
 from torch import Tensor
 
 from neuprim.core.cameras import opengl_to_viewmat
-from neuprim.core.cameras.intrinsics import Target, camera_of, check_keys, is_fisheye, lens_of, unknown_keys
+from neuprim.core.cameras.intrinsics import (
+    Target,
+    describe_unknown_keys,
+    has_fisheye_lens,
+    read_camera,
+    read_lens_coefficients,
+    refuse_unsupported_keys,
+)
 from neuprim.core.cameras.pinhole import check_viewmat
 from neuprim.core.data.distortion import Distortion, Fisheye, Radial
-from neuprim.core.data.image_views import ImageFrame, Mask, masks_beside
+from neuprim.core.data.image_views import ImageFrame, Mask, find_masks
 from neuprim.core.data.posed_images import (
     BadViews,
     FolderSettings,
     MissingFiles,
-    every_nth,
+    exif_hint,
     find_image,
-    missing_files,
-    turned,
-    unique_names,
+    missing_files_error,
+    split_every_nth,
+    unique_view_names,
 )
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import image_info
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.notices import warn_once
 
-__all__ = ["Layout", "read_frames", "read_splits", "split_frames"]
+__all__ = ["TransformsLayout", "read_transforms_frames", "read_transforms_splits", "split_named_frames"]
 
 _POSES = ("transform_matrix", "R_opt", "T_opt")
 
@@ -44,7 +51,7 @@ def _viewmat(record: JsonReader) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Layout:
+class TransformsLayout:
     """What a format has of its own.
 
     Attributes:
@@ -64,12 +71,12 @@ class Layout:
     masks: bool = False
 
 
-def read_frames(
+def read_transforms_frames(
     folder: Path,
     document: JsonReader,
     records: list[JsonReader],
     settings: FolderSettings,
-    layout: Layout,
+    layout: TransformsLayout,
     skip_missing: bool = False,
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
     """The frames whose images exist and are good, and their records, both in the order of ``records``; names are unique
@@ -86,23 +93,23 @@ def read_frames(
             unknown camera model, most views bad, or any with ``settings.strict``.
     """
     for record in (document, *records):
-        check_keys(record)
+        refuse_unsupported_keys(record)
     names = [layout.name(r) for r in records]
     files = [layout.image(folder, r) for r in records]
     absent = [
         f"{n}{r.values.get('file_ext') or ''}" for n, r, f in zip(names, records, files, strict=True) if f is None
     ]
     if absent and (not skip_missing or len(absent) == len(records)):
-        raise missing_files(document.where, absent, "" if skip_missing else _skip_hint(settings))
+        raise missing_files_error(document.where, absent, "" if skip_missing else _skip_hint(settings))
     present = [(r, f, n) for r, f, n in zip(records, files, names, strict=True) if f is not None]
     masks = _masks(folder, document, [(r, f) for r, f, _ in present], layout)
     kept: list[JsonReader] = []
     frames: list[ImageFrame] = []
     bad = BadViews(document.where, settings.strict)
     for (record, file, _), mask, name in zip(
-        present, masks, unique_names([n for *_, n in present], document.where), strict=True
+        present, masks, unique_view_names([n for *_, n in present], document.where), strict=True
     ):
-        fisheye = is_fisheye(
+        fisheye = has_fisheye_lens(
             record, document
         )  # before anything else, as other keys mean nothing to a lens that is not known
         if not _damaged(record):
@@ -111,8 +118,8 @@ def read_frames(
         viewmat = None if info is None else bad.read(name, _pose, record, layout)
         if info is None or viewmat is None:
             continue
-        target = Target(info.width, info.height, str(file), turned(info))
-        camera = camera_of(record, document, target, viewmat, warn_once).validate(record.where)
+        target = Target(info.width, info.height, str(file), exif_hint(info))
+        camera = read_camera(record, document, target, viewmat, warn_once).validate(record.where)
         told = (
             any(r.has("w") for r in (record, document)) and info.width != info.height
         )  # the size says which way up pixels are
@@ -123,7 +130,7 @@ def read_frames(
         kept.append(record)
         frames.append(ImageFrame(name, file, camera, info, mask, _distortion(record, document, fisheye)))
     bad.settle(len(present))
-    unknown = unknown_keys(document, records, layout.keys)
+    unknown = describe_unknown_keys(document, records, layout.keys)
     if unknown:
         warn_once(unknown)
     return kept, frames
@@ -133,7 +140,7 @@ def _skip_hint(settings: FolderSettings) -> str:
     return "; scene.skip_missing=true leaves such frames out" if hasattr(settings, "skip_missing") else ""
 
 
-def _pose(record: JsonReader, layout: Layout) -> Tensor:
+def _pose(record: JsonReader, layout: TransformsLayout) -> Tensor:
     viewmat = layout.viewmat(record)
     check_viewmat(viewmat, record.where)
     return viewmat
@@ -155,12 +162,12 @@ def _numbers(value: object) -> list[float]:
 
 
 def _masks(
-    folder: Path, document: JsonReader, present: Sequence[tuple[JsonReader, Path]], layout: Layout
+    folder: Path, document: JsonReader, present: Sequence[tuple[JsonReader, Path]], layout: TransformsLayout
 ) -> list[Mask | None]:
     """The mask of every frame: what ``mask_path`` names, in the frame or in the file, else what lies beside the
     images."""
     if layout.masks and not any(r.has("mask_path") for r in (document, *(r for r, _ in present))):
-        return masks_beside(folder, [file for _, file in present])
+        return find_masks(folder, [file for _, file in present])
     masks, lost = [], []
     for record, _ in present:
         source = record if record.has("mask_path") else document
@@ -169,13 +176,13 @@ def _masks(
         lost += [name] if name and file is None else []
         masks.append(None if file is None else Mask(file))
     if lost:
-        raise missing_files(f"{document.where}: mask_path", lost)
+        raise missing_files_error(f"{document.where}: mask_path", lost)
     return masks
 
 
 def _distortion(record: JsonReader, document: JsonReader, fisheye: bool) -> Distortion | None:
     """The lens; None where all of its coefficients are zero."""
-    lens = lens_of(record, document)
+    lens = read_lens_coefficients(record, document)
     k, p = [lens[f"k{i}"] for i in (1, 2, 3, 4)], [lens["p1"], lens["p2"]]
     if fisheye:
         return Fisheye(*k)
@@ -187,7 +194,7 @@ def _distortion(record: JsonReader, document: JsonReader, fisheye: bool) -> Dist
 Read = Callable[[str], list[ImageFrame]]
 
 
-def read_splits(
+def read_transforms_splits(
     folder: Path, train: str, test: str, hold_out: int, read: Read
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
     """(training, test) of ``transforms_SPLIT.json`` files; with ``hold_out`` every so many training views are the test
@@ -203,7 +210,7 @@ def read_splits(
             raise ConfigError(
                 f"scene.hold_out is {hold_out}, but {folder} has only {len(frames)} training view; expected at least 2"
             )
-        return every_nth(frames, hold_out)
+        return split_every_nth(frames, hold_out)
     path = folder / f"transforms_{test}.json"
     hint = "; scene.hold_out=8 holds out every 8th training view instead"
     if not path.is_file():
@@ -214,7 +221,7 @@ def read_splits(
         raise MissingFiles(f"{error}{hint}") from None
 
 
-def split_frames(
+def split_named_frames(
     document: JsonReader, records: Sequence[JsonReader], frames: Sequence[ImageFrame], every: int
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
     """(training, test) by ``train_filenames``, ``val_filenames`` and ``test_filenames``; without any every n-th is a
@@ -229,13 +236,13 @@ def split_frames(
     keys = [key for key in ("train_filenames", "val_filenames", "test_filenames") if document.has(key)]
     lists = {key: set(map(_plain, document.texts(key))) for key in keys}
     if not lists:
-        return every_nth(frames, every)
+        return split_every_nth(frames, every)
     listed = {_plain(r.text("file_path")): f for r, f in zip(records, frames, strict=True)}
     everything = {_plain(r.text("file_path")) for r in document.objects("frames")}
     for key, names in lists.items():
         unknown = sorted(names - everything)
         if unknown:
-            raise missing_files(f"{document.where}: {key} names images that no frame has", unknown)
+            raise missing_files_error(f"{document.where}: {key} names images that no frame has", unknown)
     held = [key for key in ("test_filenames", "val_filenames") if key in lists]
     judged = next((key for key in held if lists[key]), held[0] if held else "")
     train_names = (

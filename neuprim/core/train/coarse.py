@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from neuprim.core.data import Pixels, View
-from neuprim.core.data.image_views import averaged, whole
+from neuprim.core.data.image_views import average_pixels, reduce_mask
 
 __all__ = ["reduced", "reduction"]
 
@@ -34,6 +34,6 @@ def reduced(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
         factor //= 2
     if factor == 1:
         return view, pixels
-    alpha = None if pixels.alpha is None else averaged(pixels.alpha[..., None], factor)[..., 0]
-    mask = None if pixels.mask is None else whole(pixels.mask, factor)
-    return replace(view, camera=camera.reduced(factor)), Pixels(averaged(pixels.rgb, factor), alpha, mask)
+    alpha = None if pixels.alpha is None else average_pixels(pixels.alpha[..., None], factor)[..., 0]
+    mask = None if pixels.mask is None else reduce_mask(pixels.mask, factor)
+    return replace(view, camera=camera.reduced(factor)), Pixels(average_pixels(pixels.rgb, factor), alpha, mask)

@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.dataset_check import check_points
-from neuprim.core.data.initial import subset, surrounding_points
+from neuprim.core.data.initial import draw_points, surrounding_points
 from neuprim.core.data.points_file import COMPRESSED, read_points
-from neuprim.core.data.ray_points import NOT_SEEN, views_that_see
+from neuprim.core.data.ray_points import GIVE_POINTS, count_seeing_views
 from neuprim.core.errors import ConfigError, DataError, nearest
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
@@ -48,7 +48,7 @@ def initial_model(
     where = settings.init.get("points", "matter")
     if isinstance(where, str) and where.lower().endswith((".ply", *COMPRESSED)):
         points = read_points(Path(where).expanduser(), dataset.channels, dataset.color_space).within(dataset.world)
-        cloud = subset(points, settings.primitives, generator)
+        cloud = draw_points(points, settings.primitives, generator)
     elif where in ("matter", "box"):
         cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)
         cloud = _surrounded(cloud, dataset, settings, generator)
@@ -57,9 +57,9 @@ def initial_model(
     check_points(cloud, settings.primitives, dataset)
     if len(cloud.means) == 0:
         raise DataError(f"{dataset.name}: no starting points found; expected points or images with visible content")
-    if not bool((views_that_see(dataset.train, cloud.means) > 0).any()):
+    if not bool((count_seeing_views(dataset.train, cloud.means) > 0).any()):
         raise DataError(
-            f"{dataset.name}: none of {len(cloud.means)} starting points is in the image of a training camera; {NOT_SEEN}"
+            f"{dataset.name}: none of {len(cloud.means)} starting points is in the image of a training camera; {GIVE_POINTS}"
         )
     extent = scene_extent(
         dataset.extent, cloud.means, [dataset.train.view(i).camera for i in range(len(dataset.train))]
@@ -100,6 +100,6 @@ def _surrounded(cloud: PointCloud, dataset: Dataset, settings: ModelSettings, ge
         raise ConfigError(
             f"model.init.surroundings={share!r}: matter of {dataset.name} depends on {named}; expected a scene at rest"
         )
-    own = subset(cloud, min(len(cloud.means), round((1.0 - share) * settings.primitives)), generator)
+    own = draw_points(cloud, min(len(cloud.means), round((1.0 - share) * settings.primitives)), generator)
     more = surrounding_points(dataset.train, own, settings.primitives - len(own.means), generator)
     return PointCloud(torch.cat([own.means, more.means]), torch.cat([own.colors, more.colors]))

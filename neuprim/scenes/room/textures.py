@@ -1,4 +1,9 @@
-"""What the room's surfaces look like: colours as functions of the position and of the width that is averaged over."""
+"""Patterns evaluated where a ray hits, averaged over the width that the ray stands for, so that distant detail blurs
+and does not flicker.
+
+Everything is a function of position; nothing is stored, nothing is random but by the hash of a cell's whole
+coordinates.
+"""
 
 from __future__ import annotations
 
@@ -7,25 +12,110 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from neuprim.scenes.room.patterns import cells, checks, mix, noise, stripes
-from neuprim.scenes.shapes import srgb
+from neuprim.scenes.shapes import parse_srgb
 
 __all__ = [
     "Texture",
-    "bricks",
     "books",
+    "bricks",
+    "cells",
+    "checks",
     "chequered",
     "marble",
+    "mix",
+    "noise",
     "painting",
     "planks",
     "plaster",
     "rug",
     "sky",
     "speckled",
+    "stripes",
     "wallpaper",
 ]
 
 Array = NDArray[np.float32]
+
+_PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
+
+
+def stripes(x: Array, period: float, part: float, width: Array) -> Array:
+    """(M,) share of the intervals of ``width`` (M,) about ``x`` (M,) that the first ``part`` (0..1) of every ``period``
+    covers."""
+    half = np.maximum(width / np.float32(period), np.float32(1e-4)) / 2
+    t = x / np.float32(period)
+    return ((_filled(t + half, part) - _filled(t - half, part)) / (2 * half)).astype(np.float32, copy=False)
+
+
+def _filled(t: Array, part: float) -> NDArray[np.float64]:
+    """How much of 0..t is covered; double precision, as nearly equal values are subtracted."""
+    wide = t.astype(np.float64)
+    whole = np.floor(wide)
+    return whole * part + np.minimum(wide - whole, part)
+
+
+def checks(x: Array, y: Array, cell: float, width: Array) -> Array:
+    """(M,) share of the light squares of a chequerboard of edge ``cell``."""
+    return (0.5 + 2 * (stripes(x, 2 * cell, 0.5, width) - 0.5) * (stripes(y, 2 * cell, 0.5, width) - 0.5)).astype(
+        np.float32
+    )
+
+
+def noise(points: Array, width: Array, cell: float, seed: int, octaves: int = 4, fall: float = 0.55) -> Array:
+    """(M,) smooth noise about -1..1 of mean 0 at ``points`` (M, D): lattices of edge ``cell``, ``cell``/2, ..., each
+    ``fall`` times weaker.
+
+    An octave is left out where its cells are smaller than about ``width`` (M,), having averaged out.
+    """
+    total = np.zeros(len(points), dtype=np.float32)
+    strength = 1.0
+    for octave in range(octaves):
+        edge = cell / 2**octave
+        weight = np.clip(1.5 - width / np.float32(edge), 0, 1) * np.float32(strength)
+        seen = np.flatnonzero(weight > 0)
+        if len(seen) == len(points):
+            total += weight * _lattice(points / np.float32(edge), seed + octave)
+        else:
+            total[seen] += weight[seen] * _lattice(points[seen] / np.float32(edge), seed + octave)
+        strength *= fall
+    return total
+
+
+def cells(index: NDArray[np.integer], seed: int) -> Array:
+    """(M,) numbers 0..1, evenly spread and without pattern, one for each of the whole coordinates ``index`` (M, D)."""
+    h = np.full(len(index), (seed * 0x27D4EB2F + 0x165667B1) & 0xFFFFFFFF, dtype=np.uint32)
+    for axis in range(index.shape[1]):
+        h = (h ^ index[:, axis].astype(np.int64).astype(np.uint32)) * np.uint32(_PRIMES[axis % 3])
+        h ^= h >> np.uint32(15)
+    h *= np.uint32(0x2C1B3C6D)
+    h ^= h >> np.uint32(12)
+    h *= np.uint32(0x297A2D39)
+    h ^= h >> np.uint32(15)
+    return (h >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
+
+
+def mix(one: Array, other: Array, share: Array) -> Array:
+    """(M, 3) from ``one`` where ``share`` (M,) is 0 to ``other`` where it is 1; both (3,) or (M, 3)."""
+    t = np.clip(share, 0, 1)[:, None].astype(np.float32, copy=False)
+    return one + t * (other - one)
+
+
+def _lattice(points: Array, seed: int) -> Array:
+    """(M,) values of -1..1 at whole coordinates, blended in between by the quintic whose first and second derivatives
+    vanish there."""
+    base = np.floor(points)
+    t = points - base
+    t = t * t * t * (t * (t * 6 - 15) + 10)
+    corner = base.astype(np.int64)
+    total = np.zeros(len(points), dtype=np.float32)
+    for bits in range(2 ** points.shape[1]):
+        step = [(bits >> axis) & 1 for axis in range(points.shape[1])]
+        weight = np.ones(len(points), dtype=np.float32)
+        for axis, up in enumerate(step):
+            weight *= t[:, axis] if up else 1 - t[:, axis]
+        total += weight * cells(corner + step, seed)
+    return 2 * total - 1
+
 
 Texture = Callable[[Array, Array], Array]
 """(M, 3) positions in scene units and (M,) widths in the same -> (M, 3) linear RGB reflectance 0..1."""
@@ -33,7 +123,7 @@ Texture = Callable[[Array, Array], Array]
 
 def speckled(code: str, seed: int, strength: float = 0.12, cell: float = 0.5) -> Texture:
     """One colour, unevenly painted."""
-    colour = srgb(code)
+    colour = parse_srgb(code)
     return lambda p, w: np.clip(colour * (1 + np.float32(strength) * noise(p, w, cell, seed))[:, None], 0, 1)
 
 
@@ -41,7 +131,7 @@ def planks(
     dark: str, light: str, along: int, across: int, seed: int, width: float = 0.3, length: float = 2.2
 ) -> Texture:
     """Boards along one axis beside each other along another, each of its own tone, with a grain and narrow gaps."""
-    one, other = srgb(dark), srgb(light)
+    one, other = parse_srgb(dark), parse_srgb(light)
 
     def texture(p: Array, w: Array) -> Array:
         row = np.floor(p[:, across] / width)
@@ -60,7 +150,7 @@ def planks(
 
 def bricks(u: int, v: int, seed: int, width: float = 0.62, height: float = 0.22, mortar: float = 0.03) -> Texture:
     """A wall of bricks, each of its own red, rough, every other row moved by half a brick."""
-    dark, light, grout = srgb("#7d3527"), srgb("#cf7d5a"), srgb("#c9c0b2")
+    dark, light, grout = parse_srgb("#7d3527"), parse_srgb("#cf7d5a"), parse_srgb("#c9c0b2")
 
     def texture(p: Array, w: Array) -> Array:
         row = np.floor(p[:, v] / height)
@@ -81,7 +171,7 @@ def bricks(u: int, v: int, seed: int, width: float = 0.62, height: float = 0.22,
 
 def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> Texture:
     """Squares of two colours with fine joints, worn unevenly."""
-    first, second = srgb(one), srgb(other)
+    first, second = parse_srgb(one), parse_srgb(other)
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
@@ -95,7 +185,12 @@ def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> T
 
 def wallpaper(u: int, v: int, seed: int) -> Texture:
     """Broad and narrow stripes with a row of dots in every broad one."""
-    ground, broad, narrow, dot = srgb("#e9dcc0"), srgb("#9db8a2"), srgb("#4f7a6b"), srgb("#b5533c")
+    ground, broad, narrow, dot = (
+        parse_srgb("#e9dcc0"),
+        parse_srgb("#9db8a2"),
+        parse_srgb("#4f7a6b"),
+        parse_srgb("#b5533c"),
+    )
 
     def texture(p: Array, w: Array) -> Array:
         x, y = p[:, u], p[:, v]
@@ -115,7 +210,12 @@ def wallpaper(u: int, v: int, seed: int) -> Texture:
 
 def plaster(u: int, v: int, seed: int, panel: float) -> Texture:
     """Rough plaster in clouds of ochre; below the height ``panel`` a wainscot of upright boards."""
-    light, dark, board, seam = srgb("#e6c98c"), srgb("#b0764a"), srgb("#5d6f86"), srgb("#2f3a4a")
+    light, dark, board, seam = (
+        parse_srgb("#e6c98c"),
+        parse_srgb("#b0764a"),
+        parse_srgb("#5d6f86"),
+        parse_srgb("#2f3a4a"),
+    )
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
@@ -126,14 +226,14 @@ def plaster(u: int, v: int, seed: int, panel: float) -> Texture:
         )
         rail: Array = np.clip((0.06 - np.abs(p[:, v] - panel)) / np.maximum(w, 0.005) + 0.5, 0, 1)
         below: Array = np.clip((panel - p[:, v]) / np.maximum(w, 0.005) + 0.5, 0, 1)
-        return np.clip(mix(mix(rough, boards, below), srgb("#efe9dc"), rail), 0, 1)
+        return np.clip(mix(mix(rough, boards, below), parse_srgb("#efe9dc"), rail), 0, 1)
 
     return texture
 
 
 def painting(u: int, v: int, seed: int) -> Texture:
     """A picture: three colours flow into each other, with contours where one gives way to the next."""
-    palette = [srgb(code) for code in ("#12355b", "#e4572e", "#f3a712", "#76b041")]
+    palette = [parse_srgb(code) for code in ("#12355b", "#e4572e", "#f3a712", "#76b041")]
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
@@ -150,7 +250,10 @@ def painting(u: int, v: int, seed: int) -> Texture:
 def books(u: int, v: int, seed: int, thickness: float = 0.11, shelf: float = 0.5) -> Texture:
     """Spines side by side: each of its own colour, with a band, and a dark line to the next."""
     colours = np.stack(
-        [srgb(c) for c in ("#8c2f39", "#1d3557", "#e0b04c", "#3a5a40", "#d8d0c0", "#5e3a78", "#c8553d", "#247ba0")]
+        [
+            parse_srgb(c)
+            for c in ("#8c2f39", "#1d3557", "#e0b04c", "#3a5a40", "#d8d0c0", "#5e3a78", "#c8553d", "#247ba0")
+        ]
     )
 
     def texture(p: Array, w: Array) -> Array:
@@ -161,14 +264,14 @@ def books(u: int, v: int, seed: int, thickness: float = 0.11, shelf: float = 0.5
         height = (p[:, v] / shelf) % 1
         band = (np.abs(height - 0.35 - 0.3 * cells(index, seed + 1)) < 0.06) * (1 - far)
         gap = stripes(p[:, u] + 0.008, thickness, 0.016 / thickness, w)
-        return mix(colour, srgb("#f1e4b8"), 0.8 * band) * (1 - 0.8 * gap)[:, None]
+        return mix(colour, parse_srgb("#f1e4b8"), 0.8 * band) * (1 - 0.8 * gap)[:, None]
 
     return texture
 
 
 def marble(seed: int) -> Texture:
     """Dark veins through something light, in all three dimensions."""
-    light, vein = srgb("#e4e0d8"), srgb("#5a6470")
+    light, vein = parse_srgb("#e4e0d8"), parse_srgb("#5a6470")
 
     def texture(p: Array, w: Array) -> Array:
         flow = noise(p, w, 0.9, seed, octaves=5, fall=0.6)
@@ -180,7 +283,7 @@ def marble(seed: int) -> Texture:
 
 def rug(radius: float, seed: int) -> Texture:
     """Rings about the z axis, some of them cut into wedges, woven from coarse yarn."""
-    red, navy, cream = srgb("#a63a3a"), srgb("#1f2f4f"), srgb("#e8dcc2")
+    red, navy, cream = parse_srgb("#a63a3a"), parse_srgb("#1f2f4f"), parse_srgb("#e8dcc2")
 
     def texture(p: Array, w: Array) -> Array:
         r: Array = np.hypot(p[:, 0], p[:, 1])
@@ -198,7 +301,7 @@ def rug(radius: float, seed: int) -> Texture:
 
 def sky(seed: int, low: float, high: float) -> Texture:
     """Clouds before a blue that pales from the height ``high`` down to ``low``; what is behind a window."""
-    zenith, horizon, cloud = srgb("#4f8fd6"), srgb("#cfe3f2"), srgb("#ffffff")
+    zenith, horizon, cloud = parse_srgb("#4f8fd6"), parse_srgb("#cfe3f2"), parse_srgb("#ffffff")
 
     def texture(p: Array, w: Array) -> Array:
         blue = mix(horizon, zenith, (p[:, 2] - low) / (high - low))

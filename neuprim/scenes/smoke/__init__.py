@@ -4,7 +4,7 @@
 ``noise``: turbulence in sources), ``generate`` writes a sequence of OpenVDB files.
 """
 
-from neuprim.scenes.smoke.generate import simulate
-from neuprim.scenes.smoke.scenes import SCENES, Scene
+from neuprim.scenes.smoke.generate import simulate_smoke
+from neuprim.scenes.smoke.scenes import SCENES, SmokeScene
 
-__all__ = ["SCENES", "Scene", "simulate"]
+__all__ = ["SCENES", "SmokeScene", "simulate_smoke"]

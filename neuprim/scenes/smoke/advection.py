@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-__all__ = ["Stencil", "advect", "stencil"]
+__all__ = ["Stencil", "advect_field", "stencil"]
 
 Job = TypeVar("Job")
 
@@ -66,7 +66,7 @@ def stencil(points: list[Tensor], shape: tuple[int, int, int]) -> Stencil:
     return Stencil(base[:, None] + torch.tensor(_corners(shape), dtype=torch.int32), weights)
 
 
-def advect(fields: Tensor, velocity: Tensor, time: float, cell: float, blurred: int = 0) -> Tensor:
+def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blurred: int = 0) -> Tensor:
     """(C, X, Y, Z) fields, carried for ``time`` seconds by a velocity (3, X, Y, Z) in world units per second at the
     centres.
 

@@ -28,12 +28,20 @@ import torch
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.validation import Range, coerce
-from neuprim.scenes.cached import cached_folder
-from neuprim.scenes.smoke.projection import Box
-from neuprim.scenes.smoke.scenes import SCENES, Scene, Stage
-from neuprim.scenes.smoke.solver import State, advance
+from neuprim.scenes.image_set import write_cached_folder
+from neuprim.scenes.smoke.scenes import SCENES, SmokeScene, Stage
+from neuprim.scenes.smoke.solver import Box, GasState, advance_gas
 
-__all__ = ["SOLVER_VERSION", "THRESHOLD", "TIMESTEPS", "Resolution", "box_of", "cache_key", "grids_of", "simulate"]
+__all__ = [
+    "SOLVER_VERSION",
+    "THRESHOLD",
+    "TIMESTEPS",
+    "Resolution",
+    "simulation_box",
+    "simulation_key",
+    "make_vdb_grids",
+    "simulate_smoke",
+]
 
 SOLVER_VERSION = 1
 """Part of the cache's key: to be raised with every change to the solver, the scenes' sources or the files' layout."""
@@ -50,7 +58,7 @@ TIMESTEPS = (1, 1000)
 Progress = Callable[[str, float], None]
 
 
-def simulate(
+def simulate_smoke(
     name: str,
     frames: int | None,
     resolution: int,
@@ -80,16 +88,16 @@ def simulate(
     )
     resolution = coerce(resolution, Resolution, "scene.resolution")
     seed = coerce(seed, Annotated[int, Range(0, 2**63 - 1)], "seed")
-    final = Path(cache_dir) / f"sim-{name}-{cache_key(scene, count, resolution, seed)}"
+    final = Path(cache_dir) / f"sim-{name}-{simulation_key(scene, count, resolution, seed)}"
     files = [f"{name}_{i}.vdb" for i in range(count)]
 
     def write(folder: Path) -> None:
         _write(scene, count, resolution, seed, folder, progress)
 
-    return cached_folder(final, files, write, f"scene {name}: cannot write the simulated frames")
+    return write_cached_folder(final, files, write, f"scene {name}: cannot write the simulated frames")
 
 
-def cache_key(scene: Scene, frames: int, resolution: int, seed: int) -> str:
+def simulation_key(scene: SmokeScene, frames: int, resolution: int, seed: int) -> str:
     """A short hash of everything that the files depend on."""
     settings = {
         "version": SOLVER_VERSION,
@@ -105,12 +113,12 @@ def cache_key(scene: Scene, frames: int, resolution: int, seed: int) -> str:
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def box_of(resolution: int) -> Box:
+def simulation_box(resolution: int) -> Box:
     """One world unit wide and deep, 1.5 high, rounded up to whole blocks of 8 voxels."""
     return Box((resolution, resolution, -(-3 * resolution // 16) * 8), 1.0 / resolution)
 
 
-def grids_of(state: State, scene: Scene, box: Box) -> list[Grid]:
+def make_vdb_grids(state: GasState, scene: SmokeScene, box: Box) -> list[Grid]:
     """What is written of a state: the scene's grids, in half floats, without the faint."""
     half = (box.cell * 0.5, box.cell * 0.5)
     corner = (half[0] - box.shape[0] * half[0], half[1] - box.shape[1] * half[1], half[0])  # the centre of voxel 0
@@ -127,7 +135,7 @@ def grids_of(state: State, scene: Scene, box: Box) -> list[Grid]:
     return grids
 
 
-def _albedo(state: State) -> np.ndarray:
+def _albedo(state: GasState) -> np.ndarray:
     """(X, Y, Z, 3) in 0..1, where there is smoke."""
     assert state.colour is not None
     density = state.density
@@ -136,20 +144,20 @@ def _albedo(state: State) -> np.ndarray:
     return np.ascontiguousarray(straight.permute(1, 2, 3, 0).numpy())
 
 
-def _write(scene: Scene, count: int, resolution: int, seed: int, folder: Path, progress: Progress) -> None:
+def _write(scene: SmokeScene, count: int, resolution: int, seed: int, folder: Path, progress: Progress) -> None:
     text = f"{scene.name}: simulating {count} frames"
     progress(text, 0.0)
-    box = box_of(resolution)
-    stage, state = Stage(box, seed), State.empty(box, scene.coloured)
+    box = simulation_box(resolution)
+    stage, state = Stage(box, seed), GasState.empty(box, scene.coloured)
     metadata = {"creator": "neuprim simulation", "comment": f"simulated by neuprim: {scene.name}, seed {seed}"}
     pool, writing = ThreadPoolExecutor(1), None
     try:
         for frame in range(count):
             with _one_torch_thread():
-                state = advance(state, scene.solver, box, scene.forcing(stage, state.time), scene.frame_time)
+                state = advance_gas(state, scene.solver, box, scene.forcing(stage, state.time), scene.frame_time)
             _finish(writing)
             path = folder / f"{scene.name}_{frame}.vdb"
-            writing = pool.submit(write_vdb, path, grids_of(state, scene, box), metadata=metadata)
+            writing = pool.submit(write_vdb, path, make_vdb_grids(state, scene, box), metadata=metadata)
             progress(text, (frame + 1) / count)
         _finish(writing)
     finally:
@@ -172,7 +180,7 @@ def _finish(writing: Future[None] | None) -> None:
         writing.result()  # raises what the writer raised
 
 
-def _scene(name: str) -> Scene:
+def _scene(name: str) -> SmokeScene:
     if name not in SCENES:
         raise ConfigError(f"scene {name!r} is not simulated{nearest(str(name), SCENES)}")
     return SCENES[name]

@@ -13,7 +13,7 @@ import numpy as np
 from neuprim.config import RunConfig, suspects_of
 from neuprim.core.channels import channels_of
 from neuprim.core.data import Dataset
-from neuprim.core.data.dataset import held_out
+from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import refuse_existing, write_json, write_text
@@ -46,7 +46,7 @@ class Request:
         same model again. out: the new run directory; None: beside the run, its name with "-pruned".
         overwrite: whether files there may be replaced.
         hold_out: n > 1: one of n training views neither decides nor is trained on, as in
-        :func:`~neuprim.core.data.dataset.held_out`; 0: all do.
+        :func:`~neuprim.core.data.dataset.hold_out_views`; 0: all do.
     """
 
     run_dir: Path
@@ -111,7 +111,7 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
         suspects.know(dataset)
         check_dataset(dataset, task.conditions)
         if request.hold_out:
-            dataset = replace(dataset, train=held_out(dataset, request.hold_out).train)
+            dataset = replace(dataset, train=hold_out_views(dataset, request.hold_out).train)
         begun = time.monotonic()
         steps = request.steps if request.steps is not None else steps_in(request.seconds, config, task, dataset, model)
         search = Search(config, task, dataset, request.tolerance, steps, progress)

@@ -16,7 +16,7 @@ from neuprim.config import suspects_of, task_of
 from neuprim.config.target import Target
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
 from neuprim.core.compression import Quantizers
-from neuprim.core.data.dataset import held_out
+from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.io.files import atomic_path, write_text
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.model.primitives import Primitives
@@ -82,7 +82,7 @@ class Workshop:
     def measured(self, model: Primitives) -> dict[str, float]:
         """PSNR and SSIM on the views held out that judged the trainings."""
         trying = self.trying
-        judged = held_out(trying.dataset, trying.record.hold_out)
+        judged = hold_out_views(trying.dataset, trying.record.hold_out)
         truths, rows = truths_of(judged, VIEWS), []
         settings = trying.config.renderer
         with torch.no_grad():
@@ -183,7 +183,7 @@ def quantised(shop: Workshop, before: Finished) -> Finished:
     words = (before.run_dir / "config.yaml").read_text(encoding="utf-8")
     least = min(0.0, judge.margin(before.held)) - (ALLOWANCE if judge.margin(before.held) < 0 else 0.0)
     trying.events(Finishing("storing in few bits"))
-    views = replace(trying.dataset, train=held_out(trying.dataset, trying.record.hold_out).train)
+    views = replace(trying.dataset, train=hold_out_views(trying.dataset, trying.record.hold_out).train)
     rounding = Rounding(model, views, judge_of(trying.config, views))
 
     def stored(made: Quantizers) -> int:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from neuprim.core.data import Clip, Dataset
-from neuprim.core.data.dataset_check import extra_of
+from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.model.primitives import Primitives
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def recording_of(dataset: Dataset) -> Recording | None:
         return None
     from neuprim.tasks.dynamic.volume.dataset import Recording
 
-    return extra_of(dataset, Recording)
+    return get_extra(dataset, Recording)
 
 
 def mask(dataset: Dataset, index: int) -> Tensor | None:

@@ -20,11 +20,18 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import PointCloud, ViewSet
-from neuprim.core.data.dataset import SomeViews
+from neuprim.core.data.dataset import ViewSubset
 from neuprim.core.data.hull import EmptyHull, hull_surface
-from neuprim.core.data.initial import box_points, check_count, distinct, farthest_points, has_silhouettes, median_colors
+from neuprim.core.data.initial import (
+    box_points,
+    check_point_count,
+    drop_repeated_points,
+    farthest_points,
+    median_colors,
+    views_have_alpha,
+)
 from neuprim.core.data.ray_points import ray_points
-from neuprim.core.data.scene_frame import axes_meet
+from neuprim.core.data.scene_frame import optical_axes_meet
 
 __all__ = ["moving_points"]
 
@@ -57,12 +64,12 @@ def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> Poi
         ConfigError: ``count`` is not positive.
         DataError: cameras share times, but their masks have no common volume at any; or an image is damaged.
     """
-    check_count(count)
+    check_point_count(count)
     times = torch.stack([views.view(i).conditions["time"] for i in range(len(views))]).float()
-    if not axes_meet([views.view(i).camera for i in range(len(views))]):
+    if not optical_axes_meet([views.view(i).camera for i in range(len(views))]):
         rays, owner = ray_points(views, count, generator, _MATTER)
-        return distinct(PointCloud(rays.means, rays.colors, {"time": times[owner]}))
-    if has_silhouettes(views):
+        return drop_repeated_points(PointCloud(rays.means, rays.colors, {"time": times[owner]}))
+    if views_have_alpha(views):
         points = _hull_points(views, times, count, generator)
         if points is not None:
             return points
@@ -78,7 +85,7 @@ def _hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Gen
     empty: EmptyHull | None = None
     for number, (indices, _) in enumerate(moments):
         try:
-            found, side = hull_surface(SomeViews(views, indices), _RESOLUTION, seen_views=_SEEN, matter=_MATTER)
+            found, side = hull_surface(ViewSubset(views, indices), _RESOLUTION, seen_views=_SEEN, matter=_MATTER)
         except EmptyHull as error:
             empty = error
             continue
@@ -102,9 +109,9 @@ def _hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Gen
     colors = torch.empty_like(means)
     for number in owner.unique().tolist():
         mine = owner == number
-        colors[mine] = median_colors(SomeViews(views, moments[number][0]), means[mine], _MATTER)
+        colors[mine] = median_colors(ViewSubset(views, moments[number][0]), means[mine], _MATTER)
     when = torch.tensor([time for _, time in moments], dtype=torch.float32)
-    return distinct(PointCloud(means, colors, {"time": when[owner]}))
+    return drop_repeated_points(PointCloud(means, colors, {"time": when[owner]}))
 
 
 def _moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:

@@ -25,8 +25,15 @@ import torch
 
 from neuprim.core.data import Dataset
 from neuprim.core.data.image_views import ImageFrame
-from neuprim.core.data.posed_images import EveryNth, FolderSettings, SplitName, data_folder, posed_images
-from neuprim.core.data.transforms_json import Layout, read_frames, split_frames
+from neuprim.core.data.posed_images import (
+    EveryNth,
+    FolderSettings,
+    SceneDetails,
+    SplitName,
+    assemble_dataset,
+    find_data_folder,
+)
+from neuprim.core.data.transforms_json import TransformsLayout, read_transforms_frames, split_named_frames
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
@@ -50,7 +57,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
             cameras, empty splits.
     """
     asked = validate(MultiviewSettings, settings, "scene")
-    folder = data_folder(asked.path)
+    folder = find_data_folder(asked.path)
     name, single = folder.resolve().name, folder / "transforms.json"
     files = {split: folder / f"transforms_{split}.json" for split in (asked.train_split, asked.test_split)}
     if not files[asked.train_split].is_file() and single.is_file():
@@ -58,8 +65,8 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
         clock = _clock(records, [], asked.time_range)
         records, frames = _frames(asked, document, records, clock)
-        train, test = split_frames(document, records, frames, asked.test_every)
-        return posed_images(str(single), name, train, test, asked, context, start=moving_points)
+        train, test = split_named_frames(document, records, frames, asked.test_every)
+        return assemble_dataset(str(single), name, train, test, asked, context, SceneDetails(start=moving_points))
     if not any(path.is_file() for path in files.values()):
         raise DataError(
             f"{folder}: has neither {files[asked.train_split].name} nor transforms.json; expected one of them"
@@ -72,15 +79,14 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     splits = {split: list(document.objects("frames")) for split, document in documents.items()}
     clock = _clock([r for s in splits.values() for r in s], _others(folder, splits), asked.time_range)
     read = {split: _frames(asked, documents[split], splits[split], clock)[1] for split in splits}
-    return posed_images(
+    return assemble_dataset(
         str(folder),
         name,
         read[asked.train_split],
         read[asked.test_split],
         asked,
         context,
-        up=torch.tensor([0.0, 0.0, 1.0]),
-        start=moving_points,
+        SceneDetails(up=torch.tensor([0.0, 0.0, 1.0]), start=moving_points),
     )
 
 
@@ -88,8 +94,10 @@ def _frames(
     asked: MultiviewSettings, document: JsonReader, records: list[JsonReader], clock: _Range
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
     """The frames with their times 0..1, and their records."""
-    layout = Layout(keys=("time", "train_filenames", "val_filenames", "test_filenames", "ply_file_path"), masks=True)
-    records, frames = read_frames(data_folder(asked.path), document, records, asked, layout)
+    layout = TransformsLayout(
+        keys=("time", "train_filenames", "val_filenames", "test_filenames", "ply_file_path"), masks=True
+    )
+    records, frames = read_transforms_frames(find_data_folder(asked.path), document, records, asked, layout)
     low, high = clock
     times = [(r.number("time") - low) / (high - low) for r in records]
     return records, [

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import Clip, Dataset
-from neuprim.core.data.dataset_check import extra_of
+from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.errors import DataError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Lighting:
         divide by
             it; "none" where intensities are given as they arrive, or nobody knows.
         classes: index of a test view -> (H, W) uint8, what its pixels show, indices of
-        :data:`~neuprim.scenes.lit.CLASSES`;
+        :data:`~neuprim.scenes.PIXEL_CLASSES`;
             errors are then told by class.
         parts: beginnings of the names of test views whose scores are also told apart, e.g. those with a new light.
         baselines: name -> function of a test view's index that gives (H, W, 3) linear light over the exposure, an image
@@ -61,7 +61,7 @@ def lighting_of(dataset: Dataset) -> Lighting:
     Raises:
         DatasetFault: its ``extra`` is something else.
     """
-    return extra_of(dataset, Lighting) or Lighting()
+    return get_extra(dataset, Lighting) or Lighting()
 
 
 def bright(views: ImageViews, where: str) -> float:

@@ -16,13 +16,12 @@ from torch import Tensor
 
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.data.image_views import ImageViews
-from neuprim.core.data.posed_images import HoldOut, in_scene
+from neuprim.core.data.posed_images import HoldOut, frame_in_scene
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import read_image
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import Accepts, validate
-from neuprim.scenes.lit.generate import LitSettings, generate
-from neuprim.scenes.lit.rig import NEAR_LIGHTS, PARTS
+from neuprim.scenes.lit import NEAR_LIGHTS, PARTS, LitSettings, generate_lit_solids
 from neuprim.tasks.relight import olat
 from neuprim.tasks.relight.data import Lighting
 
@@ -56,7 +55,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     asked = validate(LitSolidsSettings, settings, "scene")  # before a minute of drawing
     drawn = LitSettings(**{f.name: getattr(asked, f.name) for f in fields(LitSettings)})
     reading = {"background": asked.background, "hold_out": asked.hold_out}
-    folder = generate(drawn, context.cache_dir, context.progress)
+    folder = generate_lit_solids(drawn, context.cache_dir, context.progress)
     dataset = olat.load({"path": str(folder), "falloff": "inverse_square", **reading}, context)
     return replace(
         dataset,
@@ -78,7 +77,7 @@ def _known(dataset: Dataset, folder: Path) -> Lighting:
     if _beside(test.file(0), "nearest.exr").is_file():  # not where training views are held out
         baselines[f"nearest_light_of_{NEAR_LIGHTS}"] = partial(companion, test, "nearest.exr")
     views = olat.read_split(folder, "circle", olat.OlatSettings(path=folder))
-    circle = ImageViews([in_scene(f, dataset.world, ("light",)) for f in views], to_linear=True)
+    circle = ImageViews([frame_in_scene(f, dataset.world, ("light",)) for f in views], to_linear=True)
     film = Clip("light_round", range(len(circle)), 12.0, circle)
     return Lighting("inverse_square", partial(classes, test), PARTS, baselines, (film,))
 

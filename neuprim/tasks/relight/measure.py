@@ -15,7 +15,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.images import linear_to_srgb
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.metrics.flip import flip, flip_available
-from neuprim.scenes.lit import CLASSES
+from neuprim.scenes import PIXEL_CLASSES
 
 __all__ = ["class_errors", "class_shares", "scores"]
 
@@ -43,19 +43,19 @@ def class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, 
 
     Args:
         rendered, truth: (H, W, 3) linear light over the exposure.
-        classes: (H, W) uint8, indices of :data:`CLASSES`.
+        classes: (H, W) uint8, indices of :data:`PIXEL_CLASSES`.
 
     Raises:
         DataError: the map has another size than the images, or a value that is no class.
     """
-    if classes.shape != truth.shape[:2] or int(classes.max()) >= len(CLASSES):
+    if classes.shape != truth.shape[:2] or int(classes.max()) >= len(PIXEL_CLASSES):
         raise DataError(
             f"pixel classes: found {tuple(classes.shape)} with values up to {int(classes.max())}; "
-            f"expected {tuple(truth.shape[:2])} with values below {len(CLASSES)}"
+            f"expected {tuple(truth.shape[:2])} with values below {len(PIXEL_CLASSES)}"
         )
     squares = (rendered.clamp(0.0, 1.0) - truth.clamp(0.0, 1.0)).double().square().mean(-1)
     result: dict[str, float] = {}
-    for value, name in enumerate(CLASSES):
+    for value, name in enumerate(PIXEL_CLASSES):
         inside = classes == value
         if bool(inside.any()):
             result |= {f"mse_{name}": float(squares[inside].mean()), f"pixels_{name}": float(inside.sum())}
@@ -64,5 +64,7 @@ def class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, 
 
 def class_shares(maps: list[Tensor]) -> dict[str, float]:
     """Share of each class, in percent of the pixels that are not background."""
-    counts = torch.stack([torch.bincount(m.reshape(-1).long(), minlength=len(CLASSES)) for m in maps]).sum(0)
-    return {name: 100.0 * float(counts[i]) / max(float(counts[1:].sum()), 1.0) for i, name in enumerate(CLASSES) if i}
+    counts = torch.stack([torch.bincount(m.reshape(-1).long(), minlength=len(PIXEL_CLASSES)) for m in maps]).sum(0)
+    return {
+        name: 100.0 * float(counts[i]) / max(float(counts[1:].sum()), 1.0) for i, name in enumerate(PIXEL_CLASSES) if i
+    }

@@ -51,12 +51,13 @@ from neuprim.core.data.posed_images import (
     Background,
     FolderSettings,
     HoldOut,
+    SceneDetails,
     SplitName,
-    data_folder,
+    assemble_dataset,
+    find_data_folder,
     find_image,
-    posed_images,
 )
-from neuprim.core.data.transforms_json import Layout, read_frames, read_splits
+from neuprim.core.data.transforms_json import TransformsLayout, read_transforms_frames, read_transforms_splits
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import Conditions
@@ -78,22 +79,24 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         with exposure=auto.
     """
     asked = validate(OlatSettings, settings, "scene")
-    folder = data_folder(asked.path)
-    train, test = read_splits(
+    folder = find_data_folder(asked.path)
+    train, test = read_transforms_splits(
         folder, asked.train_split, asked.test_split, asked.hold_out, lambda split: read_split(folder, split, asked)
     )
-    return posed_images(
+    return assemble_dataset(
         str(folder),
         folder.resolve().name,
         train,
         test,
         asked,
         context,
-        up=torch.tensor([0.0, 0.0, 1.0]),
-        to_linear=True,
-        exposure=(lambda views: bright(views, str(folder))) if asked.exposure == "auto" else asked.exposure,
-        extra=Lighting(asked.falloff),
-        places=("light",),
+        SceneDetails(
+            up=torch.tensor([0.0, 0.0, 1.0]),
+            to_linear=True,
+            exposure=(lambda views: bright(views, str(folder))) if asked.exposure == "auto" else asked.exposure,
+            extra=Lighting(asked.falloff),
+            positions=("light",),
+        ),
     )
 
 
@@ -107,8 +110,8 @@ def read_split(folder: Path, split: str, asked: OlatSettings) -> list[ImageFrame
     near = document.number_or("camera_near", 3.0, "a distance above 0", 0.0)
     if document.number_or("camera_far", max(10.0, 2.0 * near), f"a distance above camera_near, {near:g}") <= near:
         raise document.fail("camera_far", f"a distance above camera_near, {near:g}")
-    layout = Layout(_KEYS, _name, _image, lambda record: _viewmat(record, asked.ignore_corrections))
-    records, frames = read_frames(folder, document, list(document.objects("frames")), asked, layout)
+    layout = TransformsLayout(_KEYS, _name, _image, lambda record: _viewmat(record, asked.ignore_corrections))
+    records, frames = read_transforms_frames(folder, document, list(document.objects("frames")), asked, layout)
     return [replace(frame, conditions=_light(record, document)) for record, frame in zip(records, frames, strict=True)]
 
 

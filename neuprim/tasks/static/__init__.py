@@ -66,21 +66,21 @@ def _mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
 
 def _blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.static.datasets.blender import load
+    from neuprim.tasks.static.datasets import load_blender
 
-    return load(settings, context)
+    return load_blender(settings, context)
 
 
 def _nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.static.datasets.nerfstudio import load
+    from neuprim.tasks.static.datasets import load_nerfstudio
 
-    return load(settings, context)
+    return load_nerfstudio(settings, context)
 
 
 def _colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.static.datasets.colmap import load
+    from neuprim.tasks.static.datasets import load_colmap
 
-    return load(settings, context)
+    return load_colmap(settings, context)
 
 
 def _facts(dataset: Dataset) -> Mapping[str, Any]:

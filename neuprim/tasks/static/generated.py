@@ -11,11 +11,9 @@ import torch
 from neuprim.core.data import Dataset
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import validate
-from neuprim.scenes.room.generate import RoomSettings
-from neuprim.scenes.room.generate import generate as generate_room
-from neuprim.scenes.solids.generate import SolidsSettings
-from neuprim.scenes.solids.generate import generate as generate_solids
-from neuprim.tasks.static.datasets import blender, nerfstudio
+from neuprim.scenes.room.generate import RoomSettings, generate_room
+from neuprim.scenes.solids import SolidsSettings, generate_solids
+from neuprim.tasks.static.datasets import load_blender, load_nerfstudio
 
 __all__ = ["load_room", "load_solids"]
 
@@ -28,7 +26,7 @@ def load_solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: the cache directory cannot be written.
     """
     folder = generate_solids(validate(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
-    return replace(blender.load({"path": str(folder)}, context), name="solids", data_source="generated")
+    return replace(load_blender({"path": str(folder)}, context), name="solids", data_source="generated")
 
 
 def load_room(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
@@ -39,5 +37,5 @@ def load_room(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: the cache directory cannot be written.
     """
     folder = generate_room(validate(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
-    dataset = nerfstudio.load({"path": str(folder)}, context)
+    dataset = load_nerfstudio({"path": str(folder)}, context)
     return replace(dataset, name="room", data_source="generated", up=torch.tensor([0.0, 0.0, 1.0]))

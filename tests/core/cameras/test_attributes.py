@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from neuprim.core.cameras.pinhole import exr_attributes
+from neuprim.core.cameras.pinhole import camera_exr_attributes
 from tests import scenes
 
 CAMERA = scenes.camera(64, 48, shift=(5.0, -3.0))
@@ -13,7 +13,7 @@ POINTS = torch.tensor([[0.0, 0.0, 0.0], [0.3, -0.2, 0.1], [-0.4, 0.5, 0.2]], dty
 
 
 def test_points_through_the_matrices_land_where_the_camera_projects_them() -> None:
-    found = exr_attributes(CAMERA, 0.25)
+    found = camera_exr_attributes(CAMERA, 0.25)
     rows = np.concatenate([POINTS.numpy(), np.ones((3, 1))], 1) @ found["worldToNDC"]  # row vectors, as Imath
     pixels, z = CAMERA.project(POINTS)
     assert np.abs(rows[:, :2] / rows[:, 3:] * (64, 48) - pixels.numpy()).max() < 1e-3
@@ -21,7 +21,7 @@ def test_points_through_the_matrices_land_where_the_camera_projects_them() -> No
 
 
 def test_camera_space_is_left_handed_with_y_up_and_z_ahead() -> None:
-    matrix = exr_attributes(CAMERA, 0.25)["worldToCamera"]
+    matrix = camera_exr_attributes(CAMERA, 0.25)["worldToCamera"]
     view = CAMERA.viewmat
     ahead = CAMERA.position - view[1, :3] + 2 * view[2, :3]  # up in the image is against the second row
     assert np.abs(np.append(ahead.numpy(), 1.0) @ matrix - (0.0, 1.0, 2.0, 1.0)).max() < 1e-5
@@ -32,7 +32,7 @@ def test_camera_space_is_left_handed_with_y_up_and_z_ahead() -> None:
 
 
 def test_the_screen_window_is_that_of_the_pixels() -> None:
-    found = exr_attributes(CAMERA, 0.25)
+    found = camera_exr_attributes(CAMERA, 0.25)
     left, right = ((x - CAMERA.cx) / CAMERA.fx for x in (0, 64))
     bottom, top = ((CAMERA.cy - y) / CAMERA.fy for y in (48, 0))
     assert abs(found["screenWindowWidth"] - (right - left)) < 1e-6

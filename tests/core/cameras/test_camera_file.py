@@ -56,14 +56,6 @@ def test_focal_lengths_and_overrides_by_frame(tmp_path: Path) -> None:
     assert (second.fx, second.fy, second.cx, second.cy, second.width, second.height) == (10.0, 11.5, -3.0, 7.0, 20, 30)
 
 
-def test_size_from_outside_serves_where_the_file_names_none(tmp_path: Path) -> None:
-    data = {k: v for k, v in GOOD.items() if k not in ("w", "h")}
-    (_, camera), _ = read_cameras(write(tmp_path / "c.json", data), (30, 20))
-    assert (camera.width, camera.height, camera.fx) == (30, 20, pytest.approx(15.0))
-    (_, camera), _ = read_cameras(write(tmp_path / "d.json", GOOD), (30, 20))
-    assert (camera.width, camera.height) == (64, 48)
-
-
 def pose(**cells: Any) -> list[list[Any]]:
     matrix: list[list[Any]] = [list(row) for row in POSE]
     for key, value in cells.items():
@@ -134,29 +126,6 @@ def test_bad_files_are_refused_by_name_and_field(tmp_path: Path, data: Any, word
     with pytest.raises(DataError, match=words) as caught:
         read_cameras(path)
     assert str(path) in str(caught.value)
-
-
-def test_the_bad_frame_is_named(tmp_path: Path) -> None:
-    path = write(
-        tmp_path / "c.json", {**GOOD, "frames": [{"transform_matrix": POSE}, {"transform_matrix": pose(m00=-1.0)}]}
-    )
-    with pytest.raises(DataError, match=r"frames\[1\]"):
-        read_cameras(path)
-
-
-def test_missing_file_folder_and_bytes(tmp_path: Path) -> None:
-    (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00{}")
-    for path in (tmp_path / "none.json", tmp_path, tmp_path / "bytes.json"):
-        with pytest.raises(DataError, match=path.name):
-            read_cameras(path)
-
-
-def test_a_file_too_large_is_not_read(tmp_path: Path) -> None:
-    path = tmp_path / "large.json"
-    with open(path, "wb") as file:
-        file.truncate(10 * 2**30)  # sparse
-    with pytest.raises(DataError, match="bytes"):
-        read_cameras(path)
 
 
 def test_three_rows_and_null_intrinsics_are_as_the_data_loaders_take_them(tmp_path: Path) -> None:
@@ -251,13 +220,6 @@ def test_bad_camera_paths_are_refused_by_name_and_field(tmp_path: Path, change: 
     with pytest.raises(DataError, match=words) as caught:
         read_camera_file(write(tmp_path / "path.json", {**PATH, **change}))
     assert "path.json" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_too_many_cameras_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neuprim.core.cameras.camera_files.MOST", 1)
-    for data, key in ((GOOD, "frames"), (PATH, "camera_path")):
-        with pytest.raises(DataError, match=f"{key} has 2 cameras; expected at most 1"):
-            read_camera_file(write(tmp_path / "c.json", data))
 
 
 def test_a_file_of_something_else(tmp_path: Path) -> None:

@@ -36,15 +36,6 @@ def test_opengl_axes() -> None:
     assert torch.allclose(right_and_up, torch.tensor([21.0 + 5.0, 14.0 - 6.0], dtype=torch.float64))
 
 
-def test_opengl_rotation_is_inverted() -> None:
-    a = 0.7
-    c2w = EYE.clone()
-    c2w[:3, :3] = torch.tensor([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
-    c2w[:3, 3] = torch.tensor([0.5, -1.0, 2.0])
-    inverse = torch.linalg.inv(c2w @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)))
-    assert torch.allclose(opengl_to_viewmat(c2w), inverse)
-
-
 def test_resizing_keeps_pixel_edges() -> None:
     # halves of an image stay halves: pixel centres are at +0.5, so coordinates scale without an offset
     point = torch.tensor([0.3, -0.2, 2.0])
@@ -63,10 +54,6 @@ def test_look_at(up: Tensor) -> None:
     assert torch.allclose(project(view, target), torch.tensor([21.0, 14.0], dtype=torch.float64))
     assert project(view, target + 0.1 * up)[1] < 14.0, "up is towards smaller rows"
     assert (view.viewmat[:3, :3] @ (target.double() - view.position) + 0)[2] > 0
-
-
-def test_look_at_along_up() -> None:
-    camera(look_at(torch.tensor([0.0, 0.0, 5.0]), torch.zeros(3), Z)).validate("here")
 
 
 def test_orbit() -> None:
@@ -106,7 +93,3 @@ def test_refusals(bad: Camera, words: str) -> None:
     with pytest.raises(DataError, match=r"file\.json: frame 3") as caught:
         bad.validate("file.json: frame 3")
     assert words in str(caught.value)
-
-
-def test_principal_point_outside_the_image_is_allowed() -> None:
-    replace(camera(), cx=-500.0).validate("here")

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import builtins
 import struct
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
 from neuprim.core.cameras.camera_files import read_camera_file
-from neuprim.core.errors import BackendUnavailable, DataError
+from neuprim.core.errors import DataError
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'neuprim[colmap]'")
 
@@ -62,16 +60,6 @@ def test_points_may_be_missing(tmp_path: Path) -> None:
     assert not (folder / "points3D.txt").exists()
 
 
-@pytest.mark.parametrize("points", [True, False])
-def test_binary(tmp_path: Path, points: bool) -> None:
-    read = pycolmap.Reconstruction(str(model(tmp_path / "text")))
-    (tmp_path / "binary").mkdir()
-    read.write_binary(str(tmp_path / "binary"))
-    if not points:
-        (tmp_path / "binary" / "points3D.bin").unlink()
-    check(tmp_path / "binary")
-
-
 def test_distortion_is_told_and_fisheyes_are_refused(tmp_path: Path) -> None:
     folder = model(tmp_path / "m", images=IMAGES.replace("1 a.png", "2 a.png"))
     assert read_camera_file(folder).notes == ("the lens distortion of 1 of 2 cameras (SIMPLE_RADIAL) is left out",)
@@ -86,27 +74,6 @@ def test_distortion_is_told_and_fisheyes_are_refused(tmp_path: Path) -> None:
             read_camera_file(bent)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"cameras": "1 PINHOLE 640 480 500\n"}, "not a readable COLMAP model"),
-        ({"cameras": "1 LENS 640 480 500 320 240\n"}, "not a readable COLMAP model"),
-        ({"cameras": "cameras\n"}, "not a readable COLMAP model"),
-        ({"images": "1 1 0 0 0 0 0 0 9 a.png\n\n"}, "not a readable COLMAP model"),
-        ({"images": ""}, "has no images with a pose"),
-        ({"images": None}, r"[12] files not found: images.txt"),
-        ({"images": "1 1 0 0 0 nan 0 0 1 a.png\n\n"}, "COLMAP model|non-finite"),
-        ({"cameras": "1 PINHOLE 640 480 -5 500 320 240\n"}, "focal lengths > 0"),
-        ({"cameras": "1 PINHOLE 0 480 5 500 320 240\n"}, "image size 0x480; expected positive|COLMAP model"),
-    ],
-)
-def test_damaged_text_is_refused_with_the_folder(tmp_path: Path, change: dict[str, Any], words: str) -> None:
-    for points in ("", None):
-        with pytest.raises(DataError, match=words) as caught:
-            read_camera_file(model(tmp_path / f"m{points is None}", **{**change, "points": points}) / "cameras.txt")
-        assert str(tmp_path / f"m{points is None}") in str(caught.value)
-
-
 def test_a_count_that_the_file_does_not_pay_for(tmp_path: Path) -> None:
     read = pycolmap.Reconstruction(str(model(tmp_path / "text")))
     (tmp_path / "binary").mkdir()
@@ -115,16 +82,3 @@ def test_a_count_that_the_file_does_not_pay_for(tmp_path: Path) -> None:
     path.write_bytes(struct.pack("<Q", 2**60) + path.read_bytes()[8:])
     with pytest.raises(DataError, match=r"images.bin: truncated or corrupt"):
         read_camera_file(tmp_path / "binary")
-
-
-def test_the_package_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *rest: Any, **more: Any) -> Any:
-        if name == "pycolmap":
-            raise ImportError("no such package")
-        return real(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(BackendUnavailable, match=r"pip install 'neuprim\[colmap\]'"):
-        read_camera_file(model(tmp_path / "m"))

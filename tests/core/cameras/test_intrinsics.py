@@ -7,7 +7,14 @@ from typing import Any
 
 import pytest
 
-from neuprim.core.cameras.intrinsics import Target, camera_of, check_keys, is_fisheye, lens_of, unknown_keys
+from neuprim.core.cameras.intrinsics import (
+    Target,
+    describe_unknown_keys,
+    has_fisheye_lens,
+    read_camera,
+    read_lens_coefficients,
+    refuse_unsupported_keys,
+)
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 
@@ -21,7 +28,7 @@ ANGLE = 2 * math.atan(32 / 50)
 def camera(frame: dict[str, Any], file: dict[str, Any], target: Target = IMAGE) -> tuple[tuple[float, ...], list[str]]:
     """fx, fy, cx, cy and what was said."""
     said: list[str] = []
-    found = camera_of(
+    found = read_camera(
         JsonReader({"transform_matrix": POSE, **frame}, "t.json: frames[0]"),
         JsonReader(file, "t.json"),
         target,
@@ -130,11 +137,11 @@ def test_a_lens_comes_whole_from_the_frame() -> None:
         JsonReader({"k1": 0.1}, "f"),
         JsonReader({"k1": 0.5, "k2": 0.5, "camera_model": "OPENCV_FISHEYE"}, "t"),
     )
-    assert (lens_of(frame, file)["k1"], lens_of(frame, file)["k2"]) == (0.1, 0.0)
-    assert is_fisheye(frame, file), "the model is not among the coefficients"
-    assert not is_fisheye(JsonReader({"camera_model": "OPENCV"}, "f"), file)
+    assert (read_lens_coefficients(frame, file)["k1"], read_lens_coefficients(frame, file)["k2"]) == (0.1, 0.0)
+    assert has_fisheye_lens(frame, file), "the model is not among the coefficients"
+    assert not has_fisheye_lens(JsonReader({"camera_model": "OPENCV"}, "f"), file)
     with pytest.raises(DataError, match=r"camera_model is .FULL_OPENCV"):
-        is_fisheye(JsonReader({"camera_model": "FULL_OPENCV"}, "f"), file)
+        has_fisheye_lens(JsonReader({"camera_model": "FULL_OPENCV"}, "f"), file)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +164,7 @@ def test_a_lens_comes_whole_from_the_frame() -> None:
 )
 def test_keys_that_change_the_picture_are_refused_by_name(key: str, value: Any) -> None:
     with pytest.raises(DataError, match=f"t.json: {key} "):
-        check_keys(JsonReader({key: value}, "t.json"))
+        refuse_unsupported_keys(JsonReader({key: value}, "t.json"))
 
 
 def test_the_same_keys_may_say_nothing() -> None:
@@ -169,9 +176,9 @@ def test_the_same_keys_may_say_nothing() -> None:
         "shift_x": 0,
         "n_frames": 2,
     }
-    check_keys(JsonReader({**nothing, "frames": [{}, {}]}, "t.json"))
+    refuse_unsupported_keys(JsonReader({**nothing, "frames": [{}, {}]}, "t.json"))
     with pytest.raises(DataError, match="n_frames is 1; expected 2"):
-        check_keys(JsonReader({"n_frames": 1, "frames": [{}, {}]}, "t.json"))
+        refuse_unsupported_keys(JsonReader({"n_frames": 1, "frames": [{}, {}]}, "t.json"))
 
 
 def test_unknown_keys_are_named_once_and_those_of_real_files_are_not() -> None:
@@ -183,6 +190,6 @@ def test_unknown_keys_are_named_once_and_those_of_real_files_are_not() -> None:
         JsonReader({"file_path": "a", "colmap_im_id": i, "sharpness": 3.0, "time": 0.1, "depth_file_path": "d"}, "f")
         for i in range(3)
     ]
-    line = unknown_keys(file, frames, ())
+    line = describe_unknown_keys(file, frames, ())
     assert line.startswith("t.json: keys that are not read: exposures, frames[].time; task=dynamic")
-    assert unknown_keys(file, frames, ("time", "exposures")) == ""
+    assert describe_unknown_keys(file, frames, ("time", "exposures")) == ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -43,14 +42,6 @@ def test_an_identity_changes_nothing() -> None:
         and World().world_points(POINTS) is POINTS
         and World.of({}, "it").identity
     )
-
-
-@pytest.mark.parametrize(
-    "record", [{}, [], 3, {"scene_from_world": 1}, {"scene_from_world": [[1, 2]]}, {"scene_from_world": "a"}]
-)
-def test_a_damaged_header_is_refused(record: Any) -> None:
-    with pytest.raises(DataError, match=r"^model: header field 'world' is damaged"):
-        World.of({"world": record}, "model")
 
 
 @pytest.mark.parametrize("diagonal", [(1.0, 1, 2), (1, 1, -1), (0, 0, 0), (math.nan, 1, 1)])

@@ -122,11 +122,6 @@ def test_some_are_a_shell_far_behind_everything_where_some_view_looks() -> None:
     assert bool(seen.all())
 
 
-def test_the_generator_is_the_only_chance() -> None:
-    assert torch.equal(fill(Room(), 120).means, fill(Room(), 120).means)
-    assert not torch.equal(fill(Room(), 120).means, fill(Room(), 120, seed=1).means)
-
-
 def test_pixels_that_do_not_count_are_not_lifted() -> None:
     views = Room(1, masked=True)
     found = fill(views, 100)
@@ -135,32 +130,6 @@ def test_pixels_that_do_not_count_are_not_lifted() -> None:
     near = found.means.norm(dim=1) < 6.5
     u = 40 * local[:, 0] / local[:, 2] + camera.cx
     assert int(near.sum()) > 50 and bool((u[near] >= SIZE[0] / 2).all())
-
-
-def test_nothing_is_made_of_nothing() -> None:
-    none = known().rows(torch.zeros(0, dtype=torch.int64))
-    generator = torch.Generator().manual_seed(0)
-    assert len(surrounding_points(Room(), none, 50, generator).means) == 0
-    assert len(surrounding_points(Room(), known(), 0, generator).means) == 0
-    few = known(3)  # fewer than a depth is guessed from
-    assert len(surrounding_points(Room(), few, 50, generator).means) <= 50
-
-
-@pytest.mark.parametrize("share", ["1.5", "-0.1", "yes"])
-def test_a_share_is_a_share(share: str) -> None:
-    config = compose(
-        [
-            "task=static",
-            "scene=solids",
-            "scene.size=16",
-            "scene.train_views=4",
-            "scene.test_views=1",
-            f"model.init.surroundings={share}",
-        ],
-        False,
-    )
-    with pytest.raises(ConfigError, match=r"model\.init\.surroundings"):
-        make_trainer(config, task_of(config), load_dataset(config, task_of(config)))
 
 
 def test_matter_that_moves_has_no_surroundings() -> None:
@@ -178,17 +147,3 @@ def test_matter_that_moves_has_no_surroundings() -> None:
         match=r"model\.init\.surroundings=0\.2: matter of smoke_fire \(simulated\) depends on time; expected a scene at rest",
     ):
         make_trainer(config, task_of(config), load_dataset(config, task_of(config)))
-
-
-def test_a_camera_sees_what_lies_before_it_and_inside_its_image() -> None:
-    camera = Room(1).cameras[0]
-    hit = on_the_wall(camera)
-    spots, depth = camera.project(hit.reshape(-1, 3))
-    y, x = torch.meshgrid(torch.arange(SIZE[1]) + 0.5, torch.arange(SIZE[0]) + 0.5, indexing="ij")
-    assert torch.allclose(spots, torch.stack([x, y], -1).reshape(-1, 2).double(), atol=1e-9) and bool((depth > 0).all())
-    assert bool(camera.sees(hit.reshape(-1, 3)).all())
-    behind = 2 * camera.position - hit.reshape(-1, 3)
-    assert not bool(camera.sees(behind).any())
-    small = camera.reduced(5)
-    assert (small.width, small.height) == (SIZE[0] // 5, SIZE[1] // 5)
-    assert torch.allclose(small.project(hit.reshape(-1, 3))[0] * 5, spots)

@@ -14,7 +14,7 @@ import yaml
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.metrics import means, psnr
 from neuprim.core.metrics.flip import flip, flip_available
-from neuprim.scenes.lit import CLASSES
+from neuprim.scenes import PIXEL_CLASSES
 from neuprim.tasks.relight import lit_solids as lit
 from neuprim.tasks.relight import measure, olat
 from neuprim.tasks.relight.measure import class_errors, class_shares, scores
@@ -59,7 +59,7 @@ def test_wrong_class_maps_are_refused() -> None:
     with pytest.raises(DataError, match="pixel classes"):
         class_errors(rendered, truth, torch.zeros(8, 16, dtype=torch.uint8))
     with pytest.raises(DataError, match="values up to 5"):
-        class_errors(rendered, truth, torch.full((16, 16), len(CLASSES), dtype=torch.uint8))
+        class_errors(rendered, truth, torch.full((16, 16), len(PIXEL_CLASSES), dtype=torch.uint8))
 
 
 def test_means_leave_views_out_that_lack_a_number() -> None:

@@ -28,8 +28,7 @@ from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import SceneContext
 from neuprim.plugins.judging import facts_of
 from neuprim.runs.measure import draw_sum
-from neuprim.scenes.lit.scene import solids
-from neuprim.scenes.lit.shading import shade
+from neuprim.scenes.lit import build_lit_solids, shade_point_light
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import LightNetwork
@@ -82,12 +81,12 @@ def test_intensity_gives_the_centre_the_environments_irradiance(falloff: str, ex
 def test_a_white_sky_shows_albedo() -> None:
     """The ray caster's own shading of the built-in slab: a matt surface under uniform light of 1 is as bright as its
     albedo."""
-    scene = Scene([s for s in solids() if s.name == "slab"])
+    scene = Scene([s for s in build_lit_solids() if s.name == "slab"])
     told = {**facts(1e4), "center": [0.0, 0.0, 0.0]}
     lights = illuminate(Environment(torch.ones(64, 128, 3)), 600, told).conditions
     total = np.zeros(3)
     for light in lights:
-        seen = shade(scene, [0.2, 0.1, 3.0], [[0.0, 0.0, -1.0]], light["light"].numpy(), 1.0)
+        seen = shade_point_light(scene, [0.2, 0.1, 3.0], [[0.0, 0.0, -1.0]], light["light"].numpy(), 1.0)
         total += seen.rgb[0].astype(np.float64) * light["light_intensity"].double().numpy()
     albedo = scene.intersect([0.2, 0.1, 3.0], np.array([[0.0, 0.0, -1.0]], np.float32)).albedo[0]
     assert albedo.min() > 0.4

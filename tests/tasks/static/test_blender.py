@@ -16,8 +16,7 @@ from neuprim.core.data.image_views import ImageViews
 from neuprim.core.errors import DataError
 from neuprim.core.io.exr import write_exr
 from neuprim.core.notices import NeuprimWarning
-from neuprim.core.task import SceneContext
-from neuprim.tasks.static.datasets.blender import load
+from neuprim.tasks.static.datasets import load_blender as load
 
 W, H, ANGLE = 48, 36, 0.9
 
@@ -61,15 +60,6 @@ def test_marks_are_where_cameras_say(folder: Path, scenes: Any, context: Any) ->
     assert data.background.tolist() == [1.0, 1.0, 1.0] and not data.random_background
     assert data.center.norm() < 1e-3 and data.up.tolist() == [0.0, 0.0, 1.0]
     assert 3.0 < data.extent < 4.0
-
-
-def test_down_sampling_keeps_marks_in_place(folder: Path, scenes: Any, context: Any) -> None:
-    for factor in (2, 5):  # 48 x 36 leaves remainders for 5
-        data = load({"path": folder, "downsample": factor}, context)
-        assert max(scenes.off_by(data.train, i) for i in range(6)) < 0.03
-        camera = data.train.view(0).camera
-        assert (camera.width, camera.height) == (W // factor, H // factor) == data.train.pixels(0).rgb.shape[1::-1]
-        assert data.downsampling == f"{W // factor}x{H // factor} from 48x36 by area"
 
 
 def test_straight_alpha_is_premultiplied_before_it_is_averaged(folder: Path, context: Any) -> None:
@@ -133,14 +123,6 @@ def test_focal_lengths_and_principal_point_of_the_file(folder: Path, scenes: Any
     assert max(scenes.off_by(s, i) for s in (data.train, data.test) for i in range(len(s))) < 0.02
 
 
-def test_without_test_images_a_hold_out_is_offered(folder: Path, scenes: Any, context: Any) -> None:
-    for file in (folder / "test").iterdir():
-        file.unlink()
-    scenes.refused(load, {"path": folder}, context, "2 files not found", "scene.hold_out=8")
-    (folder / "transforms_test.json").unlink()
-    scenes.refused(load, {"path": folder}, context, "transforms_test.json", "not found", "scene.hold_out=8")
-
-
 def test_exr_is_linear_premultiplied_and_kept_above_one(folder: Path, context: Any) -> None:
     for split, n in (("train", 6), ("test", 2)):
         for i in range(n):
@@ -165,12 +147,6 @@ def test_images_load_lazily_and_within_the_cache(folder: Path, context: Any) -> 
         small.pixels(2)
 
 
-def test_progress_is_reported(folder: Path, tmp_path: Path, context: Any) -> None:
-    seen: list[tuple[str, float]] = []
-    load({"path": folder}, SceneContext(0, tmp_path, lambda text, fraction: seen.append((text, fraction))))
-    assert ("reading training images", 1.0) in seen and ("reading test images", 1.0) in seen
-
-
 def test_chair(chair: Path, context: Any) -> None:
     data = load({"path": chair, "downsample": 4}, context)
     assert (len(data.train), len(data.test)) == (100, 25)
@@ -184,76 +160,7 @@ def test_chair(chair: Path, context: Any) -> None:
     )
 
 
-def test_starting_points_of_the_chair(chair: Path, context: Any) -> None:
-    data = load({"path": chair}, context)
-    points = data.initial_points(2000, torch.Generator().manual_seed(0))
-    assert len(points.means) == 2000 and points.means.abs().max() < 1.15
-    inside = []
-    for i in range(len(data.test)):  # views that had no part in it
-        camera, alpha = data.test.view(i).camera, data.test.pixels(i).alpha
-        assert alpha is not None
-        p = points.means.double() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        u, v = camera.fx * p[:, 0] / p[:, 2] + camera.cx, camera.fy * p[:, 1] / p[:, 2] + camera.cy
-        inside.append((alpha[v.long(), u.long()] > 0.5).float().mean().item())
-    assert math.fsum(inside) / len(inside) > 0.93 and min(inside) > 0.8
-
-
 # ---------------------------------------------------------------- bad input
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({}, ["scene.path: required and not given; expected the data set's folder"]),
-        ({"path": []}, ["scene.path=[]: expected the data set's folder"]),
-        ({"path": "", "x": 1}, ["scene.x"]),
-        ({"back_ground": "white"}, ["scene.back_ground", "did you mean 'scene.background'"]),
-        ({"background": "green"}, ["scene.background=green: expected auto, white, black or random"]),
-        ({"downsample": 0}, ["scene.downsample=0: expected a whole number of at least 1"]),
-        ({"downsample": 1.5}, ["scene.downsample=1.5: expected a whole number"]),
-        ({"downsample": True}, ["scene.downsample=true: expected a whole number"]),
-        ({"downsample": 100}, ["scene.downsample is 100", "48x36"]),
-        ({"hold_out": 1}, ["scene.hold_out=1: expected 0, or a whole number of at least 2"]),
-        ({"hold_out": -2}, ["scene.hold_out=-2"]),
-        ({"test_split": ""}, ["scene.test_split='': expected the name"]),
-        ({"test_split": "none"}, ["transforms_none.json", "not found"]),
-        ({"preload": "yes"}, ["scene.preload=yes: expected true or false"]),
-    ],
-)
-def test_bad_settings(folder: Path, scenes: Any, context: Any, settings: dict[str, Any], words: list[str]) -> None:
-    if settings and "path" not in settings:
-        settings = {"path": str(folder), **settings}
-    scenes.refused(load, settings, context, *words)
-
-
-def test_bad_folder(folder: Path, scenes: Any, context: Any) -> None:
-    scenes.refused(load, {"path": folder / "no"}, context, str(folder / "no"), "does not exist")
-    scenes.refused(load, {"path": folder / "transforms_test.json"}, context, "is a file")
-    scenes.refused(load, {"path": folder / "train"}, context, "transforms_train.json", "not found")
-    scenes.refused(load, {"path": "x" * 5000}, context, "expected the data set's folder")
-    scenes.refused(load, {"path": "~nobody-of-that-name/x"}, context, "expected the data set's folder")
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"", ["not valid JSON"]),
-        (b"{", ["not valid JSON", "line 1"]),
-        (b"\xff\xfe\x00", ["not valid JSON"]),
-        (b"[" * 100_000, ["not valid JSON"]),
-        (b"[]", ["top level is a list of 0", "expected an object"]),
-        (b"{}", ["frames is missing", "non-empty list"]),
-        (b'{"frames": []}', ["frames is a list of 0", "non-empty list"]),
-        (b'{"frames": {}}', ["frames is an object"]),
-        (b'{"frames": [3]}', ["frames[0] is 3", "expected an object"]),
-        (b'{"frames": [{}]}', ["frames[0]", "file_path is missing"]),
-        (b'{"frames": [{"file_path": 3}]}', ["frames[0]", "file_path is 3", "text"]),
-        (b'{"frames": [{"file_path": "a\\u0000b"}]}', ["file_path"]),
-    ],
-)
-def test_bad_json(folder: Path, scenes: Any, context: Any, content: bytes, words: list[str]) -> None:
-    (folder / "transforms_train.json").write_bytes(content)
-    scenes.refused(load, {"path": folder}, context, str(folder / "transforms_train.json"), *words)
 
 
 def set_matrix(i: int, j: int, value: Any) -> Any:
@@ -297,27 +204,6 @@ def test_bad_fields(folder: Path, scenes: Any, context: Any, change: Any, words:
     scenes.refused(load, {"path": folder, "strict": True}, context, "transforms_train.json", *words)
 
 
-def test_a_matrix_of_three_rows_is_complete(folder: Path, context: Any) -> None:
-    edit(folder / "transforms_train.json", lambda d: d["frames"][3]["transform_matrix"].pop())
-    load({"path": folder}, context)
-
-
-def test_all_missing_images_are_listed(folder: Path, scenes: Any, context: Any) -> None:
-    for i in (1, 4, 5):
-        (folder / "train" / f"r_{i}.png").unlink()
-    text = scenes.refused(load, {"path": folder}, context, "3 files not found", *(f"train/r_{i}" for i in (1, 4, 5)))
-    assert "r_0" not in text
-
-
-def test_long_lists_of_missing_images_are_cut(folder: Path, scenes: Any, context: Any) -> None:
-    def change(document: Any) -> None:
-        document["frames"] = [{**document["frames"][0], "file_path": f"none_{i}"} for i in range(40)]
-
-    edit(folder / "transforms_train.json", change)
-    text = scenes.refused(load, {"path": folder}, context, "40 files not found", "none_9", "and 30 more")
-    assert "none_10" not in text
-
-
 def test_damaged_images_are_found_while_loading(folder: Path, scenes: Any, context: Any) -> None:
     bad = folder / "test" / "r_1.png"
     data = bad.read_bytes()
@@ -340,15 +226,3 @@ def test_mixed_sizes_channels_and_kinds(folder: Path, scenes: Any, context: Any)
     bad.unlink()
     write_exr(bad.with_suffix(".exr"), torch.zeros(H, W, 4))
     scenes.refused(load, {"path": folder}, context, "r_3.exr", "mixes OpenEXR")
-
-
-def test_random_background_needs_alpha(folder: Path, scenes: Any, context: Any) -> None:
-    for file in [*(folder / "train").iterdir(), *(folder / "test").iterdir()]:
-        scenes.save(file, np.zeros((H, W, 3)))
-    assert load({"path": folder}, context).background.tolist() == [0.0] * 3
-    scenes.refused(load, {"path": folder, "background": "random"}, context, "scene.background is 'random'", "no alpha")
-
-
-def test_hold_out_of_a_single_view(folder: Path, scenes: Any, context: Any) -> None:
-    edit(folder / "transforms_train.json", lambda d: d.__setitem__("frames", d["frames"][:1]))
-    scenes.refused(load, {"path": folder, "hold_out": 2}, context, "scene.hold_out is 2", "only 1")

@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.cameras.colmap import check_binary_model
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.notices import NeuprimWarning
-from neuprim.tasks.static.datasets.colmap import load
+from neuprim.tasks.static.datasets import load_colmap as load
 
 W, H = 64, 50
 PARAMS = {
@@ -87,12 +86,6 @@ def test_marks_are_where_cameras_say(capture: Any, scenes: Any, context: Any, mo
     assert worst(scenes, load({"path": path, "downsample": 2}, context)) < 0.06
 
 
-def test_points_are_the_models(capture: Any, context: Any) -> None:
-    points = load({"path": capture()}, context).initial_points(5, torch.Generator().manual_seed(0))
-    assert torch.allclose(points.means, torch.tensor(POINTS).float())
-    assert torch.allclose(points.colors, torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.2, 1.0]]))
-
-
 def test_names_with_blanks_are_whole_in_text_models(capture: Any, context: Any) -> None:
     path = capture(text=True)
     file = path / "sparse" / "0" / "images.txt"
@@ -149,11 +142,6 @@ def test_damaged_views_are_left_out(capture: Any, scenes: Any, context: Any) -> 
     assert len(data.train) == 7 and len(data.test) == 2 and worst(scenes, data) < 0.02
 
 
-def test_without_points_a_box_in_front_of_the_cameras(capture: Any, context: Any) -> None:
-    points = load({"path": capture(points=False)}, context).initial_points(50, torch.Generator().manual_seed(0))
-    assert len(points.means) == 50 and points.means.abs().max() < 1.0
-
-
 def test_text_models(capture: Any, scenes: Any, context: Any) -> None:
     assert worst(scenes, load({"path": capture("OPENCV", text=True)}, context)) < 0.06
 
@@ -176,13 +164,6 @@ def test_reduced_folders_scale_the_camera_to_the_actual_size(
         load({"path": path, "images": "images_3", "downsample": 2}, context).downsampling
         == "images_3, then 10x8 from 21x17 by area"
     )
-
-
-def test_sizes_may_differ(capture: Any, scenes: Any, context: Any) -> None:
-    path = capture()
-    scenes.save(path / "images" / "03.png", np.zeros((H // 2, W // 2)))
-    data = load({"path": path}, context)
-    assert {data.train.view(i).camera.width for i in range(len(data.train))} == {W, W // 2}
 
 
 def test_test_every_and_skip_missing(capture: Any, scenes: Any, context: Any) -> None:
@@ -211,55 +192,6 @@ def test_without_pycolmap_the_extra_is_named(tmp_path: Path, context: Any, monke
         load({"path": tmp_path}, context)
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"image": "images_4"}, ["scene.image", "did you mean 'scene.images'"]),
-        ({"images": [4]}, ["scene.images=[4]: expected the image folder's name"]),
-        ({"images": "images_4"}, ["images_4", "does not exist", "scene.images"]),
-        ({"model": "sparse/1"}, ["sparse/1", "no cameras.bin or cameras.txt"]),
-        ({"test_every": 0}, ["scene.test_every=0: expected a whole number of at least 2"]),
-        ({"hold_out": 3}, ["scene.hold_out: no such setting"]),
-    ],
-)
-def test_bad_settings(capture: Any, scenes: Any, context: Any, settings: dict[str, Any], words: list[str]) -> None:
-    scenes.refused(load, {"path": capture(), **settings}, context, *words)
-
-
-@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
-@pytest.mark.parametrize("part", [0.0, 0.05, 0.5, 0.99])
-def test_truncated_models(capture: Any, scenes: Any, context: Any, file: str, part: float) -> None:
-    path = capture()
-    bad = path / "sparse" / "0" / file
-    if not bad.is_file():
-        pytest.skip(f"this pycolmap writes no {file}")
-    data = bad.read_bytes()
-    bad.write_bytes(data[: int(len(data) * part)])
-    scenes.refused(load, {"path": path}, context, str(bad), "truncated or corrupt")
-
-
-@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
-def test_corrupt_counts_and_trailing_bytes(capture: Any, scenes: Any, context: Any, file: str) -> None:
-    path = capture()
-    bad = path / "sparse" / "0" / file
-    if not bad.is_file():
-        pytest.skip(f"this pycolmap writes no {file}")
-    data = bad.read_bytes()
-    bad.write_bytes(struct.pack("<Q", 2**60) + data[8:])
-    scenes.refused(load, {"path": path}, context, str(bad), "truncated or corrupt")
-    bad.write_bytes(data + b"more")
-    scenes.refused(load, {"path": path}, context, str(bad), "corrupt")
-
-
-def test_inconsistent_models(capture: Any, scenes: Any, context: Any) -> None:
-    path = capture()
-    bad = path / "sparse" / "0" / "images.bin"
-    data = bad.read_bytes()
-    at = data.index(b"00.png") - 4
-    bad.write_bytes(data[:at] + struct.pack("<i", 7) + data[at + 4 :])  # there is no camera 7
-    scenes.refused(load, {"path": path}, context, str(path / "sparse" / "0"), "not a readable COLMAP model")
-
-
 def test_models_with_rigs_of_two_cameras(tmp_path: Path, pycolmap: Any) -> None:
     if not hasattr(pycolmap, "Rig"):
         pytest.skip("this pycolmap has no rigs")
@@ -277,19 +209,6 @@ def test_models_with_rigs_of_two_cameras(tmp_path: Path, pycolmap: Any) -> None:
     reconstruction.add_rig(rig)
     reconstruction.write(str(tmp_path))
     check_binary_model(tmp_path, lambda model: 4)
-
-
-def test_missing_model_files(capture: Any, scenes: Any, context: Any) -> None:
-    path = capture()
-    for file in ("images.bin", "points3D.bin"):
-        (path / "sparse" / "0" / file).unlink()
-    scenes.refused(load, {"path": path}, context, "2 files not found", "images.bin", "points3D.bin")
-
-
-def test_damaged_text_model(capture: Any, scenes: Any, context: Any) -> None:
-    path = capture(text=True)
-    (path / "sparse" / "0" / "cameras.txt").write_text("1 PINHOLE 64\n")
-    scenes.refused(load, {"path": path}, context, "sparse/0")
 
 
 @pytest.mark.parametrize(
@@ -323,19 +242,6 @@ def test_wrong_image_shape(capture: Any, scenes: Any, context: Any) -> None:
     path = capture()
     scenes.save(path / "images" / "03.png", np.zeros((H, W // 2)))
     scenes.refused(load, {"path": path}, context, "03.png", "32x50", "expected 64x50", "or a reduction")
-
-
-def test_damaged_and_grey_images(capture: Any, scenes: Any, context: Any) -> None:
-    path = capture()
-    file = path / "images" / "03.png"
-    file.write_bytes(file.read_bytes()[:-40])
-    scenes.refused(load, {"path": path, "strict": True}, context, str(file), "truncated or corrupt")
-    Image.fromarray(np.zeros((H, W), np.uint16)).save(file)
-    scenes.refused(load, {"path": path, "strict": True}, context, str(file), "16-bit grey")
-
-
-def test_too_few_images(capture: Any, scenes: Any, context: Any) -> None:
-    scenes.refused(load, {"path": capture(count=1)}, context, "training split has no images")
 
 
 def test_a_whole_run_ends_in_a_report(capture: Any, scenes: Any, tmp_path: Path) -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 import warnings
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -19,19 +17,13 @@ from neuprim.config import compose
 from neuprim.core.cameras import Camera
 from neuprim.core.checkpoint import read_header
 from neuprim.core.data import Dataset
-from neuprim.core.errors import BackendUnavailable
 from neuprim.core.task import SceneContext
-from neuprim.plugins.registry import load_task
 from neuprim.runs.run import run
-from neuprim.scenes.meshes import ball, corner_normals
-from neuprim.scenes.raycast import Scene
-from neuprim.scenes.shapes import Solid, plain
-from neuprim.scenes.solids.generate import SolidsSettings
-from neuprim.scenes.solids.shading import encode_srgb
+from neuprim.scenes.shading import encode_srgb
 from neuprim.tasks.static.mesh import generate as generator
 from neuprim.tasks.static.mesh.generate import MeshSettings, generate, load
 from neuprim.tasks.static.mesh.gltf import read_gltf
-from neuprim.tasks.static.mesh.materials import GREY, Texture, decode_texture, read_surfaces
+from neuprim.tasks.static.mesh.materials import Texture, decode_texture, read_surfaces
 from neuprim.tasks.static.mesh.model import ModelFolder
 from neuprim.tasks.static.mesh.obj import read_obj
 from neuprim.tasks.static.mesh.surface import FARTHEST, Surface
@@ -111,15 +103,6 @@ def test_an_obj_takes_its_colours_and_textures_from_its_library(tmp_path: Path) 
     np.testing.assert_array_equal(colours(scene, [[-0.6, 0.1, -3]], [[0, 0, 1.0]]), [(255, 128, 0)])
 
 
-def test_colours_of_an_objs_vertices_stand_in_the_place_of_its_materials(tmp_path: Path) -> None:
-    """As MeshLab writes them, beside a material of some grey."""
-    (tmp_path / "m.mtl").write_text("newmtl m\nKd 0.3 0.3 0.3\n")
-    corners = "v -1 -1 0 1 0 0\nv 1 -1 0 1 0 0\nv 1 1 0 0 0 1\nv -1 1 0 0 0 1\n"
-    (tmp_path / "m.obj").write_text(f"mtllib m.mtl\n{corners}usemtl m\nf 1 2 3\nf 1 3 4\n")
-    found = colours(surface(tmp_path / "m.obj", "z"), [[0.9, -0.899, 3], [-0.85, 0.9, 3]], [[0, 0, -1.0]] * 2)
-    assert found[0, 0] > 240 and found[0, 2] < 80 and found[1, 2] > 240 and found[1, 0] < 80
-
-
 @pytest.mark.parametrize(
     ("line", "name"),
     [
@@ -137,16 +120,6 @@ def test_names_of_textures_in_libraries(tmp_path: Path, line: str, name: str) ->
     (tmp_path / "m.obj").write_text("mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
     model = read_obj(ModelFolder(tmp_path / "m.obj"))
     assert list(model.images) == [name] and model.materials["m"].texture == name
-
-
-def test_a_ply_has_the_colours_of_its_vertices(tmp_path: Path) -> None:
-    vertices, faces, _ = cube()
-    shown = ((vertices + 1) * 100 + 30).astype(np.uint8)
-    scene = surface(write_ply(tmp_path / "cube.ply", vertices, faces, shown))
-    s = FARTHEST / math.sqrt(3)
-    for corner in vertices[:4]:  # of the side towards +x
-        found = colours(scene, [[3, *(corner[1:] * s * 0.999)]], [[-1.0, 0, 0]])
-        np.testing.assert_allclose(found[0], (corner + 1) * 100 + 30, atol=2)
 
 
 def test_a_ply_has_the_colours_of_its_faces(tmp_path: Path) -> None:
@@ -168,17 +141,6 @@ def test_the_texture_that_a_ply_names(tmp_path: Path) -> None:
     )
     found = colours(surface(tmp_path / "square.ply"), [[-0.5, 0.5, 3], [0.5, -0.5, 3]], [[0, 0, -1.0]] * 2)
     np.testing.assert_array_equal(found, [RED, YELLOW])
-
-
-@pytest.mark.parametrize("text", [False, True])
-def test_an_stl_is_grey_and_says_so(tmp_path: Path, text: bool) -> None:
-    mesh = trimesh.Trimesh(*cube()[:2], process=False)
-    (tmp_path / "cube.stl").write_bytes(
-        mesh.export(file_type="stl_ascii").encode() if text else mesh.export(file_type="stl")
-    )
-    with pytest.warns(match="cube.stl: 12 of 12 faces have no colour; drawn grey"):
-        scene = surface(tmp_path / "cube.stl")
-    np.testing.assert_allclose(scene.intersect([[3.0, 0.1, 0]], [[-1.0, 0, 0]]).albedo, [GREY])
 
 
 def test_base_colours_are_linear_and_multiply_texture_and_vertices(tmp_path: Path) -> None:
@@ -317,14 +279,6 @@ def test_texels_are_mixed_in_linear_light_about_their_middles() -> None:
     )  # wraps around
 
 
-@pytest.mark.parametrize(("wrap", "same"), [("repeat", 0.2), ("mirror", 0.8), ("clamp", 1.0)])
-def test_beyond_the_edge(wrap: str, same: float) -> None:
-    pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 4)).astype(np.uint8)
-    texture, sharp = Texture(pixels, (wrap, wrap)), np.zeros(1, np.float32)
-    beyond, inside = (texture.look_up(np.array([[u, u]], np.float32), sharp) for u in (1.2, same))
-    np.testing.assert_allclose(beyond, inside, atol=1e-5)
-
-
 def test_a_ray_that_covers_many_texels_sees_their_mean() -> None:
     pixels = np.zeros((33, 64, 4), np.uint8)
     pixels[:, ::2] = 255
@@ -390,26 +344,6 @@ def test_normals_of_the_file_are_used_and_others_follow_from_the_angles(tmp_path
         assert hits.hit.all() and (turned > 10 if smooth else turned < 0.1).all()
 
 
-def test_a_vertex_with_many_faces_costs_no_memory(tmp_path: Path) -> None:
-    """Smoothing takes pairs of faces around a vertex: 10,000 of them would be 10^8."""
-    angle = np.linspace(0, 2 * np.pi, 10_001)[:-1]
-    vertices = np.concatenate([[[0, 0, 0.5]], np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)])
-    rim = np.arange(10_000)
-    faces = np.stack([0 * rim, 1 + rim, 1 + (rim + 1) % 10_000], 1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        scene = surface(write_ply(tmp_path / "fan.ply", vertices, faces))
-    hits = scene.intersect([[0.3, 0.2, 3.0]], [[0, 0, -1.0]])
-    assert hits.hit.all() and hits.normal[0, 2] == pytest.approx(2 / math.sqrt(5), abs=0.01)
-
-
-def test_normals_do_not_depend_on_how_many_are_made_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    mesh = ball([0, 0, 0], 1.0, fine=False)
-    whole = corner_normals(mesh)
-    monkeypatch.setattr("neuprim.scenes.meshes.CORNERS_AT_ONCE", 1000)
-    np.testing.assert_array_equal(corner_normals(mesh), whole)
-
-
 def test_faces_without_area_are_left_out_and_counted(tmp_path: Path) -> None:
     vertices, faces, _ = cube()
     faces = np.concatenate([faces, [[0, 0, 1], [0, 1, 0]]])
@@ -420,36 +354,6 @@ def test_faces_without_area_are_left_out_and_counted(tmp_path: Path) -> None:
 
 # The data set
 # --------------------------------------------------------------------------------------------------------------------------
-
-
-def test_flat_shows_colours_and_daylight_shades_them(tmp_path: Path) -> None:
-    path = write_glb(tmp_path / "cube.glb")
-    flat, lit = (read(path, tmp_path, shading=shading).train.pixels(1) for shading in ("flat", "daylight"))
-    assert flat.alpha is not None and lit.alpha is not None
-    np.testing.assert_array_equal(flat.alpha, lit.alpha)
-    bright, shaded = flat.rgb[flat.alpha == 1], lit.rgb[lit.alpha == 1]
-    assert (bright.max(1).values > 0.99).float().mean() > 0.7 and (shaded.max(1).values > 0.99).float().mean() < 0.1
-    assert shaded.mean() < 0.9 * bright.mean()
-
-
-def test_white_in_the_sun_is_not_clipped(tmp_path: Path) -> None:
-    white = trimesh.Trimesh(*cube()[:2], process=False)
-    white.visual.vertex_colors = np.full((24, 4), 255, np.uint8)
-    dataset = read(write_glb(tmp_path / "white.glb", (white, np.eye(4))), tmp_path, train_views=10)
-    tops = [
-        pixels.rgb[pixels.alpha == 1].max()
-        for pixels in map(dataset.train.pixels, range(10))
-        if pixels.alpha is not None
-    ]
-    assert 0.9 < max(tops) < 1.0
-
-
-def test_it_is_called_after_its_file_and_marked_generated(tmp_path: Path) -> None:
-    dataset = read(write_glb(tmp_path / "my cube.glb"), tmp_path)
-    assert (dataset.name, dataset.data_source, dataset.color_space) == ("my cube.glb", "generated", "srgb")
-    assert (len(dataset.train), len(dataset.test)) == (4, 2) and dataset.up.tolist() == [0, 0, 1]
-    facts = load_task("static").facts(dataset)
-    assert facts["rendered_from"] == "my cube.glb" and np.shape(facts["scene_from_file"]) == (4, 4)
 
 
 def test_images_are_kept_by_contents_and_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -478,39 +382,6 @@ def test_images_are_kept_by_contents_and_settings(tmp_path: Path, monkeypatch: p
     path.with_suffix(".mtl").write_text("newmtl skin\nKd 1 1 1\nnewmtl back\n")
     folders.add(generate(settings, cache))
     assert len(folders) == 9 == len(list(cache.iterdir()))
-
-
-def test_an_interruption_leaves_nothing_and_progress_is_told(tmp_path: Path) -> None:
-    path, said = write_glb(tmp_path / "cube.glb"), []
-
-    def stop(text: str, fraction: float) -> None:
-        said.append(text)
-        if fraction > 0.3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        generate(MeshSettings(path=path, **SMALL), tmp_path / "cache", stop)
-    assert list((tmp_path / "cache").iterdir()) == []
-    assert said[:2] == ["mesh: reading cube.glb", "mesh: building the scene"] and said[-1].startswith(
-        "mesh: drawing 48x48 images"
-    )
-
-
-def test_the_same_model_from_three_formats_looks_alike(tmp_path: Path) -> None:
-    mesh = textured()
-    glb = read(write_glb(tmp_path / "a.glb"), tmp_path)
-    for name, data in trimesh.Scene(mesh).export(file_type="gltf").items():
-        (tmp_path / name).write_bytes(data)
-    gltf_ = read(tmp_path / "model.gltf", tmp_path)
-    text, files = trimesh.exchange.obj.export_obj(mesh, include_texture=True, return_texture=True)
-    (tmp_path / "a.obj").write_text(text)
-    for name, data in files.items():
-        (tmp_path / name).write_bytes(data)
-    obj = read(tmp_path / "a.obj", tmp_path)
-    for other in (gltf_, obj):
-        for index in range(4):
-            difference = glb.train.pixels(index).rgb - other.train.pixels(index).rgb
-            assert difference.abs().mean() < 1e-3
 
 
 def test_it_trains_end_to_end_and_the_files_units_are_kept(tmp_path: Path) -> None:
@@ -542,22 +413,3 @@ def test_it_trains_end_to_end_and_the_files_units_are_kept(tmp_path: Path) -> No
 
 # What it shares
 # ------------------------------------------------------------------------------------------------------------------------
-
-
-def test_the_yaml_has_every_setting_and_its_default(tmp_path: Path) -> None:
-    found = compose(["scene=mesh", f"scene.path='{tmp_path}/a.glb'", f"output_dir='{tmp_path}/out'"]).scene
-    assert dict(found) == {**asdict(MeshSettings(path=tmp_path / "a.glb")), "path": str(tmp_path / "a.glb")}
-    assert {name: found[name] for name in asdict(SolidsSettings())} == asdict(SolidsSettings())
-
-
-def test_without_trimesh_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(BackendUnavailable, match=r"scene=mesh needs the package trimesh .*pip install trimesh"):
-        load_task("static").scene("mesh").load({"path": str(tmp_path)}, SceneContext(0, tmp_path))
-
-
-def test_hits_know_their_triangle_and_where_in_it_they_are() -> None:
-    sphere = Scene([Solid("ball", ball([0, 0, 0], 0.5), plain("#ff8000"), 0.7)])
-    hits = sphere.intersect([[3.0, 0.1, 0.2]], [[-1.0, 0, 0]])
-    corners = sphere._vertices[sphere._faces[hits.triangle]]
-    np.testing.assert_allclose(np.einsum("nk,nkc->nc", hits.weight, corners), hits.position, atol=1e-5)

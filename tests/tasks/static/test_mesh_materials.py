@@ -15,12 +15,12 @@ import trimesh
 
 from neuprim.core import notices
 from neuprim.core.errors import DataError
-from neuprim.scenes.solids.shading import encode_srgb, radiance
+from neuprim.scenes.shading import daylight_radiance, encode_srgb
 from neuprim.tasks.static.mesh import generate as generator
 from neuprim.tasks.static.mesh.materials import GREY, SurfacePart, read_surfaces
 from neuprim.tasks.static.mesh.model import ModelFolder
 from neuprim.tasks.static.mesh.surface import Surface
-from tests.models import BLUE, GREEN, RED, YELLOW, cube, gltf, quarters
+from tests.models import BLUE, GREEN, RED, YELLOW, cube, quarters
 
 DOWN = [[0.0, 0.0, -1.0]]
 
@@ -89,7 +89,9 @@ def shown(path: Path, lit: bool = False) -> list[int]:
     """The display colour of the upper left quarter, seen from above."""
     scene = surface(path)
     at = np.array([[-0.5, 0.5, 3.0]], np.float32)
-    image, hit = radiance(scene, at, DOWN) if lit else generator._colours(scene, at, np.array(DOWN, np.float32))
+    image, hit = (
+        daylight_radiance(scene, at, DOWN) if lit else generator._colours(scene, at, np.array(DOWN, np.float32))
+    )
     assert hit.all()
     return np.round(encode_srgb(image[0]) * 255).astype(int).tolist()
 
@@ -447,14 +449,3 @@ def test_colours_in_the_attributes_of_an_stl(tmp_path: Path) -> None:
     assert colours_along_x(plain) == [[1, 0, 0], grey, [0, 1, 0]]
     whole = write_stl(tmp_path / "b.stl", b"COLOR=" + bytes([0, 0, 255, 255]) + b",MATERIAL=", red, 1 << 15, green)
     assert colours_along_x(whole) == [[0, 0, 1], [0, 0, 1], [0, 1, 0]]
-
-
-def test_the_triangle_of_the_other_tests_stands(tmp_path: Path) -> None:
-    """Without scenes, all roots are drawn; cameras and lights beside them change nothing."""
-    document, data = gltf(cameras=[{"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1}}])
-    document["nodes"] = [{"camera": 0, "children": [1]}, {"mesh": 0, "scale": [-1, 1, 1]}]
-    del document["scenes"], document["scene"]
-    (tmp_path / "triangle.bin").write_bytes(data)
-    (tmp_path / "a.gltf").write_text(json.dumps(document))
-    (part,) = parts_of(tmp_path / "a.gltf")
-    np.testing.assert_allclose(part.corners[0], [[0, 0, 0], [-1, 0, 0], [0, 1, 0]])

@@ -117,27 +117,6 @@ def test_an_obj_with_concave_faces_and_relative_indices(tmp_path: Path, relative
     assert sum(area(part.corners) for part in parts) == pytest.approx(2 * 7 + 3 * 16)
 
 
-@pytest.mark.parametrize(
-    ("line", "text"),
-    [
-        ("f 1 2 -4", "line 4 is 'f 1 2 -4' (the index -4 of 3 v)"),
-        ("f 1 2 0", "the index 0 of 3 v"),
-        ("f 1 2 4", "a face has the vertex 3 of 3"),
-        ("f 1/1 2/1 3/1", "a face has the texture coordinates 1 of 0"),
-        ("f 1//1 2//1 3//1", "a face has the normal 1 of 0"),
-        ("f 1 2 x", "line 4 is 'f 1 2 x'"),
-        ("f 1 2 99999999999999999999", "line 4 is"),
-        ("v 1 2", "2 numbers, at least 3 expected"),
-        ("v 1 2 three", "line 4 is 'v 1 2 three'"),
-    ],
-)
-def test_damaged_lines_are_named(tmp_path: Path, line: str, text: str) -> None:
-    (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\n{line}\n")
-    with pytest.raises(DataError) as caught:
-        read_surfaces(generator._READERS[".obj"](ModelFolder(tmp_path / "a.obj")))
-    assert text in str(caught.value) and "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize("order", ["<", ">", ""])
 @pytest.mark.parametrize("mixed", [False, True])
 def test_a_ply_with_concave_faces(tmp_path: Path, order: str, mixed: bool) -> None:

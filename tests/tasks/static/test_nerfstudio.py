@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from neuprim.core.notices import NeuprimWarning
-from neuprim.tasks.static.datasets.nerfstudio import load
+from neuprim.tasks.static.datasets import load_nerfstudio as load
 
 W, H = 64, 50
 PINHOLE = {"fl_x": 60.0, "fl_y": 66.0, "cx": 29.3, "cy": 27.1, "w": W, "h": H}
@@ -84,11 +84,6 @@ def test_off_centre_pinhole(capture: Any, scenes: Any, context: Any) -> None:
     assert names(data.test) == ["00", "08"] and names(data.train) == ["01", "02", "03", "04", "05", "06", "07", "09"]
     assert data.background.tolist() == [0.0] * 3
     assert data.up[2] > 0.9 and data.center.norm() < 0.05
-
-
-def test_down_sampling(capture: Any, scenes: Any, context: Any) -> None:
-    data = load({"path": capture(sigma=2.0), "downsample": 3}, context)
-    assert worst(scenes, data) < 0.03 and data.downsampling == "21x16 from 64x50 by area"
 
 
 @pytest.mark.parametrize(
@@ -226,11 +221,6 @@ def test_views_for_validation_never_train(
     assert (names(data.train), names(data.test)) == (train, test)
 
 
-def test_validation_that_would_train_is_refused(capture: Any, scenes: Any, context: Any) -> None:
-    path = capture(train_filenames=["images/01.png", "images/02.png"], val_filenames=["images/01.png"])
-    scenes.refused(load, {"path": path}, context, "train_filenames and val_filenames share 1 images")
-
-
 @pytest.mark.parametrize("name", ["masks/{0}.png", "masks/{0}.png.png", "images/dynamic_mask_{0}.png"])
 def test_masks_beside_the_images_count(capture: Any, context: Any, name: str) -> None:
     path = capture()
@@ -315,13 +305,6 @@ def test_one_bad_view_is_left_out_and_named(
     scenes.refused(load, {"path": path, "strict": True}, context)
 
 
-def test_most_views_bad_is_refused(capture: Any, scenes: Any, context: Any) -> None:
-    path = capture()
-    for i in range(6):
-        (path / "images" / f"{i:02d}.png").write_bytes(b"")
-    scenes.refused(load, {"path": path}, context, "00.png: file is empty", "6 of 10 views of")
-
-
 def test_a_transparent_view_among_others_is_left_out(capture: Any, scenes: Any, context: Any) -> None:
     path = capture()
     for i in range(10):
@@ -331,10 +314,6 @@ def test_a_transparent_view_among_others_is_left_out(capture: Any, scenes: Any, 
     with pytest.warns(NeuprimWarning, match=r"03.png: image is transparent everywhere.*; view 03 is left out"):
         data = load({"path": path}, context)
     assert "03" not in names(data.train) and len(data.initial_points(10, torch.Generator().manual_seed(0)).means) == 10
-
-
-def test_every_nth_is_a_setting(capture: Any, context: Any) -> None:
-    assert names(load({"path": capture(), "test_every": 3}, context).test) == ["00", "03", "06", "09"]
 
 
 def test_ply_points(capture: Any, context: Any) -> None:
@@ -352,35 +331,7 @@ def test_ply_points(capture: Any, context: Any) -> None:
     )
 
 
-def test_points_of_another_format_are_not_guessed_at(capture: Any, scenes: Any, context: Any) -> None:
-    path = capture(ply_file_path="points.xyz")
-    (path / "points.xyz").write_text("1 2 3\n4 5 6\n")
-    scenes.refused(load, {"path": path}, context, "points.xyz", "'1 2 3'; expected a PLY file")
-
-
-def test_same_stems_in_different_folders_get_different_names(capture: Any, context: Any) -> None:
-    path = capture(count=3)
-    (path / "more").mkdir()
-    (path / "images" / "01.png").rename(path / "more" / "00.png")
-    edit(path, lambda d: next(f for f in d["frames"] if "01" in f["file_path"]).update(file_path="more\\00.png"))
-    data = load({"path": path}, context)
-    assert sorted(names(data.train) + names(data.test)) == ["images_00", "images_02", "more_00"]
-
-
 # ---------------------------------------------------------------- bad input
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"skip_missin": True}, ["scene.skip_missin", "did you mean 'scene.skip_missing'"]),
-        ({"skip_missing": 1}, ["scene.skip_missing=1: expected true or false"]),
-        ({"test_every": 1}, ["scene.test_every=1", "at least 2"]),
-        ({"background": "random"}, ["no alpha"]),
-    ],
-)
-def test_bad_settings(capture: Any, scenes: Any, context: Any, settings: dict[str, Any], words: list[str]) -> None:
-    scenes.refused(load, {"path": capture(), **settings}, context, *words)
 
 
 def frame(**fields: Any) -> Callable[[Any], None]:
@@ -437,41 +388,3 @@ def test_missing_images_are_listed_or_skipped(capture: Any, scenes: Any, context
     for file in (path / "images").iterdir():
         file.unlink()
     scenes.refused(load, {"path": path, "skip_missing": True}, context, "10 files not found")
-
-
-def test_lists_may_name_skipped_images(capture: Any, context: Any) -> None:
-    path = capture(test_filenames=["images/02.png", "images/03.png"])
-    (path / "images" / "02.png").unlink()
-    data = load({"path": path, "skip_missing": True}, context)
-    assert names(data.test) == ["03"] and "02" not in names(data.train)
-
-
-def test_bad_masks(capture: Any, scenes: Any, context: Any) -> None:
-    path = capture(mask_path="mask.png")
-    Image.fromarray(np.ones((H, W - 1), np.uint8)).save(path / "mask.png")
-    scenes.refused(load, {"path": path}, context, "mask.png", "63x50", "expected 64x50")
-    Image.fromarray(np.zeros((H, W), np.uint8)).save(path / "mask.png")
-    scenes.refused(load, {"path": path}, context, "leave no pixel that counts")  # of all views
-    (path / "mask.png").write_bytes(b"rubbish")
-    scenes.refused(load, {"path": path}, context, "mask.png", "not a readable PNG")
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"ply\n", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", b"rubbish"]
-)
-def test_bad_ply(capture: Any, scenes: Any, context: Any, content: bytes) -> None:
-    path = capture(ply_file_path="points.ply")
-    (path / "points.ply").write_bytes(content)
-    scenes.refused(load, {"path": path}, context, "points.ply")
-
-
-def test_damaged_image(capture: Any, scenes: Any, context: Any) -> None:
-    path = capture()
-    file = path / "images" / "03.png"
-    file.write_bytes(file.read_bytes()[:-40])
-    scenes.refused(load, {"path": path, "strict": True}, context, str(file), "truncated or corrupt")
-
-
-def test_a_whole_run_ends_in_a_report(capture: Any, scenes: Any, tmp_path: Path) -> None:
-    metrics = scenes.fitted("nerfstudio", capture(sigma=8.0), tmp_path / "run")
-    assert metrics["scene"] == "nerfstudio" and metrics["data_source"] == "real" and len(metrics["per_view"]) == 2

@@ -20,7 +20,7 @@ from neuprim.core.notices import warn_once
 from neuprim.core.task import Chunks, SceneContext
 from neuprim.core.validation import validate
 from neuprim.core.volumes.source import Extent
-from neuprim.scenes.smoke import simulate
+from neuprim.scenes.smoke.generate import simulate_smoke
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.chunks import number_of_chunks, planned
 from neuprim.tasks.dynamic.volume.dataset import TRAINING, stored_points, volume_dataset
@@ -173,7 +173,7 @@ def _files(asked: VolumeSettings, context: SceneContext) -> tuple[Path, str, Dat
     if asked.vdb is not None:
         return asked.vdb, asked.vdb.name, "real"
     assert asked.simulation is not None, "settings were checked"
-    folder = simulate(
+    folder = simulate_smoke(
         asked.simulation, asked.timesteps, asked.resolution, context.seed, context.cache_dir, context.progress
     )
     return folder, f"{asked.simulation} (simulated)", "simulated"

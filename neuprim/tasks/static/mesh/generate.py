@@ -23,11 +23,10 @@ from neuprim.core.data import Dataset
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import nonempty_text, validate
-from neuprim.scenes.image_set import Progress
+from neuprim.scenes.image_set import Progress, hash_settings
 from neuprim.scenes.raycast import Scene
-from neuprim.scenes.settings import settings_key
-from neuprim.scenes.solids.generate import FIELD_OF_VIEW, Seen, SolidsSettings, image_set
-from neuprim.scenes.solids.shading import DAYLIGHT, Daylight, radiance
+from neuprim.scenes.shading import DAYLIGHT, Daylight, daylight_radiance
+from neuprim.scenes.solids import FIELD_OF_VIEW, Radiance, SolidsSettings, make_image_set
 from neuprim.tasks.static.mesh.gltf import read_gltf
 from neuprim.tasks.static.mesh.materials import read_surfaces
 from neuprim.tasks.static.mesh.model import Model, ModelFolder, Up, find_model_file
@@ -87,12 +86,12 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """
     asked = validate(MeshSettings, settings, "scene")
     folder = generate(asked, context.cache_dir, context.progress)
-    from neuprim.tasks.static.datasets import blender
+    from neuprim.tasks.static.datasets import load_blender
 
     known = JsonReader.open(folder / "transforms_train.json")
     facts = {name: known.values[name] for name in ("rendered_from", "scene_from_file")}
     world = World(torch.tensor(facts["scene_from_file"], dtype=torch.float64)).validate(f"{folder}: scene_from_file")
-    dataset = blender.load({"path": str(folder)}, replace(context, world=None))  # the images are of the scene itself
+    dataset = load_blender({"path": str(folder)}, replace(context, world=None))  # the images are of the scene itself
     return replace(dataset, name=facts["rendered_from"], data_source="generated", world=world, extra=facts)
 
 
@@ -106,7 +105,7 @@ def generate(settings: MeshSettings, cache_dir: Path, progress: Progress = lambd
     progress(f"mesh: reading {path.name}", 0.0)
     model = _READERS[path.suffix.lower()](ModelFolder(path, settings.skip_missing))
     upward: Up = model.upward if settings.up == "auto" else settings.up
-    key = settings_key(replace(settings, path=Path(f"{path.name} {model.digest}"), up=upward), GENERATOR_VERSION)
+    key = hash_settings(replace(settings, path=Path(f"{path.name} {model.digest}"), up=upward), GENERATOR_VERSION)
     spacing = 2 * math.tan(FIELD_OF_VIEW / 2) / (settings.size * settings.supersampling)
 
     def build() -> Scene:
@@ -115,8 +114,8 @@ def generate(settings: MeshSettings, cache_dir: Path, progress: Progress = lambd
     def facts(scene: Surface) -> dict[str, Any]:
         return {"rendered_from": path.name, "scene_from_file": scene.scene_from_file.tolist()}
 
-    seen: Seen = partial(radiance, light=LIGHT) if settings.shading == "daylight" else _colours
-    return image_set("mesh", key, settings, build, seen, facts).generate(cache_dir, progress)
+    seen: Radiance = partial(daylight_radiance, light=LIGHT) if settings.shading == "daylight" else _colours
+    return make_image_set("mesh", key, settings, build, seen, facts).generate(cache_dir, progress)
 
 
 def _colours(

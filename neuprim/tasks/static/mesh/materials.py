@@ -16,7 +16,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.exr import MAX_PIXELS
 from neuprim.core.io.images import srgb_to_linear
 from neuprim.core.notices import warn_once
-from neuprim.scenes.shapes import srgb
+from neuprim.scenes.shapes import parse_srgb
 from neuprim.tasks.static.mesh.model import (
     MAX_FACES,
     MAX_PARTS,
@@ -30,7 +30,7 @@ from neuprim.tasks.static.mesh.model import (
 
 __all__ = ["GREY", "SurfacePart", "Texture", "decode_texture", "read_surfaces"]
 
-GREY = srgb("#b4b4b4")
+GREY = parse_srgb("#b4b4b4")
 """Of what the file says no colour of."""
 
 _FARTHEST_UV = 1e6

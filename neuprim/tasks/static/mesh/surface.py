@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from neuprim.core.errors import DataError
 from neuprim.core.notices import warn_once
-from neuprim.scenes.meshes import corner_normals
 from neuprim.scenes.raycast import LIFT, Engine, Hits, Scene
-from neuprim.scenes.reflectance import dot
-from neuprim.scenes.shapes import Solid, plain
+from neuprim.scenes.shading import dot
+from neuprim.scenes.shapes import Solid, corner_normals, uniform_colour
 from neuprim.tasks.static.mesh.materials import SurfacePart, Texture, decode_texture
 from neuprim.tasks.static.mesh.model import MAX_TEXELS, Model, Up
 
@@ -106,7 +105,7 @@ class Surface(Scene):
         kept &= ~faint
         mesh = _mesh(points, faces[kept])
         normals = _smooth(_file_normals(parts, matrix[:3, :3])[kept], across[kept], mesh)
-        super().__init__([Solid("mesh", mesh, plain("#ffffff"), 0.0, normals=normals)], engine)
+        super().__init__([Solid("mesh", mesh, uniform_colour("#ffffff"), 0.0, normals=normals)], engine)
         pool: _Pool = {}
         area = double / spacing**2
         self._base = _Layer(model, parts, kept, area, pool)

@@ -13,7 +13,7 @@ import torch
 from neuprim.core.cameras.camera_files import read_cameras
 from neuprim.core.data import Dataset, Pixels, View, ViewSet, camera_extent
 from neuprim.core.data.initial import initial_points
-from neuprim.core.data.posed_images import data_folder
+from neuprim.core.data.posed_images import find_data_folder
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import read_image, read_mask
 from neuprim_spectral.bands import BANDS
@@ -38,7 +38,7 @@ class FileViews(ViewSet):
 def files(path, test_every):
     if not isinstance(test_every, int) or test_every < 2:
         raise ConfigError(f"scene.test_every={test_every}: expected a whole number of at least 2")
-    folder = data_folder(path)
+    folder = find_data_folder(path)
     frames = _frames(folder)
     train = [f for i, f in enumerate(frames) if i % test_every]
     if not train:

@@ -1,8 +1,8 @@
-"""The camera that takes the photographs: 4:3, a wide angle, and a lens that bends; rays of its pixels, and back from
-points to pixels."""
+"""Cameras of the scene ``room``: a lens with distortion, and the path that photographs are taken from."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -10,10 +10,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neuprim.core.cameras import Camera
+from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data.distortion import Radial
 
-__all__ = ["LENS", "Lens", "bands"]
+__all__ = [
+    "FARTHEST",
+    "HIGHEST",
+    "LENS",
+    "LOWEST",
+    "Lens",
+    "NEAREST",
+    "lens_ray_bands",
+    "room_camera_poses",
+    "camera_positions",
+]
 
 LENS = Radial(k1=-0.08, k2=0.02, p1=0.001, p2=-0.0005)
 
@@ -85,7 +95,7 @@ class Lens:
         return local @ pose[:3, :3].T
 
 
-def bands(lens: Lens, pose: NDArray[np.float64], samples: int) -> Iterator[NDArray[np.float64]]:
+def lens_ray_bands(lens: Lens, pose: NDArray[np.float64], samples: int) -> Iterator[NDArray[np.float64]]:
     """(N, 3) unit directions in the scene, whole rows of pixels at a time from the top, row by row of rays.
 
     Args:
@@ -98,3 +108,52 @@ def bands(lens: Lens, pose: NDArray[np.float64], samples: int) -> Iterator[NDArr
     for top in range(0, len(down), rows):
         x, y = np.meshgrid(across, down[top : top + rows])
         yield lens.rays(pose, np.stack([x, y], axis=-1).reshape(-1, 2))
+
+
+NEAREST, FARTHEST = 2.6, 4.5
+"""Bounds of the distance to the subject's middle, the origin; scene units."""
+
+LOWEST, HIGHEST = 0.3, 2.0
+"""Bounds of the height above it."""
+
+_ROUNDS = 2
+_SEEDS = {"train": 20250311, "test": 20250312}
+
+
+def camera_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
+    """Where on the walk, 0 to 1, the photographs of each split are taken: (train,) and (test,).
+
+    The test ones divide the walk evenly, whatever the training ones are; these fill the gaps, evenly in each.
+    """
+    held_out = (np.arange(test) + 0.5) / test
+    gap = np.arange(train) * test // train
+    first = np.searchsorted(gap, gap)
+    within = (np.arange(train) - first + 1) / (np.bincount(gap, minlength=test)[gap] + 1)
+    return {"train": (gap - 0.5 + within) / test, "test": held_out}
+
+
+def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float64]]]:
+    """Camera-to-world matrices (4, 4), OpenGL axes, of both splits. Those of the test split depend on their own number
+    alone."""
+    return {split: _walk(t, _SEEDS[split]) for split, t in camera_positions(train, test).items()}
+
+
+def _walk(times: NDArray[np.float64], seed: int) -> list[NDArray[np.float64]]:
+    shake = 2 * np.random.default_rng(seed).random((len(times), 7)) - 1
+    return [_pose(float(t), s) for t, s in zip(times, shake, strict=True)]
+
+
+def _pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) at ``t`` of the walk; ``shake`` (7,) of -1..1 moves the hand, the aim and the horizon."""
+    turn = 2 * math.pi
+    distance = 3.55 + 0.8 * math.sin(turn * (5 * t + 0.15)) + 0.12 * shake[0]
+    height = 1.1 - 0.6 * math.cos(turn * t) + 0.1 * math.sin(turn * 7 * t) + 0.06 * shake[1]
+    azimuth = turn * _ROUNDS * t + 0.06 * shake[2]
+    across = math.sqrt(distance**2 - height**2)
+    eye = np.array([across * math.cos(azimuth), across * math.sin(azimuth), height])
+    aim = 0.14 * shake[3:6] + [0, 0, -0.05]
+    roll = math.radians(2.5) * shake[6]
+    sideways = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+    up = math.cos(roll) * np.array([0, 0, 1.0]) + math.sin(roll) * sideways
+    view = look_at(*(torch.from_numpy(np.asarray(v, dtype=np.float64)) for v in (eye, aim, up)))
+    return torch.linalg.inv(view).numpy() @ np.diag([1.0, -1.0, -1.0, 1.0])

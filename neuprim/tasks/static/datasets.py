@@ -1,13 +1,4 @@
-"""COLMAP reconstructions: a model below ``sparse`` and an image folder; needs the extra ``neuprim[colmap]``.
-
-Sizes may differ from image to image. Distorted models are undistorted to a pinhole of the same focal lengths; what a
-photograph does not show is masked out, as is what an image in ``masks/`` blackens. Reduced copies (``images_4``) scale
-the cameras to the files' actual sizes. A line says how many images of the folder have no pose.
-
-Settings beside the common ones: ``images`` (folder, default "images"), ``model`` (default "auto": of the models in
-``sparse`` the one with the most posed images), ``test_every`` (default 8: every 8th image by name, from the first, is a
-test view) and ``skip_missing`` (default false).
-"""
+"""Load data sets of posed images: NeRF-synthetic ("blender"), nerfstudio and COLMAP folders."""
 
 from __future__ import annotations
 
@@ -21,32 +12,134 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.colmap import PINHOLES, largest_model, pinhole_of, pycolmap_package, read_model, viewmat_of
-from neuprim.core.cameras.intrinsics import same_shape
+from neuprim.core.cameras.colmap import (
+    PINHOLES,
+    colmap_viewmat,
+    import_pycolmap,
+    largest_colmap_model,
+    pinhole_parameters,
+    read_colmap_model,
+)
+from neuprim.core.cameras.intrinsics import is_resized_copy
 from neuprim.core.cameras.pinhole import check_viewmat
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.distortion import Distortion
-from neuprim.core.data.image_views import ImageFrame, masks_beside
+from neuprim.core.data.image_views import ImageFrame, find_masks
+from neuprim.core.data.points_file import read_points
 from neuprim.core.data.posed_images import (
     IMAGE_SUFFIXES,
     BadViews,
     EveryNth,
     FolderSettings,
-    data_folder,
-    every_nth,
+    HoldOut,
+    SceneDetails,
+    SplitName,
+    assemble_dataset,
+    exif_hint,
+    find_data_folder,
     find_image,
-    missing_files,
-    posed_images,
-    turned,
-    unique_names,
+    missing_files_error,
+    split_every_nth,
+    unique_view_names,
+)
+from neuprim.core.data.transforms_json import (
+    TransformsLayout,
+    read_transforms_frames,
+    read_transforms_splits,
+    split_named_frames,
 )
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import ImageInfo, image_info
+from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.notices import warn_once
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import nonempty_text, validate
 
-__all__ = ["ColmapSettings", "load"]
+__all__ = ["BlenderSettings", "ColmapSettings", "NerfstudioSettings", "load_blender", "load_colmap", "load_nerfstudio"]
+
+
+@dataclass(frozen=True)
+class BlenderSettings(FolderSettings):
+    """What the user may set.
+
+    Attributes:
+        train_split, test_split: names in transforms_NAME.json.
+        hold_out: n: evaluate on every n-th training view instead of the test split; 0 for that split.
+    """
+
+    train_split: SplitName = "train"
+    test_split: SplitName = "test"
+    hold_out: HoldOut = 0
+
+
+def load_blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """The scene in the folder ``settings["path"]``; straight-alpha PNG is premultiplied in its stored sRGB values.
+
+    Raises:
+        ConfigError: unknown or impossible settings.
+        DataError: missing or damaged files, wrong or missing fields, mixed image sizes, impossible cameras.
+    """
+    asked = validate(BlenderSettings, settings, "scene")
+    folder = find_data_folder(asked.path)
+
+    def read(split: str) -> list[ImageFrame]:
+        document = JsonReader.open(folder / f"transforms_{split}.json")
+        _, frames = read_transforms_frames(
+            folder, document, list(document.objects("frames")), asked, TransformsLayout()
+        )
+        for frame in frames:
+            info, first = frame.info, frames[0].info
+            if (info.width, info.height) != (first.width, first.height):
+                found = (
+                    f"image is {info.width}x{info.height}; expected {first.width}x{first.height} as {frames[0].path}"
+                )
+                raise DataError(f"{frame.path}: {found}{exif_hint(info)}")
+        return frames
+
+    train, test = read_transforms_splits(folder, asked.train_split, asked.test_split, asked.hold_out, read)
+    details = SceneDetails(up=torch.tensor([0.0, 0.0, 1.0]))
+    return assemble_dataset(str(folder), folder.resolve().name, train, test, asked, context, details)
+
+
+@dataclass(frozen=True)
+class NerfstudioSettings(FolderSettings):
+    """What the user may set.
+
+    Attributes:
+        skip_missing: leave out frames whose image is missing; otherwise they are an error.
+        test_every: every n-th frame is held out.
+    """
+
+    skip_missing: bool = False
+    test_every: EveryNth = 8
+
+
+def load_nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """The capture in the folder ``settings["path"]``.
+
+    Raises:
+        ConfigError: unknown or impossible settings.
+        DataError: missing or damaged files, wrong or missing fields, impossible cameras, an unknown camera model, empty
+        splits.
+    """
+    asked = validate(NerfstudioSettings, settings, "scene")
+    folder = find_data_folder(asked.path)
+    path = folder / "transforms.json"
+    document = JsonReader.open(path)
+    records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
+    layout = TransformsLayout(keys=("ply_file_path", "train_filenames", "val_filenames", "test_filenames"), masks=True)
+    records, frames = read_transforms_frames(folder, document, records, asked, layout, asked.skip_missing)
+    train, test = split_named_frames(document, records, frames, asked.test_every)
+    points = _read_nerfstudio_points(folder, document) if document.has("ply_file_path") else None
+    return assemble_dataset(str(path), folder.resolve().name, train, test, asked, context, SceneDetails(points=points))
+
+
+def _read_nerfstudio_points(folder: Path, document: JsonReader) -> PointCloud:
+    """Points of ``ply_file_path``, in the frame of the poses."""
+    path = folder / document.text("ply_file_path")
+    if not path.is_file():
+        raise missing_files_error(f"{document.where}: ply_file_path", [str(path)])
+    return read_points(path, 3, "srgb")
 
 
 @dataclass(frozen=True)
@@ -65,7 +158,7 @@ class ColmapSettings(FolderSettings):
     skip_missing: bool = False
 
 
-def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def load_colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """The reconstruction in the folder ``settings["path"]``; its 3-D points are the initial points.
 
     Raises:
@@ -75,24 +168,23 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
             model's, no posed images, empty splits.
     """
     asked = validate(ColmapSettings, settings, "scene")
-    folder = data_folder(asked.path)
+    folder = find_data_folder(asked.path)
     model = folder / asked.model
     if asked.model == "auto":
-        largest, line = largest_model(folder)
+        largest, line = largest_colmap_model(folder)
         model = largest or folder / "sparse" / "0"
         if line:
             warn_once(f"{line} (scene.model takes another)")
-    reconstruction = read_model(model)
-    frames = _read_frames(model, folder, reconstruction, asked)
-    train, test = every_nth(frames, asked.test_every)
+    reconstruction = read_colmap_model(model)
+    frames = _read_colmap_frames(model, folder, reconstruction, asked)
+    train, test = split_every_nth(frames, asked.test_every)
     prefix = "" if asked.images == "images" else asked.images
-    points = _read_points(reconstruction, model)
-    return posed_images(
-        str(model), folder.resolve().name, train, test, asked, context, points=points, prefix=prefix, home=folder
-    )
+    points = _read_colmap_points(reconstruction, model)
+    details = SceneDetails(points=points, prefix=prefix, home=folder)
+    return assemble_dataset(str(model), folder.resolve().name, train, test, asked, context, details)
 
 
-def _read_frames(model: Path, folder: Path, reconstruction: Any, asked: ColmapSettings) -> list[ImageFrame]:
+def _read_colmap_frames(model: Path, folder: Path, reconstruction: Any, asked: ColmapSettings) -> list[ImageFrame]:
     posed = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
     place = folder / asked.images
     if not posed:
@@ -102,23 +194,23 @@ def _read_frames(model: Path, folder: Path, reconstruction: Any, asked: ColmapSe
     files = [place / i.name if (place / i.name).is_file() else find_image(place, i.name) for i in posed]
     absent = [i.name for i, file in zip(posed, files, strict=True) if file is None]
     if absent and (not asked.skip_missing or len(absent) == len(posed)):
-        raise missing_files(
+        raise missing_files_error(
             str(place), absent, "" if asked.skip_missing else "; scene.skip_missing=true leaves such images out"
         )
     present = [(i, file) for i, file in zip(posed, files, strict=True) if file is not None]
     _tell_unposed(place, {file for _, file in present}, model)
-    masks = masks_beside(folder, [file for _, file in present], place)
+    masks = find_masks(folder, [file for _, file in present], place)
     frames: list[ImageFrame] = []
     bad = BadViews(str(model), asked.strict)
     for (image, file), mask, name in zip(
-        present, masks, unique_names([i.name for i, _ in present], str(model)), strict=True
+        present, masks, unique_view_names([i.name for i, _ in present], str(model)), strict=True
     ):
         where = f"{model}: camera {image.camera_id} of image {image.name}"
         read = bad.read(name, _info_and_pose, image, file, where)
         if read is None:
             continue
         info, viewmat = read
-        camera = _camera(where, image, viewmat, file, info)
+        camera = _colmap_camera(where, image, viewmat, file, info)
         lens = reconstruction.cameras[image.camera_id]
         distortion = None if lens.model_name in PINHOLES else _Lens.of(lens, info)
         frames.append(ImageFrame(name, file, camera.validate(where), info, mask, distortion))
@@ -141,23 +233,23 @@ def _tell_unposed(place: Path, posed: set[Path], model: Path) -> None:
 
 
 def _info_and_pose(image: Any, file: Path, where: str) -> tuple[ImageInfo, Tensor]:
-    info, viewmat = image_info(file), viewmat_of(image)
+    info, viewmat = image_info(file), colmap_viewmat(image)
     check_viewmat(viewmat, where)
     return info, viewmat
 
 
-def _camera(where: str, image: Any, viewmat: Tensor, file: Path, info: ImageInfo) -> Camera:
+def _colmap_camera(where: str, image: Any, viewmat: Tensor, file: Path, info: ImageInfo) -> Camera:
     lens = image.camera
     if lens.width <= 0 or lens.height <= 0 or not np.isfinite(lens.params).all():
         raise DataError(
             f"{where}: size {lens.width}x{lens.height}, parameters {lens.params}; expected a positive size, finite numbers"
         )
-    if not same_shape((lens.width, lens.height), (info.width, info.height)):
+    if not is_resized_copy((lens.width, lens.height), (info.width, info.height)):
         found = (
             f"image is {info.width}x{info.height}; expected {lens.width}x{lens.height} ({where}) or a reduction of it"
         )
-        raise DataError(f"{file}: {found}{turned(info)}")
-    fx, fy, cx, cy = pinhole_of(lens, where)
+        raise DataError(f"{file}: {found}{exif_hint(info)}")
+    fx, fy, cx, cy = pinhole_parameters(lens, where)
     return Camera(viewmat, fx, fy, cx, cy, int(lens.width), int(lens.height)).resized(info.width, info.height)
 
 
@@ -177,14 +269,14 @@ class _Lens(Distortion):
         return _Lens(lens.model_name, int(lens.width), int(lens.height), tuple(map(float, lens.params)), scale)
 
     def project(self, points: np.ndarray, camera: Camera) -> np.ndarray:
-        lens = pycolmap_package().Camera(
+        lens = import_pycolmap().Camera(
             model=self.model, width=self.width, height=self.height, params=list(self.params)
         )
         rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
         return np.asarray(lens.img_from_cam(rays), dtype=np.float64) * self.scale
 
 
-def _read_points(reconstruction: Any, model: Path) -> PointCloud | None:
+def _read_colmap_points(reconstruction: Any, model: Path) -> PointCloud | None:
     """The model's points, in order of their numbers; None where it has none."""
     points = [p for _, p in sorted(reconstruction.points3D.items())]
     if not points:

@@ -1,18 +1,15 @@
-"""The room around the solids: a box of 12 x 12 x 5 with the subject's table in its middle, and large things along its
-walls.
-
-Walls, floor and ceiling are slabs that overlap at the edges, so that no ray leaves. Nothing stands within :data:`FREE`
-of the middle's vertical but the table, the rug below and the lamp above: that is where the cameras are.
-"""
+"""The interior of the scene ``room``: what stands where, what rays meet, and how it is lit."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike, NDArray
 
-from neuprim.scenes.meshes import ball, chamfered_box, lathe, merged, rod
+from neuprim.scenes.raycast import Engine, Hits, Scene
 from neuprim.scenes.room.textures import (
     Texture,
     books,
@@ -27,9 +24,21 @@ from neuprim.scenes.room.textures import (
     speckled,
     wallpaper,
 )
-from neuprim.scenes.shapes import FLOOR
+from neuprim.scenes.shading import Colour, add_surroundings, dot, reflect_light, visible_light
+from neuprim.scenes.shapes import FLOOR, Solid, ball, chamfered_box, lathe, merge_meshes, rod, uniform_colour
 
-__all__ = ["FREE", "HIGH", "LAMP", "LOW", "Furnishing", "furnishings"]
+__all__ = [
+    "FREE",
+    "Furnishing",
+    "HIGH",
+    "LAMP",
+    "LAMPLIGHT",
+    "LOW",
+    "Lamplight",
+    "Room",
+    "furnish_room",
+    "lamplight_radiance",
+]
 
 LOW, HIGH = (-6.0, -6.0, -1.6), (6.0, 6.0, 3.4)
 """Opposite corners of the room's inside, scene units; the solids stand in [-1, 1]^3."""
@@ -64,11 +73,11 @@ class Furnishing:
     glow: float = 0.0
 
 
-def furnishings() -> list[Furnishing]:
+def furnish_room() -> list[Furnishing]:
     """All of the room but the solids, the same at every call."""
     return [
         *_shell(),
-        *_table(),
+        *_place_table(),
         *_lamp(),
         *_by_the_bricks(),
         *_by_the_plaster(),
@@ -116,12 +125,12 @@ def _shell() -> list[Furnishing]:
             chequered("#d9cfba", "#3f7f86", 0, 2, 0.5, 61),
             0.3,
         ),
-        Furnishing("skirting", merged(skirting), speckled("#e8e2d6", 71, 0.05)),
-        Furnishing("beams", merged(beams), planks("#4a2f1b", "#6e4a2c", 0, 1, 73, width=0.14)),
+        Furnishing("skirting", merge_meshes(skirting), speckled("#e8e2d6", 71, 0.05)),
+        Furnishing("beams", merge_meshes(beams), planks("#4a2f1b", "#6e4a2c", 0, 1, 73, width=0.14)),
     ]
 
 
-def _table() -> list[Furnishing]:
+def _place_table() -> list[Furnishing]:
     """A round table under the plate of the solids, on a rug."""
     top, foot = _PLATE_FOOT, LOW[2]
     leg = [(0.02, 0.62), (0.09, 0.6), (0.16, 0.2), (0.5, 0.13), (top - foot - 0.16, 0.16), (top - foot - 0.08, 0.5)]
@@ -149,7 +158,7 @@ def _lamp() -> list[Furnishing]:
     ]
 
 
-def _frame(
+def _picture_frame(
     x: float, y: float, low: float, high: float, half: float, along: int, width: float, depth: float
 ) -> trimesh.Trimesh:
     """Four bars around the opening of half width ``half`` between two heights, on the wall through (x, y) that runs
@@ -164,7 +173,7 @@ def _frame(
         level[along], level[2] = 2 * half, width
         bars.append(chamfered_box(upright, middle + sign * side * (half + width / 2), 0.015))
         bars.append(chamfered_box(level, middle + np.array([0, 0, sign * (high - low + width) / 2]), 0.015))
-    return merged(bars)
+    return merge_meshes(bars)
 
 
 def _by_the_bricks() -> list[Furnishing]:
@@ -184,14 +193,17 @@ def _by_the_bricks() -> list[Furnishing]:
             "pane", _between((x - 0.02, -1.4, low), (x + 0.05, 1.4, high), 0.005), sky(101, low, high), glow=0.95
         ),
         Furnishing(
-            "window", merged([_frame(x, 0, low, high, 1.4, 1, 0.14, 0.2), *bars]), speckled("#f2efe8", 103, 0.05), 0.3
+            "window",
+            merge_meshes([_picture_frame(x, 0, low, high, 1.4, 1, 0.14, 0.2), *bars]),
+            speckled("#f2efe8", 103, 0.05),
+            0.3,
         ),
         Furnishing(
             "sill", _between((x - 0.3, -1.65, low - 0.24), (x, 1.65, low - 0.14)), speckled("#f2efe8", 105, 0.05), 0.3
         ),
         Furnishing(
             "crates",
-            merged([_between(*c, 0.03) for c in crate]),
+            merge_meshes([_between(*c, 0.03) for c in crate]),
             planks("#7c5a34", "#cfa46a", 1, 2, 107, width=0.22, length=1.3),
         ),
     ]
@@ -210,10 +222,12 @@ def _by_the_plaster() -> list[Furnishing]:
         for i, (gap, height) in enumerate([(0.0, 0.5), (0.5, 0.46), (0.0, 0.52), (1.1, 0.44), (0.2, 0.5)])
     ]
     return [
-        Furnishing("shelf", merged(boards), planks("#4d3524", "#7d5a3c", 0, 1, 111, width=0.4)),
-        Furnishing("books", merged(rows), books(0, 2, 113, shelf=shelf)),
+        Furnishing("shelf", merge_meshes(boards), planks("#4d3524", "#7d5a3c", 0, 1, 111, width=0.4)),
+        Furnishing("books", merge_meshes(rows), books(0, 2, 113, shelf=shelf)),
         Furnishing("picture", _between((1.2, 5.93, 0.5), (4.0, 6.0, 2.5), 0.005), painting(0, 2, 115)),
-        Furnishing("frame", _frame(2.6, 6.0, 0.5, 2.5, 1.4, 0, 0.14, 0.24), speckled("#b8892f", 117, 0.2, 0.2), 0.6),
+        Furnishing(
+            "frame", _picture_frame(2.6, 6.0, 0.5, 2.5, 1.4, 0, 0.14, 0.24), speckled("#b8892f", 117, 0.2, 0.2), 0.6
+        ),
     ]
 
 
@@ -226,12 +240,17 @@ def _by_the_wallpaper() -> list[Furnishing]:
     ]
     seat += [_between((-5.9, y, -1.6), (-5.2, y + 0.25, -1.35)) for y in (-2.5, 1.05)]
     return [
-        Furnishing("bench", merged(seat), chequered("#b5533c", "#d98f4e", 1, 2, 0.2, 121)),
+        Furnishing("bench", merge_meshes(seat), chequered("#b5533c", "#d98f4e", 1, 2, 0.2, 121)),
         Furnishing("small picture", _between((-6.0, -2.4, 0.3), (-5.94, -0.8, 1.5), 0.005), painting(1, 2, 123)),
-        Furnishing("small frame", _frame(-6.0, -1.6, 0.3, 1.5, 0.8, 1, 0.1, 0.2), speckled("#26221e", 125, 0.1), 0.4),
+        Furnishing(
+            "small frame", _picture_frame(-6.0, -1.6, 0.3, 1.5, 0.8, 1, 0.1, 0.2), speckled("#26221e", 125, 0.1), 0.4
+        ),
         Furnishing("tall picture", _between((-6.0, 0.3, 0.1), (-5.94, 1.4, 2.0), 0.005), painting(1, 2, 127)),
         Furnishing(
-            "tall frame", _frame(-6.0, 0.85, 0.1, 2.0, 0.55, 1, 0.1, 0.2), speckled("#8a5a2b", 129, 0.15, 0.2), 0.4
+            "tall frame",
+            _picture_frame(-6.0, 0.85, 0.1, 2.0, 0.55, 1, 0.1, 0.2),
+            speckled("#8a5a2b", 129, 0.15, 0.2),
+            0.4,
         ),
         Furnishing("pillar", lathe([-5.0, 5.0, -1.6], [0, 0, 1], column), marble(131), 0.4),
     ]
@@ -251,7 +270,7 @@ def _by_the_tiles() -> list[Furnishing]:
         Furnishing(
             "cupboard", _between((-4.5, -6.0, -1.6), (-2.0, -5.25, 0.8), 0.03), speckled("#496a81", 141, 0.15, 0.3), 0.2
         ),
-        Furnishing("panels", merged(panels), speckled("#6f93a8", 143, 0.15, 0.3), 0.2),
+        Furnishing("panels", merge_meshes(panels), speckled("#6f93a8", 143, 0.15, 0.3), 0.2),
         Furnishing(
             "pot",
             lathe([-0.2, -5.4, -1.6], [0, 0, 1], pot),
@@ -259,6 +278,96 @@ def _by_the_tiles() -> list[Furnishing]:
             0.3,
         ),
         Furnishing("bush", ball([-0.2, -5.4, -0.2], 0.62), speckled("#3f7d3a", 147, 0.7, 0.25)),
-        Furnishing("door", merged(door), planks("#6e2f24", "#8f4a35", 2, 0, 149, width=0.4), 0.3),
-        Furnishing("door frame", _frame(2.1, -6.0, -1.8, 1.5, 0.8, 0, 0.12, 0.24), speckled("#efe9dc", 151, 0.05), 0.2),
+        Furnishing("door", merge_meshes(door), planks("#6e2f24", "#8f4a35", 2, 0, 149, width=0.4), 0.3),
+        Furnishing(
+            "door frame", _picture_frame(2.1, -6.0, -1.8, 1.5, 0.8, 0, 0.12, 0.24), speckled("#efe9dc", 151, 0.05), 0.2
+        ),
     ]
+
+
+_GRAZING = 0.04
+"""Least cosine between a ray and a surface's normal for the width that the ray stands for."""
+
+
+class Room(Scene):
+    """Solids, and what is around them.
+
+    Args:
+        solids: the subject, coloured as in scenes of its own.
+        around: coloured by textures that are averaged over what a ray stands for.
+        spacing: of neighbouring rays at distance 1.
+
+    Attributes:
+        glow: (solids and furnishings,) float32 radiance sent out per unit of reflectance; above 0 nothing else is seen.
+        subject: how many of the first bodies are solids.
+    """
+
+    def __init__(
+        self, solids: Sequence[Solid], around: Sequence[Furnishing], spacing: float, engine: Engine = "auto"
+    ) -> None:
+        super().__init__(
+            [*solids, *(Solid(f.name, f.mesh, uniform_colour("#000000"), f.gloss) for f in around)], engine
+        )
+        self.subject = len(solids)
+        self.glow = np.array([0.0] * len(solids) + [f.glow for f in around], dtype=np.float32)
+        self._textures = [f.texture for f in around]
+        self._spacing = np.float32(spacing)
+
+    def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
+        """As of any scene, for directions of unit length."""
+        hits = super().intersect(origins, directions)
+        towards = np.asarray(directions, dtype=np.float32)[hits.hit]
+        # A pixel covers an ellipse of the surface; its area decides, so grazing views blur across rather than flicker
+        # along.
+        root: NDArray[np.float32] = np.sqrt(np.maximum(np.abs(dot(hits.face, towards)), np.float32(_GRAZING)))
+        width = hits.distance * self._spacing / root
+        albedo = hits.albedo.copy()
+        for index in np.unique(hits.solid[hits.solid >= self.subject]):
+            mine = np.flatnonzero(hits.solid == index)
+            albedo[mine] = self._textures[index - self.subject](hits.position[mine], width[mine])
+        return replace(hits, albedo=albedo)
+
+
+@dataclass(frozen=True)
+class Lamplight:
+    """The fixed light of the room.
+
+    Attributes:
+        position: (3,) the lamp, a point for shading.
+        power: (3,) linear RGB irradiance of a surface that faces the lamp at distance 1; it falls with the distance
+        squared. above, below: (3,) linear RGB radiance from straight above and straight below, blended in between.
+    """
+
+    position: Colour = LAMP
+    power: Colour = (39.0, 35.8, 30.0)
+    above: Colour = (0.31, 0.32, 0.34)
+    below: Colour = (0.27, 0.25, 0.23)
+
+
+LAMPLIGHT = Lamplight()
+
+
+def lamplight_radiance(
+    room: Room, origins: ArrayLike, directions: ArrayLike, light: Lamplight = LAMPLIGHT
+) -> NDArray[np.float32]:
+    """What N rays see: (N, 3) linear RGB; zero where nothing is hit, which inside of the room does not happen.
+
+    Args:
+        origins: (N, 3) or (3,).
+        directions: (N, 3) unit vectors.
+    """
+    d = np.asarray(directions, dtype=np.float32)
+    hits = room.intersect(origins, d)
+    to_eye = -d[hits.hit]
+    to_lamp = np.array(light.position, dtype=np.float32) - hits.position
+    away = np.sqrt(dot(to_lamp, to_lamp))
+    to_lamp /= away[:, None]
+    lit = visible_light(
+        room, hits, to_lamp, np.maximum(away - np.float32(1.2 * BULB), 0)
+    )  # the bulb itself is no obstacle
+    rgb = reflect_light(hits, to_eye, to_lamp) * (np.array(light.power, dtype=np.float32) * (lit / away**2)[:, None])
+    add_surroundings(rgb, hits, to_eye, light.above, light.below)
+    glow = room.glow[hits.solid][:, None]
+    image = np.zeros(d.shape, dtype=np.float32)
+    image[hits.hit] = np.where(glow > 0, glow * hits.albedo, rgb)
+    return image

@@ -1,0 +1,341 @@
+"""The scene ``lit_solids`` as a data set on disk, in the layout of GS³ that any loader of it reads.
+
+    transforms_train.json, transforms_test.json, transforms_circle.json      camera_angle_x, poses with OpenGL axes,
+    pl_pos, pl_intensity train/r_0000.exr                 RGBA, linear radiance over the exposure, premultiplied, half
+    floats train/r_0000_unshadowed.exr      the same as if nothing cast a shadow (attached shadows stay)
+    train/r_0000_classes.png         8-bit grey, index into PIXEL_:data:`neuprim.scenes.PIXEL_CLASSES`
+    test/new_light_03_nearest.exr    test views only: the camera's view under the nearest of 25 training lights
+
+A pixel is background where fewer than half of its rays hit anything; else it has the class of more than half of those
+that hit, and is "lit" where there is none such. The light's intensity is :data:`INTENSITY` in every image, so images
+fade with the square of its distance.
+
+Scene, cameras and lights are fixed: equal settings give equal files whatever the seed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+from neuprim.core.io.exr import write_exr
+from neuprim.core.validation import Range, validate_fields
+from neuprim.scenes import PIXEL_CLASSES
+from neuprim.scenes.image_set import (
+    ImageSet,
+    ImageSize,
+    Progress,
+    Supersampling,
+    average_rays,
+    camera_pose,
+    hash_settings,
+    ray_bands,
+    unit_direction,
+)
+from neuprim.scenes.raycast import Scene
+from neuprim.scenes.shading import dot, reflectance_lobes
+from neuprim.scenes.shapes import FLOOR, Solid, build_solids, lathe, ring, uniform_colour
+
+__all__ = [
+    "BRIGHT",
+    "CIRCLE_FRAMES",
+    "DISTANCE",
+    "GENERATOR_VERSION",
+    "INTENSITY",
+    "LitSettings",
+    "LitView",
+    "NEAR_LIGHTS",
+    "PARTS",
+    "LitImage",
+    "RADIUS",
+    "ShadedRays",
+    "generate_lit_solids",
+    "draw_lit_solids",
+    "shade_point_light",
+    "build_lit_solids",
+    "place_cameras_and_lights",
+]
+
+GENERATOR_VERSION = 1
+"""Part of the cache's key: to be raised with every change to solids, rig, shading or file layout."""
+
+DISTANCE = (4.0, 5.0)
+"""Of cameras and lights from the origin, least and most, scene units."""
+
+RADIUS = 1.19
+"""A sphere about the origin that holds everything, scene units."""
+
+FIELD_OF_VIEW = 2 * float(np.arcsin(RADIUS / DISTANCE[0]))
+"""Radians; holds the whole scene from the nearest camera."""
+
+INTENSITY = 69.2
+"""Radiant intensity of the lights over the exposure: it makes 1 the 99.5th percentile of the training images at the
+default settings."""
+
+
+@dataclass(frozen=True)
+class LitSettings:
+    """What changes the images of ``scene=lit_solids``.
+
+    Attributes:
+        size: width and height of the images in pixels.
+        train_views, test_views: images of each split.
+        supersampling: rays per pixel along each axis.
+    """
+
+    size: ImageSize = 160
+    train_views: Annotated[int, Range(1, 100000)] = 500
+    test_views: Annotated[int, Range(1, 10000)] = 100
+    supersampling: Supersampling = 2
+
+    def __post_init__(self) -> None:
+        validate_fields(self, "scene")
+
+    def key(self) -> str:
+        """A short hash of every setting and the generator's version."""
+        return hash_settings(self, GENERATOR_VERSION)
+
+
+@dataclass(frozen=True)
+class LitImage:
+    """One image.
+
+    Attributes:
+        rgba: (size, size, 4) float32 linear radiance and coverage, premultiplied.
+        unshadowed: (size, size, 4) the same as if nothing cast a shadow.
+        classes: (size, size) uint8, index into :data:`neuprim.scenes.PIXEL_CLASSES`.
+    """
+
+    rgba: NDArray[np.float32]
+    unshadowed: NDArray[np.float32]
+    classes: NDArray[np.uint8]
+
+
+def generate_lit_solids(
+    settings: LitSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None
+) -> Path:
+    """Write the data set unless a complete one is there; returns its folder ``cache_dir/lit_solids-KEY``.
+
+    Raises:
+        DataError: the cache directory cannot be written.
+    """
+    lens = {"camera_angle_x": FIELD_OF_VIEW, "camera_near": DISTANCE[0] - 1.5, "camera_far": DISTANCE[1] + 1.5}
+
+    def draw(scene: Scene, view: LitView, paths: Sequence[Path]) -> None:
+        pose = camera_pose(view.camera)
+        taken = draw_lit_solids(scene, pose, view.light, settings.size, settings.supersampling)
+        file, unshadowed, classes, *nearest_light = paths
+        write_exr(file, torch.from_numpy(taken.rgba), half=True)
+        write_exr(unshadowed, torch.from_numpy(taken.unshadowed), half=True)
+        Image.fromarray(taken.classes).save(classes)
+        for path in nearest_light:
+            assert view.near_light is not None
+            write_exr(
+                path,
+                torch.from_numpy(
+                    draw_lit_solids(scene, pose, view.near_light, settings.size, settings.supersampling).rgba
+                ),
+                half=True,
+            )
+
+    return ImageSet(
+        name="lit_solids",
+        key=settings.key(),
+        size=settings.size,
+        place_cameras_and_lights=place_cameras_and_lights(settings.train_views, settings.test_views),
+        lens=lens,
+        build_solids=lambda: Scene(build_lit_solids()),
+        frame=_frame,
+        files=_files,
+        draw=draw,
+    ).generate(cache_dir, progress)
+
+
+def draw_lit_solids(
+    scene: Scene, pose: NDArray[np.float64], light: NDArray[np.float64], size: int, supersampling: int
+) -> LitImage:
+    """The view of a camera at ``pose`` (camera to world, OpenGL axes) under a light at ``light`` (3,) of
+    :data:`INTENSITY`."""
+    parts = []
+    for directions in ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
+        seen = shade_point_light(scene, pose[:3, 3], directions, light, INTENSITY)
+        kinds = seen.classes[:, None] == np.arange(len(PIXEL_CLASSES), dtype=np.uint8)
+        parts.append(
+            average_rays(
+                np.concatenate([seen.rgb, seen.unshadowed, kinds], axis=1, dtype=np.float32), size, supersampling
+            )
+        )
+    mean = np.concatenate(parts)
+    shares = mean[..., 6:]
+    alpha = shares[..., 1:].sum(axis=-1, keepdims=True)
+    classes = np.where(alpha[..., 0] < 0.5, 0, PIXEL_CLASSES.index("lit")).astype(np.uint8)
+    for value in range(2, len(PIXEL_CLASSES)):
+        classes[(classes > 0) & (shares[..., value] > alpha[..., 0] / 2)] = value
+    rgba, unshadowed = (np.concatenate([colour, alpha], axis=-1) for colour in (mean[..., :3], mean[..., 3:6]))
+    return LitImage(rgba, unshadowed, classes)
+
+
+def _files(view: LitView) -> list[str]:
+    nearest = [] if view.near_light is None else [f"{view.name}_nearest.exr"]
+    return [f"{view.name}.exr", f"{view.name}_unshadowed.exr", f"{view.name}_classes.png", *nearest]
+
+
+def _frame(split: str, view: LitView) -> dict[str, Any]:
+    return {
+        "file_path": f"./{split}/{view.name}",
+        "file_ext": ".exr",
+        "transform_matrix": camera_pose(view.camera).tolist(),
+        "pl_pos": view.light.tolist(),
+        "pl_intensity": [INTENSITY] * 3,
+    }
+
+
+CAMERA_POLAR = math.radians(75.0)
+LIGHT_POLAR = math.radians(60.0)
+PARTS = ("new_view", "new_light", "new_both")
+CIRCLE_FRAMES = 36
+
+NEAR_LIGHTS = 25
+"""The baseline "nearest light" knows the lights of this many training images, the first ones."""
+
+
+@dataclass(frozen=True)
+class LitView:
+    """One image to take.
+
+    Attributes:
+        camera, light: (3,) float64 positions, scene units.
+        near_light: (3,) the one of the baseline's lights in the direction nearest to the light's; test views only.
+    """
+
+    name: str
+    camera: NDArray[np.float64]
+    light: NDArray[np.float64]
+    near_light: NDArray[np.float64] | None = None
+
+
+def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, list[LitView]]:
+    """All views by split: "train", "test", "circle"."""
+    digits = max(4, len(str(train_views)))
+    cameras, lights = _draw(1, train_views)
+    train = [LitView(f"r_{i:0{digits}d}", cameras[i], lights[i]) for i in range(train_views)]
+    known = lights[:NEAR_LIGHTS]
+    new_cameras, new_lights = _draw(2, test_views)
+    # The baseline's own lights are no test of it, so seen ones come from the rest where there is one.
+    first = NEAR_LIGHTS if train_views > NEAR_LIGHTS else 0
+    counts = [(test_views + 2 - part) // 3 for part in range(3)]
+    test = []
+    for part, name in enumerate(PARTS):
+        for i in range(counts[part]):
+            fresh = sum(counts[:part]) + i
+            seen = first + i * (train_views - first) // max(counts[part], 1)
+            camera = cameras[seen] if name == "new_light" else new_cameras[fresh]
+            light = lights[seen] if name == "new_view" else new_lights[fresh]
+            test.append(
+                LitView(f"{name}_{i:0{max(2, len(str(test_views)) - 1)}d}", camera, light, _nearest(known, light))
+            )
+    middle = sum(DISTANCE) / 2
+    eye = middle * unit_direction(math.cos(math.radians(58.0)), -1.1)
+    turns = [2 * math.pi * i / CIRCLE_FRAMES for i in range(CIRCLE_FRAMES)]
+    circle = [
+        LitView(f"light_{i:02d}", eye, middle * unit_direction(math.cos(math.radians(45.0)), turn))
+        for i, turn in enumerate(turns)
+    ]
+    return {"train": train, "test": test, "circle": circle}
+
+
+def _draw(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
+    """Positions of ``count`` cameras and lights; a longer list begins with the shorter one."""
+    numbers = np.random.default_rng([20241208, key]).random((count, 6))
+    return [_position(n[:3], CAMERA_POLAR) for n in numbers], [_position(n[3:], LIGHT_POLAR) for n in numbers]
+
+
+def _position(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]:
+    """Three numbers 0..1 as a point whose direction is uniform on the cap of half-angle ``polar`` about the zenith."""
+    cosine = 1.0 - numbers[0] * (1.0 - math.cos(polar))
+    return (DISTANCE[0] + numbers[2] * (DISTANCE[1] - DISTANCE[0])) * unit_direction(cosine, 2 * math.pi * numbers[1])
+
+
+def _nearest(lights: list[NDArray[np.float64]], light: NDArray[np.float64]) -> NDArray[np.float64]:
+    cosines = [float(known @ light / np.linalg.norm(known)) for known in lights]
+    return lights[int(np.argmax(cosines))]
+
+
+_THICK, _EDGE = 0.1, 0.012
+_MAJOR, _MINOR = 0.235, 0.1
+
+
+def build_lit_solids() -> list[Solid]:
+    """All solids, the same at every call. The slab is bright and even, so that shadows show; the ring is nearly black,
+    so that its highlights do."""
+    profile = [(0.0, 1.0 - _EDGE), (_EDGE, 1.0), (_THICK - _EDGE, 1.0), (_THICK, 1.0 - _EDGE)]
+    slab = Solid(
+        "slab", lathe([0, 0, FLOOR - _THICK], [0, 0, 1], profile, sections=256), uniform_colour("#c9c2b4"), 0.0
+    )
+    polished = ring([-0.66, 0.2, FLOOR + _MAJOR + _MINOR], [1.0, 0.35, 0.0], _MAJOR, _MINOR)
+    others = [solid for solid in build_solids() if solid.name != "plate"]
+    return [slab, *others, Solid("glossy ring", polished, uniform_colour("#3a1c4a"), 0.35, specular=2.8)]
+
+
+BRIGHT = 0.5 / (np.pi * (sum(DISTANCE) / 2) ** 2)
+"""Radiance per unit intensity from which a highlight counts as one, 1/length^2."""
+
+_LIT, _CAST, _ATTACHED, _HIGHLIGHT = (
+    PIXEL_CLASSES.index(n) for n in ("lit", "cast_shadow", "attached_shadow", "highlight")
+)
+
+
+@dataclass(frozen=True)
+class ShadedRays:
+    """What N rays see.
+
+    Attributes:
+        rgb: (N, 3) float32 linear radiance, zero where nothing is hit.
+        unshadowed: (N, 3) the same as if nothing cast a shadow.
+        classes: (N,) uint8, index into :data:`neuprim.scenes.PIXEL_CLASSES`; 0 where nothing is hit.
+    """
+
+    rgb: NDArray[np.float32]
+    unshadowed: NDArray[np.float32]
+    classes: NDArray[np.uint8]
+
+
+def shade_point_light(
+    scene: Scene, origins: ArrayLike, directions: ArrayLike, light: ArrayLike, intensity: float
+) -> ShadedRays:
+    """Cast N rays.
+
+    Args:
+        origins: (N, 3) or (3,).
+        directions: (N, 3) unit vectors.
+        light: (3,) position of the point light.
+        intensity: its radiant intensity, equal in all colours and directions.
+    """
+    d = np.asarray(directions, dtype=np.float32)
+    hits = scene.intersect(origins, d)
+    way = np.asarray(light, dtype=np.float32) - hits.position
+    square = dot(way, way)
+    to_light = (way / np.sqrt(square)[:, None]).astype(np.float32, copy=False)
+    cosine, highlight = reflectance_lobes(hits, -d[hits.hit], to_light)
+    facing = (cosine > 0) & (dot(hits.face, to_light) > 0)
+    irradiance = np.where(facing, cosine * np.float32(intensity / np.pi) / square, np.float32(0))
+    unshadowed = (hits.albedo + highlight[:, None]) * irradiance[:, None]
+    starts = hits.lifted()[facing]  # what faces away needs no ray
+    visible = facing.copy()
+    visible[facing] = ~scene.occluded(starts, np.asarray(light, dtype=np.float32) - starts, 1.0)
+    gleam = highlight * irradiance
+    shining = visible & (highlight > hits.albedo.max(axis=1)) & (gleam > np.float32(BRIGHT * intensity))
+    classes = np.where(facing, np.where(visible, np.where(shining, _HIGHLIGHT, _LIT), _CAST), _ATTACHED)
+    shaded = ShadedRays(np.zeros(d.shape, np.float32), np.zeros(d.shape, np.float32), np.zeros(len(d), np.uint8))
+    shaded.rgb[hits.hit] = unshadowed * visible[:, None]
+    shaded.unshadowed[hits.hit] = unshadowed
+    shaded.classes[hits.hit] = classes
+    return shaded

@@ -1,1 +1,0 @@
-"""Loaders of posed photographs and renders: one module per format, each with ``load(settings, context) -> Dataset``."""

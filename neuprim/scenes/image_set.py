@@ -115,14 +115,13 @@ def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: C
 
 
 def write_cached_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
-    """Have ``write`` fill the folder ``final`` unless all files are there; returns it.
+    """Have ``write`` fill the folder ``final`` unless all ``files`` exist; return it.
 
-    The folder appears under its name only when complete, so an interrupted run leaves nothing that could be taken for a
-    data set.
+    The folder appears under its name only when complete, so an interrupted run leaves nothing.
 
     Args:
-        files: every file that belongs there, relative to the folder.
-        write: fills the empty folder that it is given; with equal files, whoever calls it.
+        files: all files of the folder, relative to it.
+        write: fills the empty folder that it gets, with equal files at every call.
         what: for messages, e.g. ``"scene solids: cannot write the generated images"``.
 
     Raises:
@@ -142,19 +141,21 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class ImageSet(Generic[V]):
-    """What one scene says of its images; ``V`` is whatever it keeps of a view until the image is drawn.
+    """Description of the images of a scene, written as ``transforms_SPLIT.json`` and ``SPLIT/...``.
+
+    ``V`` is the type of a view.
 
     Attributes:
         name: of the scene.
-        key: a short hash of all that the files depend on.
+        key: hash of everything the files depend on.
         size: width and height in pixels, for messages.
-        splits: the views of every split, in order.
-        lens: what a transforms file says before its frames.
-        build: makes the scene, of solids that do not move.
-        frame: (split, view) -> its entry in the transforms file.
-        files: view -> the names of its files, in the folder of its split.
+        splits: views of each split, in order.
+        lens: fields of a transforms file before its frames.
+        build: makes the scene.
+        frame: (split, view) -> entry in the transforms file.
+        files: view -> names of its files in the folder of its split.
         draw: (scene, view, paths) writes these files; called from several threads.
-        facts: scene -> what else a transforms file says before its frames.
+        facts: scene -> further fields of a transforms file.
     """
 
     name: str
@@ -169,7 +170,7 @@ class ImageSet(Generic[V]):
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {}
 
     def generate(self, cache_dir: Path, progress: Progress) -> Path:
-        """Write the data set unless a complete one is there; returns its folder ``cache_dir/NAME-KEY``.
+        """Write the data set unless it is complete; return its folder ``cache_dir/NAME-KEY``.
 
         Raises:
             DataError: the cache directory cannot be written.

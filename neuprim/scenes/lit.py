@@ -1,16 +1,15 @@
-"""The scene ``lit_solids`` as a data set on disk, in the layout of GS³ that any loader of it reads.
+"""The scene ``lit_solids`` on disk, in the layout of GS³.
 
-    transforms_train.json, transforms_test.json, transforms_circle.json      camera_angle_x, poses with OpenGL axes,
-    pl_pos, pl_intensity train/r_0000.exr                 RGBA, linear radiance over the exposure, premultiplied, half
-    floats train/r_0000_unshadowed.exr      the same as if nothing cast a shadow (attached shadows stay)
-    train/r_0000_classes.png         8-bit grey, index into PIXEL_:data:`neuprim.scenes.PIXEL_CLASSES`
-    test/new_light_03_nearest.exr    test views only: the camera's view under the nearest of 25 training lights
+    transforms_{train,test,circle}.json    camera_angle_x, poses with OpenGL axes, pl_pos, pl_intensity
+    train/r_0000.exr                 RGBA, linear radiance over the exposure, premultiplied, half floats
+    train/r_0000_unshadowed.exr      the same without cast shadows
+    train/r_0000_classes.png         8-bit grey, index into :data:`neuprim.scenes.PIXEL_CLASSES`
+    test/new_light_03_nearest.exr    test views only: the view under the nearest of 25 training lights
 
-A pixel is background where fewer than half of its rays hit anything; else it has the class of more than half of those
-that hit, and is "lit" where there is none such. The light's intensity is :data:`INTENSITY` in every image, so images
-fade with the square of its distance.
+A pixel is background if fewer than half of its rays hit anything. Otherwise it has the class of more than half of the
+rays that hit, else "lit". The light has the intensity :data:`INTENSITY` in every image.
 
-Scene, cameras and lights are fixed: equal settings give equal files whatever the seed.
+Scene, cameras and lights are fixed: equal settings give equal files for any seed.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ default settings."""
 
 @dataclass(frozen=True)
 class LitSettings:
-    """What changes the images of ``scene=lit_solids``.
+    """Settings of ``scene=lit_solids`` that change the images.
 
     Attributes:
         size: width and height of the images in pixels.
@@ -100,7 +99,7 @@ class LitSettings:
         validate_fields(self, "scene")
 
     def key(self) -> str:
-        """A short hash of every setting and the generator's version."""
+        """Hash all settings and the version of the generator."""
         return hash_settings(self, GENERATOR_VERSION)
 
 
@@ -110,7 +109,7 @@ class LitImage:
 
     Attributes:
         rgba: (size, size, 4) float32 linear radiance and coverage, premultiplied.
-        unshadowed: (size, size, 4) the same as if nothing cast a shadow.
+        unshadowed: the same without cast shadows.
         classes: (size, size) uint8, index into :data:`neuprim.scenes.PIXEL_CLASSES`.
     """
 
@@ -122,7 +121,7 @@ class LitImage:
 def generate_lit_solids(
     settings: LitSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None
 ) -> Path:
-    """Write the data set unless a complete one is there; returns its folder ``cache_dir/lit_solids-KEY``.
+    """Write the data set unless it is complete; return its folder ``cache_dir/lit_solids-KEY``.
 
     Raises:
         DataError: the cache directory cannot be written.
@@ -150,9 +149,9 @@ def generate_lit_solids(
         name="lit_solids",
         key=settings.key(),
         size=settings.size,
-        place_cameras_and_lights=place_cameras_and_lights(settings.train_views, settings.test_views),
+        splits=place_cameras_and_lights(settings.train_views, settings.test_views),
         lens=lens,
-        build_solids=lambda: Scene(build_lit_solids()),
+        build=lambda: Scene(build_lit_solids()),
         frame=_frame,
         files=_files,
         draw=draw,
@@ -162,8 +161,7 @@ def generate_lit_solids(
 def draw_lit_solids(
     scene: Scene, pose: NDArray[np.float64], light: NDArray[np.float64], size: int, supersampling: int
 ) -> LitImage:
-    """The view of a camera at ``pose`` (camera to world, OpenGL axes) under a light at ``light`` (3,) of
-    :data:`INTENSITY`."""
+    """Draw the view at ``pose`` (camera to world, OpenGL axes) under a light at ``light`` (3,) of :data:`INTENSITY`."""
     parts = []
     for directions in ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
         seen = shade_point_light(scene, pose[:3, 3], directions, light, INTENSITY)
@@ -213,7 +211,7 @@ class LitView:
 
     Attributes:
         camera, light: (3,) float64 positions, scene units.
-        near_light: (3,) the one of the baseline's lights in the direction nearest to the light's; test views only.
+        near_light: (3,) the baseline light nearest in direction; test views only.
     """
 
     name: str
@@ -223,7 +221,13 @@ class LitView:
 
 
 def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, list[LitView]]:
-    """All views by split: "train", "test", "circle"."""
+    """Return all views by split: "train", "test", "circle".
+
+    Cameras look at the origin from 4 to 5 units, at most 75 degrees from the zenith; lights are as far away, at most
+    60 degrees from it. Directions are uniform on their cap, distances on their range. The test split has three equal
+    parts: ``new_view`` (new camera, training light), ``new_light`` (training camera, new light) and ``new_both``.
+    ``circle`` is a film: one new camera and a light that goes round once, 45 degrees from the zenith.
+    """
     digits = max(4, len(str(train_views)))
     cameras, lights = _draw(1, train_views)
     train = [LitView(f"r_{i:0{digits}d}", cameras[i], lights[i]) for i in range(train_views)]
@@ -253,13 +257,13 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
 
 
 def _draw(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
-    """Positions of ``count`` cameras and lights; a longer list begins with the shorter one."""
+    """Positions of ``count`` cameras and lights; longer lists begin with shorter ones."""
     numbers = np.random.default_rng([20241208, key]).random((count, 6))
     return [_position(n[:3], CAMERA_POLAR) for n in numbers], [_position(n[3:], LIGHT_POLAR) for n in numbers]
 
 
 def _position(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]:
-    """Three numbers 0..1 as a point whose direction is uniform on the cap of half-angle ``polar`` about the zenith."""
+    """Map three numbers 0..1 to a point in a direction uniform on the cap of half-angle ``polar`` about the zenith."""
     cosine = 1.0 - numbers[0] * (1.0 - math.cos(polar))
     return (DISTANCE[0] + numbers[2] * (DISTANCE[1] - DISTANCE[0])) * unit_direction(cosine, 2 * math.pi * numbers[1])
 
@@ -274,8 +278,7 @@ _MAJOR, _MINOR = 0.235, 0.1
 
 
 def build_lit_solids() -> list[Solid]:
-    """All solids, the same at every call. The slab is bright and even, so that shadows show; the ring is nearly black,
-    so that its highlights do."""
+    """Build the solids without their plate, a bright slab that shows shadows, and a dark ring that shows highlights."""
     profile = [(0.0, 1.0 - _EDGE), (_EDGE, 1.0), (_THICK - _EDGE, 1.0), (_THICK, 1.0 - _EDGE)]
     slab = Solid(
         "slab", lathe([0, 0, FLOOR - _THICK], [0, 0, 1], profile, sections=256), uniform_colour("#c9c2b4"), 0.0
@@ -295,12 +298,12 @@ _LIT, _CAST, _ATTACHED, _HIGHLIGHT = (
 
 @dataclass(frozen=True)
 class ShadedRays:
-    """What N rays see.
+    """Radiance of N rays.
 
     Attributes:
         rgb: (N, 3) float32 linear radiance, zero where nothing is hit.
-        unshadowed: (N, 3) the same as if nothing cast a shadow.
-        classes: (N,) uint8, index into :data:`neuprim.scenes.PIXEL_CLASSES`; 0 where nothing is hit.
+        unshadowed: (N, 3) the same without cast shadows.
+        classes: (N,) uint8, index into :data:`neuprim.scenes.PIXEL_CLASSES`.
     """
 
     rgb: NDArray[np.float32]
@@ -311,13 +314,17 @@ class ShadedRays:
 def shade_point_light(
     scene: Scene, origins: ArrayLike, directions: ArrayLike, light: ArrayLike, intensity: float
 ) -> ShadedRays:
-    """Cast N rays.
+    """Cast N rays and shade them under one point light.
+
+    Radiance is (albedo / pi + highlight) cosine intensity / distance^2, or 0 in shadow. Classes: attached shadow, where
+    the surface or its shading normal faces away; cast shadow, where something lies between; highlight, where it is
+    brighter than the diffuse part and :data:`BRIGHT`; lit otherwise.
 
     Args:
         origins: (N, 3) or (3,).
         directions: (N, 3) unit vectors.
         light: (3,) position of the point light.
-        intensity: its radiant intensity, equal in all colours and directions.
+        intensity: radiant intensity of the light.
     """
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)

@@ -58,7 +58,7 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 @dataclass(frozen=True)
 class SolidsSettings:
-    """What the user may set for ``scene=solids``.
+    """Settings of ``scene=solids``.
 
     Attributes:
         size: width and height of the images in pixels.
@@ -75,7 +75,7 @@ class SolidsSettings:
         validate_fields(self, "scene")
 
     def key(self) -> str:
-        """A short hash of every setting and the generator's version."""
+        """Hash all settings and the version of the generator."""
         return hash_settings(self, GENERATOR_VERSION)
 
 
@@ -87,7 +87,7 @@ class _View(NamedTuple):
 def generate_solids(
     settings: SolidsSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None
 ) -> Path:
-    """Write the data set unless a complete one is there; returns its folder ``cache_dir/solids-KEY``.
+    """Write the data set unless it is complete; return its folder ``cache_dir/solids-KEY``.
 
     Raises:
         DataError: the cache directory cannot be written.
@@ -101,12 +101,11 @@ def make_image_set(
     name: str,
     key: str,
     settings: SolidsSettings,
-    build_solids: Callable[[], Scene],
+    build: Callable[[], Scene],
     seen: Radiance = daylight_radiance,
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {},
 ) -> ImageSet[_View]:
-    """Whatever ``build_solids`` makes, seen by the cameras of the solids; arguments as of
-    :class:`~neuprim.scenes.image_set.ImageSet`."""
+    """Describe images of the scene that ``build`` makes, taken by the cameras of the solids."""
     counts = {"train": settings.train_views, "test": settings.test_views}
 
     def draw(scene: Scene, view: _View, paths: Sequence[Path]) -> None:
@@ -122,7 +121,7 @@ def make_image_set(
             for split, count in counts.items()
         },
         lens={"camera_angle_x": FIELD_OF_VIEW},
-        build_solids=build_solids,
+        build=build,
         frame=lambda split, view: {
             "file_path": f"./{split}/{view.name}",
             "transform_matrix": camera_pose(view.eye).tolist(),
@@ -134,16 +133,15 @@ def make_image_set(
 
 
 def solids_camera_poses(split: str, count: int) -> list[NDArray[np.float64]]:
-    """``count`` camera-to-world matrices (4, 4), OpenGL axes, looking at the origin from distance 4.
+    """Return ``count`` camera-to-world matrices (4, 4), OpenGL axes, looking at the origin from distance 4.
 
-    "train" is a Fibonacci lattice of equal area from 9 degrees below the horizon to 78 above; "test" is another,
-    turning the other way from 3 to 64 degrees, so that its views fall between the first's.
+    "train" is a Fibonacci lattice of equal area from 9 degrees below the horizon to 78 above. "test" turns the other
+    way, from 3 to 64 degrees, so that its views fall between the training views.
     """
     return [camera_pose(eye) for eye in _eyes(split, count)]
 
 
 def _eyes(split: str, count: int) -> list[NDArray[np.float64]]:
-    """(3,) positions of the cameras of :func:`solids_camera_poses`."""
     low, high, phase, turn = {"train": (-0.16, 0.98, 0.0, GOLDEN_ANGLE), "test": (0.05, 0.9, 1.0, -GOLDEN_ANGLE)}[split]
     return [DISTANCE * unit_direction(low + (high - low) * (i + 0.5) / count, phase + i * turn) for i in range(count)]
 
@@ -151,8 +149,7 @@ def _eyes(split: str, count: int) -> list[NDArray[np.float64]]:
 def draw_solids(
     scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int, seen: Radiance = daylight_radiance
 ) -> NDArray[np.uint8]:
-    """(size, size, 4) RGBA in sRGB with straight alpha, as Blender stores it: rays are averaged premultiplied and
-    linear, then encoded."""
+    """(size, size, 4) RGBA, sRGB with straight alpha. Rays are averaged premultiplied and linear, then encoded."""
     bands_of_rays = ray_bands(pose, FIELD_OF_VIEW, size, supersampling)
     mean = np.concatenate([average_rays(_rgba(scene, pose, d, seen), size, supersampling) for d in bands_of_rays])
     alpha = mean[..., 3:]

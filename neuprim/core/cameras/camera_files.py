@@ -34,13 +34,13 @@ _MAX_BYTES = 64 * 1024 * 1024
 
 
 def read_json_cameras(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
-    """The cameras of a file with ``frames`` or ``camera_path``.
+    """Read a file with ``frames`` or ``camera_path``.
 
     Args:
-        size: (width, height) where the file names none.
+        size: (width, height) where the file has none.
 
     Raises:
-        DataError: names the file, the frame and the field that is missing or wrong.
+        DataError: names file, frame and field.
     """
     document = JsonReader.open(path, _MAX_BYTES)
     if document.has("camera_path"):
@@ -74,7 +74,7 @@ def _times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
 
 
 def _rate(document: JsonReader, count: int) -> float | None:
-    """``fps``, else the ``count`` of frames over ``seconds``; None where the file says neither."""
+    """``fps``, else ``count`` frames over ``seconds``; None without either."""
     for key, rate in (("fps", lambda value: value), ("seconds", lambda value: count / value)):
         if document.has(key):
             found = rate(document.number(key, "a number above 0", 0.0))
@@ -88,8 +88,7 @@ def _rate(document: JsonReader, count: int) -> float | None:
 
 
 def _read_frames(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
-    """``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``; a frame may override
-    every intrinsic."""
+    """Read ``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``."""
     records, found, bent = _listed_cameras(document, "frames"), [], 0
     notes: dict[str, None] = {}
     refuse_unsupported_keys(document)
@@ -97,7 +96,8 @@ def _read_frames(document: JsonReader, size: tuple[int, int] | None) -> CameraVi
         refuse_unsupported_keys(record)
         if has_fisheye_lens(record, document, ()):
             raise DataError(
-                f"{record.where}: the camera is a fisheye (camera_model, is_fisheye); expected one of {', '.join(MODELS)}"
+                f"{record.where}: the camera is a fisheye (camera_model, is_fisheye); expected one of "
+                f"{', '.join(MODELS)}"
             )
         bent += any(read_lens_coefficients(record, document).values())
         stated = JsonReader(
@@ -117,8 +117,10 @@ def _read_frames(document: JsonReader, size: tuple[int, int] | None) -> CameraVi
 
 
 def _camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
-    """``{"render_width", "render_height", "fps", "seconds", "camera_path": [{"camera_to_world": 16 numbers, "fov":
-    degrees}]}``: ``fov`` is vertical, the middle of the image is the principal point, and axes are OpenGL's.
+    """Read a path of nerfstudio's viewer.
+
+    ``{"render_width", "render_height", "fps", "seconds", "camera_path": [{"camera_to_world": 16 numbers, "fov"}]}``:
+    ``fov`` is vertical, in degrees, and axes are OpenGL's.
     """
     kind = document.values.get("camera_type", "perspective")
     if kind != "perspective":
@@ -132,7 +134,10 @@ def _camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraVi
         view = opengl_to_viewmat(_flat_matrix(record, "camera_to_world"))
         camera = Camera(view, focal, focal, 0.5 * width, 0.5 * height, width, height)
         found.append((f"camera_{i:03d}", camera.validate(f"{record.where}.camera_to_world")))
-    note = "poses are taken as they are; nerfstudio's viewer has them in the frame that its dataparser moved and scaled the scene to"
+    note = (
+        "poses are taken as they are; nerfstudio's viewer has them in the frame that its dataparser moved "
+        "and scaled the scene to"
+    )
     return CameraViews(tuple(found), _times(records, "render_time"), _rate(document, len(found)), (note,))
 
 
@@ -178,11 +183,11 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
 
 
 def split_usd_prim(path: Path) -> tuple[Path, str]:
-    """``FILE#/World/Camera`` as a file and what stands after it; a file of that very name comes first."""
+    """Split ``FILE#/World/Camera``; a file of that very name comes first."""
     text, hash_, prim = str(path).partition("#")
     return (Path(text), prim) if hash_ and not path.exists() else (path, "")
 
 
 def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[tuple[str, Camera]]:
-    """Names and cameras of :func:`read_camera_file`."""
+    """Return names and cameras of :func:`read_camera_file`."""
     return list(read_camera_file(path, size).named)

@@ -1,5 +1,8 @@
-"""COLMAP's sparse models, text or binary, by COLMAP's own package (the extra ``neuprim[colmap]``): its cameras, and
-poses of its images."""
+"""COLMAP's sparse models, text or binary, read by its own package (the extra ``neuprim[colmap]``).
+
+Binary files are checked record by record first. COLMAP's reader accepts truncated files, and a damaged count can keep
+it busy for hours.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 
 
 def import_pycolmap() -> Any:
-    """The package; raises :class:`BackendUnavailable` where it is missing."""
+    """Import the package; raise :class:`BackendUnavailable` if it is missing."""
     try:
         import pycolmap
     except ImportError as error:
@@ -54,7 +57,7 @@ def _kind(folder: Path) -> str | None:
 
 
 def read_colmap_model(folder: Path) -> Any:
-    """The ``pycolmap.Reconstruction`` in a folder, whose binary files are checked from end to end first.
+    """Read the ``pycolmap.Reconstruction`` in a folder.
 
     Raises:
         BackendUnavailable: pycolmap is not installed.
@@ -81,7 +84,7 @@ def read_colmap_model(folder: Path) -> Any:
 
 
 def _restore_names(model: Any, path: Path) -> None:
-    """Give images the names that ``images.txt`` has: COLMAP's reader ends a name at its first blank."""
+    """Restore the names of ``images.txt`` that contain blanks, at which COLMAP cuts them off."""
     lines = iter(path.read_text(encoding="utf-8", errors="surrogateescape").split("\n"))
     for line in lines:
         fields = line.strip().split(maxsplit=9)
@@ -101,7 +104,7 @@ def _parameter_count(model: int) -> int:
 
 
 def pinhole_parameters(lens: Any, where: str) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels of a ``pycolmap.Camera``, whatever its distortion.
+    """Return fx, fy, cx, cy in pixels of a ``pycolmap.Camera``, ignoring distortion.
 
     Raises:
         DataError: a model without focal lengths.
@@ -120,7 +123,7 @@ def pinhole_parameters(lens: Any, where: str) -> tuple[float, float, float, floa
 
 
 def colmap_viewmat(image: Any) -> Tensor:
-    """(4, 4) float64 world-to-camera matrix, OpenCV axes, of a ``pycolmap.Image``."""
+    """Return the (4, 4) float64 world-to-camera matrix, OpenCV axes, of a ``pycolmap.Image``."""
     pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3] = torch.from_numpy(np.asarray(pose.matrix(), dtype=np.float64))
@@ -128,10 +131,9 @@ def colmap_viewmat(image: Any) -> Tensor:
 
 
 def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
-    """The model with the most images of those in a project's ``sparse``, None for none, and a line for the user, which
-    may be empty.
+    """Return the model with most images in a project's ``sparse`` (or None) and a line for the user.
 
-    COLMAP writes one model for each group of images that it cannot join.
+    COLMAP writes one model per group of images that it cannot join.
     """
     place = project / "sparse"
     models = sorted((p for p in place.glob("*") if _kind(p) is not None), key=lambda p: (len(p.name), p.name))
@@ -146,7 +148,7 @@ def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
 
 
 def _count_images(model: Path) -> int:
-    """Images in a model, from its file alone; 0 where that is damaged or missing."""
+    """Number of images in a model, from its file alone; 0 if damaged or missing."""
     try:
         if (model / "images.bin").is_file():
             with open(model / "images.bin", "rb") as file:
@@ -161,8 +163,7 @@ def _count_images(model: Path) -> int:
 
 
 def find_colmap_model(path: Path) -> Path | None:
-    """The folder of the model that a path means: itself, one of its files, or a project with ``sparse``; None for
-    anything else."""
+    """Return the model folder that a path means: itself, one of its files, or a project; else None."""
     if path.is_dir():
         return path if _kind(path) is not None else largest_colmap_model(path)[0]
     return (
@@ -173,12 +174,11 @@ def find_colmap_model(path: Path) -> Path | None:
 
 
 def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
-    """Name, without its suffix, and camera of every image with a pose, by name, and lines for the user. Points need not
-    be there.
+    """Return (name without suffix, camera) of all posed images, by name, and lines for the user.
 
     Raises:
         BackendUnavailable: pycolmap is not installed.
-        DataError: as :func:`read_colmap_model`; no poses, impossible cameras, lenses that no pinhole can stand in for.
+        DataError: as :func:`read_colmap_model`; no poses, impossible cameras, or lenses that are no pinholes.
     """
     reconstruction = _without_points(folder)
     images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
@@ -213,7 +213,7 @@ def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[st
 
 
 def _without_points(folder: Path) -> Any:
-    """The model; where its points are missing, as if there were none."""
+    """Read a model whose points may be missing."""
     kind = _kind(folder)
     if kind is None or (folder / f"points3D{kind}").is_file() or not (folder / f"images{kind}").is_file():
         return read_colmap_model(folder)
@@ -233,7 +233,7 @@ _MAX_PARAMS = 64
 
 
 class _Bytes:
-    """A read position in one file; running past the end is the error that names it."""
+    """Read position in a file; running past its end raises DataError."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -244,7 +244,7 @@ class _Bytes:
         self.at = 0
 
     def skip(self, size: int) -> int:
-        """The position before moving on by ``size`` bytes."""
+        """Advance by ``size`` bytes and return the position before."""
         start, self.at = self.at, self.at + size
         if size < 0 or self.at > len(self.data):
             raise DataError(
@@ -262,15 +262,13 @@ class _Bytes:
 
 
 def check_binary_model(folder: Path, parameter_count: Callable[[int], int]) -> None:
-    """Check all ``.bin`` files of the model in ``folder`` from first to last record.
-
-    Models of COLMAP before 3.12 have no ``rigs.bin`` and ``frames.bin``.
+    """Check all ``.bin`` files of a model from first to last record; ``rigs`` and ``frames`` are optional.
 
     Args:
-        parameter_count: parameters of a COLMAP camera model by its number; -1 for an unknown one.
+        parameter_count: COLMAP camera model number -> number of parameters, or -1.
 
     Raises:
-        DataError: a file is unreadable, truncated, longer than its records, or names an unknown camera model.
+        DataError: a file is unreadable, truncated, too long, or names an unknown camera model.
     """
     for name, record in (
         ("cameras.bin", lambda f: _camera(f, parameter_count)),

@@ -1,15 +1,13 @@
-"""Intrinsics and lenses as ``transforms.json`` files state them: one reader for every loader and for camera files.
+"""Intrinsics, lenses and other keys of ``transforms.json`` files, for data loaders and camera files.
 
 Focal lengths: ``fl_x fl_y`` in pixels, ``camera_angle_x camera_angle_y`` in radians, ``x_fov y_fov`` in degrees, or
 ``camera_intrinsics`` [cx, cy, fx, fy]. Principal point: ``cx cy``. Size: ``w h``. Lens: ``camera_model``,
-``has_fisheye_lens``, ``k1 k2 k3 k4 p1 p2``.
-
-Rules:
+``is_fisheye``, ``k1 k2 k3 k4 p1 p2``.
 
 * Each group of keys comes whole from the frame, or else whole from the file.
 * Keys of one record that state the same number must agree within 1 %.
-* Lengths in pixels belong to the size that their own record states. They are scaled where the image is a resized copy
-  of that size.
+* Lengths in pixels belong to the size in their own record. They are scaled to images that are resized copies.
+* A key that changes the picture is read or refused by name. Unknown keys are named once in a warning.
 """
 
 from __future__ import annotations
@@ -62,8 +60,8 @@ class Target:
 
     Attributes:
         width, height: of the image, or of the picture to draw.
-        image: the image file; "" where there is none, and the size is the one to draw at.
-        hint: what a message about the size says at its end.
+        image: the image file; "" if there is none.
+        hint: end of messages about the size.
     """
 
     width: int
@@ -78,7 +76,7 @@ class Target:
 
 @dataclass(frozen=True)
 class _Level:
-    """The fields of a frame, or of its file, and the size in pixels that lengths among them belong to."""
+    """Fields of a frame or file, and the size in pixels that its lengths belong to."""
 
     record: JsonReader
     size: tuple[int, int]
@@ -87,7 +85,7 @@ class _Level:
         return any(self.record.has(key) for key in group)
 
     def scales(self, keys: str, target: Target) -> tuple[float, float]:
-        """Pixels of the target per pixel of this size, horizontally and vertically."""
+        """Target pixels per pixel of this size, horizontally and vertically."""
         if not is_resized_copy(self.size, target.size):
             found = (
                 f"{keys} belong to w, h {self.size[0]}x{self.size[1]}, and the image is {target.width}x{target.height}"
@@ -99,38 +97,42 @@ class _Level:
 
 
 def is_resized_copy(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether one size is a resized copy of the other, to within the rounding of sides to whole pixels."""
+    """Whether one size is a resized copy of the other, up to rounding to whole pixels."""
     scale = max(other[0] / size[0], other[1] / size[1])
     return abs(size[0] * scale - other[0]) <= 1.0 and abs(size[1] * scale - other[1]) <= 1.0
 
 
 def _owner(group: tuple[str, ...], frame: JsonReader, file: JsonReader) -> JsonReader:
-    """The record that a group of keys is taken from whole."""
+    """The record that provides a whole group of keys."""
     return frame if any(frame.has(key) for key in group) else file
 
 
 def read_camera(
     frame: JsonReader, file: JsonReader, target: Target, viewmat: Tensor | None = None, say: Say = lambda text: None
 ) -> Camera:
-    """The pinhole of a frame.
+    """Read the pinhole of a frame.
 
     Args:
-        file: the file's own fields, for what the frame leaves out.
-        viewmat: (4, 4) world to camera, OpenCV axes; None for the frame's ``transform_matrix``, camera to world with
-        OpenGL axes. say: takes lines for the user.
+        file: fields of the file, for what the frame leaves out.
+        viewmat: (4, 4) world to camera, OpenCV axes; None reads ``transform_matrix`` (camera to world, OpenGL axes).
+        say: receives lines for the user.
 
     Raises:
-        DataError: a field that is missing or wrong, or fields that contradict each other or the image.
+        DataError: missing or wrong fields, or fields that contradict each other or the image.
     """
     of_file = _Level(file, _size(file, target.size))
     of_frame = _Level(frame, _size(frame, of_file.size))
     if target.image and of_frame.size != target.size:
         stated, (width, height) = _owner(SIZE, frame, file).where, of_frame.size
         if not is_resized_copy(of_frame.size, target.size):
-            found = f"image is {target.width}x{target.height}; expected {width}x{height} (w, h in {stated}) or a reduction of it"
+            found = (
+                f"image is {target.width}x{target.height}; expected {width}x{height} (w, h in {stated}) or "
+                "a reduction of it"
+            )
             raise DataError(f"{target.image}: {found}{target.hint}")
         say(
-            f"{file.where}: w, h are {width}x{height} and the image {target.width}x{target.height}; cameras are scaled to the images"
+            f"{file.where}: w, h are {width}x{height} and the image {target.width}x{target.height}; cameras "
+            "are scaled to the images"
         )
     focal = of_frame if of_frame.has(FOCAL) else of_file
     fx, fy = _focal(frame, focal, target, say)
@@ -161,13 +163,16 @@ def _focal(frame: JsonReader, level: _Level, target: Target, say: Say) -> tuple[
     where = level.record.where
     if min(fx / target.width, fy / target.height) < _SHORTEST:
         raise DataError(
-            f"{where}: {', '.join((*x, *y))} mean focal lengths of {fx:.5g} and {fy:.5g} pixels on {target.width}x{target.height}, a field of view "
+            f"{where}: {', '.join((*x, *y))} mean focal lengths of {fx:.5g} and {fy:.5g} pixels on "
+            f"{target.width}x{target.height}, a field of view "
             "of more than 170 degrees; expected a pinhole, and lengths in pixels, not in shares of the image"
         )
     if not {*x, *y} & {"fl_x", "fl_y", "camera_intrinsics"} and not _agree(fx, fy):
         raise DataError(
-            f"{where}: {next(iter(x))} and {next(iter(y))} mean pixels that are not square, with focal lengths {fx:.5g} and {fy:.5g}; "
-            "expected square pixels, or fl_x and fl_y (Blender's angle_y is the sensor's, not the image's: leave it out)"
+            f"{where}: {next(iter(x))} and {next(iter(y))} mean pixels that are not square, with focal lengths "
+            f"{fx:.5g} and {fy:.5g}; "
+            "expected square pixels, or fl_x and fl_y (Blender's angle_y is the sensor's, not the image's: "
+            "leave it out)"
         )
     portrait = max(target.height / target.width, 1.0)
     for found, other in ((x, y), (y, x)):
@@ -183,15 +188,15 @@ def _focal(frame: JsonReader, level: _Level, target: Target, say: Say) -> tuple[
             explained |= key == "camera_angle_y" and first == "fl_y" and _agree(fx, fy) and "camera_angle_x" in other
             if not explained:
                 raise DataError(
-                    f"{text}; expected the same within {_TOLERANCE:.0%}: take out the wrong one, or give w, h of the images they are for"
+                    f"{text}; expected the same within {_TOLERANCE:.0%}: take out the wrong one, or give w, h "
+                    "of the images they are for"
                 )
             say(f"{text}; {first} is taken")
     return fx, fy
 
 
 def _stated(level: _Level, axis: int, target: Target) -> dict[str, float]:
-    """Every focal length along an axis that a record states, in pixels of the target, by its key; lengths in pixels
-    first."""
+    """Every focal length along an axis that a record states, in target pixels, by key; lengths in pixels first."""
     record, name, side = level.record, "xy"[axis], target.size[axis]
     found = {}
     if record.has(key := f"fl_{name}"):
@@ -254,7 +259,8 @@ def _middle(frame: _Level, file: _Level, focal: _Level, target: Target) -> tuple
         )
     ):
         raise DataError(
-            f"{record.where}: cx, cy are {plain}, and camera_intrinsics begins with {_intrinsics(record)[:2]}; expected the same"
+            f"{record.where}: cx, cy are {plain}, and camera_intrinsics begins with {_intrinsics(record)[:2]}; "
+            "expected the same"
         )
     if target.image or not (frame.has(SIZE) or file.has(SIZE)):  # a picture of a stated size may look past its edge
         _check_middle(record.where, keys, (cx, cy), frame.has(SIZE) or file.has(SIZE), target)
@@ -262,14 +268,15 @@ def _middle(frame: _Level, file: _Level, focal: _Level, target: Target) -> tuple
 
 
 def _check_middle(where: str, keys: str, point: tuple[float, float], stated: bool, target: Target) -> None:
-    """Refuse a principal point that lies outside, or that is the middle of an image of another size."""
+    """Refuse a principal point outside of the image, or in the middle of an image of another size."""
     (cx, cy), image = point, f"{target.image or 'the picture'} ({target.width}x{target.height})"
     kx, ky = 2.0 * cx / target.width, 2.0 * cy / target.height
     if not stated and min(kx, ky) > 0.0 and abs(kx - 1.0) > 0.05 and abs(kx - ky) <= 2 * _TOLERANCE * kx:
         size = f"{round(2 * cx)}x{round(2 * cy)}"
         found = f"{keys} are {cx:g}, {cy:g}, the middle of an image of {size} and not of {image}"
         raise DataError(
-            f"{where}: {found}; expected w, h of the images that the lengths in pixels are for, e.g. {size.replace('x', ', ')}"
+            f"{where}: {found}; expected w, h of the images that the lengths in pixels are for, e.g. "
+            f"{size.replace('x', ', ')}"
         )
     if max(cx, cy) <= 1.0 and min(target.width, target.height) > 8:
         raise DataError(f"{where}: {keys} are {cx:g}, {cy:g} on {image}; expected pixels, not shares of the image")
@@ -284,8 +291,7 @@ def _check_middle(where: str, keys: str, point: tuple[float, float], stated: boo
 
 
 def _check_one_lens(frame: _Level, file: _Level, target: Target) -> None:
-    """Refuse a frame with another focal length than its file, whose principal point or distortion it does not
-    replace."""
+    """Refuse a frame with its own focal length that takes principal point or distortion from the file."""
     if file.record.has("camera_intrinsics") or not file.has(FOCAL):
         return
     left = []
@@ -305,7 +311,7 @@ def _check_one_lens(frame: _Level, file: _Level, target: Target) -> None:
 
 
 def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, float]:
-    """The coefficients of the lens distortion by name, 0 where none is stated."""
+    """Read the distortion coefficients by name; 0 where none is given."""
     record = _owner(COEFFICIENTS, frame, file)
     return {key: record.number_or(key, 0.0) for key in COEFFICIENTS}
 
@@ -314,10 +320,10 @@ def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...
     """Whether the lens is OpenCV's fisheye.
 
     Args:
-        others: models beside :data:`MODELS` that messages offer.
+        others: further models that messages offer.
 
     Raises:
-        DataError: a camera model that is neither it nor one of :data:`MODELS`.
+        DataError: the camera model is neither that nor one of :data:`MODELS`.
     """
     record = _owner(("camera_model", "is_fisheye"), frame, file)
     model = record.text("camera_model") if record.has("camera_model") else "OPENCV"
@@ -346,8 +352,10 @@ READ = frozenset(
 
 _HARMLESS = frozenset(
     # extents, starting values and switches of the training of other programs
-    "aabb_scale aabb aabb_range render_aabb scale offset up sphere_center sphere_radius scene_scale scene_box near far bounds "
-    "camera_near camera_far n_frames sharpen sharpness sharpness_discard_threshold importance_sampling n_extra_learnable_dims "
+    "aabb_scale aabb aabb_range render_aabb scale offset up sphere_center sphere_radius scene_scale scene_box "
+    "near far bounds "
+    "camera_near camera_far n_frames sharpen sharpness sharpness_discard_threshold importance_sampling "
+    "n_extra_learnable_dims "
     "envmap from_na orientation_override auto_scale_poses_override fps seconds "
     # poses and points are already in the frame that these lead to
     "applied_transform applied_scale "
@@ -355,7 +363,8 @@ _HARMLESS = frozenset(
     "enable_depth_loading enable_ray_loading integer_depth_scale depth_unit_scale_factor depth_path depth_file_path "
     "normal_path normal_file_path "
     # names and numbers of images and cameras
-    "colmap_im_id colmap_image_id camera_id camera_idx camera_index camera_label image_id img_id frame_id frame_index id index name "
+    "colmap_im_id colmap_image_id camera_id camera_idx camera_index camera_label image_id img_id frame_id "
+    "frame_index id index name "
     "rotation metadata aux_cam_params points timestamp camera_angle "
     # of scene=mesh, which reads them itself
     "rendered_from scene_from_file".split()
@@ -367,12 +376,14 @@ _MOVES = "a camera that moves during the exposure; expected one transform_matrix
 _ALPHA = "what is transparent; expected PNG images with an alpha channel"
 _REFUSED = {
     **dict.fromkeys(
-        "latlong equirectangular panorama ftheta ftheta_p0 ftheta_p1 ftheta_p2 ortho orthographic is_ortho ortho_scale fisheye".split(),
+        "latlong equirectangular panorama ftheta ftheta_p0 ftheta_p1 ftheta_p2 ortho orthographic is_ortho "
+        "ortho_scale fisheye".split(),
         _RAYS,
     ),
     **dict.fromkeys("k5 k6 s1 s2 s3 s4 sx1 sy1 b1 b2 skew sk_x sk_y".split(), _LENS),
     **dict.fromkeys(
-        "distortion distortion_params distortion_coefficients dist_coeffs radial_distortion tangential_distortion".split(),
+        "distortion distortion_params distortion_coefficients dist_coeffs radial_distortion "
+        "tangential_distortion".split(),
         _LENS,
     ),
     **dict.fromkeys(("rolling_shutter", "transform_matrix_start", "transform_matrix_end"), _MOVES),
@@ -389,11 +400,7 @@ _LISTED = 8
 
 
 def refuse_unsupported_keys(record: JsonReader) -> None:
-    """Refuse a record with a key that changes the picture and that nothing here honours.
-
-    Raises:
-        DataError: naming the key and what it states.
-    """
+    """Raise DataError for a key that changes the picture and is not supported."""
     for key, states in _REFUSED.items():
         if key in record.values and _says(record.values[key]):
             raise DataError(f"{record.where}: {key} states {states}")
@@ -418,7 +425,7 @@ def _says(value: Any) -> bool:
 
 
 def describe_unknown_keys(file: JsonReader, frames: Iterable[JsonReader], read: Iterable[str]) -> str:
-    """A line that names the keys that neither are read nor known to be harmless; "" for none."""
+    """Return a line that names keys that are neither read nor known to be harmless; "" for none."""
     known = READ | _HARMLESS | _REFUSED.keys() | {*_KINDS, *read}
     found = dict.fromkeys(k for k in file.values if k not in known)
     found.update(dict.fromkeys(f"frames[].{k}" for r in frames for k in r.values if k not in known))

@@ -31,8 +31,8 @@ class Camera:
     """A pinhole view.
 
     Attributes:
-        viewmat: (4, 4) world-to-camera, OpenCV axes; float64 unless it carries gradients of another dtype.
-        fx, fy, cx, cy: focal lengths and principal point in pixels; the principal point may be off centre or outside.
+        viewmat: (4, 4) world to camera, OpenCV axes; float64 unless it carries gradients of another dtype.
+        fx, fy, cx, cy: focal lengths and principal point in pixels; the latter may lie outside of the image.
         width, height: image size in pixels.
     """
 
@@ -55,27 +55,25 @@ class Camera:
         return torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view sampled on another pixel grid."""
+        """Return the same view sampled on another pixel grid."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
         )
 
     def reduced(self, factor: int) -> Camera:
-        """The view on pixels exactly ``factor`` times as large; what is left over at the right and at the bottom is cut
-        off, not squeezed in."""
+        """Return the view with pixels ``factor`` times as large; remainders at the right and bottom are cut off."""
         fx, fy, cx, cy = (value / factor for value in (self.fx, self.fy, self.cx, self.cy))
         return Camera(self.viewmat, fx, fy, cx, cy, self.width // factor, self.height // factor)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 2) pixel positions x, y and (N,) depths of (N, 3) points, float64; positions mean nothing where the depth
-        is not positive."""
+        """Return (N, 2) pixels and (N,) depths of (N, 3) points, float64; pixels are valid for depth > 0."""
         view = self.viewmat.double()
         x, y, z = (points.double() @ view[:3, :3].T + view[:3, 3]).unbind(-1)
         return torch.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], dim=-1), z
 
     def sees(self, points: Tensor) -> Tensor:
-        """(N,) bool of the (N, 3) points that lie before the camera and inside its image."""
+        """(N,) bool: points in front of the camera and inside its image."""
         pixels, z = self.project(points)
         return (z > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([self.width, self.height])).all(1)
 
@@ -85,7 +83,8 @@ class Camera:
         numbers = torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=torch.float64)
         if not (torch.isfinite(numbers).all() and self.fx > 0 and self.fy > 0):
             raise DataError(
-                f"{where}: intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}; expected finite numbers, focal lengths > 0"
+                f"{where}: intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}; expected finite "
+                "numbers, focal lengths > 0"
             )
         if self.width <= 0 or self.height <= 0:
             raise DataError(f"{where}: image size {self.width}x{self.height}; expected positive")
@@ -167,13 +166,13 @@ FRAME_RATES = (0.1, 240.0)
 
 @dataclass(frozen=True)
 class CameraViews:
-    """Cameras in their order, one or more.
+    """Cameras of a file, in order.
 
     Attributes:
         named: name and camera of each.
-        times: what the file says as the time of each, in its own unit; None where it does not.
-        fps: frames per second of the film that they are; None where the file does not say.
-        notes: one line each, for the user: conventions that were met, and what of the file cannot be drawn.
+        times: time of each in the file's own unit; None without.
+        fps: frames per second of their film; None without.
+        notes: lines for the user on conventions, and on what cannot be drawn.
     """
 
     named: tuple[tuple[str, Camera], ...]
@@ -183,10 +182,12 @@ class CameraViews:
 
 
 def camera_exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
-    """Attribute name -> value: ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth`` as
-    the standard has them, and in float64, for cameras far from the origin, ``neuprim:worldToCamera``, and
-    in plain numbers ``neuprim:focalLength`` and ``neuprim:principalPoint`` (x, y, pixels), ``neuprim:near`` (camera z,
-    units of the camera's position).
+    """Return the standard camera attributes of an OpenEXR file by name.
+
+    These are ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth``. They multiply row
+    vectors, in a left-handed space with y up and z forward; device coordinates run from (0, 0) at the upper left to
+    (1, 1). Added are ``neuprim:worldToCamera`` in float64, ``neuprim:focalLength`` and ``neuprim:principalPoint``
+    (x, y, pixels), and ``neuprim:near``.
     """
     view = camera.viewmat.detach().double().cpu().numpy()
     up = np.diag([1.0, -1.0, 1.0, 1.0])

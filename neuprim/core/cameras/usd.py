@@ -71,7 +71,10 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
         _camera(JsonReader(r.values, where if len(records) == 1 else f"{where}, frame {i}"), wanted)
         for i, r in enumerate(records)
     ]
-    note = f"{stage.text('up')} is up and a unit is {stage.number('meters', 'metres per unit', 0.0):g} m in this file; taken as the axes and units of the run's data"
+    note = (
+        f"{stage.text('up')} is up and a unit is {stage.number('meters', 'metres per unit', 0.0):g} m in "
+        "this file; taken as the axes and units of the run's data"
+    )
     fps = stage.number("fps", "time codes per second above 0", 0.0) if len(cameras) > 1 else None
     if fps is not None and not FRAME_RATES[0] <= fps <= FRAME_RATES[1]:  # some tools count in ticks
         note, fps = f"{note}; timeCodesPerSecond {fps:g} is no rate of a film, --fps says another", None
@@ -132,6 +135,7 @@ def _rigid(matrix: Tensor, where: str) -> Tensor:
     mean = lengths.mean()
     if not bool(mean > 0) or float((lengths / mean - 1).abs().max()) > _SCALED:
         raise DataError(
-            f"{where}: its transform scales by {', '.join(f'{x:g}' for x in lengths.tolist())}; expected one scale for all axes"
+            f"{where}: its transform scales by {', '.join(f'{x:g}' for x in lengths.tolist())}; expected one "
+            "scale for all axes"
         )
     return torch.cat([torch.cat([matrix[:3, :3] / lengths, matrix[:3, 3:]], 1), matrix[3:]])

@@ -1,5 +1,4 @@
-"""Where a scene lies in the world of the user's files: one known transform, applied wherever coordinates come in or go
-out."""
+"""The transform between a scene and the world of the user's files."""
 
 from __future__ import annotations
 
@@ -26,10 +25,10 @@ _Camera = TypeVar("_Camera", Camera, RayCamera)
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """How scene coordinates follow from those of the user's files, the *world*: a rotation, one scale and an offset.
+    """Scene coordinates from those of the user's files, the *world*: a rotation, one scale and an offset.
 
-    Everything inside is in scene units, mostly float32. Coordinates that users give or get (cameras, lights, boxes,
-    exported positions) are in the world, float64, and are converted by this class alone.
+    Everything inside is in scene units, mostly float32. Coordinates of the user (cameras, lights, boxes, exported
+    positions) are in the world, float64, and are converted by this class alone.
 
     Attributes:
         scene_from_world: (4, 4) float64.
@@ -74,18 +73,17 @@ class World:
         return self.inverse.scene_from_world
 
     def scene_points(self, points: Tensor) -> Tensor:
-        """(..., 3) float64 scene points of world points; of an identity the same tensor."""
+        """Convert (..., 3) world points to float64 scene points; the identity returns the same tensor."""
         if self.identity:
             return points
         return points.double() @ self.scene_from_world[:3, :3].T + self.scene_from_world[:3, 3]
 
     def world_points(self, points: Tensor) -> Tensor:
-        """(..., 3) float64 world points of scene points; of an identity the same tensor."""
+        """Convert (..., 3) scene points to world points; the identity returns the same tensor."""
         return self.inverse.scene_points(points)
 
     def scene_camera(self, camera: _Camera) -> _Camera:
-        """The same view of the scene as ``camera`` has of the world. Its rotation stays one, and its depths are in
-        scene units."""
+        """Return the view of the scene that equals the view ``camera`` of the world."""
         if self.identity:
             return camera
         view, back = camera.viewmat.detach().double(), self.world_from_scene
@@ -132,8 +130,7 @@ class World:
             raise DataError(f"{where}: header field 'world' is damaged ({type(error).__name__})") from None
 
     def validate(self, where: str) -> World:
-        """Return self, or raise :class:`DataError` naming ``where`` for a matrix that is no rotation with one scale and
-        an offset."""
+        """Return self; raise :class:`DataError` naming ``where`` unless this is a rotation, one scale and an offset."""
         matrix = self.scene_from_world
         fits = (
             isinstance(matrix, Tensor)

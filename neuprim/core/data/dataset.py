@@ -1,8 +1,7 @@
-"""What a loader hands over: two sets of posed images that load lazily, what is known of them, and where matter may be
-at the start.
+"""Data sets: posed images that load on demand, starting points, and points to learn from.
 
-A :class:`Dataset` describes and decides nothing: what a model is judged by, which films are made and what its file says
-about the data is the task's, see :class:`~neuprim.core.task.TaskSpec`.
+A :class:`Dataset` only describes data. Metrics, films and headers are the task's
+(:class:`~neuprim.core.task.TaskSpec`).
 """
 
 from __future__ import annotations
@@ -79,12 +78,12 @@ class Pixels:
     mask: Tensor | None = None
 
     def to(self, device: torch.device) -> Pixels:
-        """The same on another device; copies to a card do not wait for it."""
+        """Copy to another device without waiting for it."""
         alpha, mask = (None if x is None else hardware.copy_from_host(x, device) for x in (self.alpha, self.mask))
         return Pixels(hardware.copy_from_host(self.rgb, device), alpha, mask)
 
     def over(self, background: Tensor) -> Tensor:
-        """(H, W, C) composited over a (C,) colour; opaque pixels are returned as they are."""
+        """Composite over a (C,) colour: (H, W, C). Opaque pixels are returned unchanged."""
         if self.alpha is None:
             return self.rgb
         uncovered, channels = (1.0 - self.alpha).reshape(-1), self.rgb.shape[-1]
@@ -92,7 +91,7 @@ class Pixels:
 
 
 class ViewSet(ABC):
-    """Posed images of one split. ``pixels`` reads on demand and keeps at most compact (uint8 or half) copies."""
+    """Posed images of one split. ``pixels`` reads on demand and caches compact (uint8 or half) copies."""
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -105,12 +104,7 @@ class ViewSet(ABC):
 
 
 class ViewSubset(ViewSet):
-    """Some views of another set, which keeps their pixels; e.g. those of one moment.
-
-    Args:
-        views: the whole set.
-        indices: of the chosen views, in the order they get here.
-    """
+    """The views of another set at ``indices``, in that order. The other set caches their pixels."""
 
     def __init__(self, views: ViewSet, indices: Sequence[int]) -> None:
         self._views, self._indices = views, list(indices)
@@ -130,18 +124,13 @@ class PointCloud:
     """Points where matter probably is.
 
     Attributes:
-        means: (N, 3) scene units; of a file that was just read, float64 world units (:meth:`within`).
+        means: (N, 3) scene units; right after reading a file, float64 world units (:meth:`within`).
         colors: (N, C) in the data set's colour space.
-        conditions: condition name -> (N,) the value under which matter was found at each point, e.g. "time" -> times
-        0..1;
-            empty for scenes without conditions.
-        axes, quats: (N, 3) semi-axes and (N, 4) orientations wxyz, where the points are ellipsoids.
-        alphas: (N,) opacities 0..1 through their middles.
-        deviations: (N, 3) standard deviations along the axes in place of ``axes``, where the points are Gaussians: the
-        density says how large
-            an ellipsoid looks like each.
-        steps: condition name -> from one value at which views show the scene from many sides to the next, where that is
-        known: a sequence's frames.
+        conditions: name -> (N,) values under which the points were observed, e.g. "time" -> 0..1.
+        axes, quats: (N, 3) semi-axes and (N, 4) rotations wxyz of ellipsoids.
+        alphas: (N,) opacities 0..1 at the centres.
+        deviations: (N, 3) standard deviations, instead of ``axes``, of Gaussians.
+        steps: condition name -> distance of neighbouring frames, where it is known.
     """
 
     means: Tensor
@@ -154,7 +143,7 @@ class PointCloud:
     steps: Mapping[str, float] = field(default_factory=dict)
 
     def rows(self, index: Tensor) -> PointCloud:
-        """The points at ``index``, (M,) int64 or (N,) bool, with all that belongs to them."""
+        """Select points by (M,) int64 or (N,) bool ``index``."""
         axes, quats, alphas, deviations = (
             None if value is None else value[index] for value in (self.axes, self.quats, self.alphas, self.deviations)
         )
@@ -162,8 +151,7 @@ class PointCloud:
         return PointCloud(self.means[index], self.colors[index], found, axes, quats, alphas, deviations, self.steps)
 
     def within(self, world: World) -> PointCloud:
-        """The points of a file, in the scene's coordinates as float32; subtracted in float64, so ``means`` should be of
-        a file in doubles."""
+        """Convert world to scene coordinates; positions are subtracted in float64."""
         means = world.scene_points(self.means).float()
         axes, deviations = (
             x if x is None or world.scale == 1.0 else x * world.scale for x in (self.axes, self.deviations)
@@ -179,11 +167,11 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Clip:
-    """Views that make a film in their order (one camera over time, a light going round).
+    """Views that make a film in this order.
 
     Attributes:
-        views: indices into the test split, or into ``source``.
-        source: views beside the test split, which do not count in its means; None: the test split.
+        views: indices into ``source``, or into the test split.
+        source: views outside of the test split; None for the test split.
     """
 
     name: str
@@ -200,34 +188,28 @@ generator's."""
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dataset:
-    """A scene to fit: a description of its images and the images themselves. There is no class to derive from it.
+    """A scene to fit. Create instances; subclasses are refused.
 
     Attributes:
         name: shown in reports.
         train, test: the splits.
-        start: where primitives start, see :data:`StartingPoints`.
-        extent: scene extent in scene units (see :func:`camera_extent`), the unit of position rates and size limits
-        unless matter is a hundred times
-            as far.
-        background: (C,) the colour that evaluation composites over.
-        channels: colour channels C.
-        color_space: "srgb" (display-referred values as stored in PNG) or "linear".
-        data_source: see :data:`DataSource`; printed in every output.
-        random_background: whether training composites a random colour instead (needs alpha).
+        start: rule for starting points, see :data:`StartingPoints`.
+        extent: scene extent in scene units (:func:`~neuprim.core.data.scene_frame.camera_extent`), the unit of learning
+            rates and size limits.
+        background: (C,) colour that evaluation composites over.
+        channels: number of colour channels C.
+        color_space: "srgb" (as stored in PNG) or "linear".
+        random_background: whether training composites random colours (needs alpha).
         downsampling: text for reports, e.g. "none", "images_4" or "200x200 from 800x800 by area".
-        up: (3,) the scene's upward direction, for orbits; +z unless said.
-        center: (3,) what the cameras look at, for orbits; the origin unless said.
-        bounds: (2, 3) lower and upper corner of a box around everything, scene units; None if the data do not say.
-        exposure: what the linear values of the files were divided by.
-        world: how all these coordinates follow from those of the user's files; the same unless said.
-        placement: which voxel files the scene was made from, in the same world; None without such files.
-        largest: the largest extinction anywhere, 1/scene unit, that no primitive goes beyond; None where it is not
-        known. points: points at which extinction and source radiance are known, for ``train.supervision=voxels`` and
-        ``both``; None where they
-            are not.
-        extra: what else the scene's own task likes to know, of the class that this task names, e.g. what pixels show or
-        what the images
-            were made from. None is always enough: a task judges by images, cameras and conditions then.
+        up: (3,) upward direction, for orbits.
+        center: (3,) point that the cameras look at, for orbits.
+        bounds: (2, 3) lower and upper corner of a box around everything, scene units, if known.
+        exposure: divisor that was applied to the linear values of the files.
+        world: transform between the scene and the user's files.
+        placement: the voxel files the scene was made from, if any.
+        largest: largest extinction in the scene, 1/scene unit, if known; primitives stay below it.
+        points: points of known extinction and radiance, for ``train.supervision=voxels`` and ``both``.
+        extra: further knowledge in a class of the task, e.g. pixel classes. Tasks accept None.
     """
 
     name: str
@@ -253,19 +235,20 @@ class Dataset:
 
     def __init_subclass__(cls) -> None:
         raise TypeError(
-            f"class {cls.__name__}(Dataset): a data set is made by calling neuprim.core.data.Dataset(name=..., train=..., test=..., ...); "
+            f"class {cls.__name__}(Dataset): a data set is made by calling neuprim.core.data.Dataset(name=..., "
+            "train=..., test=..., ...); "
             "what a class of its own would judge, film or tell is the task's"
         )
 
     def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
-        """At most ``count`` distinct starting points, by the data set's own rule."""
+        """Return at most ``count`` distinct starting points."""
         return self.start(self.train, count, generator)
 
     def uniform_points(self, count: int, generator: torch.Generator) -> PointCloud:
-        """``count`` mid-grey points, uniform in the box of the data set.
+        """Draw ``count`` mid-grey points, uniform in :attr:`bounds`.
 
         Raises:
-            ConfigError: the data set has none.
+            ConfigError: the data set has no bounds.
         """
         if self.bounds is None:
             raise ConfigError(
@@ -276,11 +259,10 @@ class Dataset:
         return PointCloud(means, torch.full((count, self.channels), 0.5))
 
     def orbit(self, frames: int) -> list[View]:
-        """Views circling the scene at the training cameras' mean distance and elevation; outward where these do not
-        look at its centre.
+        """Make views on a circle at the mean distance and elevation of the training cameras.
 
-        Conditions that are one number go from their least to their greatest value over the training views; others stay
-        as in the first.
+        The views look outward where the training cameras do. Scalar conditions run from their least to their greatest
+        training value; others keep the value of the first view.
         """
         cameras = [self.train.view(i).camera for i in range(len(self.train))]
         far = find_outliers(torch.stack([c.position for c in cameras]))
@@ -312,8 +294,7 @@ class Dataset:
         ]
 
     def _scalar_conditions(self) -> dict[str, tuple[Tensor, Tensor]]:
-        """Least and greatest value over the training views of every condition that is one number; an orbit goes from
-        one to the other."""
+        """Least and greatest training value of each condition that is a single number."""
         found: dict[str, list[Tensor]] = {}
         for i in range(len(self.train)):
             for name, value in self.train.view(i).conditions.items():
@@ -327,19 +308,16 @@ class Dataset:
 
 @dataclass(frozen=True)
 class PointSamples:
-    """What is true at M points of one frame.
+    """True values at M points of one frame.
 
     Attributes:
         name: of the frame, for logs.
-        conditions: of the frame, the same for all points.
+        conditions: of the frame, shared by all points.
         points: (M, 3) float32, scene units.
         sigma: (M,) float32 extinction, 1/scene unit.
-        source: (M, C) float32 extinction times source radiance in the data set's colour space, where it is the same
-        towards all directions;
-            None where it is not, or not known: then the extinction alone is learned from points.
-        sigma_scale, source_scale: typical sizes of both where there is matter, what errors are divided by.
-        components: name -> (M,) float32, the part of ``sigma`` that comes from the source grid of that name, and its
-        typical size.
+        source: (M, C) float32 extinction times isotropic source radiance; None trains the extinction only.
+        sigma_scale, source_scale: typical values inside matter, by which errors are divided.
+        components: source grid name -> its (M,) part of ``sigma``, and the typical value.
     """
 
     name: str
@@ -353,31 +331,27 @@ class PointSamples:
 
 
 class PointSupervision(ABC):
-    """Points to learn from; a data set's ``points``.
+    """Points to learn from, see :attr:`Dataset.points`.
 
     Attributes:
-        components: names of the source grids whose part of the extinction is known (:attr:`PointSamples.components`).
+        components: names of the source grids in :attr:`PointSamples.components`.
     """
 
     components: tuple[str, ...] = ()
 
     @abstractmethod
     def draw(self, count: int, generator: torch.Generator) -> PointSamples:
-        """``count`` points of one frame, both drawn by ``generator`` alone, so that a resumed run draws the same."""
+        """Draw ``count`` points of one frame; the only randomness is ``generator``."""
 
 
 def hold_out_views(dataset: Dataset, every: int) -> Dataset:
-    """The same without its test views: one of every ``every`` training views takes their place, and is not learned
-    from.
+    """Replace the test split by every ``every``-th training view, which is no longer trained on.
 
-    Which one moves on by one from each group to the next: of cameras with as many frames as a multiple of ``every``, it
-    is not always the same moment that nobody learns from.
-
-    Args:
-        every: 2 or more.
+    The position within each group of ``every`` views advances by one from group to group. So no single moment of a
+    multi-camera sequence is missing from all cameras.
 
     Raises:
-        ConfigError: that leaves nothing to learn from, or nothing to judge by.
+        ConfigError: ``every`` < 2, or fewer than two training views.
     """
     count = len(dataset.train)
     if every < 2 or count < 2:
@@ -390,14 +364,13 @@ def hold_out_views(dataset: Dataset, every: int) -> Dataset:
 
 
 class GroundTruth(ABC):
-    """The images of a scene, as they will be when all frames are made. Any process that has the scene's settings can
-    make any frame.
+    """Images of a scene that are rendered frame by frame, possibly by several processes.
 
     Attributes:
-        frames: their names, in order.
-        key: of everything that the images depend on; another process must come to the same one, or it sees other files.
-        place: folder or URL where they are kept.
-        known: plain values that spare another process work that was done here; given to the scene's ``truth`` there.
+        frames: names, in order.
+        key: hash of everything the images depend on; all processes must agree on it.
+        place: folder or URL of the images.
+        known: plain values that save other processes repeated work; passed to the scene's ``truth``.
     """
 
     frames: Sequence[str]
@@ -407,39 +380,38 @@ class GroundTruth(ABC):
 
     @abstractmethod
     def missing(self) -> list[int]:
-        """Places in ``frames`` of those that are not there, in order."""
+        """Return the indices of missing frames, in order."""
 
     @abstractmethod
     def begin(self) -> None:
-        """Make the place ready; before the first frame is made, by whoever hands them out."""
+        """Prepare the place, before the first frame is made."""
 
     @abstractmethod
     def make(self, frame: int, tell: Callable[[str], None]) -> None:
-        """Make a frame, unless it is there by now. Whole or not at all; two that make the same one do no harm.
+        """Make a frame unless it exists. Writes are atomic, so processes may overlap.
 
         Args:
-            tell: told that the place is gone and waited for.
+            tell: receives a line while the place is unavailable.
 
         Raises:
-            DataError: its file cannot be read, or the place cannot be written.
+            DataError: the source cannot be read, or the place cannot be written.
         """
 
     @abstractmethod
     def complete(self) -> None:
-        """What is to be written when all frames are there, if anything."""
+        """Write what is due when all frames exist."""
 
 
 @dataclass(frozen=True)
 class SceneContext:
-    """What a scene's loader gets beside its own settings.
+    """What a loader gets besides the settings of its scene.
 
     Attributes:
         seed: for generated scenes.
-        cache_dir: where generated data may be kept between runs (keyed by everything that matters).
+        cache_dir: for generated data, keyed by everything they depend on.
         progress: called with (text, fraction 0..1) during long work.
-        device: what may compute the ground truth where a loader has to; data sets are on the processor either way.
-        world: of the model that the scene is loaded for again, whose coordinates it keeps; None: the scene's own
-        choice.
+        device: where ground truth may be computed; data sets are on the CPU.
+        world: of the model that the scene is loaded for again; None lets the scene choose.
     """
 
     seed: int

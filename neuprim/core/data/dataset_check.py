@@ -1,8 +1,6 @@
-"""What a data set promises (see :mod:`neuprim.core.data`), compared with what it holds: one line names view, member,
-found and expected.
+"""Checks that a data set keeps the promises of :class:`~neuprim.core.data.dataset.Dataset`.
 
-Shapes and dtypes are compared wherever pixels are drawn, which costs nothing; values are looked through once, for the
-first view of each split, before a run starts.
+Shapes and dtypes are checked whenever pixels are drawn. Values are checked once, for the first view of each split.
 """
 
 from __future__ import annotations
@@ -27,17 +25,14 @@ Extra = TypeVar("Extra")
 
 
 class DatasetError(DataError):
-    """A loader broke a promise of :class:`~neuprim.core.data.dataset.Dataset`; whoever knows the loader's package adds
-    its name."""
+    """A loader broke a promise of :class:`~neuprim.core.data.dataset.Dataset`."""
 
 
 def check_dataset(dataset: Dataset, conditions: Sequence[ConditionSpec]) -> None:
-    """Refuse a data set that would fail in the middle of a run.
-
-    Looks at its members, every view without its pixels, and the pixels of the first view of both splits.
+    """Check members, all views without pixels, and the pixels of the first view of both splits.
 
     Raises:
-        DatasetFault: naming member or view, what was found and what was expected.
+        DatasetError: names the member or view, what was found and what was expected.
     """
     _members(dataset)
     for split in ("train", "test"):
@@ -55,14 +50,8 @@ def check_dataset(dataset: Dataset, conditions: Sequence[ConditionSpec]) -> None
 
 
 def check_pixels(split: str, view: View, pixels: Pixels, channels: int) -> None:
-    """Shapes and dtypes of one view's pixels: those of its camera and of the data set's channels.
-
-    Args:
-        split: "train" or "test", for the message.
-
-    Raises:
-        DatasetFault: naming view, member, found and expected.
-    """
+    """Check shapes and dtypes of the pixels of a view against its camera; raise DatasetError. ``split`` is for
+    messages."""
     size = (view.camera.height, view.camera.width)
     if not isinstance(pixels, Pixels):
         raise DatasetError(
@@ -78,18 +67,14 @@ def check_pixels(split: str, view: View, pixels: Pixels, channels: int) -> None:
 
 
 def check_mask(split: str, view: View, mask: Tensor) -> None:
-    """As :func:`check_pixels`, of a mask alone."""
+    """Check a mask alone, as :func:`check_pixels` does."""
     size = (view.camera.height, view.camera.width)
     if not (_is(mask, torch.bool) and mask.shape == size):
         _refuse(f"{split} view {view.name}: mask", mask, torch.bool, size, ", rows x columns, or None")
 
 
 def check_points(cloud: PointCloud, count: int, dataset: Dataset) -> None:
-    """Starting points, of which ``count`` at most were asked for.
-
-    Raises:
-        DatasetFault: naming member, found and expected.
-    """
+    """Check starting points, of which at most ``count`` were requested; raise DatasetError."""
     where = f"{dataset.name}: starting points"
     if not isinstance(cloud, PointCloud):
         raise DatasetError(f"{where}: found {_described(cloud)}; expected a neuprim.core.data.PointCloud")
@@ -106,11 +91,7 @@ def check_points(cloud: PointCloud, count: int, dataset: Dataset) -> None:
 
 
 def check_samples(samples: PointSamples, dataset: Dataset) -> None:
-    """Points to learn from, as a data set's ``points`` drew them; shapes and dtypes alone, as it is done in every step.
-
-    Raises:
-        DatasetFault: naming member, found and expected.
-    """
+    """Check shapes and dtypes of points to learn from, in every step; raise DatasetError."""
     where = f"{dataset.name}: points"
     if not isinstance(samples, PointSamples):
         raise DatasetError(f"{where}: drew {_described(samples)}; expected a neuprim.core.data.PointSamples")
@@ -136,11 +117,7 @@ def check_samples(samples: PointSamples, dataset: Dataset) -> None:
 
 
 def get_extra(dataset: Dataset, kind: type[Extra]) -> Extra | None:
-    """``dataset.extra``, for the task that knows what it is.
-
-    Raises:
-        DatasetFault: it is neither None nor of that class.
-    """
+    """Return ``dataset.extra``; raise DatasetError if it is neither None nor of class ``kind``."""
     extra = dataset.extra
     if extra is None or isinstance(extra, kind):
         return extra
@@ -208,7 +185,8 @@ def _view(view: View, where: str, conditions: Sequence[ConditionSpec]) -> None:
         outside = (value < low) | (value > high)
         if spec.strict and bool(outside.any()):
             raise DatasetError(
-                f"{where}: condition {spec.name!r} holds {float(value[outside].flatten()[0]):g}; expected {low:g} to {high:g}, its range"
+                f"{where}: condition {spec.name!r} holds {float(value[outside].flatten()[0]):g}; expected "
+                f"{low:g} to {high:g}, its range"
             )
 
 
@@ -236,7 +214,7 @@ def _is(value: Any, dtype: torch.dtype) -> bool:
 
 
 def _floats(where: str, value: Any, shape: tuple[int, ...], more: str = "") -> None:
-    """Finite floating numbers of any precision."""
+    """Require finite floating-point numbers of any precision."""
     if not (isinstance(value, Tensor) and value.is_floating_point() and tuple(value.shape) == shape):
         _refuse(where, value, torch.float32, shape, more)
     _finite(value, where)

@@ -1,7 +1,7 @@
-"""Lens distortion: where an undistorted pixel lies in the photograph, and the photograph resampled there.
+"""Lens distortion: where an undistorted pixel lies in the photograph, and resampling the photograph there.
 
-Only the forward map (undistorted direction -> photographed pixel) is needed, so nothing is solved iteratively. The
-undistorted view keeps focal lengths, principal point and size; what the photograph does not show is masked out.
+Only the forward map (undistorted direction -> photographed pixel) is needed. The undistorted view keeps focal
+lengths, principal point and size; pixels outside of the photograph are masked.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ __all__ = ["Distortion", "Fisheye", "Radial", "resample_image", "undistortion_gr
 
 
 class Distortion(ABC):
-    """A lens. Instances are hashable, so that views that share one share its resampling grid."""
+    """A lens. Instances are hashable, so that views with the same lens share a resampling grid."""
 
     @abstractmethod
     def project(self, points: np.ndarray, camera: Camera) -> np.ndarray:
-        """(M, 2) photographed pixels of (M, 2) undistorted directions (x/z, y/z), float64; pixel centres at +0.5."""
+        """(M, 2) photographed pixels of (M, 2) directions (x/z, y/z), float64; pixel centres at +0.5."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,7 @@ def _unfolded(camera: Camera, source: np.ndarray) -> np.ndarray:
 
 
 def resample_image(image: Tensor, source: Tensor) -> Tensor:
-    """(H', W', C) float32 bilinear samples of an (H, W, C) image at (H', W', 2) source pixels, clamped to the
-    border."""
+    """(H', W', C) float32 bilinear samples of (H, W, C) at (H', W', 2) source pixels, clamped to the border."""
     height, width = image.shape[:2]
     grid = source / torch.tensor([width, height]) * 2.0 - 1.0  # -1 and 1 are the outer edges of the outer pixels
     planes = image.float().permute(2, 0, 1)[None]

@@ -1,7 +1,7 @@
-"""The visual hull: the voxels that no alpha mask rules out (Laurentini, 1994), found coarse to fine.
+"""The visual hull: voxels that no alpha mask rules out (Laurentini, 1994), refined coarse to fine.
 
-Each voxel is tested by the box of pixels around its projection, counted in a summed-area table: coarse levels use a box
-that covers the whole voxel, so that thin parts are never lost before the finest grid.
+A voxel is tested by the pixels around its projection, counted in a summed-area table. Coarse levels use a box that
+covers the voxel, so thin parts survive until the finest grid.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _COARSE = 64
 
 
 class EmptyHull(DataError):
-    """No voxel is left, so masks and cameras disagree, or nothing is opaque."""
+    """No voxel is left: masks and cameras disagree, or nothing is opaque."""
 
 
 @dataclass(frozen=True)
 class _Silhouette:
-    """A mask's camera and the (H+1, W+1) int32 summed-area table of its pixels that may show matter."""
+    """Camera of a mask and the (H+1, W+1) int32 summed-area table of pixels that may show matter."""
 
     camera: Camera
     table: Tensor
@@ -41,7 +41,7 @@ class _Silhouette:
 
 @dataclass(frozen=True)
 class _Grid:
-    """Cubic voxels: lower corner (3,), side, and (X, Y, Z) bool of those that remain."""
+    """Cubic voxels: lower corner (3,), side, and (X, Y, Z) bool of the voxels that remain."""
 
     corner: Tensor
     voxel: float
@@ -54,15 +54,13 @@ class _Grid:
 def hull_surface(
     views: ViewSet, resolution: int, seen_views: float = 0.5, wrong_views: float = 0.02, matter: float = 0.5
 ) -> tuple[Tensor, float]:
-    """Centres (M, 3) float32 of the hull's surface voxels, and the voxel side, scene units.
-
-    A voxel stays if enough views look at it and all but a few of the views show matter there.
+    """Return centres (M, 3) float32 of the hull's surface voxels, and the voxel side, scene units.
 
     Args:
-        resolution: voxels along the hull's longest side.
-        seen_views: which part of the views must look at a voxel, the more the fewer there are.
-        wrong_views: which part of the views may show no matter there.
-        matter: the alpha above which a pixel shows matter.
+        resolution: voxels along the longest side of the hull.
+        seen_views: share of the views that must look at a voxel.
+        wrong_views: share of the views that may show no matter there.
+        matter: alpha above which a pixel shows matter.
 
     Raises:
         EmptyHull: no voxel is left.
@@ -82,7 +80,7 @@ def hull_surface(
 
 
 def _silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
-    """Masks of evenly chosen views, in an order in which neighbours in the list look from different sides."""
+    """Masks of evenly chosen views, ordered so that neighbours look from different sides."""
     chosen = sorted(
         {round(i * (len(views) - 1) / max(1, min(len(views), _VIEWS) - 1)) for i in range(min(len(views), _VIEWS))}
     )
@@ -106,8 +104,7 @@ def _silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
 
 
 def _refined(grid: _Grid, resolution: int) -> _Grid:
-    """A grid over the box of what is full, ``resolution`` voxels along its longest side, full where the coarse one
-    is."""
+    """Refine to ``resolution`` voxels along the longest side of the box of full cells."""
     cells = grid.full.nonzero()
     low, high = cells.min(0).values, cells.max(0).values + 1
     voxel = grid.voxel * float((high - low).max()) / resolution
@@ -121,7 +118,7 @@ def _refined(grid: _Grid, resolution: int) -> _Grid:
 
 
 def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float, seen_views: float, wrong_views: float) -> _Grid:
-    """The grid without the voxels that the masks rule out; ``reach`` is half the side of the tested box, in voxels."""
+    """Remove voxels that the masks rule out; ``reach`` is half the side of the tested box, in voxels."""
     cells = grid.full.nonzero()
     poses = torch.stack([s.camera.viewmat[:3].double() for s in silhouettes]).numpy()
     cameras = [s.camera for s in silhouettes]
@@ -134,7 +131,8 @@ def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float, seen_view
     cells = cells[torch.from_numpy(keep)]
     if len(cells) == 0:
         raise EmptyHull(
-            f"the visual hull of {len(silhouettes)} alpha masks is empty: no point in front of the cameras is opaque in all views; "
+            f"the visual hull of {len(silhouettes)} alpha masks is empty: no point in front of the cameras is "
+            "opaque in all views; "
             "expected masks of one scene and poses that agree with them"
         )
     full = torch.zeros_like(grid.full)

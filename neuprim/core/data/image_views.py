@@ -27,11 +27,11 @@ __all__ = ["ImageFrame", "ImageViews", "Mask", "average_pixels", "find_masks", "
 
 @dataclass(frozen=True)
 class Mask:
-    """A mask's file.
+    """A mask file.
 
     Attributes:
         path: image whose zero pixels do not count.
-        inverted: all others do not count instead.
+        inverted: the other pixels do not count instead.
     """
 
     path: Path
@@ -39,22 +39,22 @@ class Mask:
 
 
 def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) -> list[Mask | None]:
-    """The mask of every image file, or None; a line says how many there are.
+    """Find the mask of every image file and report how many there are.
 
-    ``images/a/b.jpg`` has ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg``; ``images_4`` has ``masks_4``
-    before ``masks``. instant-ngp has ``dynamic_mask_b.png`` beside the image, which is black where pixels count.
+    ``images/a/b.jpg`` has ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg`` (COLMAP, nerfstudio). Of
+    ``images_4``, ``masks_4`` is tried first. ``dynamic_mask_b.png`` beside the image (instant-ngp) is inverted.
 
     Args:
         folder: the data set's.
-        images: the images' own folder; None for the first part of their paths where it begins with "images", else
-        ``folder``.
+        images: folder of the images; None for the first part of their paths if it begins with "images".
     """
     masks = [_mask(folder, file, images) for file in files]
     found = [m for m in masks if m is not None]
     if found:
         black = "not black" if found[0].inverted else "black"
         warn_once(
-            f"{found[0].path.parent}: masks of {len(found)} of {len(files)} images are read; what is {black} there does not count"
+            f"{found[0].path.parent}: masks of {len(found)} of {len(files)} images are read; what is {black} "
+            "there does not count"
         )
     return masks
 
@@ -79,12 +79,12 @@ def _mask(folder: Path, file: Path, images: Path | None) -> Mask | None:
 
 
 def average_pixels(values: Tensor, factor: int) -> Tensor:
-    """(H // factor, W // factor, C) means of (H, W, C); what is left over at the right and at the bottom is cut off."""
+    """Average (H, W, C) over blocks: (H // factor, W // factor, C). The remainder is cut off."""
     return F.avg_pool2d(values.permute(2, 0, 1), factor).permute(1, 2, 0).contiguous()
 
 
 def reduce_mask(mask: Tensor, factor: int) -> Tensor:
-    """(H // factor, W // factor) bool of the large pixels all of whose parts count in (H, W) ``mask``."""
+    """(H // factor, W // factor) bool: all pixels of a block count."""
     return F.avg_pool2d(mask[None].float(), factor)[0] > 0.999
 
 
@@ -95,15 +95,14 @@ _LINEAR = srgb_to_linear(torch.arange(256) / 255.0)
 
 @dataclass(frozen=True)
 class ImageFrame:
-    """One image file and its pose.
+    """An image file and its pose.
 
     Attributes:
         name: unique within its split.
-        camera: the undistorted view at the file's own size.
-        info: the file's header.
-        mask: says which pixels do not count, or None.
-        distortion: the lens that took the file, or None for a pinhole.
-        conditions: what the frame depends on besides its camera (time, light, ...); empty for static scenes.
+        camera: the undistorted view at the size of the file.
+        info: header of the file.
+        distortion: lens of the photograph; None for a pinhole.
+        conditions: time, light, ...; empty for static scenes.
     """
 
     name: str
@@ -117,7 +116,7 @@ class ImageFrame:
 
 @dataclass(frozen=True)
 class _Stored:
-    """(H, W, C) uint8, half or float copy of a view's final pixels, and which of them count."""
+    """Final pixels of a view, (H, W, C) uint8, half or float, and which of them count."""
 
     data: Tensor
     premultiplied: bool
@@ -135,25 +134,22 @@ def _premultiply(rgba, rgb, alpha):  # type: ignore[no-untyped-def]
 
 
 def _premultiplied(rgba: Tensor) -> tuple[Tensor, Tensor]:
-    """(H, W, 3) and (H, W) floats of straight-alpha 8-bit pixels, in one pass: this happens at every training step."""
+    """(H, W, 3) and (H, W) floats of straight-alpha 8-bit pixels, in one pass, as every step needs them."""
     rgb, alpha = torch.empty(*rgba.shape[:2], 3), torch.empty(rgba.shape[:2])
     _premultiply(rgba.reshape(-1, 4).numpy(), rgb.reshape(-1, 3).numpy(), alpha.reshape(-1).numpy())
     return rgb, alpha
 
 
 class ImageViews(ViewSet):
-    """One split of image files.
-
-    Copies are kept as uint8 (PNG, JPEG) or half (OpenEXR, where the values fit) up to ``cache_bytes``; beyond that
-    images are read again each time. Safe to use from several threads.
+    """One split of image files, cached as uint8 (PNG, JPEG) or half (OpenEXR) up to ``cache_bytes``. Thread-safe.
 
     Args:
         frames: of one split; sizes may differ.
-        downsample: whole factor; left-over pixels at the right and bottom edges are cut off first.
-        to_linear: turn sRGB files into linear light, before they are premultiplied or averaged.
+        downsample: integer factor; remainders at the right and bottom edges are cut off.
+        to_linear: convert sRGB files to linear light before premultiplying and averaging.
 
     Attributes:
-        scale: multiplies the colours of linear light, and nothing else; 1 at first.
+        scale: factor of linear colours.
 
     Raises:
         ConfigError: an image is smaller than the factor.
@@ -184,15 +180,14 @@ class ImageViews(ViewSet):
         return View(self._frames[index].name, self._cameras[index], self._frames[index].conditions)
 
     def file(self, index: int) -> Path:
-        """The image file of view ``index``."""
+        """Return the image file of a view."""
         return self._frames[index].path
 
     def pixels(self, index: int) -> Pixels:
-        """Pixels of view ``index``.
+        """Return the pixels of a view.
 
         Raises:
-            DataError: the file is missing, damaged or changed size since the data set was opened, or its mask leaves
-            nothing.
+            DataError: the file is missing, damaged or changed, or its mask leaves nothing.
         """
         stored = self._load(range(len(self))[index])
         if self._to_linear:
@@ -220,10 +215,10 @@ class ImageViews(ViewSet):
     def preload(
         self, progress: Callable[[float], None] = lambda fraction: None, empty: bool = True
     ) -> dict[int, DataError]:
-        """Decode every image now, and keep copies while there is room: the errors of the bad ones, by index.
+        """Decode all images, cache what fits, and return the errors of bad ones by index.
 
         Args:
-            empty: whether an image may be transparent everywhere.
+            empty: whether an image may be fully transparent.
         """
         faults = {}
         with ThreadPoolExecutor(4) as pool:
@@ -243,7 +238,7 @@ class ImageViews(ViewSet):
         return DataError(f"{self.file(index)}: image is transparent everywhere; expected something to see")
 
     def drop(self, indices: Container[int]) -> None:
-        """Leave views out for good; those after them move up."""
+        """Remove views; later ones move up."""
         left = [i for i in range(len(self)) if i not in indices]
         self._frames, self._cameras = [self._frames[i] for i in left], [self._cameras[i] for i in left]
         self._stored = {new: self._stored[old] for new, old in enumerate(left) if old in self._stored}
@@ -286,7 +281,7 @@ class ImageViews(ViewSet):
         return _Stored(image, premultiplied, mask)
 
     def _process(self, frame: ImageFrame, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Undistorted and reduced, colours premultiplied, in the file's own number type."""
+        """Undistort and reduce; colours become premultiplied, the number type stays."""
         eight_bit = image.dtype == torch.uint8
         if eight_bit and self._to_linear:
             rgb = _LINEAR[image[..., :3].int()]
@@ -321,7 +316,6 @@ class ImageViews(ViewSet):
 
 
 def _reduced(frame: ImageFrame, factor: int) -> Camera:
-    """The camera of a frame after area reduction."""
     camera = frame.camera
     if min(camera.width, camera.height) < factor:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Where matter is at the start: given points, the visual hull of the alpha masks, or a box in front of the cameras."""
+"""Starting points: given points, the visual hull of alpha masks, a box before the cameras, and surroundings."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ _ROUNDS = 8
 
 
 def initial_points(views: ViewSet, points: PointCloud | None, count: int, generator: torch.Generator) -> PointCloud:
-    """At most ``count`` distinct starting points of a static scene, in scene units and the images' colour space.
+    """Return at most ``count`` distinct starting points of a static scene.
 
-    Given points win. Cameras that do not look at one point begin along their rays, see
-    :func:`~neuprim.core.data.ray_points.ray_points`. Else data with alpha uses the surface of its visual hull, and data
-    without a box about that point. Inferred points that fewer than two cameras see do not count.
+    Given points win. Cameras that do not look at one point start along their rays
+    (:func:`~neuprim.core.data.ray_points.ray_points`). Otherwise data with alpha use the surface of the visual
+    hull, and data without use a box around the focus. Inferred points are seen by at least two cameras.
 
     Raises:
         ConfigError: ``count`` is not positive.
@@ -60,13 +60,13 @@ def initial_points(views: ViewSet, points: PointCloud | None, count: int, genera
 
 
 def check_point_count(count: int) -> None:
-    """Raises ConfigError unless ``count`` is positive."""
+    """Raise ConfigError unless ``count`` is positive."""
     if count <= 0:
         raise ConfigError(f"the number of initial points is {count}; expected at least 1")
 
 
 def views_have_alpha(views: ViewSet) -> bool:
-    """Whether one of the first views has alpha that is not opaque everywhere."""
+    """Whether one of the first eight views is transparent somewhere."""
     for index in range(min(len(views), 8)):
         alpha = views.pixels(index).alpha
         if alpha is not None and bool((alpha < 0.5).any()):
@@ -75,7 +75,7 @@ def views_have_alpha(views: ViewSet) -> bool:
 
 
 def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
-    """At most ``count`` of the given points without repeated positions, drawn evenly, in their own order."""
+    """Draw at most ``count`` distinct points uniformly, in their own order."""
     _, first = np.unique(points.means.numpy(), axis=0, return_index=True)
     rows = torch.from_numpy(np.sort(first))
     if len(rows) > count:
@@ -84,13 +84,10 @@ def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> P
 
 
 def hull_points(views: ViewSet, count: int, generator: torch.Generator, resolution: int = 128) -> PointCloud:
-    """``count`` points spread over the surface of the visual hull, coloured by the pixels they project to.
-
-    Points are voxel centres with sub-voxel jitter; more points than surface voxels share voxels and differ by their
-    jitter.
+    """Spread ``count`` points over the surface of the visual hull, with sub-voxel jitter and pixel colours.
 
     Args:
-        resolution: voxels along the hull's longest side.
+        resolution: voxels along the longest side of the hull.
 
     Raises:
         DataError: the masks have no common volume.
@@ -106,11 +103,9 @@ def hull_points(views: ViewSet, count: int, generator: torch.Generator, resoluti
 
 
 def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
-    """``count`` points at most, uniform in a cube about the point the cameras look at, coloured by the pixels they
-    project to.
+    """Draw at most ``count`` points uniformly in a cube around the focus, with pixel colours.
 
-    The cube's half side is half the median distance of the cameras to that point. Points that fewer than two cameras
-    see (one, where there is one) do not count.
+    Its half side is half the median camera distance. Each point is seen by two cameras, or by the only one.
     """
     cameras = [views.view(i).camera for i in range(len(views))]
     center = focus_point(cameras)
@@ -129,7 +124,7 @@ def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointC
 
 
 def drop_repeated_points(points: PointCloud) -> PointCloud:
-    """The points without repeated positions, which jitter makes rare but cannot exclude."""
+    """Remove repeated positions."""
     _, first = np.unique(points.means.numpy(), axis=0, return_index=True)
     if len(first) == len(points.means):
         return points
@@ -141,10 +136,9 @@ def drop_repeated_points(points: PointCloud) -> PointCloud:
 
 
 def farthest_points(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """(count,) int64 rows of ``points`` (M, 3), M >= count, far from each other.
+    """Choose (count,) int64 rows of ``points`` (M, 3), M >= count, far from each other.
 
-    Exact farthest-point sampling from a random start while that is fast; for large sets one point per cell of a grid
-    whose cell size fits the count, filled up at random.
+    Exact farthest-point sampling while that is fast; for large sets one point per grid cell, then random ones.
     """
     if count * len(points) > _FPS_WORK:
         return _thinned(points, count, generator)
@@ -187,8 +181,8 @@ def _thinned(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
 def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
     """(N, C) per-channel median of the pixels that the points (N, 3) project to, straight colour.
 
-    A view counts for a point that falls inside its image, on a pixel that counts and whose alpha is above ``matter``.
-    Points that no view shows get the median of the others, or mid-grey.
+    A view counts where the point falls on a valid pixel with alpha above ``matter``. Points without views get
+    the median of the others, or mid-grey.
     """
     indices = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(len(views), _COLOR_VIEWS))})
     samples = torch.stack(
@@ -229,11 +223,10 @@ _SHELL = 0.1
 
 
 def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
-    """At most ``count`` points on what the views show and ``points`` leave out, coloured by the pixels that show them.
+    """Return at most ``count`` points on what the views show and ``points`` leave out, with pixel colours.
 
-    A grid of pixels of every view that no point projects near is lifted to the depth of the points beside it, unless
-    what has been lifted from other views covers it already. A tenth are a shell around everything, where some view
-    looks: the last resort of pixels of whose depth nothing is known.
+    Pixels without a point nearby are lifted to the depth of their neighbours, unless other views already cover
+    the place. A tenth of the points form a shell around everything, where some view looks.
     """
     if count <= 0 or not len(points.means):
         return points.rows(torch.zeros(0, dtype=torch.int64))
@@ -248,8 +241,7 @@ def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator
 
 
 def _lifted(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
-    """Pixels without points near, at the depth of those beside them; coarse grids first, so that the largest gaps are
-    filled before small ones."""
+    """Lift pixels without nearby points, coarse grids first, so that the largest gaps are filled first."""
     order = torch.randperm(len(views), generator=generator)[:_VIEWS].tolist()
     known = given.double().numpy()
     means = np.zeros((0, 3))
@@ -271,8 +263,8 @@ def _lifted(views: ViewSet, given: Tensor, count: int, generator: torch.Generato
 def _gaps(
     views: ViewSet, index: int, known: NDArray[np.float64], cell: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """(N, 3) positions and (N, C) colours of pixels ``cell`` apart that have no known point within that distance, on
-    the image and in space."""
+    """(N, 3) positions and (N, C) colours of pixels ``cell`` apart without a known point that near, in image "
+    "and space."""
     camera, image = views.view(index).camera, views.pixels(index)
     rotation, shift = camera.viewmat[:3, :3].double().numpy(), camera.viewmat[:3, 3].double().numpy()
     spots = _grid(camera.width, camera.height, cell)
@@ -305,7 +297,7 @@ def _grid(width: int, height: int, cell: float) -> NDArray[np.float64]:
 
 
 def _shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
-    """At most ``count`` points of a sphere around cameras and points, as far as some view shows them."""
+    """At most ``count`` points on a sphere around cameras and points, where some view looks."""
     cameras = [views.view(i).camera for i in range(len(views))]
     center = focus_point(cameras)
     eyes = torch.stack([c.position.double() for c in cameras]) - center

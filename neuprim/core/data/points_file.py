@@ -112,12 +112,12 @@ def _compressed(path: Path, what: str) -> DataError:
 
 
 def _columns(found: PlyVertices, names: tuple[str, ...]) -> np.ndarray | None:
-    """(N, len(names)) float64; None if one of them is missing."""
+    """(N, len(names)) float64; None if one is missing."""
     return found.columns(names) if set(names) <= set(found.names) else None
 
 
 def _sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
-    """(N, 3) logarithms of sizes, -inf along the axis that discs lack; None without sizes that can be used."""
+    """(N, 3) logarithms of sizes, -inf along the missing axis of discs; None without usable sizes."""
     there = [name for name in _SCALES if name in found.names]
     if not there:
         return None
@@ -134,7 +134,7 @@ def _sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
 
 
 def _thickened(deviations: np.ndarray) -> np.ndarray:
-    """Sizes with a thickness along axes that have none."""
+    """Give axes without size a small thickness."""
     flat = deviations < np.exp(-_LARGEST_LOG)
     least = np.where(flat, np.inf, deviations).min(1, keepdims=True)
     return np.where(flat, _FLATNESS * least, deviations)
@@ -157,13 +157,13 @@ def _colors(found: PlyVertices, path: Path) -> np.ndarray:
 
 
 def _warn_of_rounding(found: PlyVertices, means: np.ndarray, path: Path) -> None:
-    """Say where float32 coordinates far from the origin are too coarse for the cloud. Rule: coordinates are kept in
-    float64 and moved by an offset, but what the file itself rounded is lost."""
+    """Warn where float32 coordinates far from the origin are too coarse for the cloud."""
     largest = np.abs(means).max(initial=0.0)
     size, step = np.ptp(means, axis=0).max(), np.spacing(np.float32(largest))
     if found.rows.dtype["x"].itemsize == 4 and step > _COARSE * size > 0:
         warn_once(
-            f"{path}: x y z are float, which rounds coordinates as large as {largest:.7g} to {step:.2g}; expected double there"
+            f"{path}: x y z are float, which rounds coordinates as large as {largest:.7g} to {step:.2g}; "
+            "expected double there"
         )
 
 

@@ -56,15 +56,13 @@ SplitName = Annotated[str, nonempty_text("the name in transforms_NAME.json")]
 
 @dataclass(frozen=True)
 class FolderSettings:
-    """What every loader of a folder with posed images is told; a loader derives a class with its own settings beside
-    these.
+    """Settings that all loaders of folders with posed images share.
 
     Attributes:
-        path: the data set's folder, ``~`` allowed.
-        background: "auto" (white for data with alpha, else black), "white", "black", or "random" (training composites
-        random colours,
-            evaluation white).
-        downsample: whole factor, area filter on premultiplied values.
+        path: folder of the data set, ``~`` allowed.
+        background: "auto" (white for data with alpha, else black), "white", "black", or "random" (random while
+            training, white for evaluation).
+        downsample: integer factor, area filter on premultiplied values.
         preload: decode all images at once, so that damaged files are found before training.
         strict: refuse a damaged view; otherwise it is left out with a warning.
     """
@@ -80,7 +78,7 @@ class FolderSettings:
 
 
 def find_data_folder(path: str | Path) -> Path:
-    """The existing folder of the ``path`` setting, ``~`` expanded.
+    """Return the existing folder of the ``path`` setting, ``~`` expanded.
 
     Raises:
         DataError: there is no such folder.
@@ -101,13 +99,13 @@ _T = TypeVar("_T")
 
 
 class BadViews:
-    """The bad views of a data set: images that cannot be read, poses that are none, masks that leave nothing.
+    """Collects damaged views: unreadable images, impossible poses, masks that leave nothing.
 
-    One bad view is left out; keys that contradict each other are none of this, and are refused.
+    A few are left out with a warning each. Contradictory keys are not damage, and are refused elsewhere.
 
     Args:
-        where: what messages name where most views are bad.
-        strict: refuse the first bad view.
+        where: file or folder, for messages.
+        strict: raise at the first bad view.
     """
 
     def __init__(self, where: str, strict: bool) -> None:
@@ -115,7 +113,7 @@ class BadViews:
         self._faults: list[str] = []
 
     def read(self, name: str, function: Callable[_P, _T], *args: _P.args, **more: _P.kwargs) -> _T | None:
-        """What ``function`` returns; None for a view that it refuses."""
+        """Call ``function``; return None for a view that it refuses."""
         try:
             return function(*args, **more)
         except DataError as error:
@@ -123,7 +121,7 @@ class BadViews:
             return None
 
     def add(self, name: str, error: DataError) -> None:
-        """Note a bad view, or raise where none may be left out."""
+        """Note a bad view; raise if ``strict``."""
         if self._strict:
             raise error
         self._faults.append(f"{error}; view {name} is left out (scene.strict=true refuses it)")
@@ -131,7 +129,7 @@ class BadViews:
             self._first = error
 
     def settle(self, count: int) -> None:
-        """Name the bad ones of ``count`` views.
+        """Warn of the bad ones of ``count`` views.
 
         Raises:
             DataError: most views are bad.
@@ -154,12 +152,11 @@ _LISTED = 10
 
 
 class MissingFiles(DataError):
-    """Files that a data set names are not there."""
+    """Files that a data set names do not exist."""
 
 
 def find_image(folder: Path, text: str) -> Path | None:
-    """The image that ``text`` names below ``folder``: as written, else with the usual suffixes added, else in another
-    case; None if there is none."""
+    """Find the image ``name`` below ``folder``: as written, with a usual suffix, or in another case; else None."""
     text = str(folder / text.replace("\\", "/"))
     try:
         found = next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
@@ -169,19 +166,19 @@ def find_image(folder: Path, text: str) -> Path | None:
 
 
 def _warn_of_outside_images(where: str, home: Path, paths: Iterable[Path]) -> None:
-    """Warn of images that lie elsewhere than the data set that names them. Rule: other tools write such paths, so that
-    they are read; but whoever made the data set chose them, and not who trains on it, who is told once."""
+    """Warn once of images outside of the data set; they are read, as other tools write such paths."""
     own = home.resolve()
     own = own if own.is_dir() else own.parent
     outside = [path for path in paths if not path.resolve().is_relative_to(own)]
     if outside:
         warn_once(
-            f"{where}: {len(outside)} of its images lie outside of {own}, the first {outside[0].resolve()}; they are read as it says"
+            f"{where}: {len(outside)} of its images lie outside of {own}, the first {outside[0].resolve()}; "
+            "they are read as it says"
         )
 
 
 def _other_case(folder: Path, path: Path) -> Path | None:
-    """The only file whose path differs from ``path`` below ``folder`` in upper and lower case alone."""
+    """The only file whose path differs from ``path`` in upper and lower case alone."""
     if not path.is_relative_to(folder):
         return None
     for part in path.relative_to(folder).parts:
@@ -193,26 +190,27 @@ def _other_case(folder: Path, path: Path) -> Path | None:
 
 
 def exif_hint(info: ImageInfo) -> str:
-    """The end of a message about an image's size: that EXIF says to turn it, if it does."""
+    """End of a message about an image size: EXIF asks to turn the image. Empty if it does not."""
     if info.orientation < 5:
         return ""
     return (
-        f"; its EXIF orientation is {info.orientation}, so that other programs show it turned, and pixels are read as they are stored, "
+        f"; its EXIF orientation is {info.orientation}, so that other programs show it turned, and pixels are "
+        "read as they are stored, "
         "as COLMAP reads them: give w, h of the stored pixels, or turn the pixels themselves"
     )
 
 
 def missing_files_error(where: str, names: Sequence[str], hint: str = "") -> MissingFiles:
-    """One error for all absent files, the first ten by name."""
+    """Make one error for all absent files, naming the first ten."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return MissingFiles(f"{where}: {len(names)} files not found: {', '.join(names[:_LISTED])}{more}{hint}")
 
 
 def unique_view_names(paths: Iterable[str], where: str) -> list[str]:
-    """A file-name-safe name per image path: its stem, or the whole path with ``_`` for ``/`` where stems repeat.
+    """Return a file name per image path: its stem, or the whole path with ``_`` for ``/`` if stems repeat.
 
     Raises:
-        DataError: one path occurs twice.
+        DataError: a path occurs twice.
     """
     texts = [p.replace("\\", "/").removeprefix("./") for p in paths]
     repeated = [p for p, n in Counter(texts).items() if n > 1]
@@ -232,7 +230,7 @@ def _stem(path: str, whole: bool = False) -> str:
 
 
 def split_every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """(the others, every n-th beginning with the first)."""
+    """Return (the others, every n-th beginning with the first)."""
     return [f for i, f in enumerate(frames) if i % n], list(frames[::n])
 
 
@@ -361,7 +359,7 @@ def _preload(
 
 
 def frame_in_scene(frame: ImageFrame, world: World, positions: Sequence[str]) -> ImageFrame:
-    """Return the frame with its camera and its conditions ``positions`` in the scene's coordinates, subtracted in float64."""
+    """Move the camera and the conditions ``positions`` of a frame into the scene, in float64."""
     moved = {name: world.scene_points(frame.conditions[name]).float() for name in positions}
     return replace(frame, camera=world.scene_camera(frame.camera), conditions={**frame.conditions, **moved})
 

@@ -1,5 +1,4 @@
-"""Starting points along training rays, where cameras do not look at one point: an array, a ring that looks outward, a
-tripod."""
+"""Starting points along rays, for cameras that do not look at one point: arrays, outward rings, tripods."""
 
 from __future__ import annotations
 
@@ -40,22 +39,24 @@ _ROUNDS = 8
 
 
 def count_seeing_views(views: ViewSet, means: Tensor) -> Tensor:
-    """(N,) int64: how many of (at most 100 of) the views have the points (N, 3) in their images."""
+    """(N,) int64: how many of at most 100 views contain the points (N, 3)."""
     return torch.stack([views.view(i).camera.sees(means) for i in _some(len(views), _VIEWS)]).sum(0)
 
 
 def ray_points(
     views: ViewSet, count: int, generator: torch.Generator, matter: float = 0.5
 ) -> tuple[PointCloud, Tensor]:
-    """At most ``count`` points on rays through random pixels, at depths even in 1/z, with the pixels' colours; and (N,)
-    their views.
+    """Place at most ``count`` points on rays through random pixels, uniform in 1/z, with pixel colours.
 
-    The nearest and farthest depth are those at which other views show the same colours. Where no depth fits better than
-    infinity the cameras count as one: depths have an arbitrary unit then. A point counts if two cameras see it, or one
-    where they count as one.
+    Depths range over those at which other views show the same colours. If no depth fits better than infinity,
+    the cameras count as one and the depth unit is arbitrary. Points must be seen by two cameras, unless the
+    cameras count as one.
 
     Args:
-        matter: the alpha above which a pixel shows matter.
+        matter: alpha above which a pixel shows matter.
+
+    Returns:
+        The points, and the (N,) views that they come from.
 
     Raises:
         DataError: no two cameras see the same place, or no pixel shows matter.
@@ -79,21 +80,21 @@ def ray_points(
     means, colors, owner = (torch.cat(parts)[:count] for parts in zip(*found, strict=True))
     if not len(means):
         raise DataError(
-            f"no place is in the images of {needed} training cameras, so that no starting point can be inferred; {GIVE_POINTS}"
+            f"no place is in the images of {needed} training cameras, so that no starting point can be "
+            f"inferred; {GIVE_POINTS}"
         )
     return PointCloud(means, colors), owner
 
 
 def _some(count: int, most: int) -> list[int]:
-    """At most ``most`` of ``count`` numbers, evenly."""
+    """At most ``most`` evenly spaced indices below ``count``."""
     return sorted({round(i * (count - 1) / max(min(count, most) - 1, 1)) for i in range(min(count, most))})
 
 
 def _pixels(
     views: ViewSet, count: int, generator: torch.Generator, matter: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Random pixels that show matter: eyes and rays of camera-z 1 (N, 3) in float64, straight colours (N, C), and (N,)
-    the views."""
+    """Random pixels that show matter: eyes and rays with camera z = 1 (N, 3) float64, colours (N, C), views (N,)."""
     drawn = torch.randint(len(views), (count,), generator=generator)
     spots = torch.rand((count, 2), generator=generator).double()
     found = []
@@ -117,8 +118,7 @@ def _pixels(
 
 
 def _fitting(views: ViewSet, generator: torch.Generator, matter: float) -> tuple[Tensor, Tensor, int]:
-    """Depths from the nearest to the farthest that fit, how much colours differ there on average, and how many cameras
-    must see a point."""
+    """Depths that fit, the mean colour difference at each, and how many cameras must see a point."""
     cameras = [views.view(i).camera for i in range(len(views))]
     same = all(torch.equal(c.position, cameras[0].position) for c in cameras)
     unit = camera_extent(cameras)
@@ -141,7 +141,7 @@ def _fitting(views: ViewSet, generator: torch.Generator, matter: float) -> tuple
 
 
 def _difference(views: ViewSet, points: Tensor, colors: Tensor, owner: Tensor) -> Tensor:
-    """(N,) the median difference of the points' colours to what other views show there; NaN where none does."""
+    """(N,) median colour difference to other views at the points; NaN where no view shows them."""
     found = []
     for index in _some(len(views), _OTHERS):
         camera, pixels = views.view(index).camera, views.pixels(index)

@@ -16,10 +16,9 @@ __all__ = ["FAR", "optical_axes_meet", "camera_extent", "focus_point", "find_out
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """Radius of the bounding sphere of the cameras about their mean x 1.1 (the convention of 3D Gaussian splatting);
-    1.0 if zero.
+    """Radius of the bounding sphere of the cameras about their mean, times 1.1 (3D Gaussian splatting).
 
-    Cameras that are :func:`find_outliers` do not count.
+    1.0 if it is zero. Outliers (:func:`find_outliers`) are ignored.
     """
     positions = torch.stack([c.position.detach().double() for c in cameras])
     positions = positions[~find_outliers(positions)]
@@ -32,10 +31,9 @@ _OUTLYING_SHARE = 0.05
 
 
 def find_outliers(positions: Tensor) -> Tensor:
-    """(N,) bool of the (N, 3) camera centres that say nothing about place and scale of a scene.
+    """Mark (N,) camera centres of (N, 3) that are mistakes of a reconstruction.
 
-    Rule: a few cameras (one, or 5 %) farther from the median centre than 100 times the median distance are mistakes of
-    a reconstruction.
+    These are at most one, or 5 %, farther from the median centre than 100 times the median distance.
     """
     distance = (positions - positions.median(0).values).norm(dim=-1)
     far = (distance > _OUTLYING * distance.median()) & (distance.median() > 0)
@@ -43,9 +41,9 @@ def find_outliers(positions: Tensor) -> Tensor:
 
 
 def focus_point(cameras: Sequence[Camera]) -> Tensor:
-    """(3,) float64 point nearest to all optical axes in the least-squares sense, scene units.
+    """Return the (3,) float64 point nearest to all optical axes (least squares), scene units.
 
-    A weak pull towards one extent in front of the mean camera decides what (nearly) parallel axes leave open.
+    A weak pull towards one extent in front of the mean camera resolves (nearly) parallel axes.
     """
     positions, forward = _axes(cameras)
     eye = torch.eye(3, dtype=torch.float64)
@@ -59,8 +57,8 @@ def focus_point(cameras: Sequence[Camera]) -> Tensor:
 def optical_axes_meet(cameras: Sequence[Camera]) -> bool:
     """Whether the optical axes determine a point in front of the cameras.
 
-    They do if they pass it closer than half the spread of the camera centres, and nine cameras of ten look towards it.
-    Parallel axes, cameras that look outward from their centre, and cameras that share one centre do not.
+    They pass it closer than half the spread of the centres, and 9 of 10 cameras look towards it. Parallel axes, outward
+    rings and tripods do not.
     """
     positions, forward = _axes(cameras)
     offsets = focus_point(cameras) - positions
@@ -72,7 +70,7 @@ def optical_axes_meet(cameras: Sequence[Camera]) -> bool:
 
 
 def _axes(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
-    """(N, 3) centres and (N, 3) viewing directions, float64, of the cameras that count for a scene's place."""
+    """(N, 3) centres and (N, 3) viewing directions, float64, of all cameras but outliers."""
     positions = torch.stack([c.position.detach().double() for c in cameras])
     forward = torch.stack([c.viewmat[2, :3].detach().double() for c in cameras])
     usual = ~find_outliers(positions)
@@ -85,11 +83,11 @@ of it there."""
 
 
 def choose_world(cameras: Sequence[Camera], where: str = "cameras") -> World:
-    """Where the scene that cameras see lies in the world of their file.
+    """Choose the scene's place in the world of its file.
 
-    Rule: where the mean of the camera centres is farther than :data:`FAR` extents from the origin, that mean, rounded
-    to the power of ten from one to ten extents, becomes the scene's origin; all other scenes keep the coordinates of
-    their files, bit for bit. ``where`` names the file in warnings.
+    If the mean camera centre is farther than :data:`FAR` extents from the origin, it becomes the scene's origin,
+    rounded to a power of ten between one and ten extents. Other scenes keep their coordinates bit for bit.
+    ``where`` names the file in warnings.
     """
     views = [c.viewmat.detach().double() for c in cameras]
     # solved, not transposed: far from the origin a transpose turns the rounding of a file's rotations into metres
@@ -99,7 +97,8 @@ def choose_world(cameras: Sequence[Camera], where: str = "cameras") -> World:
         row = int(far.nonzero()[0])
         place = ", ".join(f"{x + 0.0:.6g}" for x in centers[row].tolist())
         warn_once(
-            f"{where}: {int(far.sum())} of {len(views)} cameras lie far from all others, the first at {place}; they do not count for the scene's size"
+            f"{where}: {int(far.sum())} of {len(views)} cameras lie far from all others, the first at {place}; "
+            "they do not count for the scene's size"
         )
     center = centers[~far].mean(0)
     there = World.at(center.tolist())

@@ -1,8 +1,7 @@
-"""The frames of ``transforms.json`` files (instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints, GS³):
-cameras, lenses, masks, splits.
+"""Frames of ``transforms.json`` files: cameras, lenses, masks and splits.
 
-Intrinsics and lenses are read by :mod:`neuprim.core.cameras.intrinsics`; :mod:`neuprim.core.cameras.intrinsics` knows all
-other keys. Poses are camera to world with OpenGL axes.
+Read are the files of instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints and GS³. Intrinsics
+and other keys: :mod:`neuprim.core.cameras.intrinsics`. Poses are camera to world with OpenGL axes.
 """
 
 from __future__ import annotations
@@ -52,12 +51,12 @@ def _viewmat(record: JsonReader) -> Tensor:
 
 @dataclass(frozen=True)
 class TransformsLayout:
-    """What a format has of its own.
+    """What differs between formats.
 
     Attributes:
-        keys: that its loader reads beside those of :data:`neuprim.core.cameras.intrinsics.READ`.
-        name: the path of a frame's image, as the file has it.
-        image: a frame's image file in the data set's folder, or None.
+        keys: further keys that the loader reads.
+        name: path of a frame's image, as the file has it.
+        image: image file of a frame in the data set's folder, or None.
         viewmat: (4, 4) world to camera, OpenCV axes.
         masks: whether a folder ``masks`` beside the images counts where the file names no mask.
     """
@@ -79,18 +78,16 @@ def read_transforms_frames(
     layout: TransformsLayout,
     skip_missing: bool = False,
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
-    """The frames whose images exist and are good, and their records, both in the order of ``records``; names are unique
-    among them.
+    """Read the good frames whose images exist, with their records, in the order of ``records``.
 
     Args:
-        folder: what paths of images and masks are relative to.
-        document: the whole file, which gives what a frame does not.
+        folder: root of the paths of images and masks.
+        document: the whole file, which provides what frames leave out.
         skip_missing: leave frames without an image out, unless that leaves none.
 
     Raises:
-        DataError: missing images or masks, wrong or missing fields, keys that contradict each other or that nothing
-        honours, an
-            unknown camera model, most views bad, or any with ``settings.strict``.
+        DataError: missing images or masks, wrong, missing, contradictory or unsupported fields, most views bad, or
+            any bad view with ``settings.strict``.
     """
     for record in (document, *records):
         refuse_unsupported_keys(record)
@@ -197,8 +194,9 @@ Read = Callable[[str], list[ImageFrame]]
 def read_transforms_splits(
     folder: Path, train: str, test: str, hold_out: int, read: Read
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """(training, test) of ``transforms_SPLIT.json`` files; with ``hold_out`` every so many training views are the test
-    split.
+    """Read (training, test) frames of ``transforms_SPLIT.json`` files.
+
+    With ``hold_out`` every so many training views are the test split.
 
     Raises:
         ConfigError: nothing to hold out.
@@ -224,14 +222,13 @@ def read_transforms_splits(
 def split_named_frames(
     document: JsonReader, records: Sequence[JsonReader], frames: Sequence[ImageFrame], every: int
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """(training, test) by ``train_filenames``, ``val_filenames`` and ``test_filenames``; without any every n-th is a
-    test view.
+    """Split frames into (training, test) by the lists of names in the file, else every n-th is a test view.
 
-    The test views are those of ``test_filenames``, else of ``val_filenames``, else all that do not train. The training
-    views are those of ``train_filenames``, else all that no list names: views for validation never train.
+    Test views are those of ``test_filenames``, else of ``val_filenames``, else all that do not train. Training views
+    are those of ``train_filenames``, else all that no list names. Validation views never train.
 
     Raises:
-        DataError: a list names an image that no frame has, or two that must be apart name the same.
+        DataError: a list names an unknown image, or training and test lists overlap.
     """
     keys = [key for key in ("train_filenames", "val_filenames", "test_filenames") if document.has(key)]
     lists = {key: set(map(_plain, document.texts(key))) for key in keys}
@@ -252,7 +249,8 @@ def split_named_frames(
     shared = sorted(train_names & test_names)
     if shared:
         raise DataError(
-            f"{document.where}: train_filenames and {judged} share {len(shared)} images, e.g. {shared[0]}; expected none"
+            f"{document.where}: train_filenames and {judged} share {len(shared)} images, e.g. {shared[0]}; "
+            "expected none"
         )
     return [f for n, f in listed.items() if n in train_names], [f for n, f in listed.items() if n in test_names]
 

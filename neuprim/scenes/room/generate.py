@@ -78,8 +78,8 @@ class ReconstructedPoints:
 
 
 def reconstruct_points(
-    build_room: Room,
-    room_lens: Lens,
+    room: Room,
+    lens: Lens,
     poses: Sequence[NDArray[np.float64]],
     luma: Callable[[int], NDArray[np.float32]],
     count: int,
@@ -100,23 +100,24 @@ def reconstruct_points(
         random = np.random.default_rng([_SEED, attempt])
         each = -(-count // len(poses))
         for camera, pose in enumerate(poses):
-            pixels = _drawn(chances[camera], room_lens.width, random.random((each, 3)))
-            directions = room_lens.rays(pose, pixels)
-            kept = directions[_seen_by_another(build_room, room_lens, poses, camera, directions)]
+            pixels = _drawn(chances[camera], lens.width, random.random((each, 3)))
+            directions = lens.rays(pose, pixels)
+            kept = directions[_seen_by_another(room, lens, poses, camera, directions)]
             batches.append((kept, np.full(len(kept), camera)))
             have += len(kept)
         if have >= count:
             break
     else:
         raise ConfigError(
-            f"scene.points={count}: only {have} points found that two of {len(poses)} training views see; expected more views"
+            f"scene.points={count}: only {have} points found that two of {len(poses)} training views see; "
+            "expected more views"
         )
     directions = np.concatenate([found for found, _ in batches])
     finder = np.concatenate([by for _, by in batches])
     random = np.random.default_rng([_SEED, _ROUNDS])
     chosen = np.sort(random.permutation(have)[:count])
     return _measured(
-        build_room, np.stack([p[:3, 3] for p in poses])[finder[chosen]], directions[chosen], finder[chosen], random
+        room, np.stack([p[:3, 3] for p in poses])[finder[chosen]], directions[chosen], finder[chosen], random
     )
 
 
@@ -136,15 +137,15 @@ def _drawn(chances: NDArray[np.float64], width: int, numbers: NDArray[np.float64
 
 
 def _seen_by_another(
-    build_room: Room,
-    room_lens: Lens,
+    room: Room,
+    lens: Lens,
     poses: Sequence[NDArray[np.float64]],
     camera: int,
     directions: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
     """(M,) whether what ``camera`` sees in these directions (M, 3) lies open to one of the other cameras, within its
     picture."""
-    hits = build_room.intersect(poses[camera][:3, 3], directions)
+    hits = room.intersect(poses[camera][:3, 3], directions)
     starts = hits.lifted()
     seen = np.zeros(len(starts), dtype=np.bool_)
     for other, pose in enumerate(poses):
@@ -154,25 +155,25 @@ def _seen_by_another(
         local = (hits.position[open_] - pose[:3, 3]) @ pose[:3, :3]
         before = local[:, 2] < -1e-3
         open_, local = open_[before], local[before]
-        x, y = room_lens.pixels(np.stack([local[:, 0], -local[:, 1]], axis=1) / -local[:, 2:]).T
-        open_ = open_[(x >= 0) & (x <= room_lens.width) & (y >= 0) & (y <= room_lens.height)]
+        x, y = lens.pixels(np.stack([local[:, 0], -local[:, 1]], axis=1) / -local[:, 2:]).T
+        open_ = open_[(x >= 0) & (x <= lens.width) & (y >= 0) & (y <= lens.height)]
         to_eye = pose[:3, 3] - starts[open_]
-        seen[open_] = ~build_room.occluded(starts[open_], to_eye, 1.0)
+        seen[open_] = ~room.occluded(starts[open_], to_eye, 1.0)
     visible = np.zeros(len(directions), dtype=np.bool_)
     visible[hits.hit] = seen
     return visible
 
 
 def _measured(
-    build_room: Room,
+    room: Room,
     origins: NDArray[np.float64],
     directions: NDArray[np.float64],
     camera: NDArray[np.intp],
     random: np.random.Generator,
 ) -> ReconstructedPoints:
     """The points that these rays (N, 3) meet, with the errors of a measurement."""
-    hits = build_room.intersect(origins, directions)
-    colours = encode_srgb(lamplight_radiance(build_room, origins, directions))
+    hits = room.intersect(origins, directions)
+    colours = encode_srgb(lamplight_radiance(room, origins, directions))
     surface, depth = hits.position.astype(np.float64), hits.distance.astype(np.float64)[:, None]
     position = surface + depth * NOISE / np.sqrt(3) * random.standard_normal(surface.shape)
     count = len(surface)

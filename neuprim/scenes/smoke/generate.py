@@ -66,17 +66,16 @@ def simulate_smoke(
     cache_dir: Path,
     progress: Progress = lambda text, fraction: None,
 ) -> Path:
-    """Run a scene unless a complete sequence is there; returns its folder ``cache_dir/sim-NAME-KEY``.
+    """Run a simulation unless its sequence is complete; return the folder ``cache_dir/sim-NAME-KEY``.
 
-    Equal arguments give equal grids on one machine, whatever the number of threads. The folder appears under its name
-    only when complete, so an interrupted run leaves nothing that could be taken for a sequence.
+    Equal arguments give equal grids on one machine for any number of threads.
 
     Args:
         name: one of :data:`~neuprim.scenes.smoke.scenes.SCENES`.
-        frames: how many frames from the start; None is the scene's own number.
+        frames: number of frames from the start; None for all.
         resolution: cells across the box, which is half as high again as it is wide.
         seed: of the turbulence; not negative.
-        progress: is told (text, fraction done).
+        progress: receives (text, fraction done).
 
     Raises:
         ConfigError: unknown scene or impossible value.
@@ -98,7 +97,7 @@ def simulate_smoke(
 
 
 def simulation_key(scene: SmokeScene, frames: int, resolution: int, seed: int) -> str:
-    """A short hash of everything that the files depend on."""
+    """Hash everything that the files depend on."""
     settings = {
         "version": SOLVER_VERSION,
         "scene": scene.name,
@@ -114,12 +113,12 @@ def simulation_key(scene: SmokeScene, frames: int, resolution: int, seed: int) -
 
 
 def simulation_box(resolution: int) -> Box:
-    """One world unit wide and deep, 1.5 high, rounded up to whole blocks of 8 voxels."""
+    """The box: one world unit wide and deep, 1.5 high, rounded up to blocks of 8 voxels."""
     return Box((resolution, resolution, -(-3 * resolution // 16) * 8), 1.0 / resolution)
 
 
 def make_vdb_grids(state: GasState, scene: SmokeScene, box: Box) -> list[Grid]:
-    """What is written of a state: the scene's grids, in half floats, without the faint."""
+    """Convert a state to the grids of the scene, in half floats, with faint values set to the background."""
     half = (box.cell * 0.5, box.cell * 0.5)
     corner = (half[0] - box.shape[0] * half[0], half[1] - box.shape[1] * half[1], half[0])  # the centre of voxel 0
     transform = scale_transform(box.cell, corner)
@@ -136,7 +135,7 @@ def make_vdb_grids(state: GasState, scene: SmokeScene, box: Box) -> list[Grid]:
 
 
 def _albedo(state: GasState) -> np.ndarray:
-    """(X, Y, Z, 3) in 0..1, where there is smoke."""
+    """(X, Y, Z, 3) in 0..1 where there is smoke."""
     assert state.colour is not None
     density = state.density
     straight = (state.colour / density.clamp_min(THRESHOLD)).clamp(0, 1)
@@ -166,7 +165,7 @@ def _write(scene: SmokeScene, count: int, resolution: int, seed: int, folder: Pa
 
 @contextmanager
 def _one_torch_thread() -> Iterator[None]:
-    """The solver divides its work itself; matrix products might round differently when torch divides them too."""
+    """Run torch on one thread: the solver divides its work itself, and results must not depend on threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -286,8 +286,8 @@ GROUND_EXPLOSION = SmokeScene(
     1 / 36,
     ("density", "temperature", "flames"),
     SolverSettings(
-        buoyancy=3.6, weight=0.35, confinement=0.35, cooling=0.7, radiation=0.3, dissipation=0.25, burn=0.75, heat=0.3, soot=0.8,
-        expansion=2.0, drag=0.25,
+        buoyancy=3.6, weight=0.35, confinement=0.35, cooling=0.7, radiation=0.3, dissipation=0.25, burn=0.75, heat=0.3,
+        soot=0.8, expansion=2.0, drag=0.25,
     ),
     _ground_explosion,
 )  # fmt: skip

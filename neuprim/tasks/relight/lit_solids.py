@@ -57,13 +57,14 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     reading = {"background": asked.background, "hold_out": asked.hold_out}
     folder = generate_lit_solids(drawn, context.cache_dir, context.progress)
     dataset = olat.load({"path": str(folder), "falloff": "inverse_square", **reading}, context)
+    rays = drawn.supersampling
     return replace(
         dataset,
         name="lit_solids",
         data_source="generated",
         background=torch.zeros(3),
         bounds=torch.tensor([[-1.0, -1.0, -0.65], [1.0, 1.0, 1.0]]),
-        downsampling=f"rendered at {drawn.size}x{drawn.size}, {drawn.supersampling}x{drawn.supersampling} rays per pixel",
+        downsampling=f"rendered at {drawn.size}x{drawn.size}, {rays}x{rays} rays per pixel",
         extra=_known(dataset, folder),
     )
 

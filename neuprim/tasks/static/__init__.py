@@ -30,7 +30,8 @@ def _check(model: Mapping[str, Any]) -> None:
     others = [key for key in model["density"] if key != "form"]
     if model["density"].get("form") == "gaussian" and others:
         raise ConfigError(
-            f"model.density.{others[0]}: of densities of the form cosine; expected none with model.density.form=gaussian"
+            f"model.density.{others[0]}: of densities of the form cosine; expected none with "
+            "model.density.form=gaussian"
         )
     validate_choices(model["colour"], "model.colour", {})
 

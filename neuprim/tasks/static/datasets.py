@@ -60,11 +60,11 @@ __all__ = ["BlenderSettings", "ColmapSettings", "NerfstudioSettings", "load_blen
 
 @dataclass(frozen=True)
 class BlenderSettings(FolderSettings):
-    """What the user may set.
+    """Settings of ``scene=blender``.
 
     Attributes:
-        train_split, test_split: names in transforms_NAME.json.
-        hold_out: n: evaluate on every n-th training view instead of the test split; 0 for that split.
+        train_split, test_split: NAME in transforms_NAME.json.
+        hold_out: n: every n-th training view is the test split, and the real one stays unread; 0 for the real one.
     """
 
     train_split: SplitName = "train"
@@ -73,7 +73,7 @@ class BlenderSettings(FolderSettings):
 
 
 def load_blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """The scene in the folder ``settings["path"]``; straight-alpha PNG is premultiplied in its stored sRGB values.
+    """Load a NeRF-synthetic folder; straight-alpha PNG is premultiplied in its stored sRGB values.
 
     Raises:
         ConfigError: unknown or impossible settings.
@@ -103,11 +103,11 @@ def load_blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
 @dataclass(frozen=True)
 class NerfstudioSettings(FolderSettings):
-    """What the user may set.
+    """Settings of ``scene=nerfstudio``.
 
     Attributes:
         skip_missing: leave out frames whose image is missing; otherwise they are an error.
-        test_every: every n-th frame is held out.
+        test_every: every n-th frame by name is a test view, where the file has no lists of names.
     """
 
     skip_missing: bool = False
@@ -115,12 +115,12 @@ class NerfstudioSettings(FolderSettings):
 
 
 def load_nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """The capture in the folder ``settings["path"]``.
+    """Load a nerfstudio or instant-ngp capture; photographs are undistorted and masked.
 
     Raises:
         ConfigError: unknown or impossible settings.
         DataError: missing or damaged files, wrong or missing fields, impossible cameras, an unknown camera model, empty
-        splits.
+            splits.
     """
     asked = validate(NerfstudioSettings, settings, "scene")
     folder = find_data_folder(asked.path)
@@ -144,11 +144,12 @@ def _read_nerfstudio_points(folder: Path, document: JsonReader) -> PointCloud:
 
 @dataclass(frozen=True)
 class ColmapSettings(FolderSettings):
-    """What the user may set.
+    """Settings of ``scene=colmap``.
 
     Attributes:
-        images, model: folders of the images and of the reconstruction; "auto" for the model in ``sparse`` with the most
-        posed images. test_every: every n-th image is held out.
+        images: folder of the images; of reduced copies (``images_4``) the cameras are scaled to the files.
+        model: folder of the reconstruction; "auto" for the model in ``sparse`` with most posed images.
+        test_every: every n-th image by name, from the first, is a test view.
         skip_missing: leave out images that are missing; otherwise they are an error.
     """
 
@@ -159,7 +160,9 @@ class ColmapSettings(FolderSettings):
 
 
 def load_colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """The reconstruction in the folder ``settings["path"]``; its 3-D points are the initial points.
+    """Load a COLMAP project; its 3-D points are the starting points.
+
+    Distorted models become pinholes of the same focal lengths. Pixels that a photograph does not show are masked.
 
     Raises:
         BackendUnavailable: pycolmap is not installed.
@@ -228,7 +231,8 @@ def _tell_unposed(place: Path, posed: set[Path], model: Path) -> None:
     ]
     if others:
         warn_once(
-            f"{place}: {len(others)} of {len(posed) + len(others)} images have no pose in {model}, e.g. {min(others).name}; left out"
+            f"{place}: {len(others)} of {len(posed) + len(others)} images have no pose in {model}, e.g. "
+            f"{min(others).name}; left out"
         )
 
 
@@ -242,7 +246,8 @@ def _colmap_camera(where: str, image: Any, viewmat: Tensor, file: Path, info: Im
     lens = image.camera
     if lens.width <= 0 or lens.height <= 0 or not np.isfinite(lens.params).all():
         raise DataError(
-            f"{where}: size {lens.width}x{lens.height}, parameters {lens.params}; expected a positive size, finite numbers"
+            f"{where}: size {lens.width}x{lens.height}, parameters {lens.params}; expected a positive size, "
+            "finite numbers"
         )
     if not is_resized_copy((lens.width, lens.height), (info.width, info.height)):
         found = (
@@ -286,6 +291,7 @@ def _read_colmap_points(reconstruction: Any, model: Path) -> PointCloud | None:
     keep = np.isfinite(means).all(axis=1)
     if not keep.all():
         raise DataError(
-            f"{model}: points3D: {int((~keep).sum())} of {len(points)} points are not finite; expected finite coordinates"
+            f"{model}: points3D: {int((~keep).sum())} of {len(points)} points are not finite; expected finite "
+            "coordinates"
         )
     return PointCloud(torch.from_numpy(means), torch.from_numpy(colors).float())

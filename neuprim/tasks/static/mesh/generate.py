@@ -1,8 +1,6 @@
-"""The scene ``mesh`` as a data set on disk: the layout, the cameras and the light of the built-in solids, with a model
-in their place.
+"""The scene ``mesh``: the cameras and light of the solids, with the user's model in their place.
 
-The transforms files also say which file was drawn (``rendered_from``) and where its points are in the scene
-(``scene_from_file``).
+The transforms files also name the model (``rendered_from``) and its place in the scene (``scene_from_file``).
 """
 
 from __future__ import annotations
@@ -59,14 +57,13 @@ LIGHT = Daylight(DAYLIGHT.direction, *(_dimmed(colour) for colour in (DAYLIGHT.s
 
 @dataclass(frozen=True)
 class MeshSettings(SolidsSettings):
-    """What the user may set for ``scene=mesh`` beside what ``solids`` has.
+    """Settings of ``scene=mesh`` beyond those of ``solids``.
 
     Attributes:
         path: the model, .glb, .gltf, .obj, .ply or .stl.
-        up: the axis of the file that points up; "auto" is y for glTF and OBJ, z for PLY and STL.
-        shading: "daylight", a sun with shadows and a soft sky; "flat", the colours themselves, unlit.
-        skip_missing: whether textures and material files that are missing or refused are left out; they are an error
-        otherwise.
+        up: axis of the file that points up; "auto" is y for glTF and OBJ, z for PLY and STL.
+        shading: "daylight" (sun with shadows and a soft sky) or "flat" (unlit colours).
+        skip_missing: leave out missing or refused textures and material files instead of raising.
     """
 
     path: Annotated[Path, nonempty_text("the model's file")] = field(kw_only=True)
@@ -76,13 +73,12 @@ class MeshSettings(SolidsSettings):
 
 
 def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """The data set of ``scene=mesh``, drawn on first use of the file's contents and read from ``context.cache_dir``
-    afterwards.
+    """Load ``scene=mesh``: drawn on first use of the file's contents, read from ``context.cache_dir`` afterwards.
 
     Raises:
         ConfigError: unknown setting or impossible value.
         DataError: the model is missing, damaged, too large or refers to files outside its folder; the cache cannot be
-        written.
+            written.
     """
     asked = validate(MeshSettings, settings, "scene")
     folder = generate(asked, context.cache_dir, context.progress)
@@ -96,7 +92,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
 
 def generate(settings: MeshSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:
-    """Write the data set unless a complete one is there; returns its folder ``cache_dir/mesh-KEY``.
+    """Write the data set unless it is complete; return its folder ``cache_dir/mesh-KEY``.
 
     Raises:
         DataError: as :func:`load`.
@@ -121,7 +117,7 @@ def generate(settings: MeshSettings, cache_dir: Path, progress: Progress = lambd
 def _colours(
     scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """What N rays see without any light: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits."""
+    """Unlit colours of N rays: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits."""
     hits = scene.intersect(origins, directions)
     image = np.zeros(directions.shape, dtype=np.float32)
     image[hits.hit] = hits.albedo if hits.emission is None else hits.albedo + hits.emission

@@ -42,14 +42,14 @@ class SurfacePart:
     """One piece of the surface.
 
     Attributes:
-        corners: (F, 3, 3) float64 positions in the file's units and axes, all finite.
-        normals: (F, 3, 3) normals of the file; None where it has none.
+        corners: (F, 3, 3) float64 positions in the units and axes of the file, finite.
+        normals: (F, 3, 3) normals of the file, if any.
         colour: (F, 3, 3) float32 linear RGB.
-        uv: (F, 3, 2) float32, v upward; None without a texture.
-        material: whose texture it is.
-        bare: whether the file says nothing of its colour.
-        alpha: (F, 3) float32 0..1; None: opaque.
-        glow: the light that it emits, ``colour``, ``uv`` and ``material`` in a part of its own; None: none.
+        uv: (F, 3, 2) float32, v upward, if there is a texture.
+        material: provides the texture.
+        bare: whether the file has no colour for it.
+        alpha: (F, 3) float32 0..1; None for opaque.
+        glow: emitted light, as ``colour``, ``uv`` and ``material`` of another part.
     """
 
     corners: NDArray[np.float64]
@@ -108,12 +108,13 @@ def _make_surface(model: Model, faces: Faces) -> SurfacePart:
 def _coordinates(
     model: Model, uv: NDArray[np.floating] | None, material: Material, faces: int
 ) -> NDArray[np.float32] | None:
-    """(F, 3, 2) places of the corners in the material's texture; None without one."""
+    """(F, 3, 2) coordinates of the corners in the material's texture; None without."""
     if material.texture is None:
         return None
     if uv is None:
         warn_once(
-            f"{model.path}: texture {material.texture[:80]!r} has no coordinates on a part of {faces} faces; drawn without it"
+            f"{model.path}: texture {material.texture[:80]!r} has no coordinates on a part of {faces} faces; "
+            "drawn without it"
         )
         return None
     with np.errstate(all="ignore"):
@@ -122,7 +123,7 @@ def _coordinates(
 
 
 def _moved(uv: NDArray[np.float32], material: Material) -> NDArray[np.float32]:
-    """Texture coordinates after the material's transform, which is written for a v that runs down."""
+    """Apply the material's texture transform, which is written for a v that points down."""
     if material.transform is None:
         return uv
     matrix = np.array(material.transform, np.float32)
@@ -140,7 +141,7 @@ _ROWS = 256
 
 
 class Texture:
-    """One image and its copies of half, a quarter, ... of its size.
+    """An image with its copies of half, a quarter, ... of the size.
 
     Args:
         pixels: (H, W, 4) uint8, sRGB with straight alpha.
@@ -155,15 +156,15 @@ class Texture:
 
     @property
     def texels(self) -> int:
-        """Of the image itself."""
+        """Number of pixels of the image."""
         return self.levels[0].shape[0] * self.levels[0].shape[1]
 
     def look_up(self, uv: NDArray[np.float32], blur: NDArray[np.float32]) -> NDArray[np.float32]:
         """(M, 4) linear RGB and alpha.
 
         Args:
-            uv: (M, 2), v upward; (0, 0) is the lower left corner of the image.
-            blur: (M,) texels of the image, along an axis, that one ray stands for.
+            uv: (M, 2), v upward; (0, 0) is the lower left corner.
+            blur: (M,) texels along an axis that one ray stands for.
         """
         level = np.clip(np.round(np.log2(np.maximum(blur, 1.0))), 0, len(self.levels) - 1).astype(np.intp)
         found = np.empty((len(uv), 4), dtype=np.float32)
@@ -205,7 +206,7 @@ def _linear(pixels: NDArray) -> NDArray[np.float32]:
 
 
 def _halved(image: NDArray) -> NDArray[np.float16]:
-    """Means of 2 x 2 pixels, in linear light; the last row or column of an odd size counts twice."""
+    """Average 2 x 2 pixels in linear light; the last row or column of an odd size counts twice."""
     height, width = image.shape[:2]
     half = np.empty(((height + 1) // 2, (width + 1) // 2, 4), np.float16)
     for top in range(0, len(half), _ROWS):

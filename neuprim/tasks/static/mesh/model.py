@@ -1,4 +1,5 @@
-"""A mesh file with its materials, read together with the files it names: under size limits, from its own folder only."""
+"""A mesh file with its materials, read together with the files it names: under size limits, from its own "
+"folder only."""
 
 from __future__ import annotations
 
@@ -139,7 +140,8 @@ def find_model_file(path: Path) -> Path:
         raise DataError(f"{path}: {error}; expected a model's file (scene.path)") from None
     if not usable:
         raise DataError(
-            f"{file}: {'is no file' if there else 'does not exist'}; expected a model's file (scene.path), {_list_suffixes()}"
+            f"{file}: {'is no file' if there else 'does not exist'}; expected a model's file (scene.path), "
+            f"{_list_suffixes()}"
         )
     if file.suffix.lower() not in SUFFIXES:
         found = f"ends in {file.suffix!r}" if file.suffix else "has no suffix"

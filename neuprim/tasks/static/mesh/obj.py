@@ -199,7 +199,8 @@ def _library(text: str, folder: ModelFolder, images: dict[str, bytes]) -> dict[s
             found[name] = replace(old, opacity=value if key == "d" else 1 - value, cutoff=0.5, blend=True)
         elif key == "map_d" and _file_name(words, rest)[0] != old.texture:
             warn_once(
-                f"{folder.file}: map_d of material {name[:40]!r} is not read; drawn as opaque as d and the alpha of map_Kd say"
+                f"{folder.file}: map_d of material {name[:40]!r} is not read; drawn as opaque as d and the "
+                "alpha of map_Kd say"
             )
     return {name: _textured(material) for name, material in found.items()}
 

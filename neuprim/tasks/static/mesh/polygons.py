@@ -82,7 +82,8 @@ def triangulate_polygons(
             owners.append(np.full(len(ears), rows[i]))
     if crossed:
         raise DataError(
-            f"{path}: {len(crossed)} of {len(sizes)} faces cross themselves, as face {min(crossed)} of {sizes[min(crossed)]} corners; "
+            f"{path}: {len(crossed)} of {len(sizes)} faces cross themselves, as face {min(crossed)} of "
+            f"{sizes[min(crossed)]} corners; "
             "expected simple polygons. Triangulate the mesh in the program that wrote it"
         )
     owner = np.concatenate(owners)

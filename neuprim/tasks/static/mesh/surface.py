@@ -1,5 +1,4 @@
-"""A model as rays meet it: in the box of the scenes, drawn alike from both sides, with its textures and the holes in
-them."""
+"""A mesh as a scene for ray casting: placed in the unit box, two-sided, with textures and holes."""
 
 from __future__ import annotations
 
@@ -41,10 +40,9 @@ _Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def scene_from_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np.float64] | None:
-    """(4, 4) that turns z up, centres the box and scales it into [-1, 1]^3, and into view; None for what has no size.
+    """(4, 4) transform that turns z up, centres the box and scales it into [-1, 1]^3 and into view.
 
-    Args:
-        upward: "y" or "z", the axis of the file that points up.
+    None for a model without size. ``upward`` ("y" or "z") is the axis of the file that points up.
     """
     turn = _Z_FROM_Y if upward == "y" else np.eye(3)
     lower = np.min([part.corners.min(axis=(0, 1)) for part in parts], axis=0)
@@ -64,13 +62,10 @@ class Surface(Scene):
     """The parts of a model, ready for ray queries.
 
     Args:
-        model: where the images are.
+        model: provides the images.
         parts: see :func:`~neuprim.tasks.static.mesh.materials.read_surfaces`.
         upward: "y" or "z".
-        spacing: of neighbouring rays at distance 1, for how much of a texture one stands.
-
-    Attributes:
-        scene_from_file: (4, 4), see :func:`scene_from_file`.
+        spacing: distance of neighbouring rays at distance 1, for texture filtering.
 
     Raises:
         DataError: a model without size, or a texture that cannot be decoded.
@@ -100,7 +95,8 @@ class Surface(Scene):
         faint = np.concatenate([_faint(part) for part in parts])
         if not (kept & ~faint).any():
             raise DataError(
-                f"{model.path}: no face has an opacity of at least 0.5; expected a model that is not all clear (alpha, d, Tr)"
+                f"{model.path}: no face has an opacity of at least 0.5; expected a model that is not all clear "
+                "(alpha, d, Tr)"
             )
         kept &= ~faint
         mesh = _mesh(points, faces[kept])
@@ -120,7 +116,7 @@ class Surface(Scene):
         self._holes = bool((self._cutoff > 0).any())
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """As of any scene; normals are those of the side that is seen."""
+        """As of any scene; normals are those of the visible side."""
         hits = super().intersect(origins, directions)
         towards = np.asarray(directions, dtype=np.float32)[hits.hit]
         side = np.where(dot(hits.face, towards) > 0, np.float32(-1), np.float32(1))[:, None]
@@ -165,12 +161,12 @@ class Surface(Scene):
 
 
 class _Layer:
-    """Colours of all faces that are drawn: values at their corners, times textures.
+    """Colours of all drawn faces: values at corners, times textures.
 
     Args:
-        kept: (F,) which faces of the parts are drawn.
-        area: (F,) twice that of a face, in rays at distance 1.
-        pool: textures that are decoded already, by image and wrapping; those of the parts are added.
+        kept: (F,) faces that are drawn.
+        area: (F,) twice the area of a face, in rays at distance 1.
+        pool: decoded textures by image and wrapping; new ones are added.
     """
 
     def __init__(
@@ -219,7 +215,7 @@ class _Layer:
 
 
 def _faint(part: SurfacePart) -> NDArray[np.bool_]:
-    """(F,) faces that are holes all over."""
+    """(F,) faces that are completely transparent."""
     if part.alpha is None or part.material.cutoff is None:
         return np.zeros(len(part.colour), dtype=np.bool_)
     clear: NDArray[np.bool_] = part.alpha.max(axis=1) < part.material.cutoff
@@ -227,7 +223,7 @@ def _faint(part: SurfacePart) -> NDArray[np.bool_]:
 
 
 def _say_translucent(model: Model, parts: Sequence[SurfacePart], pool: _Pool) -> None:
-    """One line for what should show what is behind it: nothing is translucent here."""
+    """Warn once of translucent faces, which are drawn opaque or left out."""
     soft = {
         key
         for key, texture in pool.items()
@@ -241,12 +237,13 @@ def _say_translucent(model: Model, parts: Sequence[SurfacePart], pool: _Pool) ->
             count += int(((part.alpha > 0) & (part.alpha < 1)).any(axis=1).sum())
     if count:
         warn_once(
-            f"{model.path}: {count} faces are translucent; drawn opaque where their opacity is at least 0.5, left out elsewhere"
+            f"{model.path}: {count} faces are translucent; drawn opaque where their opacity is at least 0.5, "
+            "left out elsewhere"
         )
 
 
 def _mesh(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
-    """Faces with vertices of their own where more of them touch than are smoothed over."""
+    """Give faces their own vertices where too many touch to be smoothed over."""
     around = np.bincount(faces.ravel(), minlength=len(points))
     crowded = around[faces] > _MOST_AROUND
     alone = faces[crowded]
@@ -256,15 +253,14 @@ def _mesh(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trim
 
 
 def _file_normals(parts: Sequence[SurfacePart], turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(F, 3, 3) normals of the file on the scene's axes, of any length; zero where it has none."""
+    """(F, 3, 3) normals of the file on the axes of the scene, any length; zero where there is none."""
     return np.concatenate(
         [np.zeros_like(part.corners) if part.normals is None else part.normals @ turn.T for part in parts]
     )
 
 
 def _smooth(given: NDArray[np.float64], across: NDArray[np.float64], mesh: trimesh.Trimesh) -> NDArray[np.float64]:
-    """(F, 3, 3) unit normals: the file's, turned to the side of their face; else those that the angles between faces
-    suggest."""
+    """(F, 3, 3) unit normals: the file's, turned to the side of their face; else from the angles between faces."""
     with np.errstate(all="ignore"):
         length = np.linalg.norm(given, axis=2, keepdims=True)
         unit = given / length

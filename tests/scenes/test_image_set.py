@@ -3,6 +3,7 @@ in transforms."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import stat
@@ -14,13 +15,9 @@ from typing import Any
 
 import pytest
 
-from neuprim.core.errors import DataError
-from neuprim.scenes.image_set import (
-    ImageSet,
-    draw_in_parallel,
-    write_cached_folder,
-)
+from neuprim.scenes.image_set import ImageSet, draw_in_parallel
 from neuprim.scenes.lit import LitSettings
+from neuprim.scenes.room.generate import RoomSettings
 from neuprim.scenes.solids import SolidsSettings
 
 
@@ -98,14 +95,6 @@ def test_what_ends_early_leaves_nothing(error: type[BaseException], tmp_path: Pa
     assert os.listdir(tmp_path) == []
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(DataError, match=r"^scene numbers: cannot write the generated images to .*numbers-abc: "):
-        numbers().generate(tmp_path / "file", quiet)
-    with pytest.raises(DataError, match=r"^sand to .*heap: "):
-        write_cached_folder(tmp_path / "file" / "heap", ["a"], lambda folder: None, "sand")
-
-
 def test_names_in_caches_that_exist_stay() -> None:
     """Whoever has drawn the scenes already does not draw them again."""
     assert (SolidsSettings().key(), LitSettings(size=128).key()) == ("40df9acdfa7cb07b", "53c33d7cccb60600")
@@ -130,3 +119,14 @@ def test_a_failure_cancels_what_has_not_begun() -> None:
 
 
 # ---------------------------------------------------------------- poses
+
+
+@pytest.mark.parametrize("settings", [SolidsSettings, LitSettings, RoomSettings], ids=lambda cls: cls.__name__)
+def test_every_setting_is_in_the_key_of_the_cache(settings: Any) -> None:
+    default = settings()
+    keys = {default.key()}
+    for field in dataclasses.fields(settings):
+        value = getattr(default, field.name)
+        changed = not value if isinstance(value, bool) else value + 1
+        keys.add(dataclasses.replace(default, **{field.name: changed}).key())
+    assert len(keys) == 1 + len(dataclasses.fields(settings))

@@ -9,7 +9,6 @@ from neuprim.scenes import PIXEL_CLASSES
 from neuprim.scenes.image_set import camera_pose
 from neuprim.scenes.lit import (
     FIELD_OF_VIEW,
-    NEAR_LIGHTS,
     PARTS,
     ShadedRays,
     draw_lit_solids,
@@ -113,13 +112,3 @@ def test_parts_of_the_test_split_have_seen_what_they_say() -> None:
         assert (view.light.tobytes() in lights) == (part == "new_view"), view.name
     assert list(counts.values()) == [7, 7, 6]
     assert len({s.name for s in found["test"]}) == 20 and found["test"][7].name == "new_light_00"
-
-
-def test_the_nearest_light_is_a_training_light_and_not_the_answer() -> None:
-    found = place_cameras_and_lights(100, 30)
-    known = [s.light for s in found["train"][:NEAR_LIGHTS]]
-    for view in found["test"]:
-        assert view.near_light is not None and any((view.near_light == k).all() for k in known)
-        assert not (view.near_light == view.light).all()
-        cosines = [k @ view.light / np.linalg.norm(k) for k in known]
-        assert view.near_light @ view.light / np.linalg.norm(view.near_light) == max(cosines)

@@ -19,7 +19,7 @@ from neuprim.scenes.room.interior import (
     furnish_room,
     lamplight_radiance,
 )
-from neuprim.scenes.room.textures import checks, noise, speckled, stripes
+from neuprim.scenes.room.textures import noise, speckled
 from neuprim.scenes.shapes import ball, build_solids, chamfered_box, parse_srgb
 
 
@@ -38,18 +38,6 @@ def still(count: int, width: float = 0.0) -> np.ndarray:
 
 # Patterns
 # ------------------------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("width", [0.01, 0.13, 0.7, 3.1])
-def test_stripes_and_checks_are_averages_over_the_width(width: float) -> None:
-    points = spread(40, 2)
-    within = (np.arange(2000) + 0.5) / 2000 * width - width / 2
-    x, y = (points[:, axis, None] + within for axis in (0, 1))
-    covered = (((x / 0.5) % 1) < 0.3).mean(1)
-    np.testing.assert_allclose(stripes(points[:, 0], 0.5, 0.3, still(40, width)), covered, atol=2e-3)
-    sides = [np.where((np.floor(t / 0.4) % 2) == 0, 1.0, -1.0).mean(1) for t in (x, y)]
-    light = (1 + sides[0] * sides[1]) / 2
-    np.testing.assert_allclose(checks(points[:, 0], points[:, 1], 0.4, still(40, width)), light, atol=4e-3)
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])

@@ -29,13 +29,3 @@ def test_camera_space_is_left_handed_with_y_up_and_z_ahead() -> None:
     assert matrix.dtype == np.float32 and matrix.shape == (4, 4) and matrix.flags.c_contiguous, (
         "it is written as it lies"
     )
-
-
-def test_the_screen_window_is_that_of_the_pixels() -> None:
-    found = camera_exr_attributes(CAMERA, 0.25)
-    left, right = ((x - CAMERA.cx) / CAMERA.fx for x in (0, 64))
-    bottom, top = ((CAMERA.cy - y) / CAMERA.fy for y in (48, 0))
-    assert abs(found["screenWindowWidth"] - (right - left)) < 1e-6
-    assert np.abs(found["screenWindowCenter"] - ((left + right) / 2, (bottom + top) / 2)).max() < 1e-6
-    assert found["neuprim:focalLength"].tolist() == [np.float32(CAMERA.fx), np.float32(CAMERA.fy)]
-    assert found["neuprim:principalPoint"].tolist() == [CAMERA.cx, CAMERA.cy] and found["neuprim:near"] == 0.25

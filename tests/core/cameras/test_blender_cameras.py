@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -104,12 +103,3 @@ def test_points_are_where_blender_shows_them(
         focal = 50 / 36 * larger
         expected = [width / 2 + focal * 0.5 - 0.1 * larger, height / 2 - focal * 0.25 + (-0.05) * larger]
         assert pixels[0].tolist() == pytest.approx(expected) and float(depth) == pytest.approx(2.0)
-
-
-def test_the_percentage_counts_and_other_cameras_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    camera = Camera(50.0, 36.0, (0.0, 0.0))
-    found = read_camera_file(run(tmp_path, monkeypatch, camera, (640, 480), 25)).named[0][1]
-    assert (found.width, found.height) == (160, 120) and math.isclose(found.fx, 50 / 36 * 160)
-    camera.data.type = "PANO"
-    with pytest.raises(AssertionError, match="perspective"):
-        run(tmp_path, monkeypatch, camera, (640, 480))

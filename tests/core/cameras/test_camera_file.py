@@ -175,15 +175,6 @@ def test_a_camera_path_has_vertical_fields_of_view_in_degrees(tmp_path: Path) ->
     assert found.fps == 24 and found.times is None and "moved and scaled the scene" in found.notes[0]
 
 
-def test_a_paths_times_and_seconds(tmp_path: Path) -> None:
-    timed = [{**camera, "render_time": i / 2} for i, camera in enumerate(PATH["camera_path"])]
-    data = {k: v for k, v in PATH.items() if k not in ("fps", "camera_type")}
-    found = read_camera_file(write(tmp_path / "c.json", {**data, "camera_path": timed}))
-    assert found.times == (0.0, 0.5) and found.fps == pytest.approx(0.5)
-    without = {k: v for k, v in data.items() if not k.startswith("render_")}
-    assert read_cameras(write(tmp_path / "c.json", without), (30, 20))[0][1].fy == pytest.approx(10.0)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -220,13 +211,3 @@ def test_bad_camera_paths_are_refused_by_name_and_field(tmp_path: Path, change: 
     with pytest.raises(DataError, match=words) as caught:
         read_camera_file(write(tmp_path / "path.json", {**PATH, **change}))
     assert "path.json" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_file_of_something_else(tmp_path: Path) -> None:
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(
-        DataError, match=r"folder: is a folder without cameras.txt or cameras.bin; expected a COLMAP model"
-    ):
-        read_camera_file(tmp_path / "folder")
-    with pytest.raises(DataError, match=r"frames is missing; expected a non-empty list of objects .or camera_path"):
-        read_camera_file(write(tmp_path / "c.json", {"cameras": []}))

@@ -67,13 +67,6 @@ def test_the_frames_own_wins_whole_and_lengths_follow_the_size(
     assert camera(frame, file)[0] == expected
 
 
-def test_a_resized_image_is_told_once_for_all_frames() -> None:
-    assert camera({"w": 128, "h": 96, "fl_x": 100}, {})[1] == camera({}, {"fl_x": 100, "w": 128, "h": 96})[1]
-    assert camera({}, {"fl_x": 100, "w": 128, "h": 96})[1] == [
-        "t.json: w, h are 128x96 and the image 64x48; cameras are scaled to the images"
-    ]
-
-
 @pytest.mark.parametrize(
     ("frame", "file", "words"),
     [
@@ -126,12 +119,6 @@ def test_the_sensors_angles_of_blender_give_way_to_lengths_in_pixels() -> None:
     assert found == (100, 100, 24, 36) and len(said) == 2 and all("is taken" in line for line in said)
 
 
-def test_a_picture_to_draw_may_look_past_its_edge_where_its_size_is_stated() -> None:
-    assert camera({}, {"fl_x": 50, "cx": -3, "cy": 24, "w": 64, "h": 48}, Target(64, 48))[0] == (50, 50, -3, 24)
-    with pytest.raises(DataError, match="the picture"):
-        camera({}, {"fl_x": 50, "cx": 64, "cy": 48}, Target(64, 48))
-
-
 def test_a_lens_comes_whole_from_the_frame() -> None:
     frame, file = (
         JsonReader({"k1": 0.1}, "f"),
@@ -165,20 +152,6 @@ def test_a_lens_comes_whole_from_the_frame() -> None:
 def test_keys_that_change_the_picture_are_refused_by_name(key: str, value: Any) -> None:
     with pytest.raises(DataError, match=f"t.json: {key} "):
         refuse_unsupported_keys(JsonReader({key: value}, "t.json"))
-
-
-def test_the_same_keys_may_say_nothing() -> None:
-    nothing = {
-        "latlong": False,
-        "rolling_shutter": [0, 0, 0, 0],
-        "k5": 0.0,
-        "camera_type": "perspective",
-        "shift_x": 0,
-        "n_frames": 2,
-    }
-    refuse_unsupported_keys(JsonReader({**nothing, "frames": [{}, {}]}, "t.json"))
-    with pytest.raises(DataError, match="n_frames is 1; expected 2"):
-        refuse_unsupported_keys(JsonReader({"n_frames": 1, "frames": [{}, {}]}, "t.json"))
 
 
 def test_unknown_keys_are_named_once_and_those_of_real_files_are_not() -> None:

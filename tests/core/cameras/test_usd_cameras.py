@@ -114,17 +114,6 @@ def test_another_shape_shows_the_whole_aperture_and_more(tmp_path: Path, size: t
     assert min(left, top) > -1e-3 and right < size[0] + 1e-3 and bottom < size[1] + 1e-3
 
 
-def test_one_of_several_by_its_path(tmp_path: Path) -> None:
-    path = usd(tmp_path / "a.usda", CAMERA + CAMERA.replace('"Cam"', '"Other"').replace("35", "70"))
-    with pytest.raises(
-        DataError, match="has 2 cameras; expected #PATH after the file's name, with one of /World/Cam, /World/Other"
-    ):
-        read_camera_file(path, (64, 48))
-    assert read_camera_file(Path(f"{path}#/World/Other"), (64, 48)).named[0][1].fx == pytest.approx(70 / 36 * 64)
-    with pytest.raises(DataError, match="has no camera /World/None; expected one of /World/Cam, /World/Other"):
-        read_camera_file(Path(f"{path}#/World/None"), (64, 48))
-
-
 BAD: list[tuple[str, Callable[[Path], Any], str]] = [
     ("no size", lambda p: (usd(p), None), r"names no size of an image .* give --size WxH"),
     ("no camera", lambda p: (usd(p, ""), (64, 48)), "has no camera; expected one"),

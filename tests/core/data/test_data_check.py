@@ -188,16 +188,6 @@ def test_starting_points(changes: dict[str, Any], text: str) -> None:
         initial_model(CosineDensity(1), SphericalHarmonics(0, 3), data, ModelSettings(primitives=6), 0)
 
 
-def test_a_later_view_is_noticed_when_it_is_drawn() -> None:
-    data = tiny.two_primitives()
-    spoil(index=4, rgb=lambda x: x.permute(2, 0, 1))(data)
-    check_dataset(data, ())
-    trainer = tiny.trainer(data)
-    with pytest.raises(DatasetError, match=r"train view v4: rgb is float32 \(3, "):
-        list(trainer.run())
-    assert trainer.step < 6
-
-
 def test_an_orbit_has_every_condition_of_the_training_views() -> None:
     data = tiny.two_primitives()
     plain = data.train.view

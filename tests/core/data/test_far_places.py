@@ -89,17 +89,6 @@ def test_gaussians_turn_and_grow_with_their_places() -> None:
     assert found.quats is not None and torch.allclose(found.quats.abs(), torch.tensor([[0.5**0.5, 0, 0, 0.5**0.5]]))
 
 
-def test_floats_that_are_far_away_are_told(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    rows = np.zeros(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
-    rows["x"], rows["y"] = [0, 1, 2], 5411932.25
-    write_ply(tmp_path / "p.ply", rows)
-    with pytest.warns(
-        NeuprimWarning,
-        match=r"x y z are float, which rounds coordinates as large as 5411932 to 0\.5; expected double there",
-    ):
-        read_points(tmp_path / "p.ply", 3, "srgb")
-
-
 def test_a_camera_far_from_all_others_says_nothing_about_place_and_scale() -> None:
     lost = replace(ring((0, 0, 0))[0], viewmat=ring((3e6, 0, 0), 4e6)[0].viewmat)
     with pytest.warns(NeuprimWarning, match=r"1 of 7 cameras lie far from all others, the first at 7e\+06"):

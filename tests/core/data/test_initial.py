@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.data import Pixels, PointCloud, View, ViewSet
+from neuprim.core.data import Pixels, View, ViewSet
 from neuprim.core.data.hull import hull_surface
-from neuprim.core.data.initial import _thinned, box_points, farthest_points, hull_points, initial_points
+from neuprim.core.data.initial import box_points, farthest_points, hull_points, initial_points
 from neuprim.core.data.scene_frame import focus_point
 from neuprim.core.errors import DataError
 
@@ -146,16 +146,6 @@ def test_farthest_points_spread() -> None:
     )
 
 
-def test_thinning_for_large_counts_spreads_too() -> None:
-    # two clusters of very different density: even spreading takes more from the sparse one than its share
-    cloud = torch.cat(
-        [torch.rand((9000, 3), generator=rng()), torch.rand((1000, 3), generator=rng(1)) + torch.tensor([1.0, 0, 0])]
-    )
-    rows = _thinned(cloud, 600, rng())
-    assert len(rows) == 600 == len(rows.unique())
-    assert 0.35 < (rows >= 9000).float().mean() < 0.6
-
-
 def test_colors_are_straight_and_medians_over_the_views_that_show_the_point() -> None:
     views = Views(sphere(0.7), count=15)
     for i, image in enumerate(views.images):
@@ -182,16 +172,6 @@ def test_photographs_start_in_a_box_where_the_cameras_look() -> None:
     assert torch.equal(initial_points(opaque, None, 50, rng()).means, box_points(opaque, 50, rng()).means), (
         "opaque alpha says nothing"
     )
-
-
-def test_given_points_are_kept_or_thinned() -> None:
-    views = Views(sphere(0.7), count=4)
-    given = PointCloud(torch.rand((100, 3), generator=rng()), torch.rand((100, 3), generator=rng(1)))
-    assert torch.equal(initial_points(views, given, 500, rng()).means, given.means)
-    some = initial_points(views, given, 30, rng())
-    assert len(some.means) == 30 == len(some.means.unique(dim=0))
-    rows = [(given.means == m).all(dim=1).nonzero().item() for m in some.means]
-    assert torch.equal(given.colors[rows], some.colors)
 
 
 def test_focus_point() -> None:

@@ -16,9 +16,8 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.ply import read_ply, write_ply
 from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.edge import EDGES, NORMS
+from neuprim.core.model.edge import EDGES
 from neuprim.core.model.footprint import gaussian_support
-from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.initial import initial_model
 from neuprim.core.train.settings import ModelSettings
@@ -58,22 +57,6 @@ def test_gaussians_give_places_colours_shapes_and_opacities(tmp_path: Path) -> N
     assert torch.allclose(model.params["sh_dc"][:, 0], torch.tensor(1.0), atol=1e-5) and not bool(
         model.params["sh_rest"].any()
     )
-
-
-@pytest.mark.parametrize("edge", EDGES)
-def test_primitives_cover_what_their_gaussians_do(tmp_path: Path, edge: int) -> None:
-    """Axes and mass: seen along one of its axes, a primitive hides as much of the screen as the footprint o
-    exp(-r^2/2), on the whole."""
-    model = fresh(splats(tmp_path / "g.ply"), edge=edge)
-    geometry: Geometry = model.geometry
-    alphas = torch.sigmoid(torch.tensor([0.0, 20.0, -20.0]))
-    support, middle = CosineDensity(0, edge=edge).from_gaussians(alphas)
-    spread = geometry.rotations * geometry.scales[:, None] / support[:, None, None]
-    covariance = spread @ spread.transpose(1, 2)
-    assert torch.allclose(covariance, torch.diag(torch.tensor([0.04, 0.01, 0.09])).expand(3, 3, 3), atol=1e-6)
-    chord = 3 / (1 + 3 / 2 + 3)  # the mean over the axes, each weighted by what is seen along it, over the longest
-    depth = model.params["b2"][:, 0] * NORMS[edge] * chord
-    assert torch.allclose(1 - torch.exp(-depth), middle.clamp(0.02, 0.98), atol=1e-5)
 
 
 @pytest.mark.parametrize("edge", EDGES)
@@ -189,14 +172,6 @@ def test_discs_are_flat_along_their_third_axis_and_balls_are_round(tmp_path: Pat
     write_ply(tmp_path / "bare.ply", np.lib.recfunctions.repack_fields(bare))
     with pytest.warns(match="has scale_0, scale_1, scale_2, but no rot_2; sizes are ignored"):
         assert read_points(tmp_path / "bare.ply", 3, "srgb").deviations is None
-
-
-def test_places_keep_the_digits_of_the_file(tmp_path: Path) -> None:
-    rows = np.zeros(2, [(n, "<f8") for n in "xyz"])
-    rows["x"], rows["y"] = [448250.125, 448250.1251], 5411931.0625
-    write_ply(tmp_path / "utm.ply", rows)
-    means = read_points(tmp_path / "utm.ply", 3, "srgb").means
-    assert means.dtype == torch.float64 and means[1, 0] - means[0, 0] == pytest.approx(1e-4, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["a.splat", "a.spz", "a.KSPLAT", "a.sog", "a.lcc", "a.compressed.ply"])

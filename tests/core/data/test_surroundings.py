@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import math
 
-import pytest
 import torch
 
-from neuprim.config import compose, task_of
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Pixels, PointCloud, View, ViewSet
 from neuprim.core.data.initial import surrounding_points
-from neuprim.core.errors import ConfigError
-from neuprim.runs.fit import make_trainer
-from neuprim.runs.open import load_dataset
 
 WALL = 4.0  # behind the origin, as the cameras at y < 0 see it
 SIZE = (48, 36)
@@ -130,20 +125,3 @@ def test_pixels_that_do_not_count_are_not_lifted() -> None:
     near = found.means.norm(dim=1) < 6.5
     u = 40 * local[:, 0] / local[:, 2] + camera.cx
     assert int(near.sum()) > 50 and bool((u[near] >= SIZE[0] / 2).all())
-
-
-def test_matter_that_moves_has_no_surroundings() -> None:
-    words = [
-        "task=dynamic",
-        "scene=smoke_fire",
-        "scene.size=8",
-        "scene.resolution=16",
-        "scene.timesteps=2",
-        "model.init.surroundings=0.2",
-    ]
-    config = compose(words, False)
-    with pytest.raises(
-        ConfigError,
-        match=r"model\.init\.surroundings=0\.2: matter of smoke_fire \(simulated\) depends on time; expected a scene at rest",
-    ):
-        make_trainer(config, task_of(config), load_dataset(config, task_of(config)))

@@ -77,33 +77,11 @@ def test_straight_alpha_is_premultiplied_before_it_is_averaged(folder: Path, con
     assert torch.allclose(half.over(torch.ones(3))[3, 3], torch.tensor([227.5, 177.5, 152.5]) / 255, atol=1 / 255)
 
 
-@pytest.mark.parametrize(
-    ("background", "color", "random"),
-    [("auto", 1.0, False), ("white", 1.0, False), ("black", 0.0, False), ("random", 1.0, True)],
-)
-def test_backgrounds(folder: Path, context: Any, background: str, color: float, random: bool) -> None:
-    data = load({"path": folder, "background": background}, context)
-    assert data.background.tolist() == [color] * 3 and data.random_background is random
-
-
 def test_hold_out_leaves_the_test_split_unread(folder: Path, context: Any) -> None:
     (folder / "transforms_test.json").unlink()
     data = load({"path": folder, "hold_out": 3}, context)
     assert [data.test.view(i).name for i in range(len(data.test))] == ["r_0", "r_3"]
     assert [data.train.view(i).name for i in range(len(data.train))] == ["r_1", "r_2", "r_4", "r_5"]
-
-
-def test_other_splits_suffixes_and_field_of_view_per_frame(folder: Path, context: Any) -> None:
-    def change(document: Any) -> None:
-        del document["camera_angle_x"]
-        for frame in document["frames"]:
-            frame["file_path"] += ".png"
-            frame["camera_angle_x"] = 1.2
-
-    edit(folder / "transforms_test.json", change)
-    (folder / "transforms_test.json").rename(folder / "transforms_val.json")
-    data = load({"path": folder, "test_split": "val"}, context)
-    assert data.test.view(1).camera.fx == pytest.approx(24 / math.tan(0.6))
 
 
 def test_focal_lengths_and_principal_point_of_the_file(folder: Path, scenes: Any, context: Any) -> None:
@@ -145,19 +123,6 @@ def test_images_load_lazily_and_within_the_cache(folder: Path, context: Any) -> 
     assert len(small._stored) == 1
     with pytest.raises(IndexError):
         small.pixels(2)
-
-
-def test_chair(chair: Path, context: Any) -> None:
-    data = load({"path": chair, "downsample": 4}, context)
-    assert (len(data.train), len(data.test)) == (100, 25)
-    assert data.downsampling == "50x50 from 200x200 by area"
-    assert data.center.norm() < 0.01 and data.extent == pytest.approx(5.25, abs=0.01)
-    pixels = data.train.pixels(0)
-    assert (
-        pixels.alpha is not None
-        and 0.05 < pixels.alpha.mean() < 0.6
-        and bool((pixels.rgb <= pixels.alpha[..., None] + 0.01).all())
-    )
 
 
 # ---------------------------------------------------------------- bad input

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,6 @@ from PIL import Image
 
 from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.cameras.colmap import check_binary_model
-from neuprim.core.errors import BackendUnavailable
 from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.static.datasets import load_colmap as load
 
@@ -179,19 +176,6 @@ def test_test_every_and_skip_missing(capture: Any, scenes: Any, context: Any) ->
 # ---------------------------------------------------------------- bad input
 
 
-def test_without_pycolmap_the_extra_is_named(tmp_path: Path, context: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def no_pycolmap(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name == "pycolmap":
-            raise ImportError("No module named 'pycolmap'")
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", no_pycolmap)
-    with pytest.raises(BackendUnavailable, match=r"pip install 'neuprim\[colmap\]'"):
-        load({"path": tmp_path}, context)
-
-
 def test_models_with_rigs_of_two_cameras(tmp_path: Path, pycolmap: Any) -> None:
     if not hasattr(pycolmap, "Rig"):
         pytest.skip("this pycolmap has no rigs")
@@ -223,27 +207,7 @@ def test_impossible_cameras(capture: Any, scenes: Any, context: Any, params: lis
     scenes.refused(load, {"path": capture("PINHOLE", params)}, context, "camera 1 of image 00.png", *words)
 
 
-def test_unknown_camera_model(capture: Any, scenes: Any, context: Any) -> None:
-    path = capture()
-    bad = path / "sparse" / "0" / "cameras.bin"
-    data = bytearray(bad.read_bytes())
-    data[12:16] = struct.pack("<i", 999)
-    bad.write_bytes(data)
-    scenes.refused(load, {"path": path}, context, str(bad), "camera model number 999")
-
-
-def test_panoramas_are_refused_by_name(capture: Any, scenes: Any, context: Any, pycolmap: Any) -> None:
-    if not hasattr(pycolmap.CameraModelId, "EQUIRECTANGULAR"):
-        pytest.skip("this pycolmap knows no equirectangular cameras")
-    scenes.refused(load, {"path": capture("EQUIRECTANGULAR", [64.0, 50.0])}, context, "EQUIRECTANGULAR", "pinhole")
-
-
 def test_wrong_image_shape(capture: Any, scenes: Any, context: Any) -> None:
     path = capture()
     scenes.save(path / "images" / "03.png", np.zeros((H, W // 2)))
     scenes.refused(load, {"path": path}, context, "03.png", "32x50", "expected 64x50", "or a reduction")
-
-
-def test_a_whole_run_ends_in_a_report(capture: Any, scenes: Any, tmp_path: Path) -> None:
-    metrics = scenes.fitted("colmap", capture("OPENCV", points=False, sigma=8.0), tmp_path / "run")
-    assert metrics["scene"] == "colmap" and metrics["data_source"] == "real" and len(metrics["per_view"]) == 2

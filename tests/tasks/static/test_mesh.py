@@ -13,21 +13,18 @@ import torch
 import trimesh
 from PIL import Image
 
-from neuprim.config import compose
 from neuprim.core.cameras import Camera
-from neuprim.core.checkpoint import read_header
 from neuprim.core.data import Dataset
 from neuprim.core.task import SceneContext
-from neuprim.runs.run import run
 from neuprim.scenes.shading import encode_srgb
 from neuprim.tasks.static.mesh import generate as generator
 from neuprim.tasks.static.mesh.generate import MeshSettings, generate, load
 from neuprim.tasks.static.mesh.gltf import read_gltf
-from neuprim.tasks.static.mesh.materials import Texture, decode_texture, read_surfaces
+from neuprim.tasks.static.mesh.materials import Texture, read_surfaces
 from neuprim.tasks.static.mesh.model import ModelFolder
 from neuprim.tasks.static.mesh.obj import read_obj
 from neuprim.tasks.static.mesh.surface import FARTHEST, Surface
-from tests.models import BLUE, GREEN, RED, YELLOW, cube, gltf, quarters, textured, write_glb, write_obj, write_ply
+from tests.models import BLUE, GREEN, RED, YELLOW, gltf, quarters, textured, write_glb, write_obj
 
 SMALL = {"size": 48, "train_views": 4, "test_views": 2, "supersampling": 2}
 
@@ -95,14 +92,6 @@ def test_the_back_of_a_surface_is_lit_and_coloured_as_its_front(tmp_path: Path) 
         np.testing.assert_allclose(hits.normal, [[0, 0, -down]], atol=1e-6)
 
 
-def test_an_obj_takes_its_colours_and_textures_from_its_library(tmp_path: Path) -> None:
-    scene = surface(write_obj(tmp_path / "square.obj"), "z")
-    down = [[0, 0, -1.0]] * 4
-    square = [[-0.5, 0.5, 3], [0.5, 0.5, 3], [-0.5, -0.5, 3], [0.5, -0.5, 3]]
-    np.testing.assert_array_equal(colours(scene, square, down), [RED, GREEN, BLUE, YELLOW])
-    np.testing.assert_array_equal(colours(scene, [[-0.6, 0.1, -3]], [[0, 0, 1.0]]), [(255, 128, 0)])
-
-
 @pytest.mark.parametrize(
     ("line", "name"),
     [
@@ -120,16 +109,6 @@ def test_names_of_textures_in_libraries(tmp_path: Path, line: str, name: str) ->
     (tmp_path / "m.obj").write_text("mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
     model = read_obj(ModelFolder(tmp_path / "m.obj"))
     assert list(model.images) == [name] and model.materials["m"].texture == name
-
-
-def test_a_ply_has_the_colours_of_its_faces(tmp_path: Path) -> None:
-    (tmp_path / "two.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 2\n"
-        "property list uchar int vertex_indices\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
-        "-1 -1 0\n1 -1 0\n1 1 0\n-1 1 0\n3 0 1 2 200 10 20\n3 0 2 3 30 40 250\n"
-    )
-    found = colours(surface(tmp_path / "two.ply"), [[0.5, -0.5, 3], [-0.5, 0.5, 3]], [[0, 0, -1.0]] * 2)
-    np.testing.assert_array_equal(found, [(200, 10, 20), (30, 40, 250)])
 
 
 def test_the_texture_that_a_ply_names(tmp_path: Path) -> None:
@@ -289,17 +268,6 @@ def test_a_ray_that_covers_many_texels_sees_their_mean() -> None:
     assert texture.levels[-1].shape[:2] == (1, 1)
 
 
-@pytest.mark.parametrize("mode", ["L", "LA", "P", "1", "RGB", "RGBA", "I;16"])
-def test_images_of_every_depth_are_decoded(tmp_path: Path, mode: str) -> None:
-    grey = np.full((4, 4), 128, np.uint8)
-    image = Image.fromarray(grey.astype(np.uint16) * 257) if mode == "I;16" else Image.fromarray(grey).convert(mode)
-    image.save(tmp_path / "a.png")
-    pixels = decode_texture(tmp_path, "a.png", (tmp_path / "a.png").read_bytes())
-    assert pixels.shape == (4, 4, 4) and pixels.dtype == np.uint8
-    if mode != "1":
-        np.testing.assert_array_equal(pixels[0, 0], [128, 128, 128, 255])
-
-
 # Shape and place
 # -----------------------------------------------------------------------------------------------------------------------
 
@@ -344,14 +312,6 @@ def test_normals_of_the_file_are_used_and_others_follow_from_the_angles(tmp_path
         assert hits.hit.all() and (turned > 10 if smooth else turned < 0.1).all()
 
 
-def test_faces_without_area_are_left_out_and_counted(tmp_path: Path) -> None:
-    vertices, faces, _ = cube()
-    faces = np.concatenate([faces, [[0, 0, 1], [0, 1, 0]]])
-    with pytest.warns(match="2 of 14 faces have no area; left out"):
-        scene = surface(write_ply(tmp_path / "cube.ply", vertices, faces, np.full((24, 3), 200, np.uint8)))
-    assert np.isfinite(scene._corner_normals).all() and len(scene._faces) == 12
-
-
 # The data set
 # --------------------------------------------------------------------------------------------------------------------------
 
@@ -382,33 +342,6 @@ def test_images_are_kept_by_contents_and_settings(tmp_path: Path, monkeypatch: p
     path.with_suffix(".mtl").write_text("newmtl skin\nKd 1 1 1\nnewmtl back\n")
     folders.add(generate(settings, cache))
     assert len(folders) == 9 == len(list(cache.iterdir()))
-
-
-def test_it_trains_end_to_end_and_the_files_units_are_kept(tmp_path: Path) -> None:
-    path, out = write_glb(tmp_path / "cube.glb"), tmp_path / "out"
-    words = [
-        "task=static",
-        "scene=mesh",
-        f"scene.path='{path}'",
-        f"output_dir='{out}'",
-        *(f"scene.{k}={v}" for k, v in SMALL.items()),
-    ]
-    run(compose([*words, "model.primitives=60", "train.iterations=200", "train.max_seconds=null"]))
-    curve = [json.loads(line)["psnr"] for line in (out / "metrics.jsonl").read_text().splitlines()]
-    assert curve[-1] > curve[0] + 1
-    metrics = json.loads((out / "metrics.json").read_text())
-    assert (
-        metrics["data_source"] == "generated"
-        and metrics["dataset"] == metrics["rendered_from"] == "cube.glb"
-        and np.isfinite(metrics["psnr"])
-    )
-    header = read_header(out / "model.safetensors", "model")
-    assert header["data"]["scene_from_file"] == metrics["scene_from_file"]
-    np.testing.assert_allclose(np.linalg.norm(np.array(metrics["scene_from_file"])[:3, :3] @ [1, 1, 1]), FARTHEST)
-    assert (
-        "<strong>generated data</strong> <span>rendered from cube.glb, not photographs</span>"
-        in (out / "report.html").read_text()
-    )
 
 
 # What it shares

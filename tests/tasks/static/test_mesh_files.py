@@ -20,7 +20,7 @@ from neuprim.core import notices
 from neuprim.core.errors import DataError
 from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.static.mesh import gltf as gltf_reader
-from neuprim.tasks.static.mesh import materials, model
+from neuprim.tasks.static.mesh import materials
 from neuprim.tasks.static.mesh.generate import MeshSettings, generate
 from tests.models import cube, gltf, quarters, write_gltf, write_obj, write_ply
 
@@ -56,15 +56,6 @@ def notes(path: Path, **settings: Any) -> list[str]:
 
 # The file itself
 # -----------------------------------------------------------------------------------------------------------------------
-
-
-def test_more_bytes_than_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_obj(tmp_path / "a.obj")
-    size = path.stat().st_size + path.with_suffix(".mtl").stat().st_size
-    monkeypatch.setattr(model.ModelFolder.__init__, "__defaults__", (False, size))
-    assert "the model with what it names, up to skin.png, is larger than 512 MiB" in refusal(path)
-    monkeypatch.setattr(model.ModelFolder.__init__, "__defaults__", (False, 10))
-    assert "the model is larger than 512 MiB" in refusal(path)
 
 
 # Geometry
@@ -184,16 +175,6 @@ def test_textures_are_bounded_before_they_are_decoded(tmp_path: Path, monkeypatc
         b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + chunk
     )
     assert "texture 'skin.png' claims more than 67108864 pixels" in refusal(path)
-
-
-def test_textures_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_obj(tmp_path / "a.obj")
-    quarters().save(tmp_path / "other.png")
-    path.with_suffix(".mtl").write_text("newmtl skin\nmap_Kd skin.png\nnewmtl back\nmap_Kd other.png\n")
-    path.write_text(path.read_text().replace("f 1 4 6 5", "f 1/1 4/2 6/3 5/4"))
-    monkeypatch.setattr("neuprim.tasks.static.mesh.surface.MAX_TEXELS", 300)
-    monkeypatch.setattr(materials, "MAX_TEXELS", 300)
-    assert "has 16x16 pixels; at most 300 of all textures are accepted" in refusal(path)
 
 
 # References

@@ -56,23 +56,6 @@ def test_a_simple_polygon_is_covered_once(name: str) -> None:
         assert area(polygon[triangles]) == pytest.approx(own_area(polygon), rel=1e-9) and not owner.any()
 
 
-def test_polygons_of_many_sizes_keep_their_order_and_their_corners() -> None:
-    polygons_ = [
-        np.array(shape, np.float64) + 20 * i
-        for i, shape in enumerate([U, [(0, 0), (1, 0), (0, 1)], SIMPLE["dart"], U, STAR])
-    ]
-    corners = np.pad(np.concatenate(polygons_), ((0, 0), (0, 1)))
-    sizes = np.array([len(p) for p in polygons_])
-    triangles, owner = triangulate_polygons(PATH, corners, sizes)
-    assert (np.diff(owner) >= 0).all()
-    for i, end in enumerate(np.cumsum(sizes)):
-        mine = triangles[owner == i]
-        assert mine.min() >= end - sizes[i] and mine.max() < end
-        assert area(corners[mine]) == pytest.approx(own_area(corners[end - sizes[i] : end]))
-    convex, _ = triangulate_polygons(PATH, np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), np.array([4]))
-    assert convex.tolist() == [[0, 1, 2], [0, 2, 3]]  # as other programs divide them
-
-
 def test_what_is_bent_is_covered_and_what_has_no_area_is_left_to_be_counted() -> None:
     bent = np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0.3], [1, 1, 0], [1, 2, 0.2], [0, 2, 0]])
     triangles, _ = triangulate_polygons(PATH, bent, np.array([6]))

@@ -77,15 +77,6 @@ def names(views: Any) -> list[str]:
     return [views.view(i).name for i in range(len(views))]
 
 
-def test_off_centre_pinhole(capture: Any, scenes: Any, context: Any) -> None:
-    data = load({"path": capture()}, context)
-    assert worst(scenes, data) < 0.02
-    assert data.train.pixels(0).mask is None and data.train.pixels(0).alpha is None
-    assert names(data.test) == ["00", "08"] and names(data.train) == ["01", "02", "03", "04", "05", "06", "07", "09"]
-    assert data.background.tolist() == [0.0] * 3
-    assert data.up[2] > 0.9 and data.center.norm() < 0.05
-
-
 @pytest.mark.parametrize(
     ("lens", "fields"),
     [
@@ -141,21 +132,6 @@ def test_per_frame_intrinsics_sizes_and_lenses(capture: Any, scenes: Any, contex
     data = load({"path": path, "downsample": 2}, context)
     assert worst(scenes, data) < 0.06 and data.downsampling == "1/2 by area"
     assert (data.train.view(3).camera.width, data.train.view(3).camera.height) == (40, 20)
-
-
-def test_field_of_view_stands_in_for_focal_lengths(capture: Any, context: Any) -> None:
-    path = capture()
-
-    def change(document: Any) -> None:
-        for key in PINHOLE:
-            del document[key]
-        document["camera_angle_x"] = 1.0
-
-    edit(path, change)
-    camera = load({"path": path}, context).train.view(0).camera
-    assert (camera.fx, camera.fy) == pytest.approx((32 / math.tan(0.5),) * 2) and (camera.cx, camera.cy) == (32, 25)
-    edit(path, lambda d: d.update(camera_angle_y=0.8))
-    assert load({"path": path}, context).train.view(0).camera.fy == pytest.approx(25 / math.tan(0.4))
 
 
 @pytest.mark.parametrize("per_frame", [True, False])

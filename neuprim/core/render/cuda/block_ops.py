@@ -53,7 +53,7 @@ def any_thread(yes: int) -> int:
 def _halving(width: int) -> str:
     """Every step keeps half of the values and adds those of a lane's partner: 31 shuffles per 32 values instead of 160.
 
-    A card tells a thread its lane again, so that no register has to keep it; positions are 64 bits, as rows of all
+    A GPU tells a thread its lane again, so that no register has to keep it; positions are 64 bits, as rows of all
     pairs may be billions.
 
     Lane l ends with values l m to l m + m - 1, m = width/32. Loops run over constants alone: over two counters they

@@ -3,8 +3,8 @@
 :mod:`neuprim.core.render.cpu.prepare`.
 
 Three differences of form: rows are float4 with the colours in them, neurons stay in the model's order, and TU and TV
-are 0 where a caller's
-``forced`` asks for float64, not only where this stage does. It also counts each primitive's tiles, see
+are 0 where a caller's ``forced`` asks for float64, not only where this stage does. It also counts each primitive's
+tiles, see
 :mod:`neuprim.core.render.cuda.binning`.
 """
 
@@ -146,8 +146,7 @@ def _outline(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.
             broad = wp.abs(o.xc) + wp.abs(o.skew) * (wp.abs(yc) + o.hy) + o.hx
             broad = wp.min(broad, wp.max(wp.abs(half - ux), wp.abs(d(width) - half - ux)))
             # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle
-            # each is many radii
-            # of its thin axis, and they cancel
+            # each is many radii of its thin axis, and they cancel
             slide = wp.abs(r.tu) * broad + wp.abs(r.tv) * tall
             if slide * (wp.sqrt(wp.dot(r.ex, r.ex)) * broad + wp.sqrt(wp.dot(r.ey, r.ey)) * tall) > _RADII:
                 o.in_float64 = 1
@@ -317,9 +316,8 @@ def prepare_kernel(double: bool) -> Any:
         if not wp.isfinite(total):
             state = int(_NON_FINITE)
         elif z + reach > near:
-            if (
-                biggest > _FLOAT32_MAX
-            ):  # so small against its distance that no pixel centre can hit it, or a scale or weight beyond float32
+            if biggest > _FLOAT32_MAX:
+                # so small against its distance that no pixel centre can hit it, or a scale or weight beyond float32
                 if m > d(1.0):
                     state = int(_NON_FINITE)
             else:

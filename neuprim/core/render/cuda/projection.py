@@ -25,7 +25,7 @@ EXACT = {**OPTIONS, "fuse_fp": False}
 the CPU, agree."""
 
 PER_BLOCK = 64
-"""Primitives of a block: float64 takes 163 registers, and a few more small blocks lie on a processor than large
+"""Primitives of a block: float64 takes 163 registers, and a few more small blocks fit on a multiprocessor than large
 ones."""
 
 d = wp.float64

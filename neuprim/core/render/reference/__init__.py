@@ -1,1 +1,1 @@
-"""The oracle: plain torch in float64, with autograd."""
+"""The reference backend: plain torch in float64, with autograd."""

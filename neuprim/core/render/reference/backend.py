@@ -1,8 +1,8 @@
-"""The oracle: the closed form of the method in plain torch, float64, with autograd.
+"""The reference: the closed form of the method in plain torch, float64, with autograd.
 
-Every other backend is judged against this file, so it stays close to the mathematics: whitened rays, the middle of the
-chord, one (cos, sinc) pair per neuron, front-to-back compositing. It is also the backend for densities and colours that
-do not lower to a form the fast kernels know.
+Every other backend is compared with this file, so it stays close to the mathematics: whitened rays, the middle of the
+chord, one (cos, sinc) pair per neuron, front-to-back compositing. It also draws densities and colours that do not lower
+to a form the kernels know.
 """
 
 from __future__ import annotations
@@ -68,8 +68,7 @@ class _Prepared:
         view = camera.viewmat.double()
         self.rotation = view[:3, :3]
         self.origin = -self.rotation.T @ view[:3, 3]
-        # one layout: the order of a product's sums, and the last bits of gradients, would follow that of its factors on
-        # some processors
+        # one layout: on some CPUs the order of a product's sums, and the last bits of gradients, depend on it
         means, log_scales, quats = (x.double().contiguous() for x in (g.means, g.log_scales, g.quats))
         first = log_scales.detach().argmax(dim=-1, keepdim=True)
         log_m = log_scales.gather(-1, first)
@@ -83,8 +82,7 @@ class _Prepared:
 
 
 def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
-    """Render a lowered model; see :func:`neuprim.core.render.render` for shapes. Computes in float64, returns the
-    model's dtype."""
+    """Draw a frame in float64 and return it in the model's dtype; see :data:`neuprim.core.render.draw.Draw`."""
     frame = _Prepared(lowered, camera)
     count = lowered.geometry.count
     seen = frame_rays(camera, lowered.geometry, frame.center, settings.near_plane)
@@ -148,9 +146,8 @@ def _trace(
     a = (v * v).sum(-1)
     tm = -(p * v).sum(-1) / a
     x = p + tm[:, None] * v
-    floor = (
-        settings.depth_floor if lowered.density.edge == 0 else 0.0
-    )  # a soft edge has finite gradients at the silhouette by itself
+    # a soft edge has finite gradients at the silhouette by itself
+    floor = settings.depth_floor if lowered.density.edge == 0 else 0.0
     h = _FlooredSqrt.apply(1 - (x * x).sum(-1), floor) / a.sqrt()
     m = frame.m[prim]
     t_near = rays.near[j] / m
@@ -160,9 +157,8 @@ def _trace(
     xm = p + mid[:, None] * v  # whitened chord middle
 
     world_d = dj @ frame.rotation
-    local = (frame.local[prim] @ (frame.axes[prim] * xm)[:, :, None])[
-        ..., 0
-    ]  # (x - mu)/m of the chord middle, scene axes
+    # (x - mu)/m of the chord middle, scene axes
+    local = (frame.local[prim] @ (frame.axes[prim] * xm)[:, :, None])[..., 0]
     pairs = Pairs(prim, world_d, local, half, frame.origin, t0, t1, mid, m, xm, v)
     optical_depth = lowered.optical_depth(pairs)
 
@@ -173,9 +169,8 @@ def _trace(
 
     # Front to back: composite, then stop once T < T_min. Rows are already sorted by depth of the centre.
     dense = torch.zeros(len(rows), P, dtype=torch.float64).index_put((i, j), alpha)
-    if (
-        settings.sort == "entry"
-    ):  # every ray by the depth of its entries; those that the near plane cuts are equal, and first
+    if settings.sort == "entry":
+        # every ray by the depth of its entries; those that the near plane cuts are equal, and first
         with torch.no_grad():
             entry = torch.where(tm - h > t_near, (tm - h) * m * rays.depth[j], torch.zeros_like(h))
             keys = torch.full_like(dense, torch.inf).index_put((i, j), entry)

@@ -27,7 +27,7 @@ from shared.tables import ROOT, Table, between_markers
 from shared.trials import Trial, begin, paces_of, recorded, run_all
 
 from neuprim.config import compose
-from neuprim.config.effort import LEVELS
+from neuprim.config.task_files import LEVELS
 from neuprim.core.compute.machine import cpu_name
 
 RESULTS = Path(__file__).parent / "results" / "effort"

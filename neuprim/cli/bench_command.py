@@ -44,7 +44,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _bench(args: argparse.Namespace) -> int:
     """List the tables, or run what stands for their rows."""
     from neuprim.cli.run_command import run_one
-    from neuprim.config.overrides import Typed
+    from neuprim.config.overrides import CommandLine
     from neuprim.runs.open import read_metrics
     from neuprim.runs.paper import plan, tables
 
@@ -62,7 +62,7 @@ def _bench(args: argparse.Namespace) -> int:
     results = []
     for number, one in enumerate(planned, 1):
         print(f"[{number}/{len(planned)}] {one.config.output_dir}", flush=True)
-        results.append((one, read_metrics(run_one(one.config, Typed(one.config.overrides)))))
+        results.append((one, read_metrics(run_one(one.config, CommandLine(one.config.overrides)))))
         print(*_result(*results[-1]), sep="\n", flush=True)
     print(*_means(results), _RULES, sep="\n")
     return 0

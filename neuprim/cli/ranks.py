@@ -75,11 +75,11 @@ def run_as_rank(place: Place, words: list[str], more: bool) -> int:
 def _composed(words: list[str], more: bool, group: Group) -> RunConfig:
     """The configuration; where the first rank writes is where the run is, as the others find its files there."""
     from neuprim.config import compose
-    from neuprim.config.launcher import launcher_words
-    from neuprim.config.target import target_words
-    from neuprim.config.viewer import viewer_words
+    from neuprim.config.launcher import take_launcher
+    from neuprim.config.target import take_target
+    from neuprim.config.viewer import take_viewer
 
-    elsewhere = any(len(split(words)[1]) < len(words) for split in (target_words, launcher_words, viewer_words))
+    elsewhere = any(len(split(words)[1]) < len(words) for split in (take_target, take_launcher, take_viewer))
     if group.first and (more or elsewhere):
         raise ConfigError(
             f"{group.size} processes of torchrun fit one scene together; expected neither -m, --config, --cfg, a target, a launcher, nor a viewer"
@@ -117,13 +117,13 @@ def _fit(config: RunConfig, words: Sequence[str], group: Group) -> bool:
     """Train, and on the first rank say so; returns False."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import RunProgress
-    from neuprim.config.overrides import Typed
+    from neuprim.config.overrides import CommandLine
     from neuprim.runs.events import silent
     from neuprim.runs.run import run
 
     place = group.place
     launcher = f"torchrun --nproc-per-node {place.local_size}" if place.size == place.local_size else "torchrun …"
-    command = f"{launcher} -m {shlex.join(['neuprim', 'run', *Typed(words).resuming(config.output_dir)])}"
+    command = f"{launcher} -m {shlex.join(['neuprim', 'run', *CommandLine(words).resume_arguments(config.output_dir)])}"
     try:
         if not group.first:
             with warnings.catch_warnings():

@@ -14,7 +14,7 @@ from neuprim.core.errors import ConfigError
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
     from neuprim.config.launcher import LauncherSettings
-    from neuprim.config.overrides import Typed
+    from neuprim.config.overrides import CommandLine
     from neuprim.config.viewer import ViewerSettings
 
 __all__ = ["COMMAND", "run_one"]
@@ -72,11 +72,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from neuprim.config import compose, compose_all, stored_config
-    from neuprim.config.launcher import LauncherSettings, launcher_words
-    from neuprim.config.overrides import Typed, without_place
-    from neuprim.config.target import target_words
-    from neuprim.config.viewer import viewer_words
+    from neuprim.config import compose, compose_all, read_stored_config
+    from neuprim.config.launcher import LauncherSettings, take_launcher
+    from neuprim.config.overrides import CommandLine, drop_place
+    from neuprim.config.target import take_target
+    from neuprim.config.viewer import take_viewer
     from neuprim.core.train.distributed.place import place_of
     from neuprim.runs.chunks.asked import asked, refuse_chunks
 
@@ -85,10 +85,10 @@ def _run(args: argparse.Namespace) -> int:
         from neuprim.cli.ranks import run_as_rank
 
         return run_as_rank(place, args.overrides, args.multirun or args.cfg or args.config is not None)
-    check, typed = not args.cfg, Typed(args.overrides, args.config)
-    viewer, words = viewer_words(args.overrides)
-    launcher, words = launcher_words(words)
-    wanted, words = target_words(words)
+    check, typed = not args.cfg, CommandLine(args.overrides, args.config)
+    viewer, words = take_viewer(args.overrides)
+    launcher, words = take_launcher(words)
+    wanted, words = take_target(words)
     elsewhere = launcher != LauncherSettings()
     beside = {"-m": args.multirun, "target": wanted is not None, "launcher": elsewhere}
     if viewer is not None and any(beside.values()):
@@ -97,12 +97,12 @@ def _run(args: argparse.Namespace) -> int:
         )
     if wanted is not None and args.multirun:
         raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
-    if args.multirun and not without_place(words):
+    if args.multirun and not drop_place(words):
         from neuprim.runs.sweep.record import begun_words
 
         words = begun_words(words)
-        typed = Typed([*words, *args.overrides], args.config)  # what goes on with it says all of it
-    stored = None if args.config is None else stored_config(args.config)
+        typed = CommandLine([*words, *args.overrides], args.config)  # what goes on with it says all of it
+    stored = None if args.config is None else read_stored_config(args.config)
     configs = compose_all(words, check, stored) if args.multirun else [compose(words, check, stored)]
     if args.cfg:
         if wanted is not None:
@@ -128,7 +128,10 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def run_one(
-    config: RunConfig, typed: Typed, viewer: ViewerSettings | None = None, launcher: LauncherSettings | None = None
+    config: RunConfig,
+    typed: CommandLine,
+    viewer: ViewerSettings | None = None,
+    launcher: LauncherSettings | None = None,
 ) -> Path:
     """Run one configuration in this process and return its directory.
 
@@ -153,7 +156,7 @@ def run_one(
     except KeyboardInterrupt:
         begun = any((config.output_dir / file).exists() for file in ("checkpoint.safetensors", "chunks.json"))
         there = "has the run up to here" if begun else "has no checkpoint yet"
-        command = shlex.join(["neuprim", "run", *typed.resuming(config.output_dir)])
+        command = shlex.join(["neuprim", "run", *typed.resume_arguments(config.output_dir)])
         raise KeyboardInterrupt(f"; {config.output_dir} {there}; to go on:\n  {command}") from None
 
 

@@ -11,7 +11,7 @@ from neuprim.cli.console import plain_console
 from neuprim.cli.launching import LaunchProgress
 from neuprim.config import RunConfig
 from neuprim.config.launcher import LauncherSettings
-from neuprim.config.overrides import Typed
+from neuprim.config.overrides import CommandLine
 from neuprim.runs.ground_truth import before_runs
 from neuprim.runs.launch.jobs import Result
 from neuprim.runs.launch.status import Status
@@ -22,7 +22,7 @@ from neuprim.runs.sweep.run import sweep_run
 __all__ = ["launch_one", "sweep"]
 
 
-def sweep(configs: Sequence[RunConfig], words: list[str], settings: LauncherSettings, typed: Typed) -> int:
+def sweep(configs: Sequence[RunConfig], words: list[str], settings: LauncherSettings, typed: CommandLine) -> int:
     """Launch all runs of a sweep; the exit status.
 
     Args:
@@ -38,7 +38,7 @@ def sweep(configs: Sequence[RunConfig], words: list[str], settings: LauncherSett
     return status
 
 
-def launch_one(config: RunConfig, settings: LauncherSettings, typed: Typed) -> int:
+def launch_one(config: RunConfig, settings: LauncherSettings, typed: CommandLine) -> int:
     """Launch one run somewhere else; the exit status."""
     shown = _Shown([config])
     with shown:
@@ -70,7 +70,7 @@ def _print_error(directory: Path, line: str) -> None:
     print(f"neuprim: error: {directory}: {line}", file=sys.stderr, flush=True)
 
 
-def _told(configs: Sequence[RunConfig], results: Sequence[Result | None], live: bool, typed: Typed) -> int:
+def _told(configs: Sequence[RunConfig], results: Sequence[Result | None], live: bool, typed: CommandLine) -> int:
     """Says what failed, and what is to be done after Ctrl-C; the exit status: 2 for the input's fault, 1 for a bug."""
     status = 0
     for config, result in zip(configs, results, strict=True):
@@ -95,7 +95,7 @@ def _told(configs: Sequence[RunConfig], results: Sequence[Result | None], live: 
     return status
 
 
-def _to_go_on(configs: Sequence[RunConfig], left: Sequence[RunConfig], typed: Typed) -> str:
+def _to_go_on(configs: Sequence[RunConfig], left: Sequence[RunConfig], typed: CommandLine) -> str:
     begun = [config.output_dir for config in left if (config.output_dir / "checkpoint.safetensors").exists()]
     if len(configs) == 1:
         where = f"{left[0].output_dir} {'has the run up to here' if begun else 'has no checkpoint yet'}"
@@ -104,4 +104,4 @@ def _to_go_on(configs: Sequence[RunConfig], left: Sequence[RunConfig], typed: Ty
         where = (
             f"{left[0].output_dir.parent} has {over} of {len(configs)} runs, and {len(begun)} of the others up to here"
         )
-    return f"; {where}; to go on:\n  {shlex.join(['neuprim', 'run', *typed.resuming(left[0].output_dir)])}"
+    return f"; {where}; to go on:\n  {shlex.join(['neuprim', 'run', *typed.resume_arguments(left[0].output_dir)])}"

@@ -11,7 +11,7 @@ from neuprim.cli.console import plain_console
 from neuprim.cli.progress import RunProgress
 from neuprim.config import RunConfig
 from neuprim.config.launcher import LauncherSettings
-from neuprim.config.overrides import Typed
+from neuprim.config.overrides import CommandLine
 from neuprim.config.target import Target
 from neuprim.runs.events import Event, Note, Step
 from neuprim.search.target import Record, target_run
@@ -31,14 +31,14 @@ class _Searching(RunProgress):
             self._stage = ""
 
 
-def fit_target(config: RunConfig, target: Target, budget: float, launcher: LauncherSettings, typed: Typed) -> int:
+def fit_target(config: RunConfig, target: Target, budget: float, launcher: LauncherSettings, typed: CommandLine) -> int:
     """Search and train; prints what was achieved and the run's directory."""
     console = plain_console(stderr=True)
     try:
         with _Searching(console, f"{config.task}/{config.scene_name}") as events:
             record = target_run(config, target, budget, events, launcher=launcher)
     except KeyboardInterrupt:
-        command = shlex.join(["neuprim", "run", *typed.resuming(config.output_dir)])
+        command = shlex.join(["neuprim", "run", *typed.resume_arguments(config.output_dir)])
         raise KeyboardInterrupt(f"; {config.output_dir} has the trials up to here; to go on:\n  {command}") from None
     print_record(record, console)
     print(record.achieved["run_dir"])

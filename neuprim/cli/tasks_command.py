@@ -67,7 +67,7 @@ def _note(report: PluginReport[Any]) -> str:
 
 def _task(spec: TaskSpec, added: list[PluginReport[SceneExtension]]) -> list[str]:
     from neuprim.config import check_groups, presets, task_choices
-    from neuprim.config.effort import LEVELS, levels_of
+    from neuprim.config.task_files import LEVELS, read_levels
 
     check_groups(spec)
     default = task_choices(spec)
@@ -76,7 +76,7 @@ def _task(spec: TaskSpec, added: list[PluginReport[SceneExtension]]) -> list[str
     width = max(len(name) for name, _ in rows)
     found = [("scenes", f"{name:{width}}  {text}") for name, text in rows]
     found.append(("presets", ", ".join(name + " (default)" * (name == default.preset) for name in presets(spec))))
-    levels = levels_of(spec, presets(spec))
+    levels = read_levels(spec, presets(spec))
     if levels is not None:
         found.append(("effort", f"{LEVELS[0]} (fast) to {LEVELS[-1]} (good), of preset {levels[LEVELS[0]].preset}"))
     if spec.conditions:

@@ -22,7 +22,7 @@ def tradeoff_models(args: argparse.Namespace) -> int:
     """Trains, measures, writes the set's folder and prints the fronts."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
-    from neuprim.config.launcher import launcher_words
+    from neuprim.config.launcher import take_launcher
     from neuprim.config.overrides import parse
     from neuprim.search.design.record import Model, command
     from neuprim.search.design.run import DesignRequest, design_run
@@ -34,7 +34,7 @@ def tradeoff_models(args: argparse.Namespace) -> int:
         *(word for word in args.knobs if "=" in word),
     ]  # after --knobs they look like names
     knobs = [word for word in args.knobs if "=" not in word]
-    launcher, words = launcher_words(words)
+    launcher, words = take_launcher(words)
     said = [str(a.value) for a in parse(words) if a.key == "budget"]
     if said and args.budget is not None:
         raise ConfigError(f"budget={said[-1]} and --budget {args.budget}: expected one of them")

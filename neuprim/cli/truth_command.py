@@ -31,10 +31,10 @@ def _truth(args: argparse.Namespace) -> int:
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import RunProgress
     from neuprim.config import compose, compose_all
-    from neuprim.config.launcher import launcher_words
+    from neuprim.config.launcher import take_launcher
     from neuprim.runs.ground_truth import make_truth
 
-    launcher, rest = launcher_words(args.overrides)
+    launcher, rest = take_launcher(args.overrides)
     configs = compose_all(rest) if args.multirun else [compose(rest)]
     try:
         for config in configs:

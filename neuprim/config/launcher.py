@@ -1,8 +1,4 @@
-"""The words that say where runs work: ``launcher=processes launcher.workers=4``.
-
-Like the words of a target they stand among those after ``neuprim run`` and are taken out of them here: where a run
-works changes nothing of what it makes, so that its configuration does not know.
-"""
+"""Settings of where runs work, ``launcher=processes launcher.workers=4``; they change nothing of what a run makes."""
 
 from __future__ import annotations
 
@@ -11,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, get_args
 
-from neuprim.config.overrides import key_of, parse, swept_keys
+from neuprim.config.overrides import take_group
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.core.validation import Range, validate, validate_fields
+from neuprim.core.validation import Range, format_value, validate, validate_fields
 
-__all__ = ["LAUNCHERS", "LauncherSettings", "launcher_words"]
+__all__ = ["LAUNCHERS", "LauncherSettings", "take_launcher"]
 
 Name = Literal["inline", "processes", "ray", "slurm"]
 LAUNCHERS: tuple[str, ...] = get_args(Name)
@@ -29,13 +25,11 @@ class LauncherSettings:
     Attributes:
         name: one of :data:`LAUNCHERS`.
         workers: runs at once; None: as many as there are, and as the cores of this machine or the cluster allow.
-        threads: of each run; None: the cores are shared out.
-        retries: how often a run goes on from its checkpoint after its worker died.
-        address: of Ray, as ``ray.init`` takes it: ``auto``, ``HOST:PORT``, ``ray://HOST:PORT``; of Slurm, submitit's
-        name of an executor: ``slurm`` or
-            ``local``. None: the Ray of ``RAY_ADDRESS``, else one on this machine; Slurm.
-        options: handed to the engine: Ray's options of a task, such as ``num_gpus``; submitit's parameters, such as
-        ``slurm_partition``.
+        threads: of each run; None shares the cores.
+        retries: how often a run continues from its checkpoint after its worker died.
+        address: of Ray, as ``ray.init`` takes it; of Slurm, submitit's executor ("slurm" or "local"). None: the Ray of
+            ``RAY_ADDRESS``, else one on this machine; Slurm.
+        options: for the engine: Ray's options of a task, such as ``num_gpus``; submitit's, such as ``slurm_partition``.
     """
 
     name: Name = "inline"
@@ -55,54 +49,30 @@ class LauncherSettings:
         return {name: value for name, value in every.items() if name == "name" or value != getattr(default, name)}
 
 
-_NAMES = tuple(f.name for f in dataclasses.fields(LauncherSettings) if f.name != "name")
-
-
-def launcher_words(words: Sequence[str]) -> tuple[LauncherSettings, list[str]]:
-    """What the words say of the launcher, and the other words.
+def take_launcher(overrides: Sequence[str]) -> tuple[LauncherSettings, list[str]]:
+    """Return the launcher that overrides ask for, and the other overrides.
 
     Raises:
         ConfigError: no such launcher or setting of it, an impossible value, or one that this launcher does not use.
     """
-    own = [word for word in words if _is_own(word)]
-    for key in swept_keys(own):
-        raise ConfigError(f"{key}: several values; expected one, as all runs have one launcher")
-    given: dict[str, Any] = {}
-    options: dict[str, Any] = {}
-    for said in parse(own):
-        _, _, name = said.key.partition(".")
-        if name.startswith("options."):
-            options[name.removeprefix("options.")] = said.value
-        elif not name:
-            if said.value not in LAUNCHERS:
-                raise ConfigError(f"{said.text}: no such launcher{nearest(str(said.value), LAUNCHERS)}")
-            given["name"] = said.value
-        elif name not in _NAMES or name == "options":
-            raise ConfigError(f"{said.text}: no such setting{nearest(said.key, [f'launcher.{n}' for n in _NAMES])}")
-        else:
-            given[name] = said.value
-    settings = validate(LauncherSettings, {**given, "options": options}, "launcher")
-    _check(settings)
-    return settings, [word for word in words if not _is_own(word)]
+    values, others = take_group(overrides, "launcher")
+    if "" in values:
+        name = values.pop("")
+        if name not in LAUNCHERS:
+            raise ConfigError(f"launcher={format_value(name)}: no such launcher{nearest(str(name), LAUNCHERS)}")
+        values["name"] = name
+    settings = validate(LauncherSettings, values, "launcher")
+    _refuse_unused(settings)
+    return settings, others
 
 
-def _check(settings: LauncherSettings) -> None:
-    """Refuses what a launcher has no use for: a word that does nothing would be taken for one that does."""
-    unused = {
-        "inline": ("workers", "retries", "address", "options"),
-        "processes": ("address", "options"),
-    }.get(settings.name, ())
+def _refuse_unused(settings: LauncherSettings) -> None:
+    """Refuse a setting that the launcher does not use: it would look as if it did something."""
+    users = dict.fromkeys(("address", "options"), "ray or launcher=slurm")
+    users |= dict.fromkeys(("workers", "retries"), "processes, launcher=ray or launcher=slurm")
+    unused = {"inline": tuple(users), "processes": ("address", "options")}.get(settings.name, ())
     for name in unused:
         if name in settings.given():
             raise ConfigError(
-                f"launcher.{name}: launcher={settings.name} has no use for it; expected it with launcher={_who_uses(name)}"
+                f"launcher.{name}: launcher={settings.name} does not use it; expected it with launcher={users[name]}"
             )
-
-
-def _who_uses(name: str) -> str:
-    return "ray or launcher=slurm" if name in ("address", "options") else "processes, launcher=ray or launcher=slurm"
-
-
-def _is_own(word: str) -> bool:
-    key = key_of(word)
-    return key == "launcher" or key.startswith("launcher.")

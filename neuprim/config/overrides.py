@@ -13,15 +13,15 @@ from neuprim.core.errors import ConfigError
 
 __all__ = [
     "Assignment",
-    "Typed",
-    "assigned",
+    "CommandLine",
+    "drop_place",
     "expand_sweep",
     "key_of",
     "parse",
     "sweep_names",
     "swept_keys",
-    "without_place",
-    "word",
+    "quote_override",
+    "take_group",
 ]
 
 NOT_SWEPT = ("output_dir", "resume")
@@ -93,9 +93,12 @@ def sweep_names(overrides: Sequence[str], combinations: Sequence[Sequence[str]])
     return names
 
 
-def assigned(key: str, value: str) -> str:
-    """``key=value`` as :func:`parse` reads it back, the value quoted where it would be taken for something else than
-    text."""
+def quote_override(key: str, value: Any) -> str:
+    """Return ``key=value`` as :func:`parse` reads it back; text that would be read as something else is quoted."""
+    if value is None:
+        return f"{key}=null"
+    if not isinstance(value, str):
+        return f"{key}={str(value).lower() if isinstance(value, bool) else repr(value)}"
     plain = f"{key}={value}"
     try:
         if value and parse([plain])[0].value == value:
@@ -105,32 +108,45 @@ def assigned(key: str, value: str) -> str:
     return f"{key}='" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + ("\\'" if m[2] else ""), value) + "'"
 
 
-def word(key: str, value: Any) -> str:
-    """``key=value`` as the grammar of words reads it back."""
-    if isinstance(value, str):
-        return assigned(key, value)
-    if value is None:
-        return f"{key}=null"
-    return f"{key}={str(value).lower() if isinstance(value, bool) else repr(value)}"
-
-
 @dataclass(frozen=True)
-class Typed:
-    """What was typed after ``neuprim run``: words, and the file of ``--config``."""
+class CommandLine:
+    """What was typed after ``neuprim run``: overrides, and the file of ``--config``."""
 
-    words: Sequence[str]
+    overrides: Sequence[str]
     file: Path | None = None
 
-    def resuming(self, directory: Path) -> list[str]:
-        """The words that go on with what these began: a run in ``directory``, or the sweep it is a part of."""
-        sweep = bool(swept_keys(self.words))
-        words = without_place(self.words)
+    def resume_arguments(self, directory: Path) -> list[str]:
+        """Return the arguments that continue what these began: a run in ``directory``, or the sweep it is a part of."""
+        sweep = bool(swept_keys(self.overrides))
+        words = drop_place(self.overrides)
         if not words and self.file is None and not (directory / "config.yaml").is_file():
-            words = [
-                "task=static"
-            ]  # nothing was said and nothing is written yet: the default, which a bare resume=true does not begin
+            words = ["task=static"]  # the default, which a bare resume=true does not begin
         flags = [*(["-m"] if sweep else []), *([] if self.file is None else ["--config", str(self.file)])]
-        return [*flags, *words, assigned("output_dir", str(directory.parent if sweep else directory)), "resume=true"]
+        place = str(directory.parent if sweep else directory)
+        return [*flags, *words, quote_override("output_dir", place), "resume=true"]
+
+
+def take_group(overrides: Sequence[str], group: str) -> tuple[dict[str, Any], list[str]]:
+    """Take the settings of one group out of overrides.
+
+    Returns:
+        Name -> value, the value of ``group=VALUE`` under "", and entries ``group.name.key=VALUE`` as a mapping; and the
+        other overrides.
+
+    Raises:
+        ConfigError: several values for one setting.
+    """
+    own = [word for word in overrides if key_of(word).partition(".")[0] == group]
+    for key in swept_keys(own):
+        raise ConfigError(f"{key}: several values; expected one")
+    values: dict[str, Any] = {}
+    for assignment in parse(own):
+        name, _, entry = assignment.key.partition(".")[2].partition(".")
+        if entry:
+            values.setdefault(name, {})[entry] = assignment.value
+        else:
+            values[name] = assignment.value
+    return values, [word for word in overrides if word not in own]
 
 
 def key_of(word: str) -> str:
@@ -138,7 +154,7 @@ def key_of(word: str) -> str:
     return word.partition("=")[0].strip().lstrip("+")
 
 
-def without_place(overrides: Iterable[str]) -> list[str]:
+def drop_place(overrides: Iterable[str]) -> list[str]:
     """The words that say what is made, and not where or whether it goes on."""
     return [word for word in overrides if key_of(word) not in NOT_SWEPT]
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuprim.config.record import RunConfig
+from neuprim.config.run_config import RunConfig
 from neuprim.plugins.blame import Suspects
 from neuprim.plugins.names import qualified
 from neuprim.plugins.provenance import MadeBy, Maker, load_recorded

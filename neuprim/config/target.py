@@ -1,22 +1,18 @@
-"""The words that ask for a result instead of a configuration: ``target.psnr=30 budget=10m``.
-
-They stand among the words after ``neuprim run`` and are taken out of them here; what is left composes to the
-configuration that the search starts from.
-"""
+"""A result asked for instead of a configuration, ``target.psnr=30 budget=10m``: a search finds the configuration."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
-from neuprim.config.duration import seconds_of
-from neuprim.config.overrides import Assignment, key_of, parse, swept_keys
-from neuprim.core.errors import ConfigError, nearest
+from neuprim.config.overrides import take_group
+from neuprim.core.errors import ConfigError
 from neuprim.core.validation import Range, format_value, validate
 
-__all__ = ["Target", "target_words"]
+__all__ = ["Target", "parse_duration", "take_target"]
 
 
 @dataclass(frozen=True)
@@ -49,56 +45,50 @@ class Target:
         return " ".join(f"target.{name}={value:g}" for name, value in self.given().items())
 
 
-NAMES = tuple(field.name for field in dataclasses.fields(Target))
-
-
-def target_words(words: Sequence[str]) -> tuple[tuple[Target, float] | None, list[str]]:
-    """The target and its budget, seconds, and the other words; None where no target is asked for.
+def take_target(overrides: Sequence[str]) -> tuple[tuple[Target, float] | None, list[str]]:
+    """Return the target and its budget in seconds, None where none is asked for, and the other overrides.
 
     Raises:
         ConfigError: a target without a budget or the reverse, no such target, or an impossible value.
     """
-    own = [word for word in words if _is_own(word)]
-    if not own:
-        return None, list(words)
-    for key in swept_keys(own):
-        raise ConfigError(f"{key}: several values; expected one, as a target is for one run")
-    said = {a.key: a for a in parse(own)}
-    budget = said.pop("budget", None)
-    if not said:
-        assert budget is not None
+    values, others = take_group(overrides, "target")
+    budgets, others = take_group(others, "budget")
+    if not values and not budgets:
+        return None, others
+    if budgets.keys() - {""}:
+        raise ConfigError(f"budget.{next(iter(budgets.keys() - {''}))}: no such setting; did you mean 'budget'?")
+    budget = budgets.get("")
+    if not values:
         raise ConfigError(
-            f"{budget.text}: no target; expected one of {_choices()} beside it, or train.max_seconds=S for a run without a target"
+            f"budget={format_value(budget)}: no target; expected one of {_CHOICES} beside it, "
+            "or train.max_seconds=S for a run without a target"
         )
-    given = {_name(a): a.value for a in said.values()}
-    target = validate(Target, given, "target")
+    if "" in values:
+        raise ConfigError(f"target={format_value(values[''])}: expected one of {_CHOICES}")
+    target = validate(Target, values, "target")
     if not target.given():
-        raise ConfigError(f"{next(iter(said.values())).text}: expected one of {_choices()}")
-    if budget is None:
+        raise ConfigError(f"target.{next(iter(values))}=null: expected one of {_CHOICES}")
+    if not budgets:
         raise ConfigError(
             f"{target}: expected a budget beside it, the time for search and training together, such as budget=10m"
         )
-    if not isinstance(budget.value, str):
-        raise ConfigError(f"budget={format_value(budget.value)}: expected a time such as 90s, 5m or 1h")
-    return (target, seconds_of(budget.value, budget.text)), [word for word in words if not _is_own(word)]
+    text = format_value(budget)
+    return (target, parse_duration(budget if isinstance(budget, str) else "", f"budget={text}")), others
 
 
-def _is_own(word: str) -> bool:
-    key = key_of(word)
-    return key in ("budget", "target") or key.startswith(("target.", "budget."))
+def parse_duration(text: str, asked: str) -> float:
+    """Return the seconds of a time such as 90s, 5m or 1h.
+
+    Args:
+        asked: what the user typed, for the message.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
+    if match is None or float(match[1]) == 0:
+        raise ConfigError(f"{asked}: expected a time such as 90s, 5m or 1h")
+    return float(match[1]) * {"s": 1.0, "m": 60.0, "h": 3600.0}[match[2]]
 
 
-def _name(assignment: Assignment) -> str:
-    head, _, name = assignment.key.partition(".")
-    if head == "budget":
-        raise ConfigError(f"{assignment.text}: no such setting; did you mean 'budget'?")
-    if not name:
-        raise ConfigError(f"{assignment.text}: expected one of {_choices()}")
-    if name not in NAMES:
-        raise ConfigError(f"{assignment.key}: no such target{nearest(name, NAMES)}")
-    return name
-
-
-def _choices() -> str:
-    values: dict[str, Any] = {"psnr": "DB", "ssim": "S", "megabytes": "M", "fps": "F"}
-    return ", ".join(f"target.{name}={values[name]}" for name in NAMES)
+_CHOICES = "target.psnr=DB, target.ssim=S, target.megabytes=M, target.fps=F"

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from neuprim.config.record import RunConfig
+from neuprim.config.run_config import RunConfig
 from neuprim.core.errors import ConfigError, cut
 from neuprim.core.io.trust import ENVIRONMENT, FLAG, trusted
 

@@ -1,21 +1,15 @@
-"""The words that ask for a viewer beside a training: ``viewer=true viewer.port=8080``.
-
-They say nothing about the run itself, so they are taken out of the words after ``neuprim run`` here and no file keeps
-them.
-"""
+"""Settings of the live viewer of a training, ``viewer=true viewer.port=8080``; no file of a run has them."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from neuprim.config.overrides import key_of, parse, swept_keys
-from neuprim.core.errors import ConfigError, nearest
+from neuprim.config.overrides import take_group
 from neuprim.core.validation import Range, coerce, nonempty_text, validate, validate_fields
 
-__all__ = ["LOOPBACK", "ViewerSettings", "viewer_words"]
+__all__ = ["LOOPBACK", "ViewerSettings", "take_viewer"]
 
 LOOPBACK = "127.0.0.1"
 
@@ -36,29 +30,13 @@ class ViewerSettings:
         validate_fields(self, "viewer")
 
 
-def viewer_words(words: Sequence[str]) -> tuple[ViewerSettings | None, list[str]]:
-    """The viewer that is asked for, None for none, and the other words. A word about its host or port asks for it, too.
+def take_viewer(overrides: Sequence[str]) -> tuple[ViewerSettings | None, list[str]]:
+    """Return the viewer that is asked for, None for none, and the other overrides; a host or port asks for one, too.
 
     Raises:
         ConfigError: no such setting, several values, or an impossible one.
     """
-    own = [word for word in words if _is_own(word)]
-    for key in swept_keys(own):
-        raise ConfigError(f"{key}: several values; expected one")
-    wanted, given = bool(own), {}
-    for assignment in parse(own):
-        head, dot, name = assignment.key.partition(".")
-        if not dot:
-            wanted = coerce(assignment.value, bool, "viewer")
-        else:
-            names = [field.name for field in dataclasses.fields(ViewerSettings)]
-            if name not in names:
-                raise ConfigError(f"{assignment.key}: no such setting{nearest(name, names, prefix=f'{head}.')}")
-            given[name] = assignment.value
-    settings = validate(ViewerSettings, given, "viewer")
-    return (settings if wanted else None), [word for word in words if not _is_own(word)]
-
-
-def _is_own(word: str) -> bool:
-    key = key_of(word)
-    return key == "viewer" or key.startswith("viewer.")
+    values, others = take_group(overrides, "viewer")
+    wanted = coerce(values.pop("", bool(values)), bool, "viewer")
+    settings = validate(ViewerSettings, values, "viewer")
+    return (settings if wanted else None), others

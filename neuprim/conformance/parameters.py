@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from neuprim.config import check_groups, preset_settings, presets, task_choices
-from neuprim.config.declared import complete_options
-from neuprim.config.effort import Level, levels_of
+from neuprim.config.checks import complete_options
+from neuprim.config.task_files import Level, read_levels
 from neuprim.conformance.subject import Subject
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.geometry import GEOMETRY_SPECS
@@ -46,7 +46,7 @@ def check_files(t: Subject) -> None:
     check_groups(t.task)
     choice = task_choices(t.task)
     known = t.task.parameter_names() | {s.name for s in GEOMETRY_SPECS}
-    levels = levels_of(t.task, presets(t.task)) or {}
+    levels = read_levels(t.task, presets(t.task)) or {}
     chosen: list[tuple[str, str, Level | None]] = [(f"preset {preset}", preset, None) for preset in presets(t.task)]
     chosen += [(f"effort {number}", level.preset, level) for number, level in levels.items()]
     for where, preset, level in chosen:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from neuprim.config.overrides import assigned, parse
+from neuprim.config.overrides import parse, quote_override
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.checkpoint import read_header
 from neuprim.core.compression import is_compressed
@@ -256,5 +256,5 @@ def _check_format(group: str, name: Any) -> str:
 
 def _override(key: str, value: Any) -> str:
     if isinstance(value, str):
-        return assigned(key, value)
+        return quote_override(key, value)
     return f"{key}={str(value).lower() if isinstance(value, bool) else repr(value).removesuffix('.0')}"

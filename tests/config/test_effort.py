@@ -11,7 +11,7 @@ import yaml
 
 from neuprim.cli.tasks_command import list_plugins
 from neuprim.config import RunConfig, compose, compose_all, presets
-from neuprim.config.effort import LEVELS, levels_of
+from neuprim.config.task_files import LEVELS, read_levels
 from neuprim.conformance import ConformanceError, named_checks
 from neuprim.core.errors import ConfigError
 from neuprim.plugins.registry import load_task
@@ -171,7 +171,7 @@ def test_conformance_holds_packages_to_their_levels(levels: Path) -> None:
 def test_levels_are_points_that_were_measured(name: str) -> None:
     """Each is a model that was trained in its time or less; a level is never worse than the one before, nor faster."""
     spec = load_task(name)
-    levels = levels_of(spec, presets(spec))
+    levels = read_levels(spec, presets(spec))
     assert levels is not None
     trials = json.loads((RECORDS / f"{MEASURED[name]}.json").read_text())["trials"]
     seen = []

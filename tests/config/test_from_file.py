@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from neuprim.cli import main
-from neuprim.config import RunConfig, compose, compose_all, stored_config
+from neuprim.config import RunConfig, compose, compose_all, read_stored_config
 from neuprim.core.errors import ConfigError
 
 WORDS = [
@@ -33,7 +33,7 @@ def stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunConfig:
     config = replace(config, train=replace(config.train, log_every=17, rates={"means": 0.5}))
     Path("first").mkdir()
     Path("first/config.yaml").write_text(config.to_yaml())
-    return stored_config(Path("first"))
+    return read_stored_config(Path("first"))
 
 
 def settings(config: RunConfig) -> dict[str, object]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from neuprim.config.launcher import LauncherSettings, launcher_words
+from neuprim.config.launcher import LauncherSettings, take_launcher
 from neuprim.core.errors import ConfigError
 
 
 def test_they_are_taken_out_and_the_others_stay() -> None:
-    settings, rest = launcher_words(
+    settings, rest = take_launcher(
         ["task=static", "launcher=slurm", "seed=1,2", "launcher.threads=4", "launcher.options.slurm_partition=gpu"]
     )
     assert settings == LauncherSettings("slurm", threads=4, options={"slurm_partition": "gpu"}) and rest == [
@@ -17,7 +17,7 @@ def test_they_are_taken_out_and_the_others_stay() -> None:
         "seed=1,2",
     ]
     assert settings.given() == {"name": "slurm", "threads": 4, "options": {"slurm_partition": "gpu"}}
-    assert launcher_words(["seed=1"]) == (LauncherSettings(), ["seed=1"])
+    assert take_launcher(["seed=1"]) == (LauncherSettings(), ["seed=1"])
 
 
 @pytest.mark.parametrize(
@@ -49,5 +49,5 @@ def test_they_are_taken_out_and_the_others_stay() -> None:
 )
 def test_one_line_for_what_is_wrong(words: list[str], message: str) -> None:
     with pytest.raises(ConfigError) as error:
-        launcher_words(words)
+        take_launcher(words)
     assert message in str(error.value) and "\n" not in str(error.value)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from neuprim.config.duration import seconds_of
-from neuprim.config.target import Target, target_words
+from neuprim.config.target import Target, parse_duration, take_target
 from neuprim.core.errors import ConfigError
 
 
 def test_words_are_taken_out_of_the_others() -> None:
-    found, rest = target_words(
+    found, rest = take_target(
         ["task=static", "target.psnr=30", "model.primitives=100", "+target.megabytes=1.5", "budget=10m"]
     )
     assert found == (Target(psnr=30, megabytes=1.5), 600.0)
@@ -19,14 +18,14 @@ def test_words_are_taken_out_of_the_others() -> None:
 
 
 def test_other_words_are_left_alone() -> None:
-    assert target_words(["model.primitives=1,2", "scene.path='a,b'"]) == (
+    assert take_target(["model.primitives=1,2", "scene.path='a,b'"]) == (
         None,
         ["model.primitives=1,2", "scene.path='a,b'"],
     )
 
 
 def test_the_last_of_equal_words_counts() -> None:
-    assert target_words(["target.fps=30", "budget=1h", "target.fps=60", "budget=1.5m"])[0] == (Target(fps=60), 90.0)
+    assert take_target(["target.fps=30", "budget=1h", "target.fps=60", "budget=1.5m"])[0] == (Target(fps=60), 90.0)
 
 
 @pytest.mark.parametrize(
@@ -49,11 +48,11 @@ def test_the_last_of_equal_words_counts() -> None:
 )
 def test_what_makes_no_sense_is_refused(words: list[str], message: str) -> None:
     with pytest.raises(ConfigError) as refused:
-        target_words(words)
+        take_target(words)
     assert message in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_times_in_words() -> None:
-    assert [seconds_of(text, text) for text in ("90s", "10m", "1.5h")] == [90.0, 600.0, 5400.0]
+    assert [parse_duration(text, text) for text in ("90s", "10m", "1.5h")] == [90.0, 600.0, 5400.0]
     with pytest.raises(ConfigError, match="--budget 5 m: expected a time"):
-        seconds_of("5 m", "--budget 5 m")
+        parse_duration("5 m", "--budget 5 m")

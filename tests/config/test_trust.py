@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from neuprim.cli import main
-from neuprim.config import RunConfig, compose, stored_config
+from neuprim.config import RunConfig, compose, read_stored_config
 from neuprim.config.trust import check_stored, refuse_links
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.io.trust import ENVIRONMENT, trusting
@@ -21,7 +21,7 @@ def stored(folder: Path, *words: str) -> RunConfig:
     """Of a run that somebody else made."""
     folder.mkdir()
     (folder / "config.yaml").write_text(compose([*words, f"output_dir={folder}"]).to_yaml())
-    return stored_config(folder)
+    return read_stored_config(folder)
 
 
 @pytest.mark.parametrize(

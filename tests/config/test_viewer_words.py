@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neuprim.config.viewer import LOOPBACK, ViewerSettings, viewer_words
+from neuprim.config.viewer import LOOPBACK, ViewerSettings, take_viewer
 from neuprim.core.errors import ConfigError
 
 
@@ -19,7 +19,7 @@ from neuprim.core.errors import ConfigError
     ],
 )
 def test_words_about_the_viewer_are_taken_out(words: list[str], found: ViewerSettings | None) -> None:
-    assert viewer_words(["task=static", *words, "seed=1"]) == (found, ["task=static", "seed=1"])
+    assert take_viewer(["task=static", *words, "seed=1"]) == (found, ["task=static", "seed=1"])
 
 
 @pytest.mark.parametrize(
@@ -33,4 +33,4 @@ def test_words_about_the_viewer_are_taken_out(words: list[str], found: ViewerSet
 )
 def test_words_that_make_no_sense(words: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        viewer_words(words)
+        take_viewer(words)

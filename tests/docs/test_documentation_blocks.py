@@ -17,10 +17,10 @@ from neuprim.cli import COMMANDS
 from neuprim.cli.render_overrides import split_render_overrides
 from neuprim.cli.tradeoff_command import of_words
 from neuprim.config import compose, compose_all
-from neuprim.config.launcher import launcher_words
-from neuprim.config.overrides import without_place
-from neuprim.config.target import target_words
-from neuprim.config.viewer import viewer_words
+from neuprim.config.launcher import take_launcher
+from neuprim.config.overrides import drop_place
+from neuprim.config.target import take_target
+from neuprim.config.viewer import take_viewer
 from neuprim.core.cameras.camera_files import read_cameras
 from neuprim.core.conditions import read_conditions, split_words
 from neuprim.core.data.dataset_check import check_dataset
@@ -188,21 +188,21 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
     settings = [*getattr(args, "overrides", []), *(word for word in rest if not word.startswith("-"))]
     flags = [word for word in rest if word.startswith("-")]
     if name == "run":
-        for take in (viewer_words, launcher_words, target_words):
+        for take in (take_viewer, take_launcher, take_target):
             _, settings = take(settings)
-        if (args.multirun and not without_place(settings)) or args.config is not None:
+        if (args.multirun and not drop_place(settings)) or args.config is not None:
             settings = ["task=static", *settings]  # the others are in a file
         (compose_all if args.multirun else compose)(settings, False)
         rest = flags
     elif name == "truth":
-        (compose_all if args.multirun else compose)(launcher_words(settings)[1], False)
+        (compose_all if args.multirun else compose)(take_launcher(settings)[1], False)
         rest = flags
     elif name == "bench":
         compose(["scene=blender", "scene.path=DIR", *settings], False)
         rest = flags
     elif name == "tradeoff" and of_words(args.run_dir):
         typed = [word for word in (args.run_dir, *settings) if not word.startswith("budget=")]
-        compose(launcher_words(typed)[1], False)
+        compose(take_launcher(typed)[1], False)
         rest = flags
     elif name in ("eval", "render", "tradeoff"):
         _, rest = split_render_overrides(rest)

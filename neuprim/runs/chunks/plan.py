@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig, scene_of, suspects_of, task_of
-from neuprim.config.overrides import without_place, word
+from neuprim.config.overrides import drop_place, quote_override
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import Chunks
 from neuprim.plugins.blame import blamed
@@ -122,5 +122,8 @@ def _changed(config: RunConfig, settings: dict[str, Any], directory: Path) -> Ru
         tree["non_default"][key] = [node.get(name), value]
         node[name] = value
     tree["output_dir"] = str(directory)
-    tree["overrides"] = [*without_place(config.overrides), *(word(key, value) for key, value in settings.items())]
+    tree["overrides"] = [
+        *drop_place(config.overrides),
+        *(quote_override(key, value) for key, value in settings.items()),
+    ]
     return RunConfig.from_dict(tree)

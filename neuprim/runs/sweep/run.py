@@ -10,7 +10,7 @@ from pathlib import Path
 
 from neuprim.config import RunConfig
 from neuprim.config.launcher import LauncherSettings
-from neuprim.config.overrides import parse, swept_keys, without_place
+from neuprim.config.overrides import drop_place, parse, swept_keys
 from neuprim.report.sweep import write_sweep
 from neuprim.runs.ground_truth import before_runs
 from neuprim.runs.launch.engine import Hear
@@ -50,7 +50,7 @@ def sweep_run(
         OSError: the sweep's own files cannot be written.
     """
     folder = configs[0].output_dir.parent
-    asked = SweepRecord(tuple(without_place(words)), tuple(_row(config, words) for config in configs))
+    asked = SweepRecord(tuple(drop_place(words)), tuple(_row(config, words) for config in configs))
     before = read_sweep(folder) if configs[0].resume else None
     record = asked.beside(before, folder / FILE)
     todo = [n for n, config in enumerate(configs) if not _is_done(record.rows[n], config)]
@@ -106,7 +106,7 @@ class _Keeper:
 
 
 def _row(config: RunConfig, words: Sequence[str]) -> Row:
-    own = without_place(config.overrides)
+    own = drop_place(config.overrides)
     keys = set(swept_keys(words))
     return Row(
         config.output_dir.name, tuple(own), {a.key: a.text.partition("=")[2] for a in parse(own) if a.key in keys}

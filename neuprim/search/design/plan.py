@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from neuprim.config import RunConfig
-from neuprim.config.overrides import parse, word
+from neuprim.config.overrides import parse, quote_override
 from neuprim.core.errors import ConfigError
 from neuprim.search.design.variants import LENGTH, Variant, merged
 
@@ -48,7 +48,7 @@ class Plan:
         """
         steps = self.steps_of(variant)
         said = {assignment.key for assignment in parse(words)}
-        budget = [word(LENGTH, steps)]
+        budget = [quote_override(LENGTH, steps)]
         if centre.train.max_seconds is not None:
             budget.append("train.max_seconds=null")
         every = "train.population.every"
@@ -58,7 +58,7 @@ class Plan:
             else centre.train.population.every
         )
         if every not in said and scaled != centre.train.population.every:
-            budget.append(word(every, scaled))
+            budget.append(quote_override(every, scaled))
         return merged(words, [*variant.turned, *budget])
 
     def knowing(self, variant: Variant, pace: float) -> Plan:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from neuprim.config import RunConfig, compose
-from neuprim.config.overrides import assigned, parse, word
+from neuprim.config.overrides import parse, quote_override
 from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.data import Dataset
 from neuprim.core.errors import NeuprimError
@@ -286,7 +286,10 @@ class Session:
     def _trial(self, variant: Variant, seed: int) -> Trial:
         words = self._words_of(variant)
         quiet = [] if any(a.key == "train.eval_every" for a in parse(words)) else ["train.eval_every=0"]
-        own = [word("seed", self.centre.seed + seed), assigned("output_dir", str(self._run_dir(variant, seed)))]
+        own = [
+            quote_override("seed", self.centre.seed + seed),
+            quote_override("output_dir", str(self._run_dir(variant, seed))),
+        ]
         return Trial(compose(merged(words, [*quiet, *own]), check_output=False), views=self.request.views)
 
     def _look(self, variant: Variant, outcomes: Sequence[Outcome]) -> None:

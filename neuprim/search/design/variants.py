@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import zip_longest
 
 from neuprim.config import RunConfig
-from neuprim.config.overrides import parse, word
+from neuprim.config.overrides import parse, quote_override
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.task import TaskSpec
 from neuprim.core.used_settings import build_settings
@@ -71,7 +71,7 @@ def singles(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]:
     counts = dict.fromkeys(max(1, round(part * centre.model.primitives)) for part in _PARTS["model.primitives"])
     found: dict[str, list[Variant]] = {
         "model.primitives": [
-            Variant("model.primitives", (word("model.primitives", count),))
+            Variant("model.primitives", (quote_override("model.primitives", count),))
             for count in counts
             if count != centre.model.primitives
         ]
@@ -82,7 +82,7 @@ def singles(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]:
         if now in values:
             place = values.index(now)
             ladder.sort(key=lambda value: abs(values.index(value) - place))
-        found[knob] = [Variant(knob, (word(knob, value),)) for value in ladder]
+        found[knob] = [Variant(knob, (quote_override(knob, value),)) for value in ladder]
     found[LENGTH] = [Variant(LENGTH, length=part) for part in _PARTS[LENGTH]]
     return found
 

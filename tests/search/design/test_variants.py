@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from neuprim.config import compose, task_of
-from neuprim.config.overrides import parse, word
+from neuprim.config.overrides import parse, quote_override
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import TaskFault
@@ -63,7 +63,7 @@ def test_every_word_composes(words: tuple[str, ...]) -> None:
         for variant in ladder:
             config = compose(merged(words, variant.turned), check_output=False)
             for assignment in parse(variant.turned):
-                assert word(assignment.key, assignment.value) == assignment.text
+                assert quote_override(assignment.key, assignment.value) == assignment.text
             assert config.task
 
 

@@ -1,4 +1,3 @@
-import errno
 import shlex
 import subprocess
 import sys
@@ -11,10 +10,9 @@ import pytest
 import neuprim
 from neuprim import runs
 from neuprim.cli import main
-from neuprim.cli.eval_command import print_metrics
 from neuprim.config import RunConfig
 from neuprim.core.environment import EnvironmentFile
-from neuprim.core.errors import DataError, NonFiniteError
+from neuprim.core.errors import NonFiniteError
 from neuprim.runs.events import Events
 from tests.plugins.fakes import install, site, toy
 
@@ -141,17 +139,6 @@ def test_one_line_and_status_2(
     assert calls == []
 
 
-def test_errors_of_many_lines_become_one(
-    calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def run(config: RunConfig, events: Events, launcher: Any = None) -> Path:
-        raise DataError("missing images:\n  a.png\n  b.png")
-
-    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", run)
-    assert main(["run", "task=toy"]) == 2
-    assert error_line(capsys) == "neuprim: error: missing images: a.png b.png\n"
-
-
 def test_interrupt_is_130_and_a_bug_keeps_its_traceback(calls: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(config: RunConfig, events: Events, launcher: Any = None) -> Path:
         raise KeyboardInterrupt
@@ -212,27 +199,7 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
         )
 
 
-def test_a_disk_that_refuses_is_no_bug(
-    calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(config: RunConfig, events: Events, launcher: Any = None) -> Path:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", full)
-    assert main(["run", "task=toy"]) == 2
-    assert error_line(capsys) == "neuprim: error: writing: No space left on device\n"
-
-
 # ---------------------------------------------------------------- eval, render
-
-
-def test_eval_counts_what_is_too_long_for_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    print_metrics({"psnr": 30.0, "per_view": [{"psnr": 1.0}, {"psnr": 2.0}], "background": [0.0, 0.0]})
-    assert [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()] == [
-        "psnr 30.0000",
-        "per_view 2 entries, in the run's metrics.json",
-        "background [0.0, 0.0]",
-    ]
 
 
 def test_eval_prints_metrics(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
@@ -319,14 +286,6 @@ def test_tasks_lists_all_and_the_broken_ones(toy: Path, site: Path, capsys: pyte
     assert "bad  (neuprim-bad 2)  BROKEN" in out
     assert "ImportError: no such luck" in out
     assert f"(neuprim {neuprim.__version__})" in out
-
-
-def test_tasks_reports_a_plugin_whose_yaml_is_missing(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (toy / "conf/scene/toy/files.yaml").unlink()
-    assert main(["tasks"]) == 0
-    out = capsys.readouterr().out
-    assert "toy  (neuprim-toy 0.3)  BROKEN" in out
-    assert "has no scene/toy/files.yaml" in out
 
 
 def test_help_and_version(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:

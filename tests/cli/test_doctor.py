@@ -63,43 +63,6 @@ def test_what_is_missing_or_too_old_says_how_to_install(monkeypatch: pytest.Monk
     assert "skipped" not in rows
 
 
-def test_a_package_of_two_extras_is_one_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = [name for name, _ in doctor._packages()]
-    assert len(rows) == len(set(rows)) and "pyvista" in rows
-    needs = [
-        "not-there>=1; extra == 'viewer'",
-        "not-there>=2; extra == 'mesh'",
-        "rich>=1; extra == 'viewer'",
-        "rich>=999; extra == 'mesh'",
-    ]
-    monkeypatch.setattr(metadata, "requires", lambda name: needs)
-    rows = dict(doctor._packages())
-    assert rows["not-there"] == "not installed: pip install 'neuprim[viewer]' or 'neuprim[mesh]'"
-    assert rows["rich"].endswith("but neuprim needs >=999: pip install 'neuprim[mesh]'")
-
-
-def test_the_printed_command_keeps_its_brackets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metadata, "requires", lambda name: ["not-there>=1; extra == 'video'"])
-    monkeypatch.setattr(doctor, "_probe", lambda name: "no [red]luck[/red] :boom:")
-    text = report()[1]
-    assert "not installed: pip install 'neuprim[video]'" in text
-    assert "does not work: no [red]luck[/red] :boom:" in text
-
-
-def test_a_backend_that_raises_is_shown_not_fatal(monkeypatch: pytest.MonkeyPatch) -> None:
-    import neuprim.core.render
-
-    def explode(name: str) -> str:
-        raise RuntimeError(f"{name} has\nno llvm")
-
-    monkeypatch.setattr(neuprim.core.render, "probe", explode)
-    assert doctor._probe("cpu") == "RuntimeError: cpu has no llvm"
-
-
-def test_the_oracle_works_here() -> None:
-    assert doctor._probe("reference") is None
-
-
 @pytest.mark.parametrize("backend", [backend.name for backend in backends.available_backends()])
 def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor._probe(backend) is None

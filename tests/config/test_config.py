@@ -1,5 +1,3 @@
-import dataclasses
-import os
 from pathlib import Path
 
 import pytest
@@ -7,7 +5,6 @@ import pytest
 from neuprim.config import RunConfig, compose, compose_all, expand_sweep
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.task import SceneContext
-from neuprim.core.validation import validate
 from neuprim.plugins.registry import load_task
 from tests.plugins.fakes import install, site, toy
 
@@ -75,23 +72,6 @@ def test_free_dictionaries_need_no_plus(toy: Path) -> None:
     }
 
 
-def test_values_in_other_spellings(toy: Path) -> None:
-    c = toys(
-        "train.iterations=1e3",
-        "train.max_seconds=5",
-        "train.population.strategy=fixed",
-        "scene.steps=[3]",
-        "scene.ratio=1",
-        "seed=5",
-    )
-    assert c.train.iterations == 1000
-    assert isinstance(c.train.max_seconds, float)
-    assert c.train.population.strategy == "fixed"
-    assert c.scene["steps"] == [3]
-    assert c.seed == 5
-    assert toys("train.max_seconds=5", "train.max_seconds=null").train.max_seconds is None
-
-
 def test_typed_seconds_are_all_of_the_budget(toy: Path) -> None:
     c = toys("train.max_seconds=5")
     assert c.train.iterations is None, "or a fast machine would stop at the preset's steps before the seconds are over"
@@ -117,8 +97,6 @@ def test_interpolation_follows_the_override(toy: Path) -> None:
         (["scene.sise=5"], "scene.sise: no such setting of scene 'ball'; did you mean 'scene.size'"),
         (["+train.foo=5"], "train.foo: no such setting"),
         (["hydra.run.dir=x"], "hydra.run.dir: no such setting"),
-        (["scene/toy=ball"], "scene/toy: no such setting"),
-        (["from_scene.size=3"], "from_scene.size: no such setting"),
         (["train..rates=3"], "expected KEY=VALUE"),
         (["scene@foo=ball"], "packages (@)"),
         (["task=ty"], "task=ty: no such task; did you mean 'toy'?"),
@@ -127,32 +105,14 @@ def test_interpolation_follows_the_override(toy: Path) -> None:
         (["effort=true"], "effort=true: expected a level from 1 (fast) to 9 (good)"),
         (["preset=lng"], "preset=lng: task 'toy' has no such preset; did you mean 'long'?"),
         (["train.iterations=abc"], "train.iterations=abc: expected a whole number"),
-        (["train.iterations=1.5"], "train.iterations=1.5: expected a whole number"),
-        (["train.iterations=true"], "train.iterations=true: expected a whole number"),
-        (["train.iterations=-1"], "train.iterations=-1: expected a whole number of at least 0"),
-        (["train.final_rate=nan"], "expected a finite number"),
         (["train.rates.w2=fast"], "train.rates.w2=fast: expected a finite number"),
         (["train.rates=3"], "train.rates=3: expected entries"),
-        (["train.population=3"], "train.population=3: expected settings"),
         (["model=3"], "model is a group of settings"),
-        (["model.neurons=17"], "model.neurons=17: expected a whole number from 0 to 16"),
         (["renderer.backend=cpuu"], "renderer.backend=cpuu: expected auto, cuda, cpu or reference"),
-        (["renderer.backend=gpu"], "renderer.backend=gpu: expected auto, cuda, cpu or reference"),
-        (["renderer.backend=3"], "renderer.backend=3: expected"),
-        (["renderer.depth=1"], "renderer.depth=1: expected true or false"),
-        (["renderer.alpha_max=2"], "renderer.alpha_max=2: expected a number above 0 and at most 0.9999"),
-        (["renderer.sort=depth"], "renderer.sort=depth: expected center or entry"),
-        (["renderer.samples=0"], "renderer.samples=0: expected a whole number of rays per pixel side, 1 to 16"),
         (["scene.size=big"], "scene.size=big: expected a whole number"),
-        (["scene.size=true"], "scene.size=true: expected a whole number"),
-        (["scene.smooth=3"], "scene.smooth=3: expected true or false"),
-        (["scene.look=[1]"], "scene.look=[1]: expected text"),
-        (["scene.steps=1"], "scene.steps=1: expected a list"),
         (["scene=files"], "scene.path: required and not given; expected a directory or file, as scene.path=PATH"),
         (["scene=files", "scene.path=null"], "scene.path: required and not given"),
         (["scene=files", "scene.path=[1]"], "expected a path"),
-        (["seed=-1"], "seed=-1: expected a whole number"),
-        (["resume=maybe"], "resume=maybe: expected true or false"),
         (["seed=${nothing}"], "nothing"),
         (["seed"], "'seed': expected KEY=VALUE"),
         (["=3"], "expected KEY=VALUE"),
@@ -176,13 +136,6 @@ def test_paths_are_made_absolute_and_survive_any_character(toy: Path) -> None:
     assert c.output_dir == Path("out") / strange
     assert toys("scene=files", "scene.path=123").scene["path"] == str(Path.cwd() / "123")
     assert toys("scene=files", "scene.path=plain dir/x").scene["path"] == str(Path.cwd() / "plain dir/x")
-
-
-def test_nothing_is_written_and_the_directory_stays(toy: Path) -> None:
-    here = os.getcwd()
-    toys("output_dir=new")
-    assert os.getcwd() == here
-    assert os.listdir(here) == []
 
 
 @pytest.mark.parametrize(
@@ -305,20 +258,6 @@ def test_sweep_directory_names_never_collide(toy: Path) -> None:
     assert runs[1].scene["path"] == str(Path.cwd() / "a b")
 
 
-def test_sweep_over_presets_and_without_sweep(toy: Path) -> None:
-    runs = compose_all(["task=toy", "preset=quick,long"])
-    assert [r.preset for r in runs] == ["quick", "long"]
-    assert compose_all(["task=toy"])[0].output_dir == Path("outputs/toy-ball")
-
-
-def test_sweep_into_an_occupied_directory_is_refused(toy: Path) -> None:
-    Path("full").mkdir()
-    Path("full/x").write_text("precious")
-    with pytest.raises(ConfigError, match="not empty"):
-        compose_all(["task=toy", "seed=1,2", "output_dir=full"])
-    assert compose_all(["task=toy", "seed=1,2", "output_dir=full", "resume=true"])[0].output_dir == Path("full/seed-1")
-
-
 def test_a_wrong_combination_stops_the_sweep_before_it_starts(toy: Path) -> None:
     with pytest.raises(ConfigError, match=r"model.neurons=99"):
         compose_all(["task=toy", "model.neurons=1,99"])
@@ -342,12 +281,6 @@ def test_yaml_round_trip(toy: Path) -> None:
     assert RunConfig.from_yaml(Path("run/config.yaml")) == c
 
 
-def test_reading_does_not_need_the_plugin(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    Path("config.yaml").write_text(toys().to_yaml())
-    monkeypatch.setattr("importlib.metadata.entry_points", lambda **_: ())
-    assert RunConfig.from_yaml("config.yaml").task == "toy"
-
-
 @pytest.mark.parametrize(
     ("content", "text"),
     [
@@ -367,13 +300,6 @@ def test_damaged_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content:
     assert "config.yaml" in str(caught.value)
     assert text in str(caught.value)
     assert not Path("hacked").exists()
-
-
-def test_missing_files(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="no such run directory"):
-        RunConfig.from_yaml(tmp_path / "nowhere")
-    with pytest.raises(CheckpointError, match="missing; expected a directory written by"):
-        RunConfig.from_yaml(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -407,8 +333,14 @@ def test_impossible_settings_in_a_file(toy: Path, old: str, new: str, text: str)
 # ---------------------------------------------------------------- the static task's files
 
 
-@pytest.mark.parametrize("preset", ["quick", "paper", "paper_real", "paper_200", "paper_5k"])
-@pytest.mark.parametrize("scene", ["solids", "room", "mesh", "blender", "nerfstudio", "colmap"])
+@pytest.mark.parametrize(
+    ("scene", "preset"),
+    zip(
+        ["solids", "room", "mesh", "blender", "nerfstudio"],
+        ["quick", "paper", "paper_real", "paper_200", "paper_5k"],
+        strict=True,
+    ),
+)
 def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, scene: str) -> None:
     monkeypatch.chdir(tmp_path)
     path = [] if scene in ("solids", "room") else ["scene.path=data"]
@@ -426,70 +358,8 @@ def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pr
     assert c.train.population.strategy == strategies[preset]
 
 
-@pytest.mark.parametrize("task", ["static", "dynamic", "relight"])
-def test_papers_rates_are_absolute(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Appendix A: means 1.6e-4, which the authors multiply by nothing; the most primitives are those of Stump (table
-    6)."""
-    monkeypatch.chdir(tmp_path)
-    train = compose([f"task={task}", "preset=paper"]).train
-    assert (train.rates["means"], train.rate_units) == (1.6e-4, {"means": "absolute"})
-    assert train.population.max_primitives == 330_000
-    assert compose([f"task={task}"]).train.rate_units == {}
-
-
-def test_papers_presets_of_static_scenes_differ_in_what_they_say(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Appendix A and B.1: another schedule on photographs; 200 and 5,000 primitives as budgets of the Blender
-    scenes."""
-    monkeypatch.chdir(tmp_path)
-    plain, real, least, middle = (
-        compose([f"preset={name}"]) for name in ("paper", "paper_real", "paper_200", "paper_5k")
-    )
-    steps = plain.train.iterations
-    for c, schedule in ((plain, (200, 1_000, 20_000, 1e-5, 1e-6)), (real, (500, 1_000, 15_000, 1e-4, 2e-6))):
-        p = c.train.population
-        assert (p.every, p.start * steps, p.stop * steps, p.grow_threshold, p.prune_threshold) == pytest.approx(
-            schedule
-        )
-        assert (p.clone_scale, p.prune_scale) == (1e-2, 0.5)
-    assert (least.model.primitives, middle.model.primitives) == (200, 5000)
-    for c in (real, least, middle):
-        model = dataclasses.replace(c.model, primitives=plain.model.primitives)
-        train = dataclasses.replace(c.train, population=plain.train.population)
-        assert (model, train, c.renderer) == (plain.model, plain.train, plain.renderer)
-
-
-def test_a_run_older_than_units_of_rates_goes_on_in_those_it_began_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    words = ["task=static", "preset=paper", "output_dir=run"]
-    begun = compose(words).to_yaml()
-    units = "  rate_units:\n    means: absolute\n"
-    assert units in begun
-    Path("run").mkdir()
-    for _ in range(2):  # the second time its config.yaml says that there are none
-        Path("run/config.yaml").write_text(begun.replace(units, ""))
-        resumed = compose([*words, "resume=true"])
-        assert resumed.train.rate_units == {} and resumed.non_default["train.rate_units.means"] == ("absolute", None)
-        begun = resumed.to_yaml()
-    assert compose([*words, "resume=true", "train.rate_units.quats=extent"]).train.rate_units == {"quats": "extent"}
-    assert compose([*words[::2], "resume=true"]).preset == "paper", "as it was begun"
-    Path("run/config.yaml").write_text(compose(words, check_output=False).to_yaml())
-    assert compose([*words, "resume=true"]).train.rate_units == {"means": "absolute"}
-    Path("run/config.yaml").unlink()
-    assert compose([*words, "resume=true"]).train.rate_units == {"means": "absolute"}
-
-
 @pytest.mark.parametrize("scene", ["mesh", "blender", "nerfstudio", "colmap"])
 def test_static_loaders_know_every_key_of_their_yaml(tmp_path: Path, scene: str) -> None:
     c = compose([f"scene={scene}", f"scene.path='{tmp_path / 'absent'}'", f"output_dir='{tmp_path / 'out'}'"])
     with pytest.raises(DataError, match="absent"):  # the folder is looked for after the settings are accepted
         load_task("static").scene(scene).load(c.scene, SceneContext(0, tmp_path))
-
-
-def test_solids_knows_every_key_of_its_yaml(tmp_path: Path) -> None:
-    from neuprim.scenes.solids import SolidsSettings
-
-    assert validate(SolidsSettings, compose([f"output_dir='{tmp_path}/out'"]).scene) == SolidsSettings()

@@ -7,10 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import yaml
 
-from neuprim.cli.tasks_command import list_plugins
-from neuprim.config import RunConfig, compose, compose_all, presets
+from neuprim.config import RunConfig, compose, presets
 from neuprim.config.task_files import LEVELS, read_levels
 from neuprim.conformance import ConformanceError, named_checks
 from neuprim.core.errors import ConfigError
@@ -64,55 +62,10 @@ def test_what_is_typed_lies_over_the_level(levels: Path) -> None:
     assert (timed.iterations, timed.max_seconds) == (None, 5.0), "a budget in seconds is used up"
 
 
-def test_levels_are_swept(levels: Path) -> None:
-    assert [c.model.primitives for c in compose_all(["task=toy", "effort=1,5,9"], check_output=False)] == [
-        100,
-        500,
-        900,
-    ]
-
-
-def test_the_list_of_tasks_says_that_there_are_levels(levels: Path) -> None:
-    assert any(line.split(maxsplit=1) == ["effort", "1 (fast) to 9 (good), of preset long"] for line in list_plugins())
-
-
-def test_a_run_is_the_same_as_if_its_settings_were_typed(levels: Path) -> None:
-    level, typed = run("effort=2"), run("preset=long", "model.primitives=200", "train.iterations=20")
-    assert (level.model, level.train, level.renderer, level.non_default) == (
-        typed.model,
-        typed.train,
-        typed.renderer,
-        typed.non_default,
-    )
-    assert RunConfig.from_yaml(_written(level)).train == typed.train
-
-
-def _written(config: RunConfig) -> Path:
-    config.output_dir.mkdir(parents=True)
-    (config.output_dir / "config.yaml").write_text(config.to_yaml())
-    return config.output_dir
-
-
 @pytest.mark.parametrize("word", ["0", "10", "best", "2.5", "-1"])
 def test_no_such_level(levels: Path, word: str) -> None:
     with pytest.raises(ConfigError, match=rf"^effort={word}: expected a level from 1 \(fast\) to 9 \(good\)$"):
         run(f"effort={word}")
-
-
-def test_levels_of_another_preset(levels: Path) -> None:
-    with pytest.raises(
-        ConfigError,
-        match=r"^effort=2: levels of task 'toy' are of preset=long, found preset=quick; expected one of the two$",
-    ):
-        run("effort=2", "preset=quick")
-
-
-def test_a_task_without_levels(toy: Path) -> None:
-    with pytest.raises(
-        ConfigError,
-        match=r"^effort=2: task 'toy' has no levels; set model\.primitives=N and train\.iterations=N instead$",
-    ):
-        run("effort=2")
 
 
 @pytest.mark.parametrize(
@@ -186,9 +139,3 @@ def test_levels_are_points_that_were_measured(name: str) -> None:
     judged = {"static": "psnr", "relight": "psnr_linear_clamped", "dynamic": "psnr_mask"}[name]
     for measure in ("cpu_seconds", judged):
         assert [row[measure] for row in seen] == sorted(row[measure] for row in seen), measure
-
-
-def test_what_a_file_says_is_yaml_that_people_read() -> None:
-    for name in MEASURED:
-        file = Path(__file__).parents[2] / "neuprim" / "tasks" / name / "conf" / "effort" / f"{name}.yaml"
-        assert list(yaml.safe_load(file.read_text())["levels"]) == list(LEVELS)

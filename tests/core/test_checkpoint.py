@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import pickle
-import struct
 import sys
 import time
 from collections.abc import Callable
@@ -85,87 +83,12 @@ def _umask() -> int:
     return old
 
 
-@pytest.mark.parametrize("neurons", [0, 16])
-def test_extreme_widths(tmp_path: Path, neurons: int) -> None:
-    path = tmp_path / "m.safetensors"
-    checkpoint.save_model(path, model(neurons, 0), "static", {})
-    assert checkpoint.load_model(path, TASK)[0].params["W1"].shape == (5, neurons, 3)
-
-
-def test_any_tensor_layout_and_type(tmp_path: Path) -> None:
-    tensors = {
-        "strided": torch.arange(12.0).reshape(3, 4).T,
-        "bytes": torch.arange(5, dtype=torch.uint8),
-        "empty": torch.zeros(0, 3),
-        "n": torch.tensor(7),
-    }
-    checkpoint.write(tmp_path / "c", "checkpoint", tensors, {"step": 3})
-    header, again = checkpoint.read(tmp_path / "c", "checkpoint")
-    assert header == {"format": checkpoint.FORMAT, "kind": "checkpoint", "step": 3}
-    assert all(torch.equal(tensors[k], again[k]) and tensors[k].dtype == again[k].dtype for k in tensors)
-
-
 # ---------------------------------------------------------------- what is damaged
-
-
-def test_truncated_anywhere(saved: Path) -> None:
-    whole = saved.read_bytes()
-    cuts = sorted({*(int(i * len(whole) / 48) for i in range(48)), 1, 7, 8, 9, len(whole) - 1})
-    for cut in cuts:
-        saved.write_bytes(whole[:cut])
-        refused(saved)
-    saved.write_bytes(whole)
-    checkpoint.load_model(saved, TASK)
-
-
-def test_a_header_that_claims_terabytes(saved: Path) -> None:
-    whole = saved.read_bytes()
-    for length in (2**40, 2**63, 2**64 - 1):
-        saved.write_bytes(struct.pack("<Q", length) + whole[8:])
-        refused(saved)
-    huge = json.dumps(
-        {
-            "means": {"dtype": "F32", "shape": [2**38, 3], "data_offsets": [0, 3 * 2**40]},
-            "__metadata__": {"neuprim": "{}"},
-        }
-    ).encode()
-    saved.write_bytes(struct.pack("<Q", len(huge)) + huge + b"\0" * 64)
-    refused(saved)
-    overflow = json.dumps({"means": {"dtype": "F32", "shape": [2**62, 2**62], "data_offsets": [0, 64]}}).encode()
-    saved.write_bytes(struct.pack("<Q", len(overflow)) + overflow + b"\0" * 64)
-    refused(saved)
-
-
-def test_deeply_nested_json(saved: Path) -> None:
-    rewrite(saved, header="[" * 100_000)
-    refused(saved)
-    nested = b'{"a":' * 50_000
-    saved.write_bytes(struct.pack("<Q", len(nested)) + nested)
-    refused(saved)
 
 
 class Bomb:
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         return os.mkdir, ("executed",)
-
-
-@pytest.mark.parametrize("maker", ["pickle", "torch", "text", "empty", "zeros"])
-def test_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "model.safetensors"
-    if maker == "pickle":
-        path.write_bytes(pickle.dumps(Bomb()))
-    elif maker == "torch":
-        torch.save({"x": Bomb()}, path)
-    else:
-        path.write_bytes({"text": b"task: static\n" * 20, "empty": b"", "zeros": b"\0" * 1000}[maker])
-    assert "safetensors" in refused(path) or "header" in refused(path)
-    assert not (tmp_path / "executed").exists()
-
-
-def test_missing_files_and_folders(tmp_path: Path) -> None:
-    assert "no such model" in refused(tmp_path / "none.safetensors")
-    refused(tmp_path)
 
 
 def test_safetensors_of_another_program(tmp_path: Path) -> None:
@@ -186,17 +109,6 @@ def test_another_format_version(saved: Path) -> None:
     rewrite(saved, format=checkpoint.FORMAT + 1)
     message = refused(saved)
     assert str(checkpoint.FORMAT + 1) in message and str(checkpoint.FORMAT) in message
-
-
-def test_another_kind(saved: Path) -> None:
-    with pytest.raises(CheckpointError, match="kind is 'model'; expected 'checkpoint'"):
-        checkpoint.read(saved, "checkpoint")
-
-
-@pytest.mark.parametrize("text", ["not json", "[]", "3", "null", '{"kind": "model"}', "{}"])
-def test_headers_that_are_not_ours(saved: Path, text: str) -> None:
-    rewrite(saved, header=text)
-    refused(saved)
 
 
 def test_unknown_field_class(saved: Path) -> None:
@@ -227,14 +139,6 @@ def test_absurd_density_settings(saved: Path, entry: Any) -> None:
     refused(saved)
 
 
-@pytest.mark.parametrize("settings", [{"degree": 10**9}, {"degree": 99}, {"degree": -1}, {"degree": "1"}, {"degree": 1, "channels": 10**6}, {"degree": 1, "channels": None}, {"degree": 1, "sh_every": "soon"}])  # fmt: skip
-def test_absurd_colour_settings(saved: Path, settings: dict[str, Any]) -> None:
-    rewrite(saved, colour={"class": "SphericalHarmonics", "settings": settings})
-    if "sh_every" in settings:  # kept as it is and never compared: a model that renders, or a refusal
-        return
-    refused(saved)
-
-
 def test_a_degree_that_does_not_exist_is_refused_when_its_tensors_fit(saved: Path) -> None:
     rewrite(
         saved,
@@ -255,12 +159,6 @@ def test_a_degree_that_does_not_exist_is_refused_when_its_tensors_fit(saved: Pat
 def test_wrong_shapes(saved: Path, value: Tensor) -> None:
     rewrite(saved, tensors={"means": value})
     refused(saved)
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.int32, torch.bool, torch.bfloat16])
-def test_wrong_types(saved: Path, dtype: torch.dtype) -> None:
-    rewrite(saved, tensors={"b1": torch.zeros(5, 3, dtype=dtype)})
-    assert "b1" in refused(saved) and str(dtype) in refused(saved)
 
 
 def test_missing_and_extra_tensors(saved: Path) -> None:
@@ -313,9 +211,3 @@ def test_an_interruption_leaves_the_old_file(
         checkpoint.save_model(saved, model(2), "static", {})
     assert saved.read_bytes() == before
     assert [p.name for p in saved.parent.iterdir()] == [saved.name]
-
-
-def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(CheckpointError, match="could not write"):
-        checkpoint.save_model(tmp_path / "file" / "model.safetensors", model(), "static", {})

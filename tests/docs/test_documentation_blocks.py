@@ -147,18 +147,6 @@ def test_python_blocks(page: Path, static_run: Path, tmp_path: Path, monkeypatch
     AFTER.get(name_of(page), lambda names: None)(names)
 
 
-def test_blocks_that_do_not_run_are_few_and_known() -> None:
-    skipped = [name_of(b.page) for b in EVERY if b.skipped is not None]
-    assert {page: skipped.count(page) for page in skipped} == NOT_RUN
-
-
-def test_tables_of_this_test_name_pages_that_have_blocks() -> None:
-    assert {*PREPARE, *AFTER} <= {name_of(page) for page in PYTHON}
-    for page, words in OF_THE_READER.items():
-        text = (ROOT / page).read_text(encoding="utf-8") if (ROOT / page).exists() else " ".join(words)
-        assert [word for word in words if word not in text] == []
-
-
 def test_json_blocks_are_json_and_the_cameras_are_cameras(tmp_path: Path) -> None:
     texts = [b.text for b in EVERY if b.language == "json"]
     (cameras,) = [text for text in texts if "frames" in json.loads(text)]

@@ -253,11 +253,6 @@ def test_the_page_stands_alone(finished: Path) -> None:
     assert references and references <= set(ids)
 
 
-def test_the_same_run_gives_the_same_page(finished: Path) -> None:
-    before = (finished / "report.html").read_text(encoding="utf-8")
-    assert page_of(finished) == before
-
-
 @pytest.mark.parametrize(
     ("source", "badge"),
     [("real", None), ("generated", "generated data"), ("simulated", "simulated data"), ("dreamt", "dreamt")],
@@ -319,30 +314,11 @@ def test_any_missing_or_wrong_field_is_a_dash(quick: Path) -> None:
                 assert structure.text.count("–") > dashes, key
 
 
-def test_empty_metrics(quick: Path) -> None:
-    (quick / "metrics.json").write_text("{}")
-    text = Structure(page_of(quick)).text
-    assert "PSNR, mean –" in text and "Training –" in text and "chequered-ball" in text and "not finished" not in text
-
-
 def test_infinite_psnr(quick: Path) -> None:
     views = [{"name": "a", **to_json("psnr", math.inf), "ssim": 1.0}, {"name": "b", "psnr": 30.0, "ssim": 0.9}]
     change(quick, per_view=views, **to_json("psnr", math.inf), psnr_worst=30.0)
     text = Structure(page_of(quick)).text
     assert "PSNR, mean ∞ dB" in text and "a ∞ dB PSNR 1.0000 SSIM" in text and "PSNR, worst view 30.00 dB b" in text
-
-
-def test_views_worse_than_a_black_image_are_named_at_the_head(quick: Path) -> None:
-    assert "black image" not in page_of(quick)
-    change(
-        quick,
-        worse_than_black_image=["cam_01_frame_0000", "<b>"],
-        density_frames=[{"max_error": 0.25}, {"max_error": 0.5}],
-    )
-    page = page_of(quick)
-    head = page[: page.index("Curves")] if "Curves" in page else page
-    assert "2 views are worse than a black image" in head and "cam_01_frame_0000, &lt;b&gt;" in head
-    assert "Largest error of density" in head and ">50<small>%" in head
 
 
 def test_an_interrupted_run_says_so(quick: Path) -> None:
@@ -354,12 +330,6 @@ def test_an_interrupted_run_says_so(quick: Path) -> None:
     assert "1 line of metrics.jsonl could not be read" in text
     assert "PSNR, held-out – not logged yet" in text and "at step 40" in text
     assert "Metrics of the last checkpoint" not in text and "static" in text
-
-
-def test_a_run_that_only_has_its_config(tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text("task: {name: relight}\nscene: null\n")
-    text = Structure(page_of(tmp_path)).text
-    assert "relight" in text and "No step was logged." in text and "Curves" not in text and "Held-out views" not in text
 
 
 def test_views_are_told_apart_by_index(tmp_path: Path) -> None:
@@ -393,34 +363,6 @@ def test_numbers_go_to_the_view_they_belong_to(quick: Path) -> None:
     text = Structure(page_of(quick)).text
     assert "cam/a b 11.00 dB PSNR" in text
     assert "b – dB PSNR – SSIM" in text  # "b" is no other spelling of "other", whatever its index
-
-
-def test_damaged_pictures_are_named_as_such(quick: Path) -> None:
-    path = quick / "renders" / "test_000_a_truth.png"
-    path.write_bytes(path.read_bytes()[:60])
-    (quick / "renders" / "orbit.webp").write_bytes(b"")
-    assert Structure(page_of(quick)).text.count("file damaged") == 2
-
-
-def test_many_views_are_thinned_and_it_is_said(quick: Path) -> None:
-    change(quick, per_view=[{"name": f"v{i}", "psnr": 20.0 + i, "ssim": 0.5} for i in range(40)])
-    pictures = quick / "renders"
-    for kind in ("", "_truth", "_error"):
-        content = (pictures / f"test_000_a{kind}.png").read_bytes()
-        (pictures / f"test_001_b{kind}.png").unlink()
-        (pictures / f"test_000_a{kind}.png").unlink()
-        for i in range(40):
-            (pictures / f"test_{i:03d}_v{i}{kind}.png").write_bytes(content)
-    structure = Structure(page_of(quick))
-    assert "24 of 40 views, evenly spaced." in structure.text and "All 40 held-out views" in structure.text
-    titles = [a["alt"] for t, a in structure.elements if t == "img" and str(a["alt"]).startswith("render of")]
-    assert len(titles) == 24 and titles[0] == "render of view v0" and titles[-1] == "render of view v39"
-
-
-def test_large_pictures_are_compressed_and_it_is_said(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "compressed on this page" not in page_of(quick)
-    monkeypatch.setattr("neuprim.report.pictures.INLINE_LIMIT", 50)
-    assert "compressed on this page" in Structure(page_of(quick)).text
 
 
 @pytest.mark.parametrize("step", ["replace", "render"])

@@ -117,16 +117,6 @@ def test_charts_keep_text_as_text_and_follow_the_page() -> None:
     assert not re.search(r"#01020|font-family|<style|<metadata|xmlns|xlink|<!", svg)
 
 
-def test_log_axis_only_where_it_fits() -> None:
-    for values in ([(1, 0.5), (2, 0.4)], [(1, 0.0), (2, 100.0)]):
-        assert curve(values, [], "steps", log=True) == curve(values, [], "steps", log=False)
-
-
-@pytest.mark.parametrize(("last", "unit"), [(100.0, "seconds"), (1000.0, "minutes"), (20000.0, "hours")])
-def test_time_axis_unit(last: float, unit: str) -> None:
-    assert unit in texts(curve([(0, 1), (last, 2)], [], "seconds"))
-
-
 def test_charts_of_nothing_and_of_one_point() -> None:
     assert curve([], [], "steps") is None
     assert curve([(0, 3)], [], "steps") is not None and curve([], [(7, 3)], "seconds") is not None

@@ -119,8 +119,8 @@ def _choices_of(stored: RunConfig) -> dict[str, str]:
         return name if maker is None or maker.package in ("", BUILT_IN) else qualified(maker.package, name)
 
     return {
-        "task": word(stored.task, made and made.task),
-        "scene": word(stored.scene_name, made and made.scene),
+        "task": word(stored.task, None if made is None else made.task),
+        "scene": word(stored.scene_name, None if made is None else made.scene),
         "preset": stored.preset,
     }
 

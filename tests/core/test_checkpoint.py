@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import struct
 import sys
 import time
 from collections.abc import Callable
@@ -211,3 +212,27 @@ def test_an_interruption_leaves_the_old_file(
         checkpoint.save_model(saved, model(2), "static", {})
     assert saved.read_bytes() == before
     assert [p.name for p in saved.parent.iterdir()] == [saved.name]
+
+
+def test_a_header_that_claims_terabytes(saved: Path) -> None:
+    whole = saved.read_bytes()
+    for length in (2**40, 2**63, 2**64 - 1):
+        saved.write_bytes(struct.pack("<Q", length) + whole[8:])
+        refused(saved)
+    huge = json.dumps(
+        {
+            "means": {"dtype": "F32", "shape": [2**38, 3], "data_offsets": [0, 3 * 2**40]},
+            "__metadata__": {"neuprim": "{}"},
+        }
+    ).encode()
+    saved.write_bytes(struct.pack("<Q", len(huge)) + huge + b"\0" * 64)
+    refused(saved)
+    overflow = json.dumps({"means": {"dtype": "F32", "shape": [2**62, 2**62], "data_offsets": [0, 64]}}).encode()
+    saved.write_bytes(struct.pack("<Q", len(overflow)) + overflow + b"\0" * 64)
+    refused(saved)
+
+
+@pytest.mark.parametrize("text", ["not json", "[]", "3", "null", '{"kind": "model"}', "{}"])
+def test_headers_that_are_not_ours(saved: Path, text: str) -> None:
+    rewrite(saved, header=text)
+    refused(saved)

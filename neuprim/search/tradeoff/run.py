@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuprim.config import duration
+from neuprim.config.target import parse_duration
 from neuprim.core.compute import device
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.compute.threads import core_count
@@ -57,7 +57,7 @@ def seconds_of(budget: str, said: str = "--budget ") -> float:
     Raises:
         ConfigError: it is something else.
     """
-    return duration.seconds_of(budget, f"{said}{budget}")
+    return parse_duration(budget, f"{said}{budget}")
 
 
 @dataclass(frozen=True)

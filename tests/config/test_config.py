@@ -335,10 +335,12 @@ def test_impossible_settings_in_a_file(toy: Path, old: str, new: str, text: str)
 
 @pytest.mark.parametrize(
     ("scene", "preset"),
-    zip(
-        ["solids", "room", "mesh", "blender", "nerfstudio"],
-        ["quick", "paper", "paper_real", "paper_200", "paper_5k"],
-        strict=True,
+    list(
+        zip(
+            ["solids", "room", "mesh", "blender", "nerfstudio"],
+            ["quick", "paper", "paper_real", "paper_200", "paper_5k"],
+            strict=True,
+        )
     ),
 )
 def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, scene: str) -> None:

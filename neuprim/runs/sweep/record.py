@@ -117,7 +117,7 @@ def begun_words(words: Sequence[str]) -> list[str]:
             f"{said}: no values to sweep; expected KEY=A,B,C, or output_dir=DIR resume=true of a sweep ({FILE} in it)"
         )
     for word in before.words:
-        if "${" in word:  # what a file says is data; see neuprim.config.composing
+        if "${" in word:  # what a file says is data; see neuprim.config.compose
             raise ConfigError(
                 f"{Path(str(where)) / FILE}: {cut(word)} refers to something outside of the file; type the sweep's words again, with resume=true"
             )

@@ -162,7 +162,8 @@ def rasterize(
     ):
         able = " or ".join(f'backend="{b.name}"' for b in backends.available_backends() if b.differentiates_intrinsics)
         raise BackendUnavailable(
-            f'rasterize: Ks requires a gradient, which backend="{knobs.backend}" does not compute; pass {able} or Ks.detach()'
+            f'rasterize: Ks requires a gradient, which backend="{knobs.backend}" does not compute; '
+            f"pass {able} or Ks.detach()"
         )
     w2, b2 = amplified(w2, b2, log_gain)
     geometry, density = Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, float(omega0), edge)

@@ -99,7 +99,10 @@ def _number(value: float | None, kind: str) -> str:
 
 def _listing(chosen: Sequence[Table]) -> Iterator[str]:
     for table in chosen:
-        yield f"table{'s' if len(table.numbers) > 1 else ''} {', '.join(map(str, table.numbers))}: {table.title} (task=static scene={table.loader})"
+        yield (
+            f"table{'s' if len(table.numbers) > 1 else ''} {', '.join(map(str, table.numbers))}: "
+            f"{table.title} (task=static scene={table.loader})"
+        )
         for row in table.rows:
             yield f"  {row.name}: preset={row.preset}{f'; beside {row.beside[0]}' if row.beside[0] else ''}"
             for scene, found in row.figures.items():
@@ -120,7 +123,10 @@ def _estimate(planned: Sequence[Planned]) -> Iterator[str]:
         if train.max_seconds is None:
             if key not in paces:
                 paces[key] = pace(one)
-                yield f"{one.row.name}, {one.scene}: {1e3 * paces[key]:.0f} ms a step at the start, {train.iterations:,} steps"
+                yield (
+                    f"{one.row.name}, {one.scene}: {1e3 * paces[key]:.0f} ms a step at the start, "
+                    f"{train.iterations:,} steps"
+                )
             assert train.iterations is not None, "a run without seconds has steps"
             total += paces[key] * train.iterations
             grows = grows or train.population.strategy == "gradient"
@@ -142,7 +148,10 @@ def _result(one: Planned, metrics: Mapping[str, Any]) -> Iterator[str]:
 
     steps, seconds = metrics["iterations"], _duration(metrics["train_seconds"])
     width, height = metrics["image_size"]
-    yield f"{one.scene}, {one.row.name}: preset={one.row.preset}, seed {one.config.seed}, {metrics['checkpoint']} checkpoint after {steps:,} steps in {seconds}"
+    yield (
+        f"{one.scene}, {one.row.name}: preset={one.row.preset}, seed {one.config.seed}, "
+        f"{metrics['checkpoint']} checkpoint after {steps:,} steps in {seconds}"
+    )
     yield f"  images of {width}x{height}, down-sampling {metrics['downsampling']}{_others(one)}"
     for kind, ours, theirs, other in compared(one, metrics):
         beside = f"   {one.row.beside[0]} {_number(other, kind)}" if one.row.beside[0] and kind != "primitives" else ""
@@ -165,7 +174,10 @@ def _means(results: Sequence[tuple[Planned, Mapping[str, Any]]]) -> Iterator[str
     for title, name in rows:
         own = [(one, metrics) for one, metrics in results if (one.table.title, one.row.name) == (title, name)]
         seeds = len({one.config.seed for one, _ in own})
-        yield f"{title}, {name}: means over {len({one.scene for one, _ in own})} scenes, {seeds} seed{'s' * (seeds > 1)}; ours of the last checkpoint, the paper's of the best"
+        yield (
+            f"{title}, {name}: means over {len({one.scene for one, _ in own})} scenes, {seeds} "
+            f"seed{'s' * (seeds > 1)}; ours of the last checkpoint, the paper's of the best"
+        )
         pairs = [pair for one, metrics in own for pair in compared(one, metrics) if pair[0] != "primitives"]
         for kind in ("PSNR", "SSIM", "LPIPS"):
             both = [

@@ -24,14 +24,23 @@ list or a range, --time 0.2,0.8 or --time 0:1:20, one frame each.
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    cameras = "which cameras; a file is JSON (frames, or a path of nerfstudio's viewer), USD (FILE#/PRIM) or a COLMAP model's folder"
+    cameras = (
+        "which cameras; a file is JSON (frames, or a path of nerfstudio's viewer), USD (FILE#/PRIM) or a "
+        "COLMAP model's folder"
+    )
     parser.add_argument("--camera", required=True, metavar="orbit|test|FILE", help=cameras)
-    space = "coordinates of a file's cameras, of lights, and in .exr files: those of the run's data (default), or of the model (volumes: its unit box)"
+    space = (
+        "coordinates of a file's cameras, of lights, and in .exr files: those of the run's data "
+        "(default), or of the model (volumes: its unit box)"
+    )
     parser.add_argument("--space", choices=("world", "scene"), help=space)
     parser.add_argument("--size", type=parse_size, metavar="WxH", help="pixels (default: the data set's)")
     formats = ("png", "exr", "npy", "webp", "gif", "mp4")
     parser.add_argument("--format", choices=formats, help="default: png, or webp for an animation")
-    layers = "of an .exr: beauty, alpha, depth, density, and what the run's task adds (an unknown name lists them); default: all"
+    layers = (
+        "of an .exr: beauty, alpha, depth, density, and what the run's task adds (an unknown name lists "
+        "them); default: all"
+    )
     parser.add_argument("--layers", metavar="NAME,...", help=layers)
     datatype = (
         "light and alpha of an .exr in 16 or 32 bits (default: float); depth and other numbers are float in either"

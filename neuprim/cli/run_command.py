@@ -22,7 +22,7 @@ __all__ = ["COMMAND", "run_one"]
 _COMMON_KEYS = """\
 commonest keys:
   task=NAME scene=NAME preset=NAME     what to fit, and how (`neuprim tasks` lists them)
-  effort=N                             1 (fast) to 9 (good): how many primitives and views, where the task has measured it
+  effort=N                             1 (fast) to 9 (good): a size and length that the task has measured
   scene.path=DIR                       data of a scene that reads files
   output_dir=DIR resume=true           where to write; continue an interrupted run
   train.iterations=N train.max_seconds=S
@@ -32,8 +32,8 @@ commonest keys:
   renderer.sort=center|entry           renderer.samples=N (rays per pixel side) renderer.threads=N
   seed=N
   viewer=true viewer.port=N            look at the model in the browser while it is trained; pause, step, save, stop
-  target.psnr=DB budget=10m            the smallest model that has it, searched and trained in that time; also target.ssim=S,
-                                       with target.megabytes=M and target.fps=F as limits, or these alone: the best within them
+  target.psnr=DB budget=10m            the smallest model that reaches it, found in that time; also target.ssim=S,
+                                       target.megabytes=M and target.fps=F as limits, or these alone
   launcher=inline|processes|ray|slurm  where runs work; launcher.workers=N launcher.threads=N launcher.retries=N
                                        launcher.address=... launcher.options.KEY=VALUE (docs/launching.md)
   scene.cache=DIR|URL                  volumes: where their ground truth is kept (`neuprim truth` makes it before)

@@ -42,7 +42,8 @@ def _truth(args: argparse.Namespace) -> int:
                 made = make_truth(config, launcher, events)
             if made is None:
                 raise ConfigError(
-                    f"scene={config.scene_name}: its images are not rendered frame by frame; expected a scene of volumes, as task=dynamic scene=vdb"
+                    f"scene={config.scene_name}: its images are not rendered frame by frame; expected "
+                    "a scene of volumes, as task=dynamic scene=vdb"
                 )
             print(made.place, flush=True)
     except KeyboardInterrupt:

@@ -128,7 +128,8 @@ def options_of(spec: TaskSpec, loss: LossExtension | None) -> Options:
     both = sorted(spec.options.keys() & loss.options.keys())
     if both:
         raise ConfigError(
-            f"train.loss={loss.name}: the loss and task {spec.name!r} both have an option {both[0]!r}; they cannot be combined"
+            f"train.loss={loss.name}: the loss and task {spec.name!r} both have an option "
+            f"{both[0]!r}; they cannot be combined"
         )
     return {**spec.options, **loss.options}
 

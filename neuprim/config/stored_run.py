@@ -1,4 +1,4 @@
-"""Settings of an earlier run: under those of ``neuprim run --config FILE``, and of a run that ``resume=true`` continues."""
+"""Settings of an earlier run, for ``neuprim run --config FILE`` and for a run that ``resume=true`` continues."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _SHARD, _VIEWS = "train.shard", "train.views_per_step"
 """Settings of each process, which follow from how many are launched."""
 
 _FREE = ("memory", "chunks")
-"""Settings of scenes that a resumed run may change: what is decoded at once, and the chunks, which have their own record."""
+"""Settings of scenes that a resumed run may change: what is decoded at once, and the chunks (they have a record)."""
 
 _SEARCH, _SWEEP = "target.json", "sweep.json"
 """Records of directories that hold more than one run; they go on with the overrides of a search or a sweep."""
@@ -84,7 +84,7 @@ def stored_choices(stored: RunConfig, chosen: Mapping[str, str | None]) -> dict[
 def stored_assignments(stored: RunConfig, scene: str | None, values: Sequence[Assignment]) -> Iterator[Assignment]:
     """Yield every setting of a stored run as an assignment that stands under the user's ``values``.
 
-    Left out is what the user's values make void: settings of another scene or form of density, the other kind of budget.
+    Settings that the user's values make void are left out: of another scene or form of density, the other budget.
     """
     typed = {a.key for a in values}
     if split(scene or "")[1] == stored.scene_name:
@@ -167,8 +167,8 @@ def find_resumed_run(
 
     Raises:
         ConfigError: only the directory was typed, and no run is there.
-        CheckpointError, ConfigError: its ``config.yaml`` is damaged. Where settings were typed, unknown ones in the file
-            are a warning.
+        CheckpointError, ConfigError: its ``config.yaml`` is damaged. Where settings were typed, unknown ones in the
+            file are a warning.
         UnknownPlugin: the place follows from a task, which is not installed.
     """
     given: dict[str, Any] = {a.key: a.value for a in assignments}

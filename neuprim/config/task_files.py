@@ -190,12 +190,14 @@ def choose_level(spec: TaskSpec, chosen: str | None, preset: str | None, presets
     levels = read_levels(spec, presets)
     if levels is None:
         raise ConfigError(
-            f"{EFFORT}={chosen}: task {spec.name!r} has no levels; set model.primitives=N and train.iterations=N instead"
+            f"{EFFORT}={chosen}: task {spec.name!r} has no levels; set model.primitives=N and "
+            "train.iterations=N instead"
         )
     level = levels[int(chosen)]
     if preset not in (None, level.preset):
         raise ConfigError(
-            f"{EFFORT}={chosen}: levels of task {spec.name!r} are of preset={level.preset}, found preset={preset}; expected one of the two"
+            f"{EFFORT}={chosen}: levels of task {spec.name!r} are of preset={level.preset}, found "
+            f"preset={preset}; expected one of the two"
         )
     return level
 

@@ -54,7 +54,8 @@ def check_stored(config: RunConfig, typed: Mapping[str, Any] | None = None) -> N
         )
         allow = f"type {key}=... to use it" if typed is not None else f"{FLAG} allows it"
         raise ConfigError(
-            f"{config.source}: {key} is {cut(value)!r}, {what}; {allow}, {ENVIRONMENT}=1 in the environment does so for all runs"
+            f"{config.source}: {key} is {cut(value)!r}, {what}; {allow}, {ENVIRONMENT}=1 in the "
+            "environment does so for all runs"
         )
 
 

@@ -116,7 +116,7 @@ def write_in_pieces(
     header: Mapping[str, Any],
     pieces: Callable[[str], Iterable[Tensor]],
 ) -> None:
-    """As :func:`write`, of tensors that are nowhere whole, see :func:`~neuprim.core.io.safetensors_stream.write_safetensors_stream`."""
+    """Write as :func:`write` tensors that do not fit into memory (:mod:`neuprim.core.io.safetensors_stream`)."""
     text = json.dumps({"format": FORMAT, "kind": kind, **header}, allow_nan=False)
     try:
         with atomic_path(path) as temporary:
@@ -251,7 +251,8 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
     _, tensors = read(path, "model")
     if not isinstance(density, DensityField) or not isinstance(colour, ColourField):
         raise CheckpointError(
-            f"{path}: density and colour fields are {type(density).__name__} and {type(colour).__name__}; expected one of each"
+            f"{path}: density and colour fields are {type(density).__name__} and "
+            f"{type(colour).__name__}; expected one of each"
         )
     own = (*density.parameters(), *colour.parameters())
     if "sparse" in header:
@@ -281,7 +282,8 @@ def _field(path: Path, header: Mapping[str, Any], task: TaskSpec, kind: str) -> 
     known = task.fields or {}
     if entry["class"] not in known:
         raise CheckpointError(
-            f"{path}: unknown {kind} field {cut(entry['class'])!r} for task {task.name!r}{nearest(entry['class'], known)}"
+            f"{path}: unknown {kind} field {cut(entry['class'])!r} for task "
+            f"{task.name!r}{nearest(entry['class'], known)}"
         )
     for name, value in entry["settings"].items():
         if not isinstance(value, (int, float, str, bool, type(None), list)) or (

@@ -180,7 +180,8 @@ def read_environment(path: Path, up: Tensor | None = None, rotation: float = 0.0
     info = image_info(path)
     if info.width != 2 * info.height:
         raise DataError(
-            f"{path}: image is {info.width}x{info.height}; expected an environment in latitude and longitude, twice as wide as high"
+            f"{path}: image is {info.width}x{info.height}; expected an environment in latitude and "
+            "longitude, twice as wide as high"
         )
     pixels = read_image(path)[..., :3]
     radiance = pixels if info.linear else srgb_to_linear(pixels.float() / 255.0)
@@ -217,7 +218,8 @@ def _cells(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Arra
         if wrong.any():
             y, x, channel = (int(i[0]) for i in np.nonzero(wrong))
             raise DataError(
-                f"{where}: radiance {band[y, x, channel]} at row {top + y}, column {x}, channel {channel}; expected 0 or more"
+                f"{where}: radiance {band[y, x, channel]} at row {top + y}, column {x}, channel "
+                f"{channel}; expected 0 or more"
             )
         polar = (rows + 0.5) * (math.pi / height)
         solid = (

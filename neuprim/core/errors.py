@@ -102,7 +102,8 @@ _HEAD, _TAIL = 1200, 300
 between them is cut."""
 
 _FULL_CARD = (
-    "the card's memory is full; expected a smaller image or grid, fewer primitives, or CUDA_VISIBLE_DEVICES= in the environment, "
+    "the card's memory is full; expected a smaller image or grid, fewer primitives, or "
+    "CUDA_VISIBLE_DEVICES= in the environment, "
     "which leaves cards out. What was saved is intact"
 )
 

@@ -98,7 +98,8 @@ def tiles(items: Sequence[tuple[str, str, str, str]], lead: range = range(1)) ->
         small = f"<small>{unit}</small>" if unit else ""
         kind = "tile lead" if i in lead else "tile"
         cells.append(
-            f'<div class="{kind}"><dt>{label}</dt><dd>{value}{small}</dd><dd class="note" title="{note}">{note}</dd></div>'
+            f'<div class="{kind}"><dt>{label}</dt><dd>{value}{small}</dd><dd class="note" '
+            f'title="{note}">{note}</dd></div>'
         )
     return f'<dl class="tiles">{"".join(cells)}</dl>'
 

@@ -40,8 +40,8 @@ from neuprim.core.compute.threads import core_count
 from neuprim.core.data import Dataset
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs.fit import complete, start
-from neuprim.runs.measure import draw
+from neuprim.runs.fit import prepare_training, train_to_end
+from neuprim.runs.measure import render_image
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.dynamic.judging import recording_of
@@ -95,9 +95,9 @@ KEYS = (
 def fit(words: list[str], change: Callable[[Trainer], None] = lambda trainer: None) -> tuple[Trainer, dict[str, Any]]:
     """What `neuprim run` does, less its files: the trainer after its budget, and the metrics."""
     torch.set_num_threads(1)
-    fitted = start(compose(["task=dynamic", *words], check_output=False))
+    fitted = prepare_training(compose(["task=dynamic", *words], check_output=False))
     change(fitted.trainer)
-    return fitted.trainer, complete(fitted).metrics()
+    return fitted.trainer, train_to_end(fitted).metrics()
 
 
 def numbers(*words: str) -> int:
@@ -175,7 +175,7 @@ def between_frames(trainer: Trainer) -> dict[str, float]:
     for index in range(len(data.test)):
         view, t = data.test.view(index), index % frames
         rendered, truth = (
-            draw(trainer.model, view, trainer.renderer, data.background),
+            render_image(trainer.model, view, trainer.renderer, data.background),
             data.test.pixels(index).over(data.background),
         )
         error = (rendered - truth)[recording.track(index)].double().square().mean().item()
@@ -186,7 +186,7 @@ def between_frames(trainer: Trainer) -> dict[str, float]:
                 view.conditions["time"] + q / 4 * (after.conditions["time"] - view.conditions["time"]) for q in range(5)
             ]
             images = [
-                draw(trainer.model, type(view)("", view.camera, {"time": s}), trainer.renderer, data.background)
+                render_image(trainer.model, type(view)("", view.camera, {"time": s}), trainer.renderer, data.background)
                 for s in steps
             ]
             whole = (images[4] - images[0]).abs().mean().item()

@@ -190,7 +190,7 @@ def train(names: list[str], folders: dict[str, Any]) -> list[dict[str, Any]]:
     from shared.forms import SCENES
     from shared.trials import Trial, begin
 
-    from neuprim.runs.fit import complete
+    from neuprim.runs.fit import train_to_end
 
     table, rows = Table("scene", "primitives", "steps", "ms a step", "PSNR", "of it"), []
     for name in names:
@@ -200,7 +200,7 @@ def train(names: list[str], folders: dict[str, Any]) -> list[dict[str, Any]]:
         while fitted.trainer.step < STEPS[name] // 2:  # kernels are compiled and views read in this half
             fitted.trainer.train_step()
         before = fitted.trainer.elapsed
-        fitted = complete(fitted)
+        fitted = train_to_end(fitted)
         ms = 1e3 * (fitted.trainer.elapsed - before) / (STEPS[name] - STEPS[name] // 2)
         metrics = fitted.metrics()
         rows.append(

@@ -1,4 +1,4 @@
-"""Two ranks of one thread against one process of two threads and of one: views per second, and bytes that a step sends.
+"""Two ranks of one thread against one process of two threads and of one: views per second.
 
     python benchmarks/ranks.py [--parts pace steps] [--scenes solids smoke_fire lit_solids large] [--rounds 15]
     [--seconds 0.5] [--docs] [--print]
@@ -48,13 +48,13 @@ BUDGET, VIEWS = ("task=static", "scene=solids", "scene.size=128", "model.primiti
 def trainers(scene: str, group: Any) -> dict[str, Any]:
     """The same training in every way; on ranks but the first only what they take part in."""
     from neuprim.config import compose
-    from neuprim.runs.fit import start
-    from neuprim.runs.training import make_ready
+    from neuprim.runs.fit import prepare_training
+    from neuprim.runs.training import compile_for_run
 
     words = [*SCENES[scene], "train.population.strategy=fixed", "train.population.grow_from=1", "seed=0"]
     made: dict[str, Any] = {}
     dataset = None
-    for way in WAYS if group.first else ("together",):
+    for way in WAYS if group.is_first else ("together",):
         config = compose(words, check_output=False)
         views = 2 if way in ("two threads", "one thread") else 1
         config = replace(config, train=replace(config.train, views_per_step=views))
@@ -62,12 +62,10 @@ def trainers(scene: str, group: Any) -> dict[str, Any]:
             config,
             renderer=replace(config.renderer, device="cpu", threads=1 if way in ("together", "one thread") else 2),
         )
-        fitted = start(config, dataset=dataset)
+        fitted = prepare_training(config, dataset=dataset, group=group if way == "together" else None)
         dataset = fitted.dataset
         trainer = fitted.trainer
-        if way == "together":
-            trainer.join(group)
-        make_ready(trainer)
+        compile_for_run(trainer)
         trainer.step = (trainer.settings.iterations or 0) // 2
         made[way] = trainer
     return made
@@ -75,7 +73,7 @@ def trainers(scene: str, group: Any) -> dict[str, Any]:
 
 def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, Any]:
     """Seconds per view of every way and round, by the first rank's clock."""
-    from neuprim.runs.fit import one_torch_thread
+    from neuprim.runs.fit import use_one_torch_thread
 
     with group.in_turn():
         made = trainers(scene, group)
@@ -87,53 +85,42 @@ def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, An
             made[way].train_step()
         return (time.perf_counter() - begun) / steps, (time.process_time() - used) / steps
 
-    with one_torch_thread():
+    with use_one_torch_thread():
         for way in made:
             turn(way, 10)
-        steps = group.tell({"steps": max(round(seconds / turn("together", 10)[0]), 4)})[0]["steps"]
+        steps = group.gather(max(round(seconds / turn("together", 10)[0]), 4))[0]
         times: dict[str, list[float]] = {way: [] for way in WAYS}
         used: dict[str, list[float]] = {way: [] for way in WAYS}
-        sent = 0
         for _ in range(rounds):
             for way in WAYS:
                 if way in made:
                     if way == "together":
-                        group.tell({})  # the others have waited for the first rank's turns
-                        before = group.sent
+                        group.gather(None)  # the others have waited for the first rank's turns
                     took, worked = turn(way, steps)
                     times[way].append(took / (1 if way == "single view" else 2))
                     used[way].append(
                         worked / (1 if way in ("single view", "together") else 2)
                     )  # a rank works for one view a step
-                    if way == "together":
-                        sent = (group.sent - before) // steps
     trainer = made["together"]
     view = trainer.dataset.train.view(0).camera
     numbers = sum(value.numel() for value in trainer.model.params.values())
     return {
-        "scene": scene,
-        "size": [view.width, view.height],
-        "primitives": trainer.model.count,
-        "numbers": numbers,
-        "sent": sent,
-        "steps": steps,
-        "seconds": times,
-        "processor": used,
-    }
+        "scene": scene, "size": [view.width, view.height], "primitives": trainer.model.count, "numbers": numbers,
+        "steps": steps, "seconds": times, "processor": used,
+    }  # fmt: skip
 
 
 def worker(scenes: list[str], rounds: int, seconds: float, out: Path) -> None:
     """What each process of the torchrun does."""
-    from neuprim.core.train.distributed.group import Group
-    from neuprim.core.train.distributed.place import place_of
-    from neuprim.core.train.distributed.wire import Wire
+    from neuprim.core.train.distributed.process_group import ProcessGroup
+    from neuprim.core.train.distributed.torchrun import read_torchrun_rank
 
-    place = place_of()
+    place = read_torchrun_rank()
     assert place is not None and place.size == 2
-    group = Group(place, Wire(place, os.environ))
+    group = ProcessGroup(place, os.environ)
     for scene in scenes:
         found = measure(scene, rounds, seconds, group)
-        if group.first:
+        if group.is_first:
             record = json.loads(out.read_text()) if out.exists() else {}
             record[scene] = found
             out.write_text(json.dumps(record, indent=1) + "\n")
@@ -142,17 +129,9 @@ def worker(scenes: list[str], rounds: int, seconds: float, out: Path) -> None:
 
 def table(record: dict[str, Any]) -> str:
     rows = Table(
-        "scene",
-        "image",
-        "primitives",
-        "views/s of 2 ranks × 1 thread",
-        "over 1 process × 2 threads, 2 views a step",
-        "over the same, 1 view a step",
-        "over 1 process × 1 thread, 2 views",
-        "processor time of a view, over 1 process × 2 threads",
-        "a step sends, measured",
-        "by the formula",
-    )
+        "scene", "image", "primitives", "views/s of 2 ranks × 1 thread", "over 1 process × 2 threads, 2 views a step", "over the same, 1 view a step",
+        "over 1 process × 1 thread, 2 views", "processor time of a view, over 1 process × 2 threads", "bytes a step sends",
+    )  # fmt: skip
     for scene, found in record["scenes"].items():
         times = found["seconds"]
 
@@ -164,23 +143,12 @@ def table(record: dict[str, Any]) -> str:
             a / b for a, b in zip(found["processor"]["together"], found["processor"]["two threads"], strict=True)
         )
         width, height = found["size"]
-        formula = 4 * (found["numbers"] + 2 * found["primitives"]) + 2048
+        formula = 4 * (found["numbers"] + 2 * found["primitives"])
         rows.row(
-            TITLES.get(scene, f"`{scene}`"),
-            f"{width}×{height}",
-            f"{found['primitives']:,}",
-            f"{1 / statistics.median(times['together']):.1f}",
-            ratio("two threads"),
-            ratio("single view"),
-            ratio("one thread"),
-            f"{work:.2f}",
-            f"{found['sent']:,} B",
-            f"{formula:,} B",
-        )
-    note = (
-        f"Each ratio: median of {record['rounds']} rounds; of the fastest turns. {record['cpu']}, "
-        f"{record['cores']} cores that other work shared."
-    )
+            TITLES.get(scene, f"`{scene}`"), f"{width}×{height}", f"{found['primitives']:,}", f"{1 / statistics.median(times['together']):.1f}",
+            ratio("two threads"), ratio("single view"), ratio("one thread"), f"{work:.2f}", f"{formula:,} B",
+        )  # fmt: skip
+    note = f"Each ratio: median of {record['rounds']} rounds; of the fastest turns. {record['cpu']}, {record['cores']} cores that other work shared."
     return f"{rows}\n\n{note}"
 
 
@@ -210,8 +178,7 @@ def table_of_steps(found: dict[str, Any]) -> str:
         rows.row(views, f"{found['views'] // int(views):,}", f"{spread(values, 2)} dB")
     seeds = len(next(iter(found["psnr"].values())))
     return (
-        f"{rows}\n\n`neuprim run {' '.join(found['words'])}`, {found['views']:,} views in all, rates as for one "
-        f"view a step, means of {seeds} seeds "
+        f"{rows}\n\n`neuprim run {' '.join(found['words'])}`, {found['views']:,} views in all, rates as for one view a step, means of {seeds} seeds "
         "± half the spread."
     )
 

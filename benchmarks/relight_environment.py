@@ -33,7 +33,7 @@ from neuprim.core.environment import Environment
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.images import write_png
 from neuprim.core.metrics import psnr
-from neuprim.runs.measure import draw_sum
+from neuprim.runs.measure import render_light_sum
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.scenes.lit import INTENSITY, build_lit_solids, draw_lit_solids
 from neuprim.scenes.raycast import Scene
@@ -115,11 +115,11 @@ def main() -> None:
             lights = list(around.conditions)
             scores = []
             for view, reference in zip(views, distant, strict=True):
-                drawn = draw_sum(model, view, lights, config.renderer, torch.zeros(3)).double()
+                drawn = render_light_sum(model, view, lights, config.renderer, torch.zeros(3)).double()
                 cast = truth(scene, view.camera, lights, 2)
                 seen = list(around.frames(False))
                 fair = (
-                    draw_sum(model, view, seen, config.renderer, torch.zeros(3)).double(),
+                    render_light_sum(model, view, seen, config.renderer, torch.zeros(3)).double(),
                     truth(scene, view.camera, seen, 2),
                 )
                 pairs = ((drawn, cast), fair, (drawn, reference), (cast, reference))
@@ -132,7 +132,7 @@ def main() -> None:
             camera = views[-1].camera.resized(PIXELS, PIXELS)
             around = illuminate(environment, 64, facts)
             lights = list(around.frames(False))
-            drawn = draw_sum(model, View("picture", camera), lights, config.renderer, torch.zeros(3))
+            drawn = render_light_sum(model, View("picture", camera), lights, config.renderer, torch.zeros(3))
             planes = radiance.clamp(0, 1).movedim(-1, 0)[None]
             small = torch.nn.functional.interpolate(
                 planes, size=(PIXELS // 2, PIXELS), mode="bilinear", antialias=True

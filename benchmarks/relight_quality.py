@@ -35,7 +35,7 @@ from neuprim.config import compose
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.compute.threads import core_count
 from neuprim.core.data import Dataset
-from neuprim.runs.fit import Fitted, compile_kernels, complete, start
+from neuprim.runs.fit import Fitted, compile_kernels, prepare_training, train_to_end
 from neuprim.tasks.relight.judging import baselines
 
 RESULTS = Path(__file__).parent / "results" / "relight_quality.json"
@@ -89,7 +89,7 @@ def prepared(words: list[str], dataset: Dataset | None) -> Fitted:
         ],
         check_output=False,
     )
-    fitted = start(config, dataset=dataset)
+    fitted = prepare_training(config, dataset=dataset)
     compile_kernels(fitted.trainer)
     return fitted
 
@@ -100,7 +100,7 @@ def pace(variants: dict[str, list[str]], dataset: Dataset) -> dict[str, float]:
 
 
 def fit(words: list[str], dataset: Dataset) -> dict[str, Any]:
-    found = complete(prepared(words, dataset)).metrics()
+    found = train_to_end(prepared(words, dataset)).metrics()
     return {k: found[k] for k in KEYS if k in found}
 
 

@@ -44,7 +44,7 @@ from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import write_json
 from neuprim.core.render import render
 from neuprim.runs.export import export_run
-from neuprim.runs.fit import start
+from neuprim.runs.fit import prepare_training
 from neuprim.runs.open import open_run
 from neuprim.webpage import Condition, web_page
 from neuprim.webpage.page import camera_numbers
@@ -144,7 +144,9 @@ def prepared(chromium: Any, scene: str, count: int, folder: Path) -> dict[str, A
     """Milliseconds of the worker. The model has not learned yet: how much work it is does not depend on what it would
     have."""
     words, sweep = STARTS[scene]
-    fitted = start(compose([*words, f"model.primitives={count}", "train.population.grow_from=1"], check_output=False))
+    fitted = prepare_training(
+        compose([*words, f"model.primitives={count}", "train.population.grow_from=1"], check_output=False)
+    )
     fitted.unlock()
     model, view, specs = fitted.model, fitted.dataset.test.view(0), fitted.task.conditions
     page = web_page(

@@ -1,9 +1,9 @@
-"""Ranks that are threads of one process, so that trainings of several can be tried in a second: all is as between
-processes, but for the wire."""
+"""Ranks that are threads of one process, so that a training of several takes a second."""
 
 from __future__ import annotations
 
 import threading
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -12,91 +12,76 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from neuprim.core.errors import RankError
-from neuprim.core.train.distributed.group import Group
-from neuprim.core.train.distributed.place import Place
+from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.distributed.torchrun import TorchrunRank
 
 T = TypeVar("T")
 
 
-class Threads:
-    """The wires of ``size`` ranks."""
+class Killed(Exception):
+    """Ends a rank as a signal would: without a message."""
+
+
+class _Exchange:
+    """A place where ``size`` threads meet: by round of messages, what each has to say."""
 
     def __init__(self, size: int) -> None:
         self.size, self.store = size, dist.HashStore()
-        self._barrier = threading.Barrier(size, timeout=60)
-        self._rows: list[Tensor] = [torch.empty(0)] * size
-        self._parts: list[list[Tensor]] = [[]] * size
-
-    def wire(self, rank: int) -> Any:
-        return _Wire(self, rank)
-
-    def swap(self, rank: int, rows: Tensor, found: Tensor) -> None:
-        try:
-            self._rows[rank] = rows.clone()
-            self._barrier.wait()
-            torch.stack([given[rank] for given in self._rows], out=found)
-            self._barrier.wait()
-        except threading.BrokenBarrierError:
-            raise RankError("broken") from None
-
-    def exchange(self, rank: int, rows: Tensor, found: Tensor, give: list[int], take: list[int]) -> None:
-        try:
-            self._parts[rank] = [part.clone() for part in rows.split(give)]
-            self._barrier.wait()
-            parts = [given[rank] for given in self._parts]
-            assert [len(part) for part in parts] == take, "both ends of an exchange know its length"
-            found.copy_(torch.cat(parts))
-            self._barrier.wait()
-        except threading.BrokenBarrierError:
-            raise RankError("broken") from None
-
-    def hang_up(self) -> None:
-        self._barrier.abort()
+        self.changed, self.closed = threading.Condition(), False
+        self.rounds: defaultdict[int, dict[int, Any]] = defaultdict(dict)
 
 
-class _Wire:
-    hosted = False
+class ThreadGroup(ProcessGroup):
+    """A rank whose messages go through memory instead of torch.distributed."""
 
-    def __init__(self, threads: Threads, rank: int) -> None:
-        self._threads, self.rank, self.store = threads, rank, threads.store
+    def __init__(self, rank: int, exchange: _Exchange) -> None:
+        self._exchange, self.store, self._round = exchange, exchange.store, 0
+        self.place = TorchrunRank(rank, exchange.size, rank, exchange.size, "here")
+        self.rank, self.size = rank, exchange.size
 
-    def swap(self, rows: Tensor, found: Tensor) -> None:
-        self._threads.swap(self.rank, rows, found)
+    def gather(self, value: Any) -> list[Any]:
+        meeting, self._round = self._exchange, self._round + 1
+        with self._errors(), meeting.changed:
+            values = meeting.rounds[self._round]
+            values[self.rank] = value
+            meeting.changed.notify_all()
+            meeting.changed.wait_for(lambda: len(values) == self.size or meeting.closed, 60)
+            if len(values) < self.size:
+                raise RuntimeError("broken")
+            return [values[rank] for rank in range(self.size)]
 
-    def exchange(self, rows: Tensor, found: Tensor, give: list[int], take: list[int]) -> None:
-        self._threads.exchange(self.rank, rows, found, give, take)
+    def exchange(self, sent: Tensor, received: Tensor) -> None:
+        torch.stack([rows[self.rank] for rows in self.gather(sent.clone())], out=received)
+
+    def all_gather(self, received: Tensor, own: Tensor) -> None:
+        torch.stack(self.gather(own.clone()), out=received)
 
     def close(self) -> None:
-        self._threads.hang_up()
+        with self._exchange.changed:
+            self._exchange.closed = True
+            self._exchange.changed.notify_all()
 
 
-class Killed(Exception):
-    """Ends a rank as a signal would: it says nothing."""
-
-
-def together(size: int, work: Callable[[Group], T]) -> list[T | Exception]:
+def run_ranks(size: int, work: Callable[[ProcessGroup], T]) -> list[T | Exception]:
     """What ``work`` returns or raises on each of ``size`` ranks; one that raises leaves, as a process would."""
-    threads = Threads(size)
+    exchange = _Exchange(size)
 
     def one(rank: int) -> T | Exception:
-        group = Group(Place(rank, size, rank, size, "here"), threads.wire(rank))
+        group = ThreadGroup(rank, exchange)
         try:
-            found = work(group)
+            return work(group)
         except Exception as error:
             if not isinstance(error, Killed):
-                group.fail(str(error), isinstance(error, RankError))
-            group.close(failed=True)
+                group.record_failure(str(error))
+            group.close()
             return error
-        group.pulse.stop()
-        return found
 
     with ThreadPoolExecutor(size) as pool:
         return list(pool.map(one, range(size)))
 
 
-def done(found: list[T | Exception]) -> list[T]:
-    """The same where no rank may have raised."""
+def results(found: list[T | Exception]) -> list[T]:
+    """The results of ranks of which none may have raised."""
     for each in found:
         if isinstance(each, Exception):
             raise each

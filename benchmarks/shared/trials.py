@@ -16,9 +16,9 @@ from neuprim.config.launcher import LauncherSettings
 from neuprim.core.checkpoint import save_model
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.events import Events
-from neuprim.runs.fit import Fitted, compile_kernels, complete, start
+from neuprim.runs.fit import Fitted, compile_kernels, prepare_training, train_to_end
 from neuprim.runs.launch.jobs import Job, Result
-from neuprim.runs.launch.table import launch
+from neuprim.runs.launch.launcher import launch
 
 __all__ = ["Trial", "begin", "paces_of", "recorded", "run_all"]
 
@@ -65,7 +65,7 @@ def begin(trial: Trial) -> Fitted:
         words.append(f"train.population.every={max(trial.iterations // trial.interventions, 1)}")
     if trial.keep is not None:
         words.append(f"output_dir='{trial.keep.resolve()}'")
-    return start(compose(words, check_output=False), hold_out=trial.hold_out)
+    return prepare_training(compose(words, check_output=False), hold_out=trial.hold_out)
 
 
 Wanted = Sequence[str] | Callable[[dict[str, Any]], dict[str, Any]]
@@ -78,7 +78,7 @@ def train(trial: Trial, wanted: Wanted) -> dict[str, Any]:
     fitted = begin(trial)
     compile_kernels(fitted.trainer)
     start = time.thread_time()
-    complete(fitted)
+    train_to_end(fitted)
     seconds = time.thread_time() - start
     metrics = fitted.metrics()
     if trial.keep is not None:

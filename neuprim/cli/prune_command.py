@@ -55,7 +55,7 @@ _ROWS = (
 
 
 def _report(made: Pruning, tolerance: float) -> None:
-    from neuprim.runs.kept import kept_words
+    from neuprim.runs.kept import describe_kept_shares
 
     for number, stage in enumerate(made.stages, 1):
         less = f", {', '.join(stage.words)}" if stage.words else ""
@@ -73,7 +73,7 @@ def _report(made: Pruning, tolerance: float) -> None:
         print(f"{name:{widths[0]}}  {before:>{widths[1]}}  {after:>{widths[2]}}".rstrip())
     for word in made.words:
         print(f"all primitives: {word}")
-    for line in kept_words(made.kept):
+    for line in describe_kept_shares(made.kept):
         print(line)
     print(f"fine-tuned for {made.steps:,} steps, {made.seconds:.0f} s in all")
 

@@ -1,4 +1,4 @@
-"""``torchrun -m neuprim run``: one run by several processes, of which the first one speaks."""
+"""``torchrun -m neuprim run``: one run by several processes, of which rank 0 writes and prints."""
 
 from __future__ import annotations
 
@@ -17,135 +17,127 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, RankError, one_
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
-    from neuprim.core.train.distributed.group import Group
-    from neuprim.core.train.distributed.place import Place
+    from neuprim.core.train.distributed.process_group import ProcessGroup
+    from neuprim.core.train.distributed.torchrun import TorchrunRank
 
 __all__ = ["run_as_rank"]
 
 
-def run_as_rank(place: Place, words: list[str], more: bool) -> int:
+def run_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
     """Fit one scene as one of several ranks; returns the exit status.
 
-    What goes wrong is one line, whoever finds it: of all ranks, the first to say so.
+    An error is printed once, in one line, by the first rank that fails.
 
     Args:
         words: the overrides.
-        more: whether anything but one run is asked for.
+        more: whether anything but one run was asked for.
     """
     from neuprim.core.compute.threads import limit_process_threads, machine_cores
-    from neuprim.core.train.distributed.group import Group
-    from neuprim.core.train.distributed.wire import Wire
+    from neuprim.core.train.distributed.process_group import ProcessGroup
 
-    group = Group(place, Wire(place, os.environ))
-    failed = True
+    group = ProcessGroup(place, os.environ)
 
-    def terminated(number: int, frame: FrameType | None) -> None:
+    def terminate(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        raise group.cause(RankError("ended by SIGTERM"))
+        raise group.explain(RankError("ended by SIGTERM"))
 
-    before = signal.signal(
-        signal.SIGTERM, terminated
-    )  # torchrun sends it where another rank died; a training listens for it itself
+    # torchrun sends it when another rank ended; a training handles it by itself
+    before = signal.signal(signal.SIGTERM, terminate)
     try:
         with limit_process_threads(max(machine_cores() // place.local_size, 1)):
-            _fit(_composed(words, more, group), words, group)
-        failed = False
+            _fit(_compose(words, more, group), words, group)
         return 0
     except KeyboardInterrupt:
-        group.fail("interrupted")
-        if group.first:
+        group.record_failure("interrupted")
+        if group.is_first:
             raise
         return 130
     except Exception as error:
         line = one_line(error)
         if line is None:
-            group.fail(f"{type(error).__name__}: {error}")
+            group.record_failure(f"{type(error).__name__}: {error}")
             print(f"neuprim: rank {group.rank} failed:", file=sys.stderr)
             raise
-        if not (isinstance(error, RankError) and error.told):
-            said = group.fail(line, isinstance(error, RankError))
-            if said is not None:
-                print(f"neuprim: error: {said}", file=sys.stderr, flush=True)
+        reported = isinstance(error, RankError) and error.reported
+        if not reported and group.record_failure(line):
+            where = "" if group.is_first or isinstance(error, RankError) else f"rank {group.rank}: "
+            print(f"neuprim: error: {where}{line}", file=sys.stderr, flush=True)
         return 2
     finally:
-        group.close(failed)
+        group.close()
         signal.signal(signal.SIGTERM, before)
 
 
-def _composed(words: list[str], more: bool, group: Group) -> RunConfig:
-    """The configuration; where the first rank writes is where the run is, as the others find its files there."""
+def _compose(words: list[str], more: bool, group: ProcessGroup) -> RunConfig:
+    """Compose the configuration; all ranks take the output directory of rank 0, which writes there."""
     from neuprim.config import compose
     from neuprim.config.launcher import take_launcher
     from neuprim.config.target import take_target
     from neuprim.config.viewer import take_viewer
 
     elsewhere = any(len(split(words)[1]) < len(words) for split in (take_target, take_launcher, take_viewer))
-    if group.first and (more or elsewhere):
+    if group.is_first and (more or elsewhere):
         raise ConfigError(
-            f"{group.size} processes of torchrun fit one scene together; expected neither -m, --config, --cfg, a target, a launcher, nor a viewer"
+            f"{group.size} processes of torchrun fit one scene together; expected neither -m, --config, --cfg, "
+            "a target, a launcher, nor a viewer"
         )
-    config = compose(words) if group.first else None
-    directory = group.tell({"output_dir": "" if config is None else str(config.output_dir)})[0]["output_dir"]
+    config = compose(words) if group.is_first else None
+    directory = group.gather(None if config is None else str(config.output_dir))[0]
     if config is None:
         config = replace(compose(words, check_output=False), output_dir=Path(directory))
-    _choose_card(config, group.place)
+    _select_gpu(config, group.place)
     return config
 
 
-def _choose_card(config: RunConfig, place: Place) -> None:
-    """A card for each rank of a machine, the first for the first.
+def _select_gpu(config: RunConfig, place: TorchrunRank) -> None:
+    """Use GPU i for the i-th rank of a machine.
 
     Raises:
-        BackendUnavailable: there are cards, and too few.
+        BackendUnavailable: there are GPUs, but fewer than ranks.
     """
     import torch
 
     from neuprim.core.compute.device import CPU
 
-    cards = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if cards == 0 or config.renderer.device == CPU:
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if gpus == 0 or config.renderer.device == CPU:
         return
-    if cards < place.local_size:
+    if gpus < place.local_size:
         raise BackendUnavailable(
-            f"renderer.device={config.renderer.device}: {cards} cards for {place.local_size} ranks of this machine; "
-            f"expected a card for each, or renderer.device={CPU}"
+            f"renderer.device={config.renderer.device}: {gpus} GPUs for {place.local_size} ranks of this machine; "
+            f"expected one for each, or renderer.device={CPU}"
         )
     torch.cuda.set_device(place.local_rank)
 
 
-def _fit(config: RunConfig, words: Sequence[str], group: Group) -> bool:
-    """Train, and on the first rank say so; returns False."""
+def _fit(config: RunConfig, words: Sequence[str], group: ProcessGroup) -> None:
+    """Train, and show it on rank 0."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import RunProgress
     from neuprim.config.overrides import CommandLine
-    from neuprim.runs.events import silent
+    from neuprim.runs.events import ignore_event
     from neuprim.runs.run import run
 
     place = group.place
     launcher = f"torchrun --nproc-per-node {place.local_size}" if place.size == place.local_size else "torchrun …"
     command = f"{launcher} -m {shlex.join(['neuprim', 'run', *CommandLine(words).resume_arguments(config.output_dir)])}"
     try:
-        if not group.first:
+        if not group.is_first:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the first rank warns
-                run(config, silent, ranks=group)
-            return False
-        with RunProgress(
-            plain_console(stderr=True), f"{config.task}/{config.scene_name}, {group.size} ranks"
-        ) as events:
-            print(run(config, events, ranks=group))
+                warnings.simplefilter("ignore")  # rank 0 warns
+                run(config, ignore_event, group=group)
+            return
+        title = f"{config.task}/{config.scene_name}, {group.size} ranks"
+        with RunProgress(plain_console(stderr=True), title) as events:
+            print(run(config, events, group=group))
     except RankError as error:
-        raise RankError(f"{error}; to go on: {command}", error.told) from error
+        raise RankError(f"{error}; to go on: {command}", error.reported) from error
     except KeyboardInterrupt:
-        if not group.first:
-            # torchrun takes any other status for a failure, and ends the first rank, which has the rest to do
-            return False
-        there = (
-            "has the run up to here"
-            if (config.output_dir / "checkpoint.safetensors").exists()
-            else "has no checkpoint yet"
-        )
+        if not group.is_first:
+            # torchrun takes any other status for a failure, and ends rank 0, which still has to write
+            return
+        saved = (config.output_dir / "checkpoint.safetensors").exists()
+        state = "has the run up to here" if saved else "has no checkpoint yet"
         raise KeyboardInterrupt(
-            f"; {config.output_dir} {there}; to go on, with any number of processes:\n  {command}"
+            f"; {config.output_dir} {state}; to go on, with any number of processes:\n  {command}"
         ) from None
-    return False

@@ -80,7 +80,7 @@ def _render(arguments: argparse.Namespace) -> int:
     environment = _read_environment(arguments)
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
-    from neuprim.runs.draw import render_run
+    from neuprim.runs.render_images import RenderRequest, render_run
 
     given = {
         "space": arguments.space,
@@ -92,18 +92,20 @@ def _render(arguments: argparse.Namespace) -> int:
     with DrawProgress(plain_console(stderr=True)) as progress:
         paths = render_run(
             arguments.run_dir,
-            camera,
-            arguments.size,
-            arguments.format,
-            arguments.out,
-            arguments.frames,
-            arguments.conditions,
-            arguments.fps,
-            environment=environment,
-            tell=progress.note,
+            RenderRequest(
+                camera,
+                size=arguments.size,
+                format=arguments.format,
+                out=arguments.out,
+                frames=arguments.frames,
+                conditions=arguments.conditions,
+                fps=arguments.fps,
+                environment=environment,
+                overrides=arguments.words,
+                **more,
+            ),
+            notify=progress.note,
             progress=progress.show,
-            words=arguments.words,
-            **more,
         )
     for path in paths:
         print(path)

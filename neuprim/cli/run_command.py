@@ -77,10 +77,10 @@ def _run(args: argparse.Namespace) -> int:
     from neuprim.config.overrides import CommandLine, drop_place
     from neuprim.config.target import take_target
     from neuprim.config.viewer import take_viewer
-    from neuprim.core.train.distributed.place import place_of
-    from neuprim.runs.chunks.asked import asked, refuse_chunks
+    from neuprim.core.train.distributed.torchrun import read_torchrun_rank
+    from neuprim.runs.fit import is_chunked, refuse_chunks
 
-    place = place_of()
+    place = read_torchrun_rank()
     if place is not None:
         from neuprim.cli.ranks import run_as_rank
 
@@ -98,9 +98,9 @@ def _run(args: argparse.Namespace) -> int:
     if wanted is not None and args.multirun:
         raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
     if args.multirun and not drop_place(words):
-        from neuprim.runs.sweep.record import begun_words
+        from neuprim.runs.sweep import read_sweep_overrides
 
-        words = begun_words(words)
+        words = read_sweep_overrides(words)
         typed = CommandLine([*words, *args.overrides], args.config)  # what goes on with it says all of it
     stored = None if args.config is None else read_stored_config(args.config)
     configs = compose_all(words, check, stored) if args.multirun else [compose(words, check, stored)]
@@ -114,15 +114,15 @@ def _run(args: argparse.Namespace) -> int:
 
         return fit_target(configs[0], *wanted, launcher, typed)
     if len(configs) > 1:
-        from neuprim.cli.sweep import sweep
+        from neuprim.cli.sweep import launch_sweep
 
-        return sweep(configs, words, launcher, typed)
+        return launch_sweep(configs, words, launcher, typed)
     if viewer is not None:
         refuse_chunks(configs[0], "viewer=true shows one training")
-    if elsewhere and not asked(configs[0]):  # the chunks of a scene in chunks are what runs elsewhere
-        from neuprim.cli.sweep import launch_one
+    if elsewhere and not is_chunked(configs[0]):  # the chunks of a scene in chunks are what runs elsewhere
+        from neuprim.cli.sweep import launch_run
 
-        return launch_one(configs[0], launcher, typed)
+        return launch_run(configs[0], launcher, typed)
     print(run_one(configs[0], typed, viewer, launcher))
     return 0
 

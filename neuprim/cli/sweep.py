@@ -1,60 +1,175 @@
-"""``neuprim run -m``, and a single run that works elsewhere: launched, shown, and what is said at the end."""
+"""``neuprim run -m``, and a run that works elsewhere: launch, show progress, and report what failed or is left."""
 
 from __future__ import annotations
 
 import shlex
 import sys
+import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rich import box
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
 from neuprim.cli.console import plain_console
-from neuprim.cli.launching import LaunchProgress
 from neuprim.config import RunConfig
 from neuprim.config.launcher import LauncherSettings
 from neuprim.config.overrides import CommandLine
-from neuprim.runs.ground_truth import before_runs
-from neuprim.runs.launch.jobs import Result
-from neuprim.runs.launch.status import Status
-from neuprim.runs.launch.table import FOLDER, launch
-from neuprim.runs.sweep.one import job_of
-from neuprim.runs.sweep.run import sweep_run
+from neuprim.runs.ground_truth import render_ground_truth_of_runs
+from neuprim.runs.launch.jobs import ENDED, JobStatus, Result
+from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch
+from neuprim.runs.sweep import run_job, run_sweep
 
-__all__ = ["launch_one", "sweep"]
+__all__ = ["LaunchProgress", "launch_run", "launch_sweep"]
+
+_LINE_INTERVAL = 0.25
+"""Share of a training between two lines, where there is no terminal."""
+
+_STATE_ORDER = ("training", "finishing", "preparing", "starting", "failed", "interrupted", "done", "waiting")
+"""Jobs that go first where not all rows fit the screen."""
 
 
-def sweep(configs: Sequence[RunConfig], words: list[str], settings: LauncherSettings, typed: CommandLine) -> int:
-    """Launch all runs of a sweep; the exit status.
+def launch_sweep(configs: Sequence[RunConfig], words: list[str], settings: LauncherSettings, typed: CommandLine) -> int:
+    """Launch all runs of a sweep; returns the exit status.
 
     Args:
         words: what the sweep was asked for.
-        typed: all that was typed, for the command that goes on.
+        typed: all that was typed, for the command that continues.
     """
     folder = configs[0].output_dir.parent
-    shown = _Shown(configs)
-    with shown:
-        _, results = sweep_run(configs, words, settings, shown)
-    status = _told(configs, results, shown.live, typed)
+    progress = _RunProgress(configs)
+    with progress:
+        _, results = run_sweep(configs, words, settings, progress)
+    status = _report(configs, results, progress.live, typed)
     print(folder / "sweep.html")
     return status
 
 
-def launch_one(config: RunConfig, settings: LauncherSettings, typed: CommandLine) -> int:
-    """Launch one run somewhere else; the exit status."""
-    shown = _Shown([config])
-    with shown:
-        before_runs([config], settings, shown)
-        results = launch([job_of(config)], settings, config.output_dir / FOLDER, shown)
-    return _told([config], results, shown.live, typed)
+def launch_run(config: RunConfig, settings: LauncherSettings, typed: CommandLine) -> int:
+    """Launch one run in another process; returns the exit status."""
+    progress = _RunProgress([config])
+    with progress:
+        render_ground_truth_of_runs([config], settings, progress)
+        results = launch([run_job(config)], settings, config.output_dir / LAUNCH_FOLDER, progress)
+    return _report([config], results, progress.live, typed)
 
 
-class _Shown(LaunchProgress):
-    """Without a terminal, what is begun and done is also said on standard output."""
+class LaunchProgress:
+    """Show several jobs: one table on a terminal, a line now and then elsewhere. Call it with their statuses."""
+
+    def __init__(self, console: Console, names: Sequence[str]) -> None:
+        self.console, self.names, self.live = console, names, console.is_terminal
+        self._statuses = [JobStatus()] * len(names)
+        self._seconds: dict[int, float] = {}
+        self._printed: dict[int, tuple[object, ...]] = {}
+        self._display = (
+            Live(self, console=console, refresh_per_second=4, transient=False, redirect_stdout=True)
+            if self.live
+            else None
+        )
+
+    def __enter__(self) -> Self:
+        if self._display is not None:
+            self._display.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._display is not None:
+            self._display.stop()
+
+    def __call__(self, number: int, status: JobStatus) -> None:
+        """Show a job's status."""
+        before, self._statuses[number] = self._statuses[number], status
+        if status.state != "waiting":
+            self._seconds.setdefault(number, time.monotonic())
+        if status.state in ENDED and before.state not in ENDED:
+            self._seconds[number] = time.monotonic() - self._seconds[number]  # a time, from now on a duration
+        if not self.live:
+            self._print_line(number, status)
+
+    # ------------------------------------------------------------ lines
+
+    def _print_line(self, number: int, status: JobStatus) -> None:
+        shown = (
+            status.state,
+            int(status.progress / _LINE_INTERVAL) if status.state in ("training", "waiting") else 0,
+            status.text.rpartition(", ")[0] or status.text if status.state == "waiting" else "",
+            status.attempt,
+        )
+        if self._printed.get(number) == shown or status.state in ("starting", "failed", "interrupted"):
+            return  # the command reports these states
+        self._printed[number] = shown
+        if status.state == "done" and not status.step:
+            return  # it was done before
+        text = " ".join(filter(None, (_state(status), _steps(status), _psnr(status, " dB held out"), status.text)))
+        self.console.print(f"{self.names[number]}: {text}", highlight=False, soft_wrap=True, markup=False, emoji=False)
+
+    # ------------------------------------------------------------ table
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        table.add_column("run", overflow="fold")
+        table.add_column("state", no_wrap=True)
+        for name in ("steps", "held-out dB", "seconds"):
+            table.add_column(name, justify="right", no_wrap=True)
+        table.add_column("", overflow="ellipsis", no_wrap=True)
+        room = max(console.size.height - 6, 4)
+        order = sorted(range(len(self.names)), key=lambda n: (_STATE_ORDER.index(self._statuses[n].state), n))
+        for number in sorted(order[:room]):
+            status = self._statuses[number]
+            cells = (
+                self.names[number],
+                _state(status),
+                _steps(status),
+                _psnr(status),
+                self._elapsed(number),
+                status.text,
+            )
+            table.add_row(*(Text(cell, style=_style(status)) for cell in cells))
+        yield table
+        counts = Counter(status.state for status in self._statuses)
+        more = f"; {len(order) - room} not shown" if len(order) > room else ""
+        yield Text("  ".join(f"{counts[state]} {state}" for state in _STATE_ORDER if counts[state]) + more)
+
+    def _elapsed(self, number: int) -> str:
+        if number not in self._seconds:
+            return ""
+        ended = self._statuses[number].state in ENDED
+        return f"{self._seconds[number] if ended else time.monotonic() - self._seconds[number]:.0f}"
+
+
+def _state(status: JobStatus) -> str:
+    return status.state + (f", try {status.attempt + 1}" if status.attempt else "")
+
+
+def _steps(status: JobStatus) -> str:
+    return f"step {status.step:,} ({status.progress:.0%})" if status.step else ""
+
+
+def _psnr(status: JobStatus, unit: str = "") -> str:
+    return "" if status.psnr is None else f"{status.psnr:.2f}{unit}"
+
+
+def _style(status: JobStatus) -> str:
+    return {"failed": "red", "done": "green", "waiting": "dim"}.get(status.state, "")
+
+
+class _RunProgress(LaunchProgress):
+    """Without a terminal, also print started and finished runs on standard output."""
 
     def __init__(self, configs: Sequence[RunConfig]) -> None:
         super().__init__(plain_console(stderr=True), [config.output_dir.name for config in configs])
         self._configs = configs
 
-    def __call__(self, number: int, status: Status) -> None:
+    def __call__(self, number: int, status: JobStatus) -> None:
         fresh = self._statuses[number].state == "waiting"
         super().__call__(number, status)
         directory, many = self._configs[number].output_dir, len(self._configs)
@@ -70,8 +185,9 @@ def _print_error(directory: Path, line: str) -> None:
     print(f"neuprim: error: {directory}: {line}", file=sys.stderr, flush=True)
 
 
-def _told(configs: Sequence[RunConfig], results: Sequence[Result | None], live: bool, typed: CommandLine) -> int:
-    """Says what failed, and what is to be done after Ctrl-C; the exit status: 2 for the input's fault, 1 for a bug."""
+def _report(configs: Sequence[RunConfig], results: Sequence[Result | None], live: bool, typed: CommandLine) -> int:
+    """Print failures, and raise KeyboardInterrupt with the command that continues; returns the exit status: 2 for bad
+    input, 1 for a bug."""
     status = 0
     for config, result in zip(configs, results, strict=True):
         if result is None or result.state == "interrupted":
@@ -91,11 +207,11 @@ def _told(configs: Sequence[RunConfig], results: Sequence[Result | None], live: 
         if result is None or result.state == "interrupted"
     ]
     if left:
-        raise KeyboardInterrupt(_to_go_on(configs, left, typed))
+        raise KeyboardInterrupt(_describe_rest(configs, left, typed))
     return status
 
 
-def _to_go_on(configs: Sequence[RunConfig], left: Sequence[RunConfig], typed: CommandLine) -> str:
+def _describe_rest(configs: Sequence[RunConfig], left: Sequence[RunConfig], typed: CommandLine) -> str:
     begun = [config.output_dir for config in left if (config.output_dir / "checkpoint.safetensors").exists()]
     if len(configs) == 1:
         where = f"{left[0].output_dir} {'has the run up to here' if begun else 'has no checkpoint yet'}"

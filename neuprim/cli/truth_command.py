@@ -32,14 +32,14 @@ def _truth(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import RunProgress
     from neuprim.config import compose, compose_all
     from neuprim.config.launcher import take_launcher
-    from neuprim.runs.ground_truth import make_truth
+    from neuprim.runs.ground_truth import render_ground_truth
 
     launcher, rest = take_launcher(args.overrides)
     configs = compose_all(rest) if args.multirun else [compose(rest)]
     try:
         for config in configs:
             with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}") as events:
-                made = make_truth(config, launcher, events)
+                made = render_ground_truth(config, launcher, events)
             if made is None:
                 raise ConfigError(
                     f"scene={config.scene_name}: its images are not rendered frame by frame; expected "

@@ -43,7 +43,7 @@ class RunSettings:
         validate_fields(self, "")
         backends.check_backend_name(self.renderer.backend)
         backends.check_backend_device(self.renderer)
-        population.check_name(self.train.population.strategy)
+        population.check_strategy(self.train.population.strategy)
 
 
 @dataclass

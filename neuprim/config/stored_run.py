@@ -14,7 +14,7 @@ from neuprim.config.run_config import RunConfig, RunSettings
 from neuprim.config.task_files import task_choices, to_plain
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.notices import warn_once
-from neuprim.core.train.distributed.place import place_of
+from neuprim.core.train.distributed.torchrun import read_torchrun_rank
 from neuprim.core.validation import format_value
 from neuprim.plugins.mechanism import Group, UnknownPlugin
 from neuprim.plugins.names import BUILT_IN, qualified, split
@@ -39,7 +39,7 @@ __all__ = [
 _NOT_TAKEN = ("output_dir", "resume")
 """Settings of a stored run that say where it is."""
 
-_SHARD, _VIEWS = "train.shard", "train.views_per_step"
+_VIEWS = "train.views_per_step"
 """Settings of each process, which follow from how many are launched."""
 
 _FREE = ("memory", "chunks")
@@ -220,17 +220,17 @@ def changed_overrides(begun: RunConfig, overrides: Sequence[str]) -> list[str]:
     """Return the overrides that differ from those that the run was begun with, and those of its place."""
     before = {key_of(word): word for word in begun.overrides}
     now = {key_of(word): word for word in overrides}
-    always = (*NOT_SWEPT, _SHARD, _VIEWS)
+    always = (*NOT_SWEPT, _VIEWS)
     return [word for word in overrides if key_of(word) in always or before.get(key_of(word)) != now[key_of(word)]]
 
 
 def launch_settings(overrides: Sequence[str]) -> set[str]:
     """Return the settings that a resumed run does not take over, as they follow from how it is launched now.
 
-    One process has all primitives. Where several get the overrides that describe the run, these say each one's views.
+    Where several ranks get the overrides that describe the run, these say each one's views.
     """
-    if place_of() is None:
-        return {_SHARD}
+    if read_torchrun_rank() is None:
+        return set()
     return {_VIEWS} if {key_of(word) for word in overrides} & {"task", "scene"} else set()
 
 

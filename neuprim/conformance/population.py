@@ -12,7 +12,7 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
-from neuprim.core.train.population import SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT
+from neuprim.core.train.splitting import SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT
 
 __all__ = ["check_clone", "check_divide", "check_on_split", "check_scale_density"]
 

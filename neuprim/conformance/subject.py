@@ -23,7 +23,7 @@ from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.backends import REFERENCE
 from neuprim.core.task import TaskSpec
-from neuprim.core.train.initial import initial_model
+from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.settings import PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
 from neuprim.core.used_settings import build_settings, loss_settings

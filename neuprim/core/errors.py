@@ -63,15 +63,15 @@ class DeviceMemoryError(NeuprimError):
 
 
 class RankError(NeuprimError):
-    """Another process of the same training died, failed or differs; the message names its rank.
+    """Another process of the same training ended, failed or differs.
 
     Attributes:
-        told: whether another rank has told the user already.
+        reported: whether another rank has told the user already.
     """
 
-    def __init__(self, message: str, told: bool = False) -> None:
+    def __init__(self, message: str, reported: bool = False) -> None:
         super().__init__(message)
-        self.told = told
+        self.reported = reported
 
 
 class FormError(NeuprimError):

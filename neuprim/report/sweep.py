@@ -17,7 +17,7 @@ from neuprim.report.charts import LARGE, Points, curve_chart
 from neuprim.report.page import escape, format_bytes, format_count, format_decimal, format_duration, section
 from neuprim.report.run_record import RunRecord, ViewFiles
 
-__all__ = ["Compared", "numbers_of", "write_sweep"]
+__all__ = ["SweepRun", "numbers_of", "write_sweep_page"]
 
 LESS, MORE = "less", "more"
 BETTER: dict[str, str] = {
@@ -63,7 +63,7 @@ MOST_PICTURES, MOST_VIEWS = 8, 3
 
 
 @dataclass(frozen=True)
-class Compared:
+class SweepRun:
     """One run of a sweep.
 
     Attributes:
@@ -94,7 +94,7 @@ def numbers_of(metrics: Mapping[str, object]) -> dict[str, float]:
     return {name: value for name, value in found.items() if value is not None}
 
 
-def write_sweep(folder: Path, runs: Sequence[Compared], words: Sequence[str]) -> Path:
+def write_sweep_page(folder: Path, runs: Sequence[SweepRun], words: Sequence[str]) -> Path:
     """Write ``sweep.html`` into a sweep's directory, finished or not, and return its path.
 
     The page needs nothing else; without scripts it stands in the order of the mean PSNR.
@@ -133,7 +133,7 @@ def better(name: str) -> str | None:
 
 
 class _Page:
-    def __init__(self, folder: Path, runs: Sequence[Compared], words: Sequence[str]) -> None:
+    def __init__(self, folder: Path, runs: Sequence[SweepRun], words: Sequence[str]) -> None:
         self.folder, self.words = folder, words
         self.numbers = {run.name: run.numbers for run in runs}
         self.runs = sorted(runs, key=lambda run: -self.numbers[run.name].get("psnr", -math.inf))
@@ -203,7 +203,7 @@ class _Page:
         note = '<p class="note">Orange: the best of a column. A name leads to the run’s own report.</p>'
         return section("All runs", choice + table + note)
 
-    def _row(self, run: Compared, keys: Sequence[str], best: Mapping[str, Compared | None]) -> str:
+    def _row(self, run: SweepRun, keys: Sequence[str], best: Mapping[str, SweepRun | None]) -> str:
         chip = f'<span class="chip" style="background: {self.colours[run.name]}"></span>'
         name = escape(run.name)
         if run.run is not None and (run.run.run_dir / "report.html").is_file():
@@ -243,14 +243,14 @@ class _Page:
 
     def pictures(self) -> str:
         """The same views of the best runs; runs of different data have views of their own."""
-        groups: dict[tuple[str | None, str | None], list[tuple[Compared, RunRecord]]] = {}
+        groups: dict[tuple[str | None, str | None], list[tuple[SweepRun, RunRecord]]] = {}
         for run in self.runs:
             if run.run is not None and run.run.views:
                 groups.setdefault((run.run.name_of("task"), run.run.name_of("scene")), []).append((run, run.run))
         body = "".join(self._group(members, len(groups) > 1) for members in groups.values())
         return section("Held-out views side by side", body) if body else ""
 
-    def _group(self, members: Sequence[tuple[Compared, RunRecord]], titled: bool) -> str:
+    def _group(self, members: Sequence[tuple[SweepRun, RunRecord]], titled: bool) -> str:
         shown = members[:MOST_PICTURES]
         views = _spread(shown[0][1].views, MOST_VIEWS)
         html = (
@@ -277,7 +277,7 @@ class _Page:
         pairs += [("time of all runs together", format_duration(sum(run.seconds for run in self.runs)))]
         return section("Where the numbers come from", page.fact_list(pairs))
 
-    def _best(self, name: str) -> Compared | None:
+    def _best(self, name: str) -> SweepRun | None:
         sign = {MORE: 1.0, LESS: -1.0, None: math.nan}[better(name)]
         having = [run for run in self.runs if name in self.numbers[run.name]]
         return (

@@ -16,17 +16,17 @@ import torch
 
 from neuprim.core.compute.kernels import cache_directory
 
-__all__ = ["Compiling", "compiled", "compiling", "main", "mark_compiled", "variant"]
+__all__ = ["KernelCompilation", "is_compiled", "compile_in_background", "main", "mark_compiled", "kernel_variant"]
 
 _LIMIT = 600.0  # seconds after which the run goes on alone
 
 
-def variant(colour: str, edge: int) -> str:
+def kernel_variant(colour: str, edge: int) -> str:
     """Name of the kernels that draw a form of colour (the name of its class) with an edge of density."""
     return f"{colour}-{edge}"
 
 
-def compiled(backend: str, form: str) -> bool:
+def is_compiled(backend: str, form: str) -> bool:
     """Whether the kernels with which a backend draws a :func:`variant` are on disk."""
     return _marker(backend, form).exists()
 
@@ -44,7 +44,7 @@ def _marker(backend: str, form: str) -> Path:
     return cache_directory() / f"{backend}-{form}.compiled"
 
 
-class Compiling:
+class KernelCompilation:
     """A process that compiles, or none where there is nothing to do."""
 
     def __init__(self, process: subprocess.Popen[bytes] | None) -> None:
@@ -70,14 +70,14 @@ class Compiling:
 
 
 @contextmanager
-def compiling(backend: str | None, edge: int = 0) -> Iterator[Compiling]:
+def compile_in_background(backend: str | None, edge: int = 0) -> Iterator[KernelCompilation]:
     """Start compiling this backend for densities of an edge, None for none, unless that has been done; the process
     never outlives the block."""
     process = None
-    if backend is not None and not compiled(backend, variant("Constant", edge)) and sys.executable:
+    if backend is not None and not is_compiled(backend, kernel_variant("Constant", edge)) and sys.executable:
         quiet, words = subprocess.DEVNULL, [sys.executable, "-m", "neuprim.runs.compile", backend, str(edge)]
         process = subprocess.Popen(words, stdin=quiet, stdout=quiet, stderr=quiet)
-    started = Compiling(process)
+    started = KernelCompilation(process)
     try:
         yield started
     finally:
@@ -127,7 +127,7 @@ def main(backend: str, edge: int = 0) -> None:
     )
     loss.backward()
     RowAdam(specs, params).step(params, {spec.name: 1e-3 for spec in specs})
-    mark_compiled(backend, variant("Constant", edge))
+    mark_compiled(backend, kernel_variant("Constant", edge))
 
 
 if __name__ == "__main__":

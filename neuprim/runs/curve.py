@@ -10,12 +10,11 @@ from types import TracebackType
 from neuprim.core.io.files import write_text
 from neuprim.core.io.plain import finite, load_json
 from neuprim.core.metrics import psnr
-from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs.measure import draw
+from neuprim.runs.measure import render_image
 
-__all__ = ["curve_psnr", "next_evaluation", "open_curve", "read_curve"]
+__all__ = ["evaluate_curve_point", "next_evaluation_progress", "open_curve", "read_curve"]
 
 _VIEWS = 5  # held-out views behind the curve's eval_psnr
 _PSNR_MAX = 200.0  # dB; equal images have an infinite one
@@ -79,22 +78,21 @@ def read_curve(path: Path, settings: TrainSettings) -> tuple[tuple[float, float]
     return tuple(found)
 
 
-def next_evaluation(trainer: Trainer) -> float:
+def next_evaluation_progress(trainer: Trainer) -> float:
     """The progress at which the curve gets its next point."""
     every = trainer.settings.eval_every
     return (int(trainer.progress / every + 1e-9) + 1) * every if every > 0 else float("inf")
 
 
-def curve_psnr(trainer: Trainer) -> float:
-    """Mean PSNR of a few held-out views as :func:`~neuprim.runs.measure.measure` has it, but at most 200 dB, so that a
+def evaluate_curve_point(trainer: Trainer) -> float:
+    """Mean PSNR of a few held-out views as :func:`~neuprim.runs.measure.measure_views` has it, but at most 200 dB, so that a
     line of JSON can hold it; does not touch the training state."""
     views = trainer.dataset.test
     picks = sorted({i * len(views) // _VIEWS for i in range(_VIEWS)})
 
-    def judge(place: int, model: Primitives) -> float:
-        i = picks[place]
+    total = 0.0
+    for i in picks:
         pixels = views.pixels(i)
-        rendered = draw(model, views.view(i), trainer.renderer, trainer.dataset.background)
-        return min(psnr(rendered, pixels.over(trainer.dataset.background), pixels.mask), _PSNR_MAX)
-
-    return sum(trainer.ranks.judged(trainer.model, [views.view(i) for i in picks], judge)) / len(picks)
+        rendered = render_image(trainer.model, views.view(i), trainer.renderer, trainer.dataset.background)
+        total += min(psnr(rendered, pixels.over(trainer.dataset.background), pixels.mask), _PSNR_MAX)
+    return total / len(picks)

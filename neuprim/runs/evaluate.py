@@ -19,7 +19,7 @@ from neuprim.plugins.judging import clips_of, orbit_of
 from neuprim.report import Viewer, error_map, write_report
 from neuprim.report.regions import Regions
 from neuprim.runs.fit import Fitted
-from neuprim.runs.measure import draw, measure, summary
+from neuprim.runs.measure import measure_views, render_image, summarize_metrics
 from neuprim.webpage.scene import held_out, scene_page, start_of
 
 __all__ = ["evaluate_fitted"]
@@ -60,19 +60,19 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
             images.write_png(folder / f"{stem}_truth.png", channels.display(truth))
             images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
 
-    views = measure(model, task, dataset, config.renderer, channels, write_view, fitted.lpips)
+    views = measure_views(model, task, dataset, config.renderer, channels, write_view, fitted.lpips)
     regions.write(folder)
     for clip in clips:
         if clip.source is None:
             continue  # its frames are test views, written above
         for i in clip.views:
             truth = clip.source.pixels(i).over(dataset.background)
-            add_frame(clip, i, draw(model, clip.source.view(i), config.renderer, dataset.background), truth)
+            add_frame(clip, i, render_image(model, clip.source.view(i), config.renderer, dataset.background), truth)
     size = (directory / "model.safetensors").stat().st_size
-    metrics = summary(config, model, task, dataset, channels, views, size, fitted.training, fitted.lpips)
+    metrics = summarize_metrics(config, model, task, dataset, channels, views, size, fitted.training, fitted.lpips)
     write_json(directory / "metrics.json", metrics)
     views_around = orbit_of(task, dataset, _ORBIT_FRAMES)
-    frames = [channels.display(draw(model, v, config.renderer, dataset.background)) for v in views_around]
+    frames = [channels.display(render_image(model, v, config.renderer, dataset.background)) for v in views_around]
     write_animation(folder / "orbit.webp", frames, fps=12.0)
     write_report(directory, task.conditions, _embedded_viewer(fitted, directory))
     return metrics
@@ -89,8 +89,8 @@ def _embedded_viewer(fitted: Fitted, directory: Path) -> Viewer | None:
     ):
         return None
 
-    def render_image(model: Primitives, camera: Camera, conditions: Conditions) -> torch.Tensor:
-        return draw(model, View("", camera, conditions), config.renderer, dataset.background)
+    def render_frame(model: Primitives, camera: Camera, conditions: Conditions) -> torch.Tensor:
+        return render_image(model, View("", camera, conditions), config.renderer, dataset.background)
 
     views = held_out(dataset, channels, _SHOWN_VIEWS)
     try:
@@ -99,7 +99,7 @@ def _embedded_viewer(fitted: Fitted, directory: Path) -> Viewer | None:
             fitted.model,
             channels,
             config.renderer,
-            render_image,
+            render_frame,
             specs=task.conditions,
             start=start_of(task.conditions, views, {}),
             views=views,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from neuprim.core.train.trainer import StepReport
 
-__all__ = ["Evaluated", "Event", "Events", "Finishing", "Note", "Preparing", "Step", "silent"]
+__all__ = ["Evaluated", "Event", "Events", "Finishing", "Note", "Preparing", "Step", "ignore_event"]
 
 
 @dataclass(frozen=True)
@@ -55,5 +55,5 @@ Event = Preparing | Step | Evaluated | Finishing | Note
 Events = Callable[[Event], None]
 
 
-def silent(event: Event) -> None:
+def ignore_event(event: Event) -> None:
     """Nobody listens."""

@@ -1,11 +1,13 @@
-"""``neuprim export`` and ``neuprim import``: models out of run directories and back."""
+"""Export the model of a run directory to another format, and import it back."""
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +19,32 @@ from neuprim.core.compression import is_compressed
 from neuprim.core.conditions import flag, named, read_conditions, split_words
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
-from neuprim.core.io.files import StagedOutput, refuse_existing, staged
+from neuprim.core.io.files import StagedOutput, refuse_existing, staged, write_json
+from neuprim.core.io.plain import load_json
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.blame import origin_of, reported
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
-from neuprim.runs.export_record import record_export
 from neuprim.runs.open import COMPRESSED, load_run, open_run
+from neuprim.version import __version__
 
-__all__ = ["export_run", "import_model", "import_run"]
+__all__ = ["EXPORTS_FILE", "export_run", "import_model", "import_run"]
 
 Progress = Callable[[str, float], None]
+
+EXPORTS_FILE = "exports.json"
+"""In a run directory: formats and packages it was exported with, newest last."""
+
+_MAX_ENTRIES = 200
+"""Only the newest are kept."""
+
+_EXPORTS_MAX_FILES = 20
+"""Names kept of one export, which may have a thousand frames."""
+
+_MAX_CHARACTERS = 500
+"""Of one text."""
+
+_MAX_BYTES = 1 << 24
+"""A larger file was written by something else."""
 
 # ---------------------------------------------------------------- export
 
@@ -58,17 +76,17 @@ def export_run(
     final = _destination(run_dir, exporter, out)
     refuse_existing(final, overwrite)
     run = open_run(run_dir, progress)
-    options, conditions = _options(words, exporter, run.task.conditions)
+    options, conditions = _parse_options(words, exporter, run.task.conditions)
     notes: list[str] = []
     read_conditions(run.task.conditions, conditions, notes.append)
     with staged(final, overwrite) as output:
         job = ExportJob(run, output.out, options, conditions, progress)
         with reported(EXPORTERS, name, [run_dir / "logs", final.absolute().parent]):
             report = exporter.write(job)
-        files = _files(report, output, name)
+        files = _final_files(report, output, name)
         output.publish()
     report = replace(report, files=files, notes=(*notes, *(output.final_text(note) for note in report.notes)))
-    return record_export(name, job, report)
+    return _record_export(name, job, report)
 
 
 def _destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
@@ -81,7 +99,7 @@ def _destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
     return out
 
 
-def _files(report: Any, output: StagedOutput, name: str) -> tuple[Path, ...]:
+def _final_files(report: Any, output: StagedOutput, name: str) -> tuple[Path, ...]:
     """Where the files of a report will be."""
     who = f"exporter {name!r} of {origin_of(EXPORTERS, name).origin}"
     if not isinstance(report, ExportReport):
@@ -99,7 +117,7 @@ def _files(report: Any, output: StagedOutput, name: str) -> tuple[Path, ...]:
     return tuple(files)
 
 
-def _options(
+def _parse_options(
     words: Sequence[str], exporter: Exporter, specs: Sequence[ConditionSpec]
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Every option of the exporter, and the texts of the conditions; where both have one name, ``NAME=`` means the
@@ -120,7 +138,7 @@ def _options(
             conditions[condition] = text
         elif key in exporter.options:
             given.add(key)
-            options[key] = _scalar(text)
+            options[key] = _parse_scalar(text)
         else:
             known = [*exporter.options, *((spec.name for spec in specs) if exporter.conditions else ())]
             raise ConfigError(
@@ -129,7 +147,7 @@ def _options(
     return options, conditions
 
 
-def _scalar(text: str) -> Any:
+def _parse_scalar(text: str) -> Any:
     """A number, true, false, null, or the text; unlike YAML's, 1e-3 is a number and 1:40 is text."""
     named = {"true": True, "false": False, "null": None, "": None}
     if text in named:
@@ -140,6 +158,80 @@ def _scalar(text: str) -> Any:
         except ValueError:
             continue
     return text
+
+
+# ---------------------------------------------------------------- record
+
+
+def _record_export(word: str, job: ExportJob, report: ExportReport) -> ExportReport:
+    """Add an export to its run's list; returns its report, with a note if the list could not be written.
+
+    Args:
+        word: what chose the exporter, ``NAME`` or ``PACKAGE:NAME``.
+    """
+    path = job.run.directory / EXPORTS_FILE
+    try:
+        write_json(path, [*_read_record(path), _entry(word, job, report)][-_MAX_ENTRIES:])
+    except OSError as error:
+        return replace(
+            report,
+            notes=(*report.notes, f"{path}: not written ({error.strerror or error}); this export is not recorded"),
+        )
+    except ValueError as error:
+        return replace(report, notes=(*report.notes, f"{path}: {error}; left as it is, this export is not recorded"))
+    return report
+
+
+def _entry(word: str, job: ExportJob, report: ExportReport) -> dict[str, Any]:
+    info, files = EXPORTERS.find(word), [_relative_path(Path(file), job.run.directory) for file in report.files]
+    return {
+        "files": files[:_EXPORTS_MAX_FILES],
+        **({"more_files": len(files) - _EXPORTS_MAX_FILES} if len(files) > _EXPORTS_MAX_FILES else {}),
+        "format": info.name,
+        "package": info.distribution,
+        "version": info.version,
+        "neuprim": __version__,
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "options": _plain({**job.options, **job.conditions}),
+        "lossless": bool(report.lossless),
+    }
+
+
+def _relative_path(file: Path, directory: Path) -> str:
+    """Relative to the run directory if it lies in there, so that a run that was moved still finds it; else absolute."""
+    whole, inside = file.absolute(), directory.absolute()
+    return str(whole.relative_to(inside) if whole.is_relative_to(inside) else whole)[:_MAX_CHARACTERS]
+
+
+def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options as strict JSON holds them."""
+    plain: dict[str, Any] = {}
+    for key, value in options.items():
+        number = isinstance(value, bool | int) or (isinstance(value, float) and math.isfinite(value))
+        plain[str(key)[:_MAX_CHARACTERS]] = value if value is None or number else str(value)[:_MAX_CHARACTERS]
+    return plain
+
+
+def _read_record(path: Path) -> list[Any]:
+    """Earlier entries.
+
+    Raises:
+        ValueError: the file is not a list of exports.
+        OSError: it cannot be read.
+    """
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ValueError(f"larger than {_MAX_BYTES} bytes; expected a list of exports")
+        text = path.read_bytes()
+    except FileNotFoundError:
+        return []
+    try:
+        entries = load_json(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError("not JSON; expected a list of exports") from error
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ValueError("expected a list of exports")
+    return entries
 
 
 # ---------------------------------------------------------------- import
@@ -161,14 +253,14 @@ def import_run(path: Path, out: Path, name: str | None = None) -> Path:
         raise ConfigError(f"--out {out}: exists and is not an empty folder")
     if name is None and is_compressed(path):
         return _import_compressed(path, out)
-    reader = _reader(path, name)
+    reader = _find_reader(path, name)
     assert reader.read is not None
     with reported(EXPORTERS, name or reader.name, [out.absolute().parent]):
         stored = reader.read(path)
     return import_model(stored, path, out)
 
 
-def _reader(path: Path, name: str | None) -> Exporter:
+def _find_reader(path: Path, name: str | None) -> Exporter:
     name = name or path.suffix.lower().removeprefix(".")
     try:
         exporter = load_exporter(name)
@@ -185,7 +277,7 @@ def import_model(stored: StoredModel, path: Path, out: Path) -> Path:
     """Write a stored model as a run directory and load it once, so that nothing unsound gets the name ``out``."""
     header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
     tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}
-    return _run_of(
+    return _write_run(
         path,
         out,
         stored.config,
@@ -197,10 +289,10 @@ def _import_compressed(path: Path, out: Path) -> Path:
     config = checkpoint.stored_config(path)
     if config is None:
         raise DataError(f"{path}: holds no config.yaml; expected a file written by `neuprim compress`")
-    return _run_of(path, out, config, lambda output: shutil.copyfile(path, output / COMPRESSED))
+    return _write_run(path, out, config, lambda output: shutil.copyfile(path, output / COMPRESSED))
 
 
-def _run_of(path: Path, out: Path, config: str, write: Callable[[Path], object]) -> Path:
+def _write_run(path: Path, out: Path, config: str, write: Callable[[Path], object]) -> Path:
     """A run directory with this text of ``config.yaml`` and the model that ``write`` puts there."""
     out.parent.mkdir(parents=True, exist_ok=True)
     output = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))

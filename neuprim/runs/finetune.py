@@ -11,7 +11,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs.fit import make_loss, settings_for
+from neuprim.runs.fit import keep_model_settings, make_loss
 
 __all__ = ["fine_tuner", "steps_in"]
 
@@ -56,7 +56,7 @@ def fine_tuner(
         model.density, model.colour, {name: value.detach().clone() for name, value in model.params.items()}
     )
     whole = round(steps / (1 - begin))
-    usual = settings_for(config.train, task, copy)
+    usual = keep_model_settings(config.train, task, copy)
     final = COOL ** (1 / (1 - begin))  # a rate's factor is final ** progress
     scale = max(START * min(steps / LONG, 1.0), LEAST_START) * usual.final_rate / final**begin
     settings = replace(

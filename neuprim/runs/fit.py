@@ -10,18 +10,20 @@ from typing import Any
 
 import torch
 
-from neuprim.config import RunConfig, made_now, suspects_of, task_of
+from neuprim.config import RunConfig, made_now, scene_of, suspects_of, task_of
 from neuprim.core.channels import Channels, channels_of
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.dataset_check import check_dataset
+from neuprim.core.errors import ConfigError
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.reduction import reduce_fields
 from neuprim.core.render import backends
 from neuprim.core.task import Loss, TaskSpec
-from neuprim.core.train.distributed.refusals import refuse_parts
-from neuprim.core.train.initial import initial_model
+from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
+from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.core.used_settings import build_settings, loss_settings
@@ -30,27 +32,28 @@ from neuprim.plugins.checked import check_fields, checked_loss
 from neuprim.plugins.judging import clips_of, facts_of
 from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.registry import load_loss
-from neuprim.runs.chunks.asked import refuse_chunks
-from neuprim.runs.curve import curve_psnr, next_evaluation
-from neuprim.runs.events import Evaluated, Events, Note, Preparing, Step, silent
-from neuprim.runs.measure import measure, summary
+from neuprim.runs.curve import evaluate_curve_point, next_evaluation_progress
+from neuprim.runs.events import Evaluated, Events, Note, Preparing, Step, ignore_event
+from neuprim.runs.measure import measure_views, summarize_metrics
 from neuprim.runs.open import LOGS, load_dataset
 
 __all__ = [
     "Fitted",
-    "Make",
-    "complete",
+    "TrainerFactory",
+    "train_to_end",
     "fit",
+    "is_chunked",
+    "refuse_chunks",
     "make_loss",
     "make_trainer",
-    "one_torch_thread",
-    "start",
-    "steps",
+    "use_one_torch_thread",
+    "prepare_training",
+    "train_steps",
     "compile_kernels",
 ]
 
 
-Make = Callable[[RunConfig, TaskSpec, Dataset, Loss], Trainer]
+TrainerFactory = Callable[[RunConfig, TaskSpec, Dataset, Loss], Trainer]
 """(configuration, its task, its data, its loss) -> the trainer of a model that is there already."""
 
 
@@ -85,9 +88,11 @@ class Fitted:
         """The content of ``metrics.json``, measured on the views that judge; the model's size is that of its
         tensors."""
         self.unlock()
-        views = measure(self.model, self.task, self.dataset, self.config.renderer, self.channels, lpips=self.lpips)
+        views = measure_views(
+            self.model, self.task, self.dataset, self.config.renderer, self.channels, lpips=self.lpips
+        )
         size = 4 * sum(value.numel() for value in self.model.params.values())
-        return summary(
+        return summarize_metrics(
             self.config,
             self.model,
             self.task,
@@ -101,7 +106,7 @@ class Fitted:
         )
 
 
-def fit(config: RunConfig, events: Events = silent, dataset: Dataset | None = None) -> Fitted:
+def fit(config: RunConfig, events: Events = ignore_event, dataset: Dataset | None = None) -> Fitted:
     """Train a configuration to the end of its budget, in memory.
 
     Args:
@@ -110,30 +115,29 @@ def fit(config: RunConfig, events: Events = silent, dataset: Dataset | None = No
     Raises:
         NeuprimError: the input's fault, or numbers that left the finite.
     """
-    if config.train.shard:
-        refuse_parts(config.train, 1)
     suspects = suspects_of(config)
     with suspects.watch(config.output_dir / LOGS):
-        return complete(start(config, events, dataset, suspects), events)
+        return train_to_end(prepare_training(config, events, dataset, suspects), events)
 
 
-def complete(fitted: Fitted, events: Events = silent) -> Fitted:
+def train_to_end(fitted: Fitted, events: Events = ignore_event) -> Fitted:
     """Train what :func:`start` made to the end of its budget; returns it."""
     compile_kernels(fitted.trainer)
-    with one_torch_thread():
-        for _ in steps(fitted.trainer, events):
+    with use_one_torch_thread():
+        for _ in train_steps(fitted.trainer, events):
             pass
     fitted.unlock()
     return fitted
 
 
-def start(
+def prepare_training(
     config: RunConfig,
-    events: Events = silent,
+    events: Events = ignore_event,
     dataset: Dataset | None = None,
     suspects: Suspects | None = None,
     hold_out: int = 0,
-    make: Make | None = None,
+    make: TrainerFactory | None = None,
+    group: ProcessGroup | None = None,
 ) -> Fitted:
     """Everything up to the first step. Raises as :func:`fit`.
 
@@ -143,6 +147,7 @@ def start(
         What a task knows of
             its test views, and checks here, is of those that the data set came with.
         make: what makes the trainer; None: :func:`make_trainer`, of a fresh model.
+        group: the ranks that train the model together; None for one process.
     """
     if make is None:
         refuse_chunks(config, "this trains one model at once, and only a whole run can be fitted in chunks")
@@ -167,7 +172,7 @@ def start(
         trainer = make(config, task, dataset, loss)
         return Fitted(_as_drawn(config, trainer), task, dataset, channels, trainer, lpips)
     events(Preparing("starting points"))
-    trainer = make_trainer(config, task, dataset, loss)
+    trainer = make_trainer(config, task, dataset, loss, group)
     config = _as_drawn(config, trainer)
     asked, found = config.model.primitives, trainer.model.count
     if found < _first(config):
@@ -182,26 +187,26 @@ def _as_drawn(config: RunConfig, trainer: Trainer) -> RunConfig:
     return replace(config, renderer=replace(config.renderer, near=trainer.renderer.near))
 
 
-def steps(trainer: Trainer, events: Events = silent) -> Iterator[tuple[StepReport, float | None]]:
+def train_steps(trainer: Trainer, events: Events = ignore_event) -> Iterator[tuple[StepReport, float | None]]:
     """Step until the budget is used: what each step did, and the held-out PSNR where the curve gets a point after it.
 
     Between two steps the state may be saved or the loop left.
     """
-    next_eval = next_evaluation(trainer)
+    next_eval = next_evaluation_progress(trainer)
     for report in trainer.run():
         events(Step(report, trainer.progress))
-        hold_out_views = None
+        held_out = None
         if trainer.progress >= next_eval:
-            if trainer.ranks.first or trainer.ranks.parts:  # a view is drawn with the primitives of all
-                hold_out_views = curve_psnr(trainer)
-                events(Evaluated(hold_out_views))
-            next_eval = next_evaluation(trainer)
-        yield report, hold_out_views
+            if trainer.rank == 0:
+                held_out = evaluate_curve_point(trainer)
+                events(Evaluated(held_out))
+            next_eval = next_evaluation_progress(trainer)
+        yield report, held_out
     asked = trainer.settings.population.grow_to or 0
-    if trainer.settings.population.strategy == "relocate" and trainer.count < asked:
+    if trainer.settings.population.strategy == "relocate" and trainer.model.count < asked:
         events(
             Note(
-                f"{trainer.count:,} primitives of model.primitives={asked:,}: too few interventions, or places with an error, to split for the others; "
+                f"{trainer.model.count:,} primitives of model.primitives={asked:,}: too few interventions, or places with an error, to split for the others; "
                 "see train.population.every"
             )
         )
@@ -225,11 +230,18 @@ def make_loss(config: RunConfig, task: TaskSpec) -> Loss:
     return checked_loss(made, guard)
 
 
-def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss | None = None) -> Trainer:
+def make_trainer(
+    config: RunConfig,
+    task: TaskSpec,
+    dataset: Dataset,
+    loss: Loss | None = None,
+    group: ProcessGroup | None = None,
+) -> Trainer:
     """A fresh model of a run's configuration and what fits it.
 
     Args:
         loss: as :func:`make_loss` makes it, which is called without one.
+        group: the ranks that train the model together; None for one process.
 
     Raises:
         ConfigError: a rate or starting value for something the model does not have.
@@ -247,11 +259,12 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
     population = config.train.population
     if population.grow_to is None:
         population = replace(population, grow_to=config.model.primitives)
-    settings = settings_for(replace(config.train, population=population), task, model)
-    return Trainer(model, dataset, loss or make_loss(config, task), settings, config.renderer, config.seed)
+    settings = keep_model_settings(replace(config.train, population=population), task, model)
+    parts = model, dataset, loss or make_loss(config, task), settings, config.renderer, config.seed
+    return Trainer(*parts) if group is None else DistributedTrainer(*parts, group)
 
 
-def settings_for(train: TrainSettings, task: TaskSpec, model: Primitives) -> TrainSettings:
+def keep_model_settings(train: TrainSettings, task: TaskSpec, model: Primitives) -> TrainSettings:
     """Training settings as a model's trainer takes them: a preset has rates for every density and colour of its task,
     and the trainer refuses names that the model does not have."""
     others = task.parameter_names() - model.params.keys()
@@ -277,7 +290,7 @@ def compile_kernels(trainer: Trainer) -> None:
 
 
 @contextmanager
-def one_torch_thread() -> Iterator[None]:
+def use_one_torch_thread() -> Iterator[None]:
     """Between kernels torch has only small tensors; its own thread pool would spin on the cores the kernels need."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -285,3 +298,14 @@ def one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def is_chunked(config: RunConfig) -> bool:
+    """Whether a scene that can be fitted in chunks shall be; other scenes may use the setting for something else."""
+    return config.scene.get("chunks") not in (None, 1) and scene_of(config, task_of(config)).spec.chunks is not None
+
+
+def refuse_chunks(config: RunConfig, what: str) -> None:
+    """Raise ConfigError where something that trains one model at once is asked to do it in chunks."""
+    if is_chunked(config):
+        raise ConfigError(f"scene.chunks={config.scene['chunks']}: {what}; expected scene.chunks=null")

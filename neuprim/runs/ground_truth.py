@@ -15,15 +15,20 @@ from neuprim.core.data.dataset import GroundTruth
 from neuprim.core.errors import DataError, NeuprimError
 from neuprim.core.io.store import WAIT_MESSAGE
 from neuprim.plugins.blame import blamed
-from neuprim.runs.events import Events, Note, Preparing, silent
-from neuprim.runs.launch.engine import Hear
-from neuprim.runs.launch.jobs import Job, Result
-from neuprim.runs.launch.share import at_once
-from neuprim.runs.launch.status import Status
-from neuprim.runs.launch.table import launch
-from neuprim.runs.open import LOGS, context_of
+from neuprim.runs.events import Events, Note, Preparing, ignore_event
+from neuprim.runs.launch.executors import count_parallel_jobs
+from neuprim.runs.launch.jobs import Job, JobStatus, Result
+from neuprim.runs.launch.launcher import OnStatus, launch
+from neuprim.runs.open import LOGS, make_scene_context
 
-__all__ = ["before_runs", "before_training", "make_frames", "make_truth", "shares", "truth_of"]
+__all__ = [
+    "render_ground_truth_of_runs",
+    "render_ground_truth_for_training",
+    "render_frames_job",
+    "render_ground_truth",
+    "split_frames",
+    "load_ground_truth",
+]
 
 _MOST = 16
 """Frames that a worker takes at a time."""
@@ -32,7 +37,7 @@ _kept: dict[str, GroundTruth] = {}
 """Of this process's last job: all jobs of a launch have one scene."""
 
 
-def truth_of(
+def load_ground_truth(
     config: RunConfig,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
     known: Mapping[str, Any] | None = None,
@@ -47,10 +52,12 @@ def truth_of(
         return None
     scene = suspects_of(config).scene
     with blamed(scene.origin, f"ground truth of {scene.what}", config.output_dir / LOGS):
-        return make(config.scene, context_of(config, progress), known)
+        return make(config.scene, make_scene_context(config, progress), known)
 
 
-def make_truth(config: RunConfig, settings: LauncherSettings, events: Events = silent) -> GroundTruth | None:
+def render_ground_truth(
+    config: RunConfig, settings: LauncherSettings, events: Events = ignore_event
+) -> GroundTruth | None:
     """Have what is missing of the ground truth made where the launcher says; None of a scene that renders none.
 
     Frames that are there are not made again, and each is kept as it is done. The launcher's files lie beside the run's
@@ -66,7 +73,7 @@ def make_truth(config: RunConfig, settings: LauncherSettings, events: Events = s
         NeuprimError: what the launcher or the scene refuses, or a frame that cannot be made.
         RuntimeError: a bug in a worker, with its traceback.
     """
-    truth = truth_of(config, lambda text, fraction: events(Preparing(text, fraction)))
+    truth = load_ground_truth(config, lambda text, fraction: events(Preparing(text, fraction)))
     if truth is None:
         return None
     missing = truth.missing()
@@ -77,7 +84,7 @@ def make_truth(config: RunConfig, settings: LauncherSettings, events: Events = s
     return truth
 
 
-def before_runs(configs: Sequence[RunConfig], settings: LauncherSettings, hear: Hear) -> None:
+def render_ground_truth_of_runs(configs: Sequence[RunConfig], settings: LauncherSettings, hear: OnStatus) -> None:
     """The ground truth of runs that are to be launched, once for all that share it; ``launcher=inline`` leaves that to
     the runs.
 
@@ -98,13 +105,15 @@ def before_runs(configs: Sequence[RunConfig], settings: LauncherSettings, hear: 
                 done = event.fraction if isinstance(event, Preparing) else 0.0
                 text = f"{event.text}, {done:.0%}" if done > 0 else event.text
                 for number in numbers:
-                    hear(number, Status("waiting", text, progress=done))
+                    hear(number, JobStatus("waiting", text, progress=done))
 
         with suppress(NeuprimError):
-            make_truth(configs[numbers[0]], settings, tell)
+            render_ground_truth(configs[numbers[0]], settings, tell)
 
 
-def before_training(config: RunConfig, settings: LauncherSettings, progress: Callable[[str, float], None]) -> None:
+def render_ground_truth_for_training(
+    config: RunConfig, settings: LauncherSettings, progress: Callable[[str, float], None]
+) -> None:
     """The ground truth of the trainings of one scene, as :func:`before_runs`; raises as :func:`make_truth`."""
 
     def tell(event: object) -> None:
@@ -112,10 +121,10 @@ def before_training(config: RunConfig, settings: LauncherSettings, progress: Cal
             progress(event.text, event.fraction)
 
     if settings.name != "inline":
-        make_truth(config, settings, tell)
+        render_ground_truth(config, settings, tell)
 
 
-def shares(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
+def split_frames(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
     """Frames for one job after the other: several at first, and one by one in the end, so that nobody waits long for a
     slow worker (guided self-scheduling; Polychronopoulos and Kuck, 1987)."""
     left = list(missing)
@@ -125,7 +134,7 @@ def shares(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
         left = left[count:]
 
 
-def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
+def render_frames_job(data: Mapping[str, Any], attempt: int, events: Events) -> int:
     """The function of a job; the number of its frames that are there then. Those that are, as of a worker that died,
     are not made again."""
     config = RunConfig.from_dict(data["config"])
@@ -145,14 +154,15 @@ def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
 def _launched(
     config: RunConfig, truth: GroundTruth, missing: Sequence[int], settings: LauncherSettings, events: Events
 ) -> None:
-    workers, _ = at_once(settings, len(missing))
-    parts = list(shares(missing, workers))
+    workers, _ = count_parallel_jobs(settings, len(missing))
+    parts = list(split_frames(missing, workers))
     outputs = config.output_dir.parent.absolute()  # which every machine sees
     new, folder = not outputs.exists(), outputs / f"truth-{uuid.uuid4().hex[:8]}"
     stop = folder / "failed"
     common = {"config": config.to_dict(), "known": dict(truth.known), "key": truth.key, "stop": str(stop)}
     jobs = [
-        Job(truth.frames[part[0]], f"{__name__}:{make_frames.__name__}", {**common, "frames": part}) for part in parts
+        Job(truth.frames[part[0]], f"{__name__}:{render_frames_job.__name__}", {**common, "frames": part})
+        for part in parts
     ]
     told = _Told(truth, parts, len(missing), events, stop)
     _kept.clear()
@@ -190,14 +200,12 @@ class _Told:
         self._text = f"rendering the ground truth: {len(truth.frames):,} frames"
         self._progress()
 
-    def hear(self, number: int, status: Status) -> None:
+    def hear(self, number: int, status: JobStatus) -> None:
         name = self._truth.frames[self._parts[number][0]]
         if status.state == "waiting":
             self._note(f"{name}: its worker died; what it had not finished is made again")
         elif status.text.startswith(WAIT_MESSAGE):
             self._note(status.text)
-        elif status.text.startswith("no sign"):
-            self._note(f"{name}: no sign of its worker for a minute")
 
     def ended(self, number: int, result: Result) -> None:
         if result.state == "failed":
@@ -220,7 +228,7 @@ class _Told:
 def _truth(config: RunConfig, known: Mapping[str, Any]) -> GroundTruth:
     key = _scene(config)
     if key not in _kept:
-        made = truth_of(config, known=known)
+        made = load_ground_truth(config, known=known)
         assert made is not None, "only scenes with a ground truth are launched"
         _kept.clear()
         _kept[key] = made

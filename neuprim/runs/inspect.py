@@ -31,8 +31,8 @@ from neuprim.inspect.page import write_page
 from neuprim.inspect.window import Window, panels_of
 from neuprim.plugins.blame import reported
 from neuprim.plugins.registry import INSPECTORS, PluginError, load_inspector
-from neuprim.runs.events import Events, Note, silent
-from neuprim.runs.kept import PRUNED, kept_pieces, kept_words
+from neuprim.runs.events import Events, Note, ignore_event
+from neuprim.runs.kept import PRUNED, describe_kept_shares, kept_shares
 from neuprim.runs.open import open_run
 
 __all__ = ["OUTPUTS", "Request", "inspect_run"]
@@ -72,7 +72,7 @@ class Request:
     overwrite: bool = False
 
 
-def inspect_run(request: Request, events: Events = silent) -> list[Path]:
+def inspect_run(request: Request, events: Events = ignore_event) -> list[Path]:
     """Does it, and returns the files that were written; none where a window was shown.
 
     Several frames become numbered files for .png and .vdb, an animation for .webp, .gif and .mp4, and a slider in a
@@ -201,7 +201,7 @@ class _Film:
             )
         )
         if (request.run_dir / PRUNED).exists():
-            for line in kept_words(kept_pieces(self.model)):
+            for line in describe_kept_shares(kept_shares(self.model)):
                 events(Note(line))
 
     def __len__(self) -> int:

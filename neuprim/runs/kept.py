@@ -6,13 +6,13 @@ from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import count_numbers, nonzero_rows
 
-__all__ = ["PRUNED", "kept_pieces", "kept_words"]
+__all__ = ["PRUNED", "kept_shares", "describe_kept_shares"]
 
 PRUNED = "pruned.json"
 """Of the directory of a pruned model: how it came to be."""
 
 
-def kept_pieces(model: Primitives) -> dict[str, float]:
+def kept_shares(model: Primitives) -> dict[str, float]:
     """Group of pieces -> share of its numbers that are kept, 0 to 1, as ``density.neuron 0`` and ``colour.band 1``."""
     kept: dict[str, float] = {}
     sizes: dict[str, int] = {}
@@ -24,6 +24,6 @@ def kept_pieces(model: Primitives) -> dict[str, float]:
     return {group: value / sizes[group] for group, value in kept.items()}
 
 
-def kept_words(kept: dict[str, float]) -> list[str]:
+def describe_kept_shares(kept: dict[str, float]) -> list[str]:
     """A line for every group of pieces that is not whole."""
     return [f"{name}: {share:.0%} of its numbers are kept" for name, share in kept.items() if share < 1]

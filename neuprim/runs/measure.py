@@ -38,11 +38,19 @@ from neuprim.core.notices import warn_once
 from neuprim.core.render import RenderSettings, choose_backend, render
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import clips_of, diagnosed, judged, mask_of
-from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, placed
+from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.render_config import estimate_file_bytes, parse_render_config
 from neuprim.version import __version__
 
-__all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "quality", "summary"]
+__all__ = [
+    "ViewMetrics",
+    "render_image",
+    "render_light_sum",
+    "evaluate_run",
+    "measure_views",
+    "measure_quality",
+    "summarize_metrics",
+]
 
 _VISIBLE = 20 * math.log10(255)
 """dB: smaller errors than one of 255 levels are not visible, and an empty frame's black image has no error at all."""
@@ -73,13 +81,13 @@ class ViewMetrics:
     empty: bool = False
 
 
-def draw(model: Primitives, view: View, settings: RenderSettings, background: Tensor) -> Tensor:
+def render_image(model: Primitives, view: View, settings: RenderSettings, background: Tensor) -> Tensor:
     """(H, W, C) image of one view, without gradients; on the processor, wherever it was drawn."""
     with torch.no_grad():
         return render(model, view.camera, view.conditions, settings, background).rgb.cpu()
 
 
-def draw_sum(
+def render_light_sum(
     model: Primitives,
     view: View,
     lights: Sequence[Conditions],
@@ -105,7 +113,7 @@ def draw_sum(
     return (total + (1.0 - alpha.double())[..., None] * background.double().to(alpha.device)).to(frame.rgb).cpu()
 
 
-def measure(
+def measure_views(
     model: Primitives,
     task: TaskSpec,
     dataset: Dataset,
@@ -129,7 +137,7 @@ def measure(
         check_pixels("test", view, pixels, dataset.channels)
         truth = pixels.over(background)
         start = time.perf_counter()
-        rendered = draw(model, view, settings, background) if paint is None else paint(model, view, background)
+        rendered = render_image(model, view, settings, background) if paint is None else paint(model, view, background)
         seconds = time.perf_counter() - start
         empty = bool((rendered == background).all())
         if pixels.mask is not None:
@@ -154,9 +162,17 @@ def measure(
     return result
 
 
-def quality(model: Primitives, task: TaskSpec, dataset: Dataset, settings: RenderSettings) -> tuple[float, float]:
+def measure_quality(
+    model: Primitives, task: TaskSpec, dataset: Dataset, settings: RenderSettings
+) -> tuple[float, float]:
     """Mean PSNR and SSIM of the held-out views, as ``metrics.json`` has them, drawn where such views are best drawn."""
-    views = measure(placed(model, settings, dataset.test.view(0)), task, dataset, settings, channels_of(task, dataset))
+    views = measure_views(
+        move_to_render_device(model, settings, dataset.test.view(0)),
+        task,
+        dataset,
+        settings,
+        channels_of(task, dataset),
+    )
     return float(np.mean([v.psnr for v in views])), float(np.mean([v.ssim for v in views]))
 
 
@@ -211,12 +227,12 @@ def evaluate_run(run_dir: Path, lpips: str | Path | None = None, words: Sequence
         channels = channels_of(task, dataset)
         part = point.prepare_model(model)
         size = estimate_file_bytes(path, model, part, point.storage)
-        model = placed(part, config.renderer, dataset.test.view(0))
-        views = measure(model, task, dataset, config.renderer, channels, lpips=distance, paint=point.render_view)
-        return summary(config, model, task, dataset, channels, views, size, training, distance)
+        model = move_to_render_device(part, config.renderer, dataset.test.view(0))
+        views = measure_views(model, task, dataset, config.renderer, channels, lpips=distance, paint=point.render_view)
+        return summarize_metrics(config, model, task, dataset, channels, views, size, training, distance)
 
 
-def summary(
+def summarize_metrics(
     config: RunConfig,
     model: Primitives,
     task: TaskSpec,

@@ -28,12 +28,12 @@ from neuprim.plugins.provenance import warn_of_neuprim
 __all__ = [
     "COMPRESSED",
     "LOGS",
-    "context_of",
+    "make_scene_context",
     "load_dataset",
     "load_run",
     "model_file",
     "open_run",
-    "placed",
+    "move_to_render_device",
     "read_metrics",
 ]
 
@@ -68,7 +68,7 @@ def load_dataset(
     Raises:
         NeuprimError: what the loader refuses, or that it crashed.
     """
-    context = context_of(config, progress)
+    context = make_scene_context(config, progress)
     if (
         run_dir is not None and model_file(run_dir).exists()
     ):  # its cameras and points lie as they did for the model, whatever was added since
@@ -108,12 +108,12 @@ def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Pr
     return replace(config, renderer=with_available_device(config.renderer)), task, model, header
 
 
-def placed(model: Primitives, settings: RenderSettings, view: View) -> Primitives:
+def move_to_render_device(model: Primitives, settings: RenderSettings, view: View) -> Primitives:
     """The model where views like this one are best drawn."""
     return model.to(device_of(model, settings, view.camera, view.conditions))
 
 
-def context_of(config: RunConfig, progress: Progress) -> SceneContext:
+def make_scene_context(config: RunConfig, progress: Progress) -> SceneContext:
     """What a run's scene is loaded with.
 
     Raises:
@@ -139,7 +139,7 @@ def open_run(run_dir: Path, progress: Progress = lambda text, fraction: None) ->
             return None
         scene = suspects_of(config).scene
         with blamed(scene.origin, f"volume of {scene.what}", run_dir / LOGS):
-            return load(config.scene, context_of(config, progress))
+            return load(config.scene, make_scene_context(config, progress))
 
     def dataset() -> Dataset:
         return load_dataset(config, task, progress, run_dir)

@@ -20,7 +20,7 @@ import yaml
 from neuprim.config import RunConfig, compose
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.metrics import from_json
-from neuprim.runs.fit import compile_kernels, one_torch_thread, start
+from neuprim.runs.fit import compile_kernels, prepare_training, use_one_torch_thread
 
 __all__ = ["Figures", "Planned", "Row", "Table", "budget_words", "compared", "pace", "plan", "tables"]
 
@@ -189,9 +189,9 @@ def _known(flag: str, given: Sequence[str] | Mapping[str, str], names: Sequence[
 def pace(planned: Planned, steps: int = 8) -> float:
     """Seconds that a step takes at the start of a run, on this machine; a population that grows makes later ones
     slower."""
-    fitted = start(planned.config)
+    fitted = prepare_training(planned.config)
     compile_kernels(fitted.trainer)
-    with one_torch_thread():
+    with use_one_torch_thread():
         fitted.trainer.train_step()
         begin = time.perf_counter()
         for _ in range(steps):

@@ -8,24 +8,23 @@ from pathlib import Path
 from neuprim.config import RunConfig, suspects_of
 from neuprim.config.launcher import LauncherSettings
 from neuprim.core.metrics.words import in_words
-from neuprim.core.train.distributed import ALONE, Alone
-from neuprim.runs.chunks.asked import asked, refuse_chunks
-from neuprim.runs.chunks.train import train_in_chunks
+from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.runs.chunks import train_in_chunks
 from neuprim.runs.evaluate import evaluate_fitted
-from neuprim.runs.events import Events, Finishing, Note, silent
-from neuprim.runs.lock import held
+from neuprim.runs.events import Events, Finishing, Note, ignore_event
+from neuprim.runs.fit import is_chunked, refuse_chunks
 from neuprim.runs.open import LOGS
-from neuprim.runs.parts import assemble
-from neuprim.runs.training import Between, alone, train
+from neuprim.runs.run_directory import lock_directory
+from neuprim.runs.training import BetweenSteps, do_nothing_between, train_in_directory
 
 __all__ = ["run"]
 
 
 def run(
     config: RunConfig,
-    events: Events = silent,
-    between: Between = alone,
-    ranks: Alone = ALONE,
+    events: Events = ignore_event,
+    between: BetweenSteps = do_nothing_between,
+    group: ProcessGroup | None = None,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
 ) -> Path:
     """Fit, measure and report; returns the run directory.
@@ -35,28 +34,29 @@ def run(
 
     Args:
         events: told what happens.
-        between: called between training steps, see :data:`~neuprim.runs.training.Between`.
-        ranks: the processes that train this model, each of which calls this with the same configuration; the first one
-        alone writes files. launcher: where the chunks of a scene are fitted, if it is fitted in chunks.
+        between: called between training steps, see :data:`~neuprim.runs.training.BetweenSteps`.
+        group: the processes that train this model, each of which calls this with the same configuration; the first one
+            alone writes files. None for one process.
+        launcher: where the chunks of a scene are fitted, if it is fitted in chunks.
 
     Raises:
         NeuprimError: the input's fault, another process that is at work there, or numbers that left the finite;
         whatever was on disk before
             is intact.
-        RankError: another rank is gone; what was trained is in the checkpoint.
+        RankError: another rank ended; what was trained is in the checkpoint.
     """
     directory = config.output_dir
-    if ranks.size > 1:
+    first = group is None or group.is_first
+    if group is not None:
         refuse_chunks(config, "several ranks train one model together")
     suspects = suspects_of(config)
-    with held(directory) if ranks.first else nullcontext(), suspects.watch(directory / LOGS):
-        if asked(config):
+    with lock_directory(directory) if first else nullcontext(), suspects.watch(directory / LOGS):
+        if is_chunked(config):
             fitted, interrupted = train_in_chunks(config, suspects, events, launcher, between)
         else:
-            fitted, interrupted = train(config, suspects, events, between=between, ranks=ranks)
-        if ranks.first:
+            fitted, interrupted = train_in_directory(config, suspects, events, between=between, group=group)
+        if first:
             events(Finishing("measuring held-out views"))
-            assemble(fitted, directory)
             events(Note(in_words(evaluate_fitted(fitted, directory))))
     if interrupted:
         raise KeyboardInterrupt

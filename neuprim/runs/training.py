@@ -6,7 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -21,23 +21,29 @@ from neuprim.core.io.files import write_text
 from neuprim.core.model.edge import EDGES
 from neuprim.core.notices import warn_once
 from neuprim.core.render.backends import choose_backend, precompiled_backend
-from neuprim.core.train.distributed import ALONE, Alone
-from neuprim.core.train.restoring import part
+from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
+from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.blame import Suspects
 from neuprim.plugins.judging import facts_of
 from neuprim.plugins.provenance import check_resumed
-from neuprim.runs.compile import compiled, compiling, mark_compiled, variant
+from neuprim.runs.compile import compile_in_background, is_compiled, kernel_variant, mark_compiled
 from neuprim.runs.curve import open_curve
-from neuprim.runs.events import Events, Note, Preparing, silent
-from neuprim.runs.fit import Fitted, Make, compile_kernels, one_torch_thread, start, steps
+from neuprim.runs.events import Events, Note, Preparing, ignore_event
+from neuprim.runs.fit import (
+    Fitted,
+    TrainerFactory,
+    compile_kernels,
+    prepare_training,
+    train_steps,
+    use_one_torch_thread,
+)
 from neuprim.runs.interrupt import interruptible
-from neuprim.runs.parts import in_parts, read_part, write_parts
-from neuprim.runs.results import discard_results
+from neuprim.runs.run_directory import discard_results
 
-__all__ = ["COMPILING", "Between", "alone", "make_ready", "save", "train"]
+__all__ = ["COMPILING", "BetweenSteps", "do_nothing_between", "compile_for_run", "save_training", "train_in_directory"]
 
-Between = Callable[[Fitted, threading.Event], None]
+BetweenSteps = Callable[[Fitted, threading.Event], None]
 """Called on the training's thread before its first step and after every one, with what is trained and the event that
 ends the training as
 Ctrl-C does. It may look at the state, save it and wait, and must not change it."""
@@ -45,19 +51,19 @@ Ctrl-C does. It may look at the state, save it and wait, and must not change it.
 COMPILING = "compiling kernels, once per installation (about a minute)"
 
 
-def alone(fitted: Fitted, stop: threading.Event) -> None:
-    """Nobody is there between two steps."""
+def do_nothing_between(fitted: Fitted, stop: threading.Event) -> None:
+    """Do nothing."""
 
 
-def train(
+def train_in_directory(
     config: RunConfig,
     suspects: Suspects,
-    events: Events = silent,
+    events: Events = ignore_event,
     dataset: Dataset | None = None,
     hold_out: int = 0,
-    between: Between = alone,
-    ranks: Alone = ALONE,
-    make: Make | None = None,
+    between: BetweenSteps = do_nothing_between,
+    group: ProcessGroup | None = None,
+    make: TrainerFactory | None = None,
 ) -> tuple[Fitted, bool]:
     """Train until the budget is used or Ctrl-C, which finishes the step; leaves configuration, curve, checkpoint and
     model in the run's directory either way. Of several ranks the first one writes them.
@@ -68,68 +74,55 @@ def train(
         hold_out: n > 1: every n-th training view is a test view, and no other is; see
         :func:`~neuprim.core.data.dataset.hold_out_views`. between: called between steps, see :data:`Between`.
         make: what makes the trainer of a model that is there already; None: a fresh model is trained.
+        group: the ranks that train the model together; None for one process.
 
     Returns:
         what was trained, and whether Ctrl-C ended it.
 
     Raises:
         NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
-        RankError: another rank is gone; the first one, if it is there, has written a checkpoint of the last whole step.
+        RankError: another rank ended; the first one, if it is there, has written a checkpoint of the last whole step.
     """
-    ranks = in_parts(config, ranks)
-    ahead = (
-        precompiled_backend(config.renderer) if dataset is None else None
-    )  # beside loading; of data that are there nothing is waited for
-    edge = config.model.density.get("edge", 0)  # of a density of ours; of another's, whatever the word means there
-    with ranks.in_turn(), compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
-        fitted = start(config, events, dataset, suspects, hold_out, make)
-        begun = _begun(fitted.trainer) if ranks.parts else {}  # while the model is whole
-        fitted.trainer.join(ranks)
+    # kernels compile beside the loading of data; nothing waits for them where the data are there
+    ahead = precompiled_backend(config.renderer) if dataset is None else None
+    edge = config.model.density.get("edge", 0)  # of a built-in density; another package may mean anything by it
+    turn = nullcontext() if group is None else group.in_turn()
+    with turn, compile_in_background(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
+        fitted = prepare_training(config, events, dataset, suspects, hold_out, make, group)
+        trainer = fitted.trainer
         _resume(fitted, events)
-        if ranks.first:
+        if trainer.rank == 0:
             config.output_dir.mkdir(parents=True, exist_ok=True)
-            if config.resume and not fitted.trainer.finished:
+            if config.resume and not trainer.finished:
                 discard_results(config.output_dir)
             write_text(config.output_dir / "config.yaml", fitted.config.to_yaml())
         if kernels.running:
             events(Preparing(COMPILING))
             kernels.wait()
-        make_ready(fitted.trainer, events)
-    if ranks.size > 1:
-        facts = (
-            {**begun, "steps done": fitted.trainer.step, "primitives": fitted.trainer.count}
-            if begun
-            else _begun(fitted.trainer)
-        )
-        ranks.agree("expected the same words, data and output directory on all ranks", facts)
-    return fitted, _train(fitted, events, between) if ranks.first else _follow(fitted)
+        compile_for_run(trainer, events)
+    if isinstance(trainer, DistributedTrainer):
+        trainer.check_same_start()
+    return fitted, _train(fitted, events, between) if trainer.rank == 0 else _follow(trainer)
 
 
-def make_ready(trainer: Trainer, events: Events = silent) -> None:
+def compile_for_run(trainer: Trainer, events: Events = ignore_event) -> None:
     """Have kernels compiled outside the training clock, and remember for later runs that they are."""
     view = trainer.dataset.train.view(0)
     lowered = trainer.model.lower(view.camera, view.conditions, trainer.renderer)
-    form = variant(type(lowered.colour).__name__, lowered.density.edge)
+    form = kernel_variant(type(lowered.colour).__name__, lowered.density.edge)
     backend = choose_backend(lowered, trainer.renderer, view.camera)
-    if backend.compiles and not compiled(backend.name, form):
+    if backend.compiles and not is_compiled(backend.name, form):
         events(Preparing(COMPILING))
     compile_kernels(trainer)
     if backend.compiles:
         mark_compiled(backend.name, form)
 
 
-def _begun(trainer: Trainer) -> dict[str, Any]:
-    from neuprim.core.train.distributed.beginning import beginning
-
-    return beginning(trainer)
-
-
 def _resume(fitted: Fitted, events: Events) -> None:
     config, saved = fitted.config, fitted.config.output_dir / "checkpoint.safetensors"
     if not (config.resume and saved.exists()):
         return
-    ranks = fitted.trainer.ranks
-    header, tensors = read_part(saved, "checkpoint", ranks) if ranks.parts else checkpoint.read(saved, "checkpoint")
+    header, tensors = checkpoint.read(saved, "checkpoint")
     if header.get("task") != config.task:
         raise CheckpointError(f"{saved}: written for task {header.get('task')!r}; this run's task is {config.task!r}")
     check_resumed(header.get("made_by"), config.made_by, saved)
@@ -145,17 +138,21 @@ def _resume(fitted: Fitted, events: Events) -> None:
     events(Note(f"resumed at step {fitted.trainer.step}"))
 
 
-def _train(fitted: Fitted, events: Events, between: Between) -> bool:
+def _train(fitted: Fitted, events: Events, between: BetweenSteps) -> bool:
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     trainer, config = fitted.trainer, fitted.config
     curve = open_curve(config.output_dir / "metrics.jsonl", trainer.step)
     last_saved = time.monotonic()
     interrupted = False
-    due = trainer.ranks.saves(lambda: time.monotonic() - last_saved > config.train.checkpoint_every_seconds)
-    with interruptible(terminated=trainer.ranks.size > 1) as stop, curve, one_torch_thread(), _kept(fitted):
-        last = trainer.ranks.last(stop.is_set)
+    with (
+        interruptible(terminated=trainer.ranks > 1) as stop,
+        curve,
+        use_one_torch_thread(),
+        _save_when_a_rank_ends(fitted),
+    ):
+        trainer.stop_requested = stop.is_set
         between(fitted, stop)
-        for report, held_out in steps(trainer, events):
+        for report, held_out in train_steps(trainer, events):
             line: dict[str, Any] = {}
             if held_out is not None:
                 line["eval_psnr"] = held_out
@@ -163,30 +160,27 @@ def _train(fitted: Fitted, events: Events, between: Between) -> bool:
                 line["change"] = report.change
             if line or report.step % config.train.log_every == 0 or trainer.finished:
                 line = {"step": report.step, "seconds": round(report.seconds, 4), "loss": report.loss, **report.parts, "psnr": report.psnr, "primitives": report.primitives, **line}  # fmt: skip
-                with _full(fitted, curve.path):
+                with _warn_of_full_disk(fitted, curve.path):
                     curve.add(json.dumps(line) + "\n")
-            if due():
-                with _full(fitted, config.output_dir / "checkpoint.safetensors"):
-                    save(fitted)
+            if time.monotonic() - last_saved > config.train.checkpoint_every_seconds:
+                with _warn_of_full_disk(fitted, config.output_dir / "checkpoint.safetensors"):
+                    save_training(fitted)
                 last_saved = time.monotonic()
             between(fitted, stop)
-            if last():
+            if trainer.stopping:
                 interrupted = True
                 break
-    save(fitted)
+    save_training(fitted)
     return interrupted
 
 
 @contextmanager
-def _full(fitted: Fitted, file: Path) -> Iterator[None]:
-    """A file of the way that cannot be written, as on a full disk, is one warning: training goes on to the next
-    checkpoint, and only the last one is an error. Where several ranks write one file together, it is an error at
-    once."""
+def _warn_of_full_disk(fitted: Fitted, file: Path) -> Iterator[None]:
+    """Warn once of a file that cannot be written during the training, as on a full disk. Training goes on to the next
+    checkpoint; only the last one is an error."""
     try:
         yield
     except (CheckpointError, OSError) as error:
-        if fitted.trainer.ranks.parts:
-            raise
         said = (
             str(error)
             if isinstance(error, CheckpointError)
@@ -195,38 +189,25 @@ def _full(fitted: Fitted, file: Path) -> Iterator[None]:
         warn_once(f"{said}; training goes on from step {fitted.trainer.step} to the next checkpoint")
 
 
-def _follow(fitted: Fitted) -> bool:
-    """The same on a rank that writes nothing; one that has a part of the primitives hands it to the first, which
-    writes."""
-    ranks = fitted.trainer.ranks
-    with interruptible(terminated=True) as stop, one_torch_thread():
-        last, due = ranks.last(stop.is_set), ranks.saves(lambda: False)
-        interrupted = False
-        for _ in steps(fitted.trainer):
-            if ranks.parts and due():
-                save(fitted)
-            if last():
-                interrupted = True
-                break
-    if ranks.parts:
-        save(fitted)
-    return interrupted
+def _follow(trainer: Trainer) -> bool:
+    """Train on a rank that writes nothing; returns whether the training was interrupted."""
+    with interruptible(terminated=True) as stop, use_one_torch_thread():
+        trainer.stop_requested = stop.is_set
+        return any(trainer.stopping for _ in train_steps(trainer))
 
 
 @contextmanager
-def _kept(fitted: Fitted) -> Iterator[None]:
-    """A rank that is gone costs no step: what the others have is saved. Where it had primitives of its own they are
-    gone, and the last checkpoint counts."""
+def _save_when_a_rank_ends(fitted: Fitted) -> Iterator[None]:
+    """Save the state of the last whole step when another rank ends."""
     try:
         yield
     except RankError:
-        if not fitted.trainer.ranks.parts:
-            save(fitted)
+        save_training(fitted)
         raise
 
 
-def save(fitted: Fitted) -> None:
-    """Checkpoint and model, into the run's directory; where primitives are in parts, called on all ranks."""
+def save_training(fitted: Fitted) -> None:
+    """Write checkpoint and model into the run's directory."""
     trainer, config, dataset = fitted.trainer, fitted.config, fitted.dataset
     tensors, header = trainer.state()
     made_by = {} if config.made_by is None else {"made_by": config.made_by.to_dict()}
@@ -237,9 +218,7 @@ def save(fitted: Fitted) -> None:
     )
     place = {} if dataset.world.identity and dataset.placement is None else {"world": world}
     header = {"task": config.task, **made_by, **place, **header}
-    files = [config.output_dir / f"{name}.safetensors" for name in ("checkpoint", "model")]
-    if not trainer.ranks.parts:
-        checkpoint.write(files[0], "checkpoint", tensors, header)
+    checkpoint.write(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, header)
     extra: dict[str, Any] = {
         "background": [float(x) for x in dataset.background],
         "color_space": dataset.color_space,
@@ -249,9 +228,5 @@ def save(fitted: Fitted) -> None:
         **fitted.training,
         **place,
     }
-    if not trainer.ranks.parts:
-        checkpoint.save_model(files[1], trainer.model, config.task, extra, without_zeros=bool(trainer.zeros))
-        return
-    write_parts(files[0], "checkpoint", trainer, tensors, header)
-    head = {**checkpoint.model_header(trainer.model, config.task, extra), "primitives": trainer.count}
-    write_parts(files[1], "model", trainer, part(tensors, "params."), head, lambda name, value: True)
+    file = config.output_dir / "model.safetensors"
+    checkpoint.save_model(file, trainer.model, config.task, extra, without_zeros=bool(trainer.zero_masks))

@@ -16,7 +16,7 @@ from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
-from neuprim.runs.measure import quality
+from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import COMPRESSED, LOGS, load_dataset, load_run
 from neuprim.search.few_bits import Fewer, train_for, train_within
 
@@ -172,5 +172,5 @@ def _costs(
         suspects.know(dataset)
         for i, (text, tried) in enumerate((("before", model), ("after", again))):
             progress(f"measuring {text}", i / 2)
-            found.append(quality(tried, task, dataset, config.renderer))
+            found.append(measure_quality(tried, task, dataset, config.renderer))
     return {name: (found[0][i], found[1][i]) for i, name in enumerate(("psnr", "ssim"))}

@@ -24,7 +24,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.runs.finetune import fine_tuner, steps_in
-from neuprim.runs.fit import one_torch_thread
+from neuprim.runs.fit import use_one_torch_thread
 from neuprim.search.prune.cut import zeros_of
 from neuprim.search.prune.judge import Judge, judge_of
 
@@ -146,7 +146,7 @@ def train_for(
     Args:
         seconds: about, where there are no ``steps``.
     """
-    with one_torch_thread():
+    with use_one_torch_thread():
         if steps is None:
             steps = steps_in(seconds, config, task, dataset, model)
         whole = canonicalize(model)
@@ -178,7 +178,7 @@ def train_within(
     Args:
         seconds: about, where there are no ``steps``; 0 for no training.
     """
-    with one_torch_thread():
+    with use_one_torch_thread():
         if steps is None:
             steps = steps_in(seconds, config, task, dataset, model)
         judge = judge_of(config, dataset)
@@ -237,13 +237,13 @@ def _trained(
 ) -> Primitives:
     """A folded model after so many steps in which every image is drawn of what will be read back."""
     trainer = fine_tuner(config, task, dataset, whole, steps)
-    trainer.zeros = zeros_of(trainer.model)
+    trainer.zero_masks = zeros_of(trainer.model)
     there = {name: scheme.to(trainer.device) for name, scheme in made.items()}
 
     def stored(params: dict[str, Tensor]) -> dict[str, Tensor]:
         return fake_quantize(params, there)
 
-    trainer.stored = stored
+    trainer.fake_quantize = stored
     for done in range(steps):
         trainer.train_step()
         if done % 20 == 0:

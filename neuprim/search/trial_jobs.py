@@ -12,10 +12,8 @@ from neuprim.config.launcher import LauncherSettings
 from neuprim.core.data import Dataset
 from neuprim.core.errors import NeuprimError
 from neuprim.runs.events import Events, Preparing
-from neuprim.runs.launch.engine import Hear
-from neuprim.runs.launch.jobs import Job, Result
-from neuprim.runs.launch.status import ENDED, Status
-from neuprim.runs.launch.table import FOLDER, launch
+from neuprim.runs.launch.jobs import ENDED, Job, JobStatus, Result
+from neuprim.runs.launch.launcher import LAUNCH_FOLDER, OnStatus, launch
 from neuprim.runs.open import load_dataset
 from neuprim.search.trials import Outcome, Trial, run_trial
 
@@ -45,7 +43,7 @@ def do_trial(data: Mapping[str, Any], attempt: int, events: Events) -> Outcome:
     return run_trial(trial, _dataset(trial.config, events), events)
 
 
-def launch_jobs(jobs: Sequence[Job], settings: LauncherSettings, folder: Path, hear: Hear) -> list[Result]:
+def launch_jobs(jobs: Sequence[Job], settings: LauncherSettings, folder: Path, hear: OnStatus) -> list[Result]:
     """Results in the order of the jobs.
 
     Args:
@@ -55,7 +53,7 @@ def launch_jobs(jobs: Sequence[Job], settings: LauncherSettings, folder: Path, h
         KeyboardInterrupt: Ctrl-C came; what was trained so far is kept.
         RuntimeError: a bug in one of them, with its traceback.
     """
-    results = launch(jobs, settings, folder / FOLDER, hear)
+    results = launch(jobs, settings, folder / LAUNCH_FOLDER, hear)
     over = [result for result in results if result is not None and result.state != "interrupted"]
     for result in over:
         if result.trace:
@@ -84,7 +82,7 @@ def launched_trials(
     ]
     done = [0.0] * len(jobs)
 
-    def hear(number: int, status: Status) -> None:
+    def hear(number: int, status: JobStatus) -> None:
         done[number] = 1.0 if status.state in ENDED else status.progress
         progress(sum(done) / len(done))
 

@@ -23,12 +23,12 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.files import read_json, write_json
 from neuprim.core.metrics import from_json, psnr, ssim, to_json
 from neuprim.runs.curve import read_curve
-from neuprim.runs.events import Events, Finishing, Note, silent
+from neuprim.runs.events import Events, Finishing, Note, ignore_event
 from neuprim.runs.fit import Fitted
-from neuprim.runs.lock import held
-from neuprim.runs.measure import draw
+from neuprim.runs.measure import render_image
 from neuprim.runs.open import LOGS
-from neuprim.runs.training import train
+from neuprim.runs.run_directory import lock_directory
+from neuprim.runs.training import train_in_directory
 from neuprim.search.truths import masked, truths_of
 
 __all__ = ["FILE", "Outcome", "Trial", "read_outcome", "run_trial"]
@@ -104,7 +104,7 @@ class Outcome:
         )
 
 
-def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = silent) -> Outcome:
+def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ignore_event) -> Outcome:
     """Train and judge, or read back what is there already.
 
     Ctrl-C while it trains finishes the step, writes a checkpoint and raises KeyboardInterrupt; the same call goes on
@@ -118,7 +118,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = sil
         DataError: the folder holds a run that is no trial, or a damaged ``trial.json``.
         NeuprimError: as :func:`neuprim.runs.run.run`.
     """
-    with held(trial.config.output_dir, "trial"):
+    with lock_directory(trial.config.output_dir, "trial"):
         return _run_trial(trial, dataset, events)
 
 
@@ -145,7 +145,9 @@ def _run_trial(trial: Trial, dataset: Dataset | None, events: Events) -> Outcome
     write_json(folder / FILE, record)
     suspects = suspects_of(trial.config)
     with suspects.watch(folder / LOGS):
-        fitted, interrupted = train(replace(trial.config, resume=same), suspects, events, dataset, trial.hold_out)
+        fitted, interrupted = train_in_directory(
+            replace(trial.config, resume=same), suspects, events, dataset, trial.hold_out
+        )
         if interrupted:
             raise KeyboardInterrupt
         events(Finishing("measuring views that judge"))
@@ -169,12 +171,12 @@ def _judged(fitted: Fitted, views: int) -> Outcome:
     model, dataset, config = fitted.model, fitted.dataset, fitted.config
     truths = truths_of(dataset, views)
     rows, seconds = [], []
-    draw(
+    render_image(
         model, truths[0].view, config.renderer, dataset.background
     )  # whatever a first frame loads is no part of its time
     for truth in truths:
         start = time.perf_counter()
-        drawn = draw(model, truth.view, config.renderer, dataset.background)
+        drawn = render_image(model, truth.view, config.renderer, dataset.background)
         seconds.append(time.perf_counter() - start)
         image = masked(drawn, truth)
         rows.append((psnr(image, truth.image, truth.mask), ssim(image, truth.image)))

@@ -20,7 +20,7 @@ from neuprim.config import RunConfig
 from neuprim.config.viewer import ViewerSettings
 from neuprim.runs.events import Evaluated, Event, Events, Finishing, Note, Preparing, Step
 from neuprim.runs.fit import Fitted
-from neuprim.runs.training import save
+from neuprim.runs.training import save_training
 from neuprim.viewer.render_queue import RenderQueue
 from neuprim.viewer.server import PageServer
 from neuprim.viewer.session import Session
@@ -207,7 +207,7 @@ class LiveTraining:
     # Called by the training.
 
     def between(self, fitted: Fitted, stop: threading.Event) -> None:
-        """Serve the pages; see :data:`~neuprim.runs.training.Between`."""
+        """Serve the pages; see :data:`~neuprim.runs.training.BetweenSteps`."""
         if self._sessions is None:
             scene = self._make_scene(fitted)
             self._sessions = SessionManager(self._server, scene, self.queue, self._add_controls)
@@ -225,7 +225,7 @@ class LiveTraining:
             stop.set()
         if self._save:
             self._save = False
-            save(fitted)
+            save_training(fitted)
             self._notify_all(f"step {fitted.trainer.step} is saved in {self.config.output_dir}")
         if stop.is_set() or not self.paused:
             return False

@@ -22,8 +22,8 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import TaskSpec
 from neuprim.inspect.paint import table
-from neuprim.runs.measure import draw
-from neuprim.runs.open import placed
+from neuprim.runs.measure import render_image
+from neuprim.runs.open import move_to_render_device
 from neuprim.runs.render_config import RenderConfig
 from neuprim.viewer.quality import Front
 from neuprim.webpage.scene import held_out, start_of
@@ -167,7 +167,7 @@ class ViewerScene:
         if key not in self._cache:
             if len(self._cache) >= _CACHED_MODELS:
                 self._cache.pop(next(iter(self._cache)))
-            self._cache[key] = placed(config.prepare_model(model), config.settings, view)
+            self._cache[key] = move_to_render_device(config.prepare_model(model), config.settings, view)
         return self._cache[key]
 
     def draw(self, viewpoint: Viewpoint, config: RenderConfig) -> Picture:
@@ -191,7 +191,7 @@ class ViewerScene:
         view, pixels = self.dataset.test.view(index), self.dataset.test.pixels(index)
         truth = pixels.over(self.dataset.background)
         model = self.prepare_model(RenderConfig(self.settings), view)
-        drawn = draw(model, view, self.settings, self.dataset.background)
+        drawn = render_image(model, view, self.settings, self.dataset.background)
         images = [np.asarray(to_uint8(self.channels.display(image)).numpy()) for image in (truth, drawn)]
         return ViewComparison(images[0], images[1], psnr(drawn, truth, pixels.mask))
 

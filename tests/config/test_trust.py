@@ -12,7 +12,7 @@ from neuprim.config import RunConfig, compose, read_stored_config
 from neuprim.config.trust import check_stored, refuse_links
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.io.trust import ENVIRONMENT, trusting
-from neuprim.runs.open import context_of
+from neuprim.runs.open import make_scene_context
 
 VOLUMES = ["task=dynamic", "scene=vdb", "scene.vdb=/data/fire"]
 
@@ -34,7 +34,7 @@ def test_caches_elsewhere_need_the_users_word(tmp_path: Path, address: str, monk
     with pytest.raises(
         ConfigError, match=r"config\.yaml: scene\.cache is .*; --trust allows it, NEUPRIM_TRUST=1 in the environment"
     ):
-        context_of(config, lambda text, fraction: None)
+        make_scene_context(config, lambda text, fraction: None)
     with trusting(True):
         check_stored(config)
     check_stored(replace(config, source=None))  # of the user's own words

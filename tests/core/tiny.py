@@ -20,7 +20,9 @@ from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.train.initial import initial_model
+from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
+from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
@@ -88,14 +90,17 @@ def near_the_truth(views: ViewSet, count: int, generator: torch.Generator) -> Po
     return PointCloud(means, torch.full((count, 3), 0.5))
 
 
-def trainer(dataset: Dataset, iterations: int = 40, seed: int = 0, **changes: Any) -> Trainer:
+def trainer(
+    dataset: Dataset, iterations: int = 40, seed: int = 0, group: ProcessGroup | None = None, **changes: Any
+) -> Trainer:
     """A fresh trainer of 12 primitives; ``changes`` go to the train settings, ``population`` as a dictionary."""
     population = PopulationSettings(
         **{"strategy": "fixed", "every": 7, "start": 0.0, "stop": 1.0, **changes.pop("population", {})}
     )
     settings = TrainSettings(iterations=iterations, **changes, population=population)
     model = initial_model(CosineDensity(4), SphericalHarmonics(1, 3, 0.25), dataset, ModelSettings(primitives=12), seed)
-    return Trainer(model, dataset, photometric({"ssim_weight": settings.ssim_weight}), settings, RenderSettings(), seed)
+    parts = model, dataset, photometric({"ssim_weight": settings.ssim_weight}), settings, RenderSettings(), seed
+    return Trainer(*parts) if group is None else DistributedTrainer(*parts, group)
 
 
 def write_blender(folder: Path) -> Path:

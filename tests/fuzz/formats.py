@@ -360,10 +360,10 @@ def _read_run(folder: Path) -> None:
 
 def _records(folder: Path) -> None:
     """What runs, sweeps, chunks, searches and launches keep."""
-    from neuprim.runs.chunks.record import ChunkRecord
-    from neuprim.runs.chunks.record import Row as Chunk
-    from neuprim.runs.launch.status import Status, write_status
-    from neuprim.runs.sweep.record import Row, SweepRecord
+    from neuprim.runs.chunks import ChunkRecord
+    from neuprim.runs.chunks import ChunkRow as Chunk
+    from neuprim.runs.launch.jobs import JobStatus, write_status
+    from neuprim.runs.sweep import SweepRecord, SweepRow
     from neuprim.search.target.record import Record as TargetRecord
     from neuprim.search.target.record import Turn
     from neuprim.search.tradeoff.knobs import LeftOut
@@ -382,7 +382,7 @@ def _records(folder: Path) -> None:
     region = [{"file": "worst_0.png", "name": "a", "psnr": 10.0, "x": 1, "y": 2, "side": 3}]
     (folder / "run/renders/worst.json").write_text(json.dumps(region))
     SweepRecord(
-        ("a=1,2",), (Row("0", ("a=1",), {"a": "1"}), Row("1", ("a=2",), {"a": "2"}, "failed", "why", 2.5, 1))
+        ("a=1,2",), (SweepRow("0", ("a=1",), {"a": "1"}), SweepRow("1", ("a=2",), {"a": "2"}, "failed", "why", 2.5, 1))
     ).write(folder)
     ChunkRecord((Chunk("chunk_0", 20, 30, None), Chunk("chunk_1", 20, 30, 1.5)), 100).write(folder)
     turned = [Turn("model.neurons", 4, 2, {"psnr": 0.1}, 0.8, True)]
@@ -399,16 +399,15 @@ def _records(folder: Path) -> None:
     )
     outcome = Outcome(30.0, 0.9, 40, 12, 1000, 50, 1.5, 10.0, ((0.5, 20.0),))
     (folder / "trial.json").write_text(json.dumps({"format": 1, "asked": {}, "views": 3, "outcome": outcome.to_dict()}))
-    write_status(folder / "status.json", Status())
+    write_status(folder / "status.json", JobStatus())
 
 
 def _read_records(folder: Path) -> None:
     from neuprim.core.train.settings import TrainSettings
     from neuprim.runs import curve
-    from neuprim.runs.chunks.record import read_record as read_chunks
-    from neuprim.runs.launch.status import read_status
-    from neuprim.runs.sweep.record import read_sweep
-    from neuprim.runs.sweep.rows import sweep_rows, write_csv
+    from neuprim.runs.chunks import read_chunk_record as read_chunks
+    from neuprim.runs.launch.jobs import read_status
+    from neuprim.runs.sweep import read_sweep, read_sweep_runs, write_csv
     from neuprim.search import trials
     from neuprim.search.target.record import read_record as read_target
     from neuprim.search.tradeoff.record import read_record
@@ -418,7 +417,7 @@ def _read_records(folder: Path) -> None:
     _read_run(folder)
     curve.read_curve(folder / "run/metrics.jsonl", TrainSettings())
     if (sweep := read_sweep(folder)) is not None:
-        write_csv(folder / "out.csv", sweep_rows(folder, sweep))
+        write_csv(folder / "out.csv", read_sweep_runs(folder, sweep))
         sweep.write(folder / "again")
     if (chunks := read_chunks(folder)) is not None:
         chunks.write(folder / "again")
@@ -461,25 +460,25 @@ def _read_lpips(folder: Path) -> None:
 def _fitted(folder: Path) -> Any:
     """A training that goes on from the checkpoint in ``folder/out``."""
     from neuprim.config import compose
-    from neuprim.runs.fit import start
+    from neuprim.runs.fit import prepare_training
     from tests.core import tiny
     from tests.short_runs import words
 
-    return start(compose(words(tiny.write_blender(folder / "two"), folder / "out", 5, "resume=true")))
+    return prepare_training(compose(words(tiny.write_blender(folder / "two"), folder / "out", 5, "resume=true")))
 
 
 def _checkpoint(folder: Path) -> None:
-    from neuprim.runs.training import save
+    from neuprim.runs.training import save_training
 
     (folder / "out").mkdir()
-    save(_fitted(folder))
+    save_training(_fitted(folder))
 
 
 def _read_checkpoint(folder: Path) -> None:
-    from neuprim.runs.events import silent
+    from neuprim.runs.events import ignore_event
     from neuprim.runs.training import _resume
 
-    _resume(_fitted(folder), silent)
+    _resume(_fitted(folder), ignore_event)
 
 
 _DATASETS = "neuprim.tasks.static.datasets"

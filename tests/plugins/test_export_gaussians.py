@@ -19,7 +19,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.edge import NORMS
 from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.train.initial import initial_model
+from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.settings import ModelSettings
 from neuprim.export import appearance
 from neuprim.export.appearance import Harmonics, harmonics_of

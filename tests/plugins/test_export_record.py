@@ -13,8 +13,7 @@ import neuprim
 from neuprim.cli import main
 from neuprim.core.errors import ConfigError
 from neuprim.plugins.registry import EXPORTERS
-from neuprim.runs.export import export_run, import_run
-from neuprim.runs.export_record import FILE
+from neuprim.runs.export import EXPORTS_FILE, export_run, import_run
 from tests.plugins.fakes import install, site
 from tests.plugins.marked import static_run
 
@@ -39,7 +38,7 @@ def exported(tmp_path: Path) -> Path:
 
 
 def record(folder: Path) -> list[dict[str, Any]]:
-    entries: list[dict[str, Any]] = json.loads((folder / FILE).read_text())
+    entries: list[dict[str, Any]] = json.loads((folder / EXPORTS_FILE).read_text())
     return entries
 
 
@@ -56,7 +55,7 @@ def test_each_export_adds_its_maker(exported: Path, tmp_path: Path, site: Path) 
     export_run(exported, "neuprim:ply")
     report = export_run(exported, "Other_Ply:ply", words=["count=25", f"text={'t' * 5000}", "size=1e400"])
     export_run(exported, "npz", out=tmp_path / "elsewhere.npz")
-    assert not [note for note in report.notes if FILE in note]
+    assert not [note for note in report.notes if EXPORTS_FILE in note]
     ours, theirs, outside = record(exported)
     assert datetime.fromisoformat(ours.pop("time")) > started
     assert ours == {
@@ -83,11 +82,11 @@ def test_each_export_adds_its_maker(exported: Path, tmp_path: Path, site: Path) 
 def test_a_refused_export_is_not_recorded(exported: Path) -> None:
     with pytest.raises(ConfigError):
         export_run(exported, "ply", words=["nothing=1"])
-    assert not (exported / FILE).exists()
+    assert not (exported / EXPORTS_FILE).exists()
 
 
 def test_the_list_is_bounded(exported: Path) -> None:
-    (exported / FILE).write_text(json.dumps([{"format": str(i)} for i in range(500)]))
+    (exported / EXPORTS_FILE).write_text(json.dumps([{"format": str(i)} for i in range(500)]))
     export_run(exported, "npz")
     entries = record(exported)
     assert len(entries) == 200
@@ -97,23 +96,23 @@ def test_the_list_is_bounded(exported: Path) -> None:
 def test_an_export_succeeds_where_the_list_cannot_be_written(
     exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (exported / FILE).mkdir()
+    (exported / EXPORTS_FILE).mkdir()
     assert main(["export", str(exported), "--format", "npz", "--out", str(tmp_path / "x.npz"), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
-    assert f"{exported / FILE}: not written (Is a directory); this export is not recorded" in report["notes"]
+    assert f"{exported / EXPORTS_FILE}: not written (Is a directory); this export is not recorded" in report["notes"]
     assert (tmp_path / "x.npz").is_file()
 
 
 @pytest.mark.parametrize("text", ["{", "{}", "[1]", "\xff", "[" * 100_000])
 def test_a_file_that_is_no_list_of_exports_is_left_alone(text: str, exported: Path) -> None:
-    (exported / FILE).write_bytes(text.encode("latin-1"))
+    (exported / EXPORTS_FILE).write_bytes(text.encode("latin-1"))
     notes = export_run(exported, "npz").notes
-    assert any(FILE in note and "expected a list of exports; left as it is" in note for note in notes), notes
-    assert (exported / FILE).read_bytes() == text.encode("latin-1")
+    assert any(EXPORTS_FILE in note and "expected a list of exports; left as it is" in note for note in notes), notes
+    assert (exported / EXPORTS_FILE).read_bytes() == text.encode("latin-1")
 
 
 def test_a_huge_file_is_not_read(exported: Path) -> None:
-    with open(exported / FILE, "wb") as file:
+    with open(exported / EXPORTS_FILE, "wb") as file:
         file.truncate(2**31)
     assert any("larger than" in note for note in export_run(exported, "npz").notes)
 
@@ -121,5 +120,5 @@ def test_a_huge_file_is_not_read(exported: Path) -> None:
 def test_an_imported_run_starts_a_list_of_its_own(exported: Path, tmp_path: Path) -> None:
     export_run(exported, "npz", out=tmp_path / "x.npz")
     again = import_run(tmp_path / "x.npz", tmp_path / "again")
-    assert not (again / FILE).exists() and len(record(exported)) == 1
+    assert not (again / EXPORTS_FILE).exists() and len(record(exported)) == 1
     assert (import_run(tmp_path / "x.npz", tmp_path / "third", "neuprim:npz") / "config.yaml").is_file()

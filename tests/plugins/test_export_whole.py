@@ -17,9 +17,9 @@ from neuprim.cli import main
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimError
 from neuprim.core.io.ply import read_ply, write_ply
 from neuprim.plugins.registry import list_exporters
-from neuprim.runs.draw import render_run
 from neuprim.runs.export import export_run, import_run
 from neuprim.runs.open import load_run
+from neuprim.runs.render_images import RenderRequest, render_run
 from tests.plugins import marked
 
 LOSSLESS = ("ply", "npz")
@@ -56,7 +56,7 @@ def test_what_was_imported_renders_without_the_data(run_dir: Path, tmp_path: Pat
         json.dumps({"camera_angle_x": 0.9, "w": 20, "h": 16, "frames": [{"transform_matrix": pose}]})
     )
     pictures = [
-        render_run(d, str(tmp_path / "c.json"), None, "exr", tmp_path / f"{i}.exr", 1, {})[0]
+        render_run(d, RenderRequest(str(tmp_path / "c.json"), format="exr", out=tmp_path / f"{i}.exr", frames=1))[0]
         for i, d in enumerate((run_dir, back))
     ]
     first, second = (

@@ -30,11 +30,11 @@ from neuprim.core.model.colours import sh
 from neuprim.core.render import render
 from neuprim.export import appearance, mesh
 from neuprim.plugins.registry import load_task
-from neuprim.runs.draw import FORMATS, render_run
 from neuprim.runs.export import export_run, import_run
 from neuprim.runs.inspect import Request, inspect_run
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run, read_metrics
+from neuprim.runs.render_images import FORMATS, RenderRequest, render_run
 from tests.plugins.fakes import site
 from tests.plugins.pages import array, layers_of
 from tests.plugins.spectral import NAMES, fit, forget, install_spectral
@@ -124,30 +124,43 @@ def test_metrics_and_report_name_the_channels(trained: Path) -> None:
 
 def test_exr_and_npy_hold_every_channel(trained: Path, tmp_path: Path) -> None:
     _, drawn, _ = first_view(trained)
-    exr, other = render_run(trained, "test", None, "exr", tmp_path / "exr", 1, {}, layers="beauty")
+    exr, other = render_run(
+        trained, RenderRequest("test", format="exr", out=tmp_path / "exr", frames=1, layers="beauty")
+    )
     assert (images.read_image(exr, channels=NAMES) - drawn).abs().max() < 1e-6 and exr != other
-    npy = render_run(trained, "test", None, "npy", tmp_path / "npy", 1, {})
+    npy = render_run(trained, RenderRequest("test", format="npy", out=tmp_path / "npy", frames=1))
     assert [p.name for p in npy] == ["view0.npy", "view1.npy"]
     values = np.load(npy[0], allow_pickle=False)
     assert values.dtype == np.float32 and values.shape == (24, 24, 5) and np.array_equal(values, drawn.numpy())
-    assert render_run(trained, "orbit", None, None, tmp_path / "one.npy", 1, {}) == [tmp_path / "one.npy"]
+    assert render_run(trained, RenderRequest("orbit", out=tmp_path / "one.npy", frames=1)) == [tmp_path / "one.npy"]
     with pytest.raises(ConfigError, match=r"2 views do not fit one \.npy file"):
-        render_run(trained, "orbit", None, None, tmp_path / "two.npy", 2, {})
+        render_run(trained, RenderRequest("orbit", out=tmp_path / "two.npy", frames=2))
 
 
 def test_rendering_needs_no_data_for_the_names(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def gone(*_: object) -> None:
         raise DataError("the data are gone")
 
-    monkeypatch.setattr("neuprim.runs.draw.load_dataset", gone)
+    monkeypatch.setattr("neuprim.runs.render_images.load_dataset", gone)
     pose = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0.5], [0, 0, 0, 1]]
     (tmp_path / "cameras.json").write_text(
         json.dumps({"w": 20, "h": 16, "camera_angle_x": 0.7, "frames": [{"transform_matrix": pose}]})
     )
     (exr,) = render_run(
-        trained, str(tmp_path / "cameras.json"), None, "exr", tmp_path / "exr", 1, SHIFT, layers="beauty"
+        trained,
+        RenderRequest(
+            str(tmp_path / "cameras.json"),
+            format="exr",
+            out=tmp_path / "exr",
+            frames=1,
+            conditions=SHIFT,
+            layers="beauty",
+        ),
     )
-    (png,) = render_run(trained, str(tmp_path / "cameras.json"), None, "png", tmp_path / "png", 1, SHIFT)
+    (png,) = render_run(
+        trained,
+        RenderRequest(str(tmp_path / "cameras.json"), format="png", out=tmp_path / "png", frames=1, conditions=SHIFT),
+    )
     display = load_task("spectral").display
     assert display is not None
     shown = display(images.read_image(exr, (20, 16), NAMES))
@@ -157,7 +170,11 @@ def test_rendering_needs_no_data_for_the_names(trained: Path, tmp_path: Path, mo
 def test_webp_is_a_picture_of_the_display(trained: Path, tmp_path: Path) -> None:
     channels, drawn, _ = first_view(trained)
     said: list[str] = []
-    webp = render_run(trained, "test", None, "webp", tmp_path / "film.webp", 1, {}, tell=said.append)
+    webp = render_run(
+        trained,
+        RenderRequest("test", format="webp", out=tmp_path / "film.webp", frames=1),
+        notify=said.append,
+    )
     with Image.open(webp[0]) as film:
         frame = torch.from_numpy(np.asarray(film.convert("RGB")).astype(np.float32) / 255)
     assert (frame - channels.display(drawn)).abs().mean() < 0.03 and said == []
@@ -208,8 +225,8 @@ def test_a_meshs_colours_go_through_the_display(trained: Path, tmp_path: Path, s
 def test_whole_models_keep_every_channel(trained: Path, tmp_path: Path) -> None:
     for name in ("npz", "ply"):
         back = import_run(export_run(trained, name, tmp_path / f"m.{name}").files[0], tmp_path / name)
-        (exr,) = render_run(back, "orbit", None, "exr", tmp_path / f"{name}_out", 1, {})
-        (own,) = render_run(trained, "orbit", None, "exr", tmp_path / "own", 1, {})
+        (exr,) = render_run(back, RenderRequest("orbit", format="exr", out=tmp_path / f"{name}_out", frames=1))
+        (own,) = render_run(trained, RenderRequest("orbit", format="exr", out=tmp_path / "own", frames=1))
         every = exr_channels(own)
         assert exr_channels(exr) == every and len(every) == 8
         assert torch.equal(images.read_image(exr, channels=every), images.read_image(own, channels=every))
@@ -231,7 +248,7 @@ def test_a_damaged_header_is_the_files_fault(trained: Path, tmp_path: Path) -> N
     rest = {k: v for k, v in header.items() if k not in ("format", "kind")}
     checkpoint.write(tmp_path / "model.safetensors", "model", tensors, {**rest, "channels": ["a"]})
     with pytest.raises(CheckpointError, match=r"header names the channels \['a'\]; expected 5"):
-        render_run(tmp_path, "orbit", None, "png", None, 1, {})
+        render_run(tmp_path, RenderRequest("orbit", format="png", frames=1))
 
 
 # ---------------------------------------------------------------- without one
@@ -248,9 +265,9 @@ def test_without_a_display_it_is_said_what_is_shown(
     assert torch.equal(picture, images.to_uint8(images.linear_to_srgb(truth[..., :3])))
     assert not {"psnr_srgb", "psnr_display"} & read_metrics(out).keys()
     lines: list[str] = []
-    render_run(out, "orbit", None, "png", tmp_path / "png", 1, {}, tell=lines.append)
+    render_run(out, RenderRequest("orbit", format="png", out=tmp_path / "png", frames=1), notify=lines.append)
     assert lines == [f"shown: {SHOWN}; --format exr and npy hold all channels"]
-    render_run(out, "orbit", None, "exr", tmp_path / "exr", 1, {}, tell=lines.append)
+    render_run(out, RenderRequest("orbit", format="exr", out=tmp_path / "exr", frames=1), notify=lines.append)
     assert len(lines) == 1
     inspect_run(
         Request(out, ("primitives",), grid=8, out=tmp_path / "page.html"), lambda event: lines.append(event.text)
@@ -270,8 +287,8 @@ def test_any_number_of_channels_runs_and_is_written(site: Path, tmp_path: Path, 
     found = read_metrics(out)
     assert found["channels"] == list(names) and ("shown" in found) == ("shown:" in said) == (count > 1)
     assert np.isfinite(found["psnr"]) and np.isfinite(found["ssim"]) and "psnr_srgb" not in found
-    (npy,) = render_run(out, "orbit", None, "npy", tmp_path / "npy", 1, {})
-    (exr,) = render_run(out, "orbit", None, "exr", tmp_path / "exr", 1, {}, layers="beauty")
+    (npy,) = render_run(out, RenderRequest("orbit", format="npy", out=tmp_path / "npy", frames=1))
+    (exr,) = render_run(out, RenderRequest("orbit", format="exr", out=tmp_path / "exr", frames=1, layers="beauty"))
     values, read = torch.from_numpy(np.load(npy)), images.read_image(exr, channels=names)
     assert torch.allclose(
         read, values if space == "linear" else images.srgb_to_linear(values.clamp_min(0.0)), atol=1e-6, rtol=1e-6

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from neuprim.report.run_record import read_run
-from neuprim.report.sweep import COLOURS, Compared, better, write_sweep
+from neuprim.report.sweep import COLOURS, SweepRun, better, write_sweep_page
 from tests.browsers import browser
 
 
@@ -40,7 +40,7 @@ def sweep(folder: Path) -> Path:
     for name, (psnr, size) in numbers.items():
         run(folder / name, psnr, size, lpips=None if name == "small" else 0.1 + psnr / 100)
         runs.append(
-            Compared(
+            SweepRun(
                 name,
                 {"model.primitives": str(size)},
                 "done",
@@ -50,8 +50,8 @@ def sweep(folder: Path) -> Path:
                 read_run(folder / name),
             )
         )
-    runs.append(Compared("gone", {"model.primitives": "7"}, "failed", "no <images>", 0.1, 1, None))
-    return write_sweep(folder, runs, ["task=static", "model.primitives=1,2"])
+    runs.append(SweepRun("gone", {"model.primitives": "7"}, "failed", "no <images>", 0.1, 1, None))
+    return write_sweep_page(folder, runs, ["task=static", "model.primitives=1,2"])
 
 
 def test_it_stands_without_scripts_in_the_order_of_psnr(tmp_path: Path) -> None:
@@ -94,8 +94,8 @@ def test_of_many_runs_each_has_its_colour_and_infinite_numbers_sort(tmp_path: Pa
     runs = []
     for n in range(14):
         run(tmp_path / str(n), 10.0 + n, 100, psnr_infinite=n == 3)
-        runs.append(Compared(str(n), {}, "done", "", 1.0, 1, read_run(tmp_path / str(n))))
-    text = write_sweep(tmp_path, runs, []).read_text()
+        runs.append(SweepRun(str(n), {}, "done", "", 1.0, 1, read_run(tmp_path / str(n))))
+    text = write_sweep_page(tmp_path, runs, []).read_text()
     assert runs[3].numbers["psnr"] == math.inf and 'data-value="Infinity">∞' in text
     assert len(set(__import__("re").findall(r'class="chip" style="background: (#\w+)"', text))) == 14
     assert "8 of 14 runs, those with the best PSNR" in text

@@ -16,7 +16,7 @@ from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import DataError
 from neuprim.runs.events import Event, Events, Finishing, Preparing, Step
 from neuprim.runs.launch.jobs import Job
-from neuprim.runs.sweep.one import fit_one
+from neuprim.runs.sweep import fit_job
 
 PHASES = ("loading", "compiling", "training", "finishing")
 
@@ -86,13 +86,13 @@ def fit_and_die(data: Mapping[str, Any], attempt: int, events: Events) -> str:
         if now == phase is not None:
             kill()
 
-    before = neuprim.runs.training.make_ready
+    before = neuprim.runs.training.compile_for_run
     if phase == "compiling":
-        neuprim.runs.training.make_ready = kill
+        neuprim.runs.training.compile_for_run = kill
     try:
-        return fit_one(data["config"], attempt, heard)
+        return fit_job(data["config"], attempt, heard)
     finally:
-        neuprim.runs.training.make_ready = before
+        neuprim.runs.training.compile_for_run = before
 
 
 def wait_for(file: Path, seconds: float = 60.0) -> None:
@@ -110,4 +110,4 @@ def fit_one_and_die(data: Mapping[str, Any], attempt: int, events: Events) -> st
             os.kill(os.getpid(), signal.SIGKILL)
         events(event)
 
-    return fit_one(data, attempt, watched)
+    return fit_job(data, attempt, watched)

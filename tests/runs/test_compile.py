@@ -40,8 +40,8 @@ def test_only_the_edge_that_a_run_draws_is_compiled(edge: int, key: str) -> None
 
 def test_it_says_so_once_it_is_done(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(ahead, "cache_directory", lambda: tmp_path / "kernels")
-    constant = ahead.variant("Constant", 0)
-    assert not ahead.compiled("cpu", constant)
+    constant = ahead.kernel_variant("Constant", 0)
+    assert not ahead.is_compiled("cpu", constant)
 
     def interrupted(*args: object) -> None:
         raise KeyboardInterrupt
@@ -50,32 +50,36 @@ def test_it_says_so_once_it_is_done(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         patch.setattr(optimizer.RowAdam, "step", interrupted)  # the last that it compiles
         with pytest.raises(KeyboardInterrupt):
             ahead.main("cpu")
-    assert not ahead.compiled("cpu", constant), "a run must not wait for less than all"
+    assert not ahead.is_compiled("cpu", constant), "a run must not wait for less than all"
     ahead.main("cpu")
-    others = [("cpu", ahead.variant("RayNet", 0)), ("cpu", ahead.variant("Constant", 2)), ("reference", constant)]
-    assert ahead.compiled("cpu", constant) and not any(ahead.compiled(*other) for other in others)
+    others = [
+        ("cpu", ahead.kernel_variant("RayNet", 0)),
+        ("cpu", ahead.kernel_variant("Constant", 2)),
+        ("reference", constant),
+    ]
+    assert ahead.is_compiled("cpu", constant) and not any(ahead.is_compiled(*other) for other in others)
     monkeypatch.setattr(ahead, "cache_directory", lambda: tmp_path / "other sources")
-    assert not ahead.compiled("cpu", constant)
+    assert not ahead.is_compiled("cpu", constant)
 
 
 def test_nothing_is_started_where_there_is_nothing_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ahead.subprocess, "Popen", lambda *a, **k: pytest.fail("a process was started"))
-    monkeypatch.setattr(ahead, "compiled", lambda *a: True)
-    with ahead.compiling("cpu") as started:
+    monkeypatch.setattr(ahead, "is_compiled", lambda *a: True)
+    with ahead.compile_in_background("cpu") as started:
         assert not started.running
         started.wait()
-    monkeypatch.setattr(ahead, "compiled", lambda *a: False)
-    with ahead.compiling(None) as started:
+    monkeypatch.setattr(ahead, "is_compiled", lambda *a: False)
+    with ahead.compile_in_background(None) as started:
         assert not started.running
 
 
 def test_the_process_ends_with_the_block(monkeypatch: pytest.MonkeyPatch) -> None:
     genuine = ahead.subprocess.Popen
-    monkeypatch.setattr(ahead, "compiled", lambda *a: False)
+    monkeypatch.setattr(ahead, "is_compiled", lambda *a: False)
     monkeypatch.setattr(
         ahead.subprocess, "Popen", lambda *a, **k: genuine([sys.executable, "-c", "import time; time.sleep(60)"])
     )
     before = time.monotonic()
-    with ahead.compiling("cpu") as started:
+    with ahead.compile_in_background("cpu") as started:
         assert started.running
     assert not started.running and time.monotonic() - before < 30

@@ -22,10 +22,10 @@ from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.io.ply import read_ply
 from neuprim.core.io.vdb import read_grid
 from neuprim.export.appearance import Harmonics, sphere
-from neuprim.runs.draw import render_run
 from neuprim.runs.export import export_run, import_run
 from neuprim.runs.inspect import Request, inspect_run
 from neuprim.runs.open import open_run, read_metrics
+from neuprim.runs.render_images import RenderRequest, render_run
 from neuprim.tasks.relight import TASK as RELIGHT
 from neuprim.viewer.controls import format_condition
 from tests.core import tiny
@@ -67,8 +67,8 @@ def test_a_files_cameras_are_in_the_world_and_so_is_what_is_written_of_them(tmp_
     run = run_in(tmp_path / "run", world)
     there = write_cameras(tmp_path / "world.json", world.world_camera(LOOK))
     here = write_cameras(tmp_path / "scene.json", LOOK)
-    (a,) = render_run(run, there, None, "exr", tmp_path / "a.exr", 1, {})
-    (b,) = render_run(run, here, None, "exr", tmp_path / "b.exr", 1, {}, space="scene")
+    (a,) = render_run(run, RenderRequest(there, format="exr", out=tmp_path / "a.exr", frames=1))
+    (b,) = render_run(run, RenderRequest(here, format="exr", out=tmp_path / "b.exr", frames=1, space="scene"))
     with OpenEXR.File(str(a), separate_channels=True) as one, OpenEXR.File(str(b), separate_channels=True) as two:
         first, second = one.channels(), two.channels()
         assert np.abs(first["A"].pixels - second["A"].pixels).max() < 1e-5 and first["A"].pixels.max() > 0.9
@@ -86,14 +86,17 @@ def test_empty_images_are_told_and_a_shot_of_them_fails(tmp_path: Path) -> None:
         replace(LOOK, viewmat=look_at(torch.tensor([2.0, -3, 1.5]), torch.tensor([9.0, -9, 9]), up))
     )
     cameras = write_cameras(tmp_path / "c.json", UTM.world_camera(LOOK), away)
-    files = render_run(run, cameras, None, "png", tmp_path / "out", 1, {}, tell=said.append)
+    files = render_run(run, RenderRequest(cameras, format="png", out=tmp_path / "out", frames=1), notify=said.append)
     assert len(files) == 2 and any(
         "1 of 2 images are empty, first camera_001: the model is within (44824" in line for line in said
     )
     with pytest.raises(
         DataError, match=r"all 1 images are empty: the model is within .* looks towards .*--space scene"
     ):
-        render_run(run, write_cameras(tmp_path / "scene.json", LOOK), None, "png", tmp_path / "none", 1, {})
+        render_run(
+            run,
+            RenderRequest(write_cameras(tmp_path / "scene.json", LOOK), format="png", out=tmp_path / "none", frames=1),
+        )
     assert not list((tmp_path / "none").iterdir())
 
 

@@ -73,7 +73,7 @@ def test_what_is_to_stay_zero_does_and_nothing_else(run_dir: Path, dataset: Data
         model.density, model.colour, {**model.params, "sh_rest": model.params["sh_rest"].masked_fill(zero, 0.0)}
     )
     trainer = fine_tuner(config, task, dataset, pruned, 20)
-    trainer.zeros = {"sh_rest": zero}
+    trainer.zero_masks = {"sh_rest": zero}
     for _ in range(20):
         trainer.train_step()
     after = trainer.model.params["sh_rest"].detach()
@@ -81,7 +81,7 @@ def test_what_is_to_stay_zero_does_and_nothing_else(run_dir: Path, dataset: Data
     tensors, header = trainer.state()
     again = fine_tuner(config, task, dataset, pruned, 20)
     again.load_state(tensors, header, "state")
-    assert torch.equal(again.zeros["sh_rest"], zero)
+    assert torch.equal(again.zero_masks["sh_rest"], zero)
 
 
 def test_seconds_are_steps_at_the_model_s_pace(run_dir: Path, dataset: Dataset) -> None:

@@ -9,7 +9,7 @@ import pytest
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError
 from neuprim.runs.events import Event, Note
-from neuprim.runs.fit import complete, start
+from neuprim.runs.fit import prepare_training, train_to_end
 from tests.core import tiny
 from tests.short_runs import words
 
@@ -22,9 +22,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(scene: Path, tmp_path: Path, *more: str) -> tuple[int, int, list[str]]:
     """Primitives at the start, at the end, and what was noted."""
     events: list[Event] = []
-    fitted = start(compose(words(scene, tmp_path / "out", 100, "train.eval_every=0", *more)), events.append)
+    fitted = prepare_training(compose(words(scene, tmp_path / "out", 100, "train.eval_every=0", *more)), events.append)
     first = fitted.model.count
-    complete(fitted, events.append)
+    train_to_end(fitted, events.append)
     return first, fitted.model.count, [event.text for event in events if isinstance(event, Note)]
 
 
@@ -68,7 +68,7 @@ def test_a_sequence_is_judged_by_held_out_training_views(tmp_path: Path) -> None
         "model.primitives=20",
     ]
     config = compose([*asked, "train.iterations=2", "train.max_seconds=null", f"output_dir={tmp_path / 'out'}"])
-    fitted = complete(start(config, hold_out=3))
+    fitted = train_to_end(prepare_training(config, hold_out=3))
     metrics = fitted.metrics()
     assert metrics["split"] == "train, held out" and "per_frame" not in metrics
     assert len(metrics["per_view"]) == len(fitted.dataset.test) == 8

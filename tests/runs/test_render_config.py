@@ -17,7 +17,7 @@ from neuprim.core.checkpoint import save_model
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
-from neuprim.runs.measure import draw, evaluate_run
+from neuprim.runs.measure import evaluate_run, render_image
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.render_config import (
     GROUPS,
@@ -140,7 +140,7 @@ def test_render_and_eval_apply_the_overrides(run_dir: Path, model: Primitives, t
     assert np.array_equal(np.load(sorted(out.iterdir())[1]), image.numpy())
     small = replace(view, camera=view.camera.resized(12, 12))
     half = RenderConfig(run_config.renderer, 0.5).render_view(model, view, dataset.background)
-    plain = draw(model, small, run_config.renderer, dataset.background).permute(2, 0, 1)[None]
+    plain = render_image(model, small, run_config.renderer, dataset.background).permute(2, 0, 1)[None]
     expected = torch.nn.functional.interpolate(plain, (24, 24), mode="bilinear")[0].permute(1, 2, 0)
     assert torch.equal(half, expected)
     assert evaluate_run(run_dir, words=words)["psnr"] != evaluate_run(run_dir)["psnr"]

@@ -17,8 +17,8 @@ from neuprim.core.io.files import write_text
 from neuprim.core.notices import NeuprimWarning
 from neuprim.runs.curve import open_curve
 from neuprim.runs.open import read_metrics
-from neuprim.runs.results import result_files
 from neuprim.runs.run import run
+from neuprim.runs.run_directory import result_files
 from tests.core import tiny
 from tests.short_runs import fit, words
 

@@ -25,10 +25,10 @@ from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError
 from neuprim.core.notices import NeuprimWarning
 from neuprim.core.train.trainer import StepReport, Trainer
-from neuprim.runs.curve import curve_psnr
-from neuprim.runs.draw import render_run
-from neuprim.runs.measure import evaluate_run, measure
+from neuprim.runs.curve import evaluate_curve_point
+from neuprim.runs.measure import evaluate_run, measure_views
 from neuprim.runs.open import read_metrics
+from neuprim.runs.render_images import RenderRequest, render_run
 from neuprim.tasks.static import TASK
 from tests.core import tiny
 from tests.lpips_weights import weights, written
@@ -176,17 +176,17 @@ def test_masked_pixels_do_not_count_on_the_curve() -> None:
         for p in dataset.test.images  # type: ignore[attr-defined]
     ]
     trainer = tiny.trainer(dataset, 3)
-    views = measure(trainer.model, TASK, dataset, trainer.renderer, Channels())
-    assert curve_psnr(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
+    views = measure_views(trainer.model, TASK, dataset, trainer.renderer, Channels())
+    assert evaluate_curve_point(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
 
 
 def test_a_model_that_no_view_shows_says_so() -> None:
     dataset = tiny.two_primitives()
     trainer = tiny.trainer(dataset, 3)
-    assert not any(v.empty for v in measure(trainer.model, TASK, dataset, trainer.renderer, Channels()))
+    assert not any(v.empty for v in measure_views(trainer.model, TASK, dataset, trainer.renderer, Channels()))
     trainer.model.params["means"] = trainer.model.params["means"].detach() + 1000.0
     with pytest.warns(NeuprimWarning, match=r"two: the model is in none of 2 test views.*ply_file_path"):
-        views = measure(trainer.model, TASK, dataset, trainer.renderer, Channels())
+        views = measure_views(trainer.model, TASK, dataset, trainer.renderer, Channels())
     assert all(v.empty for v in views)
 
 
@@ -199,10 +199,11 @@ def test_the_near_plane_of_a_run_is_recorded_once(scene: Path, tmp_path: Path) -
 def test_a_perfect_view_leaves_the_curve_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = tiny.two_primitives()
     monkeypatch.setattr(
-        "neuprim.runs.curve.draw", lambda model, view, settings, background: dataset.test.pixels(0).over(background)
+        "neuprim.runs.curve.render_image",
+        lambda model, view, settings, background: dataset.test.pixels(0).over(background),
     )
     dataset.test.images = [dataset.test.images[0]] * 2  # type: ignore[attr-defined]
-    assert curve_psnr(tiny.trainer(dataset, 3)) == 200.0
+    assert evaluate_curve_point(tiny.trainer(dataset, 3)) == 200.0
 
 
 def test_a_task_may_judge_views_and_make_films_and_tell_facts(
@@ -265,10 +266,10 @@ def test_the_same_run_twice(whole: Path, scene: Path, tmp_path: Path) -> None:
 
 
 def test_render_orbit_test_and_file(whole: Path, tmp_path: Path) -> None:
-    paths = render_run(whole, "orbit", (30, 20), "png", tmp_path / "orbit", 3, {})
+    paths = render_run(whole, RenderRequest("orbit", size=(30, 20), format="png", out=tmp_path / "orbit", frames=3))
     assert [Image.open(p).size for p in paths] == [(30, 20)] * 3
     assert len({p.read_bytes() for p in paths}) == 3
-    paths = render_run(whole, "test", None, "png", tmp_path / "test", 60, {})
+    paths = render_run(whole, RenderRequest("test", format="png", out=tmp_path / "test"))
     assert [Image.open(p).size for p in paths] == [(tiny.SIZE, tiny.SIZE)] * 2
     own = sorted(p for p in (whole / "renders").glob("test_*.png") if "truth" not in p.name and "error" not in p.name)
     assert [p.read_bytes() for p in paths] == [p.read_bytes() for p in own], "the pictures that the run made itself"
@@ -283,11 +284,11 @@ def test_render_orbit_test_and_file(whole: Path, tmp_path: Path) -> None:
             }
         )
     )
-    paths = render_run(whole, str(cameras), None, "png", None, 60, {})
+    paths = render_run(whole, RenderRequest(str(cameras), format="png"))
     assert [Image.open(p).size for p in paths] == [(18, 14)] * 2
-    (path,) = render_run(whole, str(cameras), None, "webp", tmp_path / "a.webp", 60, {})
+    (path,) = render_run(whole, RenderRequest(str(cameras), format="webp", out=tmp_path / "a.webp"))
     assert path == tmp_path / "a.webp" and Image.open(path).size == (18, 14) and Image.open(path).n_frames == 2  # type: ignore[attr-defined]
-    paths = render_run(whole, "test", (8, 6), "exr", tmp_path / "exr", 60, {})
+    paths = render_run(whole, RenderRequest("test", size=(8, 6), format="exr", out=tmp_path / "exr"))
     assert [p.suffix for p in paths] == [".exr", ".exr"]
 
 

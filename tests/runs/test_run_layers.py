@@ -24,7 +24,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.plugins.judging import TaskFault
 from neuprim.runs.layers import Layers
-from neuprim.runs.measure import draw_sum
+from neuprim.runs.measure import render_light_sum
 from neuprim.runs.render_config import RenderConfig
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
@@ -135,7 +135,7 @@ def test_lights_apart_add_up_to_the_beauty(tmp_path: Path) -> None:
         np.array_equal(header["neuprim:light_001:light"], np.float32([-2, 0, 1]))
         and "neuprim:condition:light" not in header
     )
-    whole = draw_sum(model, replace(VIEW, conditions={}), lights, RenderSettings(), BLUE)
+    whole = render_light_sum(model, replace(VIEW, conditions={}), lights, RenderSettings(), BLUE)
     over, _ = written(tmp_path / "b.exr", replace(how, names="beauty"), model, replace(VIEW, conditions={}))
     assert (rgb(over) - whole).abs().max() < 1e-5
     with pytest.raises(ConfigError, match="--layers lights: 129 lights; expected at most 128"):

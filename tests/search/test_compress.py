@@ -15,10 +15,10 @@ from neuprim.cli import main
 from neuprim.core import checkpoint
 from neuprim.core.compression import LEVELS
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
-from neuprim.runs.draw import render_run
 from neuprim.runs.export import export_run, import_run
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run, model_file
+from neuprim.runs.render_images import RenderRequest, render_run
 from neuprim.search.compress import compress_run
 from neuprim.search.prune.judge import judge_of
 from tests.core import tiny
@@ -217,7 +217,9 @@ def test_eval(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_render(small: Path, whole: Path, tmp_path: Path) -> None:
-    images = [render_run(d, "test", None, "npy", tmp_path / d.name, 1, {})[0] for d in (small, whole)]
+    images = [
+        render_run(d, RenderRequest("test", format="npy", out=tmp_path / d.name, frames=1))[0] for d in (small, whole)
+    ]
     a, b = (np.load(path) for path in images)
     assert a.shape == b.shape and 0 < np.abs(a - b).max() < 0.2
 

@@ -9,7 +9,7 @@ import pytest
 
 from neuprim.config import compose
 from neuprim.config.launcher import LauncherSettings
-from neuprim.runs.launch.share import at_once
+from neuprim.runs.launch.executors import count_parallel_jobs
 from neuprim.search.trial_jobs import TrialFailed, launched_trials, trial_of, words_of
 from neuprim.search.trials import Outcome, Trial, run_trial
 from tests.core import tiny
@@ -20,7 +20,7 @@ from tests.systems import posix
 
 @posix
 def test_the_same_outcomes_as_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neuprim.runs.launch.share.machine_cores", lambda: 1)
+    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 1)
     scene = tiny.write_blender(tmp_path / "two")
     # Folders' names are as long as each other: they are written in the file, whose bytes are compared.
     here = Trial(compose(words(scene, tmp_path / "in_1", 20)), views=2)
@@ -55,5 +55,5 @@ def test_the_same_outcomes_as_here(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_how_many_a_search_counts_on(
     settings: LauncherSettings, expected: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuprim.runs.launch.share.machine_cores", lambda: 8)
-    assert at_once(settings, 100) == expected
+    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 8)
+    assert count_parallel_jobs(settings, 100) == expected

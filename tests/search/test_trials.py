@@ -16,11 +16,11 @@ from neuprim.core import checkpoint
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import write_json
 from neuprim.core.train.trainer import StepReport, Trainer
-from neuprim.runs.draw import render_run
 from neuprim.runs.events import Event, Note, Step
 from neuprim.runs.fit import fit
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run
+from neuprim.runs.render_images import RenderRequest, render_run
 from neuprim.search.tradeoff.subject import load_subject
 from neuprim.search.trials import FILE, Outcome, Trial, read_outcome, run_trial
 from neuprim.tasks.static import TASK
@@ -56,7 +56,7 @@ def test_a_trial_is_a_run_without_report_and_pictures(done: tuple[Path, Outcome]
         ["checkpoint.safetensors", "config.yaml", "metrics.jsonl", "model.safetensors", FILE]
     )
     assert load_run(folder)[2].count == 40 and load_subject(folder, (), 2).truths[0].view.name
-    assert len(render_run(folder, "test", (12, 12), "png", tmp_path / "drawn", 60, {})) == 2
+    assert len(render_run(folder, RenderRequest("test", size=(12, 12), format="png", out=tmp_path / "drawn"))) == 2
 
 
 def test_an_outcome_is_what_evaluating_the_folder_measures(done: tuple[Path, Outcome]) -> None:

@@ -43,7 +43,7 @@ def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(capture.Capture, "render", render)
-        return ground_truth.make_frames(data, attempt, events)
+        return ground_truth.render_frames_job(data, attempt, events)
 
 
 def troubled(wait: int) -> Any:

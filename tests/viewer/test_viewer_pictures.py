@@ -22,7 +22,7 @@ from neuprim.core.metrics import psnr
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
-from neuprim.runs.measure import draw
+from neuprim.runs.measure import render_image
 from neuprim.runs.open import load_run
 from neuprim.runs.render_config import RenderConfig, parse_render_config
 from neuprim.search.tradeoff.record import Measured, Record
@@ -57,7 +57,7 @@ def view_at(shows: str = COLOUR) -> Viewpoint:
 
 def test_colour_is_what_a_render_draws(model: Primitives) -> None:
     picture = draw_viewpoint(model, view_at(), RenderConfig(SETTINGS), WHITE, RGB)
-    expected = to_uint8(RGB.display(draw(model, View("", view_at().camera), SETTINGS, WHITE))).numpy()
+    expected = to_uint8(RGB.display(render_image(model, View("", view_at().camera), SETTINGS, WHITE))).numpy()
     assert picture.image.shape == (30, 40, 3) and picture.image.std() > 10 and picture.seconds > 0
     assert np.array_equal(picture.image, expected) and picture.caption == ""
 
@@ -279,7 +279,7 @@ def test_a_run_with_its_data(run_dir: Path) -> None:
     found = scene.compare_view(names[1])
     view, background = scene.load_view(names[1]), scene.dataset.background
     truth = scene.dataset.test.pixels(1).over(background)
-    drawn = draw(scene.model(), view, scene.settings, background)
+    drawn = render_image(scene.model(), view, scene.settings, background)
     assert found.psnr == psnr(drawn, truth) > 10
     assert np.array_equal(found.truth, to_uint8(truth).numpy()) and np.array_equal(found.drawn, to_uint8(drawn).numpy())
     few = parse_render_config(["density.neurons=1"], scene.settings, scene.model())

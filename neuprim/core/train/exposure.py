@@ -1,4 +1,4 @@
-"""A gain for every training image: photographs of one scene are not all exposed alike."""
+"""Learn a gain for every training image: photographs of one scene are not all exposed alike."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 
 
 class Exposures:
-    """A factor per training view and channel, with which a drawn image is multiplied before it is compared.
+    """A factor per training view and channel, by which a rendered image is multiplied before it is compared.
 
-    Factors are learned beside the model, by Adam, each when its view is seen. Their geometric mean over the views stays
-    1, so that the model keeps the photographs' mean exposure, which is what held-out views are drawn with.
+    Adam learns the logarithms of the factors, each in the steps that use its view. The geometric mean over the views
+    stays 1, so that the model keeps the photographs' mean exposure, with which held-out views are rendered.
 
     Args:
-        views: training views.
-        channels: colour channels.
-        rate: of the factors' logarithms, per step in which a view is seen.
+        views: number of training views.
+        channels: number of colour channels.
+        rate: learning rate of the logarithms.
     """
 
     def __init__(self, views: int, channels: int, rate: float, device: torch.device) -> None:
@@ -30,18 +30,17 @@ class Exposures:
         self.log_gain = torch.zeros(views, channels, device=device)
         self.m, self.v = torch.zeros_like(self.log_gain), torch.zeros_like(self.log_gain)
         self.seen = torch.zeros(views, dtype=torch.int64)
-        self._now: dict[int, Tensor] = {}
+        self._applied: dict[int, Tensor] = {}
 
     def apply(self, index: int, rgb: Tensor) -> Tensor:
         """(H, W, C) as the camera of view ``index`` would have exposed it."""
         gain = self.log_gain[index].clone().requires_grad_()
-        self._now[index] = gain
+        self._applied[index] = gain
         return rgb * gain.exp()
 
     def gradient(self, index: int) -> list[float] | None:
-        """Of the factors of a view that was applied, after its backward pass: a number per channel; None where nothing
-        came back."""
-        grad = self._now.pop(index).grad
+        """Gradient of the logarithms of a view's factors, after its backward pass; None without one."""
+        grad = self._applied.pop(index).grad
         return None if grad is None else [float(x) for x in grad.tolist()]
 
     def step(self, gradients: Mapping[int, list[float] | None]) -> None:
@@ -63,12 +62,8 @@ class Exposures:
         """Tensors from which :meth:`load_state` goes on."""
         return {"log_gain": self.log_gain, "m": self.m, "v": self.v, "seen": self.seen}
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Counterpart of :meth:`state`.
-
-        Raises:
-            ValueError: it is of other views, or not finite.
-        """
+    def check_state(self, state: dict[str, Tensor]) -> None:
+        """Raise ValueError where a state is of other views, or not finite."""
         for name, own in self.state().items():
             given = state.get(name)
             if (
@@ -79,6 +74,9 @@ class Exposures:
             ):
                 found = "missing" if given is None else f"{given.dtype} {tuple(given.shape)}"
                 raise ValueError(f"exposure.{name} is {found}; expected finite {own.dtype} {tuple(own.shape)}")
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Continue from a checked state."""
         device = self.log_gain.device
         self.log_gain, self.m, self.v = (state[k].to(device, copy=True) for k in ("log_gain", "m", "v"))
         self.seen = state["seen"].clone()

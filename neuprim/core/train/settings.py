@@ -110,8 +110,7 @@ class TrainSettings:
         that types ``max_seconds``
             alone means that: all the seconds are used, however fast the machine.
         views_per_step: views that a step looks at; gradients are their mean. A card has room for several small images.
-        shard: under torchrun, whether each rank has a part of the primitives, with their gradients and moments, instead
-        of all of them. max_seconds: stop after this many seconds of training, if given (such a run is not
+        max_seconds: stop after this many seconds of training, if given (such a run is not
         bit-reproducible). rates: learning rate by parameter name, over the specs' own.
         rate_units: unit of a parameter's rate by its name, over the spec's own: "absolute" (a position's is in scene
         units a step), or
@@ -144,7 +143,6 @@ class TrainSettings:
 
     iterations: Annotated[int, Range(at_least=0)] | None = 30_000
     views_per_step: Annotated[int, Range(1, 1024)] = 1
-    shard: bool = False
     coarse: Annotated[int, Range(1, 64)] = 1
     coarse_until: Share = 0.3
     angular_size: Annotated[float, Range(above=0)] | None = None

@@ -16,14 +16,14 @@ from torch import Tensor
 
 from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.compute.threads import parallel_for
+from neuprim.core.train.ssim_window import SSIM_TAPS, SSIM_WINDOW
 
 __all__ = ["photometric_fused"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end, which lets LLVM vectorise
-_TAPS = 11
-_x = np.arange(_TAPS) - 5.0
-_WINDOW = (np.exp(-(_x**2) / (2 * 1.5**2)) / np.exp(-(_x**2) / (2 * 1.5**2)).sum()).astype(np.float32)
+_TAPS = SSIM_TAPS
+_WINDOW = np.array(SSIM_WINDOW, np.float32)
 _ROWS = 16  # rows per band; fixed, so that sums do not depend on the number of threads
 _BLOCK = 512  # outputs of a row at a time, so that scratch arrays lie at constant offsets in the nearest cache
 _WIDE = 1024  # the same with the window's reach of 10 pixels; bounds the channels at 51

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute.warp import OPTIONS, array, launch, wp
-from neuprim.core.train.ssim_window import TAPS, WINDOW
+from neuprim.core.train.ssim_window import SSIM_TAPS, SSIM_WINDOW
 
 __all__ = ["similarity"]
 
-_TAPS = TAPS
-_Window = wp.types.vector(length=TAPS, dtype=wp.float32)
+_TAPS = SSIM_TAPS
+_Window = wp.types.vector(length=SSIM_TAPS, dtype=wp.float32)
 _vec5 = wp.types.vector(length=5, dtype=wp.float32)
 _C1, _C2 = wp.constant(0.01**2), wp.constant(0.03**2)
 
@@ -137,4 +137,4 @@ def similarity(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, 
 
 @functools.cache
 def _window() -> Any:
-    return _Window(*WINDOW)
+    return _Window(*SSIM_WINDOW)

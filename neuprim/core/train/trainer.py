@@ -1,18 +1,17 @@
-"""The training loop, for every task, in one sitting.
+"""The training loop of every task.
 
-A step: draw a view, render it, compare, go back, move the parameters, let the population react; ``train.supervision``
-may put points of known extinction in a view's place or beside it. Everything that shapes
-the next step is in :meth:`Trainer.state`, so that 2N steps equal N steps, a kill, a resume and N more, bit for bit.
+A step draws a view, renders it, compares it with the image, runs the backward pass, updates the parameters and lets the
+population react. ``train.supervision`` adds points of known extinction, or replaces the view by them. Everything that
+affects the next step is in :meth:`Trainer.state`: a run that is stopped and resumed equals one that was not, bit for bit.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from functools import cached_property
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,46 +20,104 @@ from neuprim.core.compute import device
 from neuprim.core.compute.threads import limit_threads
 from neuprim.core.data import Dataset, Pixels, PointSamples
 from neuprim.core.data.dataset_check import check_pixels
-from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, RankError, nearest
+from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.backends import device_of
 from neuprim.core.render.near_plane import resolve_near, scene_extent
+from neuprim.core.render.output import Contributions, sum_contributions
 from neuprim.core.task import Loss, Supervision
-from neuprim.core.train.ahead import Ahead
-from neuprim.core.train.angle import AngularSize
-from neuprim.core.train.coarse import reduced, reduction
-from neuprim.core.train.distributed import ALONE, Alone, Look, Seen
-from neuprim.core.train.distributed.refusals import refuse_parts
 from neuprim.core.train.exposure import Exposures
-from neuprim.core.train.losses import scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
-from neuprim.core.train.points import PointStep, point_step
+from neuprim.core.train.point_loss import PointResult, point_loss
 from neuprim.core.train.population import Change, make_population
-from neuprim.core.train.restoring import by_row, names_of, part, restored
+from neuprim.core.train.regularization import MaxScreenSize, scale_anisotropy
 from neuprim.core.train.settings import TrainSettings
-from neuprim.core.train.step import ImageStep, StepReport, of_views
+from neuprim.core.train.trainer_state import hash_names, parse_state
+from neuprim.core.train.training_views import Prefetcher, reduce_view, resolution_factor
 
-__all__ = ["COLD", "StepReport", "Trainer"]
+__all__ = ["MIN_COOLDOWN", "StepReport", "Trainer", "ViewResult", "ViewTask"]
 
-COLD = 0.02
-"""What a cool-down leaves of a rate."""
+MIN_COOLDOWN = 0.02
+"""Smallest factor of the learning rates in a cool-down."""
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one step did.
+
+    Attributes:
+        seconds: of training up to the end of this step.
+        psnr: of the training view (the mean of several), or of the extinction at points in a step without views.
+        change: what the population did, if anything.
+    """
+
+    step: int
+    seconds: float
+    loss: float
+    parts: dict[str, float]
+    psnr: float
+    primitives: int
+    view: str
+    change: str | None
+
+
+@dataclass(frozen=True)
+class ViewTask:
+    """A view to render: its index, its background, and the index of the view after it, if known."""
+
+    index: int
+    background: Tensor
+    upcoming: int | None
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """Numbers of one view of a step.
+
+    Attributes:
+        loss: of the view; of the last view of a step its share, plus the losses of points and regularisers.
+        point_parts: named parts of the loss at points.
+        gain: gradient of the logarithm of the view's exposure, one number per channel; None without exposures.
+    """
+
+    index: int
+    name: str
+    loss: float
+    psnr: float
+    parts: dict[str, float]
+    point_parts: dict[str, float] = field(default_factory=dict)
+    gain: list[float] | None = None
+
+
+class RenderedView(NamedTuple):
+    """A view, rendered and compared; the backward pass fills ``contributions``."""
+
+    loss: Tensor
+    parts: dict[str, float]
+    psnr: float
+    name: str
+    truth: Tensor
+    contributions: Contributions
 
 
 class Trainer:
     """Fits a model to the training views of a data set.
 
-    The model's tensors move to the device that the renderer's settings choose, and so does all that belongs to them;
-    random numbers are drawn on the processor, so that they are the same on every device.
+    The model's tensors move to the device that the renderer's settings choose. Random numbers are drawn on the CPU, so
+    that they are the same on every device.
 
     Attributes:
         device: where the training's tensors are.
         extent: the unit of position rates and size limits, see :func:`~neuprim.core.render.near_plane.scene_extent`.
         step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
-        stored: parameters -> what will be kept of them, with the gradients of the parameters: images are drawn of that.
-        None: of themselves. zeros: parameter -> (N, ...) bool of the numbers that stay zero; empty for none.
-        ranks: the processes that share a step's views; see :meth:`join`.
+        fake_quantize: parameters -> parameters as a file would store them, with gradients; None renders them as they are.
+        zero_masks: parameter -> (N, ...) bool of the numbers that stay zero.
+        rank, ranks: number of this process among those that train the model, and how many there are.
+        stop_requested: polled after every step; see :attr:`stopping`.
     """
+
+    rank, ranks = 0, 1
 
     def __init__(
         self,
@@ -94,62 +151,34 @@ class Trainer:
         first = dataset.train.view(0)
         self.device = device_of(model, self.renderer, first.camera, first.conditions)
         model.params = model.to(self.device).params
-        self._ahead = (
-            Ahead(self._pixels, device.free_cuda_memory(self.device) // 4) if self.device.type == device.CUDA else None
+        self.prefetcher = (
+            Prefetcher(self._load_pixels, device.free_cuda_memory(self.device) // 4)
+            if self.device.type == device.CUDA
+            else None
         )
         self.population = make_population(settings.population)
-        self.angles = None if settings.angular_size is None else AngularSize(dataset.train, settings.angular_size)
+        self.max_screen_size = (
+            None if settings.angular_size is None else MaxScreenSize(dataset.train, settings.angular_size)
+        )
         self.exposures = None
         if settings.exposure_rate > 0:
             if dataset.train.pixels(0).alpha is not None:
                 raise ConfigError(
-                    f"train.exposure_rate={settings.exposure_rate:g}: images of {dataset.name} have alpha; expected opaque photographs, "
-                    "as a gain would change the background that is put behind them"
+                    f"train.exposure_rate={settings.exposure_rate:g}: images of {dataset.name} have alpha; expected "
+                    "opaque photographs, as a gain would change the background that is put behind them"
                 )
             self.exposures = Exposures(len(dataset.train), dataset.channels, settings.exposure_rate, self.device)
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order = torch.empty(0, dtype=torch.int64)
         self.step = 0
         self.elapsed = 0.0
-        self.stored: Callable[[dict[str, Tensor]], dict[str, Tensor]] | None = None
-        self.zeros: dict[str, Tensor] = {}
-        self.ranks: Alone = ALONE
-        self._watch()
-
-    def join(self, ranks: Alone) -> None:
-        """Train with others from here on: a step looks at ``train.views_per_step`` views of every rank. Where each has
-        a part of the primitives, this one keeps its own.
-
-        Raises:
-            ConfigError: there are no views to share, or what is trained cannot be in parts.
-        """
-        if ranks.size > 1 and self.settings.supervision == "voxels":
-            raise ConfigError(
-                f"train.supervision=voxels: there are no views that {ranks.size} ranks could share; expected one process"
-            )
-        self.ranks = ranks
-        if ranks.parts:
-            refuse_parts(self.settings, ranks.size)
-            if self.step:
-                tensors, header = self.state()
-                own = ranks.cut({name: value for name, value in tensors.items() if by_row(name, value)})
-                self.load_state({**tensors, **own}, header, "the whole model")
-                return
-            self.model.params = ranks.cut(self.model.params)
-            vars(self).pop("optimizer", None)
-            self.population.count = self.count
-            self._watch()
-
-    def leave(self, params: dict[str, Tensor]) -> None:
-        """Train no more: the whole model's tensors take the place of this rank's part, and its moments go."""
-        self.ranks, self.population.count = ALONE, None
-        self.model.params = {name: params[name].to(self.device) for name in self.model.params}
-        vars(self).pop("optimizer", None)
-
-    @cached_property
-    def optimizer(self) -> RowAdam:
-        """Made when it is first needed: a rank that keeps a part of the primitives never has moments of all."""
-        return RowAdam(self.model.specs, self.model.params, self.settings.adam_beta2)
+        self.fake_quantize: Callable[[dict[str, Tensor]], dict[str, Tensor]] | None = None
+        self.zero_masks: dict[str, Tensor] = {}
+        self.stop_requested: Callable[[], bool] = lambda: False
+        self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
+        self._view_results: list[ViewResult] = []
+        self._contributions: list[Contributions] = []
+        self._require_grad()
 
     # ------------------------------------------------------------ the budget
 
@@ -166,13 +195,18 @@ class Trainer:
     def finished(self) -> bool:
         return self.progress >= 1.0
 
+    @property
+    def stopping(self) -> bool:
+        """Whether the step just done is the last one, because somebody asked to stop."""
+        return self.stop_requested()
+
     def rates(self) -> dict[str, float]:
         """Learning rate of every parameter now: warm-up, exponential decay to ``final_rate`` at the end of the budget,
         cool-down."""
         s = self.settings
         factor = s.final_rate**self.progress
         if s.cooldown and self.progress > 1 - s.cooldown:
-            factor *= max((1 - self.progress) / s.cooldown, COLD)
+            factor *= max((1 - self.progress) / s.cooldown, MIN_COOLDOWN)
         if self.step < s.warmup_steps:
             factor *= (self.step + 1) / s.warmup_steps
         unit = {"absolute": 1.0, "extent": self.extent}
@@ -187,30 +221,21 @@ class Trainer:
             yield self.train_step()
 
     def train_step(self) -> StepReport:
-        """One view, some points or both, one update; on as many threads as the renderer has.
+        """Take one step, on as many threads as the renderer has.
 
         Raises:
-            NonFiniteError: a loss, gradient or parameter is NaN or infinite; nothing was updated by this step.
-            DeviceMemoryError: the card has no room for a step; what was saved is intact.
-            RankError: another rank is gone; the state is that before the step.
+            NonFiniteError: a loss, gradient or parameter is NaN or infinite; this step updated nothing.
+            DeviceMemoryError: the GPU has no room for a step; what was saved is intact.
         """
-        drawn = self.order, self.generator.get_state() if self.ranks.size > 1 else None
         try:
             with limit_threads(self.renderer.threads):
                 return self._train_step()
-        except (
-            RankError
-        ) as error:  # the step is not done: what it drew is drawn again, by whoever goes on from this state
-            self.order = drawn[0]
-            if drawn[1] is not None:
-                self.generator.set_state(drawn[1])
-            raise error if error.told else RankError(f"{error}, in step {self.step + 1}") from error
         except torch.OutOfMemoryError as error:
             camera = self.dataset.train.view(0).camera
             size = f"{camera.width} x {camera.height} pixels"
             raise DeviceMemoryError(
-                f"{self.device}: out of memory at step {self.step} with {self.model.count} primitives, images of {size} and "
-                f"train.views_per_step={self.settings.views_per_step}; lower one of them. The last checkpoint is intact"
+                f"{self.device}: out of memory at step {self.step} with {self.model.count} primitives, images of {size} "
+                f"and train.views_per_step={self.settings.views_per_step}; lower one of them. The last checkpoint is intact"
             ) from error
 
     def _train_step(self) -> StepReport:
@@ -220,114 +245,121 @@ class Trainer:
         model.colour.set_progress(progress)
         for value in model.params.values():
             value.grad = None
+        self._view_results, self._contributions = [], []
 
-        views = 0 if self.settings.supervision == "voxels" else self.settings.views_per_step
-        looks = views * self.ranks.size
-        step = self.ranks.step(model, views, self.elapsed, start)
-        known: PointStep | None = None
-        for place, index, background, following, peers in self._deal(looks):
-            samples = self._draw_points() if place >= looks - self.ranks.size and self._points_due() else None
-            shown = step.drawn(lambda peers=peers, samples=samples: self._looks(peers, samples))  # type: ignore[misc]
-            seen = self._look(progress, index, background, following, shown)
-            loss = seen.loss / looks if looks > 1 else seen.loss
-            last = place == looks - 1
-            if last:  # points and regularisers go with the last view, whoever looks at it
-                known = None if samples is None else self._look_inside(samples, shown)
-                loss = self._beside(loss, known)
-            cost = self._go_back(loss, loss if last else seen.loss, seen, known)
-            gain = None if self.exposures is None else self.exposures.gradient(index)
-            more = {} if known is None else known.parts
-            step.add(Seen(index, seen.name, cost, seen.psnr, seen.parts, more, gain), seen.tally)
-            del seen, loss, shown  # and what the frame kept, before the next one is drawn
-        if looks:
-            tally = step.close()
+        # Loss and gradients, view by view. Points and regularisers join the last view of the step.
+        tasks = self._sample_views()
+        samples = self._draw_points() if self._points_due() else None
+        points: PointResult | None = None
+        views = self.settings.views_per_step * self.ranks
+        for number, task in enumerate(tasks, start=1):
+            view = self._render_view(task, progress)
+            loss = view.loss / views if views > 1 else view.loss
+            last = number == len(tasks) and self.rank == self.ranks - 1
+            if last:
+                points = None if samples is None else self._point_loss(samples)
+                loss = self._total_loss(loss, points)
+            cost = self._backward(loss, loss if last else view.loss, view, points)
+            gain = None if self.exposures is None else self.exposures.gradient(task.index)
+            point_parts = {} if points is None else points.parts
+            result = ViewResult(task.index, view.name, cost, view.psnr, view.parts, point_parts, gain)
+            self._collect_view(result, view.contributions)
+            del view, loss  # free what autograd saved before the next view is rendered
+        if tasks:
+            results, contributions = self._sum_views(start)
+            cost, parts, psnr, name = summarize_views(results)
         else:
-            known = self._look_inside(self._draw_points(), model)
-            loss = self._beside(None, known)
-            cost = self._go_back(loss, loss, None, known)
-            tally = known.tally()
+            assert samples is not None, "a step without views has points"
+            points = self._point_loss(samples)
+            loss = self._total_loss(None, points)
+            cost = self._backward(loss, loss, None, points)
+            results, contributions = [], points.contributions()
+            parts, psnr, name = points.parts, points.psnr, points.name
 
-        self.population.observe(model, tally)
+        # Update parameters and exposures, then the population.
+        self.population.observe(model, contributions)
         self.optimizer.step(model.params, self.rates())
         if self.dataset.largest is not None:
-            self.model.limit(self.dataset.largest)
-        for name, zero in self.zeros.items():
-            model.params[name].detach()[zero] = 0
+            model.limit(self.dataset.largest)
+        for parameter, mask in self.zero_masks.items():
+            model.params[parameter].detach()[mask] = 0
         if self.exposures is not None:
-            self.exposures.step({view.index: view.gain for view in step.seen})
-        if self.angles is not None:
-            self.angles.step(self.step, model.params["means"], model.params["log_scales"])
+            self.exposures.step({result.index: result.gain for result in results})
+        if self.max_screen_size is not None:
+            self.max_screen_size.apply(self.step, model.params["means"], model.params["log_scales"])
         self.step += 1
         change = None
         if self.population.due(self.step, progress):
-            change = self.ranks.intervene(self.population, model, self.optimizer, self.extent)
+            change = self.population.intervene(model, self.extent)
             if change is not None:
-                self._apply(change)
-        self.elapsed = self.ranks.spent(self.elapsed, start)
-        if known is not None and not looks:
-            parts, psnr, name = known.parts, known.psnr, known.name
-        else:
-            cost, parts, psnr, name = of_views(step.seen)
-        return StepReport(self.step, self.elapsed, cost, parts, psnr, self.count, name, change.text if change else None)
+                self._apply_change(change)
+        self.elapsed = self._stop_clock(start)
+        text = None if change is None else change.text
+        return StepReport(self.step, self.elapsed, cost, parts, psnr, model.count, name, text)
 
-    @property
-    def count(self) -> int:
-        """Primitives of the whole model."""
-        return self.ranks.count(self.model)
+    # ------------------------------------------------------------ what several processes do differently
 
-    def _deal(self, looks: int) -> list[tuple[int, int, Tensor, int | None, list[int]]]:
-        """Draw the views of a step; of this rank's, by turns: place in the step, view, background, the view that this
-        rank looks at next, and those that all ranks look at now.
+    def _sample_views(self) -> list[ViewTask]:
+        """Draw the views of a step with their backgrounds; none for ``train.supervision=voxels``."""
+        if self.settings.supervision == "voxels":
+            return []
+        drawn = [(self._next_view(), self._draw_background()) for _ in range(self.settings.views_per_step)]
+        upcoming = [*(index for index, _ in drawn[1:]), int(self.order[0]) if len(self.order) else None]
+        return [ViewTask(index, background, then) for (index, background), then in zip(drawn, upcoming, strict=True)]
 
-        All ranks draw all of them, so that their random numbers stay the same.
-        """
-        drawn = [(self._next_view(), self._background()) for _ in range(looks)]
-        mine = range(self.ranks.rank, looks, self.ranks.size)
-        later = int(self.order[self.ranks.rank]) if len(self.order) > self.ranks.rank else None
-        following = [*(drawn[place][0] for place in mine[1:]), later]
-        peers = [[index for index, _ in drawn[place - self.ranks.rank :][: self.ranks.size]] for place in mine]
-        return (
-            [(place, *drawn[place], then, now) for place, then, now in zip(mine, following, peers, strict=True)]
-            if looks
-            else []
-        )
+    def _collect_view(self, result: ViewResult, contributions: Contributions) -> None:
+        """Note a view after its backward pass; its gradients are added to those of the views before."""
+        self._view_results.append(result)
+        self._contributions.append(contributions)
 
-    def _looks(self, peers: list[int], samples: PointSamples | None) -> list[Look]:
-        """What all ranks look at now; points go with the last one's."""
-        looks = [Look(self.dataset.train.view(index)) for index in peers]
-        return looks if samples is None else [*looks[:-1], replace(looks[-1], beside=samples.conditions)]
+    def _sum_views(self, start: float) -> tuple[list[ViewResult], Contributions]:
+        """Results of all views of the step, in their order, and the sum of their contributions. ``start``: when the
+        step began, seconds of ``time.perf_counter``."""
+        each = self._contributions
+        return self._view_results, each[0] if len(each) == 1 else sum_contributions(each, self.model.count)
 
-    def _beside(self, loss: Tensor | None, known: PointStep | None) -> Tensor:
-        """The loss of a step's views, or None, with those of points and regularisers."""
-        if known is not None:
-            loss = known.loss if loss is None else loss + self.settings.voxel_weight * known.loss
+    def _stop_clock(self, start: float) -> float:
+        """Seconds of training up to the end of this step."""
+        return self.elapsed + time.perf_counter() - start
+
+    # ------------------------------------------------------------ parts of a step
+
+    def _total_loss(self, loss: Tensor | None, points: PointResult | None) -> Tensor:
+        """Add the losses of points and regularisers to that of the views, if there are views."""
+        if points is not None:
+            loss = points.loss if loss is None else loss + self.settings.voxel_weight * points.loss
         assert loss is not None
         if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
             loss = loss + self.settings.anisotropy_weight * scale_anisotropy(self.model.params["log_scales"])
         return loss
 
-    def _go_back(self, loss: Tensor, judged: Tensor, seen: ImageStep | None, known: PointStep | None) -> float:
-        """Add a loss to the gradients; returns the value of ``judged``, what it is made of.
+    def _backward(self, loss: Tensor, reported: Tensor, view: RenderedView | None, points: PointResult | None) -> float:
+        """Add the gradients of ``loss`` to the parameters'; returns the value of ``reported``.
 
         Raises:
-            NonFiniteError: it is none.
+            NonFiniteError: the value is NaN or infinite; names the view or points.
         """
-        cost = judged.item()
+        cost = reported.item()
         if not math.isfinite(cost):
-            self._refuse(cost, seen, known)
+            self.model.check_finite()
+            where = (
+                f"view {view.name}" if view is not None else f"points of {points.name}" if points is not None else ""
+            )
+            spoiled = view is not None and not bool(torch.isfinite(view.truth).all())
+            more = ", whose pixels are NaN or infinite somewhere" if spoiled else ""
+            raise NonFiniteError(f"loss is {cost} at step {self.step} on {where}{more}")
         loss.backward()
         return cost
 
-    def _look(
-        self, progress: float, index: int, background: Tensor, following: int | None, shown: Primitives
-    ) -> ImageStep:
-        """Draw a view and compare."""
-        pixels = self._pixels(index) if self._ahead is None else self._ahead.take(index, following)
-        factor = reduction(progress, self.settings.coarse, self.settings.coarse_until)
-        view, pixels = reduced(self.dataset.train.view(index), pixels, factor)
-        background = background.to(self.device, non_blocking=True)
+    def _render_view(self, task: ViewTask, progress: float) -> RenderedView:
+        """Render a view and compare it with its image."""
+        index = task.index
+        pixels = self._load_pixels(index) if self.prefetcher is None else self.prefetcher.take(index, task.upcoming)
+        factor = resolution_factor(progress, self.settings.coarse, self.settings.coarse_until)
+        view, pixels = reduce_view(self.dataset.train.view(index), pixels, factor)
+        background = task.background.to(self.device, non_blocking=True)
         truth = pixels.over(background)
-        output = render(self._drawn(shown), view.camera, view.conditions, self.renderer, background)
+        output = render(self._quantized_model(), view.camera, view.conditions, self.renderer, background)
         rgb = output.rgb if self.exposures is None else self.exposures.apply(index, output.rgb)
         if pixels.mask is not None:
             rgb = torch.where(pixels.mask[..., None], rgb, truth)
@@ -335,60 +367,49 @@ class Trainer:
         with torch.no_grad():
             difference = rgb - truth
             channels = difference.shape[-1]
-            tally = output.request_contributions(
-                difference.abs() @ torch.full((channels,), 1.0 / channels, device=self.device)
-            )
+            mean = torch.full((channels,), 1.0 / channels, device=self.device)
+            contributions = output.request_contributions(difference.abs() @ mean)
             flat = difference.reshape(-1)
             counted = flat.numel() if pixels.mask is None else int(pixels.mask.sum()) * channels
             mse = torch.dot(flat, flat).item() / counted
         psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
-        return ImageStep(loss, parts, psnr, view.name, truth, tally)
+        return RenderedView(loss, parts, psnr, view.name, truth, contributions)
 
-    def _drawn(self, model: Primitives) -> Primitives:
-        """What images are drawn of."""
-        return model if self.stored is None else Primitives(model.density, model.colour, self.stored(model.params))
+    def _quantized_model(self) -> Primitives:
+        """The model that images and points are rendered of."""
+        model = self.model
+        if self.fake_quantize is None:
+            return model
+        return Primitives(model.density, model.colour, self.fake_quantize(model.params))
 
-    def _pixels(self, index: int) -> Pixels:
-        """Those of a training view, where the training is."""
+    def _load_pixels(self, index: int) -> Pixels:
+        """Pixels of a training view, on the training's device."""
         pixels = self.dataset.train.pixels(index)
         check_pixels("train", self.dataset.train.view(index), pixels, self.dataset.channels)
         return pixels.to(self.device)
 
     def _points_due(self) -> bool:
-        """Whether this step looks at points, too; the last one before each multiple of ``voxels_every`` does, which is
-        what logs show."""
+        """Whether this step uses points. With ``both``, the last step before each multiple of ``voxels_every`` does,
+        which is the one that logs show."""
         source = self.settings.supervision
         return source == "voxels" or (source == "both" and (self.step + 1) % self.settings.voxels_every == 0)
 
-    def _look_inside(self, samples: PointSamples, shown: Primitives) -> PointStep:
-        """Compare at points of known extinction."""
-        return point_step(self._drawn(shown), self.dataset, samples, self.settings, self.renderer.threads)
-
     def _draw_points(self) -> PointSamples:
         points = self.dataset.points
-        assert points is not None, "refused at the start"
+        assert points is not None, "the constructor refuses data without points"
         return points.draw(self.settings.voxels_per_step, self.generator)
 
-    def _refuse(self, value: float, seen: ImageStep | None, known: PointStep | None) -> None:
-        """Say why a loss is not finite.
-
-        Raises:
-            NonFiniteError: always.
-        """
-        self.model.check_finite()
-        where = f"view {seen.name}" if seen is not None else f"points of {known.name}" if known is not None else ""
-        spoiled = seen is not None and not bool(torch.isfinite(seen.truth).all())
-        more = ", whose pixels are NaN or infinite somewhere" if spoiled else ""
-        raise NonFiniteError(f"loss is {value} at step {self.step} on {where}{more}")
+    def _point_loss(self, samples: PointSamples) -> PointResult:
+        return point_loss(self._quantized_model(), self.dataset, samples, self.settings, self.renderer.threads)
 
     def _next_view(self) -> int:
-        """Random order without replacement."""
+        """Index of the next view: random order without replacement."""
         if len(self.order) == 0:
             self.order = torch.randperm(len(self.dataset.train), generator=self.generator)
         index, self.order = int(self.order[0]), self.order[1:]
         return index
 
-    def _background(self) -> Tensor:
+    def _draw_background(self) -> Tensor:
         choice, channels = self.settings.background, self.dataset.channels
         if choice == "random" or (choice == "auto" and self.dataset.random_background):
             return torch.rand(channels, generator=self.generator)
@@ -396,53 +417,58 @@ class Trainer:
             return self.dataset.background.float()
         return torch.full((channels,), 1.0 if choice == "white" else 0.0)
 
-    def _apply(self, change: Change) -> None:
+    def _apply_change(self, change: Change) -> None:
         self.model.params = {spec.name: change.params[spec.name].contiguous() for spec in self.model.specs}
         self.optimizer.select(change.origin, change.fresh)
-        self.zeros = {name: zero[change.origin] for name, zero in self.zeros.items()}
-        self._watch()
+        self.zero_masks = {name: mask[change.origin] for name, mask in self.zero_masks.items()}
+        self._require_grad()
 
-    def _watch(self) -> None:
+    def _require_grad(self) -> None:
         for name, value in self.model.params.items():
             self.model.params[name] = value.detach().requires_grad_()
 
     # ------------------------------------------------------------ exact state
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Tensors and JSON-able numbers from which :meth:`load_state` goes on exactly, on any device; all of them on
-        the processor."""
+        """CPU tensors and JSON-able numbers from which :meth:`load_state` goes on exactly, on any device."""
         tensors = {f"params.{k}": v.detach() for k, v in self.model.params.items()}
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
         tensors |= {f"exposure.{k}": v for k, v in (self.exposures.state() if self.exposures else {}).items()}
-        tensors |= {f"zeros.{k}": v for k, v in self.zeros.items()}
+        tensors |= {f"zeros.{k}": v for k, v in self.zero_masks.items()}
         tensors |= {"generator": self.generator.get_state(), "order": self.order}
         tensors = {name: value.cpu() for name, value in tensors.items()}
-        header = {
-            "step": self.step,
-            "elapsed": self.elapsed,
-            "views": len(self.dataset.train),
-            "names": names_of(self.dataset.train),
-        }
+        train = self.dataset.train
+        header = {"step": self.step, "elapsed": self.elapsed, "views": len(train), "names": hash_names(train)}
         return tensors, header
 
     def load_state(self, tensors: dict[str, Tensor], header: dict[str, Any], where: str) -> None:
-        """Continue from :meth:`state`; of a rank with a part of the primitives, from its rows.
+        """Continue from :meth:`state`.
 
         Raises:
             CheckpointError: the state belongs to other settings or data; names what differs. The trainer is unchanged.
         """
-        found = restored(
+        found = parse_state(
             tensors, header, where, self.model, self.settings.adam_beta2, self.dataset.train, self.exposures
         )
-        model, self.optimizer = found.model, found.optimizer
-        self.model.params = model.to(self.device).params
-        if self.device != model.device:
-            self.optimizer = RowAdam(self.model.specs, self.model.params, self.settings.adam_beta2)
-            self.optimizer.load_state(part(tensors, "adam."))
+        self.model.params = found.model.to(self.device).params
+        self.optimizer = RowAdam(self.model.specs, self.model.params, self.settings.adam_beta2)
+        self.optimizer.load_state(found.optimizer.state())
+        if self.exposures is not None:
+            self.exposures.load_state(found.exposures)
         self.order, self.generator = tensors["order"].clone(), found.generator
         self.population.load_state({name: value.to(self.device) for name, value in found.population.items()})
-        self.zeros = {name: zero.to(self.device) for name, zero in found.zeros.items()}
-        self.population.count = self.count if self.ranks.parts else None
+        self.zero_masks = {name: mask.to(self.device) for name, mask in found.zero_masks.items()}
         self.step, self.elapsed = found.step, found.elapsed
-        self._watch()
+        self._require_grad()
+
+
+def summarize_views(views: Sequence[ViewResult]) -> tuple[float, dict[str, float], float, str]:
+    """Loss, its parts, PSNR and name of a step, from its views in their order."""
+    last, others, count = views[-1], views[:-1], len(views)
+    parts = {**last.parts, **last.point_parts}
+    if not others:
+        return last.loss, parts, last.psnr, last.name
+    cost = last.loss + sum(view.loss for view in others) / count
+    parts |= {part: sum(view.parts[part] for view in views) / count for part in last.parts}
+    return cost, parts, sum(view.psnr for view in views) / count, f"{last.name} and {count - 1} more"

@@ -1,21 +1,32 @@
-"""What is launched: the name of a function and plain values for it, so that any process that has the package can do
-it."""
+"""Jobs, which any process that has the package can do, their results, and how far they are.
+
+A job names a function and has plain values for it. This module imports nothing heavy, so that a worker can set its
+number of threads before libraries read it.
+"""
 
 from __future__ import annotations
 
 import importlib
+import json
+import os
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim.core.errors import one_line
+from neuprim.core.errors import ConfigError, one_line
+from neuprim.core.io.plain import load_json
+from neuprim.core.validation import validate
 
-if TYPE_CHECKING:  # which loads torch, that a worker may not have told its threads yet
-    from neuprim.runs.events import Events
+if TYPE_CHECKING:
+    from neuprim.runs.events import Event, Events
 
-__all__ = ["Job", "Result", "perform"]
+__all__ = ["ENDED", "Job", "JobStatus", "Result", "StatusListener", "perform", "read_status", "write_status"]
+
+ENDED = ("done", "failed", "interrupted")
+"""States of a job that is over."""
 
 
 @dataclass(frozen=True)
@@ -23,12 +34,10 @@ class Job:
     """One piece of work.
 
     Attributes:
-        name: unique among those launched together, and good as a file's name.
+        name: unique among those launched together, and valid as a file name.
         call: ``module:function``, which is called with ``data``, the number of times that its worker died before, and a
-        listener of events.
-            From the second time on it should go on where it was left.
-        data: values that another process can have: numbers, texts, lists, dictionaries, paths. Objects of plugins are
-        named, not sent.
+            listener of events. From the second time on it should continue where it was left.
+        data: numbers, texts, lists, dictionaries and paths. Objects of plugins are named, not sent.
     """
 
     name: str
@@ -45,7 +54,7 @@ class Result:
         value: what its function returned.
         line: why it failed.
         trace: of a bug; empty where the input is at fault.
-        seconds: from its start to its end where it worked.
+        seconds: from its start to its end in the worker.
         attempts: how often it was started.
     """
 
@@ -57,12 +66,36 @@ class Result:
     attempts: int = 1
 
 
+@dataclass(frozen=True)
+class JobStatus:
+    """How far a job is.
+
+    Attributes:
+        state: waiting, starting, preparing, training, finishing, or one of :data:`ENDED`.
+        text: what it does, or why it ended.
+        step, progress: of the training; the used fraction of its budget, 0..1.
+        psnr: held out, the last point of the curve, dB.
+        attempt: how often its worker died before.
+    """
+
+    state: str = "waiting"
+    text: str = ""
+    step: int = 0
+    progress: float = 0.0
+    psnr: float | None = None
+    attempt: int = 0
+
+    def end(self, result: Result) -> JobStatus:
+        """The last status of a job with this result."""
+        return replace(self, state=result.state, text=result.line, attempt=result.attempts - 1)
+
+
 def perform(job: Job, attempt: int, events: Events) -> Result:
-    """Do a job here. Nothing is raised: what goes wrong is in the result."""
-    begun = time.monotonic()
+    """Do a job in this process. Nothing is raised: errors are in the result."""
+    start = time.monotonic()
 
     def result(state: str, value: Any = None, line: str = "", trace: str = "") -> Result:
-        return Result(state, value, line, trace, time.monotonic() - begun, attempt + 1)
+        return Result(state, value, line, trace, time.monotonic() - start, attempt + 1)
 
     try:
         module, _, name = job.call.partition(":")
@@ -74,7 +107,48 @@ def perform(job: Job, attempt: int, events: Events) -> Result:
         line = one_line(error)
         if line is not None:
             return result("failed", line=line)
-        said = " ".join(str(error).split())
-        return result(
-            "failed", line=": ".join(filter(None, (type(error).__name__, said))), trace=traceback.format_exc()
-        )
+        text = " ".join(str(error).split())
+        line = ": ".join(filter(None, (type(error).__name__, text)))
+        return result("failed", line=line, trace=traceback.format_exc())
+
+
+class StatusListener:
+    """Turns the events of a run into its status."""
+
+    def __init__(self, attempt: int = 0) -> None:
+        self.status = JobStatus("starting", attempt=attempt)
+
+    def __call__(self, event: Event) -> None:
+        from neuprim.runs.events import Evaluated, Finishing, Preparing, Step  # torch, see above
+
+        status = self.status
+        match event:
+            case Preparing():
+                share = f", {event.fraction:.0%}" if event.fraction > 0 else ""
+                self.status = replace(status, state="preparing", text=f"{event.text}{share}")
+            case Step():
+                step = event.report.step
+                self.status = replace(status, state="training", text="", step=step, progress=event.progress)
+            case Evaluated():
+                self.status = replace(status, psnr=event.psnr)
+            case Finishing():
+                self.status = replace(status, state="finishing", text=event.text)
+
+
+def write_status(file: Path, status: JobStatus) -> None:
+    """Replace the file. Errors are ignored: a full disk must not end a run because of its display."""
+    staged = file.with_name(f".{file.name}.{os.getpid()}")
+    try:
+        staged.write_text(json.dumps(asdict(status)), encoding="utf-8")
+        os.replace(staged, file)
+    except OSError:
+        staged.unlink(missing_ok=True)
+
+
+def read_status(file: Path) -> JobStatus | None:
+    """Return the status in a file; None where there is none that can be read."""
+    try:
+        data: Any = load_json(file.read_text(encoding="utf-8"))
+        return validate(JobStatus, {f.name: data[f.name] for f in fields(JobStatus)})
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, ConfigError):
+        return None

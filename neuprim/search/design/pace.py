@@ -12,8 +12,8 @@ from typing import Any
 from neuprim.config import RunConfig
 from neuprim.core.data import Dataset
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs.fit import one_torch_thread, start
-from neuprim.runs.training import make_ready
+from neuprim.runs.fit import prepare_training, use_one_torch_thread
+from neuprim.runs.training import compile_for_run
 
 __all__ = ["Pace", "Paces"]
 
@@ -57,7 +57,7 @@ class Paces:
         self._dataset, self.compiling = dataset, 0.0
         self._trainer, starting, like = self._ready(centre)
         self._turns: list[float] = []
-        with one_torch_thread():
+        with use_one_torch_thread():
             _turn(self._trainer)
             while self._short(self._turns):
                 self._turns.append(_turn(self._trainer))
@@ -71,7 +71,7 @@ class Paces:
         """Raises what starting a training raises."""
         trainer, starting, like = self._ready(config)
         own, beside = list[float](), list[float]()
-        with one_torch_thread():
+        with use_one_torch_thread():
             _turn(trainer)
             while self._short(beside):
                 beside.append(_turn(self._trainer))
@@ -88,11 +88,11 @@ class Paces:
     def _ready(self, config: RunConfig) -> tuple[Trainer, float, tuple[Any, ...]]:
         begun = time.perf_counter()
         population = replace(config.train.population, grow_from=1.0)  # by the middle all have been born
-        trainer = start(
+        trainer = prepare_training(
             replace(config, train=replace(config.train, population=population)), dataset=self._dataset
         ).trainer
         started = time.perf_counter()
-        make_ready(trainer)
+        compile_for_run(trainer)
         self.compiling += time.perf_counter() - started
         model, settings = trainer.model, trainer.settings
         trainer.step, trainer.elapsed = (settings.iterations or 0) // 2, (settings.max_seconds or 0.0) / 2

@@ -12,11 +12,11 @@ from neuprim.config import suspects_of, task_of
 from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.render import backends
 from neuprim.report.tradeoff_models import write_models
-from neuprim.runs.fit import one_torch_thread
-from neuprim.runs.ground_truth import before_training
-from neuprim.runs.launch.share import own_share
-from neuprim.runs.lock import held
+from neuprim.runs.fit import use_one_torch_thread
+from neuprim.runs.ground_truth import render_ground_truth_for_training
+from neuprim.runs.launch.launcher import use_launcher_threads
 from neuprim.runs.open import LOGS, load_dataset
+from neuprim.runs.run_directory import lock_directory
 from neuprim.search.design.combine import fronts
 from neuprim.search.design.kept import TRIALS, centre_of, check_folder, kept_record, number_of, old_plan, same_of
 from neuprim.search.design.pictures import pictures
@@ -59,16 +59,16 @@ def design_run(
     begun = time.monotonic()
     words, folder, centre = centre_of(request)
     task = task_of(centre)
-    with one_torch_thread(), own_share(request.launcher), ExitStack() as stack:
+    with use_one_torch_thread(), use_launcher_threads(request.launcher), ExitStack() as stack:
         stack.enter_context(suspects_of(centre).watch(folder / LOGS))
         ladders = singles(centre, task)
         check_knobs(request.knobs, ladders, task.name)
         ladders = {name: ladder for name, ladder in ladders.items() if not request.knobs or name in request.knobs}
         before = read_record(folder / "tradeoff.json", Model)
         check_folder(folder, before, centre, request)
-        stack.enter_context(held(folder, "set"))
+        stack.enter_context(lock_directory(folder, "set"))
         plan = old_plan(folder, before)
-        before_training(centre, request.launcher, progress)
+        render_ground_truth_for_training(centre, request.launcher, progress)
         dataset = load_dataset(centre, task, progress)
         check_dataset(dataset, task.conditions)
         record = kept_record(folder, before, same_of(centre, dataset, request), tell)

@@ -15,7 +15,7 @@ from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.data import Dataset
 from neuprim.core.errors import NeuprimError
 from neuprim.runs.events import Event, Note, Preparing, Step
-from neuprim.runs.launch.share import at_once
+from neuprim.runs.launch.executors import count_parallel_jobs
 from neuprim.search.design.combine import combinations
 from neuprim.search.design.kept import TRIALS
 from neuprim.search.design.pace import Pace, Paces
@@ -96,7 +96,7 @@ class Session:
         self._paces: Paces | None = None
         self._known: dict[str, Pace] = {}
         self._late = 1.0
-        self._workers, self._threads = at_once(request.launcher, _MANY)
+        self._workers, self._threads = count_parallel_jobs(request.launcher, _MANY)
 
     @property
     def models(self) -> list[Model]:

@@ -13,7 +13,7 @@ from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.core.volumes.points import values_at
-from neuprim.runs.measure import draw
+from neuprim.runs.measure import render_image
 
 __all__ = ["Judge", "judge_of"]
 
@@ -81,7 +81,7 @@ class Judge:
         found = []
         for index in self.views[::step]:
             pixels = self.dataset.train.pixels(index)
-            image = draw(model, self.dataset.train.view(index), self.settings, self.dataset.background)
+            image = render_image(model, self.dataset.train.view(index), self.settings, self.dataset.background)
             found.append(min(psnr(image, pixels.over(self.dataset.background), pixels.mask), _MOST))
         return float(np.mean(found))
 

@@ -22,11 +22,11 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.finetune import steps_in
-from neuprim.runs.fit import Fitted, make_loss, one_torch_thread, settings_for
-from neuprim.runs.kept import PRUNED, kept_pieces
-from neuprim.runs.measure import draw, quality
-from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, placed, read_metrics
-from neuprim.runs.training import save
+from neuprim.runs.fit import Fitted, keep_model_settings, make_loss, use_one_torch_thread
+from neuprim.runs.kept import PRUNED, kept_shares
+from neuprim.runs.measure import measure_quality, render_image
+from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, move_to_render_device, read_metrics
+from neuprim.runs.training import save_training
 from neuprim.search.prune.cut import numbers, zeros_of
 from neuprim.search.prune.search import Search, Stage
 
@@ -105,7 +105,7 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
     config, task, model, header = load_run(request.run_dir)
     config = replace(config, output_dir=request.run_dir)
     suspects = suspects_of(config)
-    with suspects.watch(request.run_dir / LOGS), one_torch_thread():
+    with suspects.watch(request.run_dir / LOGS), use_one_torch_thread():
         progress("reading the run's data", 0.0)
         dataset = load_dataset(config, task, run_dir=request.run_dir)
         suspects.know(dataset)
@@ -122,18 +122,20 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
             there = _facts(
                 model,
                 model_file(request.run_dir),
-                quality(model, task, dataset, config.renderer),
+                measure_quality(model, task, dataset, config.renderer),
                 _paces(config, dataset, (model,))[0],
             )
-            return Pruning(None, there, there, (), kept_pieces(model), judged, tuple(search.stages), steps, seconds)
+            return Pruning(None, there, there, (), kept_shares(model), judged, tuple(search.stages), steps, seconds)
         progress("measuring held-out views", 1.0)
         paces = _paces(config, dataset, (model, small))
-        before = _facts(model, model_file(request.run_dir), quality(model, task, dataset, config.renderer), paces[0])
+        before = _facts(
+            model, model_file(request.run_dir), measure_quality(model, task, dataset, config.renderer), paces[0]
+        )
         progress("pictures and report", 1.0)
         _written(final, config, task, dataset, small, words, header, steps, seconds)
         metrics = read_metrics(final)
         after = _facts(small, final / "model.safetensors", (metrics["psnr"], metrics["ssim"]), paces[1])
-    made = Pruning(final, before, after, words, kept_pieces(small), judged, tuple(search.stages), steps, seconds)
+    made = Pruning(final, before, after, words, kept_shares(small), judged, tuple(search.stages), steps, seconds)
     write_json(final / PRUNED, _record(request, made))
     return made
 
@@ -144,13 +146,13 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
 def _paces(config: RunConfig, dataset: Dataset, models: Sequence[Primitives]) -> list[float]:
     """Median frames/s of each over some held-out views, drawn in turns, so that whatever else the machine does meets
     all of them."""
-    there = [placed(model, config.renderer, dataset.test.view(0)) for model in models]
+    there = [move_to_render_device(model, config.renderer, dataset.test.view(0)) for model in models]
     seconds: list[list[float]] = [[] for _ in there]
     for turn in range(_TURNS + 1):
         view = dataset.test.view(turn * len(dataset.test) // (_TURNS + 1))
         for model, own in zip(there, seconds, strict=True):
             begun = time.perf_counter()
-            draw(model, view, config.renderer, dataset.background)
+            render_image(model, view, config.renderer, dataset.background)
             if turn:  # whatever a first frame loads is no part of its time
                 own.append(time.perf_counter() - begun)
     return [1.0 / max(float(np.median(own)), 1e-9) for own in seconds]
@@ -185,15 +187,20 @@ def _written(
         overrides=[*(word for word in config.overrides if not word.startswith(known)), *typed],
     )
     trainer = Trainer(
-        model, dataset, make_loss(small, task), settings_for(small.train, task, model), small.renderer, small.seed
+        model,
+        dataset,
+        make_loss(small, task),
+        keep_model_settings(small.train, task, model),
+        small.renderer,
+        small.seed,
     )
-    trainer.zeros = zeros_of(trainer.model)
+    trainer.zero_masks = zeros_of(trainer.model)
     trainer.step = int(header.get("iterations") or 0) + steps
     trainer.elapsed = float(header.get("train_seconds") or 0.0) + seconds
     fitted = Fitted(small, task, dataset, channels_of(task, dataset), trainer)
     final.mkdir(parents=True, exist_ok=True)
     write_text(final / "config.yaml", small.to_yaml())
-    save(fitted)
+    save_training(fitted)
     evaluate_fitted(fitted, final)
 
 

@@ -231,7 +231,7 @@ class Search:
         model, steps = state.model, self.steps * (number + 1) // rounds - self.steps * number // rounds
         if steps and model.count:
             trainer = fine_tuner(self.config, self.task, self.dataset, model, steps)
-            trainer.zeros, left = zeros_of(trainer.model), numbers(model)
+            trainer.zero_masks, left = zeros_of(trainer.model), numbers(model)
             for done in range(steps):
                 trainer.train_step()
                 if done % 20 == 0:

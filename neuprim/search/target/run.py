@@ -13,11 +13,11 @@ from neuprim.config.target import Target
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.runs.events import Events, Preparing, silent
-from neuprim.runs.ground_truth import before_training
-from neuprim.runs.launch.share import own_share
-from neuprim.runs.lock import held
+from neuprim.runs.events import Events, Preparing, ignore_event
+from neuprim.runs.ground_truth import render_ground_truth_for_training
+from neuprim.runs.launch.launcher import use_launcher_threads
 from neuprim.runs.open import LOGS, load_dataset
+from neuprim.runs.run_directory import lock_directory
 from neuprim.search.target.record import Record, read_record
 from neuprim.search.target.searching import Search
 from neuprim.search.target.stages import publish
@@ -30,7 +30,7 @@ def target_run(
     config: RunConfig,
     target: Target,
     budget: float,
-    events: Events = silent,
+    events: Events = ignore_event,
     clock: Callable[[], float] = time.monotonic,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
 ) -> Record:
@@ -57,13 +57,17 @@ def target_run(
         return record
     suspects = suspects_of(config)
     begun = clock()
-    with held(config.output_dir, "search"), suspects.watch(config.output_dir / LOGS), own_share(launcher):
+    with (
+        lock_directory(config.output_dir, "search"),
+        suspects.watch(config.output_dir / LOGS),
+        use_launcher_threads(launcher),
+    ):
         task = task_of(config)
 
         def progress(text: str, fraction: float) -> None:
             events(Preparing(text, fraction))
 
-        before_training(config, launcher, progress)
+        render_ground_truth_for_training(config, launcher, progress)
         dataset = load_dataset(config, task, progress)
         suspects.know(dataset)
         check_dataset(dataset, task.conditions)

@@ -22,9 +22,9 @@ from neuprim.core.metrics import psnr, ssim
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.events import Finishing
-from neuprim.runs.measure import draw, quality
-from neuprim.runs.open import COMPRESSED, placed, read_metrics
-from neuprim.runs.training import train
+from neuprim.runs.measure import measure_quality, render_image
+from neuprim.runs.open import COMPRESSED, move_to_render_device, read_metrics
+from neuprim.runs.training import train_in_directory
 from neuprim.search.few_bits import Rounding
 from neuprim.search.prune.judge import judge_of
 from neuprim.search.prune.run import Request, prune_run
@@ -86,9 +86,9 @@ class Workshop:
         truths, rows = truths_of(judged, VIEWS), []
         settings = trying.config.renderer
         with torch.no_grad():
-            model = placed(model, settings, truths[0].view)
+            model = move_to_render_device(model, settings, truths[0].view)
             for truth in truths:
-                image = masked(draw(model, truth.view, settings, judged.background), truth)
+                image = masked(render_image(model, truth.view, settings, judged.background), truth)
                 rows.append((psnr(image, truth.image, truth.mask), ssim(image, truth.image)))
         return dict(zip(("psnr", "ssim"), (float(np.mean(column)) for column in zip(*rows, strict=True)), strict=True))
 
@@ -154,7 +154,7 @@ def _directory(trying: Trying, attempt: Attempt) -> Finished:
     """The run's directory from that of the training: its files, and what every run has beside them."""
     config = trying.config_of(attempt)
     trying.events(Finishing("measuring held-out views"))
-    fitted, _ = train(
+    fitted, _ = train_in_directory(
         replace(config, resume=True), suspects_of(config), dataset=trying.dataset, hold_out=trying.record.hold_out
     )
     for name in _KEPT:
@@ -201,7 +201,9 @@ def quantised(shop: Workshop, before: Finished) -> Finished:
         made, share = rounding.finest(lambda tried: stored(tried) <= most, _FIRST)
     size = stored(made)
     again = load_model(file, task)[0]
-    test = dict(zip(("psnr", "ssim"), quality(again, task, trying.dataset, trying.config.renderer), strict=True))
+    test = dict(
+        zip(("psnr", "ssim"), measure_quality(again, task, trying.dataset, trying.config.renderer), strict=True)
+    )
     return replace(
         before,
         held=shop.measured(again),

@@ -17,9 +17,8 @@ from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.runs.events import Events, Note, Preparing
-from neuprim.runs.launch.jobs import Job
-from neuprim.runs.launch.share import at_once
-from neuprim.runs.launch.status import ENDED, Status
+from neuprim.runs.launch.executors import count_parallel_jobs
+from neuprim.runs.launch.jobs import ENDED, Job, JobStatus
 from neuprim.search.changed import changed
 from neuprim.search.target.pace import Stopwatch, linear
 from neuprim.search.target.record import Attempt, Record
@@ -150,10 +149,12 @@ class Trying:
             Job(attempt.folder, f"{__name__}:{do_attempt.__name__}", words_of(self._trial(attempt)))
             for attempt in attempts
         ]
-        threads = at_once(self.launcher, TOGETHER)[1]  # the same whether one works or several: paces must compare
+        threads = count_parallel_jobs(self.launcher, TOGETHER)[
+            1
+        ]  # the same whether one works or several: paces must compare
         done = [0.0] * len(jobs)
 
-        def hear(number: int, status: Status) -> None:
+        def hear(number: int, status: JobStatus) -> None:
             done[number] = 1.0 if status.state in ENDED else status.progress
             self.events(Preparing(f"{len(jobs)} training{'s' * (len(jobs) > 1)} at work", sum(done) / len(done)))
 

@@ -23,7 +23,7 @@ from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.render import backends
 from neuprim.core.render.quadrature import compare_quadrature
 from neuprim.report.tradeoff import write_tradeoff
-from neuprim.runs.fit import one_torch_thread
+from neuprim.runs.fit import use_one_torch_thread
 from neuprim.runs.open import LOGS
 from neuprim.runs.render_config import RenderConfig, parse_render_config
 from neuprim.search.tradeoff.combine import fronts, size_points, speed_points
@@ -196,7 +196,7 @@ def tradeoff_run(
     record = _kept(folder / "tradeoff.json", _same(subject), tell)
     record.left_out.clear()
     work = _Work(request, subject, record, progress)
-    with subject.suspects.watch(request.run_dir / LOGS), one_torch_thread():
+    with subject.suspects.watch(request.run_dir / LOGS), use_one_torch_thread():
         reference = subject.reference
         fault = subject.fault(reference)
         if fault is not None:

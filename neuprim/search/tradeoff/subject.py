@@ -20,7 +20,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.blame import Suspects
-from neuprim.runs.open import load_dataset, load_run, model_file, placed
+from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.render_config import RenderConfig, parse_render_config
 from neuprim.search.tradeoff.knobs import Candidate
 from neuprim.search.truths import Truth, truths_of
@@ -79,7 +79,7 @@ class Subject:
 
     def prepared(self, point: RenderConfig) -> Primitives:
         """The model as a point draws it, where its frames are drawn."""
-        return placed(point.prepare_model(self.model), point.settings, self.truths[0].view)
+        return move_to_render_device(point.prepare_model(self.model), point.settings, self.truths[0].view)
 
     def fault(self, point: RenderConfig) -> str | None:
         """Why a point cannot be drawn here; None if it can."""

@@ -43,7 +43,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.scripts import read_script
-from neuprim.core.train.population import SPLIT_LONG, SPLIT_SHIFT
+from neuprim.core.train.splitting import SPLIT_LONG, SPLIT_SHIFT
 from neuprim.tasks.dynamic.seams import checked_seams, shares
 from neuprim.tasks.dynamic.stilled import stilled
 

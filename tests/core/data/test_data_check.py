@@ -22,7 +22,7 @@ from neuprim.core.data.dataset_check import (
 )
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.core.train.initial import initial_model
+from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.settings import ModelSettings
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core import tiny

@@ -18,7 +18,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.reference.rays import pixel_directions
-from neuprim.core.train.population import split
+from neuprim.core.train.splitting import split_primitives
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
 
@@ -108,7 +108,7 @@ def test_split_carries_sigma(dtype: torch.dtype, bound: float, neurons: int, fac
     """Relative to S/m = (|b2| + sum |w2|)/m, the largest density the primitive can have."""
     t = scenes.tensors(40, neurons, seed=1, dtype=dtype)
     parents = torch.arange(40)
-    children = split(model(t), parents, 0.5, *factors)
+    children = split_primitives(model(t), parents, 0.5, *factors)
     child = geometry(children)
     rows, x = points_inside(child, 20)
     before, after = sigma_at(t, rows % 40, x), sigma_at(children, rows, x)
@@ -165,7 +165,7 @@ def test_omega0_is_a_positive_number(wrong: Any) -> None:
 
 def test_split_follows_the_longest_axis() -> None:
     t = scenes.tensors(30, 2, seed=2, dtype=torch.float64)
-    children = split(model(t), torch.arange(30), 0.5, 0.6, 0.9)
+    children = split_primitives(model(t), torch.arange(30), 0.5, 0.6, 0.9)
     longest = t["log_scales"].argmax(1)
     change = (children["log_scales"][:30] - t["log_scales"]).exp()
     assert torch.allclose(change.gather(1, longest[:, None]), torch.tensor(0.6, dtype=torch.float64))

@@ -22,8 +22,9 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.train.population import Gradient, Relocate, split
+from neuprim.core.train.population import Gradient, Relocate
 from neuprim.core.train.settings import PopulationSettings
+from neuprim.core.train.splitting import split_primitives
 from neuprim.tasks.static import TASK
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
@@ -203,7 +204,7 @@ def test_impossible_supports(deviations: object) -> None:
 @pytest.mark.parametrize("factors", [(0.6, 0.9), (1 / 1.6, 1 / 1.6)])
 def test_split_keeps_the_mass_of_the_pair(factors: tuple[float, float]) -> None:
     m = model()
-    children = split(m, torch.arange(20), 0.5, *factors)
+    children = split_primitives(m, torch.arange(20), 0.5, *factors)
     pair = mass(children)[:20] + mass(children)[20:]
     before = mass({k: v.detach() for k, v in m.params.items()})
     assert torch.allclose(pair, before, rtol=1e-12, atol=0)

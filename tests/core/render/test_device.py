@@ -18,7 +18,7 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, Form
 from neuprim.core.model.fields import CustomDensity
 from neuprim.core.render import RenderSettings, backends, render_lowered
 from neuprim.core.render.backends import Backend, choose_backend, computing_device, device_of
-from neuprim.runs.fit import start
+from neuprim.runs.fit import prepare_training
 from tests import scenes
 from tests.core import tiny
 from tests.pretend_card import CARD, Card, pretended
@@ -60,7 +60,7 @@ def test_a_missing_gpu_is_refused_in_one_line_before_anything_is_loaded(
     monkeypatch.setattr(device, "cuda_unavailable", lambda: MISSING)
     monkeypatch.setattr("neuprim.runs.fit.load_dataset", lambda *_, **__: pytest.fail("loaded"))
     with pytest.raises(BackendUnavailable, match=line):
-        start(compose(words(tmp_path, tmp_path / "run", 3, override)))
+        prepare_training(compose(words(tmp_path, tmp_path / "run", 3, override)))
     key, value = override.removeprefix("renderer.").split("=")
     with pytest.raises(BackendUnavailable, match=line):
         render_lowered(*frame(), RenderSettings(**{key: value}))

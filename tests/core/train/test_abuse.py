@@ -16,7 +16,7 @@ from neuprim.core.data import Dataset, Pixels, PointCloud, ViewSet
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
-from neuprim.core.train.initial import initial_model
+from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer

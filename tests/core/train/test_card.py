@@ -18,17 +18,12 @@ from neuprim.core.compute import device
 from neuprim.core.data import Dataset, Pixels
 from neuprim.core.errors import DataError, NonFiniteError
 from neuprim.core.io.vdb import write_vdb
-from neuprim.core.train.distributed.group import Group
-from neuprim.core.train.distributed.place import Place
-from neuprim.core.train.distributed.shards import Shards
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs.fit import Fitted, start
+from neuprim.runs.fit import Fitted, prepare_training
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.run import run
 from tests.core import tiny
 from tests.pretend_card import CARD, pretended
-from tests.ranks import Threads
-from tests.shards import different
 from tests.short_runs import words
 from tests.tasks.dynamic.sequences import blob
 
@@ -86,7 +81,7 @@ def configured(task: str, tmp_path: Path, *more: str) -> list[str]:
 
 
 def trained(words: list[str], dataset: Dataset | None, steps: int) -> tuple[Fitted, list[Any]]:
-    fitted = start(compose(words), dataset=dataset)
+    fitted = prepare_training(compose(words), dataset=dataset)
     return fitted, [fitted.trainer.train_step() for _ in range(steps)]
 
 
@@ -217,7 +212,7 @@ def test_a_step_waits_for_the_card_as_seldom_as_it_did(
     config = configured(
         task, tmp_path, "train.population.strategy=fixed", *(["train.voxels_every=1"] if task == "time" else [])
     )
-    data = start(compose(config)).dataset
+    data = prepare_training(compose(config)).dataset
     with pretended(monkeypatch) as card:
         fitted, _ = trained(config, data, 1)
         card.waits.clear()
@@ -297,24 +292,3 @@ def test_the_pretended_card_refuses_what_a_card_refuses(monkeypatch: pytest.Monk
         assert (there * torch.tensor(2.0)).cpu().tolist() == [2.0, 2.0, 2.0]
         there[torch.tensor([0, 2])] = 5.0
         assert there.tolist() == [5.0, 1.0, 5.0] and float(there.sum()) == 11.0 and card.waits.total() == 3
-
-
-def test_primitives_in_parts_stay_on_the_card(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One rank that has all of them as its part: what is sent, found, added up and moved never mixes devices, and is
-    what the card trains without."""
-    monkeypatch.setattr("neuprim.core.train.trainer.refuse_parts", lambda *_: None)
-    dataset = tiny.two_primitives()
-    population = {"strategy": "relocate", "fraction": 0.2, "grow_to": 16}
-
-    def make() -> Trainer:
-        return tiny.trainer(dataset, 20, population=population)
-
-    with pretended(monkeypatch):
-        whole, part = make(), make()
-        group = Group(Place(0, 1, 0, 1, "here"), Threads(1).wire(0))
-        part.join(Shards(group, part.renderer.near))
-        changes = [[report.change for report in trainer.run()] for trainer in (whole, part)]
-        group.pulse.stop()
-        assert changes[0] == changes[1] and any(changes[0]) and part.model.device == CARD
-        first, second = whole.state()[0], part.state()[0]
-    assert different(second, first) == []

@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
+from neuprim.core.train.losses import photometric_torch
 from neuprim.core.train.optimizer import adam_step_reference
-from neuprim.core.train.ssim_torch import photometric_torch
 
 pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
 

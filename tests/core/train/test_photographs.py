@@ -12,11 +12,11 @@ import torch
 from neuprim.core import checkpoint
 from neuprim.core.data import Dataset, Pixels, View, ViewSet
 from neuprim.core.errors import CheckpointError, ConfigError
-from neuprim.core.train import coarse
-from neuprim.core.train.angle import AngularSize
-from neuprim.core.train.coarse import reduced, reduction
+from neuprim.core.train import training_views
 from neuprim.core.train.exposure import Exposures
+from neuprim.core.train.regularization import MaxScreenSize
 from neuprim.core.train.trainer import Trainer
+from neuprim.core.train.training_views import reduce_view, resolution_factor
 from tests.core import tiny
 
 
@@ -28,7 +28,7 @@ def plain() -> Dataset:
 @pytest.fixture(autouse=True)
 def small_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The images here are tiny to begin with."""
-    monkeypatch.setattr(coarse, "_SMALLEST", 4)
+    monkeypatch.setattr(training_views, "_MIN_SIDE", 4)
 
 
 class Gained(ViewSet):
@@ -49,10 +49,10 @@ class Gained(ViewSet):
 
 
 def test_the_factor_halves_in_equal_shares() -> None:
-    at = [reduction(p, 8, 0.3) for p in (0.0, 0.09, 0.1, 0.19, 0.2, 0.29, 0.3, 1.0)]
+    at = [resolution_factor(p, 8, 0.3) for p in (0.0, 0.09, 0.1, 0.19, 0.2, 0.29, 0.3, 1.0)]
     assert at == [8, 8, 4, 4, 2, 2, 1, 1]
-    assert [reduction(p, 6, 0.4) for p in (0.0, 0.2, 0.4)] == [6, 3, 1]
-    assert {reduction(p / 10, 1, 0.3) for p in range(11)} == {1}
+    assert [resolution_factor(p, 6, 0.4) for p in (0.0, 0.2, 0.4)] == [6, 3, 1]
+    assert {resolution_factor(p / 10, 1, 0.3) for p in range(11)} == {1}
 
 
 def test_a_coarse_view_is_the_mean_of_what_it_covers(plain: Dataset) -> None:
@@ -60,7 +60,7 @@ def test_a_coarse_view_is_the_mean_of_what_it_covers(plain: Dataset) -> None:
     height, width = pixels.rgb.shape[:2]
     mask = torch.ones(height, width, dtype=torch.bool)
     mask[1, 0] = False
-    small, rough = reduced(view, replace(pixels, mask=mask), 2)
+    small, rough = reduce_view(view, replace(pixels, mask=mask), 2)
     assert rough.rgb.shape == (height // 2, width // 2, 3) == (small.camera.height, small.camera.width, 3)
     assert torch.allclose(rough.rgb[3, 5], pixels.rgb[6:8, 10:12].mean((0, 1)), atol=1e-6)
     if pixels.alpha is not None and rough.alpha is not None:
@@ -73,7 +73,7 @@ def test_a_coarse_view_is_the_mean_of_what_it_covers(plain: Dataset) -> None:
 
 def test_a_view_is_never_reduced_to_nothing(plain: Dataset) -> None:
     view, pixels = plain.train.view(0), plain.train.pixels(0)
-    small, few = reduced(view, pixels, 1024)
+    small, few = reduce_view(view, pixels, 1024)
     assert 4 <= small.camera.width < 8 and few.rgb.shape[1] == small.camera.width
 
 
@@ -151,14 +151,14 @@ def test_a_gain_moves_by_its_own_gradient_only() -> None:
 
 
 def test_no_primitive_looks_larger_than_it_may(plain: Dataset) -> None:
-    limit = AngularSize(plain.train, 0.25, every=5)
+    limit = MaxScreenSize(plain.train, 0.25, every=5)
     eyes = torch.stack([plain.train.view(i).camera.position for i in range(len(plain.train))]).float()
     means = torch.cat([eyes[:1] + torch.tensor([0.4, 0.0, 0.0]), eyes[:1] * 50, eyes[:1]])
     log_scales = torch.tensor([[-1.0, -2.0, -3.0], [1.0, 0.5, 0.0], [0.0, 0.0, 0.0]])
     kept = log_scales.clone()
-    limit.step(4, means, kept)
+    limit.apply(4, means, kept)
     assert torch.equal(kept, log_scales), "not due"
-    limit.step(5, means, kept)
+    limit.apply(5, means, kept)
     distance = torch.cdist(means, eyes).min(1).values
     assert kept[0].max().exp() == pytest.approx(0.25 * distance[0].item(), rel=1e-5)
     assert torch.allclose(kept[0] - kept[0].max(), log_scales[0] - log_scales[0].max()), "shapes stay"

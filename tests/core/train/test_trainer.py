@@ -19,11 +19,11 @@ from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import Contributions
 from neuprim.core.task import Supervision
-from neuprim.core.train.initial import initial_model
-from neuprim.core.train.population.fixed import Fixed
+from neuprim.core.train.initial_model import initial_model
+from neuprim.core.train.population import Fixed
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
-from neuprim.core.train.trainer import COLD, StepReport, Trainer
-from neuprim.runs.measure import draw
+from neuprim.core.train.trainer import MIN_COOLDOWN, StepReport, Trainer
+from neuprim.runs.measure import render_image
 from tests.core import tiny
 
 
@@ -143,7 +143,7 @@ def test_a_cool_down_is_a_line_from_the_usual_rate_to_next_to_nothing(plain: Dat
         return shares["means"]
 
     assert [share_left(step) for step in (0, 400, 800, 900, 950)] == pytest.approx([1, 1, 1, 0.5, 0.25])
-    assert [share_left(step) for step in (999, 1000)] == pytest.approx([COLD, COLD]), (
+    assert [share_left(step) for step in (999, 1000)] == pytest.approx([MIN_COOLDOWN, MIN_COOLDOWN]), (
         "never nothing: a step must move something"
     )
 
@@ -215,7 +215,7 @@ def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count() -> None:
     dataset.train.images = [replace(p, mask=mask) for p in dataset.train.images]  # type: ignore[attr-defined]
     trainer = tiny.trainer(dataset, 3)
     drawn = [
-        draw(trainer.model, dataset.train.view(i), trainer.renderer, dataset.background)
+        render_image(trainer.model, dataset.train.view(i), trainer.renderer, dataset.background)
         for i in range(len(dataset.train))
     ]
     report = trainer.train_step()

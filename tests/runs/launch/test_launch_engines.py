@@ -16,8 +16,8 @@ import pytest
 
 from neuprim.config.launcher import LauncherSettings
 from neuprim.core.errors import BackendUnavailable, ConfigError, NeuprimError
-from neuprim.runs.launch.status import Status
-from neuprim.runs.launch.table import check_launcher, launch
+from neuprim.runs.launch.jobs import JobStatus
+from neuprim.runs.launch.launcher import check_launcher, launch
 from tests.runs import launching
 from tests.runs.launching import job
 from tests.systems import posix
@@ -31,17 +31,7 @@ pytestmark = posix
 def found_by_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     """The functions of the jobs; and whatever machine this is, it has two cores."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    for place in ("share", "ray"):
-        if place == "share" or _has("ray"):
-            monkeypatch.setattr(f"neuprim.runs.launch.{place}.machine_cores", lambda: 2)
-
-
-def _has(package: str) -> bool:
-    try:
-        __import__(package)
-    except ImportError:
-        return False
-    return True
+    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
 
 
 @pytest.fixture
@@ -53,7 +43,7 @@ def ray() -> Iterator[Any]:
 
 def all_sorts(settings: LauncherSettings, folder: Path) -> None:
     """Done, refused, a bug, its threads, and one whose worker is killed once."""
-    heard: list[tuple[int, Status]] = []
+    heard: list[tuple[int, JobStatus]] = []
     jobs = [
         job("double", launching.double, 21),
         job("refused", launching.refuse, "no images"),
@@ -79,7 +69,7 @@ def test_ray_does_all_sorts_of_jobs(ray: Any, tmp_path: Path) -> None:
 def test_ctrl_c_reaches_what_ray_has_at_work(ray: Any, tmp_path: Path) -> None:
     begun = threading.Event()
 
-    def hear(number: int, status: Status) -> None:
+    def hear(number: int, status: JobStatus) -> None:
         if status.text == "at it" and not begun.is_set():
             begun.set()
             threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
@@ -131,18 +121,18 @@ def test_submitit_does_jobs(tmp_path: Path) -> None:
 @posix
 def test_submitits_results_come_from_a_folder_of_this_launch_alone(tmp_path: Path) -> None:
     pytest.importorskip("submitit")
-    from neuprim.runs.launch.slurm import Slurm
+    from neuprim.runs.launch.executors import Slurm
 
     (tmp_path / "submitit").mkdir(mode=0o777)  # where somebody may have put pickles of theirs
-    engines = [Slurm(LauncherSettings("slurm", workers=1, address="local"), 1, tmp_path) for _ in range(2)]
-    folders = [Path(engine._executor.folder) for engine in engines]
+    executors = [Slurm(LauncherSettings("slurm", workers=1, address="local"), 1, tmp_path) for _ in range(2)]
+    folders = [Path(executor._executor.folder) for executor in executors]
     assert len({*folders, tmp_path / "submitit"}) == 3
     assert all(
         folder.parent == tmp_path and folder.stat().st_mode & 0o777 == 0o700 and not any(folder.iterdir())
         for folder in folders
     )
-    for engine in engines:
-        engine.close(False)
+    for executor in executors:
+        executor.close(False)
 
 
 @pytest.mark.slow
@@ -155,10 +145,10 @@ def test_submitit_does_all_sorts_of_jobs(tmp_path: Path) -> None:
 def test_submitit_queues_again_with_what_goes_on(tmp_path: Path) -> None:
     """What submitit asks for before a machine is taken away: a task that knows that it was begun."""
     pytest.importorskip("submitit")
-    from neuprim.runs.launch.slurm import _Requeued
+    from neuprim.runs.launch.executors import RequeuedTask
     from neuprim.runs.launch.worker import Task
 
-    again = _Requeued(
+    again = RequeuedTask(
         Task(job("once", launching.die, 1), 1, tmp_path / "0.json", tmp_path / "stop", tmp_path)
     ).checkpoint()
     assert again.function.task.attempt == 1

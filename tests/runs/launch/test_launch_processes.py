@@ -16,11 +16,9 @@ from neuprim.config.launcher import LauncherSettings
 from neuprim.core import checkpoint
 from neuprim.core.compute.threads import core_count, limit_process_threads
 from neuprim.core.errors import ConfigError
-from neuprim.runs.launch import engine
-from neuprim.runs.launch.jobs import Result
-from neuprim.runs.launch.share import own_share, shared_out
-from neuprim.runs.launch.status import ENDED, Status
-from neuprim.runs.launch.table import launch
+from neuprim.runs.launch.executors import divide_cores
+from neuprim.runs.launch.jobs import JobStatus, Result
+from neuprim.runs.launch.launcher import launch, use_launcher_threads
 from tests.core import tiny
 from tests.runs import launching
 from tests.runs.launching import PHASES, job, processes
@@ -31,7 +29,7 @@ from tests.systems import posix
 @pytest.fixture(autouse=True)
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever machine this is."""
-    monkeypatch.setattr("neuprim.runs.launch.share.machine_cores", lambda: 2)
+    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
 
 
 def states(results: list[Result | None]) -> list[str | None]:
@@ -42,7 +40,7 @@ def states(results: list[Result | None]) -> list[str | None]:
 def test_what_comes_back_and_what_stays(tmp_path: Path) -> None:
     """All that may become of a job: done, slow, refused, a bug, killed once, killed too often. None of it holds up the
     others."""
-    heard: list[tuple[int, Status]] = []
+    heard: list[tuple[int, JobStatus]] = []
     ended: list[int] = []
     jobs = [
         job("double", launching.double, 21),
@@ -81,7 +79,7 @@ def test_what_comes_back_and_what_stays(tmp_path: Path) -> None:
 def test_ctrl_c_ends_what_works_and_does_not_begin_the_rest(tmp_path: Path) -> None:
     begun = threading.Event()
 
-    def hear(number: int, status: Status) -> None:
+    def hear(number: int, status: JobStatus) -> None:
         if status.text == "dozing" and not begun.is_set():
             begun.set()
             threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
@@ -116,18 +114,6 @@ def test_killed_in_every_phase_a_run_ends_as_if_nothing_had_been(tmp_path: Path)
         assert (tmp_path / phase / "report.html").exists() and not (tmp_path / phase / ".lock").exists()
 
 
-def test_who_gives_no_sign_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    heard: list[Status] = []
-    watch = engine._Watch(lambda number, status: heard.append(status))
-    task = engine.Task(job("x", launching.double), 1, tmp_path / "0.json", tmp_path / "stop", tmp_path)
-    watch.tell(0, Status("training", step=3))
-    watch.look(0, task)
-    assert [s.text for s in heard] == [""]
-    monkeypatch.setattr(engine, "_SILENT", -1.0)
-    watch.look(0, task)
-    assert heard[-1].text == "no sign of it for 0 s" and heard[-1].step == 3 and heard[-1].state not in ENDED
-
-
 @pytest.mark.parametrize(
     ("asked", "jobs", "expected"),
     [
@@ -147,16 +133,16 @@ def test_who_gives_no_sign_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: P
 def test_cores_are_shared_out_and_never_promised_twice(asked: dict[str, int], jobs: int, expected: object) -> None:
     settings = launching.LauncherSettings("processes", **asked)
     if isinstance(expected, tuple):
-        assert shared_out(settings, jobs) == expected
+        assert divide_cores(settings, jobs) == expected
     else:
         with pytest.raises(ConfigError) as error:
-            shared_out(settings, jobs)
+            divide_cores(settings, jobs)
         assert str(error.value).startswith(str(expected))
 
 
 def test_jobs_in_a_worker_keep_its_share_of_the_cores() -> None:
     """As the chunks of a run that is itself one of a sweep."""
-    with limit_process_threads(1), own_share(LauncherSettings()):
+    with limit_process_threads(1), use_launcher_threads(LauncherSettings()):
         assert core_count() == 1
-    with own_share(LauncherSettings(threads=1)):
+    with use_launcher_threads(LauncherSettings(threads=1)):
         assert core_count() == 1

@@ -212,7 +212,7 @@ def test_several_are_trained_together_and_the_set_is_the_same(
         ]
 
     monkeypatch.setattr(session, "launched_trials", together)
-    monkeypatch.setattr("neuprim.runs.launch.share.machine_cores", lambda: 2)
+    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
     _, record = design_run(request(scene, tmp_path / "set", launcher=LauncherSettings("processes")))
     assert max(batches) > 1 and sum(batches) >= len(SINGLES)
     assert names(record) == SINGLES - {"neurons=8"} and [one.reason for one in record.left_out] == ["not finite"]

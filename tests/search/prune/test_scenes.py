@@ -18,7 +18,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.plugins.registry import load_task
-from neuprim.runs.fit import complete, start
+from neuprim.runs.fit import prepare_training, train_to_end
 from neuprim.search.prune.search import Search
 
 SIZE = 24
@@ -93,7 +93,7 @@ def pruned(task: str, *words: str, steps: int = 2400) -> tuple[Primitives, Primi
     common = ["model.primitives=24", "train.max_seconds=null", "train.eval_every=0", "renderer.threads=1"]
     config: RunConfig = compose([f"task={task}", f"scene={scene}", *common, *words], check_output=False)
     data = dataset(task == "dynamic")
-    fitted = complete(start(config, dataset=data))
+    fitted = train_to_end(prepare_training(config, dataset=data))
     search = Search(
         replace(config, output_dir=config.output_dir / "none"), load_task(task), data, tolerance=0.5, steps=steps
     )

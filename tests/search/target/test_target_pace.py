@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from neuprim.core.train.trainer import StepReport
-from neuprim.runs.events import Preparing, Step, silent
+from neuprim.runs.events import Preparing, Step, ignore_event
 from neuprim.runs.training import COMPILING
 from neuprim.search.target.pace import Stopwatch, linear
 
@@ -17,7 +17,7 @@ def step(number: int) -> Step:
 def watched(times: list[float]) -> Stopwatch:
     """Steps that end at these times."""
     now = iter(times)
-    watch = Stopwatch(lambda: next(now), silent)
+    watch = Stopwatch(lambda: next(now), ignore_event)
     for number in range(len(times)):
         watch(step(number))
     return watch
@@ -39,7 +39,7 @@ def test_one_step_has_no_pace() -> None:
 
 def test_compiling_is_told_apart() -> None:
     now = iter([10.0, 12.0, 70.0, 71.0])
-    watch = Stopwatch(lambda: next(now), silent)
+    watch = Stopwatch(lambda: next(now), ignore_event)
     for event in (Preparing(COMPILING), Preparing(COMPILING), step(1), step(2)):
         watch(event)
     assert watch.compiling == 60.0 and watch.pace == pytest.approx(1.0)

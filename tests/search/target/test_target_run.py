@@ -16,7 +16,7 @@ from neuprim.config import RunConfig, compose
 from neuprim.config.launcher import LauncherSettings
 from neuprim.config.target import Target
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.runs.events import Event, Note, Step, silent
+from neuprim.runs.events import Event, Note, Step, ignore_event
 from neuprim.runs.launch.jobs import Job, Result, perform
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import read_metrics
@@ -92,7 +92,7 @@ def test_launched_it_trains_two_lengths_together(tmp_path: Path, monkeypatch: py
     def launched(jobs: list[Job], settings: LauncherSettings, folder: Path, hear: Any) -> list[Result]:
         asked.append([job.name for job in jobs])
         assert settings.threads == 1 and folder == tmp_path / "run" / "target"
-        results = [perform(job, 0, silent) for job in jobs]
+        results = [perform(job, 0, ignore_event) for job in jobs]
         for job, result in zip(jobs, results, strict=True):
             steps, primitives = trial_of(job.data).config.train.iterations, trial_of(job.data).config.model.primitives
             pace = 0.1 + 2e-4 * primitives
@@ -104,7 +104,7 @@ def test_launched_it_trains_two_lengths_together(tmp_path: Path, monkeypatch: py
 
     clock = Clock()
     monkeypatch.setattr("neuprim.search.target.trying.launch_jobs", launched)
-    monkeypatch.setattr("neuprim.runs.launch.share.machine_cores", lambda: 2)
+    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
     settings = LauncherSettings("processes")
     record = target_run(config(tmp_path / "run"), Target(psnr=20.0), BUDGET, clock.hear, clock, settings)
     sizes = [names for names in asked if len(names) == 2]

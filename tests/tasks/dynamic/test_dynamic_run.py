@@ -15,9 +15,9 @@ from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import write_vdb
-from neuprim.runs.draw import render_run
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_run
+from neuprim.runs.render_images import RenderRequest, render_run
 from neuprim.runs.run import run
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.time import parse_times
@@ -114,12 +114,18 @@ def test_an_animation_over_time(finished: Path, tmp_path: Path, suffix: str) -> 
 
 
 def test_time_alone_changes_the_picture(finished: Path, tmp_path: Path) -> None:
-    early, late = (render_run(finished, "orbit", None, "exr", tmp_path / t, 1, {"time": t})[0] for t in ("0", "1"))
+    early, late = (
+        render_run(
+            finished,
+            RenderRequest("orbit", format="exr", out=tmp_path / t, frames=1, conditions={"time": t}),
+        )[0]
+        for t in ("0", "1")
+    )
     assert early.read_bytes() != late.read_bytes()
 
 
 def test_an_orbit_without_a_time_runs_through_the_sequence(finished: Path, tmp_path: Path) -> None:
-    paths = render_run(finished, "orbit", None, "png", tmp_path / "o", 3, {})
+    paths = render_run(finished, RenderRequest("orbit", format="png", out=tmp_path / "o", frames=3))
     assert len(paths) == 3
 
 

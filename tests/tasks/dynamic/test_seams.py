@@ -14,7 +14,7 @@ from neuprim.core.compression.codec import canonicalize, fake_quantize, fit_quan
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.train.population import split
+from neuprim.core.train.splitting import split_primitives
 from neuprim.core.volumes.points import values_at
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.density import TimeDensity
@@ -153,7 +153,9 @@ def test_the_reference_agrees_and_labels_have_no_gradient() -> None:
 def test_children_are_of_their_parents_chunk() -> None:
     whole = joined(three(), [0, 1, 2], SEAMS)
     parents = torch.arange(0, whole.count, 7)
-    assert torch.equal(split(whole, parents, 0.5, 0.6, 0.9)["chunk"], whole.params["chunk"][parents].repeat(2, 1))
+    assert torch.equal(
+        split_primitives(whole, parents, 0.5, 0.6, 0.9)["chunk"], whole.params["chunk"][parents].repeat(2, 1)
+    )
 
 
 def test_a_part_of_time_can_be_taken_away() -> None:

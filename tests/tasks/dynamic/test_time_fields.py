@@ -17,8 +17,9 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.output import Contributions
-from neuprim.core.train.population import Relocate, split
+from neuprim.core.train.population import Relocate
 from neuprim.core.train.settings import PopulationSettings
+from neuprim.core.train.splitting import split_primitives
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import PARTS, TimeDensity
@@ -194,7 +195,7 @@ def test_colour_follows_equations_10_to_12() -> None:
 def test_a_split_carries_the_field_at_all_times(time: str) -> None:
     m = model(time)
     parents = torch.arange(0, COUNT, 3)
-    children = split(m, parents, 0.5, 0.6, 0.9)
+    children = split_primitives(m, parents, 0.5, 0.6, 0.9)
     rows = torch.arange(2 * len(parents))
     for t in (0.0, 0.37, 1.0):
         own = {s.name: children[s.name] for s in m.density.parameters()}
@@ -209,7 +210,7 @@ def test_a_window_divides_into_halves_that_stay_on_its_path() -> None:
     m = model("window+motion", divide_above=0.3)
     parents = torch.arange(COUNT)
     tau = m.params["log_window"].detach().exp()[:, 0]
-    children = split(m, parents, 0.5, 0.6, 0.9)
+    children = split_primitives(m, parents, 0.5, 0.6, 0.9)
     long = tau > 0.3
     assert bool(long.any()) and not bool(long.all())
     for half, sign in ((0, -0.5), (COUNT, 0.5)):

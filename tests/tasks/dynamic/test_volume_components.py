@@ -15,7 +15,7 @@ from neuprim.core.io.vdb import Grid, read_grid, scale_transform, write_vdb
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.grid import density_grid
 from neuprim.runs.export import export_run
-from neuprim.runs.fit import start
+from neuprim.runs.fit import prepare_training
 from neuprim.runs.open import open_run
 from neuprim.runs.run import run
 from neuprim.tasks.dynamic.colour import TimeHarmonics
@@ -160,7 +160,9 @@ def words(files: Path, out: Path, *more: str) -> list[str]:
 
 
 def test_no_primitive_goes_beyond_the_largest_extinction(files: Path, tmp_path: Path) -> None:
-    trainer = start(compose(words(files, tmp_path / "run", "train.iterations=3"), check_output=False)).trainer
+    trainer = prepare_training(
+        compose(words(files, tmp_path / "run", "train.iterations=3"), check_output=False)
+    ).trainer
     model, largest = trainer.model, trainer.dataset.largest
     assert largest is not None
     with torch.no_grad():

@@ -14,7 +14,7 @@ from neuprim.core.data.dataset import PointSamples
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs.fit import fit, start
+from neuprim.runs.fit import fit, prepare_training
 from neuprim.tasks.dynamic.volume import voxels as module
 from neuprim.tasks.dynamic.volume.voxels import FrameVoxels, Voxels
 from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
@@ -60,7 +60,7 @@ def words(folder: Path, *more: str) -> list[str]:
 
 
 def trainer(folder: Path, *more: str) -> Trainer:
-    return start(compose(words(folder, *more), check_output=False)).trainer
+    return prepare_training(compose(words(folder, *more), check_output=False)).trainer
 
 
 # ---------------------------------------------------------------- what is drawn
@@ -197,7 +197,7 @@ def test_images_alone_draw_no_points(files: Path, monkeypatch: pytest.MonkeyPatc
 def test_the_preset_quick_learns_from_both_where_there_are_voxels(files: Path, tmp_path: Path) -> None:
     small = [*SMALL[:3], "model.primitives=50", "train.iterations=40", "train.max_seconds=null"]
     words = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire", *small]
-    found = start(compose(words, check_output=False)).trainer
+    found = prepare_training(compose(words, check_output=False)).trainer
     every = found.settings.voxels_every
     assert {"voxel_sigma", "voxel_source"} <= [found.train_step().parts.keys() for _ in range(every)][-1]
     assert found.model.density.settings() == {
@@ -219,7 +219,7 @@ def test_auto_is_images_where_there_are_no_voxels() -> None:
         "scene.test_views=1",
         "model.primitives=10",
     ]
-    found = start(compose([*words, "train.supervision=auto"], check_output=False)).trainer
+    found = prepare_training(compose([*words, "train.supervision=auto"], check_output=False)).trainer
     assert found.settings.supervision == "images" and "voxel_sigma" not in found.train_step().parts
 
 
@@ -242,4 +242,4 @@ def test_data_without_voxels_are_refused_by_name() -> None:
     with pytest.raises(
         ConfigError, match=r"^train\.supervision=both: .* has no voxels to learn from; expected images$"
     ):
-        start(compose([*words, "train.supervision=both"], check_output=False))
+        prepare_training(compose([*words, "train.supervision=both"], check_output=False))

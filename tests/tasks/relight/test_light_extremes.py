@@ -16,7 +16,7 @@ from neuprim.core.model.fields import RayNet
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import Supervision
-from neuprim.core.train.initial import initial_model
+from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.losses import compressed, l1, relative
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer

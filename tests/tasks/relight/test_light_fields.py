@@ -17,7 +17,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderOutput, RenderSettings, render, render_lowered
-from neuprim.core.train.population import split
+from neuprim.core.train.splitting import split_primitives
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import FORMS, LightNetwork
 from neuprim.tasks.relight.harmonics import LightHarmonics, real_harmonics
@@ -78,7 +78,7 @@ def test_a_split_carries_the_colour(form: str) -> None:
     field = LightNetwork(4, form=form, visibility="none")
     m = model(field)
     parents = torch.arange(COUNT)
-    children = split(m, parents, 0.5, 0.6, 0.9)
+    children = split_primitives(m, parents, 0.5, 0.6, 0.9)
     whole = {k: v.detach() for k, v in m.params.items()}
     for half in (slice(0, COUNT), slice(COUNT, 2 * COUNT)):
         child = {k: v[half] for k, v in children.items()}

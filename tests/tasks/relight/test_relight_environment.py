@@ -27,7 +27,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import SceneContext
 from neuprim.plugins.judging import facts_of
-from neuprim.runs.measure import draw_sum
+from neuprim.runs.measure import render_light_sum
 from neuprim.scenes.lit import build_lit_solids, shade_point_light
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight import TASK
@@ -103,7 +103,7 @@ def test_energy_through_the_model_for_any_number_of_lights(count: int) -> None:
     model = Primitives(CosineDensity(1), field, t)
     lights = illuminate(Environment(torch.ones(32, 64, 3)), count, facts()).conditions
     view = View("v", scenes.camera(12, 10))
-    seen = draw_sum(model, view, lights, SETTINGS, torch.zeros(3))
+    seen = render_light_sum(model, view, lights, SETTINGS, torch.zeros(3))
     alpha = render(model, view.camera, lights[0], SETTINGS).alpha[..., None]
     assert len(lights) == count and alpha.max() > 0.1
     assert torch.allclose(seen, 4 * math.pi * alpha * t["c_dc"], rtol=1e-5, atol=1e-7)
@@ -117,9 +117,9 @@ def test_one_texel_is_one_light_and_the_background_counts_once() -> None:
     (light,) = illuminate(Environment(texel()), 64, facts()).conditions
     one = render(model, view.camera, light, SETTINGS, sky).rgb
     assert one.max() > 1.0
-    assert torch.allclose(draw_sum(model, view, [light], SETTINGS, sky), one, atol=1e-6)
+    assert torch.allclose(render_light_sum(model, view, [light], SETTINGS, sky), one, atol=1e-6)
     halves = [{**light, "light_intensity": light["light_intensity"] * s} for s in (0.25, 0.75)]
-    assert torch.allclose(draw_sum(model, view, halves, SETTINGS, sky), one, atol=1e-5)
+    assert torch.allclose(render_light_sum(model, view, halves, SETTINGS, sky), one, atol=1e-5)
 
 
 def test_a_view_keeps_its_other_conditions() -> None:
@@ -133,7 +133,7 @@ def test_a_view_keeps_its_other_conditions() -> None:
     model = some_model()
     view = View("v", scenes.camera(4, 4), {"wavelength": torch.tensor(0.5), "light": torch.zeros(3)})
     lights = illuminate(Environment(texel()), 1, facts()).conditions
-    draw_sum(Listening(model.density, model.colour, model.params), view, lights, SETTINGS, torch.zeros(3))
+    render_light_sum(Listening(model.density, model.colour, model.params), view, lights, SETTINGS, torch.zeros(3))
     assert [sorted(c) for c in seen] == [["light", "light_intensity", "wavelength"]]
     assert torch.equal(seen[0]["light"], lights[0]["light"])
 

@@ -17,9 +17,9 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.io.exr import exr_channels, write_exr
 from neuprim.core.io.images import read_image
 from neuprim.plugins.registry import load_task
-from neuprim.runs.draw import render_run
 from neuprim.runs.fit import make_trainer
 from neuprim.runs.open import load_dataset, load_run
+from neuprim.runs.render_images import RenderRequest, render_run
 from neuprim.runs.run import run
 from tests.reports import offered
 
@@ -49,7 +49,10 @@ def test_a_run_learns(finished: Path) -> None:
 
 def test_a_new_light_changes_the_picture(finished: Path, tmp_path: Path) -> None:
     one, other = (
-        render_run(finished, "orbit", None, "exr", tmp_path / name, 1, {"light": where})[0]
+        render_run(
+            finished,
+            RenderRequest("orbit", format="exr", out=tmp_path / name, frames=1, conditions={"light": where}),
+        )[0]
         for name, where in (("a", "3,0,3"), ("b", "-3,1,2"))
     )
     assert one.read_bytes() != other.read_bytes()

@@ -12,7 +12,7 @@ pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip ins
 from neuprim.config import compose
 from neuprim.core import notices
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.runs.fit import start
+from neuprim.runs.fit import prepare_training
 from tests import scenes
 from tests.core import tiny
 from tests.short_runs import words
@@ -32,8 +32,8 @@ def test_first_gradients_are_the_cpu_backends(task: str, tmp_path: Path) -> None
         config = words(tiny.write_blender(tmp_path / "two"), tmp_path / "run", 12)
     else:
         config = [f"task={task}", *SCENES[task].split(), *SMALL, f"output_dir='{tmp_path / 'run'}'"]
-    one = start(compose([*config, "renderer.backend=cpu"]))
-    other = start(compose([*config, "renderer.backend=cuda", "renderer.device=cpu"]), dataset=one.dataset)
+    one = prepare_training(compose([*config, "renderer.backend=cpu"]))
+    other = prepare_training(compose([*config, "renderer.backend=cuda", "renderer.device=cpu"]), dataset=one.dataset)
     reports = [x.trainer.train_step() for x in (one, other)]
     assert reports[1].loss == pytest.approx(reports[0].loss, rel=1e-5) and reports[0].loss > 1e-3
     for name, value in one.trainer.optimizer.m.items():

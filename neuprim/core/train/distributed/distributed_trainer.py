@@ -1,0 +1,165 @@
+"""The trainer of one of several ranks.
+
+Every rank draws all random numbers of a step, renders its own views, and gets the gradients of all of them, added in
+the order of the views. From there all ranks compute the same, population and learning rates included. R ranks with V
+views a step equal one process with R x V views, bit for bit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError, RankError
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import RenderSettings
+from neuprim.core.render.output import Contributions
+from neuprim.core.task import Loss
+from neuprim.core.train.distributed.gradient_sum import GradientSum
+from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.settings import TrainSettings
+from neuprim.core.train.trainer import StepReport, Trainer, ViewResult, ViewTask
+from neuprim.core.train.trainer_state import hash_names
+
+__all__ = ["DistributedTrainer"]
+
+
+class _Message(NamedTuple):
+    """What a rank tells the others in a step.
+
+    Attributes:
+        checksum: of the bits of all positions before the step, to notice a rank that computes differently.
+        elapsed: seconds of training; those of rank 0 count.
+        stop: whether this rank was asked to stop.
+        present: which parameters have a gradient.
+        views: results of its views, in their order.
+    """
+
+    checksum: int
+    elapsed: float
+    stop: bool
+    present: list[bool]
+    views: list[ViewResult]
+
+
+class DistributedTrainer(Trainer):
+    """One of several ranks that train a model together; each renders ``train.views_per_step`` views of every step.
+
+    Args:
+        group: the ranks.
+
+    Raises:
+        ConfigError: also for a training without views, which ranks could not share.
+    """
+
+    def __init__(
+        self,
+        model: Primitives,
+        dataset: Dataset,
+        loss: Loss,
+        settings: TrainSettings,
+        renderer: RenderSettings,
+        seed: int,
+        group: ProcessGroup,
+    ) -> None:
+        super().__init__(model, dataset, loss, settings, renderer, seed)
+        if self.settings.supervision == "voxels":
+            raise ConfigError(
+                f"train.supervision=voxels: there are no views that {group.size} ranks could share; expected one process"
+            )
+        self.group, self.rank, self.ranks = group, group.rank, group.size
+        self._sums: GradientSum | None = None
+        self._present: list[bool] = []
+        self._checksum = 0
+        self._stopping = False
+        self._agreed = self._agreed_at = self._after = 0.0
+
+    def check_same_start(self) -> None:
+        """Refuse ranks that start with other settings, data or numbers.
+
+        Raises:
+            RankError: names the rank and what differs.
+        """
+        views, digest = self.dataset.train, hashlib.sha256()
+        for name, value in sorted(self.state()[0].items()):
+            digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+            digest.update(value.contiguous().numpy().tobytes())
+        settings = hashlib.sha256(repr((self.settings, self.renderer)).encode())
+        facts = {
+            "steps done": self.step,
+            "training views": f"{len(views)} ({hash_names(views)})",
+            "pixels of the first view": hashlib.sha256(views.pixels(0).rgb.numpy().tobytes()).hexdigest()[:16],
+            "settings": settings.hexdigest()[:16],
+            "state": digest.hexdigest()[:16],
+        }
+        self.group.check_equal(facts, "expected the same overrides, data and output directory on all ranks")
+
+    def train_step(self) -> StepReport:
+        """As :meth:`~neuprim.core.train.trainer.Trainer.train_step`.
+
+        Raises:
+            RankError: another rank ended, or computes differently. The state is that before the step.
+        """
+        order, generator = self.order, self.generator.get_state()
+        try:
+            return super().train_step()
+        except RankError as error:
+            # undo the draws, so that a training that goes on from this state repeats the step
+            self.order = order
+            self.generator.set_state(generator)
+            raise error if error.reported else RankError(f"step {self.step + 1}: {error}") from error
+
+    @property
+    def stopping(self) -> bool:
+        """Whether any rank was asked to stop before the step just done; the same on all ranks."""
+        return self._stopping
+
+    def _sample_views(self) -> list[ViewTask]:
+        drawn = [(self._next_view(), self._draw_background()) for _ in range(self.settings.views_per_step * self.ranks)]
+        own = drawn[self.rank :: self.ranks]
+        after = int(self.order[self.rank]) if len(self.order) > self.rank else None
+        upcoming = [*(index for index, _ in own[1:]), after]
+        self._checksum = _checksum(self.model.params["means"])
+        if self._sums is None or not self._sums.fits(self.model.params):
+            self._sums = GradientSum(self.model.params, self.group)
+        self._present = [False] * len(self.model.params)
+        return [ViewTask(index, background, then) for (index, background), then in zip(own, upcoming, strict=True)]
+
+    def _collect_view(self, result: ViewResult, contributions: Contributions) -> None:
+        assert self._sums is not None
+        self._view_results.append(result)
+        present = self._sums.add(self.model.params, contributions)
+        self._present = [before or now for before, now in zip(self._present, present, strict=True)]
+
+    def _sum_views(self, start: float) -> tuple[list[ViewResult], Contributions]:
+        assert self._sums is not None
+        self._agreed_at = time.perf_counter()
+        elapsed = self.elapsed + self._after + self._agreed_at - start
+        own = _Message(self._checksum, elapsed, self.stop_requested(), self._present, self._view_results)
+        messages: list[_Message] = self.group.gather(own)
+        for rank, message in enumerate(messages):
+            if message.checksum != messages[0].checksum:
+                raise RankError(
+                    f"rank {rank} does not compute as rank 0 does: its positions differ; "
+                    "expected processors or GPUs of one kind"
+                )
+        self._agreed = messages[0].elapsed
+        self._stopping = any(message.stop for message in messages)
+        present = [any(each) for each in zip(*(message.present for message in messages), strict=True)]
+        results = [view for views in zip(*(message.views for message in messages), strict=True) for view in views]
+        return results, self._sums.finish(self.model.params, present)
+
+    def _stop_clock(self, start: float) -> float:
+        """Rank 0's clock as of :meth:`_sum_views`; what the step spends afterwards counts in the next one."""
+        self._after = time.perf_counter() - self._agreed_at
+        return self._agreed
+
+
+def _checksum(means: Tensor) -> int:
+    """Sum of the bits of all numbers."""
+    return int(means.detach().view(torch.int32).sum())

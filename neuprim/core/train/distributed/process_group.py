@@ -1,0 +1,143 @@
+"""Communication between the ranks of a training, by torch.distributed: gloo for CPU memory and NCCL for GPUs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+from torch.distributed.rendezvous import rendezvous
+
+from neuprim.core.errors import ConfigError, RankError
+from neuprim.core.train.distributed.torchrun import TorchrunRank
+
+__all__ = ["ProcessGroup"]
+
+MEETING = timedelta(minutes=5)
+"""How long ranks wait for the last one to start."""
+
+TIMEOUT = timedelta(hours=12)
+"""How long a rank waits for another one, which may generate data or evaluate. A rank that ends breaks its connections
+at once, and torchrun ends the others."""
+
+_FAILED = "failed"
+"""Key of the store: the first failure of any rank."""
+
+
+class ProcessGroup:
+    """The ranks of a training that have met.
+
+    Args:
+        place: which rank this process is.
+        environment: of torchrun.
+
+    Raises:
+        ConfigError: the ranks cannot meet.
+    """
+
+    def __init__(self, place: TorchrunRank, environment: Mapping[str, str]) -> None:
+        self.place, self.rank, self.size = place, place.rank, place.size
+        backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
+        try:
+            store, _, _ = next(iter(rendezvous("env://", place.rank, place.size, timeout=MEETING)))
+            # torchrun keeps its store when it restarts the ranks
+            attempt = environment.get("TORCHELASTIC_RESTART_COUNT", "0")
+            self.store = dist.PrefixStore(f"neuprim/{attempt}", store)
+            group = dist.PrefixStore("group", self.store)
+            dist.init_process_group(backend, store=group, rank=place.rank, world_size=place.size, timeout=TIMEOUT)
+        except (RuntimeError, ValueError, OSError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise ConfigError(
+                f"rank {place.rank} of {place.size} cannot meet the others at {place.address} ({reason})"
+            ) from error
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this is the rank that writes files and messages."""
+        return self.rank == 0
+
+    # ------------------------------------------------------------ communication
+
+    def gather(self, value: Any) -> list[Any]:
+        """Return the values of all ranks, by rank.
+
+        Raises:
+            RankError: another rank ended.
+        """
+        values: list[Any] = [None] * self.size
+        with self._errors():
+            dist.all_gather_object(values, value)
+        return values
+
+    def exchange(self, sent: Tensor, received: Tensor) -> None:
+        """Send row r of (R, n) ``sent`` to rank r; row r of ``received`` comes from rank r. Raises RankError."""
+        with self._errors():
+            dist.all_to_all_single(received, sent)
+
+    def all_gather(self, received: Tensor, own: Tensor) -> None:
+        """Fill row r of (R, n) ``received`` with ``own`` (n,) of rank r. Raises RankError."""
+        with self._errors():
+            dist.all_gather(list(received.unbind(0)), own)
+
+    def check_equal(self, facts: Mapping[str, Any], hint: str) -> None:
+        """Refuse ranks that differ in ``facts``.
+
+        Raises:
+            RankError: names the rank and what differs; ``hint`` says what was expected.
+        """
+        every = self.gather(dict(facts))
+        for rank, other in enumerate(every):
+            for name, value in every[0].items():
+                if other[name] != value:
+                    raise RankError(f"rank {rank} has other {name} than rank 0: {other[name]!r}, not {value!r}; {hint}")
+
+    @contextmanager
+    def in_turn(self) -> Iterator[None]:
+        """Let rank 0 go first, then the first rank of every other machine, then the rest, so that files in caches are
+        made once. Raises RankError."""
+        turn = 0 if self.is_first else 1 if self.place.local_rank == 0 else 2
+        for _ in range(turn):
+            self.gather(None)
+        yield
+        for _ in range(2 - turn):
+            self.gather(None)
+
+    # ------------------------------------------------------------ failures
+
+    def record_failure(self, line: str) -> bool:
+        """Record in the shared store why this rank ends; returns whether it is the first rank that does, which has to
+        tell the user."""
+        own = json.dumps([self.rank, line[:4000]])
+        try:
+            return bool(self.store.compare_set(_FAILED, "", own).decode() == own)
+        except RuntimeError:  # the store went with torchrun or rank 0
+            return True
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except RuntimeError as error:  # a closed connection, or a timeout
+            raise self.explain(error) from error
+
+    def explain(self, error: Exception) -> RankError:
+        """The reason for a broken connection: the recorded failure of another rank, or that one ended without a
+        word."""
+        try:
+            if self.store.check([_FAILED]):
+                rank, line = json.loads(self.store.get(_FAILED))
+                return RankError(f"rank {rank}: {line}", reported=True)
+        except RuntimeError:
+            pass  # the store is gone, too
+        reason = " ".join(str(error).split())[:200]
+        return RankError(f"another rank ended without a message, see torchrun's report ({reason})")
+
+    def close(self) -> None:
+        """Leave the group."""
+        if dist.is_initialized():
+            dist.destroy_process_group()

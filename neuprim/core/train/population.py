@@ -1,0 +1,266 @@
+"""Population control: how primitives are born, moved and removed during a training. All splits are exact."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neuprim.core.errors import ConfigError
+from neuprim.core.model.checks import check_tensors, method
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.output import Contributions
+from neuprim.core.train.settings import PopulationSettings
+from neuprim.core.train.splitting import SPLIT_GAUSSIAN, SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT, split_primitives
+
+__all__ = ["STRATEGIES", "Change", "Fixed", "Gradient", "Population", "Relocate", "check_strategy", "make_population"]
+
+_GROWTH = 0.25
+"""Share of the primitives that is born at once: a split costs quality that training has to win back. It is more where
+the count would otherwise not be reached."""
+
+_MIN_GROWTHS = 3
+"""Shares of the time between ``start`` and ``stop``: primitives are born at least between these."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A new population: row i of ``params`` descends from old row ``origin[i]``; ``fresh`` rows start without
+    momentum."""
+
+    params: dict[str, Tensor]
+    origin: Tensor
+    fresh: Tensor
+    text: str
+
+
+class Population(ABC):
+    """Observes every step and now and then proposes a :class:`Change`."""
+
+    def __init__(self, settings: PopulationSettings) -> None:
+        self.settings = settings
+
+    def due(self, step: int, progress: float) -> bool:
+        """Whether to intervene after this step."""
+        s = self.settings
+        return s.start <= progress < s.stop and step % s.every == 0
+
+    @abstractmethod
+    def observe(self, model: Primitives, tally: Contributions) -> None:
+        """Called after the backward passes of a step, while ``.grad`` is there."""
+
+    @abstractmethod
+    def intervene(self, model: Primitives, extent: float) -> Change | None:
+        """Return the next population, or None to leave it; resets the statistics."""
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors that a checkpoint needs."""
+        return {}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:  # noqa: B027 - a strategy without statistics has none
+        """Counterpart of :meth:`state`."""
+
+
+class Fixed(Population):
+    """The primitives of the start are those of the end."""
+
+    def observe(self, model: Primitives, tally: Contributions) -> None:
+        pass
+
+    def intervene(self, model: Primitives, extent: float) -> Change | None:
+        return None
+
+
+class Relocate(Population):
+    """Move the primitives with the least weight to where weight x error is largest, and add those that are missing.
+
+    The primitive with the largest error splits in two, one child in its own row and one in the idle row. A split costs
+    more than it brings once the idle primitives are used up (children cover each other and not all of their parent):
+    ``idle`` limits who moves. While there are fewer primitives than ``grow_to``, further ones split without an idle
+    row, a quarter of all at a time, or as many as the remaining interventions need. Short budgets intervene sooner.
+    """
+
+    def __init__(self, settings: PopulationSettings) -> None:
+        super().__init__(settings)
+        self.weight: Tensor | None = None
+        self.error: Tensor | None = None
+        self._remaining = math.inf
+        self._part = 0
+
+    def due(self, step: int, progress: float) -> bool:
+        s = self.settings
+        share = (s.stop - s.start) / _MIN_GROWTHS
+        if self.weight is not None and len(self.weight) < (s.grow_to or 0) and 0 < share * step < s.every * progress:
+            # a budget so short that ``every`` would leave it without its primitives, or with all of them born at once
+            part = int((progress - s.start) // share)
+            due, self._part = self._part < min(part, _MIN_GROWTHS - 1), max(part, self._part)
+            self._remaining = max(_MIN_GROWTHS - 1 - part, 0)
+            return due
+        due = super().due(step, progress)
+        if due:
+            further = (s.stop - progress) / progress * step / s.every if progress > 0 else math.inf
+            # the schedule ends before ``stop``, so an intervention exactly there does not happen
+            self._remaining = math.inf if math.isinf(further) else max(math.ceil(further - 1e-6) - 1, 0)
+        return due
+
+    def observe(self, model: Primitives, tally: Contributions) -> None:
+        if self.weight is None or self.error is None:
+            self.weight, self.error = (torch.zeros(model.count, device=model.device) for _ in range(2))
+        weight, error = tally.of_all(model.count)
+        self.weight += weight
+        self.error += error
+
+    def intervene(self, model: Primitives, extent: float) -> Change | None:
+        weight, error = self.weight, self.error
+        self.weight = self.error = None
+        if weight is None or error is None:
+            return None
+        count = len(weight)
+        budget = int(self.settings.fraction * count)
+        births = self._births(count)
+        busiest = torch.argsort(error, descending=True, stable=True)
+        busy = torch.zeros(count, dtype=torch.bool, device=weight.device)
+        busy[busiest[:budget]] = True
+        idle = torch.argsort(weight, stable=True)
+        idle = idle[~busy[idle]][:budget]
+        if self.settings.idle is not None:
+            idle = idle[weight[idle] < self.settings.idle * weight.mean()]
+        moves = min(len(idle), budget, max(count - births, 0))  # a primitive that moves does not split
+        idle = idle[:moves]
+        moved = torch.zeros_like(busy)
+        moved[idle] = True
+        busiest = busiest[~moved[busiest]]
+        # a primitive that no view showed has no error and no reason to split
+        births = max(min(births, int((error[busiest] > 0).sum()) - moves), 0)
+        parents = busiest[: moves + births]
+        if len(parents) == 0:
+            return None
+        new = torch.arange(count, count + births, device=weight.device)
+        text = ", ".join(f"{what} {number}" for what, number in (("moved", moves), ("grew by", births)) if number)
+        return _split_into(model, parents, torch.cat([idle, new]), births, text)
+
+    def _births(self, count: int) -> int:
+        """How many primitives to add, by the same factor in each of the remaining interventions."""
+        missing = max((self.settings.grow_to or 0) - count, 0)
+        due = math.ceil(count * ((1 + missing / count) ** (1 / (self._remaining + 1)) - 1) - 1e-9)
+        return min(missing, max(int(_GROWTH * count), due, 1))
+
+    def state(self) -> dict[str, Tensor]:
+        found = {} if self.weight is None or self.error is None else {"weight": self.weight, "error": self.error}
+        return found | ({"part": torch.tensor(self._part)} if self._part else {})
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self._part = int(state["part"]) if "part" in state else 0
+        self.weight = state["weight"].clone() if "weight" in state else None
+        self.error = state["error"].clone() if "error" in state else None
+
+
+def _split_into(model: Primitives, parents: Tensor, others: Tensor, births: int, text: str) -> Change:
+    """Split ``parents`` (P,): first children take their parents' rows, second ones the rows ``others`` (P,), of which
+    the last ``births`` are new."""
+    children = split_primitives(model, parents, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)
+    rows = torch.cat([parents, others])
+    origin = torch.arange(model.count + births, device=parents.device)
+    origin[others] = parents
+    fresh = torch.zeros(model.count + births, dtype=torch.bool, device=parents.device)
+    fresh[rows] = True
+    params = {}
+    for name, value in model.params.items():
+        params[name] = value.detach()[origin]
+        params[name][rows] = children[name]
+    return Change(params, origin, fresh, text)
+
+
+class Gradient(Population):
+    """The authors' rule on the density network's gradient, with exact splits (method: "Population").
+
+    g = mean over views that saw the primitive of |dW1| + |db1| + |dw2| + |db2|, one view per step. g >= grow_threshold:
+    clone in place, both copies at half density, if max s <= clone_scale x extent, else split in two (s/1.6).
+    g < prune_threshold although seen, or max s > prune_scale x extent: prune. So is a primitive no view saw.
+    """
+
+    def __init__(self, settings: PopulationSettings) -> None:
+        super().__init__(settings)
+        self.total: Tensor | None = None
+        self.seen: Tensor | None = None
+
+    def observe(self, model: Primitives, tally: Contributions) -> None:
+        if self.total is None or self.seen is None:
+            self.total, self.seen = (torch.zeros(model.count, device=model.device) for _ in range(2))
+        saw = tally.of_all(model.count)[0] > 0
+        norm = torch.zeros_like(self.total)
+        for name in model.of(model.density):
+            grad = model.params[name].grad
+            if grad is not None and grad.numel():
+                norm += grad.reshape(model.count, -1).norm(dim=1)
+        self.total += torch.where(saw, norm, torch.zeros_like(norm))
+        self.seen += saw
+
+    def intervene(self, model: Primitives, extent: float) -> Change | None:
+        if self.total is None or self.seen is None:
+            return None
+        s = self.settings
+        seen, mean = self.seen > 0, self.total / self.seen.clamp_min(1)
+        self.total = self.seen = None
+        size = model.params["log_scales"].detach().max(dim=-1).values.exp()
+        prune = (seen & (mean < s.prune_threshold)) | (size > s.prune_scale * extent) | ~seen
+        if bool(prune.all()):
+            return None  # a run of black views must not empty the model
+        grow = ((mean >= s.grow_threshold) & ~prune).nonzero()[:, 0]
+        room = max(s.max_primitives - int((~prune).sum()), 0)
+        if len(grow) > room:  # the growth cap keeps the most wanted ones
+            grow = grow[torch.argsort(mean[grow], descending=True, stable=True)[:room]].sort().values
+        small = size[grow] <= s.clone_scale * extent
+        clones, splits = grow[small], grow[~small]
+        keep = ~prune
+        keep[splits] = False
+        kept = keep.nonzero()[:, 0]
+
+        params = {n: v.detach()[kept].clone() for n, v in model.params.items()}
+        own = {k: model.params[k].detach()[clones] for k in model.of(model.density)}
+        halved = model.density.scale_density(own, torch.full((len(clones),), 0.5, device=model.device))
+        halved = check_tensors(halved, own, method(model.density, "scale_density"))
+        copies = {**model.rows(clones), **halved}
+        position = torch.full_like(prune, -1, dtype=torch.int64)
+        position[kept] = torch.arange(len(kept), device=model.device)
+        for name, value in halved.items():
+            params[name][position[clones]] = value
+        children = split_primitives(model, splits, SPLIT_SHIFT, SPLIT_GAUSSIAN, SPLIT_GAUSSIAN)
+        params = {n: torch.cat([params[n], copies[n], children[n]]) for n in params}
+        origin = torch.cat([kept, clones, splits, splits])
+        fresh = torch.zeros_like(origin, dtype=torch.bool)
+        fresh[len(kept) :] = True
+        return Change(params, origin, fresh, f"cloned {len(clones)}, split {len(splits)}, pruned {int(prune.sum())}")
+
+    def state(self) -> dict[str, Tensor]:
+        if self.total is None or self.seen is None:
+            return {}
+        return {"total": self.total, "seen": self.seen}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self.total = state["total"].clone() if "total" in state else None
+        self.seen = state["seen"].clone() if "seen" in state else None
+
+
+STRATEGIES: dict[str, type[Population]] = {"fixed": Fixed, "relocate": Relocate, "gradient": Gradient}
+"""Value of ``train.population.strategy`` -> its class."""
+
+
+def check_strategy(name: object) -> None:
+    """Raise ConfigError unless the setting ``train.population.strategy`` may have this value."""
+    if name not in STRATEGIES:
+        *others, last = STRATEGIES
+        raise ConfigError(f"train.population.strategy={name!r}: expected {', '.join(others)} or {last}")
+
+
+def make_population(settings: PopulationSettings) -> Population:
+    """Make the strategy that the settings name.
+
+    Raises:
+        ConfigError: there is none of this name.
+    """
+    check_strategy(settings.strategy)
+    return STRATEGIES[settings.strategy](settings)

@@ -1,0 +1,74 @@
+"""Load training views: one view ahead on a GPU, and at a lower resolution early in the training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
+from dataclasses import replace
+
+from neuprim.core.data import Pixels, View
+from neuprim.core.data.image_views import average_pixels, reduce_mask
+
+__all__ = ["Prefetcher", "reduce_view", "resolution_factor"]
+
+_MIN_SIDE = 16
+"""Pixels along a side that no reduction goes below."""
+
+
+class Prefetcher:
+    """Loads the pixels of the next view in a thread; it does not change which views are used.
+
+    Args:
+        load: (index of a view) -> its pixels on the training's device; the same every time.
+        capacity: bytes of pixels to keep: loading a large view again takes longer than a step.
+    """
+
+    def __init__(self, load: Callable[[int], Pixels], capacity: int) -> None:
+        self._load, self._capacity = load, capacity
+        self._cache: dict[int, Pixels] = {}
+        self._pool: ThreadPoolExecutor | None = None
+        self._pending: tuple[int, Future[Pixels]] | None = None
+
+    def take(self, index: int, upcoming: int | None) -> Pixels:
+        """Return a view's pixels, and start loading those of ``upcoming``, if it is known. Raises what loading did."""
+        pending, self._pending = self._pending, None
+        if index in self._cache:
+            pixels = self._cache[index]
+        else:
+            pixels = pending[1].result() if pending is not None and pending[0] == index else self._load(index)
+            size = sum(x.nbytes for x in (pixels.rgb, pixels.alpha, pixels.mask) if x is not None)
+            if size <= self._capacity:
+                self._cache[index], self._capacity = pixels, self._capacity - size
+        if upcoming is not None and upcoming not in self._cache:
+            self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="neuprim-views")
+            self._pending = upcoming, self._pool.submit(copy_context().run, self._load, upcoming)
+        return pixels
+
+
+def resolution_factor(progress: float, coarse: int, until: float) -> int:
+    """Factor by which views are reduced at this used fraction of the budget.
+
+    It starts at ``coarse`` and is halved, rounded down, after equal shares of the time up to ``until``; from there on
+    it is 1.
+    """
+    if coarse <= 1 or progress >= until:
+        return 1
+    stages = coarse.bit_length() - 1
+    return coarse >> min(int(progress / until * stages), stages)
+
+
+def reduce_view(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
+    """Average a view over blocks of ``factor`` x ``factor`` pixels; the remainder at the right and bottom is cut off.
+
+    Colours are premultiplied, so the mean is what a camera with larger pixels sees. A large pixel is valid where all
+    of its parts are.
+    """
+    camera = view.camera
+    while factor > 1 and min(camera.width, camera.height) // factor < _MIN_SIDE:
+        factor //= 2
+    if factor == 1:
+        return view, pixels
+    alpha = None if pixels.alpha is None else average_pixels(pixels.alpha[..., None], factor)[..., 0]
+    mask = None if pixels.mask is None else reduce_mask(pixels.mask, factor)
+    return replace(view, camera=camera.reduced(factor)), Pixels(average_pixels(pixels.rgb, factor), alpha, mask)

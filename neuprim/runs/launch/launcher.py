@@ -1,0 +1,246 @@
+"""Launch many jobs: in this process, in others, on a Ray cluster or under Slurm."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
+from pathlib import Path
+from typing import Any
+
+from neuprim.config.launcher import LauncherSettings
+from neuprim.core.compute.threads import limit_process_threads
+from neuprim.core.errors import BackendUnavailable, NeuprimError
+from neuprim.runs.events import Event
+from neuprim.runs.interrupt import interruptible
+from neuprim.runs.launch.executors import Executor, Processes, Ray, Slurm, WorkerDied, divide_cores
+from neuprim.runs.launch.jobs import Job, JobStatus, Result, StatusListener, perform, read_status
+from neuprim.runs.launch.worker import Task, worker_environment
+
+__all__ = [
+    "LAUNCH_FOLDER",
+    "OnResult",
+    "OnStatus",
+    "check_launcher",
+    "ignore_status",
+    "launch",
+    "use_launcher_threads",
+]
+
+LAUNCH_FOLDER = "launch"
+"""In a sweep's directory: statuses while it works, and the logs of workers that printed something."""
+
+OnStatus = Callable[[int, JobStatus], None]
+"""Called with the number of a job and its status, whenever it is new."""
+
+OnResult = Callable[[int, Result], None]
+"""Called with the number of a job and its result, before its last status."""
+
+_EXECUTORS: dict[str, Callable[[LauncherSettings, int, Path], Executor]] = {
+    "processes": Processes,
+    "ray": Ray,
+    "slurm": Slurm,
+}
+_PACKAGES = {"ray": "ray", "slurm": "submitit"}
+"""Launcher -> the package that it needs."""
+
+_INTERVAL = 0.1
+"""Seconds between two looks at what is done."""
+
+
+def ignore_status(number: int, status: JobStatus) -> None:
+    """Do nothing."""
+
+
+def ignore_result(number: int, result: Result) -> None:
+    """Do nothing."""
+
+
+def check_launcher(settings: LauncherSettings, jobs: int) -> None:
+    """Refuse what cannot work, before anything is written.
+
+    Raises:
+        BackendUnavailable: the launcher needs a package that is not installed.
+        ConfigError: more workers than this machine has cores.
+    """
+    if settings.name == "processes":
+        divide_cores(settings, jobs)
+    package = _PACKAGES.get(settings.name)
+    if package is None:
+        return
+    try:
+        importlib.import_module(package)
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"launcher={settings.name} needs the package {package} ({error}): pip install 'neuprim[{settings.name}]'"
+        ) from None
+
+
+def use_launcher_threads(settings: LauncherSettings) -> AbstractContextManager[None]:
+    """Give this process the threads of ``launcher.threads`` where runs work in it; otherwise it keeps its own."""
+    return (
+        limit_process_threads(settings.threads)
+        if settings.name == "inline" and settings.threads is not None
+        else nullcontext()
+    )
+
+
+def launch(
+    jobs: Sequence[Job],
+    settings: LauncherSettings,
+    folder: Path,
+    on_status: OnStatus = ignore_status,
+    on_result: OnResult = ignore_result,
+) -> list[Result | None]:
+    """Do all jobs.
+
+    The first Ctrl-C stops every job as it stops a run, which finishes its step and writes a checkpoint; the second ends
+    their processes.
+
+    Args:
+        folder: where launcher and workers meet; every worker sees it under this path. It is removed afterwards, unless
+            workers printed something.
+
+    Returns:
+        results in the order of the jobs; None for those that Ctrl-C kept from starting.
+
+    Raises:
+        BackendUnavailable: the launcher needs a package that is not installed, or cannot be reached.
+        ConfigError: more workers than this machine has cores, or an option that the launcher refuses.
+    """
+    check_launcher(settings, len(jobs))
+    if settings.name == "inline":
+        return _run_inline(jobs, settings, on_status, on_result)
+    if not jobs:
+        return []
+    try:
+        executor = _EXECUTORS[settings.name](settings, len(jobs), folder)
+    except NeuprimError:
+        with suppress(OSError):  # there may be none
+            folder.rmdir()
+        raise
+    return _JobLoop(executor, jobs, folder, settings.retries, on_status, on_result).run()
+
+
+def _run_inline(
+    jobs: Sequence[Job], settings: LauncherSettings, on_status: OnStatus, on_result: OnResult
+) -> list[Result | None]:
+    """Do one job after the other in this process, up to the one that Ctrl-C ends."""
+    results = list[Result | None]([None] * len(jobs))
+    with use_launcher_threads(settings):
+        for number, job in enumerate(jobs):
+            listener = StatusListener()
+
+            def notify(event: Event, number: int = number, listener: StatusListener = listener) -> None:
+                listener(event)
+                on_status(number, listener.status)
+
+            on_status(number, JobStatus("starting"))
+            result = results[number] = perform(job, 0, notify)
+            on_result(number, result)
+            on_status(number, listener.status.end(result))
+            if result.state == "interrupted":
+                break
+    return results
+
+
+class _JobLoop:
+    """Hand jobs to an executor, follow them, and collect their results."""
+
+    def __init__(
+        self,
+        executor: Executor,
+        jobs: Sequence[Job],
+        folder: Path,
+        retries: int,
+        on_status: OnStatus,
+        on_result: OnResult,
+    ) -> None:
+        self._executor, self._retries, self._on_status, self._on_result = executor, retries, on_status, on_result
+        self._folder = folder.absolute()
+        self._stop = self._folder / "stop"
+        variables, threads = worker_environment(executor.threads), executor.threads
+        self._tasks = [
+            Task(job, threads, self._folder / f"{number}.json", self._stop, Path.cwd(), variables)
+            for number, job in enumerate(jobs)
+        ]
+        self._waiting = deque(enumerate(self._tasks))
+        self._running: dict[int, tuple[Any, Task]] = {}
+        self._results = list[Result | None]([None] * len(jobs))
+        self._statuses: dict[int, JobStatus] = {}
+
+    def run(self) -> list[Result | None]:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._stop.unlink(missing_ok=True)
+        finished = False
+        try:
+            with interruptible() as stopped:
+                while self._waiting or self._running:
+                    if stopped.is_set() and not self._stop.exists():
+                        self._stop_all()
+                    self._fill()
+                    for number, (handle, task) in list(self._running.items()):
+                        if self._executor.done(handle):
+                            del self._running[number]
+                            self._finish(number, handle, task)
+                        else:
+                            self._follow(number, task)
+                    time.sleep(_INTERVAL)
+            finished = True
+        finally:
+            self._executor.close(not finished)
+            self._clean_up()
+        return self._results
+
+    def _fill(self) -> None:
+        while self._waiting and len(self._running) < self._executor.workers:
+            number, task = self._waiting.popleft()
+            task.status.unlink(missing_ok=True)
+            self._running[number] = self._executor.submit(task), task
+            self._notify(number, JobStatus("starting", attempt=task.attempt))
+
+    def _stop_all(self) -> None:
+        self._stop.touch()
+        self._waiting.clear()
+        for handle, task in self._running.values():
+            if not task.status.exists():  # it waits in the executor's queue
+                self._executor.cancel(handle)
+
+    def _finish(self, number: int, handle: Any, task: Task) -> None:
+        try:
+            result = self._executor.result(handle)
+        except WorkerDied as death:
+            attempts = task.attempt + 1
+            if self._stop.exists():
+                result = Result("interrupted", attempts=attempts)
+            elif task.attempt < self._retries:
+                self._notify(number, JobStatus("waiting", "its worker died", attempt=attempts))
+                self._waiting.appendleft((number, task.retry()))
+                return
+            else:
+                times = f", {attempts} times" if attempts > 1 else ""
+                result = Result("failed", line=f"its worker died{times}: {death}", attempts=attempts)
+        self._results[number] = result
+        self._on_result(number, result)
+        self._notify(number, (read_status(task.status) or JobStatus()).end(result))
+
+    def _follow(self, number: int, task: Task) -> None:
+        status = read_status(task.status)
+        if status is not None and status.attempt >= task.attempt and status != self._statuses[number]:
+            self._notify(number, status)
+
+    def _notify(self, number: int, status: JobStatus) -> None:
+        self._statuses[number] = status
+        self._on_status(number, status)
+
+    def _clean_up(self) -> None:
+        """Remove all but the logs that have something in them."""
+        for file in (*(task.status for task in self._tasks), self._stop):
+            file.unlink(missing_ok=True)
+        for log in self._folder.glob("*.log"):
+            if not log.stat().st_size:
+                log.unlink()
+        with suppress(OSError):  # logs
+            self._folder.rmdir()

@@ -1,0 +1,392 @@
+"""Render images of a finished run: its held-out views, an orbit, or given cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+
+from neuprim.config import suspects_of, task_of
+from neuprim.core.cameras.camera_files import read_camera_file
+from neuprim.core.cameras.pinhole import CameraViews
+from neuprim.core.cameras.world import World
+from neuprim.core.channels import Channels, stored_channels
+from neuprim.core.conditions import flag, in_step, read_conditions
+from neuprim.core.data import View
+from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io import images
+from neuprim.core.io.animation import write_animation
+from neuprim.core.io.files import write_npy
+from neuprim.core.io.json_reader import JsonReader
+from neuprim.core.model.fields import Conditions
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.task import TaskSpec
+from neuprim.plugins.judging import facts_of, orbit_of
+from neuprim.runs.layers import Layers
+from neuprim.runs.measure import render_light_sum
+from neuprim.runs.open import LOGS, load_dataset, load_run, move_to_render_device
+from neuprim.runs.render_config import parse_render_config
+from neuprim.runs.run_directory import refuse_results
+
+__all__ = ["FORMATS", "SETS", "RenderRequest", "render_run", "with_conditions"]
+
+SPACES = WORLD, SCENE = ("world", "scene")
+"""Whose coordinates a file of cameras has, after ``--space``."""
+
+SETS = ("orbit", "test")
+"""Cameras of the run's own."""
+
+_TIME = "time"
+
+ANIMATIONS = ("webp", "gif", "mp4")
+_RAW = ("exr", "npy")
+FORMATS = ("png", "exr", "npy", *ANIMATIONS)
+"""What ``neuprim render`` writes: pictures of what the task's channels look like, but all channels as they are in EXR
+and npy."""
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """What to render of a run.
+
+    Attributes:
+        camera: "orbit", "test" or a file of cameras (see :mod:`neuprim.core.cameras.camera_files`).
+        size: (width, height) in pixels; None for that of the cameras.
+        format: one of :data:`FORMATS`. None: the suffix of ``out`` decides; otherwise views that differ in a condition
+            become a WebP animation and others PNGs.
+        out: a file or folder; None for a folder in the run's ``frames``.
+        frames: of an orbit.
+        conditions: name -> text, e.g. ``{"time": "0:1"}``.
+        fps: of an animation; None for what the file of cameras says, or what makes it last four seconds, at 5 to 30
+            frames per second.
+        environment: light from all around instead of the task's light.
+        overrides: of a render configuration (:mod:`neuprim.runs.render_config`).
+        layers: of an OpenEXR file, names separated by commas (:mod:`neuprim.core.layers`); None for all but a layer per
+            light.
+        datatype: of light and alpha in an OpenEXR file, "half" or "float" (16 or 32 bits, the default).
+        space: "world": cameras of a file, lights, and what is written of cameras and depths are in the coordinates of
+            the data's files; "scene": in those of the model, for volumes their unit box.
+        overwrite: replace pictures of the run's report.
+    """
+
+    camera: str
+    size: tuple[int, int] | None = None
+    format: str | None = None
+    out: Path | None = None
+    frames: int = 60
+    conditions: Mapping[str, str] = field(default_factory=dict)
+    fps: float | None = None
+    environment: EnvironmentFile | None = None
+    overrides: Sequence[str] = ()
+    layers: str | None = None
+    datatype: str | None = None
+    space: str = WORLD
+    overwrite: bool = False
+
+
+def render_run(
+    run_dir: Path,
+    request: RenderRequest,
+    notify: Callable[[str], None] = lambda text: None,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
+) -> list[Path]:
+    """Render a run's model: one file per view, or one animation of several views; returns the files.
+
+    Args:
+        notify: called with lines for the user, e.g. what the model never saw.
+        progress: called with (text, fraction 0..1) while images are rendered.
+
+    Raises:
+        DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory; no image shows anything of
+        the model.
+        BackendUnavailable: a format whose package is missing.
+    """
+    session = _RenderSession(run_dir, request, notify, progress)
+    targets = session.choose_targets()
+    if not request.overwrite:
+        refuse_results(run_dir, targets)
+    for target in targets:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    if session.animate:
+        session.write_animation(targets[0])
+    else:
+        session.write_images(targets)
+    return targets
+
+
+class _RenderSession:
+    """A loaded run with the views of a request."""
+
+    def __init__(
+        self,
+        run_dir: Path,
+        request: RenderRequest,
+        notify: Callable[[str], None],
+        progress: Callable[[str, float], None],
+    ) -> None:
+        self.run_dir, self.request, self.notify, self.progress = run_dir, request, notify, progress
+        config, task, model, header = load_run(run_dir)
+        in_world = request.space == WORLD
+        self.config, self.header = config, header
+        self.world = World.of(header, str(run_dir)) if in_world else World()
+        self.task = task if in_world else task_of(config, run_dir / "config.yaml")
+        self.render_config = parse_render_config(request.overrides, config.renderer, model)
+        self.suspects = suspects_of(config)
+        self.guard = self.suspects.watch(run_dir / LOGS)
+        self.background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
+        self.channels = stored_channels(run_dir, header, self.task, model.colour.channels)
+        self.lights = self._load_lights(request.environment)
+        self.views, self.fps = self._load_views()
+        with self.guard:
+            self.views, animated = with_conditions(self.views, self.task, request.conditions, notify)
+            model = self.render_config.prepare_model(model)
+        self.model = move_to_render_device(model, self.render_config.settings, self.views[0])
+        self.format = request.format or _choose_format(request.out, animated)
+        self.animate = self.format in ANIMATIONS and len(self.views) > 1
+        for option, value in (("--layers", request.layers), ("--datatype", request.datatype)):
+            if value is not None and self.format != "exr":
+                raise ConfigError(f"{option} {value}: of OpenEXR files; expected --format exr, found {self.format}")
+        self.layers = self._make_layers() if self.format == "exr" else None
+        if self.channels.partial and self.format not in _RAW:
+            notify(f"shown: {self.channels.shown}; --format exr and npy hold all channels")
+        self._passes = 0  # images rendered so far, one per view and light
+        self._visible = [False] * len(self.views)
+
+    def _make_layers(self) -> Layers:
+        return Layers(
+            self.run_dir,
+            self.task,
+            self.channels,
+            self.render_config,
+            self.background,
+            self.request.layers,
+            self.request.datatype == "half",
+            self.lights,
+            self.world,
+        )
+
+    def _load_lights(self, environment: EnvironmentFile | None) -> Sequence[Conditions]:
+        """Conditions of the lights that stand for an environment; none without one."""
+        if environment is None:
+            return ()
+        with self.guard:
+            illumination = self._illuminate(environment)
+        lights = illumination.frames(environment.guesses)
+        if not lights:
+            raise ConfigError(
+                f"--environment-unseen drop: all light of {environment.path} comes from where the model never saw any"
+            )
+        guessed = environment.guesses and any(illumination.guessed)
+        hint = " (--environment-unseen drop leaves it out)" if guessed else ""
+        for note in illumination.notes:
+            self.notify(f"{environment.path}: {note}{hint}")
+        return lights
+
+    def _illuminate(self, environment: EnvironmentFile) -> Illumination:
+        if self.task.environment is None:
+            raise ConfigError(
+                f"--environment {environment.path}: task {self.task.name!r} has no light that it could replace"
+            )
+        facts = self.header.get("data")
+        if facts is None:  # a model of an imported file has none
+            facts = facts_of(self.task, load_dataset(self.config, self.task))
+        if not isinstance(facts, dict):
+            raise DataError(f"the model's header: data is {type(facts).__name__}; expected an object")
+        up = JsonReader(facts, "the model's header: data").array("up", (3,), "3 numbers")
+        image = read_environment(environment.path, up, environment.rotation, environment.scale)
+        illumination = self.task.environment(image, environment.samples, facts)
+        clash = sorted(self.request.conditions.keys() & illumination.conditions[0].keys())
+        if clash:
+            raise ConfigError(f"{flag(clash[0])} and --environment: give one of them")
+        return illumination
+
+    def _load_views(self) -> tuple[list[View], float | None]:
+        """The views of the request's cameras, in the model's coordinates, and the frames per second of an animation."""
+        request, fps = self.request, self.request.fps
+        if request.camera not in SETS:
+            file = read_camera_file(Path(request.camera), request.size)
+            for note in file.notes:
+                self.notify(f"{request.camera}: {note}")
+            views, fps = _views_of(file, self.task, request.conditions), fps or file.fps
+            views = [replace(view, camera=self.world.scene_camera(view.camera)) for view in views]
+        else:
+            dataset = load_dataset(self.config, self.task, run_dir=self.run_dir)
+            self.suspects.know(dataset)
+            with self.guard:
+                if request.camera == "orbit":
+                    views = list(orbit_of(self.task, dataset, request.frames))
+                else:
+                    views = [dataset.test.view(i) for i in range(len(dataset.test))]
+        if request.size is not None:
+            views = [replace(view, camera=view.camera.resized(*request.size)) for view in views]
+        if self.lights:  # they replace the views' own; the first stands for all where only their presence counts
+            views = [replace(view, conditions={**view.conditions, **self.lights[0]}) for view in views]
+        return views, fps
+
+    def choose_targets(self) -> list[Path]:
+        """Files to write, one per view or one for an animation."""
+        out, suffix = self.request.out, f".{self.format}"
+        single = out is not None and out.suffix.lower() == suffix
+        if single and len(self.views) > 1 and not self.animate:
+            raise ConfigError(
+                f"--out {out}: {len(self.views)} views do not fit one {suffix} file; "
+                "give a folder, or --format webp for an animation"
+            )
+        if single and out is not None:
+            return [out]
+        # "renders" holds the report's pictures
+        name = _file_name(Path(self.request.camera.partition("#")[0]).resolve().stem)
+        folder = self.run_dir / "frames" / name if out is None else out
+        if self.animate:
+            return [folder.with_suffix(suffix)]
+        return [folder / f"{name}{suffix}" for name in _file_names(self.views)]
+
+    def write_animation(self, path: Path) -> None:
+        stack = [self.channels.display(self._render(view)) for view in self.views]
+        self._check_visible()
+        write_animation(path, stack, self.fps or min(30.0, max(len(self.views) / 4.0, 5.0)))
+
+    def write_images(self, paths: Sequence[Path]) -> None:
+        for view, path in zip(self.views, paths, strict=True):
+            if self.layers is None:
+                _write(path, self.format, self._render(view), self.channels, self.fps)
+            else:
+                with self.guard:
+                    self.layers.write(path, self.model, view, self._count_pass)
+        try:
+            self._check_visible()
+        except DataError:
+            for path in paths:
+                path.unlink()
+            raise
+
+    def _render(self, view: View) -> torch.Tensor:
+        config = self.render_config
+        with self.guard:
+            if not self.lights:
+                return config.render_view(self.model, view, self.background, self._count_pass)
+            small = config.scale_view(view)
+            image = render_light_sum(self.model, small, self.lights, config.settings, self.background, self._count_pass)
+            return config.upsample(image, view.camera)
+
+    def _count_pass(self, alpha: torch.Tensor) -> None:
+        """Called after every image of a view under a light, with its alpha."""
+        each, count = max(len(self.lights), 1), len(self.views)
+        self._visible[self._passes // each] |= bool((alpha > 0).any())
+        self._passes += 1
+        done = self._passes
+        self.progress(f"view {done // each + (done % each > 0)} of {count}", done / (each * count))
+
+    def _check_visible(self) -> None:
+        """Warn of images that show nothing of the model; refuse a request of which all do.
+
+        Raises:
+            DataError: says where the model is, and where the first camera looks.
+        """
+        empty = [view for view, visible in zip(self.views, self._visible, strict=True) if not visible]
+        if not empty:
+            return
+        where = _describe_position(self.model, empty[0], self.world)
+        if len(empty) < len(self.views):
+            self.notify(f"warning: {len(empty)} of {len(self.views)} images are empty, first {empty[0].name}: {where}")
+            return
+        hint = "; a file's cameras are in the units of the run's data, or of the model with --space scene"
+        if self.request.camera in SETS or self.request.space == SCENE:
+            hint = ""
+        raise DataError(f"--camera {self.request.camera}: all {len(self.views)} images are empty: {where}{hint}")
+
+
+def _describe_position(model: Primitives, view: View, world: World) -> str:
+    """Describe where the model is, and where a camera looks that does not see it."""
+    with torch.no_grad():
+        geometry, _ = model.lower_density(view.conditions)
+    if not geometry.count:
+        return "no primitive is there under these conditions"
+    means, reach = geometry.means.double().cpu(), geometry.scales.double().cpu().amax(1, keepdim=True)
+    low, high = world.world_box(torch.stack([(means - reach).min(0).values, (means + reach).max(0).values]).numpy())
+    seen = world.world_camera(view.camera)
+    at, towards = seen.position.tolist(), seen.viewmat[2, :3].tolist()
+    return f"the model is within {_point(low)} to {_point(high)}, and {view.name} at {_point(at)} looks towards {_point(towards)}"
+
+
+def _point(numbers: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{x:.7g}" for x in numbers) + ")"
+
+
+def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:
+    """One image: all channels as the data set has them in npy, or what its channels look like."""
+    if format == "npy":
+        write_npy(path, pixels.contiguous().numpy())
+    elif format == "png":
+        images.write_png(path, channels.display(pixels))
+    elif format == "webp":
+        images.write_webp(path, channels.display(pixels))
+    else:
+        write_animation(path, [channels.display(pixels)], fps or 12.0)
+
+
+def _views_of(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
+    """A view per camera; each at its own time where the file has times, the task has one, and the user gave no
+    other."""
+    timed = (
+        file.times is not None
+        and _TIME not in conditions
+        and any(spec.name == _TIME and not spec.shape for spec in task.conditions)
+    )
+    times = [{_TIME: torch.tensor(time)} for time in file.times or ()] if timed else [{} for _ in file.named]
+    return [View(name, camera, time) for (name, camera), time in zip(file.named, times, strict=True)]
+
+
+def _choose_format(out: Path | None, animated: bool) -> str:
+    suffix = "" if out is None else out.suffix.lower().removeprefix(".")
+    return suffix if suffix in FORMATS else "webp" if animated else "png"
+
+
+def with_conditions(
+    views: list[View], task: TaskSpec, texts: Mapping[str, str], warn: Callable[[str], None] = lambda text: None
+) -> tuple[list[View], bool]:
+    """Views with the conditions the user gave, and whether one of these is animated. Animated conditions go along
+    together, frame by frame; where there are more frames than cameras, or the other way round, the fewer are spread
+    evenly over the more.
+
+    Raises:
+        ConfigError: a view lacks a condition that the task needs, or as
+        :func:`neuprim.core.conditions.read_conditions`.
+    """
+    given = read_conditions(task.conditions, texts, warn)
+    frames = in_step(texts, given)
+    if frames > 1:
+        count = max(frames, len(views))
+        names = f"{{}}_{{:0{max(3, len(str(count - 1)))}d}}"
+        views = [
+            replace(views[i * len(views) // count], name=names.format(views[i * len(views) // count].name, i))
+            for i in range(count)
+        ]
+    moments = [
+        {name: values[i * len(values) // len(views)] for name, values in given.items()} for i in range(len(views))
+    ]
+    views = [replace(v, conditions={**v.conditions, **moment}) for v, moment in zip(views, moments, strict=True)]
+    for spec in task.conditions:
+        for v in views:
+            if spec.name not in v.conditions:
+                raise ConfigError(
+                    f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give {flag(spec.name)}"
+                )
+    return views, frames > 1
+
+
+def _file_names(views: Sequence[View]) -> list[str]:
+    """Of each view, with its number where two would share a file."""
+    names = [_file_name(v.name) for v in views]
+    return (
+        names
+        if len({name.lower() for name in names}) == len(names)
+        else [f"{i:03d}_{name}" for i, name in enumerate(names)]
+    )
+
+
+def _file_name(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)

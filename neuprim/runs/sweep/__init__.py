@@ -1,1 +1,0 @@
-"""``neuprim run -m``: every combination of some words, launched together and compared."""

@@ -1,0 +1,101 @@
+"""One process at a time in a directory, and nothing to clear up after a kill."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from neuprim.core.errors import ConfigError
+from neuprim.runs.run_directory import LOCK_FILE, lock_directory
+from tests.runs.launching import wait_for
+from tests.systems import posix
+
+HOLD = "import sys, time; from pathlib import Path; from neuprim.runs.run_directory import lock_directory\nwith lock_directory(Path(sys.argv[1])): time.sleep(600)"
+
+
+def test_a_second_one_is_refused_by_name_and_the_first_is_left_alone(tmp_path: Path) -> None:
+    with lock_directory(tmp_path / "run"):
+        for _ in range(2):
+            with pytest.raises(ConfigError) as error, lock_directory(tmp_path / "run", "sweep"):
+                pytest.fail("two at once")
+            found = f"{tmp_path / 'run'}: process {os.getpid()} on {socket.gethostname()} (since "
+            assert str(error.value).startswith(found) and "is at work on this sweep; expected that to end first" in str(
+                error.value
+            )
+        refused: list[str] = []
+
+        def other() -> None:
+            try:
+                with lock_directory(tmp_path / "run"):
+                    pass
+            except ConfigError as error:
+                refused.append(str(error))
+
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+        assert len(refused) == 1 and (tmp_path / "run" / LOCK_FILE).exists()
+    assert not (tmp_path / "run").exists(), "nothing was put into it"
+
+
+def test_what_was_there_stays(tmp_path: Path) -> None:
+    with lock_directory(tmp_path / "run"):
+        (tmp_path / "run" / "x").touch()
+    assert [p.name for p in (tmp_path / "run").iterdir()] == ["x"]
+    (tmp_path / "empty").mkdir()
+    with lock_directory(tmp_path / "empty"):
+        pass
+    assert (tmp_path / "empty").is_dir()
+
+
+@posix
+def test_a_killed_process_lets_go(tmp_path: Path) -> None:
+    other = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)])
+    try:
+        wait_for(tmp_path / LOCK_FILE)
+        while not (tmp_path / LOCK_FILE).read_text():
+            pass
+        with pytest.raises(ConfigError, match=f"process {other.pid} on"), lock_directory(tmp_path):
+            pass
+    finally:
+        other.kill()
+        other.wait()
+    with lock_directory(tmp_path):
+        assert f'"pid": {os.getpid()}' in (tmp_path / LOCK_FILE).read_text()
+
+
+@posix
+def test_what_killed_writers_left_is_gone_and_what_others_write_stays(tmp_path: Path) -> None:
+    script = "import sys, time; from pathlib import Path; from neuprim.core.io.files import atomic_path\nwith atomic_path(Path(sys.argv[1])): time.sleep(600)"
+    run = tmp_path / "run"
+    (run / "renders").mkdir(parents=True)
+    writers = [
+        subprocess.Popen([sys.executable, "-c", script, str(run / name)])
+        for name in ("model.safetensors", "renders/a.png", "b.npz")
+    ]
+    draft = run / f".neuprim.{writers[0].pid}.abcd1234"
+    draft.mkdir()
+    (draft / "out").touch()
+    mine = [run / "model.safetensors", run / ".hidden", run / ".notes.tmp"]
+    try:
+        while len(list(run.rglob("*.tmp"))) < 3:
+            assert all(writer.poll() is None for writer in writers)
+        for path in mine:
+            path.touch()
+        for writer in writers[:2]:
+            writer.kill()
+            writer.wait()
+        with lock_directory(run):
+            left = [path.name for path in run.rglob("*.tmp") if path not in mine]
+        assert len(left) == 1 and left[0].startswith(f".b.npz.{writers[2].pid}."), "that one is at work"
+        assert not draft.exists() and all(path.exists() for path in mine)
+    finally:
+        for writer in writers:
+            writer.kill()
+            writer.wait()

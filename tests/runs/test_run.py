@@ -257,11 +257,6 @@ def test_evaluating_again_gives_the_same_numbers(whole: Path) -> None:
         assert first[key] == second[key]
 
 
-def test_the_same_run_twice(whole: Path, scene: Path, tmp_path: Path) -> None:
-    torch.manual_seed(5)
-    assert_same_run(whole, fit(words(scene, tmp_path / "again")))
-
-
 # ---------------------------------------------------------------- pictures
 
 

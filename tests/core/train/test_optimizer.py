@@ -9,7 +9,6 @@ from torch import Tensor
 from neuprim.core.compute.threads import limit_threads
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.schema import ParameterSpec
-from neuprim.core.train import optimizer as optimizer_module
 from neuprim.core.train.optimizer import RowAdam, adam_step_reference
 
 SPECS = tuple(
@@ -182,25 +181,6 @@ def test_parameters_without_a_gradient_stay() -> None:
     assert optimizer.m["W1"].abs().max() == 0
 
 
-@pytest.mark.usefixtures("either_way")
-def test_state_goes_on_exactly() -> None:
-    p = params()
-    first = RowAdam(SPECS, p)
-    for step in range(4):
-        set_grads(p, step)
-        first.step(p, RATES)
-    q = {n: v.detach().clone().requires_grad_() for n, v in p.items()}
-    second = RowAdam(SPECS, q)
-    second.load_state(first.state())
-    for step in range(4, 8):
-        set_grads(p, step)
-        set_grads(q, step)
-        first.step(p, RATES)
-        second.step(q, RATES)
-    assert all(torch.equal(p[n], q[n]) for n in p)
-    assert all(torch.equal(first.state()[k], v) for k, v in second.state().items())
-
-
 def test_it_does_not_depend_on_the_number_of_threads() -> None:
     """More rows than one unit of work, of many ages."""
     states = []
@@ -235,19 +215,3 @@ def test_corrections_are_those_of_every_age(beta2: float) -> None:
         adam_step_reference(exact[n], grad.double(), m[n], v[n], RATES[n], ages + 1, beta2)
         step = (exact[n] - before).abs()
         assert ((p[n].detach() - exact[n]).abs() <= 1e-5 * step + 1e-6 * before.abs() + 1e-30).all()
-
-
-def test_powers_are_taken_once_for_all_rows_of_an_age(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step of a thousand more rows asks for the same table, and only a longer run for another."""
-    made: list[int] = []
-    kept = optimizer_module._corrections
-    kept.cache_clear()
-    monkeypatch.setattr(optimizer_module, "_corrections", lambda beta2, ages: made.append(ages) or kept(beta2, ages))
-    for count in (3, 1003):
-        p = params(count)
-        optimizer = RowAdam(SPECS, p)
-        optimizer.age += 5
-        for step in range(3):
-            set_grads(p, step)
-            optimizer.step(p, RATES)
-    assert made == [8, 8, 16, 8, 8, 16] and kept.cache_info().misses == 2

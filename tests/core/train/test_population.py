@@ -16,7 +16,6 @@ from neuprim.core.render.output import Contributions
 from neuprim.core.train.population import (
     Fixed,
     Gradient,
-    Population,
     Relocate,
     make_population,
 )
@@ -342,31 +341,6 @@ def test_gradients_of_other_fields_do_not_count() -> None:
         m.params[name].grad = torch.full_like(m.params[name], 1e6)
     population.observe(m, stats(torch.ones(COUNT)))
     assert torch.allclose(population.state()["total"], torch.tensor(0.5))
-
-
-@pytest.mark.parametrize("strategy", ["relocate", "gradient"])
-def test_state_goes_on_exactly(strategy: str) -> None:
-    m = model()
-    chosen = settings(strategy=strategy, fraction=0.2)
-    g = torch.Generator().manual_seed(0)
-    draws = [(torch.rand(COUNT, generator=g), torch.rand(COUNT, generator=g) * 2) for _ in range(4)]
-    whole, first, second = make_population(chosen), make_population(chosen), make_population(chosen)
-    second.load_state(whole.state())  # an empty state is a state
-
-    def feed(population: Population, part: slice) -> None:
-        for weight, size in draws[part]:
-            give_grads(m, size)
-            population.observe(m, stats(weight, weight * size))
-
-    feed(whole, slice(0, 4))
-    feed(first, slice(0, 2))
-    second.load_state(first.state())
-    feed(first, slice(2, 3))  # must not reach into what was handed over
-    feed(second, slice(2, 4))
-    assert all(torch.equal(whole.state()[k], v) for k, v in second.state().items())
-    a, b = whole.intervene(m, 1.0), second.intervene(m, 1.0)
-    assert a is not None and b is not None and torch.equal(a.origin, b.origin)
-    assert all(torch.equal(a.params[k], b.params[k]) for k in a.params)
 
 
 def test_due() -> None:

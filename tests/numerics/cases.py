@@ -1,10 +1,10 @@
-"""Models, cameras and settings that several tests draw: one case for each thing a kernel may do wrong, and arrangements
-of spheres."""
+"""Cases for the equivalence harness: one for each thing a kernel may do wrong, and arrangements of spheres."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -16,7 +16,20 @@ from tests import scenes
 
 DEFAULT = RenderSettings(depth=True)
 
-CASES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
+
+@dataclass(frozen=True)
+class Case:
+    """One frame: tensors of a model, a camera, settings (with the order), and the exponent of the density's edge."""
+
+    tensors: dict[str, Tensor]
+    camera: Camera
+    settings: RenderSettings
+    edge: int = 0
+
+
+Knobs = Mapping[str, Any]
+
+CONSTANT: dict[str, tuple[Knobs, Knobs, Knobs]] = {
     "K=0 C=1": ({"neurons": 0, "channels": 1}, {}, {}),
     "K=1 C=3": ({"neurons": 1}, {}, {}),
     "K=3 C=5": ({"neurons": 3, "channels": 5}, {}, {}),
@@ -38,21 +51,77 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "low ceiling": ({}, {}, {"alpha_max": 0.2}),
     "cuts off": ({}, {}, {"alpha_min": 0.0, "transmittance_min": 0.0}),
 }
+"""Arguments of ``scenes.tensors``, of ``scenes.camera`` and of the settings, for constant colours."""
+
+NETWORK: dict[str, tuple[Knobs, Knobs, Knobs]] = {
+    "depth": ({}, {}, {"depth": True}),
+    "depth C=5": ({"channels": 5}, {}, {"depth": True}),
+    "off-centre": ({}, {"shift": (19.3, -11.7)}, {}),
+    "principal point outside": ({}, {"shift": (-40.0, 5.0)}, {}),
+    "inside": ({"count": 90}, {"distance": 0.15, "fov": 70.0}, {"depth": True}),
+    "near plane": ({}, {}, {"near": 2.9}),
+    "wide": ({}, {"distance": 1.2, "fov": 120.0}, {}),
+    "one pixel": ({"count": 30}, {"width": 1, "height": 1, "fov": 5.0}, {}),
+    "many small": ({"count": 700, "radius": 0.04, "neurons": 2}, {}, {}),
+    "opaque": ({"count": 250, "radius": 0.35, "neurons": 2}, {}, {}),
+    "cuts off": ({}, {}, {"alpha_min": 0.0, "transmittance_min": 0.0}),
+    "low ceiling": ({}, {}, {"alpha_max": 0.2}),
+    "two rays a side": ({}, {"width": 24, "height": 17}, {"samples": 2}),
+    "30 rad over a chord": ({"colour_frequency": 15.0}, {}, {}),
+    "100 rad over a chord": ({"colour_frequency": 50.0}, {}, {}),
+    "1000 rad over a chord": ({"colour_frequency": 500.0}, {}, {}),
+    "1000 rad, inside": ({"colour_frequency": 500.0, "count": 90}, {"distance": 0.15, "fov": 70.0}, {}),
+    "far 1e3": ({"radius": 0.01, "spread": 0.05}, {"distance": 10.0, "fov": 0.6}, {}),
+    "far 1e5": ({"radius": 0.01, "spread": 0.05}, {"distance": 1000.0, "fov": 0.006}, {}),
+    "far 1e5, 100 rad": (
+        {"radius": 0.01, "spread": 0.05, "colour_frequency": 50.0},
+        {"distance": 1000.0, "fov": 0.006},
+        {},
+    ),
+    "needles": ({"axes": (1.0, 0.02, 0.03), "radius": 0.5}, {}, {}),
+    "discs": ({"axes": (1.0, 0.9, 0.01)}, {}, {}),
+    "needles, inside": (
+        {"axes": (1.0, 0.02, 0.03), "radius": 0.5},
+        {"distance": 0.5, "fov": 60.0},
+        {"depth_floor": 1e-3},
+    ),
+    "thin discs, far": (
+        {"seed": 10, "axes": (1.0, 0.8, 1e-3), "radius": 0.01, "spread": 0.05, "denser": 50.0},
+        {"distance": 100.0, "fov": 0.06},
+        {},
+    ),
+}
+"""The same for colour networks. ``spread``, ``axes`` and ``denser`` change the model, see :func:`make_case`."""
+
+
+def make_case(name: str, edge: int = 0, sort: str = "center") -> Case:
+    """Build a case by name, e.g. ``"inside"`` or ``"network: inside"``."""
+    kind, _, rest = name.partition(": ")
+    if kind == "network":
+        model, view, knobs = NETWORK[rest]
+        model = {"seed": 7, "hidden": 8, **model}
+        size, settings = {"width": 40, "height": 29}, RenderSettings()
+    else:
+        model, view, knobs = CONSTANT[name]
+        model = {"seed": 7, **model}
+        size, settings = {"width": 48, "height": 35}, DEFAULT
+    spread, axes, denser = model.pop("spread", 1.0), model.pop("axes", None), model.pop("denser", 1.0)
+    t = scenes.tensors(**model)
+    t["means"] *= 0.1 if name == "one primitive" else spread
+    t["b2"] = t["b2"] * denser + (0.2 if name == "opaque" else 0.0)
+    if name == "K=16 C=1":
+        t["w2"] *= 0.5  # optical depths like the other cases': denser chords graze where float32 has few digits left
+    if edge and kind != "network":
+        t["w2"], t["b2"] = t["w2"] * 1.5, t["b2"] * 1.5  # about as opaque as with a hard edge
+    if axes:
+        t["log_scales"] = t["log_scales"].amax(1, keepdim=True) + torch.tensor(axes).log()
+    return Case(t, scenes.camera(**{**size, **view}), replace(settings, sort=sort, **knobs), edge)
 
 
 def case(name: str) -> tuple[dict[str, Tensor], Camera, RenderSettings]:
-    model, view, knobs = CASES[name]
-    t = scenes.tensors(**{"seed": 7, **model})
-    if name == "one primitive":
-        t["means"] *= 0.1
-    if name == "opaque":
-        t["b2"] += 0.2
-    if name == "K=16 C=1":
-        t["w2"] *= (
-            # optical depths like the other cases': denser ones graze with D ~ 1e-6, where float32 has few digits left
-            0.5
-        )
-    return t, scenes.camera(**{"width": 48, "height": 35, **view}), replace(DEFAULT, **knobs)
+    """Tensors, camera and settings of a case with a hard edge, in the order of centres."""
+    made = make_case(name)
+    return made.tensors, made.camera, made.settings
 
 
 # ---------------------------------------------------------------- spheres

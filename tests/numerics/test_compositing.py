@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.errors import ConfigError
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.backends import REFERENCE
 from tests import scenes
@@ -155,21 +154,3 @@ def test_negative_integrals_are_empty_space(backend: str) -> None:
     t["b2"] = -t["b2"].abs()
     out = render_lowered(scenes.lowered(t), scenes.camera(16, 16), RenderSettings(**by(backend), alpha_min=0.0))
     assert out.alpha.abs().max() == 0
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("alpha_max", 1.0),
-        ("alpha_max", 0.0),
-        ("alpha_min", -0.1),
-        ("transmittance_min", 1.0),
-        ("near", 0.0),
-        ("depth_floor", 0.0),
-        ("threads", -1),
-        ("backend", ""),
-    ],
-)
-def test_settings_out_of_range_are_named(name: str, value: object) -> None:
-    with pytest.raises(ConfigError, match=rf"renderer\.{name}=.*expected"):
-        RenderSettings(**{name: value})  # type: ignore[arg-type]

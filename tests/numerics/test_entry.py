@@ -12,13 +12,12 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.errors import ConfigError
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.core.render.backends import REFERENCE
 from tests import scenes
 from tests.backends import BACKENDS, FAST, by
-from tests.numerics.cases import CASES, along_z, case, needle_and_sphere, spheres
-from tests.numerics.compare import assert_same_frame, draw, entries
+from tests.numerics.cases import along_z, needle_and_sphere, spheres
+from tests.numerics.equivalence import entries
 
 ENTRY = RenderSettings(sort="entry", depth=True)
 
@@ -30,58 +29,6 @@ def render(t: dict[str, Tensor], camera: Camera, settings: RenderSettings, backe
 
 
 # ---------------------------------------------------------------- fast against reference
-
-
-@pytest.mark.parametrize("backend", FAST)
-@pytest.mark.parametrize("name", CASES)
-def test_equals_reference(name: str, backend: str) -> None:
-    t, camera, settings = case(name)
-    fast, slow = assert_same_frame(t, camera, replace(settings, sort="entry"), backend=backend)
-    assert slow.output.alpha.max() > 0.1, "the view must show something"
-    seen, other = slow.tally, fast.tally
-    # the sums run over all pixels, undecided ones too: a pair on the other side of a cut, or a pair of near ties
-    assert (other.weight - seen.weight).abs().max() <= 2e-5 * seen.weight.max() + 4 / 255
-    assert (other.error_weight - seen.error_weight).abs().max() <= 2e-5 * seen.error_weight.max() + 1e-4
-    assert torch.equal(other.weight > 0.05, seen.weight > 0.05)
-
-
-def test_the_cases_show_another_image_than_the_order_of_centres() -> None:
-    t, camera, settings = case("K=8 C=3")
-    for backend in BACKENDS:
-        images = [render(t, camera, settings, backend, sort=s).rgb for s in ("center", "entry")]
-        assert (images[0] - images[1]).abs().max() > 0.02
-
-
-@pytest.mark.parametrize("backend", FAST)
-def test_float64_pixels_are_sorted_too(backend: str) -> None:
-    """Needles and discs near the camera, which fast backends draw in float64."""
-    t = scenes.tensors(40, 4, seed=2, radius=0.3)
-    t["log_scales"][:, 0] -= 4.0
-    camera = scenes.camera(40, 30, distance=0.5, fov=60)
-    assert render(t, camera, ENTRY, backend).stats.extra["float64"] > 3
-    assert_same_frame(t, camera, replace(ENTRY, depth_floor=1e-3), backend=backend)
-
-
-def test_any_number_of_threads_gives_the_same_bits() -> None:
-    t, camera = scenes.tensors(1500, 5, seed=3, radius=0.06), scenes.camera(100, 70)
-    frames = [draw("cpu", t, camera, replace(ENTRY, threads=n)) for n in (1, 2, 3)]
-    for other in frames[1:]:
-        for image in ("rgb", "alpha", "depth"):
-            assert torch.equal(getattr(frames[0].output, image), getattr(other.output, image)), image
-        for name, grad in frames[0].grads.items():
-            assert torch.equal(grad, other.grads[name]), name
-        for sums in ("weight", "error_weight"):
-            assert torch.equal(getattr(frames[0].tally, sums), getattr(other.tally, sums)), sums
-    assert frames[0].output.alpha.max() > 0.5
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_nothing_to_draw(backend: str) -> None:
-    t = scenes.tensors(20)
-    t["means"] += 50.0
-    for model in (t, {k: v[:0] for k, v in t.items()}):
-        out = render(model, scenes.camera(20, 17), ENTRY, backend)
-        assert out.alpha.abs().max() == 0
 
 
 # ---------------------------------------------------------------- the order
@@ -209,8 +156,3 @@ def test_coincident_primitives_keep_their_index_order(sort: str) -> None:
     truth = render(t, camera, settings, REFERENCE, alpha_min=0.0).rgb
     for backend in FAST:
         assert (render(t, camera, settings, backend, alpha_min=0.0).rgb - truth).abs().max() < 1e-5, backend
-
-
-def test_settings_that_do_not_exist_are_named() -> None:
-    with pytest.raises(ConfigError, match=r"renderer\.sort=depth: expected center or entry"):
-        RenderSettings(sort="depth")  # type: ignore[arg-type]

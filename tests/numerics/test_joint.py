@@ -15,7 +15,7 @@ from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.unsorted_volume import measure_sorting_errors, render_unsorted_volume
 from tests import scenes
 from tests.numerics.cases import along_z, needle_and_sphere, spheres
-from tests.numerics.compare import entries
+from tests.numerics.equivalence import entries
 
 EXACT = RenderSettings(backend="reference", alpha_min=0.0, alpha_max=0.9999, transmittance_min=0.0, depth=True)
 SKY = torch.tensor([0.2, 0.4, 0.7], dtype=torch.float64)

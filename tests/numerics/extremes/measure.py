@@ -17,7 +17,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.render import RenderSettings, render_lowered
 from tests import scenes
 from tests.backends import by
-from tests.numerics.compare import undecided
+from tests.numerics.equivalence import undecided
 from tests.numerics.extremes.oracle import Integrals, long_colours, long_integrals
 
 __all__ = [

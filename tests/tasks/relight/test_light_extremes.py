@@ -25,7 +25,7 @@ from neuprim.tasks.relight.directions import unit
 from neuprim.tasks.relight.harmonics import LightHarmonics
 from tests import scenes
 from tests.core import tiny
-from tests.numerics.compare import row_errors, undecided, weights
+from tests.numerics.equivalence import row_errors, undecided, weights
 
 LOSSES = {"l1": l1, "compressed": compressed, "relative": relative}
 COUNT = 20

@@ -12,7 +12,7 @@ from neuprim.core.render import layout as L
 from tests import scenes
 from tests.core.render.cpu.frames import frame_of
 from tests.numerics.cases import along_z
-from tests.numerics.compare import assert_same_frame
+from tests.numerics.equivalence import assert_same_frame
 
 RADIUS = 0.4
 NEAR = 0.01  # of RenderSettings

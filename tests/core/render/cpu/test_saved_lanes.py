@@ -12,7 +12,7 @@ from neuprim.core.render.cpu import backend
 from neuprim.core.render.cpu.forward import SavedForBackward
 from neuprim.core.render.layout import TILE
 from tests import scenes
-from tests.numerics.compare import assert_same_frame, draw
+from tests.numerics.equivalence import assert_same_frame, draw
 
 SETTINGS = RenderSettings(backend="cpu", threads=1, alpha_max=0.98)  # 0.99 twice would be transmittance_min itself
 

@@ -18,7 +18,7 @@ from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.cpu.prepare import _is_too_faint, _visible_square
 from neuprim.core.render.limits import MIN_RIM, VISIBLE_SHARE, min_visible_depth
 from tests import scenes
-from tests.numerics.compare import assert_same_frame
+from tests.numerics.equivalence import assert_same_frame
 
 SETTINGS = RenderSettings(backend="cpu")
 ALPHA_MIN = SETTINGS.alpha_min

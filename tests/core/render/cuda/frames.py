@@ -16,7 +16,7 @@ from neuprim.core.render import RenderSettings
 from neuprim.core.render.cuda import passes
 from tests import scenes
 from tests.backends import by
-from tests.numerics.compare import draw
+from tests.numerics.equivalence import draw
 
 Launch = Callable[..., None]
 

@@ -18,7 +18,7 @@ from neuprim.core.render.cuda.frame import Frame
 from neuprim.core.render.cuda.passes import Composited
 from tests import scenes
 from tests.backends import by
-from tests.numerics.compare import assert_same_frame
+from tests.numerics.equivalence import assert_same_frame
 
 FRAMES: dict[str, tuple[int, int, int, dict[str, Any], dict[str, Any]]] = {
     "K=0": (0, 0, 3, {}, {"depth": True}),

@@ -1,9 +1,12 @@
-"""Two backends on the same frame, and how far apart they are."""
+"""The equivalence harness: :func:`same` draws one case with two backends and bounds the difference of their results.
+
+A case (``tests/numerics/cases.py``) fixes the forms of density and colour, the edge, the order and the view. Compared
+are images, gradients of a fixed random functional of them, and the contributions that population control counts.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +19,7 @@ from neuprim.core.render.output import Contributions
 from neuprim.core.render.reference.rays import pixel_directions
 from tests import scenes
 from tests.backends import by
+from tests.numerics.cases import Case
 
 
 @dataclass
@@ -151,6 +155,44 @@ def row_errors(found: Tensor, expected: Tensor) -> Tensor:
     return (a - b).norm(dim=1) / scale.clamp_min(1e-30)
 
 
+def same(
+    fast: str,
+    reference: str,
+    case: Case,
+    image_bound: float = 1e-5,
+    grad_bound: float = 1e-3,
+) -> tuple[Frame, Frame]:
+    """Draw a case with two backends and compare; return both frames.
+
+    Images differ by at most ``image_bound``, gradients by ``grad_bound`` of each row's norm. Left out are pixels on
+    which float32 and float64 may rightly decide differently (:func:`undecided`), under 5 % of the image.
+    """
+    with scenes.soft(case.edge):
+        return _same(fast, reference, case, image_bound, grad_bound)
+
+
+def _same(fast: str, reference: str, case: Case, image_bound: float, grad_bound: float) -> tuple[Frame, Frame]:
+    t, camera, settings = case.tensors, case.camera, case.settings
+    skip = undecided(t, camera, settings)
+    assert skip.float().mean() < 0.05, f"{int(skip.sum())} undecided pixels: too many for a comparison"
+    a, b = (draw(backend, t, camera, settings, skip) for backend in (fast, reference))
+    keep = ~skip
+    report: dict[str, float] = {}
+    report["rgb"] = (a.output.rgb.double() - b.output.rgb).abs().amax(-1)[keep].max().item()
+    report["alpha"] = (a.output.alpha.double() - b.output.alpha).abs()[keep].max().item()
+    if settings.depth:
+        assert a.output.depth is not None and b.output.depth is not None
+        distance = b.output.depth.abs().max().clamp_min(1e-30)  # the sum of w z is what is drawn
+        error = (a.output.depth.double() - b.output.depth).abs() * b.output.alpha / distance
+        report["depth"] = error[keep].max().item()
+    assert all(v <= image_bound for v in report.values()), report
+    found = {k: row_errors(a.grads[k], b.grads[k]).max().item() for k in t}
+    for k in ("background", "viewmat"):
+        found[k] = ((a.grads[k].double() - b.grads[k]).norm() / b.grads[k].norm().clamp_min(1e-12)).item()
+    assert all(v <= grad_bound for v in found.values()), found
+    return a, b
+
+
 def assert_same_frame(
     t: dict[str, Tensor],
     camera: Camera,
@@ -159,27 +201,25 @@ def assert_same_frame(
     grad_bound: float = 1e-3,
     backend: str = "cpu",
 ) -> tuple[Frame, Frame]:
-    """``backend`` within ``image_bound`` of the reference, gradients within ``grad_bound`` of each row's norm; returns
-    both."""
-    skip = undecided(t, camera, settings)
-    assert skip.float().mean() < 0.05, (
-        f"{int(skip.sum())} pixels are undecided: too many for the comparison to mean much"
-    )
-    fast, slow = (draw(b, t, camera, settings, skip) for b in (backend, REFERENCE))
-    keep = ~skip
-    report: dict[str, Any] = {}
-    report["rgb"] = (fast.output.rgb.double() - slow.output.rgb).abs().amax(-1)[keep].max().item()
-    report["alpha"] = (fast.output.alpha.double() - slow.output.alpha).abs()[keep].max().item()
-    if settings.depth:
-        assert fast.output.depth is not None and slow.output.depth is not None
-        distance = slow.output.depth.abs().max().clamp_min(1e-30)
-        error = (
-            (fast.output.depth.double() - slow.output.depth).abs() * slow.output.alpha / distance
-        )  # the sum of w z is what is drawn
-        report["depth"] = error[keep].max().item()
-    assert all(v <= image_bound for v in report.values()), report
-    found = {k: row_errors(fast.grads[k], slow.grads[k]).max().item() for k in t}
-    for k in ("background", "viewmat"):
-        found[k] = ((fast.grads[k].double() - slow.grads[k]).norm() / slow.grads[k].norm().clamp_min(1e-12)).item()
-    assert all(v <= grad_bound for v in found.values()), found
-    return fast, slow
+    """:func:`same` of given tensors, against the reference."""
+    return _same(backend, REFERENCE, Case(t, camera, settings), image_bound, grad_bound)
+
+
+def same_contributions(fast: Frame, slow: Frame, skipped: float) -> None:
+    """Compare the contributions of primitives, summed over all pixels; ``skipped`` bounds pairs at the cuts."""
+    a, b = fast.tally, slow.tally
+    assert (a.weight - b.weight).abs().max() <= 2e-5 * b.weight.max() + skipped
+    assert (a.error_weight - b.error_weight).abs().max() <= 2e-5 * b.error_weight.max() + 1e-4
+    assert torch.equal(a.weight > 0.05, b.weight > 0.05)
+    assert a.weight[b.weight == 0].abs().sum() <= skipped
+
+
+def assert_same_bits(first: Frame, second: Frame) -> None:
+    """Check that images, gradients and contributions are equal to the bit."""
+    for image in ("rgb", "alpha", "depth"):
+        a, b = getattr(first.output, image), getattr(second.output, image)
+        assert (a is None) == (b is None) and (a is None or torch.equal(a, b)), image
+    for name, grad in first.grads.items():
+        assert torch.equal(grad, second.grads[name]), name
+    for sums in ("weight", "error_weight"):
+        assert torch.equal(getattr(first.tally, sums), getattr(second.tally, sums)), sums

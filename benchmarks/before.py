@@ -23,7 +23,7 @@ from typing import Any
 
 from shared.tables import ROOT, Table
 
-from neuprim.core.compute.machine import cpu_name
+from neuprim.core.compute.threads import cpu_name
 
 RESULTS = Path(__file__).parent / "results" / "before.json"
 CHAIR = ("task=static", "scene=blender", "train.background=white")

@@ -35,8 +35,7 @@ from shared.tables import ROOT, between_markers, spread
 from shared.trials import Trial, run_all
 
 from neuprim.config import compose
-from neuprim.core.compute.machine import cpu_name
-from neuprim.core.compute.threads import core_count
+from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.data import Dataset
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.train.trainer import Trainer

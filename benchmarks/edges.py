@@ -21,7 +21,7 @@ from shared.scenes import lower, random_scene, view
 from shared.tables import PERFORMANCE, Table, between_markers
 from shared.timing import fastest
 
-from neuprim.core.compute.machine import cpu_name
+from neuprim.core.compute.threads import cpu_name
 from neuprim.core.model.edge import EDGES, NORMS
 from neuprim.core.model.fields import Cosine
 

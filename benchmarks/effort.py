@@ -28,7 +28,7 @@ from shared.trials import Trial, begin, paces_of, recorded, run_all
 
 from neuprim.config import compose
 from neuprim.config.task_files import LEVELS
-from neuprim.core.compute.machine import cpu_name
+from neuprim.core.compute.threads import cpu_name
 
 RESULTS = Path(__file__).parent / "results" / "effort"
 PICTURE = ROOT / "docs" / "pictures" / "effort.png"

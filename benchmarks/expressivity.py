@@ -36,7 +36,7 @@ from shared.forms import AS_RECORDED, PAPER, SCENES, Form
 from shared.tables import between_markers, spread
 from shared.trials import Trial, begin, paces_of, run_all
 
-from neuprim.core.compute.machine import cpu_name
+from neuprim.core.compute.threads import cpu_name
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "expressivity.json"

@@ -21,7 +21,7 @@ from typing import Any
 
 from shared.tables import ROOT, Table, between_markers
 
-from neuprim.core.compute.machine import cpu_name
+from neuprim.core.compute.threads import cpu_name
 from neuprim.core.io.files import write_json
 from neuprim.search.design.run import DesignRequest, design_run
 from neuprim.search.tradeoff.run import seconds_of

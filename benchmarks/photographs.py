@@ -23,7 +23,7 @@ from typing import Any
 from shared.tables import ROOT, Table, between_markers, spread
 from shared.trials import Trial, recorded, run_all
 
-from neuprim.core.compute.machine import cpu_name
+from neuprim.core.compute.threads import cpu_name
 
 RESULTS = Path(__file__).parent / "results" / "photographs.json"
 SCENES = {

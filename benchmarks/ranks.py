@@ -197,8 +197,7 @@ def main() -> None:
     if args.worker is not None:
         worker(args.scenes, args.rounds, args.seconds, args.worker)
         return
-    from neuprim.core.compute.machine import cpu_name
-    from neuprim.core.compute.threads import core_count
+    from neuprim.core.compute.threads import core_count, cpu_name
 
     record = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"scenes": {}}
     if "pace" in args.parts and not args.print:

@@ -32,8 +32,7 @@ from shared.tables import ROOT, between_markers, spread
 from shared.trials import paces_of
 
 from neuprim.config import compose
-from neuprim.core.compute.machine import cpu_name
-from neuprim.core.compute.threads import core_count
+from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.data import Dataset
 from neuprim.runs.fit import Fitted, compile_kernels, prepare_training, train_to_end
 from neuprim.tasks.relight.judging import baselines

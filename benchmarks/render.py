@@ -23,7 +23,7 @@ from shared.tables import PERFORMANCE, Table, between_markers
 from shared.timing import fastest
 
 from neuprim.core.cameras import Camera
-from neuprim.core.compute.machine import cpu_name
+from neuprim.core.compute.threads import cpu_name
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.model.schema import ParameterSpec

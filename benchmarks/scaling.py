@@ -24,8 +24,7 @@ import torch
 from shared.scenes import lower, random_scene, view
 from shared.tables import PERFORMANCE, Table, between_markers
 
-from neuprim.core.compute.machine import cpu_name
-from neuprim.core.compute.threads import core_count
+from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
 

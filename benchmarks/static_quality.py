@@ -22,7 +22,7 @@ from shared.forms import Form
 from shared.tables import ROOT, between_markers, spread
 from shared.trials import Trial, run_all
 
-from neuprim.core.compute.machine import cpu_name
+from neuprim.core.compute.threads import cpu_name
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "static_quality.json"

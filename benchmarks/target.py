@@ -35,7 +35,7 @@ from neuprim.config import compose, task_of
 from neuprim.config.target import Target
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
-from neuprim.core.compute.machine import cpu_name
+from neuprim.core.compute.threads import cpu_name
 from neuprim.core.io.files import write_json
 from neuprim.runs.events import Event, Note
 from neuprim.runs.open import load_dataset

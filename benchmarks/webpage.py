@@ -38,7 +38,7 @@ from torch import Tensor
 
 from neuprim.config import compose
 from neuprim.core.cameras import Camera, orbit
-from neuprim.core.compute.machine import cpu_name
+from neuprim.core.compute.threads import cpu_name
 from neuprim.core.conditions import read_conditions
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import write_json

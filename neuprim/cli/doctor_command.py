@@ -58,7 +58,7 @@ def print_report(console: Console | None = None) -> int:
 
 
 def _machine() -> Rows:
-    from neuprim.core.compute.machine import cpu_name
+    from neuprim.core.compute.threads import cpu_name
 
     return [
         ("neuprim", __version__),

@@ -37,9 +37,9 @@ def print_metrics(metrics: Mapping[str, Any]) -> None:
     for name, value in rows:
         print(f"{name:{width}}  {value}")
     if "worse_than_black_image" in metrics:
-        from neuprim.core.metrics.words import in_words  # torch, loaded when needed
+        from neuprim.core.metrics.image import format_metrics  # torch, loaded when needed
 
-        print(in_words(metrics))
+        print(format_metrics(metrics))
 
 
 def _rows(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:

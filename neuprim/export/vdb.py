@@ -33,7 +33,7 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.backends import computing_device
 from neuprim.core.task import API_VERSION
-from neuprim.core.volumes.errors import Comparison, blocks, frame_errors
+from neuprim.core.volumes.density_errors import Comparison, measure_frame_errors, split_planes
 from neuprim.core.volumes.grid import density_grid
 from neuprim.core.volumes.source import Extent, Placement, VolumeSource
 from neuprim.export.common import model_box
@@ -348,7 +348,7 @@ def _errors(
     settings = job.run.settings
     component = None if source.placement.exact else source.placement.component
     part: dict[str, str] = {} if component is None else {"component": component}
-    found = frame_errors(
+    found = measure_frame_errors(
         job.run.model, frame.conditions, source, frame.source, settings.threads, computing_device(settings), **part
     )
     place = source.points(frame.source)
@@ -360,7 +360,7 @@ def _errors(
     if grid.bounds is None:
         return result
     dense = grid.to_dense()
-    for matrix, shape in blocks(*place):
+    for matrix, shape in split_planes(*place):
         chain = np.linalg.inv(scene_from_world @ grid.transform) @ matrix.numpy()
         offset = chain[:3, 3] - np.array(grid.bounds[0])
         values = ndimage.affine_transform(dense, chain[:3, :3], offset, shape, order=1, mode="grid-constant") / factor

@@ -16,9 +16,9 @@ from neuprim.core.cameras.world import World
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import Grid, VdbFrame, read_grid, read_header, sequence, write_vdb
 from neuprim.core.model.fields import Conditions
+from neuprim.core.volumes.density_errors import DensityTruth, TruthFrame
 from neuprim.core.volumes.grid import voxels_within
 from neuprim.core.volumes.source import VolumeSource
-from neuprim.core.volumes.truth import DensityTruth, TruthFrame
 from neuprim.inspect.field import FieldFrame
 
 __all__ = ["SceneUnits", "open_truth", "pair", "write_volume"]

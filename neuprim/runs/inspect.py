@@ -18,9 +18,8 @@ from neuprim.core.io.animation import write_animation
 from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.fields import Conditions
 from neuprim.core.render.backends import computing_device
-from neuprim.core.volumes.errors import frame_errors
+from neuprim.core.volumes.density_errors import DensityTruth, measure_frame_errors
 from neuprim.core.volumes.grid import POINTS_LIMIT, density_grid, lattice
-from neuprim.core.volumes.truth import DensityTruth
 from neuprim.inspect.against import open_truth, pair, write_volume
 from neuprim.inspect.field import FieldFrame, ViewOptions
 from neuprim.inspect.frames import box_of, condition_frames, in_words, round_up
@@ -217,7 +216,7 @@ class _Film:
         if self.truth is None:
             return None
         conditions, number = self.pairs[index]
-        numbers = frame_errors(self.model, conditions, self.truth, number, where=self.device)
+        numbers = measure_frame_errors(self.model, conditions, self.truth, number, where=self.device)
         words = "nothing to compare with" if numbers is None else "  ".join(f"{k} {v:.4f}" for k, v in numbers.items())
         events(Note(f"{self.truth.frames[number].name}  {in_words(conditions)}  {words}"))
         return numbers

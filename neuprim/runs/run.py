@@ -7,7 +7,7 @@ from pathlib import Path
 
 from neuprim.config import RunConfig, suspects_of
 from neuprim.config.launcher import LauncherSettings
-from neuprim.core.metrics.words import in_words
+from neuprim.core.metrics.image import format_metrics
 from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.runs.chunks import train_in_chunks
 from neuprim.runs.evaluate import evaluate_fitted
@@ -57,7 +57,7 @@ def run(
             fitted, interrupted = train_in_directory(config, suspects, events, between=between, group=group)
         if first:
             events(Finishing("measuring held-out views"))
-            events(Note(in_words(evaluate_fitted(fitted, directory))))
+            events(Note(format_metrics(evaluate_fitted(fitted, directory))))
     if interrupted:
         raise KeyboardInterrupt
     return directory

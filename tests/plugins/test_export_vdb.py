@@ -14,7 +14,7 @@ import torch
 from neuprim.core.compute import device
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import Grid, read_grid
-from neuprim.core.volumes.errors import NUMBERS
+from neuprim.core.volumes.density_errors import NUMBERS
 from neuprim.core.volumes.grid import density_grid
 from neuprim.export import vdb as exporter
 from neuprim.runs.export import export_run

@@ -16,7 +16,7 @@ from neuprim.cli import main
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.extensions import Inspector
 from neuprim.core.io.vdb import read_grid
-from neuprim.core.volumes.errors import NUMBERS
+from neuprim.core.volumes.density_errors import NUMBERS
 from neuprim.core.volumes.grid import density_at, density_grid, lattice
 from neuprim.inspect import ViewOptions, headless, views
 from neuprim.inspect.field import FieldFrame

@@ -5,19 +5,40 @@ from __future__ import annotations
 
 import itertools
 import os
+import platform
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from pathlib import Path
 from typing import Any
 
-__all__ = ["core_count", "limit_threads", "machine_cores", "parallel_for", "limit_process_threads", "resolve_threads"]
+__all__ = [
+    "core_count",
+    "cpu_name",
+    "limit_threads",
+    "machine_cores",
+    "parallel_for",
+    "limit_process_threads",
+    "resolve_threads",
+]
 
 _limit: ContextVar[int] = ContextVar("threads", default=0)
 _pools: dict[int, ThreadPoolExecutor] = {}
 _lock = threading.Lock()
 _share = 0
+
+
+def cpu_name() -> str:
+    """Return the CPU's name, as the system has it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass  # not Linux
+    return platform.processor() or platform.machine() or "unknown"
 
 
 def machine_cores() -> int:

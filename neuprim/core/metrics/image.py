@@ -27,6 +27,7 @@ from neuprim.core.errors import DataError, NonFiniteError
 __all__ = [
     "SSIM_SIGMA",
     "SSIM_WINDOW",
+    "format_metrics",
     "from_json",
     "matched",
     "means",
@@ -36,6 +37,8 @@ __all__ = [
     "ssim_3dgs",
     "to_json",
 ]
+
+_MAX_NAMED = 6  # views in one line; metrics.json names all
 
 SSIM_WINDOW = 11
 """Taps of the Gaussian window per axis (Wang et al. 2004)."""
@@ -179,3 +182,24 @@ def from_json(entries: Mapping[str, object], key: str) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
         return None
     return float(value)
+
+
+def format_metrics(metrics: Mapping[str, Any]) -> str:
+    """Summarise metrics.json in one line: mean, worst view, and views worse than an image of the background alone.
+
+    The mean is over the views that are not exact, as that of an empty frame without any error is infinite.
+    """
+    worst, bad = from_json(metrics, "psnr_worst"), metrics["worse_than_black_image"]
+    values = [value for entry in metrics["per_view"] if (value := from_json(entry, "psnr")) is not None]
+    wrong = [value for value in values if math.isfinite(value)]
+    exact = f", {len(values) - len(wrong)} exact" if len(wrong) < len(values) else ""
+    mean = sum(wrong) / len(wrong) if wrong else math.inf
+    text = f"PSNR of {len(values)} views{exact}: mean {mean:.2f} dB, worst {worst:.2f} dB ({metrics['view_worst']})"
+    if not bad:
+        return text
+    more = (
+        f" and {len(bad) - _MAX_NAMED} more, see worse_than_black_image in metrics.json"
+        if len(bad) > _MAX_NAMED
+        else ""
+    )
+    return f"{text}; worse than a black image: {len(bad)} of {len(values)} ({', '.join(bad[:_MAX_NAMED])}{more})"

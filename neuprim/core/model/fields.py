@@ -11,6 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from importlib import resources
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
@@ -52,6 +53,7 @@ __all__ = [
     "Shade",
     "Shading",
     "prunable_units_by_name",
+    "read_script",
 ]
 
 Conditions = Mapping[str, Tensor]
@@ -191,6 +193,11 @@ def prunable_units_by_name(density: DensityField, colour: ColourField) -> dict[s
         for piece in own.prunable_units():
             found[f"{kind}.{piece.name}"] = piece
     return found
+
+
+def read_script(package: str, name: str) -> str:
+    """Read a field's JavaScript beside its module, ``read_script(__package__, "density.js")``."""
+    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 class DensityField(Field):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuprim.core.errors import DataError
-from neuprim.core.volumes.truth import DensityTruth
+from neuprim.core.volumes.density_errors import DensityTruth
 
 __all__ = ["Extent", "Placement", "VolumeSource"]
 

@@ -12,8 +12,7 @@ import torch
 from neuprim.config import RunConfig, compose
 from neuprim.config.outputs import ROOT
 from neuprim.config.overrides import parse
-from neuprim.core.compute.machine import cpu_name
-from neuprim.core.compute.threads import core_count
+from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.runs.open import LOGS

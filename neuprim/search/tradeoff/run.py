@@ -17,8 +17,7 @@ import torch
 
 from neuprim.config.target import parse_duration
 from neuprim.core.compute import device
-from neuprim.core.compute.machine import cpu_name
-from neuprim.core.compute.threads import core_count
+from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.render import backends
 from neuprim.core.render.quadrature import compare_quadrature

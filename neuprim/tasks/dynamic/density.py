@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.model.canonical import canonicalize_cosines
+from neuprim.core.model.cosine_sums import canonicalize_cosines, prune_neurons
 from neuprim.core.model.densities.cosine import (
     OMEGA0,
     CosineDensity,
@@ -37,12 +37,10 @@ from neuprim.core.model.densities.cosine import (
     split_cosine,
     split_scale,
 )
-from neuprim.core.model.densities.fewer import prune_neurons
-from neuprim.core.model.fields import Conditions, Cosine, DensityField
+from neuprim.core.model.fields import Conditions, Cosine, DensityField, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
-from neuprim.core.model.scripts import read_script
 from neuprim.core.train.splitting import SPLIT_LONG, SPLIT_SHIFT
 from neuprim.tasks.dynamic.seams import checked_seams, shares
 from neuprim.tasks.dynamic.stilled import stilled

@@ -21,13 +21,11 @@ from torch import Tensor
 
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.compute import device
-from neuprim.core.model.canonical import canonicalize_cosines
-from neuprim.core.model.densities.fewer import smaller_neuron_counts
-from neuprim.core.model.fields import ColourField, Conditions, LoweredDensity, RayNet, Shading
+from neuprim.core.model.cosine_sums import canonicalize_cosines, smaller_neuron_counts
+from neuprim.core.model.fields import ColourField, Conditions, LoweredDensity, RayNet, Shading, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
-from neuprim.core.model.scripts import read_script
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.relight.directions import least_square, unit
 from neuprim.tasks.relight.fewer import fewer_units

@@ -6,7 +6,7 @@ mean is
 
     cos(phi) b(|beta W_x diag|) sinc(|beta W_d|) sinc(|beta W_l|)
 
-with b the mean over a ball (:func:`~neuprim.core.model.densities.fewer.ball_mean`), and the variance follows from cos^2
+with b the mean over a ball (:func:`~neuprim.core.model.cosine_sums.ball_mean`), and the variance follows from cos^2
 = (1 + cos 2(.))/2.
 """
 
@@ -15,7 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from neuprim.core.model.densities.fewer import ball_mean
+from neuprim.core.model.cosine_sums import ball_mean
 from neuprim.core.model.edge import sinc
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import Params

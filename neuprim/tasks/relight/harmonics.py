@@ -11,11 +11,10 @@ from torch import Tensor
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.compute import device
 from neuprim.core.model.colours.sh import coefficients, truncate_bands
-from neuprim.core.model.fields import ColourField, Conditions, Constant
+from neuprim.core.model.fields import ColourField, Conditions, Constant, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
-from neuprim.core.model.scripts import read_script
 from neuprim.tasks.relight.directions import least_square, unit
 
 __all__ = ["LightHarmonics", "real_harmonics"]

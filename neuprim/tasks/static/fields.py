@@ -9,11 +9,10 @@ from torch import Tensor
 
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.model.colours import sh
-from neuprim.core.model.fields import ColourField, Conditions, Constant
+from neuprim.core.model.fields import ColourField, Conditions, Constant, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
-from neuprim.core.model.scripts import read_script
 
 __all__ = ["SphericalHarmonics"]
 

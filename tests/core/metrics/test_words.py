@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from neuprim.core.metrics import to_json
-from neuprim.core.metrics.words import in_words
+from neuprim.core.metrics.image import format_metrics
 
 
 def metrics(values: list[float], bad: list[str]) -> dict[str, Any]:
@@ -21,14 +21,16 @@ def metrics(values: list[float], bad: list[str]) -> dict[str, Any]:
 
 
 def test_the_worst_view_and_those_worse_than_black_are_named() -> None:
-    found = in_words(metrics([40.0, 20.0, math.inf], ["v1"]))
+    found = format_metrics(metrics([40.0, 20.0, math.inf], ["v1"]))
     assert found == (
         "PSNR of 3 views, 1 exact: mean 30.00 dB, worst 20.00 dB (v1); worse than a black image: 1 of 3 (v1)"
     )
-    assert in_words(metrics([40.0], [])) == "PSNR of 1 views: mean 40.00 dB, worst 40.00 dB (v0)"
-    many = in_words(metrics([1.0] * 9, [f"v{i}" for i in range(9)]))
+    assert format_metrics(metrics([40.0], [])) == "PSNR of 1 views: mean 40.00 dB, worst 40.00 dB (v0)"
+    many = format_metrics(metrics([1.0] * 9, [f"v{i}" for i in range(9)]))
     assert many.endswith("(v0, v1, v2, v3, v4, v5 and 3 more, see worse_than_black_image in metrics.json)")
 
 
 def test_empty_frames_without_error() -> None:
-    assert in_words(metrics([math.inf, math.inf], [])).startswith("PSNR of 2 views, 2 exact: mean inf dB, worst inf dB")
+    assert format_metrics(metrics([math.inf, math.inf], [])).startswith(
+        "PSNR of 2 views, 2 exact: mean inf dB, worst inf dB"
+    )

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from neuprim.core.model.canonical import canonicalize_cosines, canonicalize_gain
+from neuprim.core.model.cosine_sums import canonicalize_cosines, canonicalize_gain
 from neuprim.core.model.fields import Constant
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.model.colours import sh
+from neuprim.core.model.cosine_sums import prune_neurons, smaller_neuron_counts
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, cosine_density
-from neuprim.core.model.densities.fewer import prune_neurons, smaller_neuron_counts
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Field
 from neuprim.core.model.geometry import Geometry

@@ -12,9 +12,15 @@ from torch import Tensor
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes import errors
-from neuprim.core.volumes.errors import NUMBERS, Comparison, blocks, frame_errors
+from neuprim.core.volumes.density_errors import (
+    NUMBERS,
+    Comparison,
+    DensityTruth,
+    TruthFrame,
+    measure_frame_errors,
+    split_planes,
+)
 from neuprim.core.volumes.grid import agreement, density_grid, voxels_within
-from neuprim.core.volumes.truth import DensityTruth, TruthFrame
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
 
@@ -55,7 +61,7 @@ def ball() -> np.ndarray:
 def test_numbers_are_those_of_the_whole_grids(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
     monkeypatch.setattr(errors, "_BLOCK", block)
     truth, m = Known(ball()), model()
-    found = frame_errors(m, {}, truth, 0)
+    found = measure_frame_errors(m, {}, truth, 0)
     assert found is not None and tuple(found) == NUMBERS
     sigma = density_grid(m, {}, truth.matrix, SHAPE).numpy().astype(float)
     wrong, both = sigma - truth.values, agreement(truth.values, sigma)
@@ -88,15 +94,15 @@ def _numbers(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
 
 
 def test_nothing_to_compare_with() -> None:
-    assert frame_errors(model(), {}, Known(ball()), 1) is None
-    assert frame_errors(model(), {}, Known(np.zeros(SHAPE, np.float32)), 0) is None
+    assert measure_frame_errors(model(), {}, Known(ball()), 1) is None
+    assert measure_frame_errors(model(), {}, Known(np.zeros(SHAPE, np.float32)), 0) is None
     assert _numbers(ball(), np.zeros(SHAPE))["correlation"] == 0
 
 
 def test_blocks_are_the_points_in_their_order() -> None:
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = torch.tensor([[0.1, 0.02, 0], [0, 0.2, 0], [0.05, 0, 0.1]])
-    parts: list[Any] = blocks(matrix, (5000, 60, 50))
+    parts: list[Any] = split_planes(matrix, (5000, 60, 50))
     assert (
         sum(shape[0] for _, shape in parts) == 5000
         and len(parts) > 2

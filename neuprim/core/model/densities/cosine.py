@@ -15,15 +15,13 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from neuprim.core.model.canonical import canonicalize_cosines, canonicalize_gain
-from neuprim.core.model.densities.fewer import prune_neurons, smaller_neuron_counts
+from neuprim.core.model.cosine_sums import canonicalize_cosines, canonicalize_gain, prune_neurons, smaller_neuron_counts
 from neuprim.core.model.edge import EDGES, NORMS, fade
-from neuprim.core.model.fields import Conditions, Cosine, DensityField
+from neuprim.core.model.fields import Conditions, Cosine, DensityField, read_script
 from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
-from neuprim.core.model.scripts import read_script
 from neuprim.core.model.tensors import number_fault
 from neuprim.core.validation import Range
 

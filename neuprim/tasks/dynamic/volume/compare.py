@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.volumes.errors import NUMBERS, frame_errors
+from neuprim.core.volumes.density_errors import NUMBERS, measure_frame_errors
 from neuprim.tasks.dynamic.volume.truth import VolumeTruth
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ THIRDS = ("early", "middle", "late")
 def compare_with_truth(model: Primitives, capture: Capture, times: list[float], per_third: int = 3) -> dict[str, Any]:
     """Errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
 
-    ``sigma_frames`` has every compared frame, see :meth:`~neuprim.core.volumes.errors.Comparison.numbers`; the thirds
+    ``sigma_frames`` has every compared frame, see :meth:`~neuprim.core.volumes.density_errors.Comparison.numbers`; the thirds
     are means over
     ``per_third`` of them, evenly spaced. Frames without any extinction are left out. Where flames add to the extinction
     of a grid, the same numbers are there of that grid's part, against its own values: ``density_frames``, ...
@@ -40,7 +40,7 @@ def _compared(
     chosen = sorted({int((i + 0.5) * count / (3 * per_third)) for i in range(3 * per_third)})
     entries: list[dict[str, Any]] = []
     for t in chosen:
-        numbers = frame_errors(
+        numbers = measure_frame_errors(
             model, {"time": torch.tensor(times[t])}, truth, t, where=capture.device, component=component
         )
         if numbers is not None:

@@ -13,8 +13,8 @@ from torch import Tensor
 from neuprim.core.compute import device
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import VdbFrame, sequence
+from neuprim.core.volumes.density_errors import DensityTruth, TruthFrame
 from neuprim.core.volumes.grid import voxels_within
-from neuprim.core.volumes.truth import DensityTruth, TruthFrame
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.medium import Medium
 

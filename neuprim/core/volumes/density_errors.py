@@ -1,13 +1,14 @@
-"""How far a model's extinction is from that of a frame, on all the points that the truth names: of files, their own
-voxels.
+"""Errors of a model's extinction against the extinction that a data set was made from.
 
-Both are asked for in blocks of planes, so that beside the truth's own memory a comparison takes a few tens of MB,
-however large the grid.
+Points are compared in blocks of planes, so a comparison needs a few tens of MB besides the ground truth itself.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,18 +18,59 @@ from neuprim.core.compute import device
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.grid import density_grid
-from neuprim.core.volumes.truth import DensityTruth
 
-__all__ = ["NUMBERS", "Comparison", "blocks", "frame_errors"]
+__all__ = ["NUMBERS", "Comparison", "DensityTruth", "TruthFrame", "measure_frame_errors", "split_planes"]
 
 NUMBERS = ("correlation", "relative_l2", "psnr_active", "max_error")
-"""What :func:`frame_errors` gives."""
+"""What :func:`measure_frame_errors` gives."""
 
 _BLOCK = 1 << 22
 """Points at a time, 16 MiB of each grid."""
 
 _NO_ERROR = 1e-20
 """An error below this share of the peak, squared, counts as this: 200 dB, as no number may be infinite."""
+
+
+@dataclass(frozen=True)
+class TruthFrame:
+    """One frame of the ground truth.
+
+    Attributes:
+        name: to show, such as that of a file.
+        conditions: that give the same frame of a model; empty if unknown.
+    """
+
+    name: str
+    conditions: Conditions
+
+
+class DensityTruth(ABC):
+    """The extinction sigma that a data set was made from, on any regular grid, 1/scene unit.
+
+    Attributes:
+        frames: in order, one or more.
+        bounds: (2, 3) float64 box around all of it, scene units.
+    """
+
+    frames: Sequence[TruthFrame]
+    bounds: Tensor
+
+    @abstractmethod
+    def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
+        """(4, 4) float64 scene_from_index and shape of the regular grid on which models are compared with a frame: of
+        files, all their own voxels in the box. None where the frame holds nothing.
+        """
+
+    @abstractmethod
+    def grid(
+        self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
+    ) -> Tensor:
+        """(X, Y, Z) float32 extinction of a frame at the points ``scene_from_index @ (i, j, k, 1)``, float64 (4, 4).
+
+        Args:
+            component: the part alone that comes from the source grid of this name
+            (:meth:`~neuprim.core.model.fields.DensityField.components`).
+        """
 
 
 class Comparison:
@@ -74,7 +116,7 @@ class Comparison:
         }
 
 
-def frame_errors(
+def measure_frame_errors(
     model: Primitives,
     conditions: Conditions,
     truth: DensityTruth,
@@ -96,13 +138,13 @@ def frame_errors(
     model = model if component is None else model.component(component)
     part = {} if component is None else {"component": component}
     found = Comparison()
-    for matrix, shape in blocks(*place):
+    for matrix, shape in split_planes(*place):
         sigma = truth.grid(frame, matrix, shape, **part).numpy()
         found.add(sigma, density_grid(model, conditions, matrix, shape, threads, where).numpy())
     return found.numbers()
 
 
-def blocks(scene_from_index: Tensor, shape: tuple[int, int, int]) -> list[tuple[Tensor, tuple[int, int, int]]]:
+def split_planes(scene_from_index: Tensor, shape: tuple[int, int, int]) -> list[tuple[Tensor, tuple[int, int, int]]]:
     """The same points in parts of whole planes."""
     planes = max(1, _BLOCK // max(1, shape[1] * shape[2]))
     made = []

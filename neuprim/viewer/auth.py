@@ -27,8 +27,9 @@ _HOST = re.compile(r"[A-Za-z0-9.\-]+(:\d+)?|\[[0-9A-Fa-f:.]+\](:\d+)?")
 
 # viser's client is one inline script, and its WebAssembly needs 'unsafe-eval'.
 _POLICY = (
-    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
-    "connect-src 'self' ws://{host} data: blob:; worker-src 'self' blob:; frame-ancestors 'none'; form-action 'none'; base-uri 'none'"
+    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
+    "style-src 'self' 'unsafe-inline'; connect-src 'self' ws://{host} data: blob:; worker-src 'self' blob:; "
+    "frame-ancestors 'none'; form-action 'none'; base-uri 'none'"
 )
 
 

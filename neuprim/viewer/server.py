@@ -99,7 +99,7 @@ class PageServer:
         disconnect: Callable[[Any], None],
         refuse: Callable[[int, str], None],
     ) -> None:
-        """Set callbacks for pages opened and closed (``viser.ClientHandle``) and refused messages (client id, reason)."""
+        """Set callbacks for opened and closed pages (``viser.ClientHandle``) and refused messages (id, reason)."""
         self._on_refusal = refuse
         self.viser.on_client_connect(connect)
         self.viser.on_client_disconnect(disconnect)
@@ -135,5 +135,6 @@ def _free_port(host: str, port: int) -> int:
             return int(probe.getsockname()[1])
     except OSError as error:
         raise ConfigError(
-            f"viewer at {host}, port {port}: {error.strerror or error}; expected an address of this machine and a free port"
+            f"viewer at {host}, port {port}: {error.strerror or error}; "
+            "expected an address of this machine and a free port"
         ) from error

@@ -93,7 +93,8 @@ def draw_viewpoint(
     width, height = view.camera.width, view.camera.height
     if width * height * settings.samples**2 > _MAX_RAYS:
         raise ConfigError(
-            f"{width} x {height} pixels with renderer.samples={settings.samples} take more than {_MAX_RAYS:,} rays; lower either"
+            f"{width} x {height} pixels with renderer.samples={settings.samples} take more than {_MAX_RAYS:,} rays; "
+            "lower either"
         )
     with torch.no_grad():
         output = render(model, view.camera, view.conditions, settings, background)

@@ -1,4 +1,4 @@
-"""Every backend draws what the float64 reference draws: form x edge x order x view, with gradients and contributions."""
+"""Every backend draws what the float64 reference draws: form x edge x order x view, with all gradients."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Access to a viewer: only its own page with its token gets in, and only messages that such a page sends are handled."""
+"""Access to a viewer: only its own page with its token, and only messages that such a page sends."""
 
 from __future__ import annotations
 

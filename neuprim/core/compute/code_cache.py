@@ -34,7 +34,8 @@ def code_cache(folder: Path) -> Path:
     if not why:
         return folder
     warn_once(
-        f"{folder}: {why}; compiled code is not taken from there, and this process compiles its own. Expected a folder of yours alone"
+        f"{folder}: {why}; compiled code is not taken from there, and this process compiles its own. "
+        "Expected a folder of yours alone"
     )
     return _private()
 

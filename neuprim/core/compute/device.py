@@ -1,7 +1,6 @@
-"""Where tensors are: the processor's memory or a card's, and what follows from it.
+"""Devices of tensors, the CPU and a CUDA device, and which kernels may read them.
 
-Everything else lets tensors' own ``device`` flow. Operations that are compiled for the processor ask :func:`on_numba`
-whether they may take what they are given; where they may not, a twin in torch code computes the same.
+Operations with a CPU kernel ask :func:`on_numba` first; other tensors take an equivalent path in torch.
 """
 
 from __future__ import annotations
@@ -13,8 +12,19 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "CUDA", "HOST", "DEVICE_TYPES", "CPU", "to_like", "cuda_unavailable", "has_warp", "copy_from_host", "on_numba", "on_warp", "current_device", "free_cuda_memory",
-]  # fmt: skip
+    "CPU",
+    "CUDA",
+    "DEVICE_TYPES",
+    "HOST",
+    "copy_from_host",
+    "cuda_unavailable",
+    "current_device",
+    "free_cuda_memory",
+    "has_warp",
+    "on_numba",
+    "on_warp",
+    "to_like",
+]
 
 CPU, CUDA = "cpu", "cuda"
 DEVICE_TYPES: tuple[str, ...] = (CPU, CUDA)
@@ -24,7 +34,7 @@ HOST = torch.device(CPU)
 
 
 def on_numba(*tensors: Tensor) -> bool:
-    """Whether operations that are compiled for the processor may read these tensors."""
+    """Whether compiled CPU kernels may read these tensors."""
     return all(tensor.is_cpu for tensor in tensors)
 
 
@@ -34,18 +44,18 @@ def _warp() -> bool:
 
 
 def on_warp(*tensors: Tensor) -> bool:
-    """Whether operations that are compiled for a card may read these tensors."""
+    """Whether Warp kernels may read these tensors."""
     return all(tensor.is_cuda for tensor in tensors) and _warp()
 
 
 def has_warp(where: torch.device) -> bool:
-    """Whether operations that are compiled for a card run there; elsewhere the processor's do it."""
+    """Whether Warp kernels run on this device."""
     return where.type == "cuda" and _warp()
 
 
 @functools.cache
 def cuda_unavailable() -> str | None:
-    """Why torch finds no card on this machine; None if it finds one."""
+    """Return why torch finds no CUDA device; None if it finds one."""
     if torch.cuda.is_available():
         return None
     return "torch finds no CUDA device" if torch.backends.cuda.is_built() else "this torch was built without CUDA"
@@ -73,5 +83,5 @@ def to_like(tensor: Tensor, like: Tensor) -> Tensor:
 
 
 def free_cuda_memory(device: torch.device) -> int:
-    """Bytes of a card's memory that nothing uses."""
+    """Return the free bytes of a CUDA device's memory."""
     return int(torch.cuda.mem_get_info(device)[0])

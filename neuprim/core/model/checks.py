@@ -112,7 +112,8 @@ def check_channels(found: int, colour: ColourField) -> None:
     set's."""
     if found != colour.channels:
         raise FormError(
-            f"{method(colour, 'lower')} returned a colour of C={found}; expected {colour.channels}, as its member channels says"
+            f"{method(colour, 'lower')} returned a colour of C={found}; "
+            f"expected {colour.channels}, as its member channels says"
         )
 
 
@@ -161,7 +162,8 @@ def check_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
         if value.shape == shape:
             return value
         raise FormError(
-            f"{who} returned shape {tuple(value.shape)}; expected {shape}, a row for each of the {shape[0]} that it was given"
+            f"{who} returned shape {tuple(value.shape)}; "
+            f"expected {shape}, a row for each of the {shape[0]} that it was given"
         )
     found = (
         f"{value.dtype} {value.layout} on {value.device}"

@@ -129,10 +129,10 @@ class Field(ABC):
         return cls().parameters()
 
     def set_progress(self, progress: float) -> None:  # noqa: B027 - a hook most fields do not need
-        """Called before every training step with the used fraction of the budget, 0..1; e.g. to unlock SH bands."""
+        """Receive the used fraction of the budget, 0..1, before every training step; e.g. to unlock SH bands."""
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Rows for children created inside their parents.
+        """Compute rows of children created inside their parents.
 
         Args:
             params: this field's tensors, one row per child, gathered from the parents.
@@ -145,13 +145,12 @@ class Field(ABC):
         return dict(params)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        """Settings of which a fitted model can do with less, and the smaller values, the largest first: ``{"degree":
-        (2, 1, 0)}``."""
+        """Return settings that a fitted model can reduce, with the smaller values in descending order, e.g.
+        ``{"degree": (2, 1, 0)}``."""
         return {}
 
     def reduce(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[Self, dict[str, Tensor]]:
-        """A field with less of one of :meth:`reductions`, and its tensors: what is closest to this one's without
-        training again.
+        """Reduce one of :meth:`reductions`: the field and tensors closest to this one's without more training.
 
         Args:
             params, geometry: of all primitives.
@@ -166,15 +165,14 @@ class Field(ABC):
         )
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """What single primitives can do without, each a set of numbers that mean nothing once they are zero; no number
-        is in two of them."""
+        """List disjoint sets of numbers that single primitives can do without."""
         return ()
 
     def canonicalize(self, params: Params) -> dict[str, Tensor]:
-        """The same field in numbers that lie as close together as they can, for files where each has few bits.
+        """Return equivalent tensors whose numbers lie close together, for quantised files.
 
-        Where several sets of numbers mean the same field, as with the sign of a cosine's argument, one of them. Images
-        may change by rounding alone; folding what is folded changes no bit.
+        Where several tensors describe the same field, as with the sign of a cosine's argument, choose one of them.
+        Images may change by rounding only; a second call changes no bit.
         """
         return dict(params)
 
@@ -187,7 +185,7 @@ class Field(ABC):
 
 
 def prunable_units_by_name(density: DensityField, colour: ColourField) -> dict[str, PrunableUnit]:
-    """The pieces of both fields, as ``density.neuron 0`` and ``colour.coefficient 1 +0, channel 2``."""
+    """Return the units of both fields by name, e.g. ``density.neuron 0`` or ``colour.coefficient 1 +0, channel 2``."""
     found = {}
     for kind, own in (("density", density), ("colour", colour)):
         for piece in own.prunable_units():
@@ -216,15 +214,14 @@ class DensityField(Field):
 
     @abstractmethod
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
-        """World density sigma (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3) inside
-        them."""
+        """Return sigma (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3) inside them."""
 
     @abstractmethod
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         """Rows whose density is ``factor`` (rows,) times as large everywhere (a clone in place halves both copies)."""
 
     def components(self, params: Params) -> dict[str, Tensor]:
-        """Name -> (N,) share, 0..1, of each primitive's extinction that comes from the source grid of that name.
+        """Return name -> (N,) share, 0..1, of each primitive's extinction that comes from the source grid of that name.
 
         Only fields fitted to data in which several grids make the extinction have any
         (:attr:`neuprim.core.data.PointSamples.components`).
@@ -233,19 +230,18 @@ class DensityField(Field):
         return {}
 
     def largest(self, params: Params, geometry: Geometry) -> Tensor | None:
-        """(N,) upper bound of each primitive's sigma, 1/scene unit, at any point and under any conditions; None where
-        none is known."""
+        """Return (N,) upper bounds of sigma over all points and conditions, 1/scene unit; None if unknown."""
         return None
 
     def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
-        """(M,) int64 ascending rows that can absorb anything under these conditions; None for all of them.
+        """Return (M,) ascending int64 rows of active primitives, which can absorb anything under these conditions.
 
-        The others are left out before anything else is computed, so they cost nothing in such a frame.
+        Inactive primitives are left out before anything else is computed. None: all are active.
         """
         return None
 
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
-        """Where the ellipsoids are under these conditions; differentiable."""
+        """Return the ellipsoids under these conditions; differentiable."""
         return geometry
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
@@ -256,7 +252,7 @@ class DensityField(Field):
         return torch.full_like(alphas, math.sqrt(5.0)), alphas
 
     def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
-        """A split along a condition instead of in space, for densities that live for a part of its range.
+        """Split along a condition instead of in space, for densities that are active in a part of its range.
 
         Args:
             params: this field's tensors, one row per parent (P rows).

@@ -43,7 +43,7 @@ __all__ = ["ActiveSet", "Lowered", "Primitives"]
 
 @dataclass(frozen=True)
 class Lowered:
-    """What one frame hands to the renderer, whatever the task.
+    """The input of the renderer for one frame, whatever the task.
 
     ``rows`` (M,) int64 says which primitives these are where a field left some out; None for all. ``shade``, if any, is
     a factor on each pixel (see :meth:`~neuprim.core.model.fields.ColourField.shade`). ``fields`` are the class names of
@@ -58,7 +58,7 @@ class Lowered:
     fields: tuple[str, str] | None = None
 
     def check(self, viewmat: Any = None, background: Any = None) -> None:
-        """Everything that a renderer takes, at its entrance.
+        """Check everything that a renderer takes.
 
         Raises:
             FormError: something does not fit; names field (where the model knows it), form, tensor, found and expected.
@@ -72,7 +72,7 @@ class Lowered:
         self.check_frame(viewmat, background)
 
     def check_frame(self, viewmat: Any, background: Any) -> None:
-        """What :meth:`Primitives.lower`, which has looked at the rest, has not seen.
+        """Check what :meth:`Primitives.lower` has not checked.
 
         Raises:
             FormError: as of :meth:`check`.
@@ -145,7 +145,7 @@ class Lowered:
 
 @dataclass(frozen=True)
 class ActiveSet:
-    """The M primitives that can absorb anything under some conditions.
+    """The M active primitives, which can absorb anything under some conditions.
 
     Attributes:
         rows: (M,) int64 ascending rows of the model; None where all are.
@@ -163,7 +163,7 @@ class ActiveSet:
     geometry: Geometry
 
     def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
-        """World density (P,), 1/scene unit, unclamped, of the active primitives ``prim`` (P,), 0..M-1, at points ``x``
+        """World density (P,), 1/scene unit, unclamped, of active primitives ``prim`` (P,), 0..M-1, at points ``x``
         (P, 3)."""
         found = self.field.density(self.own, self.stored, prim, x, self.conditions)
         return check_result(found, (len(prim),), method(self.field, "density"))
@@ -259,7 +259,7 @@ class Primitives:
         return Lowered(geometry, density, colour, active.rows, shading.pixels, names)
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
-        """Where the primitives that live in a frame are, and their density; no camera needed."""
+        """Return geometry and density of the primitives active in a frame."""
         active = self.active(conditions)
         density = self._lower_density(active, conditions)
         check_density(density, check_geometry(active.geometry, "geometry"), type(self.density).__name__)
@@ -295,8 +295,7 @@ class Primitives:
                 own[name].copy_(value)
 
     def active(self, conditions: Conditions, dtype: torch.dtype | None = None) -> ActiveSet:
-        """Which primitives live in a frame, and where; differentiable. With ``dtype``, everything is detached and of
-        that type."""
+        """Return the primitives active in a frame; differentiable. With ``dtype``, detached and of that type."""
         rows = self.density.active_rows(self.of(self.density), conditions)
         if rows is not None:
             check_rows(rows, self.count, f"{method(self.density, 'active_rows')} returned")
@@ -317,8 +316,7 @@ class Primitives:
         return ActiveSet(self.density, conditions, rows, params, own, stored, moved)
 
     def active_geometry(self, conditions: Conditions) -> tuple[Tensor | None, Geometry]:
-        """Rows of the primitives that live in a frame, None for all, and where they are; without gradient, and copying
-        what places them alone."""
+        """Return rows and geometry of the primitives active in a frame, None for all rows; without gradients."""
         own = {name: value.detach() for name, value in self.of(self.density).items()}
         rows = self.density.active_rows(own, conditions)
         geometry = Geometry(*(self.params[name].detach() for name in ("means", "log_scales", "quats")))
@@ -330,7 +328,7 @@ class Primitives:
         return rows, moved
 
     def lower_unchecked(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
-        """As :meth:`lower`, unchecked and unshaded: what kind of forms the fields lower to."""
+        """Lower without checks and shading, to find out the kinds of forms."""
         active = self.active(conditions)
         own = self._of(self.colour, active.params)
         density = self._lower_density(active, conditions)

@@ -1,9 +1,7 @@
-"""Parts of a primitive's fields that it may do without: a coefficient of its colour, a neuron of its density, a wave in
-time.
+"""Prunable units: numbers of a primitive's fields that it can do without, such as a neuron or a colour coefficient.
 
-A piece names numbers that mean nothing once they are zero, as few as can go by themselves. Pruning decides for every
-primitive which pieces it keeps; files leave out what is zero (:mod:`neuprim.core.model.sparse_storage`), and compressed files
-have next to nothing to say about it.
+A unit is as few numbers as can be zero without the others losing their meaning. Pruning decides per primitive which
+units stay. Files leave out zeros (:mod:`neuprim.core.model.sparse_storage`).
 """
 
 from __future__ import annotations
@@ -19,66 +17,64 @@ from neuprim.core.model.schema import Params
 
 __all__ = ["PrunableUnit", "count_numbers", "nonzero_rows", "removal_effect", "zero_units"]
 
-Place = tuple[int | slice, ...]
-"""Where in a parameter's own shape, behind the axis of the primitives."""
+Index = tuple[int | slice, ...]
+"""Index into a parameter, behind the axis of the primitives."""
 
 
 @dataclass(frozen=True)
 class PrunableUnit:
-    """Numbers of a field that go together.
+    """Numbers of a field that are removed together.
 
     Attributes:
         name: unique within the field, e.g. "neuron 2".
-        places: parameter -> where its numbers are.
-        group: what people are told of it together with others, e.g. "band 2"; empty: its name.
+        places: parameter -> index of the numbers.
+        group: units that are reported together, e.g. "band 2"; empty: the name.
     """
 
     name: str
-    places: Mapping[str, Place]
+    places: Mapping[str, Index]
     group: str = ""
 
     def of(self, params: Params) -> dict[str, Tensor]:
-        """Views of the numbers, (N, ...) each."""
+        """Return views of the numbers, (N, ...) each."""
         return {name: params[name][(slice(None), *place)] for name, place in self.places.items()}
 
 
-def count_numbers(piece: PrunableUnit, params: Params) -> int:
-    """How many numbers of one primitive the piece is."""
-    return sum(math.prod(value.shape[1:]) for value in piece.of(params).values())
+def count_numbers(unit: PrunableUnit, params: Params) -> int:
+    """Count the numbers of a unit in one primitive."""
+    return sum(math.prod(value.shape[1:]) for value in unit.of(params).values())
 
 
-def removal_effect(piece: PrunableUnit, params: Params, gradients: Params) -> Tensor:
-    """(N,) by how much a sum over pixels, whose gradients these are, changes when each primitive's piece is zero, to
-    first order."""
-    total: Tensor | None = None
-    slopes = piece.of(gradients)
-    for name, value in piece.of(params).items():
-        part = _flat(value.detach() * slopes[name]).sum(1)
-        total = part if total is None else total + part
-    assert total is not None, "a piece has numbers"
+def removal_effect(unit: PrunableUnit, params: Params, gradients: Params) -> Tensor:
+    """Return (N,) first-order changes, when the unit becomes zero, of the sum whose gradients are given."""
+    slopes = unit.of(gradients)
+    parts = [_flatten(value.detach() * slopes[name]).sum(1) for name, value in unit.of(params).items()]
+    total = parts[0]
+    for part in parts[1:]:
+        total = total + part
     return total
 
 
-def zero_units(pieces: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params) -> dict[str, Tensor]:
-    """Copies of the parameters in which pieces are zero.
+def zero_units(units: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params) -> dict[str, Tensor]:
+    """Copy the parameters with units set to zero.
 
     Args:
-        pieces: name -> (piece, (N,) bool of the primitives that do without it).
+        units: name -> (unit, (N,) bool of the primitives that lose it).
     """
-    names = {name for piece, gone in pieces.values() if bool(gone.any()) for name in piece.places}
-    found = {name: value.detach().clone() if name in names else value for name, value in params.items()}
-    for piece, gone in pieces.values():
+    changed = {name for unit, gone in units.values() if bool(gone.any()) for name in unit.places}
+    found = {name: value.detach().clone() if name in changed else value for name, value in params.items()}
+    for unit, gone in units.values():
         if bool(gone.any()):
-            for name, place in piece.places.items():
+            for name, place in unit.places.items():
                 found[name][(gone.to(found[name].device), *place)] = 0
     return found
 
 
-def nonzero_rows(piece: PrunableUnit, params: Params) -> Tensor:
-    """(N,) bool of the primitives of whose piece some number is not zero."""
-    return torch.stack([_flat(value.detach() != 0).any(1) for value in piece.of(params).values()]).any(0)
+def nonzero_rows(unit: PrunableUnit, params: Params) -> Tensor:
+    """Return (N,) bool of the primitives for which some number of the unit is not zero."""
+    return torch.stack([_flatten(value.detach() != 0).any(1) for value in unit.of(params).values()]).any(0)
 
 
-def _flat(value: Tensor) -> Tensor:
-    """(N, numbers of a primitive), also of no primitives."""
+def _flatten(value: Tensor) -> Tensor:
+    """(N, numbers of a primitive), also for N = 0."""
     return value.reshape(len(value), math.prod(value.shape[1:]))

@@ -1,5 +1,7 @@
-"""Models that do with less of something (:meth:`~neuprim.core.model.fields.Field.reductions`), and the words for it:
-``density.neurons=0``."""
+"""Reduced models: fields with less of a setting, such as fewer neurons, written ``density.neurons=0``.
+
+Fields declare what they can reduce by :meth:`~neuprim.core.model.fields.Field.reductions`.
+"""
 
 from __future__ import annotations
 
@@ -13,28 +15,28 @@ from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["KINDS", "validate_reduction", "reduce_fields", "reduction_names", "reduce_model"]
+__all__ = ["KINDS", "reduce_fields", "reduce_model", "reduction_names", "validate_reduction"]
 
 KINDS = ("density", "colour")
-"""What words begin with."""
+"""First parts of the names."""
 
 
 def reduction_names(density: DensityField, colour: ColourField) -> list[str]:
-    """What fields can do with less of, as ``density.neurons``."""
+    """List what fields can reduce, as ``density.neurons``."""
     return [f"{kind}.{name}" for kind, own in zip(KINDS, (density, colour), strict=True) for name in own.reductions()]
 
 
 def validate_reduction(density: DensityField, colour: ColourField, kind: str, name: str, value: Any) -> int:
-    """The value, if it is one that the field of this kind can be reduced to.
+    """Return the value if the field of this kind can be reduced to it.
 
     Raises:
-        ConfigError: it is not, or the field has nothing of this name; names what there is.
+        ConfigError: no such value or setting; names what there is.
     """
-    own = density if kind == KINDS[0] else colour
-    offered = own.reductions()
+    field = density if kind == KINDS[0] else colour
+    offered = field.reductions()
     if name not in offered:
         what = nearest(f"{kind}.{name}", reduction_names(density, colour)) or "; nothing of this model can be"
-        raise ConfigError(f"{kind}.{name}: nothing that {type(own).__name__} can do with less of{what}")
+        raise ConfigError(f"{kind}.{name}: nothing that {type(field).__name__} can do with less of{what}")
     if isinstance(value, bool) or value not in offered[name]:
         raise ConfigError(
             f"{kind}.{name}={value}: expected {' or '.join(map(str, offered[name]))}, less than the model has"
@@ -43,39 +45,40 @@ def validate_reduction(density: DensityField, colour: ColourField, kind: str, na
 
 
 def reduce_model(model: Primitives, kind: str, name: str, value: int) -> Primitives:
-    """The model whose field of this kind has less of something, as close to the whole as it can be; detached where it
-    changes."""
+    """Return the model with one field reduced, as close to the original as possible; what changes is detached."""
     own = model.density if kind == KINDS[0] else model.colour
-    mine = {key: value.detach() for key, value in model.of(own).items()}
-    field, fewer = own.reduce(mine, model.geometry, name, value)
-    params = {key: value for key, value in model.params.items() if key not in mine} | fewer
+    tensors = {key: value.detach() for key, value in model.of(own).items()}
+    field, reduced = own.reduce(tensors, model.geometry, name, value)
+    params = {key: value for key, value in model.params.items() if key not in tensors} | reduced
     if isinstance(field, DensityField):
         return Primitives(field, model.colour, params)
     assert isinstance(field, ColourField), "a field is reduced to one of its kind"
     return Primitives(model.density, field, params)
 
 
-def reduce_fields(density: DensityField, colour: ColourField, words: Sequence[str]) -> tuple[DensityField, ColourField]:
-    """Fields that do with less, before there is a model.
+def reduce_fields(
+    density: DensityField, colour: ColourField, overrides: Sequence[str]
+) -> tuple[DensityField, ColourField]:
+    """Reduce fields before there is a model.
 
     Args:
-        words: ``model.reduced``, one after the other.
+        overrides: the setting ``model.reduced``, applied one after the other.
 
     Raises:
-        ConfigError: a word is none, or something that the fields cannot do with less of.
+        ConfigError: an override is malformed, or the fields cannot be reduced that way.
     """
-    for word in words:
-        place, equals, text = word.partition("=")
-        kind, dot, name = place.partition(".")
+    for word in overrides:
+        key, equals, text = word.partition("=")
+        kind, dot, name = key.partition(".")
         if not equals or not dot or kind not in KINDS or not text.isdecimal():
             raise ConfigError(f"model.reduced={word}: expected density.NAME=COUNT or colour.NAME=COUNT")
         try:
             value = validate_reduction(density, colour, kind, name, int(text))
         except ConfigError as error:
             raise ConfigError(f"model.reduced={word}: {error}") from error
-        none = torch.zeros(0, 3)
-        empty = Geometry(none, none, torch.zeros(0, 4))
+        empty = Geometry(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4))
         own = density if kind == KINDS[0] else colour
-        field, _ = own.reduce({spec.name: torch.zeros(0, *spec.shape) for spec in own.parameters()}, empty, name, value)
+        tensors = {spec.name: torch.zeros(0, *spec.shape) for spec in own.parameters()}
+        field, _ = own.reduce(tensors, empty, name, value)
         density, colour = (field, colour) if kind == KINDS[0] else (density, field)  # type: ignore[assignment]
     return density, colour

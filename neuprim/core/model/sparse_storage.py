@@ -1,7 +1,7 @@
-"""Model files without what is zero, as pruning leaves it (:mod:`neuprim.core.model.prunable`).
+"""Sparse storage of pruned parameters in model files.
 
-A parameter is stored as two tensors, if that is less: ``NAME|there``, uint8, a bit for each of its numbers, row by row
-and the lowest bit first, and ``NAME|numbers``, float32, those whose bit is set. Tensors in memory are whole.
+Where it is smaller, a parameter is stored as two tensors: ``NAME|there``, uint8, one bit per number, row by row and
+lowest bit first, and ``NAME|numbers``, float32, the numbers whose bit is set. Tensors in memory are dense.
 """
 
 from __future__ import annotations
@@ -18,78 +18,62 @@ from neuprim.core.model.schema import ParameterSpec, Params
 
 __all__ = ["load_sparse", "store_sparse"]
 
-_THERE, _NUMBERS = "|there", "|numbers"
+_MASK, _NUMBERS = "|there", "|numbers"
 
 
 def store_sparse(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str, Tensor], list[str]]:
-    """Tensors as a file holds them, and the names of the parameters without their zeros; ``specs`` are those of the
-    fields."""
+    """Return the tensors of a file and the names of sparse parameters; ``specs`` are those of the fields."""
     stored, sparse = dict(params), []
     for name in (spec.name for spec in specs):
-        value = params[name]
-        numbers = value.detach().cpu().contiguous().flatten()
-        there = numbers.view(torch.int32) != 0  # by its bits: a zero below zero is there
-        if 4 * int(there.sum()) + (len(there) + 7) // 8 < 4 * len(there):
+        numbers = params[name].detach().cpu().contiguous().flatten()
+        mask = numbers.view(torch.int32) != 0  # compare bits, so that -0 is stored
+        if 4 * int(mask.sum()) + (len(mask) + 7) // 8 < 4 * len(mask):
             del stored[name]
-            stored[name + _THERE] = torch.from_numpy(np.packbits(there.numpy(), bitorder="little"))
-            stored[name + _NUMBERS] = numbers[there].contiguous()
+            stored[name + _MASK] = torch.from_numpy(np.packbits(mask.numpy(), bitorder="little"))
+            stored[name + _NUMBERS] = numbers[mask].contiguous()
             sparse.append(name)
     return stored, sparse
 
 
 def load_sparse(stored: Params, names: object, specs: Sequence[ParameterSpec], where: str) -> dict[str, Tensor]:
-    """The tensors of a model from those of its file.
+    """Return the dense tensors of a model file.
 
     Args:
-        names: of the parameters without their zeros, as the file's header has them.
+        names: sparse parameters, from the file's header.
         specs: of the fields' parameters.
         where: the file, for messages.
 
     Raises:
-        CheckpointError: they do not fit the model's fields or each other.
+        CheckpointError: the tensors do not fit the fields or each other.
     """
     shapes = {spec.name: spec.shape for spec in specs}
     if not isinstance(names, list) or not all(isinstance(name, str) and name in shapes for name in names):
         raise CheckpointError(
-            f"{where}: header field 'sparse' is {names!r}; expected parameters of the model's fields: {', '.join(shapes)}"
+            f"{where}: header field 'sparse' is {names!r}; "
+            f"expected parameters of the model's fields: {', '.join(shapes)}"
         )
-    count = _count(stored, where)
-    found = {name: value for name, value in stored.items() if not name.endswith((_THERE, _NUMBERS))}
+    means = stored.get("means")
+    if means is None or means.dim() != 2:
+        raise CheckpointError(f"{where}: no tensor 'means' (N, 3)")
+    found = {name: value for name, value in stored.items() if not name.endswith((_MASK, _NUMBERS))}
     for name in names:
-        size = count * math.prod(shapes[name])
-        there = _bits(stored.get(name + _THERE), size, f"{where}: {name + _THERE}")
-        numbers = _expected(stored.get(name + _NUMBERS), (int(there.sum()),), f"{where}: {name + _NUMBERS}")
+        size = len(means) * math.prod(shapes[name])
+        bits = _check(stored.get(name + _MASK), ((size + 7) // 8,), torch.uint8, f"{where}: {name + _MASK}")
+        mask = torch.from_numpy(np.unpackbits(bits.numpy(), count=size, bitorder="little").astype(bool))
+        numbers = _check(stored.get(name + _NUMBERS), (int(mask.sum()),), torch.float32, f"{where}: {name + _NUMBERS}")
         if name in found:
             raise CheckpointError(
                 f"{where}: {name} is there twice, as {name} and as {name + _NUMBERS}; expected one of them"
             )
-        found[name] = torch.zeros(size).masked_scatter_(there, numbers).reshape(count, *shapes[name])
-    _no_more(stored, {*found, *(name + part for name in names for part in (_THERE, _NUMBERS))}, where, "no parameter")
+        found[name] = torch.zeros(size).masked_scatter_(mask, numbers).reshape(len(means), *shapes[name])
+    extra = sorted(set(stored) - {*found, *(name + part for name in names for part in (_MASK, _NUMBERS))})
+    if extra:
+        raise CheckpointError(f"{where}: tensor {extra[0]!r} belongs to no parameter")
     return found
 
 
-def _count(stored: Params, where: str) -> int:
-    means = stored.get("means")
-    if means is None or means.dim() != 2:
-        raise CheckpointError(f"{where}: no tensor 'means' (N, 3)")
-    return len(means)
-
-
-def _expected(part: Tensor | None, shape: tuple[int, ...], what: str) -> Tensor:
-    if part is None or tuple(part.shape) != shape or part.dtype != torch.float32:
-        shown = "missing" if part is None else f"{part.dtype} {tuple(part.shape)}"
-        raise CheckpointError(f"{what} is {shown}; expected torch.float32 {shape}")
-    return part
-
-
-def _no_more(stored: Params, taken: set[str], where: str, to: str) -> None:
-    extra = sorted(set(stored) - taken)
-    if extra:
-        raise CheckpointError(f"{where}: tensor {extra[0]!r} belongs to {to}")
-
-
-def _bits(bits: Tensor | None, count: int, what: str) -> Tensor:
-    if bits is None or bits.dtype != torch.uint8 or tuple(bits.shape) != ((count + 7) // 8,):
-        shown = "missing" if bits is None else f"{bits.dtype} {tuple(bits.shape)}"
-        raise CheckpointError(f"{what} is {shown}; expected torch.uint8 ({(count + 7) // 8},)")
-    return torch.from_numpy(np.unpackbits(bits.numpy(), count=count, bitorder="little").astype(bool))
+def _check(tensor: Tensor | None, shape: tuple[int, ...], dtype: torch.dtype, what: str) -> Tensor:
+    if tensor is None or tuple(tensor.shape) != shape or tensor.dtype != dtype:
+        shown = "missing" if tensor is None else f"{tensor.dtype} {tuple(tensor.shape)}"
+        raise CheckpointError(f"{what} is {shown}; expected {dtype} {shape}")
+    return tensor

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.volumes import errors
+from neuprim.core.volumes import density_errors
 from neuprim.core.volumes.density_errors import (
     NUMBERS,
     Comparison,
@@ -59,7 +59,7 @@ def ball() -> np.ndarray:
 
 @pytest.mark.parametrize("block", [1, 14 * 17 * 3, 1 << 22])
 def test_numbers_are_those_of_the_whole_grids(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
-    monkeypatch.setattr(errors, "_BLOCK", block)
+    monkeypatch.setattr(density_errors, "_BLOCK", block)
     truth, m = Known(ball()), model()
     found = measure_frame_errors(m, {}, truth, 0)
     assert found is not None and tuple(found) == NUMBERS

@@ -51,8 +51,10 @@ def refuse_non_finite(lowered: Lowered) -> None:
             raise non_finite_error(tensors, int(bad.nonzero()[0]))
 
 
-def refuse_non_finite_colours(tensors: Mapping[str, Tensor]) -> None:
+def refuse_non_finite_colours(tensors: Mapping[str, Tensor], named: Mapping[str, Tensor] | None = None) -> None:
     """Raise for the first number of the colours, which the per-primitive kernels do not read; a GPU is waited for.
+
+    ``named`` are all tensors of the frame: the first of them that is not finite is the cause, e.g. a centre.
 
     Raises:
         NonFiniteError: names tensor and primitive.
@@ -63,4 +65,4 @@ def refuse_non_finite_colours(tensors: Mapping[str, Tensor]) -> None:
     for value in tensors.values():
         bad = ~torch.isfinite(value).reshape(len(value), -1).all(dim=1)
         if bool(bad.any()):
-            raise non_finite_error(tensors, int(bad.nonzero()[0]))
+            raise non_finite_error(tensors if named is None else named, int(bad.nonzero()[0]))

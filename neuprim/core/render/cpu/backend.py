@@ -158,7 +158,8 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, request: Request, viewmat: Tensor, background: Tensor, palette: Tensor, *tensors: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         weights = dict(zip(NET, tensors[len(PARAMETERS) :], strict=False))
-        refuse_non_finite_colours(weights | {"base" if weights else "colors": palette})
+        colours = weights | {"base" if weights else "colors": palette}
+        refuse_non_finite_colours(colours, dict(zip(PARAMETERS, tensors, strict=False)) | colours)
         frame = _prepare(request, viewmat, tensors)
         settings, camera = request.settings, request.camera
         h, w = camera.height, camera.width

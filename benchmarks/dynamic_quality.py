@@ -43,7 +43,7 @@ from neuprim.runs.fit import prepare_training, train_to_end
 from neuprim.runs.measure import render_image
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
-from neuprim.tasks.dynamic.judging import recording_of
+from neuprim.tasks.dynamic.evaluation import recording_of
 from neuprim.tasks.dynamic.volume.dataset import Recording
 
 RESULTS = Path(__file__).parent / "results" / "dynamic_quality.json"
@@ -177,7 +177,7 @@ def between_frames(trainer: Trainer) -> dict[str, float]:
             render_image(trainer.model, view, trainer.renderer, data.background),
             data.test.pixels(index).over(data.background),
         )
-        error = (rendered - truth)[recording.track(index)].double().square().mean().item()
+        error = (rendered - truth)[recording.matter_mask(index)].double().square().mean().item()
         errors[t % every == 0].append(-10 * math.log10(error))
         if t + 1 < frames and index < frames:
             after = data.test.view(index + 1)
@@ -202,7 +202,7 @@ def repeat_neighbour(trainer: Trainer) -> float:
     for index in range(len(data.test)):
         if (index % frames) % every:
             pair = [data.test.pixels(i).over(data.background) for i in (index - (index % frames) % every, index)]
-            error = (pair[0] - pair[1])[recording.track(index)].double().square().mean().item()
+            error = (pair[0] - pair[1])[recording.matter_mask(index)].double().square().mean().item()
             values.append(-10 * math.log10(error))
     return statistics.mean(values)
 

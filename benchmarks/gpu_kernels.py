@@ -39,7 +39,7 @@ from neuprim.core.render.cuda.layout import Form
 from neuprim.core.render.cuda.projection import PER_BLOCK
 from neuprim.core.train import adam_warp, ssim_warp
 from neuprim.core.volumes import grid_warp
-from neuprim.tasks.dynamic.volume import traverse_warp
+from neuprim.tasks.dynamic.volume import raymarch_warp
 
 RESULTS = Path(__file__).parent / "results" / "gpu_kernels.json"
 PAGE = ROOT / "docs" / "gpu.md"
@@ -72,7 +72,7 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
             ("Adam", adam_warp._kernels()),
             ("SSIM", ssim_warp._kernels()),
             ("grid", (grid_warp._kernel(),)),
-            ("rays of volumes", (traverse_warp._radiances(), traverse_warp._depths(), traverse_warp._extinctions())),
+            ("rays of volumes", (raymarch_warp._radiances(), raymarch_warp._depths(), raymarch_warp._extinctions())),
         ):
             for number, kernel in enumerate(made, 1):
                 yield f"{title} {number}" if len(made) > 1 else title, kernel, BLOCK

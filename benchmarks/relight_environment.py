@@ -37,7 +37,7 @@ from neuprim.runs.measure import render_light_sum
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.scenes.lit import INTENSITY, build_lit_solids, draw_lit_solids
 from neuprim.scenes.raycast import Scene
-from neuprim.tasks.relight.environment import illuminate
+from neuprim.tasks.relight.lighting import illuminate
 
 PAGE = ROOT / "docs" / "relighting.md"
 MANY, DISTANT = 1024, 1e4

@@ -35,7 +35,7 @@ from neuprim.config import compose
 from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.data import Dataset
 from neuprim.runs.fit import Fitted, compile_kernels, prepare_training, train_to_end
-from neuprim.tasks.relight.judging import baselines
+from neuprim.tasks.relight.evaluation import baselines
 
 RESULTS = Path(__file__).parent / "results" / "relight_quality.json"
 PLAIN = "model.colour.visibility=none"

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
-from neuprim.tasks.relight.colour import LightNetwork
-from neuprim.tasks.relight.harmonics import LightHarmonics
+from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from tests import scenes
 
 COUNT = 12

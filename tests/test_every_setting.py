@@ -22,7 +22,7 @@ GROUPS = {
     "TrainSettings": "train",
     "PopulationSettings": "train.population",
     "SolverSettings": "solver",
-    "Look": "scene.optics",
+    "Optics": "scene.optics",
     "Light": "scene.optics.light",
     "LauncherSettings": "launcher",
     "ViewerSettings": "viewer",
@@ -54,7 +54,7 @@ def test_they_are_found() -> None:
         "OlatSettings",
         "SolidsSettings",
         "SolverSettings",
-        "Look",
+        "Optics",
     }
     assert all(dataclasses.is_dataclass(cls) for cls in CLASSES) and len(FIELDS) > 100
 

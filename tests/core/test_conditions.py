@@ -13,7 +13,7 @@ from torch import Tensor
 from neuprim.core.conditions import FRAMES, export_frames, flag, in_step, named, read_conditions, split_words
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.tasks.relight.lights import orbit_in_frames, parse_lights
+from neuprim.tasks.relight.lighting import orbit_in_frames, parse_lights
 
 
 def number(text: str) -> list[Tensor]:

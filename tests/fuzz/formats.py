@@ -254,13 +254,13 @@ def _read_vdb(folder: Path) -> None:
 
 
 def _voxels(folder: Path) -> None:
-    from neuprim.tasks.dynamic.volume.voxels import Voxels
+    from neuprim.tasks.dynamic.volume.dataset import Voxels
 
     Voxels(np.array([1, 5]), np.ones((2, 4), np.float32), (2, 3, 4), np.eye(4)).write(folder / "a.npz")
 
 
 def _read_voxels(folder: Path) -> None:
-    from neuprim.tasks.dynamic.volume.voxels import Voxels
+    from neuprim.tasks.dynamic.volume.dataset import Voxels
 
     Voxels.read(folder / "a.npz").at(np.zeros((1, 3), np.int64))
 

@@ -26,7 +26,7 @@ import torch
 from neuprim.core.data import Clip
 from neuprim.core.extensions import SceneExtension
 from neuprim.core.task import SceneSpec
-from neuprim.tasks.relight.data import Lighting
+from neuprim.tasks.relight.lighting import Lighting
 from tests.core.tiny import SIZE, Views, two_primitives
 
 
@@ -131,7 +131,5 @@ def test_what_else_it_knows_of_its_pixels_counts(site: Path) -> None:
 
 def test_another_class_is_refused_before_training(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(site, "3") == 2
-    expected = (
-        "scene 'mine' of lit-scene 0.3: two: extra is a int; expected a neuprim.tasks.relight.data.Lighting, or None"
-    )
+    expected = "scene 'mine' of lit-scene 0.3: two: extra is a int; expected a neuprim.tasks.relight.lighting.Lighting, or None"
     assert expected in capsys.readouterr().err and not Path("r").exists()

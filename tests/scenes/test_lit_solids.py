@@ -26,8 +26,8 @@ from neuprim.scenes.lit import (
     generate_lit_solids,
 )
 from neuprim.scenes.raycast import Scene
-from neuprim.tasks.relight import judging, olat
-from neuprim.tasks.relight.data import lighting_of
+from neuprim.tasks.relight import evaluation, olat
+from neuprim.tasks.relight.lighting import lighting_of
 from neuprim.tasks.relight.lit_solids import classes, load
 
 SMALL = {"size": 24, "train_views": 4, "test_views": 3, "supersampling": 2}
@@ -113,10 +113,10 @@ def test_the_data_set_says_what_it_is(cache: Path) -> None:
     assert conditions["light"].shape == (3,) and 4.0 <= float(conditions["light"].norm()) <= 5.0
     assert conditions["light_intensity"].tolist() == pytest.approx([INTENSITY] * 3)
     assert all(value.dtype == torch.float32 for value in conditions.values())
-    (clip,) = judging.clips(dataset)
+    (clip,) = evaluation.clips(dataset)
     assert clip.source is not None and len(clip.views) == len(clip.source) == FEW_FRAMES
     assert clip.name == "light_round" and clip.source.view(1).name == "light_01"
-    views = judging.orbit(dataset, 5)
+    views = evaluation.orbit(dataset, 5)
     assert len({v.conditions["light"].numpy().tobytes() for v in views}) == 5
     assert all(
         4.0 <= float(v.conditions["light"].norm()) <= 5.0 and float(v.conditions["light"][2]) > 2.0 for v in views
@@ -147,7 +147,7 @@ def test_classes_agree_with_the_images(forty: Dataset) -> None:
 
 
 def test_baselines_rank_as_they_should(forty: Dataset) -> None:
-    numbers = judging.diagnose(forty, None)  # type: ignore[arg-type]  # nothing here depends on the model
+    numbers = evaluation.diagnose(forty, None)  # type: ignore[arg-type]  # nothing here depends on the model
     scores = {name: entry["psnr_linear_clamped"] for name, entry in numbers["baselines"].items()}
     assert set(scores) == {"black", "no_cast_shadows", "nearest_light_of_25"}
     assert (

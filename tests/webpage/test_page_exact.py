@@ -20,8 +20,7 @@ from neuprim.core.render import render
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
-from neuprim.tasks.relight.colour import LightNetwork
-from neuprim.tasks.relight.harmonics import LightHarmonics
+from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from neuprim.tasks.static.fields import SphericalHarmonics
 from neuprim.webpage import PageView
 from tests.browsers import Tab, open_tab

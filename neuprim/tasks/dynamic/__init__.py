@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
+import torch
+from torch import Tensor
+
+from neuprim.core.conditions import FRAMES
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import GroundTruth
 from neuprim.core.errors import ConfigError
@@ -14,20 +19,18 @@ from neuprim.core.task import API_VERSION, Chunks, SceneContext, SceneSpec, Task
 from neuprim.core.train.losses import photometric
 from neuprim.core.validation import validate_choices
 from neuprim.core.volumes.source import VolumeSource
-from neuprim.tasks.dynamic import judging
+from neuprim.tasks.dynamic import evaluation
 from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
-from neuprim.tasks.dynamic.layers import LAYERS
-from neuprim.tasks.dynamic.time import parse_times
 
-__all__ = ["TASK"]
+__all__ = ["TASK", "parse_times"]
 
 
 def _check(model: Mapping[str, Any]) -> None:
     validate_choices(model["density"], "model.density", {"time": str, "divide_above": float, **DENSITY_OPTIONS})
     validate_choices(model["colour"], "model.colour", {"frequencies": tuple(FREQUENCIES), "powers": int, "waves": int})
     try:
-        _density(model)
+        _build_density(model)
     except ValueError as error:
         raise ConfigError(f"model.density.time: {error}") from error
     try:
@@ -36,7 +39,7 @@ def _check(model: Mapping[str, Any]) -> None:
         raise ConfigError(f"model.colour: {error}") from error
 
 
-def _density(model: Mapping[str, Any], components: tuple[str, ...] = ()) -> TimeDensity:
+def _build_density(model: Mapping[str, Any], components: tuple[str, ...] = ()) -> TimeDensity:
     return TimeDensity(model["neurons"], **model["density"], components=components)
 
 
@@ -52,7 +55,7 @@ def _trade(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     components = () if dataset.points is None else dataset.points.components
-    return _density(model, components), TimeHarmonics(
+    return _build_density(model, components), TimeHarmonics(
         model["sh_degree"], dataset.channels, model["sh_every"], **model["colour"]
     )
 
@@ -60,35 +63,65 @@ def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, Co
 # Loaders are imported when used: each pulls in modules of its own.
 
 
-def _volume(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.dynamic.volume.scene import load
+def _load_volume_scene(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    from neuprim.tasks.dynamic.volume.scene import load_dataset
 
-    return load(settings, context)
-
-
-def _files(settings: Mapping[str, Any], context: SceneContext) -> VolumeSource:
-    from neuprim.tasks.dynamic.volume.scene import load_volume
-
-    return load_volume(settings, context)
+    return load_dataset(settings, context)
 
 
-def _truth(settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None) -> GroundTruth:
-    from neuprim.tasks.dynamic.volume.scene import load_truth
+def _open_volumes(settings: Mapping[str, Any], context: SceneContext) -> VolumeSource:
+    from neuprim.tasks.dynamic.volume.scene import open_volumes
 
-    return load_truth(settings, context, known)
-
-
-def _chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
-    from neuprim.tasks.dynamic.volume.scene import load_chunks
-
-    return load_chunks(config, context)
+    return open_volumes(settings, context)
 
 
-def _multiview(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def _open_ground_truth(
+    settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None
+) -> GroundTruth:
+    from neuprim.tasks.dynamic.volume.scene import open_ground_truth
+
+    return open_ground_truth(settings, context, known)
+
+
+def _split_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
+    from neuprim.tasks.dynamic.volume.scene import split_chunks
+
+    return split_chunks(config, context)
+
+
+def _load_multiview(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     from neuprim.tasks.dynamic.multiview import load
 
     return load(settings, context)
 
+
+def parse_times(text: str) -> list[Tensor]:
+    """Parse times xi in 0..1 after ``--time``: "0.5" is one, "0:1" sixty from 0 to 1, "0:1:100" a hundred.
+
+    Raises:
+        ConfigError: no such form, times outside 0..1, or a count below 2.
+    """
+    expected = "expected a time in 0..1, as 0.5, or FIRST:LAST or FIRST:LAST:COUNT, as 0:1:100"
+    parts = text.split(":")
+    try:
+        times = [float(part) for part in parts[:2]]
+        count = int(parts[2]) if len(parts) == 3 else FRAMES
+    except ValueError:
+        raise ConfigError(f"--time {text}: {expected}") from None
+    if len(parts) > 3 or not all(math.isfinite(t) and 0.0 <= t <= 1.0 for t in times) or not 2 <= count <= 100_000:
+        raise ConfigError(f"--time {text}: {expected}")
+    if len(times) == 1:
+        return [torch.tensor(times[0])]
+    return list(torch.linspace(times[0], times[1], count))
+
+
+_VOLUME_SCENES = {
+    "smoke_fire": "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR",
+    "colorful_smoke": "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR",
+    "ground_explosion": "a blast and its cloud, 130 timesteps; simulated, or scene.vdb=DIR",
+    "dust_tornado": "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR",
+    "vdb": "any sequence of .vdb files: scene.vdb=DIR",
+}
 
 TASK = TaskSpec(
     api=API_VERSION,
@@ -96,40 +129,11 @@ TASK = TaskSpec(
     summary="Smoke and fire over time, from OpenVDB sequences or images with a time each (time inside the density)",
     config_package="neuprim.tasks.dynamic.conf",
     scenes=(
-        SceneSpec(
-            "smoke_fire",
-            "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR",
-            _volume,
-            _files,
-            _truth,
-            _chunks,
+        *(
+            SceneSpec(name, summary, _load_volume_scene, _open_volumes, _open_ground_truth, _split_chunks)
+            for name, summary in _VOLUME_SCENES.items()
         ),
-        SceneSpec(
-            "colorful_smoke",
-            "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR",
-            _volume,
-            _files,
-            _truth,
-            _chunks,
-        ),
-        SceneSpec(
-            "ground_explosion",
-            "a blast and its cloud, 130 timesteps; simulated, or scene.vdb=DIR",
-            _volume,
-            _files,
-            _truth,
-            _chunks,
-        ),
-        SceneSpec(
-            "dust_tornado",
-            "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR",
-            _volume,
-            _files,
-            _truth,
-            _chunks,
-        ),
-        SceneSpec("vdb", "any sequence of .vdb files: scene.vdb=DIR", _volume, _files, _truth, _chunks),
-        SceneSpec("multiview", "images with a time per frame (D-NeRF layout): scene.path=DIR", _multiview),
+        SceneSpec("multiview", "images with a time per frame (D-NeRF layout): scene.path=DIR", _load_multiview),
     ),
     build=_build,
     loss=photometric,
@@ -138,8 +142,8 @@ TASK = TaskSpec(
     conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_times, sweep="0:1"),),
     fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
-    mask=judging.mask,
-    diagnose=judging.diagnose,
-    clips=judging.clips,
-    layers=LAYERS,
+    mask=evaluation.mask,
+    diagnose=evaluation.diagnose,
+    clips=evaluation.clips,
+    layers=evaluation.LAYERS,
 )

@@ -15,7 +15,7 @@ from neuprim.core.model.fields import ColourField, Conditions, Constant, read_sc
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
-from neuprim.tasks.dynamic.density import time_of
+from neuprim.tasks.dynamic.density import get_time
 
 __all__ = ["TimeHarmonics"]
 
@@ -23,15 +23,13 @@ FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
 """Angle of the first Fourier term at xi = 1. The paper prints i xi, whose basis is nearly rank-deficient on [0, 1]
 (condition 5e13); whole periods are well conditioned (2e5)."""
 
-_TIME = ("time_poly", "time_cos", "time_sin")
-"""The tensors of the terms in time."""
+_TIME_TENSORS = ("time_poly", "time_cos", "time_sin")
 
 _TIMES = 256
-"""At which fewer terms are fitted to all of them."""
+"""Times at which fewer terms are fitted to all terms."""
 
 _CONDITION = 1e-7
-"""Directions of the terms that are weaker than this are left out of a fit: their coefficients would not survive
-float32."""
+"""Smallest relative singular value of a fit; weaker coefficients would not survive float32."""
 
 
 class TimeHarmonics(ColourField):
@@ -74,7 +72,7 @@ class TimeHarmonics(ColourField):
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, sh.coefficient_count(self.degree) - 1
         specs = [ParameterSpec("sh_dc", (C,), 1e-2, lambda c: sh.initial_dc(c.colors))]
-        for name, terms in zip(_TIME, (self.powers, self.waves, self.waves), strict=True):
+        for name, terms in zip(_TIME_TENSORS, (self.powers, self.waves, self.waves), strict=True):
             if terms:
                 specs.append(ParameterSpec(name, (terms, C), 5e-3, _zeros(terms, C)))
         if rest:
@@ -88,20 +86,22 @@ class TimeHarmonics(ColourField):
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[TimeHarmonics, dict[str, Tensor]]:
-        """Fewer terms in time are those that are closest to all of them, by least squares over the sequence."""
+        """Fit fewer terms in time to all terms, by least squares over the sequence."""
         field = TimeHarmonics(**{**self.settings(), name: value})
         if name == "degree":
             return field, sh.truncate_bands(params, "sh_rest", value)
         times = (torch.arange(_TIMES, dtype=torch.float64) + 0.5) / _TIMES
-        all_terms, fewer = (
+        all_terms, fewer_terms = (
             torch.stack([torch.cat([torch.ones_like(x)[None], *f._terms(x).values()]) for x in times])
             for f in (self, field)
         )
-        fit = torch.linalg.pinv(fewer, rtol=_CONDITION) @ all_terms  # coefficients of all terms -> of those that stay
-        stored = torch.cat([params["sh_dc"][:, None], *(params[key] for key in _TIME if key in params)], 1)
+        fit = (
+            torch.linalg.pinv(fewer_terms, rtol=_CONDITION) @ all_terms
+        )  # coefficients of all terms -> of those that stay
+        stored = torch.cat([params["sh_dc"][:, None], *(params[key] for key in _TIME_TENSORS if key in params)], 1)
         sizes = {key: len(basis) for key, basis in field._terms(times[0]).items()}
         dc, *rest = (device.to_like(fit, stored.double()) @ stored.double()).to(stored).split([1, *sizes.values()], 1)
-        others = {key: value for key, value in params.items() if key not in _TIME}
+        others = {key: value for key, value in params.items() if key not in _TIME_TENSORS}
         kept = {key: part.contiguous() for key, part in zip(sizes, rest, strict=True) if sizes[key]}
         return field, {**others, **kept, "sh_dc": dc[:, 0].contiguous()}
 
@@ -111,10 +111,10 @@ class TimeHarmonics(ColourField):
             FREQUENCIES[self.frequencies] * xi * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
         )
         powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)
-        return dict(zip(_TIME, (powers, waves.cos(), waves.sin()), strict=True))
+        return dict(zip(_TIME_TENSORS, (powers, waves.cos(), waves.sin()), strict=True))
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
-        dc, xi = params["sh_dc"], time_of(conditions)
+        dc, xi = params["sh_dc"], get_time(conditions)
         if self.powers or self.waves:
             for name, basis in self._terms(xi).items():
                 if name in params:
@@ -122,11 +122,11 @@ class TimeHarmonics(ColourField):
         return dc, params.get("sh_rest")
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Coefficients of the direction, each of one channel, and terms in time one by one."""
-        return (*sh.coefficients(self.degree, self.channels, "sh_rest"), *self._in_time())
+        """Coefficients of the direction, per channel, and single terms in time."""
+        return (*sh.coefficients(self.degree, self.channels, "sh_rest"), *self._time_units())
 
-    def _in_time(self) -> tuple[PrunableUnit, ...]:
-        terms = zip(_TIME, (self.powers, self.waves, self.waves), strict=True)
+    def _time_units(self) -> tuple[PrunableUnit, ...]:
+        terms = zip(_TIME_TENSORS, (self.powers, self.waves, self.waves), strict=True)
         return tuple(PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, count in terms for i in range(count))
 
     def script(self) -> str:

@@ -1,18 +1,18 @@
-"""A cosine density that changes in time: one frame's is a static one, so time costs nothing per pixel (method:
-"Density").
+"""Cosine density that changes in time; the density of one frame is a static one, so time costs nothing per pixel.
 
-What varies is chosen by name, several joined by "+":
+Parts that vary are chosen by name and joined by "+":
 
     phase    b1 + xi W_t                                        equation 13 of the paper; K parameters
     offset   b2 + sum_j p_j cos(pi j xi) + q_j sin(pi j xi)     j = 1..4; 8 parameters
-    window   (w2, b2) (1 - u^2)^2, u = (xi - c)/tau, |u| < 1    the primitive lives from c - tau to c + tau; 2
-    parameters motion   mu + v (xi - c) + a (xi - c)^2                     c of the window, else 1/2; 6 parameters
+    window   (w2, b2) (1 - u^2)^2, u = (xi - c)/tau, |u| < 1    active from c - tau to c + tau; 2 parameters
+    motion   mu + v (xi - c) + a (xi - c)^2                     c of the window, else 1/2; 6 parameters
 
-xi is time over the sequence, 0..1. Primitives outside their window are left out of a frame before anything is computed.
+xi is time over the sequence, 0..1. Primitives outside their window are dropped from a frame before anything is
+computed.
 
-A model joined from chunks of a sequence has seams between them, and for every primitive the chunk that it was fitted
-in, a number that is not learned: what it lives of its own accord counts within its chunk alone, and is faded over at
-the seams (:mod:`neuprim.tasks.dynamic.seams`).
+A model joined from chunks of a sequence stores, for every primitive, the number of its chunk. Neighbouring chunks
+overlap in time. Over an overlap from a to b the earlier chunk's weight falls linearly from 1 to 0 and the later one's
+rises from 0 to 1, so that weights add up to 1 and no primitive counts at times that its chunk has not seen.
 
 Where several grids make the extinction (smoke and flames), each of ``components`` adds one parameter, share_NAME: the
 primitive's share of that grid, as a logit.
@@ -20,6 +20,7 @@ primitive's share of that grid, as a logit.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -42,10 +43,8 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.train.splitting import SPLIT_LONG, SPLIT_SHIFT
-from neuprim.tasks.dynamic.seams import checked_seams, shares
-from neuprim.tasks.dynamic.stilled import stilled
 
-__all__ = ["PARTS", "TimeDensity", "time_of"]
+__all__ = ["PARTS", "ChunkOverlaps", "TimeDensity", "chunk_weights", "drop_time_terms", "get_time", "validate_overlaps"]
 
 PARTS = ("phase", "offset", "window", "motion")
 """What may vary in time."""
@@ -55,28 +54,56 @@ _MOTION = ("velocity", "acceleration")
 _SHARE = "share_"
 
 
-def time_of(conditions: Conditions) -> Tensor:
-    """The frame's time xi, a 0-dim float64 tensor.
+ChunkOverlaps = tuple[tuple[float, float], ...]
+"""(from, to) time of each overlap of chunks, ascending; chunk k ends with overlap k."""
 
-    Raises:
-        KeyError: the frame has no condition "time".
-    """
+
+def get_time(conditions: Conditions) -> Tensor:
+    """The frame's time xi, a 0-dim float64 tensor. Raises KeyError if the frame has no condition "time"."""
     if "time" not in conditions:
         raise KeyError("a dynamic model needs the condition 'time'")
     return conditions["time"].detach().double().reshape(())
 
 
-class TimeDensity(DensityField):
-    """f(x~, xi) of K cosine neurons whose ``time`` parts vary, see the module; 5K + 1 parameters and those of the
-    parts.
+def validate_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverlaps:
+    """Overlaps as tuples. Raises ValueError unless they are pairs of ascending times, one after the other."""
+    try:
+        overlaps = tuple((float(begin), float(end)) for begin, end in seams)
+    except (TypeError, ValueError):
+        raise ValueError(f"seams {seams!r}; expected pairs of times") from None
+    flat = list(itertools.chain.from_iterable(overlaps))
+    if not all(map(math.isfinite, flat)) or flat != sorted(flat) or any(begin == end for begin, end in overlaps):
+        raise ValueError(f"seams {seams!r}; expected pairs of ascending times, one after the other")
+    return overlaps
 
-    ``init`` of the model settings: as :class:`~neuprim.core.model.densities.cosine.CosineDensity`, and ``window``, the
-    half width tau of a fresh window in units of the sequence, ``window_frames``, how many frames of a sequence it is at
-    most, and ``rate``, the bound of U(-rate, rate) that W_t starts from.
+
+def chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Tensor:
+    """Weights 0 to 1 at time ``xi`` () of primitives of these chunks, float64 in the shape of ``chunk``.
 
     Args:
-        seams: (from, to) of the times over which one chunk of the sequence hands over to the next, ascending; none: the
-        model is of one piece. components: names of the source grids whose share of the extinction each primitive keeps.
+        chunk: numbers from 0 to len(overlaps), any dtype; rounded, as compressed files may change them slightly.
+    """
+    numbers = chunk.detach().double().round()
+    weights = torch.ones_like(numbers)
+    for number, (begin, end) in enumerate(overlaps):
+        progress = ((xi.to(numbers) - begin) / (end - begin)).clamp(0.0, 1.0)
+        weights = weights * torch.where(numbers > number, progress, 1.0 - progress)
+    return weights
+
+
+class TimeDensity(DensityField):
+    """f(x~, xi) of K cosine neurons whose ``time`` parts vary (see the module); 5K + 1 parameters and the parts'.
+
+    ``init`` of the model settings: as :class:`~neuprim.core.model.densities.cosine.CosineDensity`, and
+
+    * ``window``: half width tau of a new window, in units of the sequence;
+    * ``window_frames``: largest tau in frames;
+    * ``rate``: bound of U(-rate, rate), from which W_t starts.
+
+    Args:
+        divide_above: windows longer than this are halved by population control; 0: none.
+        seams: :data:`ChunkOverlaps` of a model joined from chunks; empty for others.
+        components: names of the source grids whose share of the extinction each primitive stores.
     """
 
     init_settings = (*CosineDensity.init_settings, "window", "window_frames", "rate")
@@ -98,15 +125,18 @@ class TimeDensity(DensityField):
         self.static, self.divide_above = CosineDensity(neurons, omega0, edge, gain), divide_above
         self.exact_split = self.static.exact_split
         self.time, self.parts = "+".join(p for p in PARTS if p in parts) or "none", frozenset(parts)
-        self.seams = checked_seams(seams)
+        self.seams = validate_overlaps(seams)
         if isinstance(components, str) or not all(isinstance(name, str) and name.isidentifier() for name in components):
             raise ValueError(f"components {components!r}; expected a list of names")
         self.named = tuple(components)
 
     def settings(self) -> dict[str, Any]:
-        joined = {"seams": [list(seam) for seam in self.seams]} if self.seams else {}
-        named = {"components": list(self.named)} if self.named else {}
-        return {**self.static.settings(), "time": self.time, **joined, **named}
+        settings = {**self.static.settings(), "time": self.time}
+        if self.seams:
+            settings["seams"] = [list(overlap) for overlap in self.seams]
+        if self.named:
+            settings["components"] = list(self.named)
+        return settings
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
@@ -138,59 +168,57 @@ class TimeDensity(DensityField):
         return {name: params[_SHARE + name].sigmoid().reshape(-1) for name in self.named}
 
     def largest(self, params: Params, geometry: Geometry) -> Tensor:
-        own = dict(params)
+        changed = dict(params)
         if "offset" in self.parts:
-            own["b2"] = params["b2"] + (params["offset_cos"].abs() + params["offset_sin"].abs()).sum(1, keepdim=True)
-        return self.static.largest(own, geometry)
+            changed["b2"] = params["b2"] + (params["offset_cos"].abs() + params["offset_sin"].abs()).sum(
+                1, keepdim=True
+            )
+        return self.static.largest(changed, geometry)
 
     # ------------------------------------------------------------ one frame
 
     def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
         if "window" not in self.parts and not self.seams:
             return None
-        xi, rows = time_of(conditions), None
+        xi, rows = get_time(conditions), None
         if "window" in self.parts:
-            from neuprim.tasks.dynamic.frame_cpu import in_their_windows  # numba, loaded when first needed
+            from neuprim.tasks.dynamic.time_kernels import rows_in_window  # numba, loaded when first needed
 
-            rows = in_their_windows(params["window_center"], params["log_window"], xi)
+            rows = rows_in_window(params["window_center"], params["log_window"], xi)
         if self.seams:
-            counts = shares(params["chunk"], self.seams, xi)[:, 0] > 0
+            counts = chunk_weights(params["chunk"], self.seams, xi)[:, 0] > 0
             rows = counts.nonzero()[:, 0] if rows is None else rows[counts[rows]]
         return rows
 
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
         if "motion" not in self.parts:
             return geometry
-        from neuprim.tasks.dynamic.frame_cpu import fused_move  # numba, loaded when first needed
+        from neuprim.tasks.dynamic.time_kernels import move_means  # numba, loaded when first needed
 
         center = params["window_center"] if "window" in self.parts else torch.full_like(geometry.means[:, :1], 0.5)
-        means = fused_move(geometry.means, params["velocity"], params["acceleration"], center, time_of(conditions))
+        means = move_means(geometry.means, params["velocity"], params["acceleration"], center, get_time(conditions))
         return Geometry(means, geometry.log_scales, geometry.quats)
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
-        xi = time_of(conditions)
+        xi = get_time(conditions)
         b1 = params["b1"]
         if "phase" in self.parts:
             b1 = _advance(b1, params["W_t"], xi, 2 * math.pi / self.static.omega0)
-        own = dict(params)
+        changed = dict(params)
         if "offset" in self.parts:
             angle = math.pi * xi * torch.arange(1, OFFSET_TERMS + 1, dtype=torch.float64, device=xi.device)
             b2 = params["b2"]
-            own["b2"] = (
-                b2
-                + (
-                    params["offset_cos"] @ device.to_like(angle.cos(), b2)
-                    + params["offset_sin"] @ device.to_like(angle.sin(), b2)
-                )[:, None]
-            )
-        w2, b2 = amplified(own["w2"], own["b2"], own.get("log_gain"))
+            cosines = params["offset_cos"] @ device.to_like(angle.cos(), b2)
+            sines = params["offset_sin"] @ device.to_like(angle.sin(), b2)
+            changed["b2"] = b2 + (cosines + sines)[:, None]
+        w2, b2 = amplified(changed["w2"], changed["b2"], changed.get("log_gain"))
         if "window" in self.parts:
-            from neuprim.tasks.dynamic.frame_cpu import fused_window  # numba, loaded when first needed
+            from neuprim.tasks.dynamic.time_kernels import apply_window  # numba, loaded when first needed
 
-            w2, b2 = fused_window(w2, b2, params["window_center"], params["log_window"], xi)
+            w2, b2 = apply_window(w2, b2, params["window_center"], params["log_window"], xi)
         if self.seams:
-            share = shares(params["chunk"], self.seams, xi).to(b2)
-            w2, b2 = w2 * share, b2 * share
+            weight = chunk_weights(params["chunk"], self.seams, xi).to(b2)
+            w2, b2 = w2 * weight, b2 * weight
         return Cosine(params["W1"], b1, w2, b2, self.static.omega0, self.static.edge)
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
@@ -216,9 +244,9 @@ class TimeDensity(DensityField):
         )
 
     def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
-        """Windows longer than ``divide_above`` are halved; the halves overlap, as windows fade at their ends.
+        """Halve windows longer than ``divide_above``; the halves overlap, as windows fade at their ends.
 
-        Time is one more axis: halves lie along it as the children of a split do along the longest axis of space.
+        Halves lie along time as the children of a split lie along the longest axis of space.
         """
         if "window" not in self.parts or self.divide_above <= 0:
             return None
@@ -239,34 +267,33 @@ class TimeDensity(DensityField):
         return self.static.from_gaussians(alphas)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        """Neurons, and every part of time, which is either there or not."""
+        """Fewer neurons, and each part of time, which is either there or not."""
         return {**self.static.reductions(), **{part: (0,) for part in PARTS if part in self.parts}}
 
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[TimeDensity, dict[str, Tensor]]:
-        """Without a part of time: its mean over the sequence, see :mod:`neuprim.tasks.dynamic.stilled`."""
         if name == "neurons":
             field = TimeDensity(**{**self.settings(), "neurons": value})
             return field, prune_neurons(params, geometry, value, self.static.omega0)
-        fewer = stilled(params, geometry, name, self.static.omega0)
+        remaining = drop_time_terms(params, geometry, name, self.static.omega0)
         left = "+".join(part for part in PARTS if part in self.parts and part != name) or "none"
         field = TimeDensity(**{**self.settings(), "time": left})
         kept = {"means", *(spec.name for spec in field.parameters())}
-        return field, {key: value for key, value in fewer.items() if key in kept}
+        return field, {key: value for key, value in remaining.items() if key in kept}
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Neurons, and what changes in time but for windows, without which nothing would be left."""
-        turning = ("W_t",) if "phase" in self.parts else ()
-        found = [
-            PrunableUnit(one.name, {**one.places, **dict.fromkeys(turning, one.places["b1"])})
-            for one in self.static.prunable_units()
+        """Neurons, and all that changes in time except windows, without which nothing would be left."""
+        rates = ("W_t",) if "phase" in self.parts else ()
+        units = [
+            PrunableUnit(unit.name, {**unit.places, **dict.fromkeys(rates, unit.places["b1"])})
+            for unit in self.static.prunable_units()
         ]
         if "offset" in self.parts:
-            found.append(PrunableUnit("offset", {"offset_cos": (), "offset_sin": ()}))
+            units.append(PrunableUnit("offset", {"offset_cos": (), "offset_sin": ()}))
         if "motion" in self.parts:
-            found += [PrunableUnit(f"{name} {'xyz'[k]}", {name: (k,)}, name) for name in _MOTION for k in range(3)]
-        return tuple(found)
+            units += [PrunableUnit(f"{name} {'xyz'[k]}", {name: (k,)}, name) for name in _MOTION for k in range(3)]
+        return tuple(units)
 
     def script(self) -> str:
         return read_script(__package__, "density.js")
@@ -280,8 +307,7 @@ class TimeDensity(DensityField):
 
 
 def _advance(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:
-    """b1 + xi W_t less whole turns, 2 pi/omega0 each: exact to float32 however far outside 0..1 the time lies, as only
-    the remainder matters."""
+    """b1 + xi W_t without whole turns of 2 pi/omega0; float32-exact also for times far outside 0..1."""
     phase = b1.double() + xi * W_t.double()
     return (phase - turn * torch.round(phase.detach() / turn)).to(b1)
 
@@ -291,16 +317,110 @@ def _zeros(width: int) -> Any:
 
 
 def _initial_center(ctx: InitContext) -> Tensor:
-    """When the starting point was seen, else spread evenly at random over the sequence."""
+    """The starting point's time, else a random one, evenly distributed over the sequence."""
     if "time" in ctx.conditions:
         return ctx.conditions["time"].float().reshape(-1, 1)
     return (ctx.uniform(1) + 1) / 2
 
 
 def _initial_log_window(ctx: InitContext) -> Tensor:
-    """A sequence that is longer shows more events, not longer ones, so that frames say how long a fresh primitive
-    should live."""
+    """Limit new windows to a number of frames: a longer sequence shows more events, not longer ones."""
     half = ctx.number("window", 0.2, 0)
     if ctx.settings.get("window_frames") is not None and "time" in ctx.steps:
         half = min(half, ctx.number("window_frames", 1.0, 0) * ctx.steps["time"])
     return torch.full((ctx.count, 1), math.log(half))
+
+
+# ---------------------------------------------------------------- dropping a part of time
+
+_MEAN_TIMES = 128
+"""Times of a mean: the middles of as many equal parts of the sequence."""
+
+_MIDDLE = 0.5
+"""Reference time of motion without a window."""
+
+
+def drop_time_terms(params: Params, geometry: Geometry, part: str, omega0: float) -> dict[str, Tensor]:
+    """The tensors of a :class:`TimeDensity` with one part replaced by its mean over the sequence.
+
+    Means are over xi in 0..1, weighted by the window if there is one. A phase that advances by a over the sequence,
+    cos(phi + xi a), has the mean R cos(phi + psi) with R e^(i psi) the mean of e^(i xi a). A window leaves its mean
+    factor, a motion its mean position. The dropped part's own tensors are still in the result. With "motion", and with
+    "window" where there is a motion (then relative to xi = 1/2), "means" is there as well.
+    """
+    changes = {"phase": _mean_phase, "offset": _mean_offset, "window": _mean_window, "motion": _mean_motion}
+    return {**params, **changes[part](params, geometry, omega0)}
+
+
+def _mean_times(like: Tensor) -> Tensor:
+    return (torch.arange(_MEAN_TIMES, dtype=torch.float64, device=like.device) + 0.5) / _MEAN_TIMES
+
+
+def _window_factor(params: Params, xi: Tensor) -> Tensor:
+    """(N, 1) factors of the windows at a time."""
+    u = (xi - params["window_center"].double()) / params["log_window"].double().exp()
+    return (1 - u * u).clamp_min(0.0).square()
+
+
+def _time_weights(params: Params) -> list[tuple[Tensor, Tensor]]:
+    """(time, (N, 1) weights), which add up to 1."""
+    times = _mean_times(params["b1"])
+    if "window_center" not in params:
+        even = torch.full_like(params["b2"].double(), 1.0 / _MEAN_TIMES)
+        return [(xi, even) for xi in times]
+    factors = [_window_factor(params, xi) for xi in times]
+    total = torch.stack(factors).sum(0)
+    active = total > 0
+    return [
+        (xi, torch.where(active, f / total.where(active, torch.ones_like(total)), 1.0 / _MEAN_TIMES))
+        for xi, f in zip(times, factors, strict=True)
+    ]
+
+
+def _mean_phase(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
+    advance = omega0 * params["W_t"].double()
+    real, imaginary = torch.zeros_like(advance), torch.zeros_like(advance)
+    for xi, weight in _time_weights(params):
+        real += weight * (xi * advance).cos()
+        imaginary += weight * (xi * advance).sin()
+    b1 = params["b1"].double() + torch.atan2(imaginary, real) / omega0
+    w2 = params["w2"].double() * torch.hypot(real, imaginary)
+    return {"b1": b1.to(params["b1"]), "w2": w2.to(params["w2"])}
+
+
+def _mean_offset(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
+    cosines, sines = params["offset_cos"].double(), params["offset_sin"].double()
+    order = math.pi * torch.arange(1, cosines.shape[1] + 1, dtype=torch.float64, device=cosines.device)
+    b2 = params["b2"].double()
+    for xi, weight in _time_weights(params):
+        b2 = b2 + weight * (cosines @ (xi * order).cos() + sines @ (xi * order).sin())[:, None]
+    return {"b2": b2.to(params["b2"])}
+
+
+def _mean_window(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
+    mean = torch.stack([_window_factor(params, xi) for xi in _mean_times(params["b1"])]).mean(0)
+    faded = {
+        name: (params[name].double() * mean).to(params[name])
+        for name in ("w2", "b2", "offset_cos", "offset_sin")
+        if name in params
+    }
+    if "velocity" not in params:
+        return faded
+    later = _MIDDLE - params["window_center"].double()
+    velocity, acceleration = params["velocity"].double(), params["acceleration"].double()
+    means = geometry.means.double() + (velocity + acceleration * later) * later
+    return {
+        **faded,
+        "means": means.to(geometry.means),
+        "velocity": (velocity + 2 * acceleration * later).to(params["velocity"]),
+    }
+
+
+def _mean_motion(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
+    velocity, acceleration = params["velocity"].double(), params["acceleration"].double()
+    center = params["window_center"].double() if "window_center" in params else _MIDDLE
+    means = geometry.means.double()
+    for xi, weight in _time_weights(params):
+        later = xi - center
+        means = means + weight * (velocity + acceleration * later) * later
+    return {"means": means.to(geometry.means)}

@@ -1,30 +1,36 @@
-"""Posed images of a moving scene: ``transforms`` files in the layout of D-NeRF, with a ``time`` in every frame.
+"""Load posed images of a moving scene: ``transforms`` files in the layout of D-NeRF, with a ``time`` in every frame.
 
 Either ``transforms_SPLIT.json`` per split, whose scenes have z upwards, or one ``transforms.json``, of which every n-th
-frame by name is a test view unless it lists ``train_filenames``, ``val_filenames`` or ``test_filenames``; where both
-are there the splits count. Cameras, lenses and masks are those of :mod:`neuprim.core.data.transforms_json`; images are PNG,
-JPEG or OpenEXR.
-
-Each view has the condition "time", a float32 tensor without dimensions, 0..1.
-
-Settings beside the common ones: ``train_split``, ``test_split`` (names in the files' names, default train and test),
-``test_every`` (default 8) and ``time_range``: the "LOW:HIGH" of the files' times that becomes 0..1 (default "0:1"), or
-"auto" for the lowest and highest time of all frames, those of a train, val or test split that is not used included, so
-that a scene has one clock whatever is evaluated.
+frame by name is a test view unless it lists ``train_filenames``, ``val_filenames`` or ``test_filenames``; if both
+exist, the splits count. Cameras, lenses and masks are those of :mod:`neuprim.core.data.transforms_json`; images are
+PNG, JPEG or OpenEXR. Each view has the condition "time", a 0-dim float32 tensor, 0..1.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
-from neuprim.core.data import Dataset
+from neuprim.core.data import Dataset, PointCloud, ViewSet
+from neuprim.core.data.dataset import ViewSubset
+from neuprim.core.data.hull import EmptyHull, hull_surface
 from neuprim.core.data.image_views import ImageFrame
+from neuprim.core.data.initial import (
+    box_points,
+    check_point_count,
+    drop_repeated_points,
+    farthest_points,
+    median_colors,
+    views_have_alpha,
+)
 from neuprim.core.data.posed_images import (
     EveryNth,
     FolderSettings,
@@ -33,72 +39,77 @@ from neuprim.core.data.posed_images import (
     assemble_dataset,
     find_data_folder,
 )
+from neuprim.core.data.ray_points import ray_points
+from neuprim.core.data.scene_frame import optical_axes_meet
 from neuprim.core.data.transforms_json import TransformsLayout, read_transforms_frames, split_named_frames
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import Accepts, validate
-from neuprim.tasks.dynamic.moving import moving_points
 
-__all__ = ["MultiviewSettings", "load"]
+__all__ = ["MultiviewSettings", "load", "moving_points"]
 
 _AUTO = "auto"
 _NAMES = ("train", "val", "test")
 
-_Range = tuple[float, float]
+_TimeRange = tuple[float, float]
 
 
 def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """The scene in the folder ``settings["path"]``; sRGB from PNG and JPEG, linear light from OpenEXR.
+    """Load the scene in the folder ``settings["path"]``; sRGB from PNG and JPEG, linear light from OpenEXR.
 
     Raises:
         ConfigError: unknown or impossible settings.
         DataError: missing or damaged files, wrong or missing fields, times that are missing or out of range, impossible
             cameras, empty splits.
     """
-    asked = validate(MultiviewSettings, settings, "scene")
-    folder = find_data_folder(asked.path)
+    options = validate(MultiviewSettings, settings, "scene")
+    folder = find_data_folder(options.path)
     name, single = folder.resolve().name, folder / "transforms.json"
-    files = {split: folder / f"transforms_{split}.json" for split in (asked.train_split, asked.test_split)}
-    if not files[asked.train_split].is_file() and single.is_file():
+    files = {split: folder / f"transforms_{split}.json" for split in (options.train_split, options.test_split)}
+    if not files[options.train_split].is_file() and single.is_file():
         document = JsonReader.open(single)
         records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
-        clock = _clock(records, [], asked.time_range)
-        records, frames = _frames(asked, document, records, clock)
-        train, test = split_named_frames(document, records, frames, asked.test_every)
-        return assemble_dataset(str(single), name, train, test, asked, context, SceneDetails(start=moving_points))
+        time_range = _time_range(records, [], options.time_range)
+        records, frames = _frames(options, document, records, time_range)
+        train, test = split_named_frames(document, records, frames, options.test_every)
+        return assemble_dataset(str(single), name, train, test, options, context, SceneDetails(start=moving_points))
     if not any(path.is_file() for path in files.values()):
         raise DataError(
-            f"{folder}: has neither {files[asked.train_split].name} nor transforms.json; expected one of them"
+            f"{folder}: has neither {files[options.train_split].name} nor transforms.json; expected one of them"
         )
-    held_out = files[asked.test_split]
-    if not held_out.is_file():
-        hint = f"rename {files[asked.train_split].name} to transforms.json, of which every 8th frame is a test view (scene.test_every)"
-        raise DataError(f"{held_out}: file not found, so there are no views to judge by; {hint}")
+    test_file = files[options.test_split]
+    if not test_file.is_file():
+        raise DataError(
+            f"{test_file}: file not found, so there are no test views; rename {files[options.train_split].name} "
+            "to transforms.json, of which every 8th frame is a test view (scene.test_every)"
+        )
     documents = {split: JsonReader.open(path) for split, path in files.items()}
     splits = {split: list(document.objects("frames")) for split, document in documents.items()}
-    clock = _clock([r for s in splits.values() for r in s], _others(folder, splits), asked.time_range)
-    read = {split: _frames(asked, documents[split], splits[split], clock)[1] for split in splits}
+    time_range = _time_range(
+        [r for s in splits.values() for r in s], _unused_splits(folder, splits), options.time_range
+    )
+    read = {split: _frames(options, documents[split], splits[split], time_range)[1] for split in splits}
     return assemble_dataset(
         str(folder),
         name,
-        read[asked.train_split],
-        read[asked.test_split],
-        asked,
+        read[options.train_split],
+        read[options.test_split],
+        options,
         context,
         SceneDetails(up=torch.tensor([0.0, 0.0, 1.0]), start=moving_points),
     )
 
 
 def _frames(
-    asked: MultiviewSettings, document: JsonReader, records: list[JsonReader], clock: _Range
+    options: MultiviewSettings, document: JsonReader, records: list[JsonReader], time_range: _TimeRange
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
     """The frames with their times 0..1, and their records."""
     layout = TransformsLayout(
         keys=("time", "train_filenames", "val_filenames", "test_filenames", "ply_file_path"), masks=True
     )
-    records, frames = read_transforms_frames(find_data_folder(asked.path), document, records, asked, layout)
-    low, high = clock
+    records, frames = read_transforms_frames(find_data_folder(options.path), document, records, options, layout)
+    low, high = time_range
     times = [(r.number("time") - low) / (high - low) for r in records]
     return records, [
         replace(f, conditions={"time": torch.tensor(t, dtype=torch.float32)})
@@ -109,8 +120,8 @@ def _frames(
 # ---------------------------------------------------------------- time
 
 
-def _clock(records: Sequence[JsonReader], others: Sequence[Path], setting: str) -> _Range:
-    """The times that become 0 and 1, after a look at the time of every frame.
+def _time_range(records: Sequence[JsonReader], others: Sequence[Path], setting: str) -> _TimeRange:
+    """The times that become 0 and 1, after checking the time of every frame.
 
     Args:
         records: of all frames in use.
@@ -141,7 +152,8 @@ def _clock(records: Sequence[JsonReader], others: Sequence[Path], setting: str) 
     if low == high:
         where = records[0].where.rsplit(": ", 1)[0]
         raise DataError(
-            f"{where}: every frame has the time {low:g}; expected at least two different times for scene.time_range=auto"
+            f"{where}: every frame has the time {low:g}; "
+            "expected at least two different times for scene.time_range=auto"
         )
     return low, high
 
@@ -153,12 +165,12 @@ def _time(record: JsonReader) -> float:
     return record.number("time", f"a finite number for {name}")
 
 
-def _others(folder: Path, used: Mapping[str, Any]) -> list[Path]:
-    """Files of the usual splits that are there and not in use."""
+def _unused_splits(folder: Path, used: Mapping[str, Any]) -> list[Path]:
+    """Existing files of the usual splits that are not in use."""
     return [path for name in _NAMES if name not in used and (path := folder / f"transforms_{name}.json").is_file()]
 
 
-def _parse_range(value: str) -> _Range:
+def _parse_range(value: str) -> _TimeRange:
     """The two numbers of "LOW:HIGH"; ValueError where it is something else."""
     low, high = (float(part) for part in value.split(":"))
     if not (math.isfinite(low) and math.isfinite(high) and low < high and math.isfinite(high - low)):
@@ -175,7 +187,7 @@ def _is_range(value: str) -> bool:
 
 @dataclass(frozen=True)
 class MultiviewSettings(FolderSettings):
-    """What the user may set.
+    """Settings of the scene.
 
     Attributes:
         train_split, test_split: names in transforms_NAME.json.
@@ -189,3 +201,109 @@ class MultiviewSettings(FolderSettings):
     time_range: Annotated[str, Accepts(_is_range, 'auto, or "LOW:HIGH" in quotes with LOW below HIGH, e.g. "0:1"')] = (
         "0:1"
     )
+
+
+# ---------------------------------------------------------------- starting points
+
+_SHARED = 2
+"""Cameras per time for a hull of a single time; with fewer, neighbours in time are added."""
+_RUN = 4
+_MOMENTS = 64
+_RESOLUTION = 64
+_SEEN = 0.75
+"""Share of the cameras that must see a place: places in two of four frusta only are often taken for matter."""
+_MATTER = 0.1
+"""Least opacity of matter; the edges of smoke are seldom more opaque."""
+
+
+def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
+    """At most ``count`` distinct starting points of a moving scene, in scene units and the images' colour space.
+
+    Visual hulls of single moments are united over time; one hull of all masks would carve away whatever moves. If
+    several cameras share each time, a moment is one time. If every image has its own time, as in D-NeRF, a moment is a
+    run of four neighbours in time: a thing that moves by less than its own size meanwhile keeps its middle, and the
+    next, overlapping runs supply the rest. (Tested alternatives lose the ends of a path or fill the room.)
+
+    Points lie on the surfaces of these hulls, each with the "time" and the colour of one moment. Cameras without a
+    common target give points along rays (:func:`~neuprim.core.data.ray_points.ray_points`). Without alpha, or if every
+    image has its own time and all hulls are empty, points fill a box in front of the cameras at random times.
+
+    Args:
+        views: each with the condition "time", 0..1.
+
+    Raises:
+        ConfigError: ``count`` is not positive.
+        DataError: cameras share times, but their masks have no common volume; or an image is damaged.
+    """
+    check_point_count(count)
+    times = torch.stack([views.view(i).conditions["time"] for i in range(len(views))]).float()
+    if not optical_axes_meet([views.view(i).camera for i in range(len(views))]):
+        rays, owner = ray_points(views, count, generator, _MATTER)
+        return drop_repeated_points(PointCloud(rays.means, rays.colors, {"time": times[owner]}))
+    if views_have_alpha(views):
+        points = _hull_points(views, times, count, generator)
+        if points is not None:
+            return points
+    points = box_points(views, count, generator)
+    drawn = torch.randint(len(times), (len(points.means),), generator=generator)
+    return PointCloud(points.means, points.colors, {"time": times[drawn]})
+
+
+def _hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Generator) -> PointCloud | None:
+    """Points on the hulls; None if every image has its own time and all hulls are empty."""
+    moments, shared = _moments(times)
+    surfaces, owners, sides = [], [], []
+    empty: EmptyHull | None = None
+    for number, (indices, _) in enumerate(moments):
+        try:
+            found, side = hull_surface(ViewSubset(views, indices), _RESOLUTION, seen_views=_SEEN, matter=_MATTER)
+        except EmptyHull as error:
+            empty = error
+            continue
+        surfaces.append(found)
+        owners.append(torch.full((len(found),), number))
+        sides.append(side)
+    if not surfaces:
+        if shared and empty is not None:
+            raise empty
+        return None
+    centers, owner = torch.cat(surfaces), torch.cat(owners)
+    voxel = torch.cat([torch.full((len(s),), side) for s, side in zip(surfaces, sides, strict=True)])
+    rows = _one_per_cell(centers, float(np.median(sides)), generator)
+    rows = (
+        rows[farthest_points(centers[rows], count, generator)]
+        if count <= len(rows)
+        else rows[torch.arange(count) % len(rows)]
+    )
+    jitter = torch.rand((len(rows), 3), generator=generator) - 0.5
+    means, owner = centers[rows] + jitter * voxel[rows, None], owner[rows]
+    colors = torch.empty_like(means)
+    for number in owner.unique().tolist():
+        mine = owner == number
+        colors[mine] = median_colors(ViewSubset(views, moments[number][0]), means[mine], _MATTER)
+    when = torch.tensor([time for _, time in moments], dtype=torch.float32)
+    return drop_repeated_points(PointCloud(means, colors, {"time": when[owner]}))
+
+
+def _moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:
+    """(views, time) of at most _MOMENTS moments in order of time; and whether moments are single times."""
+    values = times.tolist()
+    sharing = Counter(values)
+    shared = float(np.median(list(sharing.values()))) >= _SHARED
+    order = sorted(range(len(values)), key=values.__getitem__)  # stable: equal times stay in order of their views
+    if shared:
+        moments = [([i for i in order if values[i] == t], t) for t in sorted(sharing) if sharing[t] >= _SHARED]
+    else:
+        last = max(0, len(order) - _RUN)
+        runs = [order[start : start + _RUN] for start in sorted({*range(0, last + 1, _RUN // 2), last})]
+        moments = [(run, values[run[len(run) // 2]]) for run in runs]
+    kept = sorted({round(i) for i in np.linspace(0, len(moments) - 1, min(len(moments), _MOMENTS))})
+    return [moments[i] for i in kept], shared
+
+
+def _one_per_cell(points: Tensor, side: float, generator: torch.Generator) -> Tensor:
+    """Rows of one random point in every cubic cell with points: things at rest are found in all moments."""
+    shuffled = torch.randperm(len(points), generator=generator)
+    cells = ((points[shuffled] - points.min(0).values) / side).floor().long().numpy()
+    _, first = np.unique(cells, axis=0, return_index=True)
+    return shuffled[torch.from_numpy(np.sort(first))]

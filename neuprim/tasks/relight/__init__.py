@@ -12,13 +12,16 @@ from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
 from neuprim.core.validation import validate_choices
-from neuprim.tasks.relight import judging
-from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightNetwork
-from neuprim.tasks.relight.data import lighting_of
-from neuprim.tasks.relight.environment import illuminate
-from neuprim.tasks.relight.harmonics import LightHarmonics
-from neuprim.tasks.relight.layers import LAYERS
-from neuprim.tasks.relight.lights import orbit_in_frames, parse_intensities, parse_lights, typical_light
+from neuprim.tasks.relight import evaluation
+from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightHarmonics, LightNetwork
+from neuprim.tasks.relight.lighting import (
+    illuminate,
+    lighting_of,
+    orbit_in_frames,
+    parse_intensities,
+    parse_lights,
+    typical_light,
+)
 
 __all__ = ["TASK"]
 
@@ -111,11 +114,11 @@ TASK = TaskSpec(
     fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},
     environment=illuminate,
     uses=("model.neurons",),
-    mask=judging.mask,
-    judge=judging.judge,
-    diagnose=judging.diagnose,
-    clips=judging.clips,
-    facts=judging.facts,
-    orbit=judging.orbit,
-    layers=LAYERS,
+    mask=evaluation.mask,
+    judge=evaluation.metrics,
+    diagnose=evaluation.diagnose,
+    clips=evaluation.clips,
+    facts=evaluation.facts,
+    orbit=evaluation.orbit,
+    layers=evaluation.LAYERS,
 )

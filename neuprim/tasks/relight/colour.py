@@ -1,13 +1,12 @@
-"""Colour under a point light: one hidden layer per primitive (equation 14), with or without a light-visibility factor.
+"""Colour under a point light: one hidden layer per primitive (equation 14), or spherical harmonics of the light.
 
-    h = cos(beta (W_x x~ + W_d d + W_l l + b))         x~ the local middle of the chord, d and l unit vectors at the
-    centre:
-                                                       from the camera, and to the light
-    additive         c = V E max(0, c_dc + W_out h)                         equation 14: 9 -> H -> 3, 107 parameters at
-    H = 8 multiplicative   c = V E max(0, albedo (1 + w_out . h))                 no tinting: 91 parameters
+    h = cos(beta (W_x x~ + W_d d + W_l l + b))             x~ the local middle of the chord; d and l unit vectors at the
+                                                           centre: from the camera, and to the light
+    additive         c = V E max(0, c_dc + W_out h)        equation 14: 9 -> H -> 3, 107 parameters at H = 8
+    multiplicative   c = V E max(0, albedo (1 + w_out . h))    no tinting: 91 parameters
 
-E is the light's intensity, divided by the squared distance where the data set says so, over that of a typical training
-light, so that learning rates do not depend on the data's unit of light; V the visibility of the light from the
+E is the light's intensity, divided by the squared distance where the dataset says so, over that of a typical training
+light, so that learning rates do not depend on the data's unit of light. V is the visibility of the light from the
 primitive (:mod:`neuprim.tasks.relight.visibility`) or 1. Everything but W_x x~ is constant over a primitive, so it
 folds into the closed form :class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
 """
@@ -17,21 +16,31 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.compute import device
-from neuprim.core.model.cosine_sums import canonicalize_cosines, smaller_neuron_counts
-from neuprim.core.model.fields import ColourField, Conditions, LoweredDensity, RayNet, Shading, read_script
+from neuprim.core.model.colours.sh import coefficients, truncate_bands
+from neuprim.core.model.cosine_sums import ball_mean, canonicalize_cosines, smaller_neuron_counts
+from neuprim.core.model.edge import sinc
+from neuprim.core.model.fields import ColourField, Conditions, Constant, LoweredDensity, RayNet, Shading, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.settings import RenderSettings
-from neuprim.tasks.relight.directions import least_square, unit
-from neuprim.tasks.relight.fewer import fewer_units
 from neuprim.tasks.relight.visibility import light_visibility
 
-__all__ = ["FORMS", "LightNetwork"]
+__all__ = [
+    "FORMS",
+    "VISIBILITY",
+    "LightHarmonics",
+    "LightNetwork",
+    "min_squared_distance",
+    "normalize_direction",
+    "prune_hidden_units",
+    "real_harmonics",
+]
 
 FORMS = ("additive", "multiplicative")
 
@@ -39,16 +48,15 @@ VISIBILITY = ("none", "primitive", "pixel")
 
 
 class LightNetwork(ColourField):
-    """See the module. H = 0 is the constant colour c_dc (times V and E).
+    """Colour network under a point light (see the module). H = 0 is the constant colour c_dc (times V and E).
 
     Args:
         hidden: H, 0..16.
         form: one of :data:`FORMS`.
-        visibility: where a depth image out of the light is asked whether light arrives: nowhere ("none": equation 14 as
-        printed), at
-            the centres of primitives ("primitive"), or at the point that each pixel shows ("pixel").
+        visibility: where the light's depth images are looked up: nowhere ("none": equation 14 as printed), at the
+            centres of primitives ("primitive"), or at the point that each pixel shows ("pixel").
         boost: beta. 1 starts flat in the light's direction, 30 overfits (method: relighting).
-        falloff: whether the light's intensity is divided by the squared distance, in scene units.
+        falloff: divide the light's intensity by the squared distance, in scene units.
         typical: E of a typical training light, in the data's units.
     """
 
@@ -109,15 +117,15 @@ class LightNetwork(ColourField):
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means
         size = geometry.length_scale.detach()[:, None]
-        view = unit(means - device.to_like(camera.position, means), size)
+        view = normalize_direction(means - device.to_like(camera.position, means), size)
         to_light = device.to_like(conditions["light"], means) - means
         strength = device.to_like(conditions["light_intensity"], means).expand(self.channels) / self.typical
         factor = strength.expand(means.shape[0], -1)
         if self.falloff:
-            factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(least_square(geometry))
+            factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_distance(geometry))
         phase = (
             (params["net_view"] * view[:, None]).sum(-1)
-            + (params["net_light"] * unit(to_light, size)[:, None]).sum(-1)
+            + (params["net_light"] * normalize_direction(to_light, size)[:, None]).sum(-1)
             + params["net_phase"]
         )
         if self.form == "additive":
@@ -128,7 +136,7 @@ class LightNetwork(ColourField):
         return RayNet(self.boost * params["net_x"], self.boost * phase, out * factor[:, :, None], base * factor)
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """x~' = x~ m/m' - (mu' - mu)/m': the children see what their parent saw."""
+        """Keep the colour of the parent: x~' = x~ m/m' - (mu' - mu)/m'."""
         r = (new.log_length_scale.double() - old.log_length_scale.double()).exp()
         shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]
         net_x = params["net_x"].double()
@@ -145,12 +153,11 @@ class LightNetwork(ColourField):
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[LightNetwork, dict[str, Tensor]]:
-        return LightNetwork(**{**self.settings(), "hidden": value}), fewer_units(
+        return LightNetwork(**{**self.settings(), "hidden": value}), prune_hidden_units(
             params, geometry, value, self.boost, self.form == "multiplicative"
         )
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Hidden units."""
         inputs = ("net_x", "net_view", "net_light", "net_phase")
         return tuple(
             PrunableUnit(f"unit {h}", {**dict.fromkeys(inputs, (h,)), "net_out": (slice(None), h)})
@@ -165,9 +172,171 @@ class LightNetwork(ColourField):
 
 
 _DARKEST = 1e-3
-"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays
-black."""
+"""Smallest initial colour: at zero and below, max(0, .) passes no gradient and black stays black."""
 
 
 def _output(ctx: InitContext) -> float:
     return ctx.number("output", 0.05)
+
+
+# ---------------------------------------------------------------- pruning
+
+
+def prune_hidden_units(
+    params: Params, geometry: Geometry, keep: int, boost: float, multiplicative: bool
+) -> dict[str, Tensor]:
+    """The tensors of a :class:`LightNetwork` with ``keep`` units per primitive: those that change the colour most.
+
+    Removed units leave their mean: of cos(phi + beta (W_x x~ + W_d d + W_l l)) with x~ over the ellipsoid, d and l over
+    all directions, it is cos(phi) b(|beta W_x diag|) sinc(|beta W_d|) sinc(|beta W_l|), b the mean over a ball. The
+    variance follows from cos^2 = (1 + cos 2(.))/2.
+
+    Args:
+        params: c_dc (N, C), net_x, net_view and net_light (N, H, 3), net_phase (N, H), and net_out (N, C, H), or (N, 1,
+            H) of the multiplicative form.
+        multiplicative: the form; there the mean becomes part of the albedo.
+    """
+    net_x, view, light = (params[name].double() * boost for name in ("net_x", "net_view", "net_light"))
+    phase, out = boost * params["net_phase"].double(), params["net_out"].double()
+    semi_axes = (geometry.log_scales.double() - geometry.log_length_scale.double()[:, None]).exp()
+    rotations = Geometry(geometry.means.double(), geometry.log_scales.double(), geometry.quats.double()).rotations
+    rates = ((net_x @ rotations) * semi_axes[:, None, :]).norm(dim=-1), view.norm(dim=-1), light.norm(dim=-1)
+
+    def mean_of(times: int) -> Tensor:
+        return (times * phase).cos() * ball_mean(times * rates[0]) * sinc(times * rates[1]) * sinc(times * rates[2])
+
+    mean = mean_of(1)
+    variance = (1 + mean_of(2)) / 2 - mean.square()
+    order = (out.square().sum(1) * variance).argsort(dim=1, descending=True, stable=True)
+    kept, gone = order[:, :keep].sort(dim=1).values, order[:, keep:]
+    fewer = {
+        name: params[name].gather(1, kept[..., None].expand(-1, -1, 3)).contiguous()
+        for name in ("net_x", "net_view", "net_light")
+    }
+    fewer["net_phase"] = params["net_phase"].gather(1, kept).contiguous()
+    outputs = out.shape[1]
+    stays = params["net_out"].gather(2, kept[:, None].expand(-1, outputs, -1))
+    left = (out * mean[:, None]).gather(2, gone[:, None].expand(-1, outputs, -1)).sum(2)
+    base = params["c_dc"].double()
+    if not multiplicative:
+        return {**params, **fewer, "net_out": stays.contiguous(), "c_dc": (base + left).to(params["c_dc"])}
+    # c_dc (1 + left + w . h) = c_dc (1 + left) (1 + w/(1 + left) . h); where little would be left, only the units go
+    scale = torch.where(1 + left > 0.1, 1 + left, torch.ones_like(left))
+    return {
+        **params,
+        **fewer,
+        "net_out": (stays.double() / scale[:, :, None]).to(params["net_out"]).contiguous(),
+        "c_dc": (base * scale).to(params["c_dc"]),
+    }
+
+
+# ---------------------------------------------------------------- spherical harmonics of the light
+
+
+class LightHarmonics(ColourField):
+    """c = E max(0, SH(direction mu -> light)): the baseline for equation 14, without view dependence or shadows.
+
+    C (degree + 1)^2 parameters; degree 5 has as many as the network of 8 units.
+    """
+
+    def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False, typical: float = 1.0) -> None:
+        if not isinstance(degree, int) or not 0 <= degree <= 8:
+            raise ValueError(f"spherical-harmonics degree {degree!r}; expected 0..8")
+        if not 0 < typical < math.inf:
+            raise ValueError(f"typical light {typical!r}; expected a number above 0")
+        self.degree, self.channels, self.falloff, self.typical = degree, channels, bool(falloff), float(typical)
+
+    def settings(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("degree", "channels", "falloff", "typical")}
+
+    def parameters(self) -> list[ParameterSpec]:
+        C, rest = self.channels, (self.degree + 1) ** 2 - 1
+        specs = [ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(1e-3).float())]
+        if rest:
+            specs.append(ParameterSpec("light_sh", (rest, C), 1e-2, lambda c: torch.zeros(c.count, rest, C)))
+        return specs
+
+    def reductions(self) -> dict[str, tuple[int, ...]]:
+        return {"degree": tuple(range(self.degree - 1, -1, -1))} if self.degree else {}
+
+    def reduce(
+        self, params: Params, geometry: Geometry, name: str, value: int
+    ) -> tuple[LightHarmonics, dict[str, Tensor]]:
+        return LightHarmonics(**{**self.settings(), "degree": value}), truncate_bands(params, "light_sh", value)
+
+    def prunable_units(self) -> tuple[PrunableUnit, ...]:
+        """Coefficients, each of one channel."""
+        return coefficients(self.degree, self.channels, "light_sh")
+
+    def script(self) -> str:
+        return read_script(__package__, "harmonics.js")
+
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        color = params["c_dc"]
+        to_light = device.to_like(conditions["light"], color) - geometry.means
+        squared = to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_distance(geometry))
+        if self.degree:
+            bands = real_harmonics(normalize_direction(to_light, geometry.length_scale.detach()[:, None]), self.degree)[
+                :, 1:
+            ]
+            color = color + (bands[:, :, None] * params["light_sh"]).sum(1)
+        strength = (
+            device.to_like(conditions["light_intensity"], color) / self.typical / (squared if self.falloff else 1.0)
+        )
+        return Constant(color.clamp_min(0.0) * strength)
+
+
+def real_harmonics(directions: Tensor, degree: int) -> Tensor:
+    """(N, (degree + 1)^2) orthonormal real spherical harmonics of unit directions, bands in order, m = -l..l, by
+    recurrence.
+
+    The associated Legendre functions without the Condon-Shortley phase: P_m^m = (2m - 1)!! sin^m, P_{m+1}^m = (2m + 1)
+    z P_m^m, (l - m) P_l^m = (2l - 1) z P_{l-1}^m - (l + m - 1) P_{l-2}^m; sin^m cos(m phi) and sin^m sin(m phi) are
+    polynomials in x, y.
+    """
+    x, y, z = directions.unbind(-1)
+    cosine, sine = [torch.ones_like(x)], [torch.zeros_like(x)]
+    for _ in range(degree):
+        cosine.append(x * cosine[-1] - y * sine[-1])
+        sine.append(x * sine[-1] + y * cosine[-2])
+    legendre: dict[tuple[int, int], Tensor] = {}
+    for m in range(degree + 1):
+        legendre[m, m] = torch.full_like(x, math.prod(range(1, 2 * m, 2)))
+        if m < degree:
+            legendre[m + 1, m] = (2 * m + 1) * z * legendre[m, m]
+        for l in range(m + 2, degree + 1):
+            legendre[l, m] = ((2 * l - 1) * z * legendre[l - 1, m] - (l + m - 1) * legendre[l - 2, m]) / (l - m)
+    columns = []
+    for l in range(degree + 1):
+        for m in range(-l, l + 1):
+            a = abs(m)
+            scale = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - a) / math.factorial(l + a)) * (
+                math.sqrt(2) if m else 1
+            )
+            columns.append(scale * legendre[l, a] * (cosine[a] if m >= 0 else sine[a]))
+    return torch.stack(columns, -1)
+
+
+# ---------------------------------------------------------------- directions
+
+_MIN_LENGTH = 1e-6
+"""Length in units of ``size`` below which a direction fades; its gradient, 1/length, stays below 1e6 per size."""
+_MIN_LIGHT_DISTANCE = 1e-4
+"""Distance in units of a primitive's size below which a light does not get stronger."""
+
+
+def normalize_direction(vector: Tensor, size: Tensor | float = 1.0) -> Tensor:
+    """(..., 3) unit vectors; vectors shorter than 1e-6 of ``size`` are scaled by 1e6/size, so that zero stays zero.
+
+    No square leaves float32's range.
+
+    Args:
+        size: (..., 1) unit of length, e.g. the size of the primitive that the vector starts from.
+    """
+    scaled = vector / vector.detach().abs().amax(-1, keepdim=True).clamp_min(_MIN_LENGTH * size)
+    return scaled / scaled.norm(dim=-1, keepdim=True).clamp_min(1.0)
+
+
+def min_squared_distance(geometry: Geometry) -> Tensor:
+    """(N, 1) smallest squared distance to a light for falloff."""
+    return (_MIN_LIGHT_DISTANCE * geometry.length_scale.detach()[:, None]).square()

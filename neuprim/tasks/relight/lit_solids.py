@@ -23,7 +23,7 @@ from neuprim.core.task import SceneContext
 from neuprim.core.validation import Accepts, validate
 from neuprim.scenes.lit import NEAR_LIGHTS, PARTS, LitSettings, generate_lit_solids
 from neuprim.tasks.relight import olat
-from neuprim.tasks.relight.data import Lighting
+from neuprim.tasks.relight.lighting import Lighting
 
 __all__ = ["LitSolidsSettings", "classes", "companion", "load"]
 

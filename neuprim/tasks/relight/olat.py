@@ -63,7 +63,7 @@ from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import Range, validate
-from neuprim.tasks.relight.data import Lighting, bright
+from neuprim.tasks.relight.lighting import Lighting, percentile_exposure
 
 __all__ = ["OlatSettings", "load", "read_split"]
 
@@ -78,29 +78,35 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: missing or damaged files, wrong or missing fields, impossible cameras, empty splits, black images
         with exposure=auto.
     """
-    asked = validate(OlatSettings, settings, "scene")
-    folder = find_data_folder(asked.path)
+    options = validate(OlatSettings, settings, "scene")
+    folder = find_data_folder(options.path)
     train, test = read_transforms_splits(
-        folder, asked.train_split, asked.test_split, asked.hold_out, lambda split: read_split(folder, split, asked)
+        folder,
+        options.train_split,
+        options.test_split,
+        options.hold_out,
+        lambda split: read_split(folder, split, options),
     )
     return assemble_dataset(
         str(folder),
         folder.resolve().name,
         train,
         test,
-        asked,
+        options,
         context,
         SceneDetails(
             up=torch.tensor([0.0, 0.0, 1.0]),
             to_linear=True,
-            exposure=(lambda views: bright(views, str(folder))) if asked.exposure == "auto" else asked.exposure,
-            extra=Lighting(asked.falloff),
+            exposure=(lambda views: percentile_exposure(views, str(folder)))
+            if options.exposure == "auto"
+            else options.exposure,
+            extra=Lighting(options.falloff),
             positions=("light",),
         ),
     )
 
 
-def read_split(folder: Path, split: str, asked: OlatSettings) -> list[ImageFrame]:
+def read_split(folder: Path, split: str, options: OlatSettings) -> list[ImageFrame]:
     """The frames of one split, with their lights as conditions.
 
     Raises:
@@ -110,8 +116,8 @@ def read_split(folder: Path, split: str, asked: OlatSettings) -> list[ImageFrame
     near = document.number_or("camera_near", 3.0, "a distance above 0", 0.0)
     if document.number_or("camera_far", max(10.0, 2.0 * near), f"a distance above camera_near, {near:g}") <= near:
         raise document.fail("camera_far", f"a distance above camera_near, {near:g}")
-    layout = TransformsLayout(_KEYS, _name, _image, lambda record: _viewmat(record, asked.ignore_corrections))
-    records, frames = read_transforms_frames(folder, document, list(document.objects("frames")), asked, layout)
+    layout = TransformsLayout(_KEYS, _name, _image, lambda record: _viewmat(record, options.ignore_corrections))
+    records, frames = read_transforms_frames(folder, document, list(document.objects("frames")), options, layout)
     return [replace(frame, conditions=_light(record, document)) for record, frame in zip(records, frames, strict=True)]
 
 

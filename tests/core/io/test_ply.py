@@ -36,7 +36,8 @@ def test_other_programs_read_it(tmp_path: Path) -> None:
 
 
 def test_ascii_big_endian_and_lists_after_the_vertices(tmp_path: Path) -> None:
-    head = "element vertex 2\nproperty float x\nproperty uchar red\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    head = "element vertex 2\nproperty float x\nproperty uchar red\n"
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     (tmp_path / "a.ply").write_text("ply\r\nformat ascii 1.0\r\ncomment hi\r\n" + head + "0.5 7\n-1e-3 255\n3 0 1 0\n")
     found = read_ply(tmp_path / "a.ply")
     assert (

@@ -20,8 +20,7 @@ from neuprim.core.task import TaskSpec
 from neuprim.plugins.registry import load_task
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
-from neuprim.tasks.relight.colour import LightNetwork
-from neuprim.tasks.relight.harmonics import LightHarmonics
+from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core.model.shaken import CONDITIONS, COUNT, camera, made
 

@@ -18,8 +18,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
-from neuprim.tasks.relight.colour import LightNetwork
-from neuprim.tasks.relight.harmonics import LightHarmonics
+from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core.model.shaken import CONDITIONS, COUNT, camera, made
 

@@ -10,9 +10,9 @@ import numpy as np
 from neuprim.core.data import Dataset
 from neuprim.core.io.vdb import Grid, scale_transform
 from neuprim.core.task import SceneContext
-from neuprim.tasks.dynamic.judging import recording_of
+from neuprim.tasks.dynamic.evaluation import recording_of
 from neuprim.tasks.dynamic.volume.dataset import Recording
-from neuprim.tasks.dynamic.volume.scene import load
+from neuprim.tasks.dynamic.volume.scene import load_dataset
 
 VOXEL = 0.5
 
@@ -28,7 +28,7 @@ def blob(center: float, names: tuple[str, ...] = ("density", "flames")) -> list[
 
 def dataset(folder: Path, tmp_path: Path, **changes: Any) -> Dataset:
     settings = {"vdb": str(folder), "size": 24, "cameras": 6, "samples": 1, "look": "smoke_fire", **changes}
-    return load(settings, SceneContext(0, tmp_path / "cache"))
+    return load_dataset(settings, SceneContext(0, tmp_path / "cache"))
 
 
 def recorded(data: Dataset) -> Recording:

@@ -13,14 +13,11 @@ from PIL import Image
 
 from neuprim.cli import main
 from neuprim.config import compose
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import write_vdb
-from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_run
-from neuprim.runs.render_images import RenderRequest, render_run
 from neuprim.runs.run import run
-from neuprim.tasks.dynamic import TASK
-from neuprim.tasks.dynamic.time import parse_times
+from neuprim.tasks.dynamic import TASK, parse_times
 from tests.reports import offered
 from tests.tasks.dynamic import sequences
 from tests.tasks.dynamic.sequences import blob
@@ -70,15 +67,6 @@ def test_a_run_learns_and_reports_every_number(finished: Path) -> None:
     assert m["vdb_bytes"] > 0 and 0 <= m["invisible_fraction"] <= 1 and m["data_source"] == "real"
 
 
-def test_the_report_shows_films_beside_their_truth(finished: Path) -> None:
-    films = sorted((finished / "renders").glob("clip_*.webp"))
-    assert len(films) == 2
-    with Image.open(films[0]) as film:
-        assert film.size == (48, 24) and getattr(film, "n_frames", 1) == 4
-    page = (finished / "report.html").read_text()
-    assert "Held-out films" in page and "PSNR over the frames" in page and "PSNR inside the mask" in page
-
-
 def test_the_report_offers_commands_that_work(finished: Path, tmp_path: Path) -> None:
     commands = offered(finished / "report.html")
     assert ["render", str(finished), "--camera", "orbit", "--time", "0:1"] in commands
@@ -87,13 +75,7 @@ def test_the_report_offers_commands_that_work(finished: Path, tmp_path: Path) ->
         assert main([*words, *small]) == 0, words
 
 
-def test_eval_gives_the_same_numbers(finished: Path) -> None:
-    again, first = evaluate_run(finished), metrics(finished)
-    for key in ("psnr", "psnr_mask", "psnr_pooled_mask", "ssim_srgb", "sigma_correlation_late"):
-        assert again[key] == pytest.approx(first[key], abs=1e-9), key
-
-
-@pytest.mark.parametrize("suffix", ["webp", "gif", "mp4"])
+@pytest.mark.parametrize("suffix", ["webp", "mp4"])
 def test_an_animation_over_time(finished: Path, tmp_path: Path, suffix: str) -> None:
     if suffix == "mp4":
         pytest.importorskip("av", reason="MP4 needs neuprim[video]")
@@ -111,22 +93,6 @@ def test_an_animation_over_time(finished: Path, tmp_path: Path, suffix: str) -> 
     else:
         with Image.open(target) as image:
             assert getattr(image, "n_frames", 1) == 7
-
-
-def test_time_alone_changes_the_picture(finished: Path, tmp_path: Path) -> None:
-    early, late = (
-        render_run(
-            finished,
-            RenderRequest("orbit", format="exr", out=tmp_path / t, frames=1, conditions={"time": t}),
-        )[0]
-        for t in ("0", "1")
-    )
-    assert early.read_bytes() != late.read_bytes()
-
-
-def test_an_orbit_without_a_time_runs_through_the_sequence(finished: Path, tmp_path: Path) -> None:
-    paths = render_run(finished, RenderRequest("orbit", format="png", out=tmp_path / "o", frames=3))
-    assert len(paths) == 3
 
 
 def test_cameras_of_a_file_need_a_time(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -182,32 +148,6 @@ def test_resuming_equals_going_on(files: Path, tmp_path: Path) -> None:
     assert all(torch.equal(first[k], second[k]) for k in first)
 
 
-@pytest.mark.parametrize("time", ["phase", "offset", "window+phase", "none"])
-def test_every_variant_runs(files: Path, tmp_path: Path, time: str) -> None:
-    folder = fit(
-        files,
-        tmp_path / "run",
-        "train.iterations=5",
-        f"model.density.time={time}",
-        "model.colour.powers=4",
-        "model.colour.waves=4",
-    )
-    named = time if time != "window+phase" else "phase+window"
-    assert load_run(folder)[2].density.settings() == {
-        "neurons": 2,
-        "edge": 2,
-        "gain": True,
-        "time": named,
-        "components": ["density"],
-    }
-
-
-def test_the_papers_preset_runs(files: Path, tmp_path: Path) -> None:
-    words = ["preset=paper", "train.iterations=20", "train.population.every=5", "model.neurons=8"]
-    model = load_run(fit(files, tmp_path / "run", *words))[2]
-    assert model.parameters_per_primitive == 143
-
-
 def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(files: Path, tmp_path: Path) -> None:
     quick, equations, paper = (compose(["task=dynamic", f"preset={name}"]) for name in ("quick", "equations", "paper"))
     assert equations.model.density == paper.model.density == {"time": "phase"}
@@ -251,42 +191,3 @@ def test_a_simulated_scene_says_so(tmp_path: Path) -> None:
     m = metrics(folder)
     assert m["data_source"] == "simulated" and "simulated" in m["dataset"]
     assert "simulated data" in (folder / "report.html").read_text()
-
-
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        (
-            "model.density.time=windows",
-            r"model\.density\.time: 'windows': expected none or some of phase, offset, window, motion",
-        ),
-        ("model.density.tme=phase", r"model\.density\.tme: no such setting; did you mean 'model.density.time'"),
-        ("model.colour.frequencies=odd", r"model\.colour\.frequencies=odd: expected periods or printed"),
-        ("model.density.divide_above=long", r"model\.density\.divide_above=long: expected a finite number"),
-        ("model.colour.powers=1.5", r"model\.colour\.powers=1\.5: expected a whole number"),
-        ("model.colour.waves=99", r"model\.colour: .*expected 0\.\.16"),
-    ],
-)
-def test_wrong_choices_are_found_before_anything_is_simulated(word: str, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        compose(["task=dynamic", word])
-
-
-def test_a_whole_number_is_a_number() -> None:
-    assert compose(["task=dynamic", "model.density.divide_above=1"]).model.density["divide_above"] == 1
-
-
-def test_windows_that_never_open(files: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"model\.init\.window=0: expected a number above 0"):
-        fit(files, tmp_path / "run", "model.init.window=0")
-
-
-def test_resuming_with_other_frames(files: Path, tmp_path: Path) -> None:
-    fit(files, tmp_path / "run", "train.iterations=2", "scene.frames=1:2")
-    with pytest.raises(ConfigError, match=r"^scene\.frames=3:4: the run to resume was begun with scene\.frames=1:2"):
-        fit(files, tmp_path / "run", "train.iterations=4", "scene.frames=3:4", "resume=true")
-
-
-def test_a_missing_folder(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no such folder"):
-        fit(tmp_path / "nothing", tmp_path / "run")

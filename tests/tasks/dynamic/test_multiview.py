@@ -12,17 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
-from PIL import Image
 from torch import Tensor
 
-from neuprim.core.data.hull import EmptyHull, hull_surface
+from neuprim.core.data.hull import EmptyHull
 from neuprim.core.data.initial import box_points
-from neuprim.core.errors import ConfigError
 from neuprim.core.io.exr import write_exr
-from neuprim.core.notices import NeuprimWarning
-from neuprim.tasks.dynamic.moving import moving_points
-from neuprim.tasks.dynamic.multiview import load
+from neuprim.tasks.dynamic.multiview import load, moving_points
 
 SIZE, ANGLE, RADIUS, COLOR = 48, 0.7, 0.35, np.array([0.8, 0.4, 0.2])
 TIMES = [i / 11 for i in range(12)]
@@ -127,25 +122,6 @@ def test_views_and_times(folder: Path, scenes: Any, context: Any) -> None:
             assert torch.allclose(pixels.rgb, torch.tensor(COLOR).float() * pixels.alpha[..., None], atol=1.5 / 255)
 
 
-def test_the_shipped_settings_are_the_defaults(folder: Path, context: Any) -> None:
-    import neuprim.tasks.dynamic.conf as conf
-
-    file = Path(str(conf.__file__)).parent / "scene" / "dynamic" / "multiview.yaml"
-    node = OmegaConf.load(file)
-    assert node.pop("_paths_") == ["path"]
-    node.path = str(folder)
-    settings = OmegaConf.to_container(node)
-    assert isinstance(settings, dict) and times_of(load(settings, context).train) == times_of(
-        load({"path": folder}, context).train
-    )
-
-
-def test_other_splits(folder: Path, scenes: Any, context: Any) -> None:
-    write(folder, "val", [(scenes.opengl_pose((0.0, -3.0, 1.0)), 0.25)], scenes)
-    assert times_of(load({"path": folder, "test_split": "val"}, context).test) == [0.25]
-    assert len(load({"path": folder, "train_split": "val"}, context).train) == 1
-
-
 def test_one_file_of_frames(tmp_path: Path, scenes: Any, context: Any) -> None:
     write(tmp_path, "", views(scenes, False), scenes)
     data = load({"path": tmp_path, "test_every": 4}, context)
@@ -192,30 +168,7 @@ def test_frame_numbers_become_times(folder: Path, scenes: Any, context: Any) -> 
     assert times_of(load({"path": folder, "time_range": "auto", "test_split": "val"}, context).test) == [1.0]
 
 
-def test_images_stay_on_disk_beyond_the_memory_bound(folder: Path, context: Any) -> None:
-    data = load({"path": folder, "preload": False}, context)
-    assert not data.train._stored  # type: ignore[attr-defined]
-    data.train._cache_bytes = 3 * SIZE * SIZE * 4  # type: ignore[attr-defined]
-    for i in range(len(data.train)):
-        data.train.pixels(i)
-    assert len(data.train._stored) == 3  # type: ignore[attr-defined]
-
-
 # ---------------------------------------------------------------- what is refused
-
-
-def test_settings_that_make_no_sense(folder: Path, scenes: Any, context: Any) -> None:
-    scenes.refused(load, {}, context, "scene.path: required and not given")
-    scenes.refused(load, {"path": folder, "time": "auto"}, context, "scene.time: no such setting", "scene.time_range")
-    for value in ("1:0", "'0'", "a:b", "0:nan", "0:1:2", "''", "true", "0:inf"):
-        given = True if value == "true" else value.strip("'")
-        scenes.refused(
-            load,
-            {"path": folder, "time_range": given},
-            context,
-            f'scene.time_range={value}: expected auto, or "LOW:HIGH"',
-        )
-    scenes.refused(load, {"path": folder, "test_every": 1}, context, "scene.test_every=1")
 
 
 def test_files_that_are_missing(folder: Path, scenes: Any, context: Any) -> None:
@@ -225,27 +178,6 @@ def test_files_that_are_missing(folder: Path, scenes: Any, context: Any) -> None
     for split in ("train", "test"):
         (folder / f"transforms_{split}.json").unlink()
     scenes.refused(load, {"path": folder}, context, str(folder), "neither transforms_train.json nor transforms.json")
-
-
-def test_without_a_test_split_one_file_is_offered(folder: Path, scenes: Any, context: Any) -> None:
-    (folder / "transforms_test.json").unlink()
-    scenes.refused(
-        load,
-        {"path": folder},
-        context,
-        "transforms_test.json: file not found",
-        "rename transforms_train.json to transforms.json",
-    )
-
-
-def test_a_moment_that_shows_nothing_stays_and_a_damaged_image_goes(folder: Path, context: Any) -> None:
-    files = sorted((folder / "train").iterdir())
-    Image.fromarray(np.zeros((SIZE, SIZE, 4), np.uint8)).save(files[0])
-    assert len(load({"path": folder}, context).train) == 48
-    files[1].write_bytes(files[1].read_bytes()[:-40])
-    with pytest.warns(NeuprimWarning, match=rf"{files[1].name}: .*truncated or corrupt.* is left out"):
-        data = load({"path": folder}, context)
-    assert len(data.train) == 47 and len(times_of(data.train)) == 47
 
 
 def test_a_scene_without_times_is_static(folder: Path, scenes: Any, context: Any) -> None:
@@ -349,23 +281,6 @@ def test_starting_points_cover_the_ball_at_all_times(folder: Path, context: Any)
     assert (points.means - where).norm(dim=-1).max() < 1.7 * RADIUS, "a point lies where the ball was at its time"
 
 
-def test_a_camera_that_jumps(tmp_path: Path, scenes: Any, context: Any) -> None:
-    """One image per time, against the ways that were not taken."""
-    write(tmp_path, "train", views(scenes, True, 40), scenes)
-    write(tmp_path, "test", views(scenes, True, 40)[:2], scenes)
-    data = load({"path": tmp_path}, context)
-    points = data.initial_points(2000, rng(1))
-    parts = covered(points.means, 0.35 * RADIUS)
-    assert np.mean(parts) > 0.98 and min(parts) > 0.85, parts
-    assert len(set(points.conditions["time"].tolist())) > 10 and beside(points.means) < 0.4
-    with pytest.raises(EmptyHull):
-        hull_surface(data.train, 64)
-    for forgiven in (0.5, 0.7):
-        tolerant = hull_surface(data.train, 64, wrong_views=forgiven)[0]
-        assert np.mean(covered(tolerant, 0.35 * RADIUS)) < 0.85 and beside(tolerant) > 0.9
-    assert np.mean(covered(box_points(data.train, 2000, rng(1)).means, 0.35 * RADIUS)) < 0.4
-
-
 def test_what_rests_is_covered_evenly(tmp_path: Path, scenes: Any, context: Any) -> None:
     """Found at all times, it gets no more points than if it had been found once."""
     still = [(pose, 0.4) for pose in scenes.ring(4, 3.5)]
@@ -377,24 +292,6 @@ def test_what_rests_is_covered_evenly(tmp_path: Path, scenes: Any, context: Any)
     points = load({"path": tmp_path}, context).initial_points(400, rng())
     gaps = torch.cdist(points.means, points.means).fill_diagonal_(9.0).min(dim=1).values
     assert gaps.quantile(0.05) > 0.3 * gaps.median() and len(set(points.conditions["time"].tolist())) == 12
-
-
-def test_starting_points_are_reproducible(folder: Path, context: Any) -> None:
-    first = load({"path": folder}, context).initial_points(300, rng(3))
-    again = load({"path": folder, "preload": False}, context).initial_points(300, rng(3))
-    assert torch.equal(first.means, again.means) and torch.equal(first.colors, again.colors)
-    assert torch.equal(first.conditions["time"], again.conditions["time"])
-    assert not torch.equal(first.means, load({"path": folder}, context).initial_points(300, rng(4)).means)
-    some = first.rows(torch.tensor([5, 2]))
-    assert some.means.shape == (2, 3) and torch.equal(some.conditions["time"], first.conditions["time"][[5, 2]])
-
-
-def test_more_points_than_voxels_and_impossible_counts(folder: Path, context: Any) -> None:
-    data = load({"path": folder}, context)
-    many = data.initial_points(60_000, rng())
-    assert len(many.means) == 60_000 == len(many.means.unique(dim=0)) == len(many.conditions["time"])
-    with pytest.raises(ConfigError, match="is 0; expected at least 1"):
-        data.initial_points(0, rng())
 
 
 def test_photographs_start_in_a_box_at_random_times(folder: Path, scenes: Any, context: Any) -> None:

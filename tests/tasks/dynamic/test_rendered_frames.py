@@ -3,20 +3,16 @@ that lies there."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from neuprim.config import compose
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.tasks.dynamic.volume import capture as capturing
-from neuprim.tasks.dynamic.volume import voxels as voxelling
-from neuprim.tasks.dynamic.volume.dataset import FrameViews
-from neuprim.tasks.dynamic.volume.voxels import FrameVoxels, Voxels
+from neuprim.tasks.dynamic.volume.dataset import FrameViews, FrameVoxels, Voxels
 from tests.tasks.dynamic.sequences import blob, dataset, recorded
 
 
@@ -36,7 +32,7 @@ def test_the_same_data_set_from_anywhere(
     address = address.replace("DIR", str(tmp_path))
     plain = dataset(files, tmp_path)
     dataset(files, tmp_path / "maker", cache=address)  # another machine, with a cache of its own
-    monkeypatch.setattr(capturing, "integrate", lambda *a, **k: pytest.fail("rendered again"))
+    monkeypatch.setattr(capturing, "render_medium", lambda *a, **k: pytest.fail("rendered again"))
     data = dataset(files, tmp_path / "reader", cache=address)
     assert recorded(data).folder.path.name == recorded(plain).folder.path.name, "keyed alike"
     for i in range(0, len(plain.train), 5):
@@ -60,19 +56,11 @@ def test_the_same_data_set_from_anywhere(
         fsspec.filesystem("memory").rm("/neuprim-truth", recursive=True)
 
 
-def test_the_word_is_a_folder_or_a_url(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    words = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'"]
-    assert compose([*words, "scene.cache=near"], check_output=False).scene["cache"] == str(tmp_path / "near")
-    assert compose([*words, "scene.cache='s3://a/b'"], check_output=False).scene["cache"] == "s3://a/b"
-    assert compose(words, check_output=False).scene["cache"] is None
-
-
 def test_damage_and_strange_files_are_refused_by_name(files: Path, tmp_path: Path) -> None:
     data = dataset(files, tmp_path)
     recording = recorded(data)
     frame = recording.folder.path / "frame_00002"
-    image = recording.capture.image(recording.folder, recording.capture.frames[1], 0)
+    image = recording.capture.fetch_image(recording.folder, recording.capture.frames[1], 0)
     image.write_bytes(image.read_bytes() + bytes(10**6))
     with pytest.raises(
         DataError, match=r"cam_00\.exr: 1,0\d\d,\d\d\d bytes; expected at most .*; delete the folder .*frame_00002"
@@ -108,7 +96,6 @@ def test_damage_and_strange_files_are_refused_by_name(files: Path, tmp_path: Pat
         np.savez(tmp_path / "voxels.npz", **{**good, **change})
         with pytest.raises(DataError, match=r"voxels\.npz: damaged .*ascending places in it, and finite values"):
             Voxels.read(tmp_path / "voxels.npz")
-    assert os.path.getsize(tmp_path / "voxels.npz") < voxelling._MOST
 
 
 def test_memory_is_bounded_by_the_setting_whatever_the_length(files: Path, tmp_path: Path) -> None:
@@ -122,8 +109,8 @@ def test_memory_is_bounded_by_the_setting_whatever_the_length(files: Path, tmp_p
     for views in (data.train, data.test):
         for i in range(len(views)):
             views.pixels(i)
-        assert 0 < sum(kept.nbytes for kept in views._kept.values()) <= max(views.memory, 96 * 96 * 8)
-    assert len(data.train._kept) < len(data.train)
+        assert 0 < sum(kept.nbytes for kept in views._cache.values()) <= max(views.memory, 96 * 96 * 8)
+    assert len(data.train._cache) < len(data.train)
     usual = dataset(files, tmp_path)
     assert (
         isinstance(usual.train, FrameViews)

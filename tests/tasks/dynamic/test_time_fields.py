@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
@@ -20,10 +19,9 @@ from neuprim.core.render.output import Contributions
 from neuprim.core.train.population import Relocate
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.core.train.splitting import split_primitives
-from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import PARTS, TimeDensity
-from neuprim.tasks.dynamic.invisible import invisible_fraction
+from neuprim.tasks.dynamic.evaluation import invisible_fraction
 from tests import scenes
 from tests.backends import BACKENDS, by
 from tests.timed_models import COUNT, model
@@ -50,22 +48,10 @@ def test_equation_13_has_the_papers_number_of_parameters(degree: int, expected: 
     assert m.parameters_per_primitive == expected
 
 
-def test_windows_with_motion_take_as_many_as_equation_13() -> None:
-    sizes = {
-        time: sum(s.size for s in TimeDensity(8, time).parameters())
-        for time in ("none", "phase", "offset", "window+motion", "window")
-    }
-    assert sizes == {"none": 41, "phase": 49, "offset": 49, "window+motion": 49, "window": 43}
-
-
 @pytest.mark.parametrize("wrong", ["phases", "phase+", "phase+phase", "", "window motion"])
 def test_unknown_variants_are_refused(wrong: str) -> None:
     with pytest.raises(ValueError, match="expected none or some of phase, offset, window, motion"):
         TimeDensity(8, wrong)
-
-
-def test_the_order_of_parts_does_not_matter() -> None:
-    assert TimeDensity(4, "motion+window").settings() == TimeDensity(4, "window+motion").settings()
 
 
 def _context(count: int, **settings: object) -> InitContext:
@@ -165,12 +151,6 @@ def test_motion_is_a_parabola_about_the_middle_of_life() -> None:
     assert torch.allclose(moved, m.params["means"] + own["velocity"] * since + own["acceleration"] * since**2)
 
 
-def test_a_frame_without_a_time_is_an_error() -> None:
-    m = model("phase")
-    with pytest.raises(KeyError, match="needs the condition 'time'"):
-        render(m, scenes.camera(), {})
-
-
 # ---------------------------------------------------------------- colour
 
 
@@ -261,12 +241,6 @@ def test_invisible_primitives_are_counted() -> None:
     assert invisible_fraction(m, times) == pytest.approx(5 / COUNT)
 
 
-def test_the_task_rebuilds_its_fields_from_their_settings() -> None:
-    for field in (TimeDensity(3, "offset+window"), TimeHarmonics(1, 3, 0.0, 2, 0, "printed")):
-        again = TASK.fields[type(field).__name__](**field.settings())  # type: ignore[index]
-        assert [(s.name, s.shape) for s in again.parameters()] == [(s.name, s.shape) for s in field.parameters()]
-
-
 @pytest.mark.parametrize(
     ("settings", "step", "expected"),
     [
@@ -283,9 +257,3 @@ def test_a_fresh_window_is_so_many_frames_at_most(
     spec = next(spec for spec in TimeDensity(0, "window").parameters() if spec.name == "log_window")
     made = spec.init(replace(_context(7, **settings), steps={} if step is None else {"time": step}))
     assert made.shape == (7, 1) and torch.allclose(made.exp(), torch.tensor(expected), rtol=1e-5)
-
-
-def test_a_window_of_no_frames_is_refused() -> None:
-    spec = next(spec for spec in TimeDensity(0, "window").parameters() if spec.name == "log_window")
-    with pytest.raises(ConfigError, match=r"model\.init\.window_frames=0"):
-        spec.init(replace(_context(7, window_frames=0), steps={"time": 0.1}))

@@ -15,9 +15,9 @@ from neuprim.config import compose
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.task import Chunks, SceneContext
-from neuprim.tasks.dynamic import judging
-from neuprim.tasks.dynamic.volume.chunks import FEWEST, FRAMES, number_of_chunks
-from neuprim.tasks.dynamic.volume.scene import load_chunks, load_volume
+from neuprim.tasks.dynamic import evaluation
+from neuprim.tasks.dynamic.volume.chunks import MAX_FRAMES, MIN_FRAMES, count_chunks
+from neuprim.tasks.dynamic.volume.scene import open_volumes, split_chunks
 from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
 
 NUMBERS = (2, 3, 5, 6, 7, 8, 10, 11, 12)
@@ -42,7 +42,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def chunks(folder: Path, cache: Path, *words: str) -> Chunks | None:
     config = config_of(folder, *words)
-    return load_chunks(config, SceneContext(0, cache / "cache"))
+    return split_chunks(config, SceneContext(0, cache / "cache"))
 
 
 def config_of(folder: Path, *words: str) -> dict[str, Any]:
@@ -67,18 +67,18 @@ def config_of(folder: Path, *words: str) -> dict[str, Any]:
         (None, 500, 0, 1),
         (1, 500, 0, 1),
         (7, 500, 0, 7),
-        ("auto", FRAMES, 0, 1),
-        ("auto", FRAMES + 1, 0, 2),
-        ("auto", 10 * FRAMES, 0, 10),
+        ("auto", MAX_FRAMES, 0, 1),
+        ("auto", MAX_FRAMES + 1, 0, 2),
+        ("auto", 10 * MAX_FRAMES, 0, 10),
         ("auto", 100, 3, 3),
-        ("auto", 100, 1000, 100 // FEWEST),
-        ("auto", FEWEST - 1, 1000, 1),
+        ("auto", 100, 1000, 100 // MIN_FRAMES),
+        ("auto", MIN_FRAMES - 1, 1000, 1),
     ],
 )
 def test_the_number_follows_from_frames_and_memory(
     asked: int | str | None, frames: int, images: int, expected: int
 ) -> None:
-    assert number_of_chunks(asked, frames, images, 1) == expected
+    assert count_chunks(asked, frames, images, 1) == expected
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,8 @@ def test_the_number_follows_from_frames_and_memory(
         (
             5,
             9,
-            "scene.chunks=5: there are 9 frames to learn from; expected at most 4, as a chunk has at least two of its own",
+            "scene.chunks=5: there are 9 frames to learn from; "
+            "expected at most 4, as a chunk has at least two of its own",
         ),
         (2, 3, "scene.chunks=2: there are 3 frames to learn from; expected null: a chunk has at least two of its own"),
         (2, 1, "scene.chunks=2: there is 1 frame to learn from; expected null: a chunk has at least two of its own"),
@@ -95,22 +96,8 @@ def test_the_number_follows_from_frames_and_memory(
 )
 def test_more_than_the_frames_allow_is_refused(asked: int, frames: int, said: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        number_of_chunks(asked, frames, 0, 1)
+        count_chunks(asked, frames, 0, 1)
     assert str(caught.value) == said
-
-
-@pytest.mark.parametrize(
-    "word", ["scene.chunks=0", "scene.chunks=many", "scene.chunks=2.5", "scene.span=3", "scene.span=5:2"]
-)
-def test_other_words_are_refused_in_one_line_with_their_key(word: str, folder: Path, cache: Path) -> None:
-    with pytest.raises(ConfigError, match=word.partition("=")[0]) as caught:
-        chunks(folder, cache, word)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_span_in_chunks_is_refused(folder: Path, cache: Path) -> None:
-    with pytest.raises(ConfigError, match=r"expected no scene.span beside it, but scene.frames"):
-        chunks(folder, cache, "scene.chunks=2", "scene.span=3:8")
 
 
 # ---------------------------------------------------------------- which frames
@@ -126,12 +113,6 @@ def test_chunks_share_out_frames_and_see_one_more_at_each_seam(folder: Path, cac
     assert [part.steps for part in found.parts] == pytest.approx([4 / 13, 5 / 13, 4 / 13])
     shares = [part.primitives for part in found.parts]  # by the matter that they see: in one frame, four and four
     assert shares == pytest.approx([1 / 9, 4 / 9, 4 / 9], rel=0.05)
-
-
-def test_learning_from_every_second_frame_alone(folder: Path, cache: Path) -> None:
-    found = chunks(folder, cache, "scene.chunks=2", "scene.train_every=2")
-    assert found is not None
-    assert [part.settings["scene.span"] for part in found.parts] == ["2:7", "5:12"]  # of 2, 5, 7, 10 and 12
 
 
 def test_time_goes_faster_in_a_chunk(folder: Path, cache: Path) -> None:
@@ -176,7 +157,7 @@ def test_a_span_has_the_whole_sequences_times_box_light_and_images(folder: Path,
     assert part.points is not None
     drawn = part.points.draw(50, torch.Generator().manual_seed(1))
     assert 0.3 - 1e-6 <= float(drawn.conditions["time"]) <= 0.8 + 1e-6
-    assert [clip.views for clip in judging.clips(part)] == [range(5), range(5, 10)]
+    assert [clip.views for clip in evaluation.clips(part)] == [range(5), range(5, 10)]
 
 
 def test_files_of_a_span_are_its_frames_in_the_sequences_time(folder: Path, tmp_path: Path) -> None:
@@ -188,11 +169,6 @@ def test_files_of_a_span_are_its_frames_in_the_sequences_time(folder: Path, tmp_
         "look": "smoke_fire",
         "span": "5:10",
     }
-    source = load_volume(settings, SceneContext(0, tmp_path / "cache"))
+    source = open_volumes(settings, SceneContext(0, tmp_path / "cache"))
     assert list(source.placement.numbers) == [5, 6, 7, 8, 10]
     assert source.placement.times["time"] == pytest.approx([0.3, 0.4, 0.5, 0.6, 0.8])
-
-
-def test_a_span_without_a_frame_is_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"scene.span=4:4: the chosen frames are 2 to 12, and none of these"):
-        dataset(folder, tmp_path, span="4:4")

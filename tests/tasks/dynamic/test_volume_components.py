@@ -68,8 +68,8 @@ def test_extinction_is_for_the_peak_of_the_sequence(peak: float, times: float, t
     values[2, 8, 8] = -peak
     (tmp_path / "files").mkdir()
     write_vdb(tmp_path / "files" / "a_1.vdb", [Grid.from_dense("density", values, transform=scale_transform(0.5))])
-    assert captured(tmp_path / "files", tmp_path).look.extinction == 14 * times
-    chosen = captured(tmp_path / "files", tmp_path, optics={"extinction": 3.0}).look
+    assert captured(tmp_path / "files", tmp_path).optics.extinction == 14 * times
+    chosen = captured(tmp_path / "files", tmp_path, optics={"extinction": 3.0}).optics
     assert chosen.extinction == 3 and chosen.flame_extinction == 14
 
 
@@ -88,7 +88,7 @@ def test_the_parts_of_the_extinction_are_those_of_the_grids(files: Path, tmp_pat
     medium = capture.medium(capture.frames[0])
     smoke, flame = (read_grid(files / "fire_0.vdb", name) for name in ("density", "flame"))
     assert medium.scattering is not None and capture.components == ("density",)
-    assert medium.scattering.sum() == pytest.approx(capture.look.extinction * smoke.to_dense().sum(), rel=1e-5)
+    assert medium.scattering.sum() == pytest.approx(capture.optics.extinction * smoke.to_dense().sum(), rel=1e-5)
     assert medium.values[..., 0].sum() == pytest.approx(medium.scattering.sum() + 14 * flame.to_dense().sum(), rel=1e-5)
 
 

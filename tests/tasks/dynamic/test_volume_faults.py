@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,13 +10,11 @@ import torch
 
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume.dataset import FrameViews
-from neuprim.tasks.dynamic.volume.looks import changed, named_look
-from neuprim.tasks.dynamic.volume.normalise import Normalisation
-from neuprim.tasks.dynamic.volume.optics import medium_of
-from neuprim.tasks.dynamic.volume.rendered import RenderedFrames
+from neuprim.tasks.dynamic.volume.medium import build_medium
+from neuprim.tasks.dynamic.volume.optics import optics_preset, override_optics
+from neuprim.tasks.dynamic.volume.survey import Normalisation
 from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
 
 
@@ -35,49 +31,9 @@ def folder(tmp_path: Path) -> Path:
 # ---------------------------------------------------------------- optics
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("albedo", 0.5, r"scene\.optics\.albedo=0\.5: expected three numbers"),
-        ("albedo", [1, 2], r"scene\.optics\.albedo=\[1, 2\]: expected three numbers"),
-        ("albedo", [1, 2, True], r"expected three numbers"),
-        ("kelvin", [1000, 2000, 3000], r"scene\.optics\.kelvin=.*: expected two rising numbers"),
-        ("kelvin", [2000, 1000], r"scene\.optics\.kelvin=.*rising"),
-        ("flame_range", [0], r"scene\.optics\.flame_range=\[0\]: expected two rising numbers"),
-        ("extinction", None, r"scene\.optics\.extinction=null: expected a finite number of at least 0"),
-        ("extinction", float("nan"), r"expected a finite number"),
-        ("gradient", [], r"scene\.optics\.gradient=\[\]: expected colours"),
-        ("gradient", [1, 2], r"scene\.optics\.gradient=\[1, 2\]: expected colours"),
-        ("light", "sun", r"scene\.optics\.light=sun: expected settings, each as scene\.optics\.light\.KEY=VALUE"),
-        (
-            "light",
-            {"colour": [1, 1, 1]},
-            r"scene\.optics\.light\.colour: no such setting; valid: scene\.optics\.light\.direction",
-        ),
-        (
-            "light",
-            {"direction": [0, 0, 0]},
-            r"scene\.optics\.light\.direction=\[0, 0, 0\]: expected three numbers that are not all 0",
-        ),
-        ("light", {"direction": [0, 1]}, r"scene\.optics\.light\.direction=\[0, 1\]: expected three numbers"),
-        (
-            "light",
-            {"irradiance": [-1, 0, 0]},
-            r"scene\.optics\.light\.irradiance=\[-1, 0, 0\]: expected three numbers of at least 0",
-        ),
-        ("flame_grid", "fire", r"scene\.optics\.flame_grid=fire: expected density, temperature, flames or color"),
-        ("extinction_grids", "density", r"scene\.optics\.extinction_grids=density: expected a list"),
-        ("up", "x", r"scene\.optics\.up=x: expected y or z"),
-    ],
-)
-def test_wrong_optics_name_key_found_and_expected(key: str, value: Any, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        changed(named_look("smoke_fire"), {key: value})
-
-
 def test_optics_of_every_form() -> None:
-    look = changed(
-        named_look("smoke_fire"),
+    look = override_optics(
+        optics_preset("smoke_fire"),
         {
             "extinction": 3,
             "albedo": [1, 0.5, 0],
@@ -89,13 +45,13 @@ def test_optics_of_every_form() -> None:
         look.extinction == 3 and look.albedo == (1.0, 0.5, 0.0) and look.gradient == ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
     )
     assert look.light is not None and look.light.irradiance == (1.0, 2.0, 3.0)
-    original = named_look("smoke_fire").light
+    original = optics_preset("smoke_fire").light
     assert original is not None and look.light.direction == original.direction
-    assert changed(look, {"light": None}).light is None
+    assert override_optics(look, {"light": None}).light is None
     with pytest.raises(
         ConfigError, match=r"scene\.optics\.light\.irradiance: required and not given; expected three numbers"
     ):
-        changed(named_look("embergen_fire"), {"light": {"direction": [0, 0, 1]}})
+        override_optics(optics_preset("embergen_fire"), {"light": {"direction": [0, 0, 1]}})
 
 
 # ---------------------------------------------------------------- grids
@@ -141,7 +97,7 @@ def test_a_vector_grid_as_density_names_the_file(folder: Path, tmp_path: Path) -
 
 
 def test_grids_far_from_the_worlds_origin_are_still_told_apart() -> None:
-    look = named_look("smoke_fire")
+    look = optics_preset("smoke_fire")
     index = np.stack(np.meshgrid(*(np.arange(24, dtype=np.float32),) * 3, indexing="ij"), -1)
     ball = np.clip(1 - np.linalg.norm(index - 12, axis=-1) / 8, 0, None)
     media = []
@@ -150,7 +106,7 @@ def test_grids_far_from_the_worlds_origin_are_still_told_apart() -> None:
         fine = Grid.from_dense("density", ball, transform=scale_transform(1e-3, (offset, 0, 0)))
         box = fine.world_bounds()
         assert box is not None
-        media.append(medium_of({"density": fine, "flames": coarse}, look, Normalisation.from_bounds(box), 1))
+        media.append(build_medium({"density": fine, "flames": coarse}, look, Normalisation.from_bounds(box), 1))
     near, far = (m.values for m in media)
     assert near.shape == far.shape and np.allclose(near, far, atol=0.02 * float(near.max()))
 
@@ -199,25 +155,3 @@ def test_light_beyond_half_floats(folder: Path, tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- the cache
-
-
-def test_two_runs_that_render_the_same_frame_do_not_disturb_each_other(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data = dataset(folder, tmp_path)
-    recording = recorded(data)
-    image = recording.capture.image(recording.folder, recording.capture.frames[0], 0)
-    before = os.stat(image).st_ino
-    RenderedFrames(recording.capture, Store.local(tmp_path / "cache")).write(0)  # as the slower one of two does
-    assert os.stat(image).st_ino == before
-    assert not list(recording.folder.path.glob(".*"))
-
-
-def test_a_damaged_image_says_what_to_do(folder: Path, tmp_path: Path) -> None:
-    data = dataset(folder, tmp_path)
-    recording = recorded(data)
-    recording.capture.image(recording.folder, recording.capture.frames[1], 0).write_bytes(b"")
-    with pytest.raises(
-        DataError, match=r"cam_00\.exr: file is empty.*; delete the folder .*frame_00002 to render the frame again"
-    ):
-        data.train.pixels(1)

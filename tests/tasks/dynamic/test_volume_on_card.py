@@ -19,10 +19,10 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.volumes.grid import lattice
 from neuprim.tasks.dynamic.density import TimeDensity
-from neuprim.tasks.dynamic.volume import Medium, integrate
-from neuprim.tasks.dynamic.volume.compare import compare_with_truth
-from neuprim.tasks.dynamic.volume.scene import load_volume
-from neuprim.tasks.dynamic.volume.truth import extinction_on
+from neuprim.tasks.dynamic.volume.ground_truth import compare_extinction, sample_extinction
+from neuprim.tasks.dynamic.volume.medium import Medium
+from neuprim.tasks.dynamic.volume.raymarch import render_medium
+from neuprim.tasks.dynamic.volume.scene import open_volumes
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.tasks.dynamic.sequences import blob, dataset, recorded
 from tests.tasks.dynamic.volumes import camera, ragged, rotation
@@ -72,9 +72,9 @@ def test_pixels_do_not_depend_on_those_beside_them(monkeypatch: pytest.MonkeyPat
     """Nor on which comes first: any part of an image has the bits of the whole."""
     on_blocks(monkeypatch)
     medium, view = ragged(3), camera((2.0, 1.0, 1.5), 24)
-    whole = integrate(medium, view, 2)
+    whole = render_medium(medium, view, 2)
     part = Camera(view.viewmat, view.fx, view.fy, view.cx, view.cy - 9, view.width, 7)
-    assert bool(whole[9:16].any()) and torch.equal(integrate(medium, part, 2), whole[9:16])
+    assert bool(whole[9:16].any()) and torch.equal(render_medium(medium, part, 2), whole[9:16])
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -84,17 +84,17 @@ def test_extinction_on_a_lattice_is_the_processors(turned: bool, monkeypatch: py
         medium = Medium(medium.values, rotation(2) @ medium.scene_from_index)
     matrix, shape = lattice(np.array([[-0.7, -0.6, -0.65], [0.7, 0.75, 0.6]]), 30)
     places = [(matrix, shape), (torch.from_numpy(medium.scene_from_index), medium.values.shape[:3])]
-    wanted = [extinction_on(medium, *place) for place in places]
+    wanted = [sample_extinction(medium, *place) for place in places]
     on_blocks(monkeypatch)
-    found = [extinction_on(medium, *place) for place in places]
+    found = [sample_extinction(medium, *place) for place in places]
     for a, b in zip(wanted, found, strict=True):
         assert a.max() > 3 and np.allclose(a, b, rtol=1e-5, atol=1e-5)
     assert np.allclose(found[1], medium.values[..., 0], rtol=1e-5, atol=1e-5)
-    assert not extinction_on(Medium(np.zeros((1, 4, 4, 4), np.float32), np.eye(4)), *places[0]).any()
+    assert not sample_extinction(Medium(np.zeros((1, 4, 4, 4), np.float32), np.eye(4)), *places[0]).any()
 
 
 def test_errors_of_a_model_are_the_processors(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    capture = load_volume(
+    capture = open_volumes(
         {"vdb": str(folder), "size": 24, "cameras": 4, "look": "smoke_fire"}, SceneContext(0, tmp_path)
     ).capture
     generator = torch.Generator().manual_seed(0)
@@ -107,9 +107,9 @@ def test_errors_of_a_model_are_the_processors(folder: Path, tmp_path: Path, monk
         conditions={"time": torch.rand(30, generator=generator)},
     )
     model = Primitives.initialise(TimeDensity(2, "window+motion"), SphericalHarmonics(0), made)
-    wanted = compare_with_truth(model, capture, [0.0, 0.5, 1.0], per_third=1)
+    wanted = compare_extinction(model, capture, [0.0, 0.5, 1.0], per_third=1)
     on_blocks(monkeypatch)
-    found = compare_with_truth(model, replace(capture), [0.0, 0.5, 1.0], per_third=1)
+    found = compare_extinction(model, replace(capture), [0.0, 0.5, 1.0], per_third=1)
     assert len(wanted["sigma_frames"]) == 3 and abs(wanted["sigma_correlation_middle"]) > 0.05
     assert {k: v for k, v in found.items() if k != "sigma_frames"} == pytest.approx(
         {k: v for k, v in wanted.items() if k != "sigma_frames"}, rel=1e-5

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.volumes.grid import lattice
-from neuprim.tasks.dynamic import judging
+from neuprim.tasks.dynamic import evaluation
 from neuprim.tasks.dynamic.volume import capture as capturing
-from neuprim.tasks.dynamic.volume.dataset import FrameViews
-from neuprim.tasks.dynamic.volume.settings import choose_frames
-from neuprim.tasks.dynamic.volume.truth import extinction_on
+from neuprim.tasks.dynamic.volume.ground_truth import sample_extinction
+from neuprim.tasks.dynamic.volume.scene import choose_frames
 from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
 
 NUMBERS = (2, 9, 10, 11)
@@ -49,7 +46,7 @@ def test_frames_in_numerical_order_cameras_and_times(folder: Path, tmp_path: Pat
         1,
     ]  # by number
     assert data.data_source == "real" and data.color_space == "linear"
-    assert judging.clips(data)[1].views == range(4, 8)
+    assert evaluation.clips(data)[1].views == range(4, 8)
     trained, held_out = (
         {tuple(v.view(i).camera.position.tolist()) for i in range(len(v))} for v in (data.train, data.test)
     )
@@ -71,13 +68,13 @@ def test_images_are_radiance_over_the_exposures_peak_with_alpha(folder: Path, tm
 
 def test_the_ball_moves_in_the_images_and_the_mask_is_its_track(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
-    mask = judging.mask(data, 0)
+    mask = evaluation.mask(data, 0)
     assert mask is not None
     for i in range(1, 4):
         alpha = data.test.pixels(i).alpha
         assert alpha is not None and bool(((alpha > 1 / 255) <= mask).all())
         assert int((alpha > 1 / 255).sum()) < int(mask.sum())
-    assert torch.equal(judging.mask(data, 3), mask)
+    assert torch.equal(evaluation.mask(data, 3), mask)
 
 
 def test_starting_points_lie_where_and_when_there_is_matter(folder: Path, tmp_path: Path) -> None:
@@ -100,8 +97,8 @@ def test_a_second_call_renders_nothing_and_an_interrupted_one_goes_on(
 ) -> None:
     first = dataset(folder, tmp_path)
     calls: list[int] = []
-    genuine = capturing.integrate
-    monkeypatch.setattr(capturing, "integrate", lambda *a, **k: calls.append(1) or genuine(*a, **k))
+    genuine = capturing.render_medium
+    monkeypatch.setattr(capturing, "render_medium", lambda *a, **k: calls.append(1) or genuine(*a, **k))
     before = first.train.pixels(5).rgb
     second = dataset(folder, tmp_path)
     assert not calls and torch.equal(second.train.pixels(5).rgb, before)
@@ -127,14 +124,6 @@ def test_whatever_matters_is_part_of_the_key(folder: Path, tmp_path: Path) -> No
     assert len(names) == 9
 
 
-def test_what_was_rendered_is_written_down(folder: Path, tmp_path: Path) -> None:
-    data = dataset(folder, tmp_path)
-    recording = recorded(data)
-    record = json.loads((recording.folder.path / "scene.json").read_text())
-    assert [f["number"] for f in record["frames"]] == list(NUMBERS) and record["cameras"] == 6
-    assert record["normalisation"] == recording.capture.normalisation.to_json()
-
-
 def test_every_nth_frame_may_be_left_out_of_training(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path, train_every=2)
     assert len(data.train) == 4 * 2 and len(data.test) == 2 * 4
@@ -146,55 +135,20 @@ def test_every_nth_frame_may_be_left_out_of_training(folder: Path, tmp_path: Pat
     assert torch.equal(data.train.pixels(1).rgb, whole.train.pixels(2).rgb)
 
 
-def test_decoded_images_are_bounded(folder: Path, tmp_path: Path) -> None:
-    data = dataset(folder, tmp_path)
-    recording = recorded(data)
-    one = 24 * 24 * 4 * 2
-    few = FrameViews(recording.capture, recording.folder, range(4), data.exposure, memory=3 * one)
-    images = [few.pixels(i).rgb for i in range(16)]
-    assert len(few._kept) == 3
-    assert all(torch.equal(few.pixels(i).rgb, images[i]) for i in range(16))
-
-
 def test_the_files_extinction_on_a_lattice(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
     recording = recorded(data)
     matrix, shape = lattice(recording.capture.bounds, 48)
     medium = recording.capture.medium(recording.capture.frames[1])
-    found = extinction_on(medium, matrix, shape)
+    found = sample_extinction(medium, matrix, shape)
     peak = np.array(np.unravel_index(found.argmax(), shape))
     world = recording.capture.normalisation.to_world((matrix[:3, :3].numpy() @ peak + matrix[:3, 3].numpy())[None])[0]
     assert np.linalg.norm(world - np.array([14.0, 6.0, 3.0])) < VOXEL
     assert found.max() == pytest.approx(float(medium.values[..., 0].max()), rel=0.15)
-    assert not extinction_on(recording.capture.medium(recording.capture.frames[0]), matrix, shape).any()
+    assert not sample_extinction(recording.capture.medium(recording.capture.frames[0]), matrix, shape).any()
 
 
 # ---------------------------------------------------------------- bad input
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"siz": 3}, r"scene\.siz: no such setting; did you mean 'scene\.size'"),
-        ({"size": 2}, r"scene\.size=2: expected a whole number from 8 to 4096"),
-        ({"field_of_view": 0.0}, r"scene\.field_of_view=0\.0: expected degrees from 1 to 120"),
-        ({"up": "x"}, r"scene\.up=x: expected y or z"),
-        ({"frames": "9-11"}, r"scene\.frames=9-11: expected all, FIRST:LAST or FIRST:LAST:STEP"),
-        ({"frames": "11:9"}, r"scene\.frames=11:9: expected"),
-        ({"look": "smok_fire"}, r"smok_fire.*'smoke_fire'"),
-        (
-            {"optics": {"extinktion": 1}},
-            r"scene\.optics\.extinktion: no such setting; did you mean 'scene\.optics\.extinction'",
-        ),
-        ({"optics": {"extinction": -1.0}}, r"scene\.optics\.extinction=-1\.0: expected a number of at least 0"),
-        ({"optics": {"extinction": "much"}}, r"scene\.optics\.extinction=much"),
-        ({"grids": {"smoke": "density"}}, r"scene\.grids\.smoke: no such setting; valid: scene\.grids\.color, "),
-        ({"vdb": None}, r"scene\.vdb: required"),
-    ],
-)
-def test_wrong_settings(folder: Path, tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        dataset(folder, tmp_path, **changes)
 
 
 def test_frames_that_do_not_exist(folder: Path, tmp_path: Path) -> None:
@@ -218,32 +172,18 @@ def test_a_grid_by_another_name(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_look_chosen_by_the_grids(folder: Path, tmp_path: Path) -> None:
-    assert recorded(dataset(folder, tmp_path, look="auto")).capture.look.extinction_grids == ("density", "temperature")
+    assert recorded(dataset(folder, tmp_path, look="auto")).capture.optics.extinction_grids == (
+        "density",
+        "temperature",
+    )
     other = tmp_path / "hot"
     other.mkdir()
     for number in (1, 2):
         write_vdb(other / f"x{number}.vdb", blob(10.0 + number, ("temperature", "flames")))
     data = dataset(other, tmp_path, look="auto")
     recording = recorded(data)
-    assert recording.capture.look.extinction_grids == ("temperature",)
-    assert recording.capture.look.flame_range == (0.0, pytest.approx(0.2, abs=0.01))  # the hottest flame of the files
-
-
-def test_level_sets_are_refused_by_name(tmp_path: Path) -> None:
-    other = tmp_path / "sets"
-    other.mkdir()
-    grid = blob(10.0, ("density",))[0]
-    write_vdb(other / "a1.vdb", [Grid(**{**vars(grid), "kind": "level set"})])
-    with pytest.raises(DataError, match="level set"):
-        dataset(other, tmp_path, grids={"density": "density"})
-
-
-def test_a_sequence_without_matter(tmp_path: Path) -> None:
-    other = tmp_path / "none"
-    other.mkdir()
-    write_vdb(other / "a1.vdb", [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32))])
-    with pytest.raises(DataError, match="no frame has an active voxel of 'density'"):
-        dataset(other, tmp_path)
+    assert recording.capture.optics.extinction_grids == ("temperature",)
+    assert recording.capture.optics.flame_range == (0.0, pytest.approx(0.2, abs=0.01))  # the hottest flame of the files
 
 
 def test_damaged_points_say_what_to_do(folder: Path, tmp_path: Path) -> None:
@@ -251,13 +191,6 @@ def test_damaged_points_say_what_to_do(folder: Path, tmp_path: Path) -> None:
     (recorded(data).folder.path / "frame_00010" / "points.npz").write_bytes(b"not a zip")
     with pytest.raises(DataError, match="delete its folder to render the frame again"):
         dataset(folder, tmp_path)
-
-
-def test_a_frame_without_the_wanted_grid_is_empty(folder: Path, tmp_path: Path) -> None:
-    write_vdb(folder / "ball_10.vdb", blob(12.0, ("temperature",)))
-    data = dataset(folder, tmp_path)
-    alpha = [pixels.alpha for pixels in map(data.test.pixels, range(4))]
-    assert [a is not None and bool(a.any()) for a in alpha] == [False, True, False, True]
 
 
 def test_voxel_sizes_and_bounds_may_change(folder: Path, tmp_path: Path) -> None:
@@ -272,11 +205,3 @@ def test_voxel_sizes_and_bounds_may_change(folder: Path, tmp_path: Path) -> None
     after = dataset(folder, tmp_path).test.pixels(2)
     assert before.alpha is not None and after.alpha is not None
     assert float((before.alpha - after.alpha).abs().mean()) < 0.01 < float(before.alpha.mean())
-
-
-def test_nan_and_infinite_voxels_count_as_nothing(folder: Path, tmp_path: Path) -> None:
-    grids = blob(12.0)
-    grids[0].values[0, 0, 0, 0], grids[0].values[1, 1, 1, 1] = np.nan, np.inf
-    write_vdb(folder / "ball_10.vdb", grids)
-    data = dataset(folder, tmp_path)
-    assert all(bool(torch.isfinite(data.train.pixels(i).rgb).all()) for i in range(len(data.train)))

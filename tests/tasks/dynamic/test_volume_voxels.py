@@ -11,12 +11,11 @@ import torch
 
 from neuprim.config import compose
 from neuprim.core.data.dataset import PointSamples
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import fit, prepare_training
-from neuprim.tasks.dynamic.volume import voxels as module
-from neuprim.tasks.dynamic.volume.voxels import FrameVoxels, Voxels
+from neuprim.tasks.dynamic.volume.dataset import FrameVoxels, Voxels
 from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
 
 SMALL = [
@@ -128,9 +127,9 @@ def test_voxels_are_read_once_kept_beside_the_images_and_bounded(
     for t, expected in enumerate(read):
         found = again.voxels(t)
         assert np.array_equal(found.index, expected.index) and np.array_equal(found.values, expected.values)
-        assert sum(v.bytes for v in again._kept.values()) <= again.memory
+        assert sum(v.bytes for v in again._cache.values()) <= again.memory
     assert not reads
-    path = again.capture.points(again.folder, again.frames[0]).with_name("voxels.npz")
+    path = again.capture.fetch_points(again.folder, again.frames[0]).with_name("voxels.npz")
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(DataError, match=r"voxels\.npz: damaged .*delete it"):
         supervision(files, tmp_path).voxels(0)
@@ -163,53 +162,6 @@ def test_it_learns_the_voxels_better_than_images_alone(files: Path, supervision:
     assert voxels["psnr_mask"] > voxels["psnr_black_image_mask"] + (2 if supervision == "voxels" else 4)
 
 
-@pytest.mark.parametrize("supervision", ["voxels", "both"])
-@pytest.mark.parametrize("strategy", ["fixed", "relocate", "gradient"])
-def test_a_run_goes_on_where_it_stopped(files: Path, supervision: str, strategy: str) -> None:
-    more = [
-        f"train.supervision={supervision}",
-        "train.iterations=24",
-        "train.voxels_per_step=200",
-        f"train.population.strategy={strategy}",
-    ]
-    more += ["train.population.every=5", "train.population.start=0", "train.population.stop=1", "train.voxels_every=3"]
-    whole, half, rest = (trainer(files, *more) for _ in range(3))
-    reports = list(whole.run())
-    for _ in range(11):
-        half.train_step()
-    rest.load_state(*half.state(), "here")
-    assert [(r.loss, r.psnr, r.view, r.primitives) for r in rest.run()] == [
-        (r.loss, r.psnr, r.view, r.primitives) for r in reports[11:]
-    ]
-    a, b = whole.state(), rest.state()
-    assert a[0].keys() == b[0].keys() and all(torch.equal(value, b[0][name]) for name, value in a[0].items())
-    due = [{"voxel_sigma", "voxel_source"} <= r.parts.keys() for r in reports]
-    assert due == [supervision == "voxels" or r.step % 3 == 0 for r in reports]
-    assert reports[0].view.startswith("frame_" if supervision == "voxels" else "cam_")
-
-
-def test_images_alone_draw_no_points(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = trainer(files, "train.iterations=3", "train.supervision=images")
-    monkeypatch.setattr(module.FrameVoxels, "draw", lambda *args: pytest.fail("drawn"))
-    assert len(list(plain.run())) == 3
-
-
-def test_the_preset_quick_learns_from_both_where_there_are_voxels(files: Path, tmp_path: Path) -> None:
-    small = [*SMALL[:3], "model.primitives=50", "train.iterations=40", "train.max_seconds=null"]
-    words = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire", *small]
-    found = prepare_training(compose(words, check_output=False)).trainer
-    every = found.settings.voxels_every
-    assert {"voxel_sigma", "voxel_source"} <= [found.train_step().parts.keys() for _ in range(every)][-1]
-    assert found.model.density.settings() == {
-        "neurons": 0,
-        "edge": 2,
-        "gain": True,
-        "time": "window+motion",
-        "components": ["density"],
-    }
-    assert found.model.parameters_per_primitive == 23 + 1
-
-
 def test_auto_is_images_where_there_are_no_voxels() -> None:
     words = [
         "task=static",
@@ -221,25 +173,3 @@ def test_auto_is_images_where_there_are_no_voxels() -> None:
     ]
     found = prepare_training(compose([*words, "train.supervision=auto"], check_output=False)).trainer
     assert found.settings.supervision == "images" and "voxel_sigma" not in found.train_step().parts
-
-
-def test_colour_may_be_left_to_the_images(files: Path) -> None:
-    found = trainer(files, "train.supervision=voxels", "train.voxel_colour=0", "train.iterations=3")
-    before = found.model.params["sh_dc"].clone()
-    assert all("voxel_source" not in r.parts for r in found.run())
-    assert torch.equal(found.model.params["sh_dc"].detach(), before.detach())
-
-
-def test_data_without_voxels_are_refused_by_name() -> None:
-    words = [
-        "task=static",
-        "scene=solids",
-        "scene.size=16",
-        "scene.train_views=4",
-        "scene.test_views=1",
-        "model.primitives=10",
-    ]
-    with pytest.raises(
-        ConfigError, match=r"^train\.supervision=both: .* has no voxels to learn from; expected images$"
-    ):
-        prepare_training(compose([*words, "train.supervision=both"], check_output=False))

@@ -20,9 +20,7 @@ from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.losses import compressed, l1, relative
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
-from neuprim.tasks.relight.colour import LightNetwork
-from neuprim.tasks.relight.directions import unit
-from neuprim.tasks.relight.harmonics import LightHarmonics
+from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork, normalize_direction
 from tests import scenes
 from tests.core import tiny
 from tests.numerics.equivalence import row_errors, undecided, weights
@@ -147,14 +145,14 @@ def test_directions_at_zero_and_at_infinity() -> None:
     v = torch.tensor(
         [[0.0, 0, 0], [1e-30, 0, 0], [1e-6, 0, 0], [3.0, 4.0, 0.0], [3e30, 4e30, 0.0], [0.0, -1e38, 0.0]]
     ).requires_grad_()
-    found = unit(v)
+    found = normalize_direction(v)
     assert torch.allclose(
         found, torch.tensor([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [0.6, 0.8, 0], [0.6, 0.8, 0], [0, -1, 0]]), atol=1e-6
     )
     (found * torch.tensor([1.0, -2.0, 3.0])).sum().backward()
     assert v.grad is not None and bool(torch.isfinite(v.grad).all()) and float(v.grad.abs().max()) < 1e7
     w = torch.randn(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    assert torch.autograd.gradcheck(unit, (w,))
+    assert torch.autograd.gradcheck(normalize_direction, (w,))
 
 
 def test_harmonics_know_the_direction_of_any_light() -> None:
@@ -178,34 +176,6 @@ def losses(rendered: Tensor, truth: Tensor, name: str) -> tuple[Tensor, Tensor]:
     value.backward()
     assert leaf.grad is not None and parts == {name: pytest.approx(value.item())}
     return value.detach(), leaf.grad
-
-
-@pytest.mark.parametrize("name", LOSSES)
-def test_losses_of_darkness_and_of_highlights(name: str) -> None:
-    dark, grey, bright = torch.zeros(6, 5, 3), torch.full((6, 5, 3), 0.5), torch.full((6, 5, 3), 1e4)
-    for rendered in (dark, grey, bright):
-        for truth in (dark, grey, bright):
-            value, gradient = losses(rendered, truth, name)
-            assert bool(torch.isfinite(value)) and bool(torch.isfinite(gradient).all())
-            if rendered is truth:
-                assert value == 0 and not bool(gradient.any())
-            else:
-                wanted = 1.0 if float(rendered[0, 0, 0]) > float(truth[0, 0, 0]) else -1.0
-                assert bool((gradient.sign() == wanted).all()), (
-                    "every pixel is pulled to the truth, from black and from a highlight too"
-                )
-
-
-@pytest.mark.parametrize("name", LOSSES)
-def test_one_highlight_leaves_the_other_pixels_their_gradient(name: str) -> None:
-    truth = torch.full((6, 5, 3), 0.5)
-    before = losses(torch.full((6, 5, 3), 0.3), truth, name)[1]
-    truth[2, 3] = 1e4
-    after = losses(torch.full((6, 5, 3), 0.3), truth, name)[1]
-    others = torch.ones(6, 5, dtype=torch.bool)
-    others[2, 3] = False
-    assert torch.equal(before[others], after[others]) and bool(torch.isfinite(after).all())
-    assert bool((after[2, 3] < 0).all())
 
 
 # ---------------------------------------------------------------- training
@@ -253,13 +223,6 @@ def test_training_survives_dark_images(loss: str) -> None:
     again, later = fit(loss, lambda i, rgb: None, 120, start=trainer.model)
     again.model.check_finite()
     assert sum(later[-6:]) < 0.8 * sum(later[:6]), "black stayed black"
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_training_survives_lights_that_are_off(loss: str) -> None:
-    trainer, values = fit(loss, blacken, 10, intensity=0.0)
-    trainer.model.check_finite()
-    assert max(values) == 0.0
 
 
 @pytest.mark.parametrize("loss", LOSSES)

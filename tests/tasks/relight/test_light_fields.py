@@ -8,20 +8,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras import Camera
-from neuprim.core.errors import ConfigError, NonFiniteError
+from neuprim.core.errors import ConfigError
 from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import Cosine, RayNet
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Lowered, Primitives
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.core.render import RenderOutput, RenderSettings, render, render_lowered
+from neuprim.core.render import RenderSettings, render
 from neuprim.core.train.splitting import split_primitives
-from neuprim.tasks.relight import TASK
-from neuprim.tasks.relight.colour import FORMS, LightNetwork
-from neuprim.tasks.relight.harmonics import LightHarmonics, real_harmonics
-from neuprim.tasks.relight.lights import parse_intensities, parse_lights
+from neuprim.tasks.relight.colour import FORMS, LightHarmonics, LightNetwork, real_harmonics
+from neuprim.tasks.relight.lighting import parse_intensities, parse_lights
 from neuprim.tasks.relight.visibility import BIAS, SOFTNESS, light_visibility
 from tests import scenes
 from tests.lit_models import COUNT, light, model
@@ -110,17 +107,6 @@ def test_lights_at_a_centre_at_infinity_and_below_the_ground(
     assert all(bool(torch.isfinite(v.grad).all()) for v in m.params.values() if v.grad is not None)
 
 
-def test_no_light_is_black() -> None:
-    m = model(LightNetwork(4), torch.float32)
-    assert not bool(render(m, scenes.camera(), light(strength=0.0)).rgb.any())
-
-
-def test_without_hidden_units_the_colour_is_constant() -> None:
-    m = model(LightNetwork(0, visibility="none"), torch.float32)
-    a, b = (render(m, scenes.camera(), light(*where)).rgb for where in ((2.0, -1.0, 3.0), (-3.0, 1.0, 0.5)))
-    assert torch.equal(a, b) and bool(a.any())
-
-
 # ---------------------------------------------------------------- shadows
 
 
@@ -194,29 +180,6 @@ def test_what_nothing_covers_is_lit_fully(light: tuple[float, float, float]) -> 
     assert int(clear.sum()) > 100 and float(found[clear].min()) > 0.999
 
 
-@pytest.mark.parametrize("row", [0, 3, 5])
-def test_a_number_that_is_not_finite_is_named_by_its_primitive(row: int) -> None:
-    """Not by its place in the slab that it is drawn with."""
-    geometry, density = slabs()
-    density.b2[row] = math.nan
-    with pytest.raises(NonFiniteError, match=rf"^b2 of primitive {row} is not finite"):
-        light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), SETTINGS)
-
-
-def test_depth_images_are_drawn_as_the_frame_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[RenderSettings] = []
-
-    def spy(lowered: Lowered, camera: Camera, settings: RenderSettings) -> RenderOutput:
-        seen.append(settings)
-        return render_lowered(lowered, camera, settings)
-
-    monkeypatch.setattr("neuprim.core.render.slabs.render_lowered", spy)
-    m = model(LightNetwork(2, visibility="pixel"), torch.float32)
-    own = RenderSettings(backend="reference", threads=1, alpha_max=0.98, samples=2)
-    render(m, scenes.camera(), light(), own)
-    assert seen and {(s.backend, s.threads, s.alpha_max, s.samples) for s in seen} == {("reference", 1, 0.98, 1)}
-
-
 @pytest.mark.parametrize("distance", [1e3, 1e8, 1e18])
 def test_distant_lights_cast_the_shadows_of_near_ones(distance: float) -> None:
     geometry, density = slabs()
@@ -281,12 +244,6 @@ def test_lights_on_the_command_line() -> None:
 def test_impossible_lights(text: str) -> None:
     with pytest.raises(ConfigError, match="expected x,y,z or orbit"):
         parse_lights(text)
-
-
-def test_the_task_rebuilds_its_fields() -> None:
-    for field in (LightNetwork(3, form="multiplicative", visibility="none"), LightHarmonics(4)):
-        again = TASK.fields[type(field).__name__](**field.settings())  # type: ignore[index]
-        assert [(s.name, s.shape) for s in again.parameters()] == [(s.name, s.shape) for s in field.parameters()]
 
 
 def test_gradients_reach_every_parameter() -> None:

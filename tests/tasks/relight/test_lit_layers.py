@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from torch import Tensor
 
 from neuprim.core.model.fields import RayNet
-from neuprim.core.render import RenderSettings, render
+from neuprim.core.render import RenderSettings
 from neuprim.core.render.draw import unproject_depth
 from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.tasks.relight import TASK
-from neuprim.tasks.relight.colour import LightNetwork
-from neuprim.tasks.relight.harmonics import LightHarmonics
+from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from neuprim.tasks.relight.visibility import light_visibility
 from tests import scenes
 from tests.chords import chords
@@ -61,12 +59,3 @@ def test_shadows_of_pixels_multiply() -> None:
     V = light_visibility(one.lowered.geometry, one.lowered.density, one.conditions["light"], EXACT)
     expected = V(unproject_depth(one.drawn.depth, CAMERA).reshape(-1, 3)).reshape(visibility.shape)
     assert (visibility - torch.where(one.drawn.alpha > 0, expected, 0.0)).abs().max() < 1e-6
-
-
-@pytest.mark.parametrize(
-    "colour", [LightNetwork(3, visibility="none"), LightHarmonics(2)], ids=["network", "harmonics"]
-)
-def test_colours_without_shadows_have_no_such_layers(colour: LightNetwork | LightHarmonics) -> None:
-    one = frame(colour)
-    assert layers(one) == {"unshadowed": None, "visibility": None}
-    assert torch.equal(one.unshaded, render(one.model, CAMERA, one.conditions, EXACT).rgb)

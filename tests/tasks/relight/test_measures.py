@@ -9,15 +9,12 @@ from typing import Any
 
 import pytest
 import torch
-import yaml
 
-from neuprim.core.errors import BackendUnavailable, DataError
+from neuprim.core.errors import DataError
 from neuprim.core.metrics import means, psnr
-from neuprim.core.metrics.flip import flip, flip_available
 from neuprim.scenes import PIXEL_CLASSES
-from neuprim.tasks.relight import lit_solids as lit
-from neuprim.tasks.relight import measure, olat
-from neuprim.tasks.relight.measure import class_errors, class_shares, scores
+from neuprim.tasks.relight import evaluation, olat
+from neuprim.tasks.relight.evaluation import class_errors, class_shares, scores
 
 CONF = Path(olat.__file__).parent / "conf" / "scene" / "relight"
 
@@ -62,25 +59,6 @@ def test_wrong_class_maps_are_refused() -> None:
         class_errors(rendered, truth, torch.full((16, 16), len(PIXEL_CLASSES), dtype=torch.uint8))
 
 
-def test_means_leave_views_out_that_lack_a_number() -> None:
-    found = means(
-        [{"a": 1.0, "psnr_x": float("inf")}, {"a": 3.0}, {"mse_mask": 0.01}, {"mse_mask": 0.03, "pixels_other": 3.0}]
-    )
-    assert found == {
-        "a": 2.0,
-        "psnr_x": None,
-        "psnr_x_infinite": True,
-        "psnr_pooled_mask": pytest.approx(16.9897),
-        "pixels_other": 3,
-    }
-
-
-def test_without_flip_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    with pytest.raises(BackendUnavailable, match=r"pip install 'neuprim\[flip\]'"):
-        flip(*images())
-
-
 def test_flip_joins_the_scores_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[Any] = []
 
@@ -89,32 +67,13 @@ def test_flip_joins_the_scores_where_it_is_installed(monkeypatch: pytest.MonkeyP
         return None, 0.25, {}
 
     monkeypatch.setitem(sys.modules, "flip_evaluator", types.SimpleNamespace(evaluate=evaluate, __spec__=None))
-    monkeypatch.setattr(measure, "flip_available", lambda: True)
+    monkeypatch.setattr(evaluation, "flip_available", lambda: True)
     rendered, truth = images()
     assert scores(rendered, truth)["flip"] == 0.25
     reference, test, dynamic_range, options = calls[0]
     assert dynamic_range == "LDR" and options["applyMagma"] is False and reference.dtype == test.dtype == "float32"
-    assert abs(reference.mean() - measure.linear_to_srgb(truth).numpy().mean()) < 1e-6
-
-
-@pytest.mark.skipif(not flip_available(), reason="flip-evaluator is not installed")
-def test_flip_of_known_images() -> None:
-    black, white = torch.zeros(32, 32, 3), torch.ones(32, 32, 3)
-    assert flip(white, white) == 0.0 and flip(black, white) > 0.9
+    assert abs(reference.mean() - evaluation.linear_to_srgb(truth).numpy().mean()) < 1e-6
 
 
 # Settings' files
-# -----------------------------------------------------------------------------------------------------------------------
-
-
-def settings_of(name: str) -> dict[str, Any]:
-    value = yaml.safe_load((CONF / f"{name}.yaml").read_text())
-    return {k: v for k, v in value.items() if k != "_paths_"}
-
-
-def test_the_files_hold_the_loaders_settings_and_defaults() -> None:
-    found = settings_of("olat")
-    assert found.pop("path") == "???"
-    assert found == {name: value for name, value in vars(olat.OlatSettings(Path("x"))).items() if name != "path"}
-    found = settings_of("lit_solids")
-    assert found == vars(lit.LitSolidsSettings())
+# ----------------------------------------------------------------

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from torch import Tensor
 
 from neuprim.cli import main
@@ -32,7 +31,7 @@ from neuprim.scenes.lit import build_lit_solids, shade_point_light
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import LightNetwork
-from neuprim.tasks.relight.environment import FAR, illuminate, summary
+from neuprim.tasks.relight.lighting import MAX_LIGHT_ANGLE, illuminate, summarize_lights
 from tests import scenes
 
 UNSHADOWED = "none"  # LightNetwork's ``visibility``
@@ -44,7 +43,9 @@ def facts(distance: float = 4.5, falloff: str = "inverse_square", exposure: floa
     g = torch.Generator().manual_seed(0)
     offsets = torch.nn.functional.normalize(torch.randn(400, 3, generator=g), dim=1)
     offsets[:, 2] = offsets[:, 2].abs()
-    return {"up": [0.0, 0.0, 1.0], "center": [0.1, 0.2, 0.3], "lights": summary(distance * offsets + torch.tensor([0.1, 0.2, 0.3]), torch.tensor([0.1, 0.2, 0.3]), falloff, exposure)} | more  # fmt: skip
+    center = torch.tensor([0.1, 0.2, 0.3])
+    lights = summarize_lights(distance * offsets + center, center, falloff, exposure)
+    return {"up": [0.0, 0.0, 1.0], "center": [0.1, 0.2, 0.3], "lights": lights} | more
 
 
 def texel(row: int = 5, column: int = 9, height: int = 16) -> Tensor:
@@ -122,22 +123,6 @@ def test_one_texel_is_one_light_and_the_background_counts_once() -> None:
     assert torch.allclose(render_light_sum(model, view, halves, SETTINGS, sky), one, atol=1e-5)
 
 
-def test_a_view_keeps_its_other_conditions() -> None:
-    seen: list[dict[str, Tensor]] = []
-
-    class Listening(Primitives):
-        def lower(self, camera: Any, conditions: Any, settings: Any = None) -> Any:
-            seen.append(dict(conditions))
-            return super().lower(camera, conditions, settings)
-
-    model = some_model()
-    view = View("v", scenes.camera(4, 4), {"wavelength": torch.tensor(0.5), "light": torch.zeros(3)})
-    lights = illuminate(Environment(texel()), 1, facts()).conditions
-    render_light_sum(Listening(model.density, model.colour, model.params), view, lights, SETTINGS, torch.zeros(3))
-    assert [sorted(c) for c in seen] == [["light", "light_intensity", "wavelength"]]
-    assert torch.equal(seen[0]["light"], lights[0]["light"])
-
-
 def test_darkness_is_one_light_of_no_intensity() -> None:
     found = illuminate(Environment(torch.zeros(4, 8, 3)), 64, facts())
     assert [c["light_intensity"].tolist() for c in found.conditions] == [[0, 0, 0]]
@@ -151,7 +136,7 @@ def test_light_from_below_is_announced() -> None:
     below = torch.zeros(32, 64, 3)
     below[24:] = 1.0
     (note,) = illuminate(Environment(below), 16, facts()).notes
-    assert note.startswith(f"100% of the environment's light comes from more than {FAR:g} degrees")
+    assert note.startswith(f"100% of the environment's light comes from more than {MAX_LIGHT_ANGLE:g} degrees")
     above = below.flip(0)
     assert illuminate(Environment(above), 16, facts()).notes == ()
 
@@ -161,13 +146,13 @@ def test_the_summary_covers_the_lights() -> None:
     lights = (
         torch.nn.functional.normalize(torch.randn(3000, 3, generator=g), dim=1) * torch.linspace(2, 4, 3000)[:, None]
     )
-    found = summary(lights, torch.zeros(3), "none", 2.0)
+    found = summarize_lights(lights, torch.zeros(3), "none", 2.0)
     kept = torch.tensor(found["directions"])
     units = torch.nn.functional.normalize(lights, dim=1)
     assert kept.shape == (256, 3) and found["distance"] == pytest.approx(3.0, abs=0.01) and found["exposure"] == 2.0
     assert float((units @ kept.T).amax(1).min()) > math.cos(math.radians(10.0))
     assert len(json.dumps(found)) < 8192
-    assert len(summary(lights[:5], torch.zeros(3), "none", 1.0)["directions"]) == 5
+    assert len(summarize_lights(lights[:5], torch.zeros(3), "none", 1.0)["directions"]) == 5
 
 
 @pytest.mark.parametrize(
@@ -252,93 +237,3 @@ def test_one_texel_is_the_flag_light(finished: Path) -> None:
     assert one.std() > 0.05 and torch.allclose(one[0, 0], torch.full((3,), 0.5), atol=1e-6)
     double = drawn(finished, "double", "--environment", file, "--environment-scale", "2")
     assert not torch.allclose(double, one, atol=1e-2) and torch.allclose(double[0, 0], one[0, 0], atol=1e-6)
-
-
-def test_rotation_is_a_turned_image(finished: Path) -> None:
-    flags = ["--environment", str(finished.parent / "texel.exr")]
-    still, turned = drawn(finished, "still", *flags), drawn(finished, "turned", *flags, "--environment-rotation", "90")
-    rolled = drawn(finished, "rolled", "--environment", str(finished.parent / "rolled_texel.exr"))
-    assert torch.allclose(turned, rolled, atol=1e-6) and not torch.allclose(turned, still, atol=1e-2)
-
-
-def test_several_cameras_and_films(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flags = ["--camera", str(finished.parent / "cameras.json"), "--environment", str(finished.parent / "texel.exr")]
-    assert main(["render", str(finished), *flags, "--out", str(finished.parent / "many")]) == 0
-    assert sorted(p.name for p in (finished.parent / "many").iterdir()) == ["camera_000.png", "camera_001.png"]
-    assert main(["render", str(finished), *flags, "--format", "gif", "--out", str(finished.parent / "film.gif")]) == 0
-    with Image.open(finished.parent / "film.gif") as film:
-        assert film.size == (16, 12)
-    capsys.readouterr()
-
-
-def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    capsys.readouterr()
-    assert main(["render", *words]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and error.startswith("neuprim: error: ")
-    return error
-
-
-def test_refusals(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = str(finished.parent / "texel.exr")
-    base = [str(finished), "--camera", str(finished.parent / "one.json")]
-    assert "--light and --environment: give one of them" in refusal(
-        capsys, *base, "--environment", file, "--light", "1,2,3"
-    )
-    assert "--environment-samples is given without --environment" in refusal(
-        capsys, *base, "--environment-samples", "9"
-    )
-    assert "'0': expected a whole number from 1 to 4096" in refusal(
-        capsys, *base, "--environment", file, "--environment-samples", "0"
-    )
-    assert "expected an angle in degrees" in refusal(
-        capsys, *base, "--environment", file, "--environment-rotation", "nan"
-    )
-    assert "no.exr: file not found" in refusal(capsys, *base, "--environment", "no.exr")
-    assert "did you mean '--environment'" in refusal(capsys, *base, "--enviroment", file)
-    negative = texel()
-    negative[0, 0, 0] = -1.0
-    write_exr(finished.parent / "negative.exr", negative, half=False)
-    assert "radiance -1.0 at row 0, column 0, channel 0" in refusal(
-        capsys, *base, "--environment", str(finished.parent / "negative.exr")
-    )
-
-
-def test_what_the_model_never_saw_is_one_line(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_exr(finished.parent / "below.exr", texel(15), half=False)
-    base = [
-        "render",
-        str(finished),
-        "--camera",
-        str(finished.parent / "one.json"),
-        "--out",
-        str(finished.parent / "b.exr"),
-    ]
-    assert main([*base, "--environment", str(finished.parent / "below.exr")]) == 0
-    error = capsys.readouterr().err
-    assert (
-        error.count("\n") == 1 and "below.exr: 100% of the environment's light comes from more than 15 degrees" in error
-    )
-    assert main([*base, "--environment", str(finished.parent / "texel.exr")]) == 0
-    assert capsys.readouterr().err == ""
-
-
-def test_tasks_without_light_refuse(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from neuprim.tasks.static import TASK as static
-
-    config = compose(["task=static", "scene=blender", "scene.path=nowhere", "model.neurons=2"])
-    (finished / "config.yaml").write_text(config.to_yaml())
-    t = scenes.tensors(3, 2)
-    _, field = static.build({**vars(config.model), "options": config.options}, type("D", (), {"channels": 3})())  # type: ignore[arg-type]
-    params = {k: v for k, v in t.items() if k != "colors"} | {
-        s.name: torch.zeros(3, *s.shape) for s in field.parameters()
-    }
-    checkpoint.save_model(finished / "model.safetensors", Primitives(CosineDensity(2), field, params), "static", {})
-    words = [
-        str(finished),
-        "--camera",
-        str(finished.parent / "one.json"),
-        "--environment",
-        str(finished.parent / "texel.exr"),
-    ]
-    assert "task 'static' has no light that it could replace" in refusal(capsys, *words)

@@ -1,4 +1,4 @@
-"""Images of every frame from every camera: what they depend on, and what is written of a frame.
+"""Capture a sequence: cameras around the unit box, the images of every frame, and where they are stored.
 
 volumes/KEY/scene.json                 what was rendered, and how scene units map to the files' world
 volumes/KEY/frame_00012/cam_07.exr     linear RGB radiance and alpha, premultiplied, half floats
@@ -9,36 +9,41 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from neuprim.core.cameras import Camera
+from neuprim.core.cameras import Camera, look_at
 from neuprim.core.compute import device as hardware
-from neuprim.core.errors import DataError
+from neuprim.core.data.dataset import GroundTruth
+from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.exr import write_exr
+from neuprim.core.io.files import write_json
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
+from neuprim.core.notices import warn_once
 from neuprim.core.volumes.source import Extent
-from neuprim.tasks.dynamic.volume.grids import GridReader
-from neuprim.tasks.dynamic.volume.march import integrate
-from neuprim.tasks.dynamic.volume.medium import Medium
-from neuprim.tasks.dynamic.volume.normalise import Normalisation
-from neuprim.tasks.dynamic.volume.optics import Look, medium_of
+from neuprim.tasks.dynamic.volume.medium import Medium, build_medium
+from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics
+from neuprim.tasks.dynamic.volume.raymarch import render_medium
+from neuprim.tasks.dynamic.volume.survey import GridReader, Normalisation
 
-__all__ = ["LAST", "POINTS", "RENDERER_VERSION", "Capture"]
+__all__ = ["LAST_FILE", "POINTS", "RENDERER_VERSION", "Capture", "RenderedFrames", "hemisphere_cameras"]
 
 RENDERER_VERSION = 2
-"""Part of the cache's key: to be raised with every change to the march, the optics, the rig or the files' layout."""
+"""Part of the cache's key: raise it with every change to the march, the optics, the cameras or the files' layout."""
 
 POINTS = 8192
-"""Starting points kept per frame."""
+"""Starting points stored per frame."""
 
-LAST = "points.npz"
+LAST_FILE = "points.npz"
 """The file of a frame that is written last."""
 
 _POINTS_BYTES = 2 * POINTS * 3 * 4 + 2**16
@@ -52,15 +57,16 @@ class Capture:
         frames: the files, in order.
         reader: which grids mean what.
         cameras: all of them, those held out included.
+        samples: rays per pixel side.
         bounds: (2, 3) box around all matter, scene units.
-        device: what renders them. A card's images have a folder of their own, as they differ in their last bits.
-        ends: numbers whose times are 0 and 1; None: the first and the last frame's.
-        measured: number of a frame -> what its extinction grid holds; empty where nobody needs to know.
+        device: what renders them. Images of a GPU have their own folder, as their last bits differ.
+        ends: frame numbers whose times are 0 and 1; None: the first and the last frame's.
+        measured: frame number -> extent of its extinction grid; empty if unknown.
     """
 
     frames: Sequence[VdbFrame]
     reader: GridReader
-    look: Look
+    optics: Optics
     cameras: Sequence[Camera]
     samples: int
     normalisation: Normalisation
@@ -71,78 +77,75 @@ class Capture:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """The extinction grid's meaning where flames add to its extinction, so that its own part is kept apart; else
-        none."""
-        return (self.reader.extinction,) if self.look.mixes(self.reader.names) else ()
+        """The extinction grid's meaning if flames add to its extinction and its part is stored apart."""
+        return (self.reader.extinction,) if self.optics.mixes(self.reader.names) else ()
 
     @property
     def clock(self) -> tuple[int, int]:
-        """Numbers whose times are 0 and 1."""
+        """Frame numbers whose times are 0 and 1."""
         return self.ends or (self.frames[0].number, self.frames[-1].number)
 
     def time(self, frame: VdbFrame) -> float:
-        """A frame's time; numbers are time: a gap in them is one in time."""
+        """A frame's time 0..1, proportional to its number, so that a gap in the numbers is one in time."""
         first, last = self.clock
         return (frame.number - first) / max(last - first, 1)
 
     def within(self, first: int, last: int) -> Capture:
-        """The frames with these numbers and between them; their times stay, and the folder of the images is that of all
-        frames."""
+        """The frames from one number to another; times and image folder stay those of all frames."""
         return replace(self, frames=[frame for frame in self.frames if first <= frame.number <= last], ends=self.clock)
 
     def key(self) -> str:
-        """A short hash of all of it; files count by name, size and time of change."""
+        """A short hash of everything; files count by name, size and modification time."""
         stats = [(f.number, str(f.path), f.path.stat().st_size, f.path.stat().st_mtime_ns) for f in self.frames]
         cameras = [(c.viewmat.tolist(), c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in self.cameras]
         parts = [
             RENDERER_VERSION,
             stats,
-            asdict(self.look),
+            asdict(self.optics),
             dict(self.reader.names),
             cameras,
             self.samples,
             self.normalisation.to_json(),
         ]
         parts += [self.device.type] * hardware.has_warp(self.device)
-        return hashlib.sha256(json.dumps(parts, default=_plain).encode()).hexdigest()[:16]
+        return hashlib.sha256(json.dumps(parts, default=_to_plain).encode()).hexdigest()[:16]
 
     def medium(self, frame: VdbFrame) -> Medium:
-        """What a frame's file holds, as extinction and radiance; nothing where it lacks the grids that absorb in the
-        others."""
+        """The medium of a frame's file; empty if the file lacks the grids that absorb in others."""
         grids = self.reader.read(frame.path)
-        if self.reader.extinction not in grids and not (self.components and self.look.flame_grid in grids):
+        if self.reader.extinction not in grids and not (self.components and self.optics.flame_grid in grids):
             return Medium.nothing()
         try:
-            return medium_of(
+            return build_medium(
                 grids,
-                replace(self.look, extinction_grids=(self.reader.extinction,)),
+                replace(self.optics, extinction_grids=(self.reader.extinction,)),
                 self.normalisation,
                 where=self.device,
             )
         except DataError as error:
             raise DataError(f"{frame.path}: {error}") from error
 
-    def name(self, frame: VdbFrame) -> str:
-        """Of the folder of a frame's files."""
+    def frame_folder(self, frame: VdbFrame) -> str:
+        """Name of the folder of a frame's files."""
         return f"frame_{frame.number:05d}"
 
-    def image(self, store: Store, frame: VdbFrame, camera: int) -> Path:
-        """File of one image. Raises DataError where the store cannot be read."""
+    def fetch_image(self, store: Store, frame: VdbFrame, camera: int) -> Path:
+        """Local file of one image. Raises DataError if the store cannot be read."""
         pixels = self.cameras[camera].width * self.cameras[camera].height
-        return store.fetch_file(f"{self.name(frame)}/cam_{camera:02d}.exr", pixels * 4 * 4 + 2**16)
+        return store.fetch_file(f"{self.frame_folder(frame)}/cam_{camera:02d}.exr", pixels * 4 * 4 + 2**16)
 
-    def points(self, store: Store, frame: VdbFrame) -> Path:
-        """File of a frame's points: means (M, 3) scene units, colors (M, 3) linear radiance, weight (), the frame's
-        total extinction, and largest (), its largest."""
-        return store.fetch_file(f"{self.name(frame)}/{LAST}", _POINTS_BYTES)
+    def fetch_points(self, store: Store, frame: VdbFrame) -> Path:
+        """Local file of a frame's points: means (M, 3) scene units, colors (M, 3) linear radiance, weight () total
+        extinction, largest () extinction, brightest () radiance of its images."""
+        return store.fetch_file(f"{self.frame_folder(frame)}/{LAST_FILE}", _POINTS_BYTES)
 
     def describe(self) -> dict[str, Any]:
-        """What ``scene.json`` holds."""
+        """The content of ``scene.json``."""
         return {
             "renderer_version": RENDERER_VERSION,
             "frames": [{"number": f.number, "file": str(f.path)} for f in self.frames],
             "grids": dict(self.reader.names),
-            "look": json.loads(json.dumps(asdict(self.look), default=_plain)),
+            "look": json.loads(json.dumps(asdict(self.optics), default=_to_plain)),
             "cameras": len(self.cameras),
             "size": [self.cameras[0].width, self.cameras[0].height],
             "samples": self.samples,
@@ -150,7 +153,7 @@ class Capture:
         }
 
     def render(self, frame: VdbFrame, folder: Path) -> None:
-        """Write all files of a frame into a folder.
+        """Render a frame and write all of its files into a folder.
 
         Raises:
             DataError: the frame's file cannot be read, or its light does not fit half floats.
@@ -159,23 +162,27 @@ class Capture:
         medium = self.medium(frame)
         brightest = 0.0
         for c, camera in enumerate(self.cameras):
-            rgba = integrate(medium, camera, samples=self.samples, where=self.device)
-            peak = float(rgba[..., :3].max().half())  # as it is stored: what half floats round to 0 is no light
+            rgba = render_medium(medium, camera, samples=self.samples, where=self.device)
+            peak = float(rgba[..., :3].max().half())  # as stored: values that half floats round to 0 are no light
             if not np.isfinite(peak):
                 raise DataError(
-                    f"{frame.path}: a radiance of {float(rgba[..., :3].max()):.3g} does not fit the images' half floats; "
+                    f"{frame.path}: "
+                    f"a radiance of {float(rgba[..., :3].max()):.3g} does not fit the images' half floats; "
                     "expected at most 65504 (scene.optics.emission, ambient and light set it)"
                 )
             brightest = max(brightest, peak)
             write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
         largest = medium.values[..., 0].max(initial=0.0)
         np.savez(
-            folder / LAST, brightest=np.float32(brightest), largest=np.float32(largest), **_points(medium, frame.number)
+            folder / LAST_FILE,
+            brightest=np.float32(brightest),
+            largest=np.float32(largest),
+            **_sample_points(medium, frame.number),
         )
 
 
-def _points(medium: Medium, seed: int) -> dict[str, Any]:
-    """Points drawn where the extinction is, in proportion to it, with jitter inside their voxels."""
+def _sample_points(medium: Medium, seed: int) -> dict[str, Any]:
+    """Draw points in proportion to the extinction, with jitter inside their voxels."""
     generator = np.random.default_rng(seed)
     sigma = medium.values[..., 0]
     total = float(sigma.sum(dtype=np.float64))
@@ -192,5 +199,158 @@ def _points(medium: Medium, seed: int) -> dict[str, Any]:
     return {"means": means.astype(np.float32), "colors": colors.astype(np.float32), "weight": np.float64(total * cell)}
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+# ---------------------------------------------------------------- rendering all frames
+
+_SCENE = "scene.json"
+
+
+class RenderedFrames(GroundTruth):
+    """Ground truth of a volume sequence: every frame from every camera, rendered when missing.
+
+    A frame's folder appears when all of its files are written. So an interrupted run continues with the missing frames,
+    and of two runs that render the same frame the slower one keeps the other's.
+
+    Args:
+        store: of ground truth; the images are in ``volumes/KEY`` of it.
+    """
+
+    def __init__(self, capture: Capture, store: Store) -> None:
+        self.capture = capture
+        self.frames = [capture.frame_folder(frame) for frame in capture.frames]
+        self.known = {
+            "normalisation": capture.normalisation.to_json(),
+            "bounds": capture.bounds.tolist(),
+            "look": {key: getattr(capture.optics, key) for key in DATA_DEPENDENT},
+            "grids": dict(capture.reader.names),
+        }
+        self._root = store
+
+    @cached_property
+    def key(self) -> str:  # type: ignore[override]
+        return self.capture.key()
+
+    @cached_property
+    def store(self) -> Store:
+        return self._root.at("volumes", self.key)
+
+    @property
+    def place(self) -> str:  # type: ignore[override]
+        return self.store.address
+
+    def missing(self) -> list[int]:
+        complete = self.store.complete_folders(LAST_FILE)
+        return [i for i, name in enumerate(self.frames) if name not in complete]
+
+    def begin(self) -> None:
+        with _describe_write_errors(self.store):
+            self.store.prepare()
+
+    def make(self, frame: int, tell: Callable[[str], None] = warn_once) -> None:
+        if not self.store.has_file(f"{self.frames[frame]}/{LAST_FILE}"):
+            self.write(frame, tell)
+
+    def write(self, frame: int, tell: Callable[[str], None] = warn_once) -> None:
+        """Render a frame and store it, unless it exists by then."""
+
+        def attempt() -> None:
+            self.store.write_folder(
+                self.frames[frame], lambda folder: self.capture.render(self.capture.frames[frame], folder), LAST_FILE
+            )
+
+        with _describe_write_errors(self.store):
+            self.store.retry(attempt, tell)
+
+    def complete(self) -> None:
+        with _describe_write_errors(self.store):
+            if not self.store.has_file(_SCENE):
+                self.store.write_file(_SCENE, lambda path: write_json(path, self.capture.describe()))
+
+    def render_missing(self, progress: Callable[[str, float], None]) -> Store:
+        """Render missing frames in this process; returns the store of the images.
+
+        Raises:
+            DataError: a file cannot be read, or the place cannot be written.
+        """
+        missing = self.missing()
+        if missing:
+            self.begin()
+        text = f"rendering the ground truth: {len(self.frames)} frames, {len(self.capture.cameras)} cameras"
+        for i in missing:
+            progress(text, i / len(self.frames))
+            self.make(i)
+        self.complete()
+        return self.store
+
+
+@contextmanager
+def _describe_write_errors(store: Store) -> Iterator[None]:
+    """Turn errors of the disk into one line that names the store."""
+    try:
+        yield
+    except (OSError, DataError) as error:
+        cause = error if isinstance(error, OSError) else error.__cause__
+        if not isinstance(cause, OSError) or (isinstance(error, DataError) and str(store.path) not in str(error)):
+            raise
+        why = cause.strerror or cause
+        raise DataError(
+            f"cannot write the rendered images to {store.address}: {why}; frames that are there are kept"
+        ) from error
+
+
+# ---------------------------------------------------------------- cameras
+
+_TEST_CAMERAS = (0.4, 0.75)
+"""Positions of the test cameras in the sequence from rim to pole: neighbours on all sides, 90 degrees apart."""
+
+
+def hemisphere_cameras(
+    size: int,
+    cameras: int = 40,
+    *,
+    up: str = "z",
+    distance: float = 2.7,
+    field_of_view: float = 27.0,
+    elevations: tuple[float, float] = (3.0, 80.0),
+) -> tuple[list[Camera], list[Camera]]:
+    """Training cameras and two test cameras on a Fibonacci lattice over the upper hemisphere around the unit box.
+
+    Args:
+        size: edge of the square images in pixels.
+        cameras: of both kinds, at least 4.
+        up: 'y' or 'z'.
+        distance: from the origin, the centre of the box, in scene units (box sides).
+        field_of_view: whole angle, degrees.
+        elevations: of the lowest and the highest camera, degrees above the horizon.
+    """
+    low, high = (math.sin(math.radians(e)) for e in elevations)
+    if up not in UP_AXES:
+        raise ConfigError(f"up {up!r}; expected 'y' or 'z'")
+    if (
+        size < 1
+        or cameras < 4
+        or distance <= 0.0
+        or not 0.0 < field_of_view < 180.0
+        or not -90 <= elevations[0] < elevations[1] <= 90
+    ):
+        raise ConfigError(
+            f"size {size}, cameras {cameras}, distance {distance}, field_of_view {field_of_view}, "
+            f"elevations {elevations}; "
+            "expected positive sizes, at least 4 cameras, an angle below 180 and rising elevations"
+        )
+    focal = 0.5 * size / math.tan(math.radians(field_of_view) / 2)
+    axis = torch.tensor(UP_AXES[up], dtype=torch.float64)
+    views = []
+    for n in range(cameras):
+        height = low + (high - low) * n / (cameras - 1)
+        angle = n * math.pi * (3.0 - math.sqrt(5.0))
+        around = math.sqrt(1.0 - height * height)
+        a, b = around * math.cos(angle), around * math.sin(angle)
+        eye = torch.tensor([a, b, height] if up == "z" else [b, height, a], dtype=torch.float64) * distance
+        viewmat = look_at(eye, torch.zeros(3, dtype=torch.float64), axis)
+        views.append(Camera(viewmat, focal, focal, size / 2, size / 2, size, size))
+    chosen = {int(cameras * part) for part in _TEST_CAMERAS}
+    return [v for n, v in enumerate(views) if n not in chosen], [v for n, v in enumerate(views) if n in chosen]

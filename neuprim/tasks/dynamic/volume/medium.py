@@ -1,9 +1,11 @@
-"""An absorbing, emitting medium on a voxel grid: what the ground-truth renderer integrates."""
+"""An absorbing, emitting medium on a voxel grid, and how grids become one."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -11,9 +13,13 @@ from scipy import ndimage
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, nearest
+from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, Grid
+from neuprim.tasks.dynamic.volume.optics import Optics
+from neuprim.tasks.dynamic.volume.raymarch import light_transmittance
+from neuprim.tasks.dynamic.volume.survey import Normalisation
 
-__all__ = ["Medium"]
+__all__ = ["Medium", "black_body_rgb", "build_medium"]
 
 _NEGLIGIBLE = 1e-7
 """Below this optical depth across a cell, and this fraction of the strongest source, a voxel counts as empty."""
@@ -27,20 +33,18 @@ class Medium:
 
     Attributes:
         values: (X, Y, Z, 4) float32, C-contiguous: σ, σ·c_R, σ·c_G, σ·c_B at voxel centres. σ is extinction in 1/scene
-        unit,
-            c the source radiance in linear RGB. The outermost layer of voxels is zero, so that the field is continuous
-            where it ends; :meth:`padded` adds that layer. No voxels at all is an empty medium.
+            unit, c the source radiance in linear RGB. The outermost voxels are zero, so that the field is continuous;
+            :meth:`padded` adds that layer. No voxels at all is an empty medium.
         scene_from_index: (4, 4) float64, affine and invertible: the centre of voxel (i, j, k) is at it @ (i, j, k, 1).
-        non_finite: how many voxels of the source were NaN or infinite and count as 0.
-        scattering: (X, Y, Z) float32, the part of σ that the extinction grid makes, where flames add to it; None where
-        all of it is that part.
+        non_finite: number of source voxels that were NaN or infinite and count as 0.
+        scattering: (X, Y, Z) float32, the extinction grid's part of σ if flames add to it; None if it is all of σ.
     """
 
     values: np.ndarray
     scene_from_index: np.ndarray
     non_finite: int = 0
     scattering: np.ndarray | None = None
-    _elsewhere: dict[torch.device, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
+    _on_device: dict[torch.device, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         v, m = self.values, self.scene_from_index
@@ -72,8 +76,8 @@ class Medium:
         shift[:3, 3] = -1.0
         around = np.zeros((*(n + 2 for n in values.shape[:3]), 4), np.float32)
         around[1:-1, 1:-1, 1:-1] = values
-        own = None if scattering is None else np.pad(scattering, 1)
-        return Medium(around, np.asarray(scene_from_index, np.float64) @ shift, non_finite, own)
+        padded = None if scattering is None else np.pad(scattering, 1)
+        return Medium(around, np.asarray(scene_from_index, np.float64) @ shift, non_finite, padded)
 
     @staticmethod
     def nothing() -> Medium:
@@ -87,15 +91,15 @@ class Medium:
 
     @property
     def bytes(self) -> int:
-        """Memory of the voxels and of the skips through empty space."""
+        """Memory of ``values`` and ``skips``."""
         return self.values.nbytes + (0 if self.empty else int(np.prod([n - 1 for n in self.values.shape[:3]])))
 
-    def on(self, where: torch.device) -> tuple[Tensor, Tensor]:
-        """``values`` and ``skips`` as tensors there; kept, as many cameras look at them."""
-        if where not in self._elsewhere:
+    def to_device(self, where: torch.device) -> tuple[Tensor, Tensor]:
+        """``values`` and ``skips`` as tensors on a device; cached for further cameras."""
+        if where not in self._on_device:
             values, skips = (device.copy_from_host(torch.from_numpy(x), where) for x in (self.values, self.skips))
-            self._elsewhere[where] = values, skips
-        return self._elsewhere[where]
+            self._on_device[where] = values, skips
+        return self._on_device[where]
 
     @cached_property
     def index_from_scene(self) -> np.ndarray:
@@ -119,3 +123,201 @@ class Medium:
         if not filled.any():
             return np.full(filled.shape, 255, np.uint8)
         return np.minimum(ndimage.distance_transform_cdt(~filled, "chessboard"), 255).astype(np.uint8)
+
+
+# ---------------------------------------------------------------- from grids to a medium
+
+_BLACK_BODY_STEPS = 1024  # entries of the table of black bodies; linear between them
+
+
+def build_medium(
+    grids: Mapping[str, Grid],
+    optics: Optics,
+    normalisation: Normalisation,
+    threads: int = 0,
+    where: torch.device = device.HOST,
+) -> Medium:
+    """Build the medium of one frame on the voxels of its extinction grid.
+
+    Other grids are sampled at those voxels' centres, trilinearly unless their transform is the same. If flames absorb,
+    the medium contains all of them. An empty frame gives an empty medium. :attr:`Medium.non_finite` counts the NaN and
+    infinite voxels of all grids that were used.
+
+    Args:
+        grids: by meaning; those that the optics do not use are ignored.
+        where: device for the light's transmittance.
+
+    Raises:
+        DataError: none of the extinction grids is there, one has the wrong number of channels, or the box is too large.
+    """
+    flames = grids.get(optics.flame_grid) if optics.emission > 0.0 or optics.flame_extinction > 0.0 else None
+    base = next((grids[name] for name in optics.extinction_grids if name in grids), None)
+    if base is None and flames is not None and optics.flame_extinction > 0.0:  # flames absorb by themselves
+        base = Grid.from_dense(optics.extinction_grids[0], np.zeros((0, 0, 0), np.float32), transform=flames.transform)
+    if base is None:
+        wanted = " or ".join(repr(n) for n in optics.extinction_grids)
+        raise DataError(f"no grid {wanted} to take the extinction from{nearest(optics.extinction_grids[0], grids)}")
+    box = base.bounds
+    if flames is not None and optics.flame_extinction > 0.0:
+        box = _unite_boxes(box, _transform_bounds(flames, base.transform))
+    if box is None:
+        return Medium.nothing()
+    density, bad = _sample_scalars(base, base.transform, box)
+    sigma_s = density * np.float32(optics.extinction)
+    flame, more = (None, 0) if flames is None else _sample_scalars(flames, base.transform, box)
+    bad += more
+    sigma = sigma_s if flame is None else sigma_s + flame * np.float32(optics.flame_extinction)
+    values = np.zeros((*sigma.shape, 4), np.float32)
+    values[..., 0] = sigma
+    scene_from_index = normalisation.matrix() @ base.transform
+    scene_from_index[:3, 3] += scene_from_index[:3, :3] @ np.array(box[0], np.float64)
+    arriving: np.ndarray = np.array(optics.ambient, np.float32)
+    if optics.light is not None:
+        lit = light_transmittance(Medium.padded(values, scene_from_index), optics.light.direction, threads, where)[
+            1:-1, 1:-1, 1:-1
+        ]
+        arriving = arriving + lit[..., None] * (
+            np.array(optics.light.irradiance, np.float32) / np.float32(4.0 * math.pi)
+        ).astype(np.float32)
+    albedo, more = _albedo(grids, optics, base.transform, box, scene_from_index)
+    values[..., 1:] = sigma_s[..., None] * (albedo * arriving)
+    if flame is not None and optics.emission > 0.0:
+        values[..., 1:] += sigma[..., None] * _glow(flame, optics)
+    return Medium.padded(values, scene_from_index, bad + more, sigma_s if optics.mixes(grids) else None)
+
+
+def _transform_bounds(grid: Grid, transform: np.ndarray) -> Bounds | None:
+    """Bounds, under another index-to-world map, of the voxels whose centres lie in the box of a grid's active ones."""
+    if grid.bounds is None or _same_voxels(grid.transform, transform):
+        return grid.bounds
+    ends = np.array(grid.bounds, np.float64) - 0.5  # of the voxels' own extent
+    corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)
+    chain = np.linalg.inv(transform) @ grid.transform
+    index = corners @ chain[:3, :3].T + chain[:3, 3]
+    low, high = (
+        np.ceil(index.min(0) - 1e-6).astype(int).tolist(),
+        (np.floor(index.max(0) + 1e-6).astype(int) + 1).tolist(),
+    )
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
+
+def _unite_boxes(a: Bounds | None, b: Bounds | None) -> Bounds | None:
+    if a is None or b is None:
+        return b if a is None else a
+    low, high = np.minimum(a[0], b[0]).tolist(), np.maximum(a[1], b[1]).tolist()
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
+
+def _same_voxels(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two index-to-world maps have the same voxels, to a millionth of one; the offset from the world's origin
+    may be large."""
+    return np.allclose(a[:3, :3], b[:3, :3], rtol=0, atol=1e-9 * float(np.abs(b[:3, :3]).max())) and np.allclose(
+        np.linalg.inv(b) @ a[:, 3], [0, 0, 0, 1], rtol=0, atol=1e-6
+    )
+
+
+def _sample_grid(grid: Grid, transform: np.ndarray, box: Bounds, channels: int) -> tuple[np.ndarray, int]:
+    """The grid at the voxel centres of ``box`` under ``transform``, and how many of its own voxels were not finite."""
+    if grid.channels != channels:
+        raise DataError(f"grid {grid.name!r} has {grid.channels} channels; expected {channels}")
+    limit = DENSE_LIMIT // 4  # the medium has four numbers per voxel
+    if _same_voxels(grid.transform, transform):
+        return _replace_non_finite(grid.to_dense(box, limit * channels))
+    if grid.bounds is None:
+        return np.zeros((*(h - l for l, h in zip(*box, strict=True)), *((3,) * (channels == 3))), np.float32), 0
+    low, high = (tuple(v + pad for v in corner) for corner, pad in zip(grid.bounds, (-1, 1), strict=True))
+    own, bad = _replace_non_finite(
+        grid.to_dense(((low[0], low[1], low[2]), (high[0], high[1], high[2])), limit * channels)
+    )
+    matrix = np.linalg.inv(grid.transform) @ transform
+    offset = matrix[:3, :3] @ np.array(box[0], np.float64) + matrix[:3, 3] - np.array(low)
+    shape = tuple(h - l for l, h in zip(*box, strict=True))
+    planes = [own] if channels == 1 else [own[..., c] for c in range(channels)]
+    found = [ndimage.affine_transform(p, matrix[:3, :3], offset, shape, order=1, mode="grid-constant") for p in planes]
+    return (found[0] if channels == 1 else np.stack(found, -1)), bad
+
+
+def _replace_non_finite(dense: np.ndarray) -> tuple[np.ndarray, int]:
+    wrong = ~np.isfinite(dense)
+    bad = int(np.count_nonzero(wrong.any(-1) if dense.ndim == 4 else wrong))
+    if bad:
+        dense[wrong] = 0.0
+    return dense, bad
+
+
+def _sample_scalars(grid: Grid, transform: np.ndarray, box: Bounds) -> tuple[np.ndarray, int]:
+    found, bad = _sample_grid(grid, transform, box, 1)
+    return np.maximum(found, 0.0), bad
+
+
+def _albedo(
+    grids: Mapping[str, Grid], optics: Optics, transform: np.ndarray, box: Bounds, scene_from_index: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """An array that broadcasts to (X, Y, Z, 3)."""
+    albedo = np.array(optics.albedo, np.float32)
+    if optics.color_grid is not None and optics.color_grid in grids:
+        color, bad = _sample_grid(grids[optics.color_grid], transform, box, 3)
+        return albedo * np.clip(color, 0.0, 1.0), bad
+    if optics.gradient is None:
+        return albedo, 0
+    axis = "xyz".index(optics.up)
+    sizes = [h - l for l, h in zip(*box, strict=True)]
+    indices = np.meshgrid(*(np.arange(n) for n in sizes), indexing="ij", sparse=True)
+    height = sum(scene_from_index[axis, a] * indices[a] for a in range(3)) + scene_from_index[axis, 3] + 0.5
+    stops = np.linspace(0.0, 1.0, len(optics.gradient))
+    return albedo * np.stack([np.interp(height, stops, [s[c] for s in optics.gradient]) for c in range(3)], -1).astype(
+        np.float32
+    ), 0
+
+
+def _glow(flame: np.ndarray, optics: Optics) -> np.ndarray:
+    """(X, Y, Z, 3) float32 emission · B(K(flame))."""
+    low, high = optics.flame_range
+    table = black_body_rgb(np.linspace(*optics.kelvin, _BLACK_BODY_STEPS), optics.kelvin[1]) * optics.emission
+    where = np.clip((flame - low) / (high - low), 0.0, 1.0) * (_BLACK_BODY_STEPS - 1)
+    return np.stack([np.interp(where, np.arange(_BLACK_BODY_STEPS), table[:, c]) for c in range(3)], -1).astype(
+        np.float32
+    )
+
+
+# ---------------------------------------------------------------- black bodies
+
+_WAVELENGTHS = np.arange(360.0, 831.0, 1.0)
+_SECOND_RADIATION_CONSTANT = 1.438776877e7
+"""h c / k in nm K."""
+
+_SRGB_FROM_XYZ = np.array(
+    [[3.2406255, -1.5372080, -0.4986286], [-0.9689307, 1.8757561, 0.0415175], [0.0557101, -0.2040211, 1.0569959]]
+)
+"""IEC 61966-2-1 with the white of D65 at (1, 1, 1)."""
+
+
+def _lobe(mean: float, below: float, above: float) -> np.ndarray:
+    off = _WAVELENGTHS - mean
+    return np.exp(-0.5 * (off * np.where(off < 0, below, above)) ** 2)
+
+
+@lru_cache(maxsize=1)
+def _observer() -> np.ndarray:
+    """(3, L) colour matching functions, CIE 1931 2° observer: the fit of Wyman, Sloan and Shirley (JCGT 2013)."""
+    x = (
+        0.362 * _lobe(442.0, 0.0624, 0.0374)
+        + 1.056 * _lobe(599.8, 0.0264, 0.0323)
+        - 0.065 * _lobe(501.1, 0.0490, 0.0382)
+    )
+    y = 0.821 * _lobe(568.8, 0.0213, 0.0247) + 0.286 * _lobe(530.9, 0.0613, 0.0322)
+    z = 1.217 * _lobe(437.0, 0.0845, 0.0278) + 0.681 * _lobe(459.0, 0.0385, 0.0725)
+    return np.stack([x, y, z])
+
+
+def black_body_xyz(kelvin: np.ndarray) -> np.ndarray:
+    """(…, 3) CIE XYZ of black bodies in one unit of radiance: ∫ B(λ, T) (x̄, ȳ, z̄) dλ, B ∝ λ⁻⁵ / (exp(hc/λkT) - 1)."""
+    exponent = _SECOND_RADIATION_CONSTANT / (_WAVELENGTHS * np.asarray(kelvin, np.float64)[..., None])
+    spectrum = (_WAVELENGTHS / 560.0) ** -5.0 / np.expm1(np.minimum(exponent, 700.0))
+    return spectrum @ _observer().T
+
+
+def black_body_rgb(kelvin: np.ndarray, hottest: float) -> np.ndarray:
+    """(…, 3) linear sRGB radiance relative to a body of ``hottest`` kelvin (largest channel 1), clipped at 0."""
+    top = np.maximum(black_body_xyz(np.array(hottest)) @ _SRGB_FROM_XYZ.T, 0.0).max()
+    return np.maximum(black_body_xyz(kelvin) @ _SRGB_FROM_XYZ.T, 0.0) / top

@@ -1,287 +1,314 @@
-"""``scene=smoke_fire`` and its like: OpenVDB files, given or simulated, as a data set."""
+"""Load volume scenes (``scene=smoke_fire`` and others): OpenVDB files, given or simulated, as a dataset."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
-import os
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 
 from neuprim.core.data import Dataset, DataSource
-from neuprim.core.errors import DataError
+from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.store import Store, open_store
 from neuprim.core.io.vdb import VdbFrame, sequence
 from neuprim.core.notices import warn_once
 from neuprim.core.task import Chunks, SceneContext
-from neuprim.core.validation import validate
+from neuprim.core.validation import Accepts, Range, coerce, nonempty_text, validate, validate_fields
 from neuprim.core.volumes.source import Extent
-from neuprim.scenes.smoke.generate import simulate_smoke
-from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.chunks import number_of_chunks, planned
-from neuprim.tasks.dynamic.volume.dataset import TRAINING, stored_points, volume_dataset
-from neuprim.tasks.dynamic.volume.grids import GridReader, find_grids
-from neuprim.tasks.dynamic.volume.looks import changed, named_look
-from neuprim.tasks.dynamic.volume.normalise import Normalisation
-from neuprim.tasks.dynamic.volume.optics import FOLLOWING, Look
-from neuprim.tasks.dynamic.volume.rendered import RenderedFrames
-from neuprim.tasks.dynamic.volume.rig import AXES, rig
-from neuprim.tasks.dynamic.volume.settings import VolumeSettings, choose_frames
-from neuprim.tasks.dynamic.volume.source import CaptureSource
+from neuprim.scenes.smoke.generate import TIMESTEPS, Resolution, simulate_smoke
+from neuprim.tasks.dynamic.volume.capture import Capture, RenderedFrames, hemisphere_cameras
+from neuprim.tasks.dynamic.volume.chunks import count_chunks, plan_chunks
+from neuprim.tasks.dynamic.volume.dataset import TRAINING_MEMORY, TrainingFrames, read_points_file, volume_dataset
+from neuprim.tasks.dynamic.volume.ground_truth import CaptureSource
+from neuprim.tasks.dynamic.volume.optics import (
+    DATA_DEPENDENT,
+    UP_AXES,
+    Axis,
+    GridMeaning,
+    Optics,
+    optics_preset,
+    override_optics,
+)
+from neuprim.tasks.dynamic.volume.survey import Normalisation, data_dependent_optics, find_grids, survey_frames
 
-__all__ = ["load", "load_chunks", "load_truth", "load_volume"]
+__all__ = ["VolumeSettings", "choose_frames", "load_dataset", "open_ground_truth", "open_volumes", "split_chunks"]
 
-Progress = Callable[[str, float], None]
+_AUTOMATIC_LOOKS = ("smoke_fire", "embergen_fire")
+"""Presets of ``scene.look=auto`` for files with a density, and for those where the hot gas itself absorbs."""
+
+# ---------------------------------------------------------------- settings
 
 
-def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """The data set of a volume scene: files found or simulated, surveyed, rendered from all cameras, kept in the cache.
+def _frame_range(frames: str) -> range | None:
+    """The numbers of "FIRST:LAST" or "FIRST:LAST:STEP", LAST included; None for text of another form."""
+    match = re.fullmatch(r"(\d{1,9}):(\d{1,9})(?::(\d{1,9}))?", frames)
+    if match is None or (step := int(match[3] or 1)) < 1 or int(match[1]) > int(match[2]):
+        return None
+    return range(int(match[1]), int(match[2]) + 1, step)
+
+
+Span = Annotated[str, Accepts(lambda v: v.count(":") == 1 and _frame_range(v) is not None, "FIRST:LAST, as 0:19")]
+Frames = Annotated[
+    str, Accepts(lambda v: v == "all" or _frame_range(v) is not None, "all, FIRST:LAST or FIRST:LAST:STEP, as 0:100:2")
+]
+
+
+@dataclass(frozen=True)
+class VolumeSettings:
+    """Settings of a volume scene.
+
+    Attributes:
+        vdb: folder of .vdb files, or None to simulate.
+        simulation: name of the built-in simulation.
+        resolution: voxels across the simulation's box.
+        timesteps: of the simulation; None: as many as the scene has.
+        frames: "all", "FIRST:LAST" or "FIRST:LAST:STEP" by number, LAST included.
+        span: "FIRST:LAST" by number, the frames for training and evaluation; times, box, exposure and images stay those
+            of all ``frames``. None: all.
+        chunks: number of chunks of time, each trained in its own run; "auto": see
+            :func:`~neuprim.tasks.dynamic.volume.chunks.count_chunks`; None or 1: one run.
+        grids: meaning -> name in the files.
+        look: name of a preset of the optics, or "auto".
+        optics: changes to the preset's settings.
+        size: width and height of the images in pixels.
+        cameras: on the upper hemisphere; two are held out.
+        field_of_view: of the cameras, degrees.
+        samples: rays per pixel side.
+        train_every: train on every n-th frame only; the test views keep all.
+        up: "y" or "z", the upward axis of the files.
+        cache: folder or URL where the ground truth is stored; None: the user's cache on this machine.
+        memory: MiB of decoded images and voxels in memory; others are read again when needed.
+    """
+
+    vdb: Annotated[Path, nonempty_text("a folder of .vdb files")] | None = None
+    simulation: str | None = None
+    resolution: Resolution = 64
+    timesteps: Annotated[int, Range(2, TIMESTEPS[1])] | None = None
+    frames: Frames = "all"
+    span: Span | None = None
+    chunks: Annotated[int, Range(1, 1000)] | Literal["auto"] | None = None
+    grids: Mapping[GridMeaning, Annotated[str, nonempty_text("the name of a grid")]] = field(default_factory=dict)
+    look: str = "auto"
+    optics: Mapping[str, Any] = field(default_factory=dict)
+    size: Annotated[int, Range(8, 4096)] = 160
+    cameras: Annotated[int, Range(4, 1000)] = 40
+    field_of_view: Annotated[float, Range(1, 120, says="degrees from 1 to 120")] = 27.0
+    samples: Annotated[int, Range(1, 16)] = 2
+    train_every: Annotated[int, Range(1, 1000)] = 1
+    up: Axis = "z"
+    cache: Annotated[str, nonempty_text("a folder, or a URL as s3://BUCKET/FOLDER")] | None = None
+    memory: Annotated[int, Range(1, 2**20)] = 1408
+
+    def __post_init__(self) -> None:
+        validate_fields(self, "scene")
+        if self.vdb is None and self.simulation is None:
+            raise ConfigError("scene.vdb: required and not given; expected a folder of .vdb files")
+        if self.span is not None and self.chunks is not None:
+            raise ConfigError(
+                f"scene.chunks={self.chunks}: chunks are spans of all chosen frames; "
+                "expected no scene.span beside it, but scene.frames"
+            )
+
+    @property
+    def memory_bytes(self) -> float:
+        return self.memory * 2.0**20
+
+    def resolve_optics(self, automatic: str) -> Optics:
+        """The preset with the user's changes; ``automatic`` is the one for "auto".
+
+        Raises:
+            ConfigError: no such preset or setting, or an impossible value.
+        """
+        preset = optics_preset(automatic if self.look == "auto" else self.look, self.up)
+        return override_optics(preset, self.optics)
+
+
+def choose_frames(frames: str, numbers: Sequence[int], where: str = "the sequence") -> list[int]:
+    """Those of the ascending ``numbers`` of a sequence that ``scene.frames`` names.
+
+    Raises:
+        ConfigError: another form than "all", "FIRST:LAST" or "FIRST:LAST:STEP".
+        DataError: none of the frames exists.
+    """
+    wanted = _frame_range(coerce(frames, Frames, "scene.frames"))
+    if wanted is None:
+        return list(numbers)
+    chosen = [n for n in numbers if n in wanted]
+    if numbers and not chosen:
+        raise DataError(f"scene.frames={frames}: {where} has frames {numbers[0]} to {numbers[-1]}, and none of these")
+    return chosen
+
+
+# ---------------------------------------------------------------- loading
+
+
+@dataclass(frozen=True)
+class _PreparedScene:
+    """Everything that is known before anything is rendered."""
+
+    settings: VolumeSettings
+    name: str
+    source: DataSource
+    capture: Capture
+    held_out: range
+
+    def span(self) -> tuple[int, int] | None:
+        """First and last number of the chosen frames within ``scene.span``; None for all of them."""
+        wanted = None if self.settings.span is None else _frame_range(self.settings.span)
+        if wanted is None:
+            return None
+        numbers = [frame.number for frame in self.capture.frames if frame.number in wanted]
+        if not numbers:
+            begin, end = self.capture.clock
+            raise DataError(
+                f"scene.span={self.settings.span}: the chosen frames are {begin} to {end}, and none of these"
+            )
+        return numbers[0], numbers[-1]
+
+    def rendered_frames(self, context: SceneContext) -> RenderedFrames:
+        cache = self.settings.cache
+        store = Store.local(context.cache_dir) if cache is None else open_store(cache, context.cache_dir / "copies")
+        return RenderedFrames(self.capture, store)
+
+
+def load_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """Load a volume scene: find or simulate files, survey them, render all cameras, store the images in the cache.
 
     Raises:
         ConfigError: unknown setting or impossible value.
         DataError: files that are missing, damaged, or without a usable grid; a cache that cannot be written.
     """
-    asked, name, source, capture, held_out = _prepare(settings, context)
-    _tell(asked, capture)
-    span = _span(asked, capture)
-    rendered = _rendered(asked, capture, context).take(context.progress)
-    up = torch.tensor(AXES[asked.up], dtype=torch.float64)
+    scene = _prepare(settings, context)
+    _report_chosen_extinctions(scene)
+    span = scene.span()
+    images = scene.rendered_frames(context).render_missing(context.progress)
     return volume_dataset(
-        name, source, capture, rendered, held_out, up, asked.train_every, span, asked.memory * 2.0**20
+        scene.name,
+        scene.source,
+        scene.capture,
+        images,
+        scene.held_out,
+        torch.tensor(UP_AXES[scene.settings.up], dtype=torch.float64),
+        TrainingFrames(scene.settings.train_every, span, scene.settings.memory_bytes),
     )
 
 
-def load_truth(
+def open_ground_truth(
     settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
 ) -> RenderedFrames:
-    """The same scene's images as work to be done; raises as :func:`load`.
+    """The scene's images as work to be done; raises as :func:`load_dataset`.
 
     Args:
         known: of the same scene's ground truth in another process, which has surveyed the files.
     """
-    asked, _, _, capture, _ = _prepare(settings, context, known)
-    return _rendered(asked, capture, context)
+    return _prepare(settings, context, known).rendered_frames(context)
 
 
-def _rendered(asked: VolumeSettings, capture: Capture, context: SceneContext) -> RenderedFrames:
-    store = (
-        Store.local(context.cache_dir) if asked.cache is None else open_store(asked.cache, context.cache_dir / "copies")
-    )
-    return RenderedFrames(capture, store)
+def open_volumes(settings: Mapping[str, Any], context: SceneContext) -> CaptureSource:
+    """The scene's files without any image; raises as :func:`load_dataset`."""
+    scene = _prepare(settings, context)
+    span = scene.span()
+    return CaptureSource(scene.capture if span is None else scene.capture.within(*span))
 
 
-def load_volume(settings: Mapping[str, Any], context: SceneContext) -> CaptureSource:
-    """The same scene's files without any image. Raises as :func:`load`."""
-    asked, _, _, capture, _ = _prepare(settings, context)
-    span = _span(asked, capture)
-    return CaptureSource(capture if span is None else capture.within(*span))
-
-
-def load_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
-    """The chunks that ``scene.chunks`` asks for, with the ground truth of all frames rendered, as their exposure is
-    one; None for one run.
+def split_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
+    """The chunks of ``scene.chunks``; None for one run. Renders all frames, as the chunks share one exposure.
 
     Raises:
-        ConfigError: more chunks than the frames allow. And as :func:`load`.
+        ConfigError: more chunks than the frames allow; and as :func:`load_dataset`.
     """
-    settings = {name: value for name, value in config["scene"].items() if name != "name"}
-    asked, _, _, capture, held_out = _prepare(settings, context)
-    learned, camera = len(capture.frames[:: asked.train_every]), capture.cameras[0]
-    images = (
-        learned * (len(capture.cameras) - len(held_out)) * camera.width * camera.height * 4 * 2
-    )  # RGBA, half floats
-    count = number_of_chunks(asked.chunks, learned, images, asked.memory * 2.0**20 * TRAINING)
+    scene = _prepare({name: value for name, value in config["scene"].items() if name != "name"}, context)
+    options, capture = scene.settings, scene.capture
+    frames, camera = len(capture.frames[:: options.train_every]), capture.cameras[0]
+    rgba_half = 4 * 2
+    views = frames * (len(capture.cameras) - len(scene.held_out))
+    image_bytes = views * camera.width * camera.height * rgba_half
+    count = count_chunks(options.chunks, frames, image_bytes, options.memory_bytes * TRAINING_MEMORY)
     if count == 1:
         return None
-    store = _rendered(asked, capture, context).take(context.progress)
+    store = scene.rendered_frames(context).render_missing(context.progress)
 
-    def weight(frame: VdbFrame) -> float:
-        return float(stored_points(capture.points(store, frame), "weight")["weight"])
+    def total_extinction(frame: VdbFrame) -> float:
+        return float(read_points_file(capture.fetch_points(store, frame), "weight")["weight"])
 
-    return planned(capture, asked.train_every, count, weight, config)
+    return plan_chunks(capture, options.train_every, count, total_extinction, config)
 
 
 def _prepare(
     settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
-) -> tuple[VolumeSettings, str, DataSource, Capture, range]:
-    """All that is known before anything is rendered: settings, name, origin, what to render, and the cameras held
-    out."""
-    asked = validate(VolumeSettings, settings, "scene")
-    _look(asked, AUTO[0])  # a typing error shows before anything is simulated
-    folder, name, source = _files(asked, context)
-    frames = _frames(folder, asked)
-    reader = find_grids(frames, {str(meaning): name for meaning, name in asked.grids.items()})
-    look = _look(asked, AUTO["density" not in reader.names])
-    reader = reader.absorbing(look.extinction_grids, folder)
+) -> _PreparedScene:
+    options = validate(VolumeSettings, settings, "scene")
+    options.resolve_optics(_AUTOMATIC_LOOKS[0])  # report typing errors before anything is simulated
+    folder, name, source = _find_files(options, context)
+    frames = _find_frames(folder, options)
+    reader = find_grids(frames, {str(meaning): name for meaning, name in options.grids.items()})
+    optics = options.resolve_optics(_AUTOMATIC_LOOKS["density" not in reader.names])
+    reader = reader.with_extinction(optics.extinction_grids, folder)
     measured: Mapping[int, Extent] = {}
     if known is None:
-        survey = _survey(frames, reader, look, context.progress)
-        if not survey.hottest > 0:  # no frame has a flame: what only flames need is left out of everything that follows
+        survey = survey_frames(frames, reader, optics, context.progress)
+        if not survey.hottest > 0:  # no flames in any frame: leave out everything that only flames need
             reader = dataclasses.replace(reader, names={m: n for m, n in reader.names.items() if m != "flames"})
         if source == "real":
-            look = dataclasses.replace(
-                look,
-                **{key: v for key, v in _following(look, reader.extinction, survey).items() if key not in asked.optics},
-            )
+            derived = data_dependent_optics(optics, reader.extinction, survey)
+            changes = {key: value for key, value in derived.items() if key not in options.optics}
+            optics = dataclasses.replace(optics, **changes)
         normalisation, measured = Normalisation.from_bounds(survey.box), survey.extents
         bounds = normalisation.to_scene(survey.box)
     else:
-        low, high = known["look"]["flame_range"]
-        look = dataclasses.replace(
-            look, **{**{key: known["look"][key] for key in FOLLOWING}, "flame_range": (low, high)}
-        )
+        derived = {key: known["look"][key] for key in DATA_DEPENDENT}
+        low, high = derived["flame_range"]
+        optics = dataclasses.replace(optics, **{**derived, "flame_range": (low, high)})
         reader = dataclasses.replace(reader, names=known["grids"])
         normalisation, bounds = Normalisation.from_json(known["normalisation"]), np.array(known["bounds"])
-    train, test = rig(asked.size, asked.cameras, up=asked.up, field_of_view=asked.field_of_view)
+    train, test = hemisphere_cameras(options.size, options.cameras, up=options.up, field_of_view=options.field_of_view)
     capture = Capture(
-        frames, reader, look, [*train, *test], asked.samples, normalisation, bounds, context.device, measured=measured
+        frames,
+        reader,
+        optics,
+        [*train, *test],
+        options.samples,
+        normalisation,
+        bounds,
+        context.device,
+        measured=measured,
     )
-    return asked, name, source, capture, range(len(train), len(train) + len(test))
+    return _PreparedScene(options, name, source, capture, range(len(train), len(train) + len(test)))
 
 
-def _tell(asked: VolumeSettings, capture: Capture) -> None:
-    """Say in one line which extinctions were chosen in place of the look's own."""
-    usual = _look(asked, AUTO["density" not in capture.reader.names])
-    grids = {"extinction": capture.reader.extinction, "flame_extinction": "flames"}
-    chosen = [
-        f"scene.optics.{key}={getattr(capture.look, key):g} (look: {getattr(usual, key):g}), as values of grid {capture.reader.names[meaning]!r} go "
-        f"to about {getattr(usual, key) / getattr(capture.look, key):.2g}"
-        for key, meaning in grids.items()
-        if getattr(capture.look, key) != getattr(usual, key)
-    ]
-    if chosen:
-        warn_once(f"{capture.frames[0].path.parent}: {'; '.join(chosen)}. Set these to choose others")
-
-
-def _span(asked: VolumeSettings, capture: Capture) -> tuple[int, int] | None:
-    """First and last number of the chosen frames that ``scene.span`` names; None for all of them."""
-    if asked.span is None:
-        return None
-    first, last = asked.span_numbers
-    own = [frame.number for frame in capture.frames if first <= frame.number <= last]
-    if not own:
-        begin, end = capture.clock
-        raise DataError(f"scene.span={asked.span}: the chosen frames are {begin} to {end}, and none of these")
-    return own[0], own[-1]
-
-
-def _files(asked: VolumeSettings, context: SceneContext) -> tuple[Path, str, DataSource]:
-    if asked.vdb is not None:
-        return asked.vdb, asked.vdb.name, "real"
-    assert asked.simulation is not None, "settings were checked"
+def _find_files(options: VolumeSettings, context: SceneContext) -> tuple[Path, str, DataSource]:
+    if options.vdb is not None:
+        return options.vdb, options.vdb.name, "real"
+    assert options.simulation is not None, "settings were checked"
     folder = simulate_smoke(
-        asked.simulation, asked.timesteps, asked.resolution, context.seed, context.cache_dir, context.progress
+        options.simulation, options.timesteps, options.resolution, context.seed, context.cache_dir, context.progress
     )
-    return folder, f"{asked.simulation} (simulated)", "simulated"
+    return folder, f"{options.simulation} (simulated)", "simulated"
 
 
-def _frames(folder: Path, asked: VolumeSettings) -> list[VdbFrame]:
-    found = sequence(folder).frames
-    chosen = choose_frames(asked.frames, [f.number for f in found], str(folder))
-    return [f for f in found if f.number in set(chosen)]
+def _find_frames(folder: Path, options: VolumeSettings) -> list[VdbFrame]:
+    frames = sequence(folder).frames
+    chosen = set(choose_frames(options.frames, [f.number for f in frames], str(folder)))
+    return [f for f in frames if f.number in chosen]
 
 
-AUTO = ("smoke_fire", "embergen_fire")
-"""Looks that ``look=auto`` takes for files with a density, and for those where the hot gas itself has to absorb."""
-
-
-def _look(asked: VolumeSettings, automatic: str) -> Look:
-    """The look by name with the user's changes.
-
-    Raises:
-        ConfigError: no such look or setting, or an impossible value.
-    """
-    return changed(named_look(automatic if asked.look == "auto" else asked.look, asked.up), asked.optics)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Survey:
-    """What the grids of all frames hold.
-
-    Attributes:
-        box: (2, 3) around all matter, world units.
-        extents: number of a frame -> that of its extinction grid.
-        hottest: the largest flame.
-        typical: meaning -> a value that one voxel in a thousand exceeds.
-    """
-
-    box: np.ndarray
-    extents: dict[int, Extent]
-    hottest: float
-    typical: dict[str, float]
-
-
-class _Histogram:
-    """How often positive values occur, to about 1 % of their size, so that a quantile of a whole sequence takes little
-    memory."""
-
-    def __init__(self) -> None:
-        self.counts = np.zeros(1 << 15, np.int64)
-
-    def add(self, values: np.ndarray) -> None:
-        """The upper half of a positive float32's bits rises with it."""
-        positive = values[np.isfinite(values) & (values > 0)]
-        self.counts += np.bincount(positive.astype(np.float32).view(np.uint32) >> 16, minlength=len(self.counts))
-
-    def quantile(self, share: float) -> float:
-        """0 without any value."""
-        below = np.cumsum(self.counts)
-        place = int(np.searchsorted(below, share * below[-1]))
-        return float(np.uint32(place << 16 | 1 << 15).view(np.float32)) if below[-1] else 0.0
-
-
-def _survey(frames: list[VdbFrame], reader: GridReader, look: Look, progress: Progress) -> _Survey:
-    """Looks through all frames. What absorbs is matter: the extinction grid, and flames where the look gives them an
-    extinction.
-
-    Raises:
-        DataError: no frame has any active voxel.
-    """
-    matter, extents, hottest = list[Extent](), dict[int, Extent](), 0.0
-    values = {meaning: _Histogram() for meaning in (reader.extinction, "flames")}
-    for i, frame in enumerate(frames):
-        progress("looking through the frames", i / len(frames))
-        own = Extent(0.0, None)
-        for meaning, grid in reader.read(frame.path).items():
-            box = grid.world_bounds()
-            if box is None or meaning not in values or grid.channels != 1:
-                continue
-            extent = Extent(max(grid.range[1], 0.0) if grid.range else 0.0, box)
-            values[meaning].add(grid.active_values())
-            if meaning == reader.extinction:
-                own = extent
-            if meaning == "flames":
-                hottest = max(hottest, extent.largest)
-            if meaning == reader.extinction or look.mixes(reader.names):
-                matter.append(extent)
-        extents[frame.number] = own
-    box = Extent.around(matter).box
-    if box is None:
-        where = os.path.commonpath([f.path for f in frames])
-        raise DataError(
-            f"{where}: no frame has an active voxel of {reader.names[reader.extinction]!r}; expected matter in at least one"
-        )
-    return _Survey(box, extents, hottest, {meaning: found.quantile(_TYPICAL) for meaning, found in values.items()})
-
-
-_TYPICAL = 0.999
-"""Quantile of a grid's voxels that counts as its peak: single voxels far above the others do not change the optics."""
-
-
-def _following(look: Look, absorbing: str, survey: _Survey) -> dict[str, Any]:
-    """The settings of a look that follow the files: its extinctions are for grids that peak at about 1, and are divided
-    by their peak.
-
-    The divisor is rounded to a power of two, so that a few frames more or less change nothing.
-    """
-    grids = {"extinction": absorbing, "flame_extinction": "flames"}
-    scaled = {
-        key: getattr(look, key) * 2.0 ** -round(math.log2(survey.typical[m]))
-        for key, m in grids.items()
-        if survey.typical[m] > 0
-    }
-    return {**scaled, **({"flame_range": (0.0, survey.hottest)} if survey.hottest > 0 else {})}
+def _report_chosen_extinctions(scene: _PreparedScene) -> None:
+    """Print one line with the extinctions that were chosen instead of the preset's."""
+    capture = scene.capture
+    preset = scene.settings.resolve_optics(_AUTOMATIC_LOOKS["density" not in capture.reader.names])
+    grids = {"extinction": capture.reader.extinction, "flame_extinction": "flames"}
+    lines = []
+    for key, meaning in grids.items():
+        value, usual = getattr(capture.optics, key), getattr(preset, key)
+        if value != usual:
+            lines.append(
+                f"scene.optics.{key}={value:g} (look: {usual:g}), as values of grid {capture.reader.names[meaning]!r} "
+                f"go to about {usual / value:.2g}"
+            )
+    if lines:
+        warn_once(f"{capture.frames[0].path.parent}: {'; '.join(lines)}. Set these to choose others")

@@ -56,8 +56,8 @@ def ours() -> list[Grid]:
         "corner": (1, -2, 3),
         "offset": (0.5, 1.0, -2.0),
     }
-    background = Grid("background", np.eye(4), np.float32(0.25), np.zeros((1, 3), np.int32), np.full((1, 8, 8, 8), 2.0, np.float32),
-                      np.ones((1, 8, 8, 8), bool), Tiles.none())  # fmt: skip
+    values, mask = np.full((1, 8, 8, 8), 2.0, np.float32), np.ones((1, 8, 8, 8), bool)
+    background = Grid("background", np.eye(4), np.float32(0.25), np.zeros((1, 3), np.int32), values, mask, Tiles.none())
     return [
         random_grid(rng, name="float"),
         random_grid(rng, half=True, name="half"),

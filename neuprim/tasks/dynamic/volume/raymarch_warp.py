@@ -1,8 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Rays through the cells between voxel centres on a card, a thread a pixel or a voxel: the twin of
-:mod:`~neuprim.tasks.dynamic.volume.traverse`, step by step. Places along a ray are float64, what is gathered float32,
-as there.
-Warp is imported with this module."""
+"""March rays on a GPU, one thread per pixel or voxel: the twin of :mod:`~neuprim.tasks.dynamic.volume.raymarch`.
+
+Positions along a ray are float64, accumulated values float32, as there. Warp is imported with this module.
+"""
 
 from __future__ import annotations
 
@@ -264,14 +264,14 @@ def radiances(
 
     Args:
         values, skips: of a :class:`~neuprim.tasks.dynamic.volume.medium.Medium`. pose (3, 4), lens (4,), float64: see
-            :func:`~neuprim.tasks.dynamic.volume.traverse.radiances`.
+            :func:`~neuprim.tasks.dynamic.volume.raymarch.radiances`.
     """
     image = torch.empty(height * width, 4, dtype=torch.float32, device=values.device)
     launch(
         _radiances(), height * width,
         (
-            array(values, wp.vec4), array(skips, wp.uint8), array(pose, d), array(lens, d), wp.vec2i(width, height), samples, subdivisions,
-            array(image, wp.vec4),
+            array(values, wp.vec4), array(skips, wp.uint8), array(pose, d), array(lens, d), wp.vec2i(width, height),
+            samples, subdivisions, array(image, wp.vec4),
         ), values.device,
     )  # fmt: skip
     return image.view(height, width, 4)

@@ -1,4 +1,4 @@
-"""What a frame's time does to primitives that live and move, with its gradient, fused per primitive."""
+"""Windows and motion of primitives at a frame's time, with gradients, fused per primitive."""
 
 from __future__ import annotations
 
@@ -14,31 +14,30 @@ from neuprim.core.compute.operation import apply_autograd
 from neuprim.core.model.densities.gain_cpu import scale_backward
 from neuprim.core.model.edge import fade
 
-__all__ = ["WINDOW_EDGE", "fused_move", "fused_window", "in_their_windows"]
+__all__ = ["WINDOW_EDGE", "move_means", "apply_window", "rows_in_window"]
 
-WINDOW_EDGE = 2  # the exponent of the window in time, which is to a life what an edge is to a support
+WINDOW_EDGE = 2  # exponent of the window in time
 
 
 @exact_kernel
-def _in_their_windows(center, log_window, xi, rows):  # type: ignore[no-untyped-def]
-    """How many there are; ``rows`` begins with them."""
-    found = 0
+def _rows_in_window(center, log_window, xi, rows):  # type: ignore[no-untyped-def]
+    """Write the rows to the start of ``rows``; returns their number."""
+    count = 0
     for n in range(center.shape[0]):
         if abs(xi - np.float64(center[n, 0])) < np.exp(np.float64(log_window[n, 0])):
-            rows[found] = n
-            found += 1
-    return found
+            rows[count] = n
+            count += 1
+    return count
 
 
-def in_their_windows(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
-    """Ascending int64 rows of ``center`` and ``log_window`` (N, 1) with abs(xi - center) < exp(log_window), in float64;
-    no gradient."""
+def rows_in_window(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
+    """Ascending int64 rows of (N, 1) tensors with abs(xi - center) < exp(log_window), in float64; no gradient."""
     center, log_window = center.detach(), log_window.detach()
     if not device.on_numba(center, log_window):
         return ((xi - center[:, 0].double()).abs() < log_window[:, 0].double().exp()).nonzero()[:, 0]
     rows = np.empty(len(center), np.int64)
-    found = _in_their_windows(center.contiguous().numpy(), log_window.contiguous().numpy(), float(xi), rows)
-    return torch.from_numpy(rows[:found])
+    count = _rows_in_window(center.contiguous().numpy(), log_window.contiguous().numpy(), float(xi), rows)
+    return torch.from_numpy(rows[:count])
 
 
 class _Window(torch.autograd.Function):
@@ -62,7 +61,7 @@ class _Window(torch.autograd.Function):
         return g_w2, g_b2, -g_u / tau, -g_u * u, None
 
 
-def fused_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
+def apply_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
     """(w2, b2) (N, K) and (N, 1) times (1 - u^2)^2, u = (xi - center)/exp(log_window), 0 beyond |u| = 1.
 
     ``center`` and ``log_window`` are (N, 1), all of one dtype; no gradient for the time ``xi`` ().
@@ -101,7 +100,7 @@ class _Move(torch.autograd.Function):
         return pulled, *made, None
 
 
-def fused_move(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:
+def move_means(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:
     """(N, 3) means + velocity (xi - center) + acceleration (xi - center)^2.
 
     ``velocity`` and ``acceleration`` are (N, 3), ``center`` (N, 1), all of one dtype; no gradient for the time ``xi``

@@ -1,0 +1,179 @@
+"""The extinction of a scene's files, or of other files read by the same rules, in scene units; and its comparison."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from neuprim.core.compute import device
+from neuprim.core.errors import DataError
+from neuprim.core.io.vdb import VdbFrame, sequence
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.volumes.density_errors import NUMBERS, DensityTruth, TruthFrame, measure_frame_errors
+from neuprim.core.volumes.grid import voxels_within
+from neuprim.core.volumes.source import Placement, VolumeSource
+from neuprim.tasks.dynamic.volume.capture import Capture
+from neuprim.tasks.dynamic.volume.medium import Medium
+
+__all__ = ["CaptureSource", "VolumeTruth", "compare_extinction", "placement_of", "sample_extinction"]
+
+THIRDS = ("early", "middle", "late")
+
+
+def sample_extinction(
+    medium: Medium,
+    scene_from_index: Tensor,
+    shape: tuple[int, int, int],
+    where: torch.device = device.HOST,
+    part: bool = False,
+) -> np.ndarray:
+    """(X, Y, Z) float32 extinction at a lattice's points, trilinear, computed on the device ``where``.
+
+    Args:
+        part: only the extinction grid's part.
+    """
+    if medium.values.size == 0:
+        return np.zeros(shape, np.float32)
+    chain = np.linalg.inv(medium.scene_from_index) @ scene_from_index.numpy()
+    sigma = medium.scattering if part and medium.scattering is not None else medium.values[..., 0]
+    if device.has_warp(where) and not medium.empty and sigma is not medium.scattering:
+        from neuprim.tasks.dynamic.volume import raymarch_warp
+
+        index_map = device.copy_from_host(torch.from_numpy(np.ascontiguousarray(chain[:3])), where)
+        return raymarch_warp.extinctions(medium.to_device(where)[0], index_map, shape).cpu().numpy()
+    index = np.indices(shape, dtype=np.float64).reshape(3, -1)
+    points = chain[:3, :3] @ index + chain[:3, 3:]
+    values: np.ndarray = ndimage.map_coordinates(sigma, points, order=1, mode="constant", cval=0.0)
+    return values.reshape(shape).astype(np.float32)
+
+
+class VolumeTruth(DensityTruth):
+    """The frames of ``path`` or the scene's own; grids, optics, placement and times are those of the scene.
+
+    A frame's time follows from its number: the scene's first is 0 and its last 1. Frames of a folder outside these are
+    left out; a single file outside them has no time. Models are compared on a frame's own voxels within the sequence's
+    box.
+
+    Raises:
+        DataError: no file, or no frame within the scene's times.
+    """
+
+    def __init__(self, capture: Capture, path: Path | None = None) -> None:
+        self.capture, self.bounds = capture, torch.from_numpy(capture.bounds).double()
+        first, last = capture.clock
+        if path is None:
+            files = list(capture.frames)
+        elif path.is_dir():
+            files = [frame for frame in sequence(path).frames if first <= frame.number <= last]
+            if not files:
+                raise DataError(f"{path}: no frame from {first} to {last}, which are the scene's")
+        else:
+            numbers = re.findall(r"[0-9]{1,18}", path.stem)  # the last one counts, as in a folder
+            files = [VdbFrame(int(numbers[-1]) if numbers else -1, path)]
+        self._files = files
+        self._cached: tuple[int, Medium] | None = None
+        self.frames = [
+            TruthFrame(
+                file.path.name,
+                {"time": torch.tensor(capture.time(file))} if first <= file.number <= last else {},
+            )
+            for file in files
+        ]
+
+    def medium(self, frame: int) -> Medium:
+        """The medium of a frame's file; the last one is cached, as grids are requested in parts."""
+        if self._cached is None or self._cached[0] != frame:
+            self._cached = (frame, self.capture.medium(self._files[frame]))
+        return self._cached[1]
+
+    def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
+        medium = self.medium(frame)
+        if medium.empty:
+            return None
+        inside = np.array(medium.values.shape[:3]) - 2.0  # without the empty layer around it
+        ends = np.stack(np.meshgrid(*np.stack([np.ones(3), inside], -1), indexing="ij"), -1).reshape(-1, 3)
+        corners = ends @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
+        low, high = self.bounds.numpy()
+        box = np.stack([np.minimum(corners.min(0), low), np.maximum(corners.max(0), high)])
+        return voxels_within(box, medium.scene_from_index)
+
+    def grid(
+        self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
+    ) -> Tensor:
+        part = component is not None
+        sigma = sample_extinction(self.medium(frame), scene_from_index, shape, self.capture.device, part)
+        return torch.from_numpy(sigma)
+
+
+def placement_of(capture: Capture) -> Placement:
+    """How the scene lies in the world of its files; times as in the dataset."""
+    optics, names = capture.optics, capture.reader.names
+    flames_absorb = optics.flame_extinction > 0 and optics.flame_grid in names
+    return Placement(
+        capture.normalisation.matrix(),
+        [frame.number for frame in capture.frames],
+        {"time": [capture.time(frame) for frame in capture.frames]},
+        optics.extinction or 1.0,
+        names[capture.reader.extinction],
+        exact=not flames_absorb and optics.extinction > 0,
+        component=capture.reader.extinction,
+        extents=[capture.measured[frame.number] for frame in capture.frames] if capture.measured else (),
+    )
+
+
+class CaptureSource(VolumeTruth, VolumeSource):
+    """The frames of a :class:`~neuprim.tasks.dynamic.volume.capture.Capture`, for exports and comparisons."""
+
+    def __init__(self, capture: Capture) -> None:
+        super().__init__(capture)
+        self.placement = placement_of(capture)
+
+    def transform(self, frame: int) -> np.ndarray | None:
+        grids = self.capture.reader.read(self.capture.frames[frame].path)
+        extinction = grids.get(self.capture.reader.extinction)
+        return None if extinction is None else extinction.transform
+
+    def of(self, path: Path) -> VolumeTruth:
+        return VolumeTruth(self.capture, path)
+
+
+# ---------------------------------------------------------------- comparison
+
+
+def compare_extinction(model: Primitives, capture: Capture, times: list[float], per_third: int = 3) -> dict[str, Any]:
+    """Errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
+
+    ``sigma_frames`` has the numbers of every compared frame (:func:`~neuprim.core.volumes.density_errors.measure_frame_errors`); the
+    thirds are means over ``per_third`` of them, evenly spaced. Frames without extinction are left out. If flames add to
+    the extinction of a grid, the same numbers exist for that grid's part: ``density_frames``, ...
+    """
+    result: dict[str, Any] = {}
+    for component in (None, *model.density.components(model.params)):
+        result |= _compare_component(model, capture, times, per_third, component)
+    return result
+
+
+def _compare_component(
+    model: Primitives, capture: Capture, times: list[float], per_third: int, component: str | None
+) -> dict[str, Any]:
+    count, truth = len(capture.frames), VolumeTruth(capture)
+    chosen = sorted({int((i + 0.5) * count / (3 * per_third)) for i in range(3 * per_third)})
+    entries: list[dict[str, Any]] = []
+    for t in chosen:
+        conditions = {"time": torch.tensor(times[t])}
+        numbers = measure_frame_errors(model, conditions, truth, t, where=capture.device, component=component)
+        if numbers is not None:
+            entries.append({"frame": capture.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **numbers})
+    name = component or "sigma"
+    result: dict[str, Any] = {f"{name}_frames": entries}
+    for key in NUMBERS:
+        for third in THIRDS:
+            values = [e[key] for e in entries if e["third"] == third]
+            result[f"{name}_{key}_{third}"] = float(np.mean(values)) if values else None
+    return result

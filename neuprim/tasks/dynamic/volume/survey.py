@@ -1,0 +1,252 @@
+"""Find the grids of a sequence, measure them, and place the sequence in the scene's unit box."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuprim.core.errors import DataError, nearest
+from neuprim.core.io.vdb import Grid, VdbFrame, read_grids, read_header
+from neuprim.core.volumes.source import Extent
+from neuprim.tasks.dynamic.volume.optics import Optics
+
+__all__ = ["GridReader", "Normalisation", "SequenceSurvey", "data_dependent_optics", "find_grids", "survey_frames"]
+
+USUAL_NAMES = {
+    "density": ("density", "smoke", "soot"),
+    "temperature": ("temperature", "heat", "temp"),
+    "flames": ("flames", "flame", "fire"),
+    "color": ("color", "colour", "Cd", "albedo"),
+}
+"""Grid names of exporters (EmberGen, Mantaflow, Houdini) by meaning."""
+
+_PEAK_QUANTILE = 0.999
+"""Quantile of a grid's voxels that counts as its peak, so that single outliers do not change the optics."""
+
+
+@dataclass(frozen=True)
+class GridReader:
+    """Reads the grids of files by meaning.
+
+    Attributes:
+        names: meaning ("density", "temperature", "flames", "color") -> name in the files.
+        extinction: meaning of the grid that absorbs.
+    """
+
+    names: Mapping[str, str]
+    extinction: str = "density"
+
+    def with_extinction(self, wanted: Sequence[str], folder: Path) -> GridReader:
+        """Choose the first of the optics' ``extinction_grids`` that the sequence has.
+
+        Raises:
+            DataError: it has none of them.
+        """
+        available = [meaning for meaning in wanted if meaning in self.names]
+        if not available:
+            listed = ", ".join(f"{meaning} ({name!r})" for meaning, name in self.names.items())
+            raise DataError(
+                f"{folder}: this look absorbs by {' or '.join(wanted)}, and the files have {listed}; "
+                f"choose another scene.look, or name the grid: scene.grids.{wanted[0]}=NAME"
+            )
+        return replace(self, extinction=available[0])
+
+    def read(self, path: Path) -> dict[str, Grid]:
+        """Read the grids of one file by meaning; grids that the file lacks are left out (exporters drop empty ones)."""
+        in_file = {grid.name for grid in read_header(path).grids}
+        wanted = {meaning: name for meaning, name in self.names.items() if name in in_file}
+        return dict(zip(wanted, read_grids(path, list(wanted.values())), strict=True))
+
+
+def find_grids(frames: Sequence[VdbFrame], given: Mapping[str, str]) -> GridReader:
+    """Find the grids that some frame has: those the user named, then those with a usual name.
+
+    Raises:
+        DataError: a named grid is in no file or cannot be read (level sets, points), or no grid absorbs.
+    """
+    refusals: dict[str, str | None] = {}  # name -> why the grid cannot be used
+    for frame in frames:
+        for grid in read_header(frame.path).grids:
+            refusal = grid.refusal()
+            if grid.name not in refusals or refusal is None:
+                refusals[grid.name] = refusal
+    folder = frames[0].path.parent
+    names: dict[str, str] = {}
+    for meaning, usual in USUAL_NAMES.items():
+        if meaning in given:
+            name = given[meaning]
+            where = f"{folder}: scene.grids.{meaning}={name}"
+            if name not in refusals:
+                raise DataError(f"{where}: no frame has such a grid{nearest(name, refusals)}")
+            if refusals[name]:
+                raise DataError(f"{where}: the grid {refusals[name]}")
+            names[meaning] = name
+        else:
+            usable = [name for name in usual if name in refusals and refusals[name] is None]
+            names |= {meaning: usable[0]} if usable else {}
+    if not {"density", "temperature"} & names.keys():
+        listed = ", ".join(f"{name} ({why or 'readable'})" for name, why in sorted(refusals.items())) or "none"
+        raise DataError(
+            f"{folder}: no grid of density or temperature; found: {listed}. Name one: scene.grids.density=NAME"
+        )
+    return GridReader(names)
+
+
+# ---------------------------------------------------------------- measuring
+
+
+@dataclass(frozen=True)
+class SequenceSurvey:
+    """What the grids of all frames hold.
+
+    Attributes:
+        box: (2, 3) around all matter, world units.
+        extents: frame number -> extent of its extinction grid.
+        hottest: the largest flame.
+        peaks: meaning -> a value that one voxel in a thousand exceeds.
+    """
+
+    box: np.ndarray
+    extents: dict[int, Extent]
+    hottest: float
+    peaks: dict[str, float]
+
+
+class _Histogram:
+    """Counts of positive values with a relative resolution of about 1 %, for quantiles of a whole sequence."""
+
+    def __init__(self) -> None:
+        self.counts = np.zeros(1 << 15, np.int64)
+
+    def add(self, values: np.ndarray) -> None:
+        positive = values[np.isfinite(values) & (values > 0)]
+        # the upper half of a positive float32's bits rises with its value
+        self.counts += np.bincount(positive.astype(np.float32).view(np.uint32) >> 16, minlength=len(self.counts))
+
+    def quantile(self, share: float) -> float:
+        """0 without any value."""
+        cumulative = np.cumsum(self.counts)
+        place = int(np.searchsorted(cumulative, share * cumulative[-1]))
+        return float(np.uint32(place << 16 | 1 << 15).view(np.float32)) if cumulative[-1] else 0.0
+
+
+def survey_frames(
+    frames: list[VdbFrame], reader: GridReader, optics: Optics, progress: Callable[[str, float], None]
+) -> SequenceSurvey:
+    """Read all frames and measure their grids. Matter is what absorbs: the extinction grid, and flames if they do.
+
+    Raises:
+        DataError: no frame has an active voxel.
+    """
+    matter, extents, hottest = list[Extent](), dict[int, Extent](), 0.0
+    histograms = {meaning: _Histogram() for meaning in (reader.extinction, "flames")}
+    for i, frame in enumerate(frames):
+        progress("looking through the frames", i / len(frames))
+        extents[frame.number] = Extent(0.0, None)
+        for meaning, grid in reader.read(frame.path).items():
+            box = grid.world_bounds()
+            if box is None or meaning not in histograms or grid.channels != 1:
+                continue
+            extent = Extent(max(grid.range[1], 0.0) if grid.range else 0.0, box)
+            histograms[meaning].add(grid.active_values())
+            if meaning == reader.extinction:
+                extents[frame.number] = extent
+            if meaning == "flames":
+                hottest = max(hottest, extent.largest)
+            if meaning == reader.extinction or optics.mixes(reader.names):
+                matter.append(extent)
+    box = Extent.around(matter).box
+    if box is None:
+        where = os.path.commonpath([f.path for f in frames])
+        name = reader.names[reader.extinction]
+        raise DataError(f"{where}: no frame has an active voxel of {name!r}; expected matter in at least one")
+    return SequenceSurvey(box, extents, hottest, {m: h.quantile(_PEAK_QUANTILE) for m, h in histograms.items()})
+
+
+def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurvey) -> dict[str, Any]:
+    """Settings of the optics for these files: presets are for grids that peak at about 1, so divide by the peak.
+
+    The divisor is rounded to a power of two, so that a few more or fewer frames change nothing.
+    """
+    grids = {"extinction": extinction, "flame_extinction": "flames"}
+    settings: dict[str, Any] = {
+        key: getattr(optics, key) * 2.0 ** -round(math.log2(survey.peaks[meaning]))
+        for key, meaning in grids.items()
+        if survey.peaks[meaning] > 0
+    }
+    if survey.hottest > 0:
+        settings["flame_range"] = (0.0, survey.hottest)
+    return settings
+
+
+# ---------------------------------------------------------------- placement
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """scene = (world - center) · scale, the same for all frames; axes are not turned.
+
+    Attributes:
+        center: of the sequence's box, world units.
+        scale: scene units per world unit, > 0.
+    """
+
+    center: tuple[float, float, float]
+    scale: float
+
+    def __post_init__(self) -> None:
+        if len(self.center) != 3 or not all(math.isfinite(c) for c in self.center) or not 0.0 < self.scale < math.inf:
+            raise DataError(
+                f"normalisation: center {self.center}, scale {self.scale}; expected three finite numbers and one > 0"
+            )
+
+    @staticmethod
+    def from_bounds(bounds: np.ndarray) -> Normalisation:
+        """Map the (2, 3) box ``bounds``, world units, to one around the origin with longest side 1."""
+        low, high = np.asarray(bounds, np.float64)
+        longest = float((high - low).max())
+        if not np.isfinite(high - low).all() or longest <= 0.0 or (high < low).any():
+            raise DataError(
+                f"normalisation: box from {low.tolist()} to {high.tolist()}; expected a finite one with a volume"
+            )
+        x, y, z = ((low + high) / 2).tolist()
+        return Normalisation((x, y, z), 1.0 / longest)
+
+    def to_scene(self, points: np.ndarray) -> np.ndarray:
+        """Convert (…, 3) world points to float64 scene points."""
+        return (np.asarray(points, np.float64) - self.center) * self.scale
+
+    def to_world(self, points: np.ndarray) -> np.ndarray:
+        """Convert (…, 3) scene points to float64 world points."""
+        return np.asarray(points, np.float64) / self.scale + self.center
+
+    def matrix(self) -> np.ndarray:
+        """(4, 4) float64, world to scene, acting on column vectors."""
+        matrix = np.diag([self.scale, self.scale, self.scale, 1.0])
+        matrix[:3, 3] = -np.asarray(self.center) * self.scale
+        return matrix
+
+    def to_json(self) -> dict[str, Any]:
+        """Numbers that :meth:`from_json` reads back exactly."""
+        return {"center": list(self.center), "scale": self.scale}
+
+    @staticmethod
+    def from_json(record: Mapping[str, Any], where: str = "normalisation") -> Normalisation:
+        """Read what :meth:`to_json` gave; ``where`` names the file in errors.
+
+        Raises:
+            DataError: a missing key, or anything but numbers.
+        """
+        try:
+            x, y, z = (float(c) for c in record["center"])
+            return Normalisation((x, y, z), float(record["scale"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(
+                f"{where}: {dict(record)!r} ({error!r}); expected 'center' (three numbers) and 'scale'"
+            ) from None

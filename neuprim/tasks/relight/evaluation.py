@@ -1,0 +1,201 @@
+"""Evaluate relit images: scores, pixel classes, baselines, films, an orbit of the light, and image layers.
+
+Images are linear light over the exposure, in which 1 is as bright as a display shows. Scores clamp them to 0..1 first,
+as one highlight of 20 would dominate an image's error. "linear_clamped" compares these values, "display" their sRGB
+values. FLIP is measured where its package is installed (``neuprim[flip]``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.data import Clip, Dataset, View
+from neuprim.core.errors import DataError
+from neuprim.core.io.images import linear_to_srgb
+from neuprim.core.layers import LayerFrame, LayerSpec
+from neuprim.core.metrics import means as mean_metrics
+from neuprim.core.metrics import psnr, ssim
+from neuprim.core.metrics.flip import flip, flip_available
+from neuprim.core.model.primitives import Primitives
+from neuprim.scenes import PIXEL_CLASSES
+from neuprim.tasks.relight.lighting import lighting_of, summarize_lights
+
+__all__ = [
+    "LAYERS",
+    "baselines",
+    "class_errors",
+    "class_shares",
+    "clips",
+    "diagnose",
+    "facts",
+    "mask",
+    "metrics",
+    "orbit",
+    "scores",
+]
+
+_MIN_ALPHA = 1.0 / 255.0  # of a pixel that shows matter
+
+
+def mask(dataset: Dataset, index: int) -> Tensor | None:
+    """Pixels of a test view that show matter; None for images without alpha."""
+    alpha = dataset.test.pixels(index).alpha
+    return None if alpha is None else alpha > _MIN_ALPHA
+
+
+def metrics(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
+    """:func:`scores`, and where the dataset has them the errors of pixel classes and the PSNR of the view's part."""
+    return _view_metrics(dataset, index, rendered, truth, structure=True)
+
+
+def _view_metrics(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor, structure: bool) -> dict[str, float]:
+    known, result = lighting_of(dataset), scores(rendered, truth, structure)
+    part = next((p for p in known.parts if dataset.test.view(index).name.startswith(p)), None)
+    if part is not None:
+        result[f"psnr_linear_clamped_{part}"] = result["psnr_linear_clamped"]
+    return result if known.classes is None else result | class_errors(rendered, truth, known.classes(index))
+
+
+def diagnose(dataset: Dataset, model: Primitives) -> dict[str, Any]:
+    """Exposure, falloff, scores of images without a model, and pixel classes in percent of the pixels with matter."""
+    known = lighting_of(dataset)
+    result: dict[str, Any] = {"exposure": dataset.exposure, "falloff": known.falloff, "baselines": baselines(dataset)}
+    if not flip_available():
+        result["flip_missing"] = "pip install 'neuprim[flip]'"
+    if known.classes is not None:
+        result["class_percent"] = class_shares([known.classes(i) for i in range(len(dataset.test))])
+    return result
+
+
+def baselines(dataset: Dataset) -> dict[str, dict[str, Any]]:
+    """Mean scores over the test views of images without a model, by name; without SSIM and FLIP, which are slow."""
+    result = {"black": _mean_metrics(dataset, lambda i, truth: torch.zeros_like(truth))}
+    for name, guess in lighting_of(dataset).baselines.items():
+        result[name] = _mean_metrics(dataset, lambda i, truth, guess=guess: guess(i))  # type: ignore[misc]
+    return result
+
+
+def _mean_metrics(dataset: Dataset, guess: Callable[[int, Tensor], Tensor]) -> dict[str, Any]:
+    """Mean scores over the test views of ``guess(index, truth)``, an (H, W, 3) image."""
+    entries = []
+    for i in range(len(dataset.test)):
+        truth = dataset.test.pixels(i).over(dataset.background)
+        entries.append(_view_metrics(dataset, i, guess(i, truth), truth, structure=False))
+    return mean_metrics(entries)
+
+
+def clips(dataset: Dataset) -> Sequence[Clip]:
+    """The dataset's films."""
+    return lighting_of(dataset).clips
+
+
+def facts(dataset: Dataset) -> dict[str, Any]:
+    """Summary of the training lights for the model's header."""
+    lights = torch.stack([dataset.train.view(i).conditions["light"] for i in range(len(dataset.train))])
+    return {"lights": summarize_lights(lights, dataset.center, lighting_of(dataset).falloff, dataset.exposure)}
+
+
+def orbit(dataset: Dataset, frames: int) -> list[View]:
+    """Views that circle the scene while the light circles it the other way at its mean distance and height."""
+    training = [dataset.train.view(i).conditions for i in range(len(dataset.train))]
+    up, center = (x.double() / n for x, n in ((dataset.up, dataset.up.double().norm()), (dataset.center, 1.0)))
+    offsets = torch.stack([c["light"] for c in training]).double() - center
+    radius, sine = offsets.norm(dim=-1).mean(), ((offsets @ up) / offsets.norm(dim=-1).clamp_min(1e-30)).mean()
+    helper = torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())]
+    side = torch.linalg.cross(up, helper)
+    side = side / side.norm()
+    other = torch.linalg.cross(up, side)
+    intensity = torch.stack([c["light_intensity"] for c in training]).mean(0)
+    views = []
+    for i, view in enumerate(dataset.orbit(frames)):
+        turn = -2.0 * math.pi * i / frames
+        across = math.cos(turn) * side + math.sin(turn) * other
+        light = center + radius * (sine * up + (1.0 - sine * sine).clamp_min(0.0).sqrt() * across)
+        views.append(View(view.name, view.camera, {"light": light.float(), "light_intensity": intensity}))
+    return views
+
+
+# ---------------------------------------------------------------- scores
+
+
+def scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> dict[str, float]:
+    """``psnr_linear_clamped``, ``psnr_display``, ``ssim_display`` and, where its package is installed, ``flip``.
+
+    Args:
+        rendered, truth: (H, W, 3) linear light over the exposure.
+        structure: measure the last two as well, which take longest.
+    """
+    first, second = rendered.clamp(0.0, 1.0), truth.clamp(0.0, 1.0)
+    result = {"psnr_linear_clamped": psnr(first, second)}
+    first, second = linear_to_srgb(first), linear_to_srgb(second)
+    result["psnr_display"] = psnr(first, second)
+    if structure:
+        result["ssim_display"] = ssim(first, second)
+        if flip_available():
+            result["flip"] = flip(first, second)
+    return result
+
+
+def class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, float]:
+    """``mse_NAME`` (linear_clamped) and ``pixels_NAME`` of every class that the image has, to be pooled over views.
+
+    Args:
+        rendered, truth: (H, W, 3) linear light over the exposure.
+        classes: (H, W) uint8, indices of :data:`PIXEL_CLASSES`.
+
+    Raises:
+        DataError: the map has another size than the images, or a value that is no class.
+    """
+    if classes.shape != truth.shape[:2] or int(classes.max()) >= len(PIXEL_CLASSES):
+        raise DataError(
+            f"pixel classes: found {tuple(classes.shape)} with values up to {int(classes.max())}; "
+            f"expected {tuple(truth.shape[:2])} with values below {len(PIXEL_CLASSES)}"
+        )
+    squares = (rendered.clamp(0.0, 1.0) - truth.clamp(0.0, 1.0)).double().square().mean(-1)
+    result: dict[str, float] = {}
+    for value, name in enumerate(PIXEL_CLASSES):
+        inside = classes == value
+        if bool(inside.any()):
+            result |= {f"mse_{name}": float(squares[inside].mean()), f"pixels_{name}": float(inside.sum())}
+    return result
+
+
+def class_shares(maps: list[Tensor]) -> dict[str, float]:
+    """Share of each class, in percent of the pixels that are not background."""
+    counts = torch.stack([torch.bincount(m.reshape(-1).long(), minlength=len(PIXEL_CLASSES)) for m in maps]).sum(0)
+    return {
+        name: 100.0 * float(counts[i]) / max(float(counts[1:].sum()), 1.0) for i, name in enumerate(PIXEL_CLASSES) if i
+    }
+
+
+# ---------------------------------------------------------------- layers
+
+
+def unshadowed(frame: LayerFrame) -> Tensor | None:
+    """(H, W, C) the frame without shadows; None for colours without shadows."""
+    return None if frame.shading is None else frame.unshaded
+
+
+def visibility(frame: LayerFrame) -> Tensor | None:
+    """(H, W) mean visibility of the light; None for colours without shadows."""
+    return None if frame.shading is None else frame.shading.clamp(0.0, 1.0)  # rounding may exceed 1
+
+
+LAYERS = (
+    LayerSpec(
+        "unshadowed", "the image as if the light arrived everywhere, linear light, premultiplied by alpha", unshadowed
+    ),
+    LayerSpec(
+        "visibility",
+        "how much of the light arrives, 0 to 1: the mean over what the pixel shows, "
+        "weighted by its part in the pixel; 0 where alpha is 0",
+        visibility,
+        ("Y",),
+    ),
+)
+"""What :attr:`~neuprim.core.task.TaskSpec.layers` of the task holds."""

@@ -1,0 +1,270 @@
+"""Lights of datasets, of the command line, and of environments.
+
+Every view has two conditions: "light", (3,) float32, the point light's position in scene units, and "light_intensity",
+(3,) float32, its radiant intensity per colour as the files give it, else 1. Images are linear light over the exposure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras.world import World
+from neuprim.core.data import Clip, Dataset
+from neuprim.core.data.dataset_check import get_extra
+from neuprim.core.environment import Environment, Illumination
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.json_reader import JsonReader
+
+if TYPE_CHECKING:
+    from neuprim.core.data.image_views import ImageViews
+
+__all__ = [
+    "EXPOSURE_PERCENTILE",
+    "MAX_LIGHT_ANGLE",
+    "ORBIT",
+    "Falloff",
+    "Lighting",
+    "illuminate",
+    "lighting_of",
+    "orbit_in_frames",
+    "parse_intensities",
+    "parse_lights",
+    "percentile_exposure",
+    "summarize_lights",
+    "typical_light",
+]
+
+Falloff = Literal["none", "inverse_square"]
+
+EXPOSURE_PERCENTILE = 99.5
+"""An automatic exposure lets this percentile of the training images' values be 1."""
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Optional facts about a relighting dataset besides images, cameras and lights: its ``extra``.
+
+    Attributes:
+        falloff: "inverse_square" if images darken with the square of the light's distance, so that a renderer divides
+            by it; "none" if intensities are given as they arrive, or unknown.
+        classes: index of a test view -> (H, W) uint8 pixel classes, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`;
+            errors are then reported per class.
+        parts: prefixes of names of test views that get scores of their own, e.g. those with a new light.
+        baselines: name -> function of a test view's index that gives (H, W, 3) linear light over the exposure, an image
+            without a model; a black one is always included.
+        clips: films besides the test views.
+    """
+
+    falloff: Falloff = "none"
+    classes: Callable[[int], Tensor] | None = None
+    parts: tuple[str, ...] = ()
+    baselines: Mapping[str, Callable[[int], Tensor]] = field(default_factory=dict)
+    clips: tuple[Clip, ...] = ()
+
+
+def lighting_of(dataset: Dataset) -> Lighting:
+    """The dataset's facts about its light, or the defaults.
+
+    Raises:
+        DatasetFault: its ``extra`` is something else.
+    """
+    return get_extra(dataset, Lighting) or Lighting()
+
+
+def percentile_exposure(views: ImageViews, where: str) -> float:
+    """The percentile :data:`EXPOSURE_PERCENTILE` of all premultiplied colour values of some views, before scaling.
+
+    Values are rounded to half precision and clamped at zero; one image is in memory at a time.
+
+    Raises:
+        DataError: it is zero, so almost everything is black; ``where`` names the data.
+    """
+    # counts per bit pattern, as patterns of non-negative half floats ascend with their values
+    counts = torch.zeros(1 << 15, dtype=torch.int64)
+    for i in range(len(views)):
+        values = (views.pixels(i).rgb / views.scale).clamp(0.0, 65504.0).half()
+        counts += torch.bincount(values.reshape(-1).view(torch.int16).long().clamp_min(0), minlength=len(counts))
+    total = counts.cumsum(0)
+    rank = EXPOSURE_PERCENTILE / 100.0 * float(total[-1] - 1)
+    index = int(torch.searchsorted(total, math.floor(rank) + 1))
+    value = float(torch.tensor([index], dtype=torch.int16).view(torch.half))
+    if not value > 0.0:
+        raise DataError(
+            f"{where}: {EXPOSURE_PERCENTILE} % of the training images' values are black; "
+            "expected light, or a number for scene.exposure"
+        )
+    return value
+
+
+# ---------------------------------------------------------------- the command line
+
+ORBIT = (4.5, 40.0, 60)
+"""Distance in scene units, polar angle in degrees and frames of ``--light orbit``."""
+
+
+def parse_lights(text: str, world: World | None = None) -> list[Tensor]:
+    """Parse ``--light``: positions (3,) float32 in scene units.
+
+    "x,y,z" is one, in the coordinates of the data's files; "orbit", or "orbit:DISTANCE:POLAR:FRAMES", circles the
+    scene's z axis.
+
+    Raises:
+        ConfigError: another form, or numbers that are not finite.
+    """
+    expected = "expected x,y,z or orbit or orbit:DISTANCE:POLAR_DEGREES:FRAMES"
+    if text.split(":")[0] == "orbit":
+        parts = text.split(":")[1:]
+        try:
+            values = [float(p) for p in parts] + list(ORBIT[len(parts) :])
+            distance, polar, frames = values[0], values[1], int(values[2])
+        except (ValueError, IndexError, OverflowError):
+            raise ConfigError(f"--light {text}: {expected}") from None
+        if len(parts) > 3 or not (0 < distance < 1e6 and 0 <= polar <= 180 and 2 <= frames <= 100_000):
+            raise ConfigError(f"--light {text}: {expected}")
+        across, height = distance * math.sin(math.radians(polar)), distance * math.cos(math.radians(polar))
+        turns = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames)
+        return list(
+            torch.stack([across * turns.cos(), across * turns.sin(), torch.full_like(turns, height)], -1).float()
+        )
+    return [(world or World()).scene_points(_numbers(text, "light", expected)).float()]
+
+
+def orbit_in_frames(text: str, count: int) -> str | None:
+    """``"orbit:4"`` in 24 frames -> ``"orbit:4:40:24"``; None unless it is an orbit without a number of frames."""
+    parts = text.split(":")
+    if parts[0] != "orbit" or len(parts) > 3:
+        return None
+    return ":".join([*parts, *(f"{x:g}" for x in ORBIT[len(parts) - 1 : 2]), str(count)])
+
+
+def parse_intensities(text: str) -> list[Tensor]:
+    """Parse ``--light-intensity``: (3,) float32 from "r,g,b" or one number.
+
+    Raises:
+        ConfigError: another form, or numbers that are negative or not finite.
+    """
+    expected = "expected r,g,b or one number, 0 or more"
+    found = _numbers(f"{text},{text},{text}" if "," not in text else text, "light-intensity", expected).float()
+    if bool((found < 0).any()):
+        raise ConfigError(f"--light-intensity {text}: {expected}")
+    return [found]
+
+
+def _numbers(text: str, name: str, expected: str) -> Tensor:
+    try:
+        values = [float(p) for p in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(math.isfinite(v) for v in values):
+        raise ConfigError(f"--{name} {text}: {expected}")
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def typical_light(dataset: Dataset, falloff: bool) -> float:
+    """Median over the training views of the light's mean intensity, with ``falloff`` over its squared distance.
+
+    1 if that is zero, as for a dataset in the dark.
+    """
+    values = []
+    for i in range(len(dataset.train)):
+        conditions = dataset.train.view(i).conditions
+        squared = (conditions["light"].double() - dataset.center.double()).square().sum().clamp_min(1e-30)
+        values.append(conditions["light_intensity"].double().mean() / (squared if falloff else 1.0))
+    found = float(torch.stack(values).median())
+    return found if 0 < found < math.inf else 1.0
+
+
+# ---------------------------------------------------------------- environments
+
+MAX_LIGHT_ANGLE = 15.0
+"""Degrees from every training light beyond which a direction counts as unseen."""
+
+_MAX_DIRECTIONS = 256  # of training lights in a model's header
+
+
+def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: float) -> dict[str, Any]:
+    """Summarise the training lights for a model's header.
+
+    Args:
+        lights: (L, 3) positions, scene units.
+        center: (3,) of the scene.
+        falloff: see :class:`Lighting`.
+        exposure: of the data set.
+
+    Returns:
+        mean ``distance`` from the centre; ``directions``, at most 256, chosen by farthest-point sampling; ``falloff``;
+        ``exposure``.
+    """
+    offsets = lights.double() - center.double()
+    distance = offsets.norm(dim=-1)
+    units = offsets / distance.clamp_min(1e-30)[:, None]
+    chosen = [0]
+    nearest = units @ units[0]
+    while len(chosen) < min(_MAX_DIRECTIONS, len(units)):
+        chosen.append(int(nearest.argmin()))
+        nearest = torch.maximum(nearest, units @ units[chosen[-1]])
+    return {
+        "distance": float(distance.mean()),
+        "directions": [[round(float(x), 4) for x in units[i]] for i in chosen],
+        "falloff": falloff,
+        "exposure": float(exposure),
+    }
+
+
+def illuminate(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
+    """Approximate an environment by point lights like those of the training; a black one gives one of intensity 0.
+
+    Each direction becomes a point light at the training lights' mean distance r from the scene's centre, of the
+    intensity that gives the centre the environment's irradiance E = radiance x solid angle:
+
+        falloff inverse_square:  I = exposure E r^2    the model draws I/distance^2 over the exposure
+        falloff none:            I = exposure E / pi   an intensity of 1 gives a white matt surface the value 1
+
+    In both, a uniform environment of radiance 1 gives an unshaded white matt surface the value 1. Light from a finite
+    distance is not parallel: away from the centre it differs from that of a distant environment by about 2 offset/r.
+
+    Args:
+        facts: of the dataset, from the model's header.
+
+    Raises:
+        DataError: facts that are missing or damaged.
+    """
+    data = JsonReader(dict(facts), "the model's header: data")
+    center = data.array("center", (3,), "3 numbers")
+    up = data.array("up", (3,), "3 numbers")
+    lights = data.values.get("lights")
+    if not isinstance(lights, dict):
+        raise data.fail("lights", "an object with distance, directions, falloff and exposure")
+    known = JsonReader(lights, f"{data.where}: lights")
+    distance = known.number("distance", "a distance above 0", 0.0)
+    exposure = known.number("exposure", "a number above 0", 0.0)
+    if known.text("falloff") not in ("none", "inverse_square"):
+        raise known.fail("falloff", "none or inverse_square")
+    listed = known.values.get("directions")
+    number = len(listed) if isinstance(listed, list) and 0 < len(listed) <= _MAX_DIRECTIONS else 1
+    trained = known.array("directions", (number, 3), f"1 to {_MAX_DIRECTIONS} directions of 3 numbers")
+    trained = trained / trained.norm(dim=-1, keepdim=True).clamp_min(1e-30)
+    factor = exposure * (distance**2 if known.values["falloff"] == "inverse_square" else 1.0 / math.pi)
+    beams = environment.beams(count)
+    frames = [
+        {"light": (center + distance * d).float(), "light_intensity": (factor * e).float()}
+        for d, e in zip(beams.directions, beams.irradiance, strict=True)
+    ]
+    if not frames:
+        return Illumination(
+            ({"light": (center + distance * up).float(), "light_intensity": torch.zeros(3)},),
+            ("the environment is black",),
+        )
+    unseen = environment.share_beyond(trained, MAX_LIGHT_ANGLE)
+    extrapolated = ((beams.directions @ trained.T).amax(1) < math.cos(math.radians(MAX_LIGHT_ANGLE))).tolist()
+    far = (
+        f"{unseen:.0%} of the environment's light comes from more than {MAX_LIGHT_ANGLE:g} degrees off every training "
+        "light, where the model guesses"
+    )
+    return Illumination(tuple(frames), (far,) if unseen > 0.01 else (), tuple(extrapolated))

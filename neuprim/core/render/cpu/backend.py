@@ -21,7 +21,8 @@ from neuprim.core.render.cpu.binning import TileLists, bin_primitives
 from neuprim.core.render.cpu.colour_net import Net, net_backward, prepare_net
 from neuprim.core.render.cpu.entry import backward_tiles_by_entry, composite_tiles_by_entry
 from neuprim.core.render.cpu.forward import Image, SavedForBackward, composite_tiles
-from neuprim.core.render.cpu.prepare import Parameters, Projected, View, prepare, prepare_backward, prepare_wide
+from neuprim.core.render.cpu.prepare import Parameters, Projected, View, prepare, prepare_wide
+from neuprim.core.render.cpu.prepare_backward import prepare_backward
 from neuprim.core.render.cpu.tiles import FrameArrays
 from neuprim.core.render.cpu.trigonometry import EDGE_TYPES
 from neuprim.core.render.limits import NON_FINITE, VISIBLE, min_visible_depth

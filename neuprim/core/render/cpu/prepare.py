@@ -1,4 +1,4 @@
-"""The per-primitive stage, in float64: anchors, whitening, exact bounds; and its hand-written backward pass.
+"""The per-primitive stage, in float64: anchors, whitening, exact bounds.
 
 Precision is won here. Each primitive is anchored at its own projected centre, so that whitened rays are affine in the
 pixel offset and float32 never sees the distance to the camera (method: "Line integral").
@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel, strict
+from neuprim.core.compute.views import borrow_array, release_array
 from neuprim.core.model.edge import NORMS
-from neuprim.core.model.rotation import rotation, rotation_backward
+from neuprim.core.model.rotation import rotation
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.limits import (
@@ -35,7 +36,16 @@ from neuprim.core.render.limits import (
     VISIBLE,
 )
 
-__all__ = ["Parameters", "Projected", "View", "prepare", "prepare_backward", "prepare_wide"]
+__all__ = [
+    "Parameters",
+    "Projected",
+    "View",
+    "borrow_parameters",
+    "borrow_view",
+    "camera_frame",
+    "prepare",
+    "prepare_wide",
+]
 
 Array = np.ndarray[Any, Any]
 
@@ -120,6 +130,27 @@ def _scratch(K):  # type: ignore[no-untyped-def]
     return _Scratch(np.empty((10, 3)), np.empty((K, 4)), np.empty(K))
 
 
+# Kernels borrow all arrays: a tuple that is handed on for each primitive would count the references of each of them.
+
+
+@strict
+def _borrow_scratch(s):  # type: ignore[no-untyped-def]
+    return _Scratch(borrow_array(s.work), borrow_array(s.waves), borrow_array(s.rate))
+
+
+@strict
+def borrow_parameters(p):  # type: ignore[no-untyped-def]
+    return Parameters(
+        borrow_array(p.means), borrow_array(p.log_scales), borrow_array(p.quats), borrow_array(p.W1),
+        borrow_array(p.b1), borrow_array(p.w2), borrow_array(p.b2),
+    )  # fmt: skip
+
+
+@strict
+def borrow_view(v):  # type: ignore[no-untyped-def]
+    return View(borrow_array(v.R), borrow_array(v.t), v.fx, v.fy, v.cx, v.cy, v.width, v.height, v.near, v.turns)
+
+
 @strict
 def _is_too_faint(most, edge, least):  # type: ignore[no-untyped-def]
     """Whether no chord can reach the depth ``least``: no half chord is longer than the longest semi-axis."""
@@ -155,7 +186,7 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
 
 
 @strict
-def _frame(mean, log_scale, quat, view, local, B, axes, c, anchor):  # type: ignore[no-untyped-def]
+def camera_frame(mean, log_scale, quat, view, local, B, axes, c, anchor):  # type: ignore[no-untyped-def]
     """Fill camera-axes orientation B, axes s/m, centre c and the anchor (depth, pixel x, pixel y); returns (m, 1/|q|).
 
     The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number.
@@ -190,7 +221,7 @@ def _wide_row(i, parameters, view, scratch, order, row):  # type: ignore[no-unty
     near, turns, K = view.near, view.turns, W1.shape[1]
     B, axes, c, local, anchor, w = work[0:3], work[3], work[4], work[5:8], work[8], work[9]
     fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
-    m, _ = _frame(means[i], log_scales[i], quats[i], view, local, B, axes, c, anchor)
+    m, _ = camera_frame(means[i], log_scales[i], quats[i], view, local, B, axes, c, anchor)
     tc = anchor[0] / m
     u, v = (anchor[1] - cx) / fx, (anchor[2] - cy) / fy
     w[0], w[1], w[2] = tc * u - c[0] / m, tc * v - c[1] / m, tc - c[2] / m
@@ -283,10 +314,14 @@ def _longest(c, m, reach, row, view, e0, ex, ey):  # type: ignore[no-untyped-def
 @exact_kernel
 def prepare_wide(start, stop, which, parameters, view, order, wide):  # type: ignore[no-untyped-def]
     """Fill the float64 rows of primitives ``which[start:stop]``, which the pixel stage draws in float64."""
-    scratch = _scratch(parameters.W1.shape[1])
+    parameters, view, memory = borrow_parameters(parameters), borrow_view(view), _scratch(parameters.W1.shape[1])
+    scratch = _borrow_scratch(memory)
     for n in range(start, stop):
         wide[n, :] = 0.0
         _wide_row(which[n], parameters, view, scratch, order, wide[n])
+    release_array(memory.work)
+    release_array(memory.waves)
+    release_array(memory.rate)
 
 
 @exact_kernel
@@ -296,9 +331,11 @@ def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no
     ``least`` is the optical depth below which nothing is drawn; silhouettes are those of the rays that can reach it. Of
     a primitive that cannot reach it anywhere nothing is filled but its status, an empty box and a depth of 0.
     """
+    parameters, view = borrow_parameters(parameters), borrow_view(view)
     rows, spans, boxes, kinds, order, depth, status, in_float64 = out
     w2, b2, near, K = parameters.w2, parameters.b2, view.near, parameters.W1.shape[1]
-    scratch, row = _scratch(K), np.zeros(rows.shape[1])
+    memory, row = _scratch(K), np.zeros(rows.shape[1])
+    scratch = _borrow_scratch(memory)
     work, rate = scratch.work, scratch.rate
     B, axes, c = work[0:3], work[3], work[4]
     e0, ex, ey, xa = row[P.E0 : P.EX], row[P.EX : P.EY], row[P.EY : P.XA], row[P.XA : P.XU]
@@ -389,90 +426,6 @@ def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no
         if x1 > x0 and y1 > y0:
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = int(x0), int(y0), int(x1), int(y1)
             status[i] = VISIBLE
-
-
-@exact_kernel
-def prepare_backward(start, stop, parameters, view, projected, grads, touched, out, g_view):  # type: ignore[no-untyped-def]
-    """Chain rule from gradient rows to parameters, for primitives ``start:stop``.
-
-    Args:
-        projected: of the forward pass.
-        grads: (N, gradient_width), of which rows that are not ``touched`` are left out.
-        out: :class:`Parameters` of gradients, float32; filled.
-        g_view: (N, 3, 4), filled with each primitive's part of dL/d(R | t); empty if that is not wanted.
-    """
-    means, log_scales, quats, W1, _, _, _ = parameters
-    g_means, g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2 = out
-    rows, order, R, turns, K = projected.rows, projected.order, view.R, view.turns, W1.shape[1]
-    local, B, A = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    gA, gB, gL = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    axes, c, anchor, ref, w = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    gc, gl, gq, q = np.empty(3), np.empty(3), np.empty(4), np.empty(4)
-    fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
-    for i in range(start, stop):
-        if not touched[i]:
-            continue
-        g = grads[i]
-        m, inverse = _frame(means[i], log_scales[i], quats[i], view, local, B, axes, c, anchor)
-        tc = anchor[0] / m
-        ref[0], ref[1], ref[2] = (anchor[1] - cx) / fx, (anchor[2] - cy) / fy, 1.0
-        for j in range(3):
-            w[j] = tc * ref[j] - c[j] / m
-            gc[j] = 0.0
-        for a in range(3):
-            gx = np.float64(g[P.XA + a])
-            row_sum = 0.0
-            for j in range(3):
-                A[a, j] = B[j, a] / axes[a]
-                gA[a, j] = g[P.E0 + a] * ref[j] + gx * w[j]
-            gA[a, 0] += g[P.EX + a] / fx
-            gA[a, 1] += g[P.EY + a] / fy
-            for j in range(3):
-                gB[j, a] = gA[a, j] / axes[a]
-                row_sum += gA[a, j] * A[a, j]
-                gc[j] -= A[a, j] * gx / m
-            gl[a] = -row_sum  # A scales with 1/s_a
-        log_m = -np.float64(g[P.G_LOG_M])  # the density's own 1/m
-        for a in range(3):
-            for j in range(3):
-                gL[a, j] = 0.0
-        for n in range(K):
-            k, o, og = order[i, n], P.NEURONS + P.PER_NEURON * n, P.G_NEURONS + P.PER_NEURON * n
-            for j in range(3):
-                gw = np.float64(g[og + P.WX + j])
-                gl[j] += gw * rows[i, o + P.WX + j]  # W on whitened axes scales with s_j/m
-                log_m -= gw * rows[i, o + P.WX + j]
-                for a in range(3):
-                    gL[a, j] += turns * axes[j] * W1[i, k, a] * gw
-            for a in range(3):
-                g_W1[i, k, a] = turns * (
-                    g[og + P.WX] * axes[0] * local[a, 0]
-                    + g[og + P.WY] * axes[1] * local[a, 1]
-                    + g[og + P.WZ] * axes[2] * local[a, 2]
-                )
-            g_b1[i, k] = turns * g[og + P.PHASE]
-            g_w2[i, k] = g[og + P.AMPLITUDE]
-        g_b2[i] = g[P.G_OFFSET]
-        first = 0
-        for j in range(1, 3):
-            if log_scales[i, j] > log_scales[i, first]:
-                first = j
-        gl[first] += log_m
-        for a in range(3):
-            g_log_scales[i, a] = gl[a]
-            g_means[i, a] = R[0, a] * gc[0] + R[1, a] * gc[1] + R[2, a] * gc[2]
-            for j in range(3):  # B = R local
-                gL[a, j] += R[0, a] * gB[0, j] + R[1, a] * gB[1, j] + R[2, a] * gB[2, j]
-        for j in range(4):
-            q[j] = quats[i, j]
-        rotation_backward(q, inverse, gL, gq)
-        for j in range(4):
-            g_quats[i, j] = gq[j]
-        if g_view.shape[0] > 0:
-            for a in range(3):
-                for j in range(3):
-                    value = gc[a] * means[i, j]
-                    for b in range(3):
-                        value += gB[a, b] * local[j, b]
-                    g_view[i, a, j] = value
-                g_view[i, a, 3] = gc[a]
+    release_array(memory.work)
+    release_array(memory.waves)
+    release_array(memory.rate)

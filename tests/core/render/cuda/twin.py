@@ -16,7 +16,8 @@ from neuprim.core.render import layout as P
 from neuprim.core.render.cpu.backend import _view
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
 from neuprim.core.render.cpu.layout import gradient_width
-from neuprim.core.render.cpu.prepare import Parameters, Projected, View, prepare, prepare_backward, prepare_wide
+from neuprim.core.render.cpu.prepare import Parameters, Projected, View, prepare, prepare_wide
+from neuprim.core.render.cpu.prepare_backward import prepare_backward
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.frame import Frame, prepare_frame
 from neuprim.core.render.limits import NON_FINITE, VISIBLE, min_visible_depth

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -59,8 +60,8 @@ def refuse_non_finite_colours(tensors: Mapping[str, Tensor], named: Mapping[str,
     Raises:
         NonFiniteError: names tensor and primitive.
     """
-    sums = torch.stack([tensor.detach().sum(dtype=torch.float64) for tensor in tensors.values()])
-    if bool(torch.isfinite(sums).all()):
+    total = sum(tensor.detach().sum(dtype=torch.float64) for tensor in tensors.values())
+    if math.isfinite(total):  # one number, so that a GPU is waited for once
         return
     for value in tensors.values():
         bad = ~torch.isfinite(value).reshape(len(value), -1).all(dim=1)

@@ -138,7 +138,7 @@ def numba_frame(case: Case, t: dict[str, Tensor]) -> Numba:
     parameters = Parameters(*(t[name].numpy() for name in PARAMETERS))
     count, K = parameters.W1.shape[:2]
     projected, view = Projected.allocate(count, K), _view(case.camera, case.camera.viewmat, case.near, case.turns)
-    projected.order[:] = 0  # which is not filled for what is too faint
+    projected.order[:], projected.rows[:] = 0, 0  # which are not filled for what is too faint
     prepare(0, count, parameters, view, case.edge, LEAST, projected)
     which = np.flatnonzero(projected.in_float64 & (projected.status == VISIBLE))
     wide = np.empty((len(which), projected.rows.shape[1]))

@@ -35,14 +35,14 @@ def settings_classes() -> list[type]:
             if (
                 isinstance(value, type)
                 and value.__module__ == module.name
-                and (name.endswith("Settings") or _verifies(value))
+                and (name.endswith("Settings") or _validates_itself(value))
             ):
                 found[f"{module.name}.{name}"] = value
     return [found[name] for name in sorted(found)]
 
 
-def _verifies(cls: type) -> bool:
-    return "verify" in getattr(getattr(cls, "__post_init__", None), "__code__", settings_classes.__code__).co_names
+def _validates_itself(cls: type) -> bool:
+    return "validate_fields" in getattr(getattr(cls, "__post_init__", None), "__code__", settings_classes.__code__).co_names
 
 
 def required(cls: type) -> dict[str, Any]:

@@ -1,19 +1,18 @@
 import shlex
 import subprocess
 import sys
-import types
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import neuprim
-from neuprim import runs
 from neuprim.cli import main
 from neuprim.config import RunConfig
 from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import NonFiniteError
 from neuprim.runs.events import Events
+from neuprim.runs.render_images import RenderRequest
 from tests.plugins.fakes import install, site, toy
 
 __all__ = ["site", "toy"]
@@ -21,7 +20,7 @@ __all__ = ["site", "toy"]
 
 @pytest.fixture
 def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Stand-ins for the modules that do the work; they record what they were asked."""
+    """Replace the functions that do the work by ones that record what they were given."""
     made: list[Any] = []
 
     def run(config: RunConfig, events: Events, launcher: Any = None) -> Path:
@@ -34,19 +33,13 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         made.append((run_dir, *words) if words else run_dir)
         return {"psnr": 31.23456, "views": 20, "worst": {"name": "r_3", "psnr": 27.0}}
 
-    def render_run(
-        *args: Any, environment: Any = None, tell: Any = None, progress: Any = None, words: Any = ()
-    ) -> list[Path]:
-        made.append((*args, *words) if environment is None else (*args, environment))
+    def render_run(run_dir: Path, request: Any, **callbacks: Any) -> list[Path]:
+        made.append((run_dir, request))
         return [Path("a.png"), Path("b.png")]
 
-    homes = (("run", {"run": run}), ("measure", {"evaluate_run": evaluate_run}), ("draw", {"render_run": render_run}))
-    for name, functions in homes:
-        module = types.ModuleType(f"neuprim.runs.{name}")
-        for key, function in functions.items():
-            setattr(module, key, function)
-        monkeypatch.setitem(sys.modules, f"neuprim.runs.{name}", module)
-        monkeypatch.setattr(runs, name, module, raising=False)
+    monkeypatch.setattr("neuprim.runs.run.run", run)
+    monkeypatch.setattr("neuprim.runs.measure.evaluate_run", evaluate_run)
+    monkeypatch.setattr("neuprim.runs.render_images.render_run", render_run)
     return made
 
 
@@ -218,48 +211,19 @@ def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     main(["run", "task=toy", "output_dir=r"])
     capsys.readouterr()
     assert main(["render", "r", "--camera", "test"]) == 0
-    assert calls[-1] == (Path("r"), "test", None, None, None, 60, {}, None)
+    assert calls[-1] == (Path("r"), RenderRequest("test", overrides=[]))
     assert capsys.readouterr().out == "a.png\nb.png\n"
     Path("cams.json").touch()
-    flags = [
-        "--camera",
-        "cams.json",
-        "--size",
-        "640x480",
-        "--format",
-        "exr",
-        "--out",
-        "o",
-        "--frames",
-        "3",
-        "--fps",
-        "12",
-    ]
-    assert main(["render", "r", *flags, "--time", "0:1", "--light-pos=-1,0,2"]) == 0
-    assert calls[-1] == (
-        Path("r"),
-        "cams.json",
-        (640, 480),
-        "exr",
-        Path("o"),
-        3,
-        {"time": "0:1", "light_pos": "-1,0,2"},
-        12.0,
-    )
+    flags = "--camera cams.json --size 640x480 --format exr --out o --frames 3 --fps 12 --time 0:1 --light-pos=-1,0,2"
+    assert main(["render", "r", *flags.split()]) == 0
+    conditions = {"time": "0:1", "light_pos": "-1,0,2"}
+    assert calls[-1][1] == RenderRequest("cams.json", (640, 480), "exr", Path("o"), 3, conditions, 12.0, overrides=[])
     for words in (["--light_pos", "-1,0,2"], ["--light-pos", "-1,0,2"], ["light-pos=-1,0,2"], ["--light_pos=-1,0,2"]):
         assert main(["render", "r", "--camera", "orbit", *words]) == 0
-        assert calls[-1][6] == {"light_pos": "-1,0,2"}
-    flags = [
-        "--camera",
-        "orbit",
-        "--environment",
-        "sky.exr",
-        "--environment-samples",
-        "9",
-        "--environment-rotation=-45",
-    ]
-    assert main(["render", "r", *flags]) == 0
-    assert calls[-1][-1] == EnvironmentFile(Path("sky.exr"), 9, -45.0, 1.0)
+        assert calls[-1][1].conditions == {"light_pos": "-1,0,2"}
+    flags = "--camera orbit --environment sky.exr --environment-samples 9 --environment-rotation=-45"
+    assert main(["render", "r", *flags.split()]) == 0
+    assert calls[-1][1].environment == EnvironmentFile(Path("sky.exr"), 9, -45.0, 1.0)
 
 
 def test_render_knows_the_conditions_of_the_runs_task(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:

@@ -42,7 +42,10 @@ def settings_classes() -> list[type]:
 
 
 def _validates_itself(cls: type) -> bool:
-    return "validate_fields" in getattr(getattr(cls, "__post_init__", None), "__code__", settings_classes.__code__).co_names
+    return (
+        "validate_fields"
+        in getattr(getattr(cls, "__post_init__", None), "__code__", settings_classes.__code__).co_names
+    )
 
 
 def required(cls: type) -> dict[str, Any]:

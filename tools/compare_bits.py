@@ -77,6 +77,12 @@ def _run(checkout: Path, folder: Path, arguments: str) -> None:
         sys.exit(f"{checkout}: neuprim {arguments} failed:\n{result.stderr[-2000:]}")
 
 
+def _write_metadata(checkout: Path) -> None:
+    """Give a checkout metadata of its own; without it, Python finds the entry points of the installed package."""
+    command = [sys.executable, "-c", "from setuptools import setup; setup()", "-q", "egg_info"]
+    subprocess.run(command, cwd=checkout, check=True, capture_output=True)
+
+
 def sums(folder: Path) -> dict[str, str]:
     """Name -> SHA-256 of every tensor of the models, of the exported arrays, and of the exported files."""
     found = {}
@@ -119,15 +125,16 @@ def main() -> int:
             capture_output=True,
         )
         try:
-            maker = (
-                other / "tools" / Path(__file__).name
-            )  # the other commit's own names of settings, where it has this command
+            _write_metadata(other)
+            # The other commit's command, where it has one, knows its own names of settings.
+            maker = other / "tools" / Path(__file__).name
             if maker.exists():
                 subprocess.run([sys.executable, str(maker), "--make", f"{temporary}/other"], check=True)
             else:
                 make(other, Path(temporary) / "other")
         finally:
             subprocess.run(["git", "worktree", "remove", "--force", str(other)], cwd=CHECKOUT, check=True)
+        _write_metadata(CHECKOUT)
         make(CHECKOUT, Path(temporary) / "this")
         there, here = sums(Path(temporary) / "other"), sums(Path(temporary) / "this")
     different = sorted(name for name in there.keys() | here.keys() if there.get(name) != here.get(name))

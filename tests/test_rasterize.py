@@ -185,7 +185,7 @@ def test_population_statistics_come_back_per_camera() -> None:
         assert torch.allclose(tally.error_weight, tally.weight * (0.5 if c == 1 else 1.0))
     with pytest.raises(
         DataError,
-        match=rf"^rasterize: watch: error has shape \(2, 3\); expected \(3, {HEIGHT}, {WIDTH}\), that of alpha$",
+        match=rf"^rasterize: request_contributions: error has shape \(2, 3\); expected \(3, {HEIGHT}, {WIDTH}\), that of alpha$",
     ):
         out.request_contributions(torch.ones(2, 3))
 

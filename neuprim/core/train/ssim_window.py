@@ -1,4 +1,4 @@
-"""The window of SSIM: 11 taps of a Gaussian of 1.5 pixels, as kornia has it."""
+"""The window of SSIM for kernels in numba and Warp: 11 taps of a Gaussian of 1.5 pixels, as kornia has it."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ KERNELS = {
 """Where code asks which form it has, as compiled kernels, and the samples that stand beside a closed form, know only
 some."""
 
-OWN = {"core/model/forms.py", "tasks/dynamic/invisible.py"}
+OWN = {"core/model/forms.py", "tasks/dynamic/evaluation.py"}
 """A sum of two of a kind; a density that is the task's own."""
 
 

@@ -70,29 +70,36 @@ def _names(node: ast.AST) -> set[str]:
     return {n.id for n in ast.walk(node) if isinstance(n, ast.Name)}
 
 
-def frozen_into_kernels() -> dict[Path, str]:
-    """File of the package -> one name in it that some compiled function uses, directly or by way of others."""
+def _compiled_functions(module: ModuleType) -> list[tuple[str, str]]:
     from numba.core.dispatcher import Dispatcher
 
-    everything = modules()
-    todo = [
+    return [
         (value.py_func.__module__, value.py_func.__name__)
-        for module in everything
         for value in vars(module).values()
-        if isinstance(value, Dispatcher) and value.py_func.__module__.startswith("neuprim.")
+        if isinstance(value, Dispatcher) and value.py_func.__module__ == module.__name__
     ]
+
+
+def kernel_modules() -> list[ModuleType]:
+    """Modules of the package with compiled functions."""
+    return [module for module in modules() if _compiled_functions(module)]
+
+
+def frozen_into_kernels(module: ModuleType) -> set[Path]:
+    """Files of the package with a name that some compiled function of a module uses, directly or by way of others."""
+    todo = _compiled_functions(module)
     sources: dict[str, Source] = {}
     seen: set[tuple[str, str]] = set()
-    found: dict[Path, str] = {}
+    found: set[Path] = set()
     while todo:
-        module, name = todo.pop()
-        if (module, name) in seen or not module.startswith("neuprim."):
+        where, name = todo.pop()
+        if (where, name) in seen or not where.startswith("neuprim."):
             continue
-        seen.add((module, name))
-        source = sources[module] = sources.get(module) or Source(module)
+        seen.add((where, name))
+        source = sources[where] = sources.get(where) or Source(where)
         if name in source.made_of:
-            found.setdefault(source.file, name)
-            todo += [(module, other) for other in source.made_of[name]]
+            found.add(source.file)
+            todo += [(where, other) for other in source.made_of[name]]
         elif name in source.imported:
             base, original = source.imported[name]
             whole = f"{base}.{original}"

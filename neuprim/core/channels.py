@@ -19,8 +19,6 @@ from neuprim.core.task import Display, TaskSpec
 if TYPE_CHECKING:
     from neuprim.core.data import Dataset
 
-__all__ = ["Channels", "channels_of", "stored_channels"]
-
 _LISTED = 8  # names that a line of text lists; of more, the first three and the last
 
 

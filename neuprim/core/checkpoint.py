@@ -27,21 +27,6 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.sparse_storage import load_sparse, store_sparse
 from neuprim.core.task import TaskSpec
 
-__all__ = [
-    "FORMAT",
-    "extra_of",
-    "load_model",
-    "model_header",
-    "read",
-    "read_header",
-    "save_compressed",
-    "save_model",
-    "shapes",
-    "stored_config",
-    "write",
-    "write_in_pieces",
-]
-
 FORMAT = 1
 _KEY = "neuprim"
 _NUMBERS = ("step", "elapsed", "views", "iterations", "train_seconds", "primitives")

@@ -20,8 +20,6 @@ from torch import Tensor
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.model.fields import ConditionSpec
 
-__all__ = ["FRAMES", "Warn", "export_frames", "flag", "in_step", "named", "read_conditions", "split_words"]
-
 FRAMES = 60
 """Frames of a range that does not say how many."""
 

@@ -28,8 +28,6 @@ from torch import Tensor
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import image_info, read_image, srgb_to_linear
 
-__all__ = ["MAX_LIGHTS", "Beams", "Environment", "EnvironmentFile", "Illumination", "read_environment"]
-
 MAX_LIGHTS = 4096
 _ROWS = 512  # larger images are summed to at most so many rows of cells, of which no energy is lost
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, linear

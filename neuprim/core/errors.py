@@ -10,22 +10,6 @@ import errno
 import sys
 from collections.abc import Iterable
 
-__all__ = [
-    "DISK",
-    "BackendUnavailable",
-    "CheckpointError",
-    "ConfigError",
-    "DataError",
-    "DeviceMemoryError",
-    "FormError",
-    "NeuprimError",
-    "NonFiniteError",
-    "RankError",
-    "cut",
-    "nearest",
-    "one_line",
-]
-
 DISK = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),

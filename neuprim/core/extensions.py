@@ -26,17 +26,6 @@ from neuprim.core.task import Loss, SceneSpec, TaskSpec
 from neuprim.core.validation import Option, Range, coerce
 from neuprim.core.volumes.source import VolumeSource
 
-__all__ = [
-    "Exporter",
-    "ExportJob",
-    "ExportReport",
-    "Inspector",
-    "LossExtension",
-    "SceneExtension",
-    "StoredModel",
-    "TrainedModel",
-]
-
 
 @dataclass(frozen=True)
 class TrainedModel:

@@ -15,8 +15,6 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.io.exr import channel_name_error
 from neuprim.core.render.layer_frame import LayerFrame
 
-__all__ = ["COMMON", "LIGHTS", "LayerFrame", "LayerSpec", "chosen_layers", "layer_fault"]
-
 
 @dataclass(frozen=True)
 class LayerSpec:

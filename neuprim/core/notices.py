@@ -12,8 +12,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["NeuprimWarning", "warn_once", "warnings_as_lines"]
-
 
 class NeuprimWarning(UserWarning):
     """Something that a user should know and that stops nothing; its text is the whole message."""

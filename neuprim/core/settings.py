@@ -8,8 +8,6 @@ from typing import Annotated, Literal
 from neuprim.core.errors import ConfigError
 from neuprim.core.validation import Range, nonempty_text, validate_fields
 
-__all__ = ["DeviceChoice", "MetricsSettings", "RenderSettings", "SortOrder"]
-
 SortOrder = Literal["center", "entry"]
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]

@@ -17,18 +17,6 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.validation import Option
 from neuprim.core.volumes.source import VolumeSource
 
-__all__ = [
-    "API_VERSION",
-    "Chunk",
-    "Chunks",
-    "Illuminate",
-    "Loss",
-    "SceneContext",
-    "SceneSpec",
-    "Supervision",
-    "TaskSpec",
-]
-
 API_VERSION = 1
 """Version of the interfaces in ``neuprim.core``; a plugin names the one it was written for."""
 

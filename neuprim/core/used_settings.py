@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension
     from neuprim.core.task import TaskSpec
 
-__all__ = ["OPTIONAL", "TrackedMapping", "build_settings", "loss_settings"]
-
 OPTIONAL = ("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight")
 """Shared settings that a task or loss uses only if it says so."""
 

@@ -27,24 +27,6 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from neuprim.core.errors import ConfigError, cut, nearest
 
-__all__ = [
-    "Accepts",
-    "Option",
-    "Range",
-    "Unbounded",
-    "validate",
-    "validate_choices",
-    "coerce",
-    "field_types",
-    "join_key",
-    "infer_type",
-    "option_type",
-    "refuse_unknown",
-    "format_value",
-    "nonempty_text",
-    "validate_fields",
-]
-
 T = TypeVar("T")
 
 Option = tuple[Any, str] | tuple[Any, str, Any]

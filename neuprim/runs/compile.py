@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from neuprim.core.compute.kernels import cache_directory
+from neuprim.core.compute.kernels import cache_directory, sources_hash
 
 __all__ = ["KernelCompilation", "is_compiled", "compile_in_background", "main", "mark_compiled", "kernel_variant"]
 
@@ -41,7 +41,7 @@ def mark_compiled(backend: str, form: str) -> None:
 
 
 def _marker(backend: str, form: str) -> Path:
-    return cache_directory() / f"{backend}-{form}.compiled"
+    return cache_directory() / f"{backend}-{form}-{sources_hash(Path(__file__))}.compiled"
 
 
 class KernelCompilation:

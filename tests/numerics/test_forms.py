@@ -283,7 +283,9 @@ def test_an_error_map_of_another_size(backend: str, samples: int) -> None:
     """Where it is given, not in the backward pass."""
     t = {k: v.requires_grad_() for k, v in scenes.tensors(N).items()}
     out = render_lowered(scenes.lowered(t), CAMERA, settings(backend, samples=samples))
-    with pytest.raises(FormError, match=r"^request_contributions: error has shape \(3, 4\); expected \(16, 20\), that of the frame$"):
+    with pytest.raises(
+        FormError, match=r"^request_contributions: error has shape \(3, 4\); expected \(16, 20\), that of the frame$"
+    ):
         out.request_contributions(torch.ones(3, 4))
     with pytest.raises(FormError, match=r"^request_contributions: error has type ndarray; expected a torch tensor$"):
         out.request_contributions(np.ones((16, 20)))  # type: ignore[arg-type]

@@ -10,8 +10,6 @@ from neuprim.core.compression.quantizers import MAX_BITS, MIN_BITS
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.model.schema import ParameterSpec
 
-__all__ = ["LEVELS", "DEFAULT_LEVEL", "BitTable", "bit_table"]
-
 OTHERS = "others"
 
 

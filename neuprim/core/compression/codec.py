@@ -37,18 +37,6 @@ from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import nonzero_rows
 
-__all__ = [
-    "Quantizers",
-    "StoredSize",
-    "format_bits",
-    "encode_sections",
-    "storage_order",
-    "canonicalize",
-    "fake_quantize",
-    "fit_quantizers",
-    "fit_quantizers_to_error",
-]
-
 Quantizers = dict[str, Columns | Rotations]
 """Parameter -> how its numbers are coded."""
 

@@ -38,17 +38,6 @@ from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import atomic_path
 from neuprim.core.io.plain import load_json
 
-__all__ = [
-    "CONFIG",
-    "MAGIC",
-    "MAX_EXPANSION",
-    "VERSION",
-    "is_compressed",
-    "read_compressed",
-    "read_head",
-    "write_compressed",
-]
-
 MAGIC = b"\x89NEUPRIM"
 VERSION = 1
 CONFIG = "config.yaml"

@@ -17,18 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = [
-    "CLIPS",
-    "MAX_BITS",
-    "MIN_BITS",
-    "Columns",
-    "Rotations",
-    "columns_of_step",
-    "fit_columns",
-    "relative_error",
-    "snap_to_zero",
-]
-
 MIN_BITS = 3
 """Smallest bits of a component of an orientation."""
 

@@ -17,28 +17,6 @@ from torch import Tensor
 
 from neuprim.core.compression.quantizers import MAX_BITS, MIN_BITS, Columns, Rotations
 
-__all__ = [
-    "CODINGS",
-    "COLUMNS",
-    "MAX_TEXT",
-    "POSITIONS",
-    "ROTATIONS",
-    "MASKS",
-    "MASKS_NAME",
-    "SPARSE",
-    "TEXT",
-    "CorruptSection",
-    "Section",
-    "compress_planes",
-    "content_size",
-    "morton_encode",
-    "pack",
-    "pack_masks",
-    "pack_sparse",
-    "unpack",
-    "unpack_masks",
-]
-
 TEXT, COLUMNS, POSITIONS, ROTATIONS, MASKS, SPARSE = range(6)
 CODINGS = {
     TEXT: "text",

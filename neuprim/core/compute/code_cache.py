@@ -17,8 +17,6 @@ from pathlib import Path
 
 from neuprim.core.notices import warn_once
 
-__all__ = ["code_cache", "weakness"]
-
 
 def code_cache(folder: Path) -> Path:
     """The folder, made where it is missing, or a private one with a warning if others may write it."""

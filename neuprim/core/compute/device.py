@@ -11,21 +11,6 @@ import importlib.util
 import torch
 from torch import Tensor
 
-__all__ = [
-    "CPU",
-    "CUDA",
-    "DEVICE_TYPES",
-    "HOST",
-    "copy_from_host",
-    "cuda_unavailable",
-    "current_device",
-    "free_cuda_memory",
-    "has_warp",
-    "on_numba",
-    "on_warp",
-    "to_like",
-]
-
 CPU, CUDA = "cpu", "cuda"
 DEVICE_TYPES: tuple[str, ...] = (CPU, CUDA)
 """The devices that models are kept on."""

@@ -1,9 +1,9 @@
 """How the kernels are compiled: flags, and where numba keeps the result.
 
 numba's cache notices edits of the file a kernel is in, but not of *other* files whose functions it inlined or whose
-constants it froze; and site-packages may be read-only. So the cache lives in the user's own cache folder, under a name
-made of the version and a hash of every source that can end up in compiled code: see :func:`kernel_sources`.
-``NUMBA_CACHE_DIR``, where set, wins.
+constants it froze; and site-packages may be read-only. So the cache lives in the user's own cache folder, and a
+kernel's code under a name made of its module and a hash of every source that can end up in it: see
+:func:`kernel_sources`. Checkouts with the same sources share it. ``NUMBA_CACHE_DIR``, where set, wins.
 """
 
 from __future__ import annotations
@@ -19,24 +19,12 @@ from typing import Any
 import llvmlite.binding as llvm
 import numba
 from numba import njit
+from numba.core import caching
 from numba.extending import overload
 
 from neuprim.core.compute.code_cache import code_cache
 from neuprim.core.io import files
 from neuprim.version import __version__
-
-__all__ = [
-    "FAST",
-    "dispatch_by_length",
-    "cache_directory",
-    "exact_kernel",
-    "inline",
-    "kernel",
-    "kernel_sources",
-    "sources_hash",
-    "strict",
-    "inline_source",
-]
 
 
 def _prefer_wide_vectors() -> None:
@@ -66,38 +54,51 @@ FAST = {"nnan", "nsz", "arcp", "contract", "afn", "reassoc"}
 """Floating-point freedom of the pixel kernels. NaN checks vanish under it: rows are checked before (``prepare``)."""
 
 
-_COMPILED = re.compile(
-    rb"\bnumba\b|\bcompute\.kernels import [^\n]*\b(?:exact_kernel|kernel|inline|strict|inline_source)\b"
-)
+_ROOT = Path(__file__).parents[2]
+_IMPORT = re.compile(r"^\s*from (neuprim[\w.]*) import (\([^)]*\)|[^\n]*)|^\s*import (neuprim[\w.]+)", re.M)
 
 
-def kernel_sources(package: Path) -> list[Path]:
-    """Files of a package that can end up in compiled code: all of ``core/render/cpu``, and those that use its
-    decorators or name numba.
-
-    A module of constants for kernels outside that folder says "numba" in its text, and is found by that; the tests
-    compare this list with all that the kernels refer to.
-    """
-    own = package / "core" / "render" / "cpu"
-    return [
-        file for file in sorted(package.rglob("*.py")) if own in file.parents or _COMPILED.search(file.read_bytes())
-    ]
+def kernel_sources(module: Path, package: Path = _ROOT) -> set[Path]:
+    """Files whose text can end up in the compiled kernels of a module: its own, and those of all modules of the package
+    that it imports, directly or not; of this one, which says how kernels are compiled, no further."""
+    found: set[Path] = set()
+    todo = [module]
+    while todo:
+        file = todo.pop()
+        if file not in found:
+            found.add(file)
+            if file != package / "core" / "compute" / "kernels.py":
+                todo += _imported(file, package)
+    return found
 
 
 @functools.cache
-def sources_hash(package: Path) -> str:
-    """Twelve hexadecimal digits that change with any of :func:`kernel_sources`."""
-    digest = hashlib.sha256()
-    for source in kernel_sources(package):
-        digest.update(source.relative_to(package).as_posix().encode() + b"\0" + source.read_bytes() + b"\0")
+def _imported(file: Path, package: Path) -> set[Path]:
+    names: set[str] = set()
+    for base, imported, whole in _IMPORT.findall(file.read_text(encoding="utf-8")):
+        words = re.findall(r"(\w+)(?: as \w+)?", re.sub(r"#.*", "", imported))
+        names |= {whole} if whole else {f"{base}.{word}" for word in words}
+    files = set()
+    for name in names:
+        _, *parts = name.split(".")
+        # a name of a module, or of something in one
+        paths = [package.joinpath(*parts), package.joinpath(*parts[:-1])]
+        candidates = [file for path in paths for file in (path.with_suffix(".py"), path / "__init__.py")]
+        files |= {next(file for file in candidates if file.exists())}
+    return files
+
+
+def sources_hash(module: Path, package: Path = _ROOT) -> str:
+    """Twelve hexadecimal digits that change with the version and any of :func:`kernel_sources`."""
+    digest = hashlib.sha256(f"{module.name} {__version__}".encode())
+    for source in sorted(kernel_sources(module, package)):
+        digest.update(source.name.encode() + b"\0" + source.read_bytes() + b"\0")
     return digest.hexdigest()[:12]
 
 
 def cache_directory() -> Path:
-    """Folder of the compiled kernels for this version of the sources, which nobody else may write."""
-    if os.environ.get("NUMBA_CACHE_DIR"):
-        return code_cache(Path(os.environ["NUMBA_CACHE_DIR"]))
-    own = files.cache_directory() / "kernels" / f"{__version__}-{sources_hash(Path(__file__).parents[2])}"
+    """Folder of the compiled kernels, which nobody else may write."""
+    own = Path(os.environ.get("NUMBA_CACHE_DIR") or files.cache_directory() / "kernels")
     chosen = code_cache(own)
     if chosen != own.absolute():
         os.environ["NUMBA_CACHE_DIR"] = str(chosen)  # processes that this one starts use the private folder too
@@ -105,16 +106,28 @@ def cache_directory() -> Path:
 
 
 _cache_directory = functools.cache(cache_directory)  # once a process: every kernel asks
+_sources_hash = functools.cache(sources_hash)
+
+
+class KernelLocator(getattr(caching, "UserProvidedCacheLocator", object)):  # type: ignore[misc]
+    """numba's own, but for a folder that does not depend on where the sources are; a numba without this choice does
+    not ask."""
+
+    @classmethod
+    def get_suitable_cache_subpath(cls, py_file: str) -> str:
+        return Path(py_file).stem
 
 
 def _jit(**options: Any) -> Callable[[Any], Any]:
     def decorate(function: Any) -> Any:
-        previous = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        numba.config.CACHE_DIR = str(_cache_directory())  # type: ignore[attr-defined]
+        config: Any = numba.config
+        previous = config.CACHE_DIR, getattr(config, "CACHE_LOCATOR_CLASSES", "")
+        config.CACHE_DIR = str(_cache_directory() / _sources_hash(Path(function.__code__.co_filename).resolve()))
+        config.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelLocator.__name__}"
         try:
             return njit(**options)(function)
         finally:  # other packages keep their own cache
-            numba.config.CACHE_DIR = previous  # type: ignore[attr-defined]
+            config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = previous
 
     return decorate
 

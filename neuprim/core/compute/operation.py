@@ -7,8 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["apply_autograd", "needs_grad"]
-
 
 class _Nowhere:
     """Takes what a forward pass leaves behind for a backward pass that will not come."""

@@ -14,16 +14,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "core_count",
-    "cpu_name",
-    "limit_threads",
-    "machine_cores",
-    "parallel_for",
-    "limit_process_threads",
-    "resolve_threads",
-]
-
 _limit: ContextVar[int] = ContextVar("threads", default=0)
 _pools: dict[int, ThreadPoolExecutor] = {}
 _lock = threading.Lock()

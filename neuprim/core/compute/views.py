@@ -10,8 +10,6 @@ from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
-__all__ = ["copy16", "compress16", "borrow_array", "release_array"]
-
 _COMPRESSES = 19 <= binding.llvm_version_info[0] <= 22
 """Whether LLVM moves the chosen elements of a vector together by one instruction; it is called experimental, and other
 versions are not asked."""

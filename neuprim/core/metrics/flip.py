@@ -11,8 +11,6 @@ from torch import Tensor
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.metrics import matched
 
-__all__ = ["PIXELS_PER_DEGREE", "flip", "flip_available"]
-
 PIXELS_PER_DEGREE = 67.0
 """The authors' default: a 0.7 m wide screen of 3840 pixels at 0.7 m."""
 

@@ -24,20 +24,6 @@ from torch.nn.functional import pad
 
 from neuprim.core.errors import DataError, NonFiniteError
 
-__all__ = [
-    "SSIM_SIGMA",
-    "SSIM_WINDOW",
-    "format_metrics",
-    "from_json",
-    "matched",
-    "means",
-    "psnr",
-    "psnr_gain",
-    "ssim",
-    "ssim_3dgs",
-    "to_json",
-]
-
 _MAX_NAMED = 6  # views in one line; metrics.json names all
 
 SSIM_WINDOW = 11

@@ -21,8 +21,6 @@ from torch.nn.functional import conv2d, max_pool2d
 from neuprim.core.errors import DataError
 from neuprim.core.metrics.image import matched
 
-__all__ = ["Lpips"]
-
 
 class _Layer(NamedTuple):
     """A convolution with its rectifier.

@@ -35,21 +35,6 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import Shaped, Sizes, tensor_fault
 
-__all__ = [
-    "check_channels",
-    "check_colour",
-    "check_density",
-    "check_geometry",
-    "check_halves",
-    "check_result",
-    "check_rows",
-    "check_shading",
-    "check_shape",
-    "check_start",
-    "check_tensors",
-    "method",
-]
-
 _DENSITIES: tuple[type[Shaped], ...] = (Cosine, CustomDensity)
 _COLOURS: tuple[type[Shaped], ...] = (Constant, RayNet, CustomColour)
 

@@ -26,8 +26,6 @@ from neuprim.core.model.edge import sinc
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import Params
 
-__all__ = ["ball_mean", "canonicalize_cosines", "canonicalize_gain", "prune_neurons", "smaller_neuron_counts"]
-
 _SLACK = 1e-6  # of a turn: phases that rounding left beside an end stay, so that a second pass changes no bit
 
 

@@ -19,8 +19,6 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["EDGES", "NORMS", "chord_integral", "fade", "legendre", "profile", "sinc", "spherical_bessel"]
-
 EDGES = (0, 1, 2)
 """Exponents p that there are."""
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.cameras.world import World
-from neuprim.core.model.forms import (
+from neuprim.core.model.forms import (  # noqa: F401 - the forms are part of this interface
     Constant,
     Cosine,
     CustomColour,
@@ -36,25 +36,6 @@ from neuprim.core.model.schema import ParameterSpec, Params
 
 if TYPE_CHECKING:
     from neuprim.core.settings import RenderSettings
-
-__all__ = [
-    "ColourField",
-    "ConditionSpec",
-    "Conditions",
-    "Constant",
-    "Cosine",
-    "DensityField",
-    "Field",
-    "LoweredColour",
-    "LoweredDensity",
-    "CustomDensity",
-    "CustomColour",
-    "RayNet",
-    "Shade",
-    "Shading",
-    "prunable_units_by_name",
-    "read_script",
-]
 
 Conditions = Mapping[str, Tensor]
 """Condition name ("time", "light", a plugin's "wavelength") -> value for one frame."""

@@ -14,8 +14,6 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-__all__ = ["gaussian_support"]
-
 _LOGITS = torch.linspace(-6, 6, 25, dtype=torch.float64)
 """Of the opacities that are tabulated; beyond, the nearest counts."""
 _NODES, _FAR = 160, 5.0

@@ -20,19 +20,6 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.tensors import MOST_UNITS, Shaped, Shapes, Sizes, function_fault, labelled, number_fault
 
-__all__ = [
-    "Constant",
-    "Cosine",
-    "LoweredColour",
-    "LoweredDensity",
-    "CustomDensity",
-    "CustomColour",
-    "RayNet",
-    "Shade",
-    "Shading",
-]
-
-
 # ---------------------------------------------------------------- closed forms of density
 
 

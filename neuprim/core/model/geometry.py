@@ -11,8 +11,6 @@ from torch import Tensor
 from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import Shaped, Shapes
 
-__all__ = ["GEOMETRY_SPECS", "Geometry", "quaternion_to_matrix"]
-
 
 def quaternion_to_matrix(quats: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of wxyz quaternions (..., 4), normalised on use.

@@ -8,8 +8,6 @@ from torch import Tensor
 
 from neuprim.core.model.geometry import Geometry
 
-__all__ = ["Pairs"]
-
 
 @dataclass(frozen=True)
 class Pairs:

@@ -38,8 +38,6 @@ from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import function_fault
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["ActiveSet", "Lowered", "Primitives"]
-
 
 @dataclass(frozen=True)
 class Lowered:

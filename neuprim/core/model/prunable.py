@@ -15,8 +15,6 @@ from torch import Tensor
 
 from neuprim.core.model.schema import Params
 
-__all__ = ["PrunableUnit", "count_numbers", "nonzero_rows", "removal_effect", "zero_units"]
-
 Index = tuple[int | slice, ...]
 """Index into a parameter, behind the axis of the primitives."""
 

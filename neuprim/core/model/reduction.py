@@ -15,8 +15,6 @@ from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["KINDS", "reduce_fields", "reduce_model", "reduction_names", "validate_reduction"]
-
 KINDS = ("density", "colour")
 """First parts of the names."""
 

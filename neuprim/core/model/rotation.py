@@ -7,8 +7,6 @@ import numpy as np
 
 from neuprim.core.compute.kernels import strict
 
-__all__ = ["rotation", "rotation_backward"]
-
 
 @strict
 def rotation(q, out):  # type: ignore[no-untyped-def]

@@ -18,8 +18,6 @@ from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.operation import apply_autograd, needs_grad
 from neuprim.core.compute.threads import parallel_for
 
-__all__ = ["take_rows"]
-
 _FEW = 4096
 """Below, without a gradient, torch is done before a kernel would have begun with the last tensor."""
 

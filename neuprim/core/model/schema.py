@@ -16,8 +16,6 @@ from torch import Tensor
 
 from neuprim.core.validation import Range, coerce
 
-__all__ = ["InitContext", "ParameterSpec", "Params", "RateUnit"]
-
 RateUnit = Literal["absolute", "extent"]
 """What a learning rate is a multiple of; see :class:`ParameterSpec`."""
 

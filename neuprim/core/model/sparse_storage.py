@@ -16,8 +16,6 @@ from torch import Tensor
 from neuprim.core.errors import CheckpointError
 from neuprim.core.model.schema import ParameterSpec, Params
 
-__all__ = ["load_sparse", "store_sparse"]
-
 _MASK, _NUMBERS = "|there", "|numbers"
 
 

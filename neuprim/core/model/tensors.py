@@ -17,19 +17,6 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 
-__all__ = [
-    "MOST_UNITS",
-    "Shape",
-    "Shaped",
-    "Shapes",
-    "Sizes",
-    "function_fault",
-    "labelled",
-    "number_fault",
-    "tensor_fault",
-    "tensors_fault",
-]
-
 Shape = tuple[int | str, ...]
 """A letter stands for a size that tensors share."""
 

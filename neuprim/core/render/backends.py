@@ -26,27 +26,6 @@ from neuprim.core.notices import warn_once
 from neuprim.core.render.draw import Draw
 from neuprim.core.settings import RenderSettings
 
-__all__ = [
-    "AUTO",
-    "REFERENCE",
-    "TABLE",
-    "Backend",
-    "available_backends",
-    "backend_names",
-    "candidate_backends",
-    "check_backend_device",
-    "check_backend_name",
-    "check_device",
-    "choose_backend",
-    "computing_device",
-    "device_of",
-    "find_backend",
-    "gpu_unavailable",
-    "precompiled_backend",
-    "unsupported_by_kernels",
-    "with_available_device",
-]
-
 AUTO = "auto"
 """The setting that takes the first backend of the table that can draw the frame."""
 

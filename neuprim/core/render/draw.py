@@ -16,8 +16,6 @@ from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.output import RenderOutput, mean_depth
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["Draw", "draw_samples", "on_device", "unproject_depth", "with_shade"]
-
 Draw = Callable[..., RenderOutput]
 """A backend's ``render(lowered, camera, background, settings)``; which cameras it takes differs."""
 

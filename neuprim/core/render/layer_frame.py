@@ -16,8 +16,6 @@ from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.core.render.draw import unproject_depth
 
-__all__ = ["LayerFrame"]
-
 _CLEAR = 2e-4
 """A pixel whose transmittance stays above this has no clamped primitive: one alone, at ``alpha_max`` = 0.9999, would
 take it to half of that."""

@@ -14,8 +14,6 @@ from neuprim.core.cameras import Camera
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["nearest_and_median_depth", "resolve_near", "scene_extent"]
-
 _MAX_CAMERAS, _MAX_POINTS = 100, 100_000  # of which depths are measured
 _SHARE, _CLEARANCE = 1.0 / 400.0, 0.1  # the near plane as a part of the typical and of the nearest depth
 _MIN_EXTENT = 0.01

@@ -11,8 +11,6 @@ from torch import Tensor
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.primitives import Lowered
 
-__all__ = ["non_finite_error", "refuse_non_finite", "refuse_non_finite_colours"]
-
 
 def non_finite_error(tensors: Mapping[str, Tensor], row: int) -> NonFiniteError:
     """Return the error for primitive ``row``, which is not finite or leaves the range of float32."""

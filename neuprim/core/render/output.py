@@ -11,8 +11,6 @@ from torch import Tensor
 
 from neuprim.core.model.checks import check_shape
 
-__all__ = ["ContributionRequest", "Contributions", "RenderOutput", "RenderStats", "mean_depth", "sum_contributions"]
-
 
 @dataclass
 class Contributions:

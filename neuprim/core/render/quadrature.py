@@ -25,8 +25,6 @@ from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.reference.backend import render
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["Quadrature", "compare_quadrature", "sampled_depth"]
-
 
 @dataclass(frozen=True)
 class Quadrature:

@@ -21,8 +21,6 @@ from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["NET", "PARAMETERS", "Request", "gradients_like", "parameters_of", "rasterize", "remember_inputs"]
-
 PARAMETERS = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
 """Inputs of the per-primitive stage, in the order in which its kernels take them."""
 

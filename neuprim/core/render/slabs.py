@@ -15,8 +15,6 @@ from neuprim.core.render.backends import choose_backend
 from neuprim.core.render.non_finite import refuse_non_finite
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["render_slabs"]
-
 
 def render_slabs(
     geometry: Geometry, density: LoweredDensity, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings

@@ -36,8 +36,6 @@ from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.reference.rays import pixel_directions, screen_boxes
 from neuprim.core.settings import RenderSettings, SortOrder
 
-__all__ = ["Keep", "SortingError", "measure_sorting_errors", "render_unsorted_volume"]
-
 Keep = Literal["opacity", "density"]
 _BLOCK = 8  # pixels on a side; bounds memory, changes nothing
 _ORDERS: tuple[SortOrder, ...] = ("center", "entry")

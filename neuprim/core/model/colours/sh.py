@@ -14,8 +14,6 @@ from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import Params
 from neuprim.core.model.tensors import Shape, Sizes, tensors_fault
 
-__all__ = ["C0", "basis", "coefficient_count", "colors", "truncate_bands", "initial_dc"]
-
 
 def coefficient_count(degree: int) -> int:
     """Coefficients per channel of all bands up to ``degree``."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["C0", "C1", "C2", "C3"]
-
 C0 = 0.5 / math.sqrt(math.pi)
 """Y_00: a colour c of every direction has the coefficient (c - 0.5)/C0."""
 

@@ -13,8 +13,6 @@ from neuprim.core.compute.operation import apply_autograd
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
 
-__all__ = ["fused_colors"]
-
 _CHUNK = 8192  # primitives per unit of work: a quarter of a millisecond, beside what waking a thread takes
 
 

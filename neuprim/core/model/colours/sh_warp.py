@@ -12,8 +12,6 @@ from neuprim.core.compute import device
 from neuprim.core.compute.warp import OPTIONS, array, launch, wp
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
 
-__all__ = ["fused_colors"]
-
 d, f = wp.float64, wp.float32
 _C0, _C1 = wp.constant(d(C0)), wp.constant(d(C1))
 _vec15 = wp.types.vector(length=15, dtype=wp.float64)

@@ -25,17 +25,6 @@ from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.tensors import number_fault
 from neuprim.core.validation import Range
 
-__all__ = [
-    "DENSITY_OPTIONS",
-    "DENSITY_TRADE",
-    "OMEGA0",
-    "CosineDensity",
-    "amplified",
-    "cosine_density",
-    "split_cosine",
-    "split_scale",
-]
-
 OMEGA0 = 30.0
 """SIREN boost: multiplies the whole phase."""
 

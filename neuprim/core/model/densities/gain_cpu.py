@@ -12,8 +12,6 @@ from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.operation import apply_autograd
 
-__all__ = ["fused_gain", "scale_backward"]
-
 
 @exact_kernel
 def scale_backward(w2, b2, factor, p_w2, p_b2, g_w2, g_b2, pulled):  # type: ignore[no-untyped-def]

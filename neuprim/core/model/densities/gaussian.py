@@ -21,8 +21,6 @@ from neuprim.core.model.fields import Conditions, CustomDensity, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 
-__all__ = ["GaussianDensity", "bell_integral"]
-
 _SHORT = 0.2
 """Intervals with w (1 + |u|) below this are integrated by their Taylor series: differences of erfc lose a digit per
 decade of w."""

@@ -39,8 +39,6 @@ from neuprim.core.render.rasterize import (
 )
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["render", "render_slabs"]
-
 _PRIMITIVES_PER_CHUNK = 512
 _UNITS_PER_THREAD = 8  # units of work among which threads share a frame
 _TILES_ALONE = 64  # tiles that a thread which shares with no other does at once, at least

@@ -36,8 +36,6 @@ from neuprim.core.render.cpu.tiles import (
 )
 from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
-__all__ = ["ImageGradient", "backward_tiles", "opacity", "optical_depths", "sum_rows"]
-
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(P.TILE).astype(np.float32)

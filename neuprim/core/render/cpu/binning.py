@@ -14,8 +14,6 @@ from neuprim.core.render import layout as P
 from neuprim.core.render.cpu.prepare import Projected
 from neuprim.core.render.limits import VISIBLE
 
-__all__ = ["TileLists", "bin_primitives", "depth_order"]
-
 Array = np.ndarray[Any, Any]
 
 

@@ -11,8 +11,6 @@ from neuprim.core.compute.kernels import inline, inline_source
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render import layout as P
 
-__all__ = ["add_ray", "by_depth", "chord", "put_ray", "ray", "through_chord", "weight", "zero_ray"]
-
 f = np.float32
 _MEANS = tuple(f(n / 2) for n in NORMS)  # of (1 - u^2)^p over [-1, 1]
 

@@ -24,8 +24,6 @@ from neuprim.core.render.cpu.float64 import phase_float64
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns
 from neuprim.core.render.limits import FLOAT64_TURNS
 
-__all__ = ["Net", "net_backward", "prepare_net", "ray_colour_gradient", "ray_colours"]
-
 f = np.float32
 _TURNS = 1.0 / (2.0 * np.pi)
 _PRIMITIVES_PER_CHUNK = 512

@@ -25,8 +25,6 @@ from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.gradients import chord_gradient, lanes_with_slopes, neuron_gradients
 from neuprim.core.render.cpu.tiles import box_pixels, compact, field_values, pair_window, row_spans
 
-__all__ = ["backward_tiles_by_entry", "composite_tiles_by_entry"]
-
 f = np.float32
 
 # One row per hit of the tile, because hits are read in another order than they are written. The backward pass fills the

@@ -24,8 +24,6 @@ from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, dsinc_turns, sinc_turns
 
-__all__ = ["FLOAT64_SCRATCH", "chords_float64", "neurons_float64", "phase_float64", "slopes_float64"]
-
 f = np.float32
 _PI2 = 2.0 * np.pi
 _TERMS = 14

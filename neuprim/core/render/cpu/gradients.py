@@ -19,8 +19,6 @@ from neuprim.core.render.cpu.float64 import chords_float64, slopes_float64
 from neuprim.core.render.cpu.tiles import chords
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns, slopes_fast, slopes_medium, slopes_slow
 
-__all__ = ["AT_ONCE", "chord_gradient", "gradients_at_once", "lanes_with_slopes", "neuron_gradients"]
-
 f = np.float32
 AT_ONCE = 2  # neurons, at most, whose sums stay in registers beside those of the chord
 _TINY = f(1e-30)

@@ -36,17 +36,6 @@ from neuprim.core.render.limits import (
     VISIBLE,
 )
 
-__all__ = [
-    "Parameters",
-    "Projected",
-    "View",
-    "borrow_parameters",
-    "borrow_view",
-    "camera_frame",
-    "prepare",
-    "prepare_wide",
-]
-
 Array = np.ndarray[Any, Any]
 
 

@@ -9,8 +9,6 @@ from neuprim.core.model.rotation import rotation_backward
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu.prepare import borrow_parameters, borrow_view, camera_frame
 
-__all__ = ["prepare_backward"]
-
 
 @exact_kernel
 def prepare_backward(start, stop, parameters, view, projected, grads, touched, out, g_view):  # type: ignore[no-untyped-def]

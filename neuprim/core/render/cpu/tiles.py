@@ -21,20 +21,6 @@ from neuprim.core.render.cpu.chord import by_depth, chord, ray, weight
 from neuprim.core.render.cpu.float64 import chords_float64, neurons_float64
 from neuprim.core.render.cpu.trigonometry import cos_turns, profiles_fast, profiles_medium, profiles_slow
 
-__all__ = [
-    "FrameArrays",
-    "aligned",
-    "box_pixels",
-    "chords",
-    "compact",
-    "fetch_ahead",
-    "field_values",
-    "lend_frame",
-    "pair_window",
-    "prefetch_depths",
-    "row_spans",
-]
-
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(P.TILE).astype(np.float32)

@@ -20,21 +20,6 @@ import numpy as np
 
 from neuprim.core.compute.kernels import dispatch_by_length, inline
 
-__all__ = [
-    "EDGE_TYPES",
-    "TAU",
-    "cos_turns",
-    "dsinc_turns",
-    "one_minus_exp",
-    "profiles_fast",
-    "profiles_medium",
-    "profiles_slow",
-    "sinc_turns",
-    "slopes_fast",
-    "slopes_medium",
-    "slopes_slow",
-]
-
 EDGE_TYPES: tuple[tuple[int, ...], ...] = ((), (0,), (0, 0))
 """The exponents p = 0, 1, 2 as kernels take them: as many zeros. A tuple's length belongs to its type, so that numba
 compiles a kernel for each p that is drawn, and none that is not."""

@@ -30,8 +30,6 @@ from neuprim.core.render.rasterize import (
 )
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["render", "render_slabs"]
-
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod

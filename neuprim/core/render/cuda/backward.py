@@ -43,8 +43,6 @@ from neuprim.core.render.cuda.chord import (
 from neuprim.core.render.cuda.layout import Form
 from neuprim.core.render.cuda.trigonometry import TAU, band_of, cos_turns, sin_turns
 
-__all__ = ["pairs_kernel", "pixels_kernel", "sum_pairs"]
-
 
 @functools.cache
 def pixels_kernel(form: Form, depth: bool) -> Any:

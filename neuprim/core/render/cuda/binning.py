@@ -20,8 +20,6 @@ from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK
 from neuprim.core.render.layout import HX, HY, SKEW, UNBOUNDED, XC, YC
 
-__all__ = ["Counted", "TileLists", "bin_primitives", "count_tiles", "ellipse", "row_spans", "tile_range"]
-
 d = wp.float64
 _E0, _EX, _TILE, _UNBOUNDED = L.E0, L.EX, L.TILE, wp.constant(d(UNBOUNDED))
 _MARGIN, _ROUNDING = 2e-3, 4e-7  # pixels, and per pixel of the ellipse; a pixel too many is rejected by its own D

@@ -17,19 +17,6 @@ from typing import Any
 from neuprim.core.compute.warp import wp
 from neuprim.core.render.cuda.layout import TILE, WARP
 
-__all__ = [
-    "any_thread",
-    "column_of",
-    "hit_at",
-    "int_at",
-    "number_at",
-    "number_of_row",
-    "row_sums",
-    "row_type",
-    "set_hit",
-    "span_of",
-]
-
 _ANY = """
 #if defined(__CUDA_ARCH__)
     return __syncthreads_or(yes);

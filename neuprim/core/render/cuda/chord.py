@@ -13,19 +13,6 @@ from typing import Any
 from neuprim.core.compute.warp import wp
 from neuprim.core.render.cuda import layout as L
 
-__all__ = [
-    "Chord",
-    "Ray",
-    "chord",
-    "phase",
-    "pixel_of_lane",
-    "pixel_of_slot",
-    "ray_of",
-    "slot_of_pixel",
-    "through_chord",
-    "xyz",
-]
-
 
 @wp.struct
 class Ray:

@@ -30,18 +30,6 @@ from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, View, project_
 from neuprim.core.render.cuda.trigonometry import TAU, cos_turns, sin_turns
 from neuprim.core.render.limits import FLOAT64_TURNS
 
-__all__ = [
-    "FIRST_COLOUR",
-    "Net",
-    "fill_wide_net",
-    "float64_hues_kernel",
-    "float64_net_kernel",
-    "net_backward",
-    "net_pairs_kernel",
-    "net_width",
-    "prepare_net",
-]
-
 FIRST_COLOUR = L.G_NEURONS
 """Column of a network's gradient row where the C bases begin, then (WX, WY, WZ, PHASE, C weights) of each unit; the
 ray's come first."""

@@ -14,8 +14,6 @@ from neuprim.core.compute.warp import FAST, wp
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.layout import Form
 
-__all__ = ["composite_kernel", "uncomposite_kernel"]
-
 
 @wp.func
 def _begin(keys: wp.array(dtype=wp.int64), count: int, pixel: int):

@@ -24,8 +24,6 @@ from neuprim.core.render.cuda.block_ops import row_sums, row_type
 from neuprim.core.render.cuda.chord import pixel_of_slot
 from neuprim.core.render.cuda.layout import CUT_AT, Form
 
-__all__ = ["chord64", "float64_opacity_kernel", "float64_pairs_kernel", "through64"]
-
 _TWO_PI = 6.283185307179586
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
 vec5d = wp.types.vector(length=5, dtype=wp.float64)

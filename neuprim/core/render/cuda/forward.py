@@ -20,8 +20,6 @@ from neuprim.core.render.cuda.chord import chord, phase, pixel_of_lane, ray_of, 
 from neuprim.core.render.cuda.layout import CUT_AT, Form
 from neuprim.core.render.cuda.trigonometry import band_of, cos_turns, opacity
 
-__all__ = ["BATCH", "forward_kernel"]
-
 
 @wp.func
 def key_of(pixel: int, entry: float):

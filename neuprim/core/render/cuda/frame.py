@@ -19,8 +19,6 @@ from neuprim.core.render.layout import SPAN_WIDTH
 from neuprim.core.render.limits import min_visible_depth
 from neuprim.core.render.rasterize import Request
 
-__all__ = ["Frame", "NotFinite", "Projection", "as_arrays", "prepare_frame"]
-
 
 class NotFinite(ValueError):
     """Primitive ``row`` is not finite, or outside float32; the caller says which of its numbers."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from neuprim.core.render import layout
-from neuprim.core.render.layout import (
+from neuprim.core.render.layout import (  # noqa: F401 - kernels read them as L.TILE
     ANCHOR_Z,
     G_ERROR,
     G_LOG_M,
@@ -22,12 +22,6 @@ from neuprim.core.render.layout import (
     TILE,
     UNIT,
 )
-
-__all__ = [
-    "AMPLITUDE", "ANCHOR_Z", "CUT_AT", "E0", "EX", "EY", "Form", "G_ERROR", "G_LOG_M", "G_NEURONS", "G_OFFSET",
-    "G_WEIGHT", "NEURONS", "PER_NEURON", "PIXELS", "REST", "SCALARS", "TILE", "UNIT", "WARP", "XA", "XU", "XV",
-    "amplitudes", "colours", "columns", "gradient_width", "net_columns", "wide_width",
-]  # fmt: skip
 
 E0, EX, EY, XA, XU, XV, REST, NEURONS = 0, 1, 2, 3, 4, 5, 6, 7
 """float4 columns: a vector each, and beside it a scalar, see :data:`SCALARS`; REST holds four scalars, then come the

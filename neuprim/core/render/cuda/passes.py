@@ -27,8 +27,6 @@ from neuprim.core.render.cuda.frame import Frame
 from neuprim.core.render.cuda.layout import Form
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["Composited", "ImageGradient", "backward", "forward"]
-
 _MAX_HITS = 2**31
 
 _NUMBERS = {

@@ -42,8 +42,6 @@ from neuprim.core.render.limits import (
     VISIBLE,
 )
 
-__all__ = ["prepare_kernel", "wide_kernel"]
-
 d, f = wp.float64, wp.float32
 _VISIBLE, _CULLED, _NON_FINITE = (
     wp.constant(wp.uint8(VISIBLE)),

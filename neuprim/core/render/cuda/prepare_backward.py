@@ -14,8 +14,6 @@ from neuprim.core.render.cuda.frame import Frame, as_arrays
 from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, project_primitive, view_of, whiten
 from neuprim.core.render.layout import E0, EX, EY, XA
 
-__all__ = ["prepare_backward", "quaternion_gradient"]
-
 d, f = wp.float64, wp.float32
 _E0, _EX, _EY, _XA = E0, EX, EY, XA
 _G_OFFSET, _G_LOG_M, _G_WEIGHT, _G_NEURONS, _PER_NEURON = L.G_OFFSET, L.G_LOG_M, L.G_WEIGHT, L.G_NEURONS, L.PER_NEURON

@@ -8,18 +8,6 @@ the numbers are.
 from neuprim.core.compute.warp import OPTIONS, wp
 from neuprim.core.render.limits import ANCHOR_RADII
 
-__all__ = [
-    "EXACT",
-    "PER_BLOCK",
-    "ProjectedPrimitive",
-    "Ray",
-    "View",
-    "project_primitive",
-    "rounded",
-    "view_of",
-    "whiten",
-]
-
 EXACT = {**OPTIONS, "fuse_fp": False}
 """Options of the per-primitive kernels: every product is rounded, so that two kernels that count the same tiles, and
 the CPU, agree."""

@@ -14,8 +14,6 @@ from typing import Any
 
 from neuprim.core.compute.warp import wp
 
-__all__ = ["BANDS", "COSINE", "TAU", "band_of", "cos_turns", "opacity", "sin_turns"]
-
 TAU = 2.0 * math.pi
 
 COSINE = (

@@ -20,8 +20,6 @@ from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.reference.rays import Rays, frame_rays
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["render"]
-
 _BLOCK = 32  # pixels on a side; bounds memory, changes nothing
 
 

@@ -14,8 +14,6 @@ from neuprim.core.cameras import Camera
 from neuprim.core.cameras.projections import AnyCamera, RayCamera
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 
-__all__ = ["FrameRays", "Rays", "frame_rays", "pixel_directions", "screen_boxes"]
-
 
 @dataclass(frozen=True)
 class Rays:

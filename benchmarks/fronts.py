@@ -23,8 +23,9 @@ from shared.tables import ROOT, Table, between_markers
 
 from neuprim.core.compute.threads import cpu_name
 from neuprim.core.io.files import write_json
-from neuprim.search.design.run import DesignRequest, design_run
-from neuprim.search.tradeoff.run import seconds_of
+from neuprim.search.ablation import run_ablation
+from neuprim.search.ablation_folder import AblationRequest
+from neuprim.search.render_tradeoff import parse_budget
 
 VIEWS = 25
 """Held-out views, evenly spread: as many as the chair has."""
@@ -97,7 +98,7 @@ def measure(name: str, data: Path | None, out: Path) -> dict[str, Any]:
     scene = SCENES[name]
     where = [] if data is None else [f"{scene.data}={data.resolve()}"]
     words = [*scene.words, *where, "renderer.threads=1", f"output_dir={(out / name).resolve()}"]
-    _, record = design_run(DesignRequest(words, seconds_of(scene.budget), VIEWS, knobs=scene.knobs), print)
+    _, record = run_ablation(AblationRequest(words, parse_budget(scene.budget), VIEWS, knobs=scene.knobs), print)
     whole = record.to_dict()
     shown = [
         {key: point[key] for key in KEYS} | {"psnr": point["quality"]["psnr"], "ssim": point["quality"]["ssim"]}

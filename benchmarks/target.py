@@ -12,6 +12,8 @@ smallest that has the target, both stored at the usual level. *first full run* i
 alone, and what it had; *stored* what the
 model has, pruned and in as few bits as still meet the target; *bytes* are of that.
 
+tests/search/test_size_search.py replays the decisions of a search on the recorded grids in a second.
+
 It is a reduced comparison: half of the presets' views, one thread, some minutes of one core a search. Trainings are
 kept in --work, so that a benchmark that is cut short goes on; --grid trains the grid alone. Results go to
 benchmarks/results/target.json; --docs puts the tables between the markers of docs/tradeoffs.md, --print runs nothing.
@@ -39,9 +41,8 @@ from neuprim.core.compute.threads import cpu_name
 from neuprim.core.io.files import write_json
 from neuprim.runs.events import Event, Note
 from neuprim.runs.open import load_dataset
-from neuprim.search.target import target_run
-from neuprim.search.target.run import hold_out
-from neuprim.search.target.trying import VIEWS
+from neuprim.search.target import choose_hold_out, run_target
+from neuprim.search.trial_runner import VIEWS
 from neuprim.search.trials import Trial, run_trial
 
 RESULTS = Path(__file__).parent / "results" / "target.json"
@@ -135,7 +136,7 @@ def searched(name: str, where: Sequence[str], work: Path, seed: int) -> list[dic
     for psnr in scene.targets:
         out = work / f"{name}-{psnr:g}-{seed}"
         config = compose([*words(name, where, out), f"model.primitives={scene.start}", f"seed={seed}"])
-        record = target_run(config, Target(psnr=psnr), scene.budget, tell)
+        record = run_target(config, Target(psnr=psnr), scene.budget, tell)
         full = [a for a in record.attempts if a.purpose == "full"]
         chosen = next(a for a in full if a.folder == record.chosen)
         runs.append(
@@ -147,10 +148,10 @@ def searched(name: str, where: Sequence[str], work: Path, seed: int) -> list[dic
                 "primitives": chosen.count,
                 "words": chosen.words,
                 "predicted": chosen.predicted["psnr"],
-                "first": [full[0].predicted["psnr"], full[0].quality("psnr")],
+                "first": [full[0].predicted["psnr"], full[0].measured("psnr")],
                 "full_runs": len(full),
                 "trials": len(record.attempts) - len(full),
-                "held_out": chosen.quality("psnr"),
+                "held_out": chosen.measured("psnr"),
                 "held_out_stored": record.achieved["held_out"]["psnr"],
                 "test_stored": record.achieved["test"]["psnr"],
                 "bytes_usual": chosen.packed,
@@ -171,7 +172,7 @@ def gridded(name: str, where: Sequence[str], work: Path) -> dict[str, Any]:
             config = compose([*words(name, where, out), f"model.primitives={size}", *([less] if less else [])])
             task = task_of(config)
             dataset = dataset or load_dataset(config, task)
-            every = hold_out(dataset)
+            every = choose_hold_out(dataset)
             outcome = run_trial(Trial(config, every, VIEWS), dataset)
             model, _ = load_model(out / "model.safetensors", task)
             packed, text = out / "packed.neuprim", (out / "config.yaml").read_text(encoding="utf-8")

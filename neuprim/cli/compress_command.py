@@ -33,12 +33,13 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _compress(args: argparse.Namespace) -> int:
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import LineProgress
-    from neuprim.search.compress import compress_run
+    from neuprim.search.compress import CompressRequest, compress_run
 
     progress = LineProgress(plain_console(stderr=True))
-    made = compress_run(
-        args.run_dir, args.level, args.bits, args.out, args.force, progress, args.seconds, args.steps, args.tolerance
+    request = CompressRequest(
+        args.run_dir, args.level, args.bits, args.out, args.force, args.seconds, args.steps, args.tolerance
     )
+    made = compress_run(request, progress)
     print_compression(made)
     return 0
 

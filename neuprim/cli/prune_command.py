@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from neuprim.cli.command import Command, parse_decibels, parse_seconds, parse_whole
 
 if TYPE_CHECKING:
-    from neuprim.search.prune.run import Pruning
+    from neuprim.search.pruning import Pruning
 
 __all__ = ["COMMAND"]
 
@@ -35,9 +35,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _prune(args: argparse.Namespace) -> int:
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
-    from neuprim.search.prune.run import Request, prune_run
+    from neuprim.search.pruning import PruneRequest, prune_run
 
-    request = Request(args.run_dir, args.tolerance, args.seconds, args.steps, args.out, args.force)
+    request = PruneRequest(args.run_dir, args.tolerance, args.seconds, args.steps, args.out, args.force)
     with DrawProgress(plain_console(stderr=True)) as progress:
         made = prune_run(request, progress.show)
     _report(made, args.tolerance)

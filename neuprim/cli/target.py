@@ -14,9 +14,9 @@ from neuprim.config.launcher import LauncherSettings
 from neuprim.config.overrides import CommandLine
 from neuprim.config.target import Target
 from neuprim.runs.events import Event, Note, Step
-from neuprim.search.target import Record, target_run
-from neuprim.search.target.record import FILE
-from neuprim.search.target.words import promised
+from neuprim.search.size_predictor import format_forecast
+from neuprim.search.target import run_target
+from neuprim.search.target_record import TARGET_FILE, TargetRecord
 
 __all__ = ["fit_target", "print_record"]
 
@@ -36,7 +36,7 @@ def fit_target(config: RunConfig, target: Target, budget: float, launcher: Launc
     console = plain_console(stderr=True)
     try:
         with _Searching(console, f"{config.task}/{config.scene_name}") as events:
-            record = target_run(config, target, budget, events, launcher=launcher)
+            record = run_target(config, target, budget, events, launcher=launcher)
     except KeyboardInterrupt:
         command = shlex.join(["neuprim", "run", *typed.resume_arguments(config.output_dir)])
         raise KeyboardInterrupt(f"; {config.output_dir} has the trials up to here; to go on:\n  {command}") from None
@@ -45,7 +45,7 @@ def fit_target(config: RunConfig, target: Target, budget: float, launcher: Launc
     return 0
 
 
-def print_record(record: Record, console: Console) -> None:
+def print_record(record: TargetRecord, console: Console) -> None:
     """What was predicted and achieved, and why it ended."""
 
     def line(text: str) -> None:
@@ -53,7 +53,7 @@ def print_record(record: Record, console: Console) -> None:
 
     found = record.achieved
     for name, (value, doubt) in found["predicted"].items():
-        text = f"predicted {promised(name, value, doubt)}; held out {found['held_out'][name]:.4g}"
+        text = f"predicted {format_forecast(name, value, doubt)}; held out {found['held_out'][name]:.4g}"
         line(f"{text}; test views {found['test'][name]:.4g}, {found['test_before_storing'][name]:.4g} before storing")
     whole = Path(found["run_dir"]) / "model.safetensors"
     line(
@@ -64,4 +64,4 @@ def print_record(record: Record, console: Console) -> None:
         line(f"ended: {why}")
     if record.warning:
         line(f"neuprim: warning: {record.warning}")
-    line(f"everything that was tried: {FILE}")
+    line(f"everything that was tried: {TARGET_FILE}")

@@ -1,4 +1,4 @@
-"""``neuprim tradeoff``: what speed and size cost in accuracy, of a finished run."""
+"""``neuprim tradeoff``: measure what speed and size cost in accuracy, of a finished run or of trained models."""
 
 from __future__ import annotations
 
@@ -14,32 +14,34 @@ from neuprim.core.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from neuprim.search.tradeoff.record import Measured, Record
+    from neuprim.search.points import Point, Record
 
-__all__ = ["COMMAND", "of_words"]
+__all__ = ["COMMAND", "is_override"]
 
 _USAGE = """\
 neuprim tradeoff RUN_DIR | KEY=VALUE ... [KEY=VALUE ...] [--views N] [--repeats N] [--knobs NAME ...] [--budget TIME]
                        [--seeds N] [--lpips FILE]"""
 _FORMS = """\
-neuprim tradeoff RUN_DIR measures the knobs of drawing on a finished run.
+neuprim tradeoff RUN_DIR measures the settings of rendering on a finished run.
 neuprim tradeoff task=NAME scene=NAME budget=20m [KEY=VALUE ...] [output_dir=DIR]
-  trains a designed set of models around the one that these words of `neuprim run` name, and measures them side by side.
+  trains a designed set of models around the one of these overrides of `neuprim run`, and measures them together.
 
 After RUN_DIR, """
 
+_FILES = ("tradeoff.json", "tradeoff.csv", "tradeoff.html", "front.png")
 
-def of_words(first: str) -> bool:
-    """Whether the first argument is a word of ``neuprim run`` and not a run's directory."""
+
+def is_override(first: str) -> bool:
+    """Return whether the first argument is an override of ``neuprim run`` and not a run directory."""
     return "=" in first and not Path(first).exists()
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.usage = _USAGE
     add_trust_flag(parser)
-    parser.add_argument("run_dir", metavar="RUN_DIR|KEY=VALUE", help="a finished run, or words of `neuprim run`")
+    parser.add_argument("run_dir", metavar="RUN_DIR|KEY=VALUE", help="a finished run, or overrides of `neuprim run`")
     parser.add_argument(
-        "--views", type=parse_count, default=5, metavar="N", help="held-out views, evenly spread (default: 5)"
+        "--views", type=parse_count, default=5, metavar="N", help="test views, evenly spread (default: 5)"
     )
     parser.add_argument("--repeats", type=parse_count, default=15, metavar="N", help="rounds of timing (default: 15)")
     parser.add_argument(
@@ -57,7 +59,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _take_rest(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    if of_words(arguments.run_dir):
+    if is_override(arguments.run_dir):
         arguments.words = [word for word in rest if not word.startswith("-")]
         return [word for word in rest if word.startswith("-") and word != "--"]
     arguments.words, rest = split_render_overrides(rest)
@@ -65,76 +67,112 @@ def _take_rest(arguments: argparse.Namespace, rest: list[str], parser: argparse.
 
 
 def _tradeoff(args: argparse.Namespace) -> int:
-    if of_words(args.run_dir):
-        from neuprim.cli.tradeoff_models import tradeoff_models
-
-        return tradeoff_models(args)
-    args.run_dir = Path(args.run_dir)
-    check_run_directory(args.run_dir)
-    return _tradeoff_of_run(args)
+    args.words += [word for word in args.knobs if "=" in word]  # overrides after --knobs look like names
+    args.knobs = [word for word in args.knobs if "=" not in word]
+    return _compare_models(args) if is_override(args.run_dir) else _compare_rendering(args)
 
 
-def _tradeoff_of_run(args: argparse.Namespace) -> int:
-    """Measure, write RUN_DIR/tradeoff and print the fronts."""
+def _compare_rendering(args: argparse.Namespace) -> int:
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
-    from neuprim.search.tradeoff.record import command
-    from neuprim.search.tradeoff.run import FOLDER, Request, seconds_of, tradeoff_run
+    from neuprim.search.points import TRADEOFF_FOLDER
+    from neuprim.search.render_tradeoff import (
+        TradeoffRequest,
+        format_render_command,
+        measure_tradeoff,
+        parse_budget,
+    )
 
-    words = [*args.words, *(word for word in args.knobs if "=" in word)]  # after --knobs they look like names
-    knobs = [word for word in args.knobs if "=" not in word]
+    run_dir, views, repeats = Path(args.run_dir), args.views, args.repeats
+    check_run_directory(run_dir)
     if args.seeds is not None:
-        raise ConfigError(
-            "--seeds: of models that are trained (neuprim tradeoff task=NAME ...); a finished run has one"
-        )
-    request = Request(args.run_dir, args.views, args.repeats, knobs, seconds_of(args.budget or "5m"), words, args.lpips)
-    folder = args.run_dir / FOLDER
+        raise ConfigError("--seeds: of models that are trained (neuprim tradeoff task=NAME ...); a run has one")
+    budget = parse_budget(args.budget or "5m")
+    request = TradeoffRequest(run_dir, views, repeats, args.knobs, budget, args.words, args.lpips)
+    folder = run_dir / TRADEOFF_FOLDER
     try:
         with DrawProgress(plain_console(stderr=True)) as progress:
-            record = tradeoff_run(request, progress.note, progress.show)
+            record = measure_tradeoff(request, progress.note, progress.show)
     except KeyboardInterrupt:
         if not (folder / "tradeoff.json").exists():
             raise
-        raise KeyboardInterrupt(
-            f"; {folder / 'tradeoff.json'} has the points up to here; the same command goes on"
-        ) from None
-    console = plain_console()
-    for title, numbers in (("front of speed", record.speed), ("front of size", record.size)):
-        console.print(_table(title, record, numbers))
-        for place, number in enumerate(numbers, 1):
-            console.print(f"{command(str(args.run_dir), record.points[number].words)}  # {place}")
-        console.print()
-    for name in ("tradeoff.json", "tradeoff.csv", "tradeoff.html", "front.png"):
-        console.print(folder / name)
+        kept = f"; {folder / 'tradeoff.json'} has the points up to here; the same command goes on"
+        raise KeyboardInterrupt(kept) from None
+    commands = [format_render_command(str(run_dir), point.words) for point in record.points]
+    _print_fronts(folder, record, commands)
     return 0
 
 
-def _table(title: str, record: Record, numbers: Sequence[int]) -> Table:
-    """The reference, and the points of a front under the numbers that their commands have."""
+def _compare_models(args: argparse.Namespace) -> int:
+    from neuprim.cli.console import plain_console
+    from neuprim.cli.progress import DrawProgress
+    from neuprim.config.launcher import take_launcher
+    from neuprim.config.overrides import parse
+    from neuprim.search.ablation import format_run_command, run_ablation
+    from neuprim.search.ablation_folder import AblationRequest
+    from neuprim.search.render_tradeoff import parse_budget
+
+    launcher, words = take_launcher([args.run_dir, *args.words])
+    said = [str(a.value) for a in parse(words) if a.key == "budget"]
+    if said and args.budget is not None:
+        raise ConfigError(f"budget={said[-1]} and --budget {args.budget}: expected one of them")
+    budget = parse_budget(said[-1], "budget=") if said else parse_budget(args.budget or "20m")
+    seeds = args.seeds or 1
+    request = AblationRequest(words, budget, args.views, args.repeats, args.knobs, seeds, args.lpips, launcher)
+    try:
+        with DrawProgress(plain_console(stderr=True)) as progress:
+            folder, record = run_ablation(request, progress.note, progress.show)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("; what is trained is kept, and the same command goes on") from None
+    _print_fronts(folder, record, [format_run_command(point.words) for point in record.points])
+    return 0
+
+
+def _print_fronts(folder: Path, record: Record, commands: Sequence[str]) -> None:
+    from neuprim.cli.console import plain_console
+
+    console = plain_console()
+    if "length" in record.facts:
+        console.print(record.facts["length"], markup=False)
+    for title, numbers in (("front of speed", record.speed), ("front of size", record.size)):
+        console.print(_build_table(title, record, numbers))
+        for place, number in enumerate(numbers, 1):
+            console.print(f"{commands[number]}  # {place}", markup=False)
+        console.print()
+    if record.points[0].run_dir:
+        for one in record.left_out:
+            console.print(f"left out: {' '.join(one.words) or one.knob}: {one.reason}", markup=False)
+    for name in _FILES:
+        console.print(folder / name)
+
+
+def _build_table(title: str, record: Record, numbers: Sequence[int]) -> Table:
+    """Build the table of the reference and a front; the numbers are those of the commands."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
+    trained = bool(record.points[0].run_dir)
     table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
-    for name in ("#", "time", "ms", "frames/s", "PSNR", "SSIM", "exact", "bytes", "MB"):
+    names = ["#", "time", "ms", "frames/s", "PSNR", "SSIM", "exact", "bytes", "MB", *(["ms/step"] if trained else [])]
+    for name in names:
         table.add_column(name, justify="right", no_wrap=True)
-    for place, number in (("ref.", 0), *((str(k), number) for k, number in enumerate(numbers, 1))):
-        table.add_row(*(Text(cell) for cell in (place, *_cells(record.points[number]))))
+    first = "centre" if trained else "ref."
+    for place, number in ((first, 0), *((str(k), number) for k, number in enumerate(numbers, 1))):
+        table.add_row(*(Text(cell) for cell in (place, *_format_cells(record.points[number]))))
     return table
 
 
-def _cells(point: Measured) -> tuple[str, ...]:
+def _format_cells(point: Point) -> tuple[str, ...]:
     q = point.quality
     about = "" if point.spread is None else f" ± {point.spread:.3f}"
-    return (
-        *(
-            (f"{point.ratio:.3f}{about}", f"{point.time:.2f}", f"{1e3 / point.time:.1f}")
-            if point.ms
-            else ("–", "–", "–")
-        ),
-        *(f"{q['psnr']:.2f}", f"{q['ssim']:.4f}", f"{q['psnr_exact']:.1f}", f"{point.bytes:,}"),
-        "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e6:.1f}",
-    )
+    seeds = "" if point.seed_spread is None else f" ± {point.seed_spread:.2f}"
+    times = ("–", "–", "–")
+    if point.ms:
+        times = (f"{point.ratio:.3f}{about}", f"{point.time:.2f}", f"{1e3 / point.time:.1f}")
+    memory = "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e6:.1f}"
+    quality = (f"{q['psnr']:.2f}{seeds}", f"{q['ssim']:.4f}", f"{q['psnr_exact']:.1f}")
+    return (*times, *quality, f"{point.bytes:,}", memory, *([f"{point.ms_per_step:.1f}"] if point.run_dir else []))
 
 
 COMMAND = Command(

@@ -1,14 +1,12 @@
-"""The page of ``neuprim tradeoff``: charts with the front marked, pictures of its points side by side, and every
-point's numbers."""
+"""The page of ``neuprim tradeoff``: fronts, pictures of their points, and the numbers of all points."""
 
 from __future__ import annotations
 
 import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,23 +19,30 @@ from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
 from neuprim.report.page import escape, format_bytes, format_count, format_decimal, section
 from neuprim.report.pictures import Inlined, color_bar, error_map, inline
 
-__all__ = ["DIFFERENCE", "Page", "Picture", "write_page", "write_tradeoff"]
+__all__ = ["Picture", "write_tradeoff"]
 
-DIFFERENCE = 0.05
-"""Difference from the reference point at the bright end of its colours."""
-
-TIME = "time of a frame, as a multiple of the reference’s"
-
-SLOWEST = 12.0
+_SLOWEST = 12.0
 """Multiples of the reference's time beyond which points are off the charts."""
 
 
-@dataclass(frozen=True)
-class Picture:
-    """What a point shows: (H, W, 3) sRGB values, and those of the reference point that it is compared with, if any."""
+class Picture(NamedTuple):
+    """Displayed image of a point, (H, W, 3) sRGB, and the image that it is compared with (None: not compared)."""
 
     image: Tensor
     against: Tensor | None
+
+
+class _Texts(NamedTuple):
+    """What differs between pages of a finished run and of trained models."""
+
+    eyebrow: str
+    reference: str
+    compared_with: str
+    difference: float
+
+
+_RENDERED = _Texts("speed and accuracy of a finished run", "the reference", "the reference’s", 0.05)
+_TRAINED = _Texts("trade-offs of trained models", "the centre", "the ground truth", 0.2)
 
 
 def write_tradeoff(
@@ -46,22 +51,18 @@ def write_tradeoff(
     """Write ``tradeoff.html`` and ``front.png`` into ``folder``.
 
     Args:
-        record: content of ``tradeoff.json``.
-        pictures: of points by their number in it; -1 is the ground truth.
-        command: the words of a point -> the command that draws it, ready to paste.
+        record: content of ``tradeoff.json``, of a finished run or of trained models.
+        pictures: number of a point -> its picture; -1 is the ground truth.
+        command: overrides of a point -> the command that draws or trains it.
     """
-    write_page(folder, Page(record, pictures, command))
-
-
-def write_page(folder: Path, page: Page) -> None:
-    """Write ``tradeoff.html`` and ``front.png`` into ``folder``."""
-    title = f"{page.record['task']} / {page.record['scene']} – speed and accuracy"
+    page = _Page(record, pictures, command)
+    title = f"{record['task']} / {record['scene']} – speed and accuracy"
     sections = [
         page.heading(),
-        page.headline(),
+        page.tiles(),
         page.charts(),
-        page.speed(),
-        page.size(),
+        page.cards("speed", "The front of speed", "Each is faster than all that are as good."),
+        page.cards("size", "The front of size", "Each is smaller than all that are as good."),
         page.table(),
         page.left_out(),
         page.facts(),
@@ -70,24 +71,20 @@ def write_page(folder: Path, page: Page) -> None:
     write_text(folder / "tradeoff.html", elements.render_page(title, sections, "compared"))
 
 
-class Page:
-    """What both pages of `neuprim tradeoff` have; texts are those of a finished run's drawing."""
-
+class _Page:
     def __init__(
         self, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Callable[[Sequence[str]], str]
     ) -> None:
-        self.record, self.points, self.command = record, record["points"], command
-        self.front_of: dict[str, list[int]] = {name: list(record["front"][name]) for name in ("speed", "size")}
-        self.pictures = pictures
-
-    eyebrow, reference_is, time_is = "speed and accuracy of a finished run", "the reference", TIME
-    difference = DIFFERENCE
+        self.record, self.points, self.pictures, self.command = record, record["points"], pictures, command
+        self.front: dict[str, list[int]] = {name: list(record["front"][name]) for name in ("speed", "size")}
+        self.trained = bool(self.points[0].get("run_dir"))
+        self.texts = _TRAINED if self.trained else _RENDERED
 
     # ------------------------------------------------------------ numbers
 
     def quality(self, number: int, name: str = "psnr") -> float:
-        found = from_json(self.points[number]["quality"], name)
-        return math.nan if found is None else found
+        value = from_json(self.points[number]["quality"], name)
+        return math.nan if value is None else value
 
     def ratio(self, number: int) -> float:
         return float(self.points[number].get("time_ratio", math.nan))
@@ -96,100 +93,91 @@ class Page:
         return float(self.points[number].get("time_ratio_spread") or 0.0)
 
     def name(self, number: int) -> str:
+        if self.trained:
+            return str(self.points[number]["name"])
         words = self.points[number]["words"]
         return " ".join(word.removeprefix("renderer.") for word in words) or "as the run draws"
 
-    def lost(self, number: int) -> str:
+    def gain(self, front: str, number: int) -> str:
+        if front == "speed":
+            return f"{1 / self.ratio(number):.2f}× as fast"
+        return f"{self.points[0]['bytes'] / self.points[number]['bytes']:.2f}× smaller"
+
+    def change(self, number: int) -> str:
         change = self.quality(number) - self.quality(0)
         return f"{'+' if change >= 0.005 else '−' if change <= -0.005 else '±'}{abs(change):.2f} dB"
 
     # ------------------------------------------------------------ sections
 
     def heading(self) -> str:
-        r, mark = self.record, ""
+        r, more = self.record, ""
         if r["data_source"] != "real":
-            mark = elements.badge(f"{r['data_source']} data")
-        return elements.masthead(self.eyebrow, f"{r['task']} / {r['scene']}", mark + self.remark())
+            more = elements.badge(f"{r['data_source']} data")
+        if self.trained:
+            more += f'\n<p class="note">{escape(r["length"])}</p>'
+        return elements.masthead(self.texts.eyebrow, f"{r['task']} / {r['scene']}", more)
 
-    def remark(self) -> str:
-        """HTML below the heading."""
-        return ""
-
-    def headline(self) -> str:
+    def tiles(self) -> str:
         base = self.points[0]
-        size, unit = format_bytes(base["bytes"])
+        (size, unit), count = format_bytes(base["bytes"]), base.get("primitives") or self.record.get("primitives")
         tiles = [
-            ("As compared with", format_decimal(base.get("ms_per_frame"), 2), "ms a frame", escape(self.name(0))),
-            ("PSNR", format_decimal(self.quality(0), 2), "dB", f"{len(self.record['same']['views'])} held-out views"),
-            ("Model file", size, unit, f"{format_count(self.record['primitives'])} primitives"),
-            *self._within("speed", "Fastest", lambda i: f"{1 / self.ratio(i):.2f}"),
-            *self._within("size", "Smallest", lambda i: f"{base['bytes'] / self.points[i]['bytes']:.2f}"),
+            (self.texts.reference, format_decimal(base.get("ms_per_frame"), 2), "ms a frame", escape(self.name(0))),
+            ("PSNR", format_decimal(self.quality(0), 2), "dB", f"{len(self.record['same']['views'])} test views"),
+            ("Model file", size, unit, f"{format_count(count)} primitives"),
         ]
+        for front, label in (("speed", "Fastest"), ("size", "Smallest")):
+            good = [i for i in self.front[front] if self.quality(i) >= self.quality(0) - 0.1]
+            if good:
+                value, _, what = self.gain(front, good[-1]).partition("×")
+                tiles.append((f"{label} within 0.1 dB", value, f"times{what}", escape(self.name(good[-1]))))
         return elements.tiles(tiles, lead=range(3, len(tiles)))
 
-    def _within(self, front: str, label: str, value: Any) -> list[tuple[str, str, str, str]]:
-        """The last point of a front that loses at most a tenth of a decibel."""
-        good = [i for i in self.front_of[front] if self.quality(i) >= self.quality(0) - 0.1]
-        if not good:
-            return []
-        what = "times as fast" if front == "speed" else "times smaller"
-        return [(f"{label} within 0.1 dB", value(good[-1]), what, escape(self.name(good[-1])))]
-
     def fronts(self) -> list[Chart]:
-        """Quality against time and against bytes; the latter of points that are smaller, or the reference."""
-        bytes_of = [float(p["bytes"]) for p in self.points]
-        smaller = [i for i in range(len(self.points)) if i == 0 or bytes_of[i] < bytes_of[0]]
-        in_time = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr")
-        in_bytes = self._dots("size", smaller, lambda i: bytes_of[i], lambda i: 0.0, "psnr")
+        """Return PSNR against time and against bytes; of a finished run the latter of smaller points alone."""
+        numbers, bytes_of = range(len(self.points)), [float(p["bytes"]) for p in self.points]
+        sized = [i for i in numbers if self.trained or i == 0 or bytes_of[i] < bytes_of[0]]
+        dots = [Dot(bytes_of[i], self.quality(i), 0.0, self._mark("size", i), i == 0) for i in sized]
         return [
-            front_chart("PSNR against time", self.time_is, "PSNR, dB", in_time, most=SLOWEST),
-            front_chart("PSNR against size", "bytes of the model file", "PSNR, dB", in_bytes),
+            self._time_chart("PSNR against time", "psnr", True),
+            front_chart("PSNR against size", "bytes of the model file", "PSNR, dB", dots),
         ]
 
-    def _dots(
-        self,
-        front: str,
-        numbers: Sequence[int],
-        cost: Callable[[int], float],
-        spread: Callable[[int], float],
-        good: str,
-    ) -> list[Dot]:
-        place = {number: str(k + 1) for k, number in enumerate(self.front_of[front])}
-        return [Dot(cost(i), self.quality(i, good), spread(i), place.get(i), i == 0) for i in numbers]
+    def _time_chart(self, title: str, quality: str, joined: bool) -> Chart:
+        dots = [
+            Dot(self.ratio(i), self.quality(i, quality), self.spread(i), self._mark("speed", i), i == 0)
+            for i in range(len(self.points))
+        ]
+        axis = f"time of a frame, as a multiple of that of {self.texts.reference}"
+        return front_chart(title, axis, "PSNR, dB", dots, joined=joined, most=math.inf if self.trained else _SLOWEST)
+
+    def _mark(self, front: str, number: int) -> str | None:
+        return str(self.front[front].index(number) + 1) if number in self.front[front] else None
 
     def charts(self) -> str:
-        near = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr_exact")
-        more = [
-            front_chart("PSNR against the exact image", self.time_is, "dB", near, joined=False, most=SLOWEST),
-            *self._marching(),
-        ]
-        panels = elements.chart_panels(
-            [(f"{escape(chart.title)}, dB", chart) for chart in [*self.fronts(), *more]], "charts"
-        )
+        charts = [*self.fronts(), self._time_chart("PSNR against the exact image", "psnr_exact", False)]
         note = (
-            '<p class="note">Ringed: the reference. Orange and numbered: the front. Bars: half the range between the quartiles of all rounds.'
-            f"{self._march_note()}</p>"
+            f"Ringed: {self.texts.reference}. Orange and numbered: the front. Bars: half of the interquartile range of "
+            "all rounds."
         )
-        return section("Fronts", f"{panels}{note}")
+        if self.trained:
+            note += " Trainings with another seed differ by some hundredths to tenths of a decibel."
+        else:
+            note += self._march_note()
+            charts += self._march_charts()
+        panels = elements.chart_panels([(f"{escape(chart.title)}, dB", chart) for chart in charts], "charts")
+        return section("Fronts", f'{panels}<p class="note">{note}</p>')
 
-    def _marching(self) -> list[Chart]:
+    def _march_charts(self) -> list[Chart]:
         rows = self.record["marching"].get("rows", [])
         if not rows:
             return []
-        closed = rows[0]["seconds"]
         dots = [
-            Dot(row["seconds"] / closed, row["psnr"], 0.0, str(row["samples"]))
+            Dot(row["seconds"] / rows[0]["seconds"], row["psnr"], 0.0, str(row["samples"]))
             for row in rows[1:]
             if row["psnr"] is not None
         ]
-        return [
-            front_chart(
-                "Sampled chords against the closed form",
-                "time of the integrals, as a multiple of the closed form's",
-                "dB",
-                dots,
-            )
-        ]
+        axis = "time of the integrals, as a multiple of the closed form's"
+        return [front_chart("Sampled chords against the closed form", axis, "dB", dots)]
 
     def _march_note(self) -> str:
         marching = self.record["marching"]
@@ -197,140 +185,108 @@ class Page:
             return f" Sampling of chords: not measured, {escape(marching.get('not_measured'))}."
         width, height = marching["image_size"]
         return (
-            f" Sampled chords: n midpoint samples on each of {format_count(marching['chords'])} chords of an image of {width}×{height}, in float64 torch; "
-            "numbers are n, and the closed form takes 1."
+            f" Sampled chords: n midpoint samples on each of {format_count(marching['chords'])} chords of an image of "
+            f"{width}×{height}, in float64; the numbers are n."
         )
 
-    def speed(self) -> str:
-        note = "Each is faster than all that are as good. Beside the picture: its difference from the reference’s."
-        return self._cards("The front of speed", note, "speed", lambda i: f"{1 / self.ratio(i):.2f}× as fast")
-
-    def size(self) -> str:
-        base = self.points[0]["bytes"]
-        note = "Each is smaller than all that are as good; bytes are those of a model file that stores it so."
-        return self._cards(
-            "The front of size", note, "size", lambda i: f"{base / self.points[i]['bytes']:.2f}× smaller"
-        )
-
-    def _cards(self, title: str, note: str, front: str, gain: Any) -> str:
-        cards = [self._card(None, -1, "ground truth", "")] if -1 in self.pictures else []
-        if 0 not in self.front_of[front]:
-            cards.append(self._card(None, 0, self.name(0), self.reference_is))
-        for k, number in enumerate(self.front_of[front]):
-            cards.append(self._card(k + 1, number, self.name(number), gain(number)))
-        ticks = f'<p class="note">Difference: 0<span class="bar" style="background: {color_bar()}"></span>{self.difference:g} or more.</p>'
+    def cards(self, front: str, title: str, note: str) -> str:
+        """Return a card with picture, numbers and command for every point of a front."""
+        cards = [self._card(-1, "ground truth", "")] if -1 in self.pictures else []
+        if 0 not in self.front[front]:
+            cards.append(self._card(0, escape(self.name(0)), self.texts.reference))
+        for place, number in enumerate(self.front[front], 1):
+            cards.append(self._card(number, f"{place}. {escape(self.name(number))}", self.gain(front, number)))
+        bar = f'<span class="bar" style="background: {color_bar()}"></span>'
+        ticks = f'<p class="note">Difference: 0{bar}{self.texts.difference:g} or more.</p>'
+        note = f"{note} Beside the picture: its difference from {self.texts.compared_with}."
         return section(title, f'<p class="note">{note}</p>{ticks}<div class="points">{"".join(cards)}</div>')
 
-    def _card(self, place: int | None, number: int, name: str, gain: str) -> str:
-        head = f"{place}. {escape(name)}" if place else escape(name)
-        html = f'<article class="point"><header><span class="gain">{gain}</span><h3>{head}</h3></header>'
+    def _card(self, number: int, heading: str, gain: str) -> str:
+        html = f'<article class="point"><header><span class="gain">{gain}</span><h3>{heading}</h3></header>'
         if number in self.pictures:
-            html += self._pair(self.pictures[number], name)
+            html += self._pair(self.pictures[number], "ground truth" if number < 0 else self.name(number))
         if number < 0:
             return html + "</article>"
         point, (size, unit) = self.points[number], format_bytes(self.points[number]["bytes"])
-        numbers = (
-            f"{format_decimal(self.quality(number), 2)} dB ({self.lost(number)}), SSIM {format_decimal(self.quality(number, 'ssim'), 4)}; "
-            f"{format_decimal(point.get('ms_per_frame'), 2)} ms, {format_decimal(point.get('frames_per_second'), 1)} frames/s; {size} {unit}"
-        )
+        quality = f"{format_decimal(self.quality(number), 2)} dB ({self.change(number)})"
+        ssim = format_decimal(self.quality(number, "ssim"), 4)
+        ms, rate = format_decimal(point.get("ms_per_frame"), 2), format_decimal(point.get("frames_per_second"), 1)
+        numbers = f"{quality}, SSIM {ssim}; {ms} ms, {rate} frames/s; {size} {unit}"
         return f"{html}<p>{numbers}</p><code>{escape(self.command(point['words']))}</code></article>"
 
     def _pair(self, picture: Picture, name: str) -> str:
-        images = [picture.image]
+        images = [(picture.image, escape(name))]
         if picture.against is not None:
-            images.append(torch.from_numpy(error_map(picture.image, picture.against, self.difference)).float() / 255)
-        drawn = [_inlined(image) for image in images]
-        captions = (escape(name), f"difference of {escape(name)}")
-        figures = [
-            elements.picture(one, "", text) for one, text in zip(drawn, captions, strict=False) if one is not None
-        ]
+            error = error_map(picture.image, picture.against, self.texts.difference)
+            images.append((torch.from_numpy(error).float() / 255, f"difference of {escape(name)}"))
+        figures = [elements.picture(_inline_image(image), "", text) for image, text in images]
         return f'<div class="pair">{"".join(figures)}</div>'
 
     def table(self) -> str:
-        head = "".join(
-            f"<th>{title}</th>"
-            for title in (
-                "point",
-                "time",
-                "±",
-                "ms",
-                "frames/s",
-                "PSNR",
-                "change",
-                "SSIM",
-                "against exact, dB",
-                "bytes",
-                "memory, MB",
-                "rounds",
-            )
+        columns: dict[str, Callable[[int, Mapping[str, Any]], str]] = {
+            "PSNR": lambda i, p: format_decimal(self.quality(i), 3),
+            "change": lambda i, p: self.change(i),
+            "SSIM": lambda i, p: format_decimal(self.quality(i, "ssim"), 4),
+            "against exact, dB": lambda i, p: format_decimal(self.quality(i, "psnr_exact"), 1),
+            "time": lambda i, p: format_decimal(p.get("time_ratio"), 3),
+            "±": lambda i, p: format_decimal(self.spread(i), 3) if len(p["ratios"]) > 2 else elements.MISSING,
+            "ms": lambda i, p: format_decimal(p.get("ms_per_frame"), 2),
+            "frames/s": lambda i, p: format_decimal(p.get("frames_per_second"), 1),
+            "bytes": lambda i, p: format_count(p["bytes"]),
+            "memory, MB": lambda i, p: format_decimal(None if p["peak_bytes"] is None else p["peak_bytes"] / 1e6, 1),
+            "rounds": lambda i, p: format_count(len(p["ms"])),
+        }
+        if self.trained:
+            columns |= {
+                "primitives": lambda i, p: format_count(p["primitives"]),
+                "numbers each": lambda i, p: format_count(p["parameters_per_primitive"]),
+                "steps": lambda i, p: format_count(p["steps"]),
+                "ms a step": lambda i, p: format_decimal(p["ms_per_step"], 2),
+                "seconds": lambda i, p: format_decimal(p["seconds"], 1),
+            }
+        marked = set(self.front["speed"]) | set(self.front["size"])
+        rows = []
+        for i, point in enumerate(self.points):
+            cells = "".join(f"<td>{cell(i, point)}</td>" for cell in columns.values())
+            kind = ' class="front"' if i in marked else ""
+            rows.append(f"<tr{kind}><th scope=row>{escape(self.name(i))}</th>{cells}</tr>")
+        note = (
+            f'<p class="note">Time and ± are multiples of the time of {self.texts.reference} in the same round; orange: '
+            "on a front.</p>"
         )
-        marked = set(self.front_of["speed"]) | set(self.front_of["size"])
-        rows = "".join(self._row(i, i in marked) for i in range(len(self.points)))
-        table = f'<div class="scroll"><table class="numbers"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
-        note = '<p class="note">Time and ± are multiples of the reference’s of the same round; orange: on a front.</p>'
-        return section(f"All {format_count(len(self.points))} points", table + note)
-
-    def _row(self, i: int, marked: bool) -> str:
-        p = self.points[i]
-        peak = None if p["peak_bytes"] is None else p["peak_bytes"] / 1e6
-        cells = (
-            *(
-                format_decimal(p.get("time_ratio"), 3),
-                format_decimal(self.spread(i), 3) if len(p["ratios"]) > 2 else "–",
-            ),
-            *(format_decimal(p.get("ms_per_frame"), 2), format_decimal(p.get("frames_per_second"), 1)),
-            *(
-                format_decimal(self.quality(i), 3),
-                self.lost(i),
-                format_decimal(self.quality(i, "ssim"), 4),
-                format_decimal(self.quality(i, "psnr_exact"), 1),
-            ),
-            *(format_count(p["bytes"]), format_decimal(peak, 1), format_count(len(p["ms"]))),
-        )
-        kind = ' class="front"' if marked else ""
-        return (
-            f"<tr{kind}><th scope=row>{escape(self.name(i))}</th>"
-            + "".join(f"<td>{cell}</td>" for cell in cells)
-            + "</tr>"
-        )
+        title = f"All {format_count(len(self.points))} {'models' if self.trained else 'points'}"
+        return section(title, elements.number_table(["point", *columns], rows) + note)
 
     def left_out(self) -> str:
-        rows = "".join(
-            f"<tr><th scope=row>{escape(one['knob'])}</th><td>{escape(' '.join(one['words']))}</td><td>{escape(one['reason'])}</td></tr>"
-            for one in self.record["left_out"]
-        )
-        if not rows:
-            return ""
-        head = "<tr><th>knob</th><th>point</th><th>why</th></tr>"
-        return section(
-            "Not measured", f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
-        )
+        rows = []
+        for one in self.record["left_out"]:
+            cells = "".join(f"<td>{escape(text)}</td>" for text in (" ".join(one["words"]), one["reason"]))
+            rows.append(f"<tr><th scope=row>{escape(one['knob'])}</th>{cells}</tr>")
+        return section("Not measured", elements.number_table(("knob", "point", "why"), rows, "")) if rows else ""
 
     def facts(self) -> str:
         r, same = self.record, self.record["same"]
-        width, height = same["image_size"]
+        pairs = [("views", ", ".join(same["views"])), ("image size", "×".join(map(str, same["image_size"])))]
         exact = r.get("exact", {})
-        checked = (
-            ""
-            if exact.get("float64", True)
-            else (
-                f"; {format_decimal(exact['psnr_against_float64'], 0)} dB from float64 at {'×'.join(map(str, exact['checked_size']))}"
-            )
-        )
-        pairs = [
-            ("views", ", ".join(same["views"])),
-            ("image size", f"{width}×{height}"),
-            ("exact images", f"{exact.get('drawn_by', '–')}{checked}"),
-            ("backend", r["backend"]),
-            *((name, str(value)) for name, value in same["machine"].items()),
-            *((name, str(value)) for name, value in same["versions"].items()),
-            ("model", same["model"][:16]),
-            *((f"{name} not measured", str(why)) for name, why in r.get("not_measured", {}).items()),
-        ]
+        text = str(exact.get("drawn_by", elements.MISSING))
+        if not exact.get("float64", True):
+            size = "×".join(map(str, exact["checked_size"]))
+            text += f"; {format_decimal(exact['psnr_against_float64'], 0)} dB from float64 at {size}"
+        pairs += [("exact images", text), ("backend", str(r["backend"]))]
+        if self.trained:
+            pairs += [
+                ("overrides of the centre", " ".join(r["words"]) or "none"),
+                ("budget", f"{r['budget_seconds']:g} s, of which {r['spent_seconds']:.0f} were used"),
+                ("seeds", str(r["seeds"])),
+            ]
+        else:
+            pairs.append(("model", same["model"][:16]))
+        pairs += [(name, str(value)) for name, value in (*same["machine"].items(), *same["versions"].items())]
+        pairs += [(f"{name} not measured", str(why)) for name, why in r.get("not_measured", {}).items()]
         return section("Where the numbers come from", elements.fact_list(pairs))
 
 
-def _inlined(image: Tensor) -> Inlined | None:
+def _inline_image(image: Tensor) -> Inlined | None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
         write_png(path, image)

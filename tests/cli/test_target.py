@@ -71,7 +71,7 @@ def test_an_interruption_says_what_goes_on(
     def interrupted(*args: Any, **where: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("neuprim.cli.target.target_run", interrupted)
+    monkeypatch.setattr("neuprim.cli.target.run_target", interrupted)
     out = tmp_path / "run"
     assert main(["run", *TINY, "target.psnr=20", "budget=5m", f"output_dir={out}"]) == 130
     error = capsys.readouterr().err

@@ -15,7 +15,7 @@ import torch
 
 from neuprim.cli import COMMANDS
 from neuprim.cli.render_overrides import split_render_overrides
-from neuprim.cli.tradeoff_command import of_words
+from neuprim.cli.tradeoff_command import is_override
 from neuprim.config import compose, compose_all
 from neuprim.config.launcher import take_launcher
 from neuprim.config.overrides import drop_place
@@ -188,7 +188,7 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
     elif name == "bench":
         compose(["scene=blender", "scene.path=DIR", *settings], False)
         rest = flags
-    elif name == "tradeoff" and of_words(args.run_dir):
+    elif name == "tradeoff" and is_override(args.run_dir):
         typed = [word for word in (args.run_dir, *settings) if not word.startswith("budget=")]
         compose(take_launcher(typed)[1], False)
         rest = flags

@@ -364,12 +364,10 @@ def _records(folder: Path) -> None:
     from neuprim.runs.chunks import ChunkRow as Chunk
     from neuprim.runs.launch.jobs import JobStatus, write_status
     from neuprim.runs.sweep import SweepRecord, SweepRow
-    from neuprim.search.target.record import Record as TargetRecord
-    from neuprim.search.target.record import Turn
-    from neuprim.search.tradeoff.knobs import LeftOut
-    from neuprim.search.tradeoff.record import Measured, Record
+    from neuprim.search.points import LeftOut, Point, Record
+    from neuprim.search.target_record import SettingChange, TargetRecord
     from neuprim.search.trials import Outcome
-    from tests.search.target_records import attempt
+    from tests.search.simulated_search import attempt
 
     _run(folder)
     view = {"name": "a", "psnr": 20.0, "ssim": 0.9}
@@ -385,13 +383,13 @@ def _records(folder: Path) -> None:
         ("a=1,2",), (SweepRow("0", ("a=1",), {"a": "1"}), SweepRow("1", ("a=2",), {"a": "2"}, "failed", "why", 2.5, 1))
     ).write(folder)
     ChunkRecord((Chunk("chunk_0", 20, 30, None), Chunk("chunk_1", 20, 30, 1.5)), 100).write(folder)
-    turned = [Turn("model.neurons", 4, 2, {"psnr": 0.1}, 0.8, True)]
+    turned = [SettingChange("model.neurons", 4, 2, {"psnr": 0.1}, 0.8, True)]
     TargetRecord({"psnr": 30.0}, {}, length=200, attempts=[attempt(100, 50, 30.0)], turns=turned).write(
         folder / "target"
     )
     points = [
-        Measured("reference", (), {"psnr": 30.0}, 100, None, [1.0, 1.1, 1.2], [1.0] * 3),
-        Measured("sort", ("renderer.sort=entry",), {"psnr": 29.0}, 100, 5, [0.5], [0.5]),
+        Point("reference", (), {"psnr": 30.0}, 100, None, [1.0, 1.1, 1.2], [1.0] * 3),
+        Point("sort", ("renderer.sort=entry",), {"psnr": 29.0}, 100, 5, [0.5], [0.5]),
     ]
     (folder / "run/tradeoff").mkdir()
     Record({"views": 1}, {}, points, [LeftOut("a", ("b=1",), "why")], [0, 1], [0]).write(
@@ -409,9 +407,9 @@ def _read_records(folder: Path) -> None:
     from neuprim.runs.launch.jobs import read_status
     from neuprim.runs.sweep import read_sweep, read_sweep_runs, write_csv
     from neuprim.search import trials
-    from neuprim.search.target.record import read_record as read_target
-    from neuprim.search.tradeoff.record import read_record
-    from neuprim.search.tradeoff.record import write_csv as write_points
+    from neuprim.search.points import read_record
+    from neuprim.search.points import write_csv as write_points
+    from neuprim.search.target_record import read_target_record as read_target
     from neuprim.viewer.quality import read_front
 
     _read_run(folder)
@@ -425,12 +423,12 @@ def _read_records(folder: Path) -> None:
         (
             target.write(folder / "again"),
             target.words,
-            target.done("size"),
+            target.finished("size"),
             [one.count for one in target.attempts if one.outcome],
         )
     read_front(folder / "run")
     if (points := read_record(folder / "run/tradeoff/tradeoff.json")) is not None:
-        write_points(folder / "out.csv", points, lambda i: 40)
+        write_points(folder / "out.csv", points, 40)
     trials.read_outcome(folder)
     read_status(folder / "status.json")
 

@@ -21,10 +21,18 @@ from neuprim.runs.fit import fit
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.render_images import RenderRequest, render_run
-from neuprim.search.tradeoff.subject import load_subject
-from neuprim.search.trials import FILE, Outcome, Trial, read_outcome, run_trial
+from neuprim.search.trials import (
+    TRIAL_FILE,
+    Outcome,
+    Trial,
+    TrialFailed,
+    launch_trials,
+    read_outcome,
+    run_trial,
+)
 from neuprim.tasks.static import TASK
 from tests.core import tiny
+from tests.runs.launching import processes
 from tests.short_runs import words
 from tests.systems import posix
 
@@ -53,9 +61,9 @@ def steps_of(heard: list[Event]) -> int:
 def test_a_trial_is_a_run_without_report_and_pictures(done: tuple[Path, Outcome], tmp_path: Path) -> None:
     folder = done[0]
     assert sorted(p.name for p in folder.iterdir()) == sorted(
-        ["checkpoint.safetensors", "config.yaml", "metrics.jsonl", "model.safetensors", FILE]
+        ["checkpoint.safetensors", "config.yaml", "metrics.jsonl", "model.safetensors", TRIAL_FILE]
     )
-    assert load_run(folder)[2].count == 40 and load_subject(folder, (), 2).truths[0].view.name
+    assert load_run(folder)[2].count == 40
     assert len(render_run(folder, RenderRequest("test", size=(12, 12), format="png", out=tmp_path / "drawn"))) == 2
 
 
@@ -93,7 +101,7 @@ def test_other_settings_are_trained_anew_and_said(scene: Path, tmp_path: Path) -
     first = run_trial(Trial(config_of(scene, folder)))
     second = run_trial(Trial(config_of(scene, folder, "model.neurons=0")), events=heard.append)
     said = [event.text for event in heard if isinstance(event, Note)]
-    assert f"{folder}: tried with another model.neurons; trained anew" in said and steps_of(heard) == STEPS
+    assert f"{folder}: made with another model.neurons; trained anew" in said and steps_of(heard) == STEPS
     assert second.parameters_per_primitive < first.parameters_per_primitive
     heard.clear()
     run_trial(Trial(config_of(scene, folder, "model.neurons=0"), hold_out=3), events=heard.append)
@@ -188,14 +196,30 @@ def test_a_run_that_is_no_trial_is_left_alone(scene: Path, tmp_path: Path) -> No
     "text", ["{", "[]", '{"format": 1}', '{"format": 9, "asked": {}, "views": 8, "outcome": null}']
 )
 def test_a_damaged_record_is_refused(scene: Path, tmp_path: Path, text: str) -> None:
-    (tmp_path / FILE).write_text(text)
+    (tmp_path / TRIAL_FILE).write_text(text)
     with pytest.raises(DataError, match=r"trial\.json: .*delete its folder to train anew"):
         run_trial(Trial(config_of(scene, tmp_path)))
 
 
 @pytest.mark.parametrize("change", [{"psnr": "much"}, {"curve": [1]}, {"bytes": None}])
 def test_a_damaged_outcome_is_refused(done: tuple[Path, Outcome], tmp_path: Path, change: dict[str, object]) -> None:
-    record = json.loads((done[0] / FILE).read_text())
-    write_json(tmp_path / FILE, {**record, "outcome": {**record["outcome"], **change}})
+    record = json.loads((done[0] / TRIAL_FILE).read_text())
+    write_json(tmp_path / TRIAL_FILE, {**record, "outcome": {**record["outcome"], **change}})
     with pytest.raises(DataError, match=r"trial\.json: .*delete its folder"):
         read_outcome(tmp_path)
+
+
+@posix
+def test_launched_trials_equal_those_of_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 1)
+    scene = tiny.write_blender(tmp_path / "two")
+    # The names of the folders are equally long, as the file holds them and its bytes are compared.
+    here, there = (Trial(compose(words(scene, tmp_path / name, 20)), views=2) for name in ("in_1", "in_2"))
+    gone = replace(there, config=compose(words(tmp_path / "nowhere", tmp_path / "gone", 20)))
+    progress: list[float] = []
+    first, second = launch_trials([[there], [gone]], processes(), tmp_path, progress.append)
+    expected = run_trial(here)
+    assert isinstance(first, list)
+    assert (first[0].psnr, first[0].ssim, first[0].bytes) == (expected.psnr, expected.ssim, expected.bytes)
+    assert isinstance(second, TrialFailed) and "nowhere" in str(second)
+    assert progress == sorted(progress) and progress[-1] == 1.0 and not (tmp_path / "launch").exists()

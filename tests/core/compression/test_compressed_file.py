@@ -7,7 +7,6 @@ import io
 import json
 import math
 import os
-import random
 import struct
 import subprocess
 import sys
@@ -270,27 +269,6 @@ def test_a_file_by_hand_is_read_as_the_page_says(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- what is damaged
-
-
-def test_truncated_anywhere(tmp_path: Path, whole: bytes) -> None:
-    path = tmp_path / "m"
-    for cut in sorted({*range(60), *(i * len(whole) // 200 for i in range(200)), len(whole) - 1}):
-        path.write_bytes(whole[:cut])
-        refused(path)
-    path.write_bytes(whole + b"\0")
-    refused(path, "follow it")
-    path.write_bytes(whole)
-    checkpoint.load_model(path, TASK)
-
-
-def test_every_flipped_bit_is_noticed(tmp_path: Path, whole: bytes) -> None:
-    """Check sums cover every byte."""
-    path, numbers = tmp_path / "m", random.Random(0)
-    for i in (*range(400), *numbers.sample(range(400, len(whole)), 300)):
-        damaged = bytearray(whole)
-        damaged[i] ^= 1 << numbers.randrange(8)
-        path.write_bytes(damaged)
-        refused(path)
 
 
 def sparse(mask_of: int, codes: bytes) -> tuple[int, tuple[int, ...], bytes, bytes]:

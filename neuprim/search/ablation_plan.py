@@ -1,0 +1,205 @@
+"""Plan an ablation: the variants of a model, how long they train, and which are worth combining."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from neuprim.config import RunConfig
+from neuprim.config.overrides import parse, quote_override
+from neuprim.core.data import Dataset
+from neuprim.core.task import TaskSpec
+from neuprim.core.train.trainer import Trainer
+from neuprim.core.used_settings import build_settings
+from neuprim.plugins.trading import traded
+from neuprim.runs.fit import prepare_training, use_one_torch_thread
+from neuprim.runs.training import compile_for_run
+from neuprim.search.config_values import get_setting
+from neuprim.search.pareto import Step, combine_steps
+from neuprim.search.points import COMBINED, Point, name_variant
+
+__all__ = ["CENTRE", "Plan", "StepTimes", "Variant", "combine_models", "list_variants", "override", "plan_lengths"]
+
+CENTRE = "centre"
+"""Name of the model that others are compared with."""
+
+LENGTH = "train.iterations"
+"""The knob whose values are shares of the full length."""
+
+_COUNTS, _LENGTHS = (0.5, 2.0, 0.25, 4.0, 1 / 8, 1 / 16, 1 / 32, 1 / 64), (0.5, 0.25)
+"""Multiples of the centre's primitives and length, in every task."""
+
+_MIN_LENGTH, _MIN_STEPS = 1 / 20, 100
+"""Least training of the centre: this share of its steps, or so many steps where its budget is in seconds."""
+
+_STEPS_PER_TURN, _TURNS = 4, 6
+"""Step times: variant and centre alternate, so that load of the machine affects both."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A model to train: the knob, the overrides over the centre's, and the share of the full training."""
+
+    knob: str
+    turned: tuple[str, ...] = ()
+    length: float = 1.0
+
+    @property
+    def name(self) -> str:
+        return name_variant(self.turned, self.length)
+
+    @property
+    def folder(self) -> str:
+        text = re.sub(r"[^A-Za-z0-9._+-]+", "-", "_".join(self.name.split(" "))).strip("._-")
+        return text[:80]
+
+    @property
+    def label(self) -> tuple[str, ...]:
+        """Its overrides as the record of what is left out has them."""
+        return (*self.turned, *((f"{self.length:g} of the length",) if self.length != 1.0 else ()))
+
+
+def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]:
+    """Return knob -> its variants, those next to the centre's value first."""
+    counts = dict.fromkeys(max(1, round(part * centre.model.primitives)) for part in _COUNTS)
+    knob = "model.primitives"
+    variants = {knob: [Variant(knob, (quote_override(knob, n),)) for n in counts if n != centre.model.primitives]}
+    for knob, values in traded(task, build_settings(task, centre.model, centre.options)).items():
+        now = None if knob in centre.unused else get_setting(centre, knob)
+        others = [value for value in values if value != now]
+        if now in values:
+            others.sort(key=lambda value: abs(values.index(value) - values.index(now)))
+        variants[knob] = [Variant(knob, (quote_override(knob, value),)) for value in others]
+    variants[LENGTH] = [Variant(LENGTH, length=part) for part in _LENGTHS]
+    return variants
+
+
+def override(words: Sequence[str], over: Sequence[str]) -> list[str]:
+    """Return overrides with others over them, each setting once."""
+    again = {assignment.key for assignment in parse(over)}
+    return [*(a.text for a in parse(words) if a.key not in again), *over]
+
+
+@dataclass
+class Plan:
+    """Training lengths; a continued set keeps them.
+
+    Attributes:
+        steps: of the centre.
+        seconds: of the full length, about.
+        whole: steps of the centre's configuration; 0 where its budget is in seconds.
+        paces: name of a variant -> seconds per step over the centre's.
+    """
+
+    steps: int
+    seconds: float
+    whole: int
+    paces: dict[str, float] = field(default_factory=lambda: {CENTRE: 1.0})
+
+    def overrides(self, variant: Variant, words: Sequence[str], centre: RunConfig) -> list[str]:
+        """Return what trains a variant; interventions into the population are as many as in a full run."""
+        steps = max(1, round(self.steps * variant.length / self.paces[variant.name]))
+        budget = [quote_override(LENGTH, steps)] + ["train.max_seconds=null"] * (centre.train.max_seconds is not None)
+        every, key = centre.train.population.every, "train.population.every"
+        scaled = max(1, round(every * steps / self.whole)) if self.whole else every
+        if scaled != every and key not in {assignment.key for assignment in parse(words)}:
+            budget.append(quote_override(key, scaled))
+        return override(words, [*variant.turned, *budget])
+
+    def describe(self) -> str:
+        text = f"Every model trains for the same time, about {self.seconds:.3g} s: {self.steps:,} steps of the centre"
+        if self.whole and self.steps < self.whole:
+            return f"{text}, of {self.whole:,} of its configuration. Fronts of longer trainings may differ."
+        return f"{text}, all of its configuration."
+
+
+def plan_lengths(centre: RunConfig, pace: float, available: float, lengths: Sequence[float]) -> Plan:
+    """Return the lengths with which trainings fit into the available seconds.
+
+    Args:
+        pace: seconds per step of the centre.
+        lengths: of all trainings, as shares of the full length.
+    """
+    if centre.train.iterations is None:
+        assert centre.train.max_seconds is not None, "a configuration has a budget"
+        most, least, whole = centre.train.max_seconds / pace, float(_MIN_STEPS), 0
+    else:
+        most = whole = centre.train.iterations
+        least = max(1.0, whole * _MIN_LENGTH)
+    steps = max(1, int(min(most, max(available / sum(lengths) / pace, least))))
+    return Plan(steps, steps * pace, whole)
+
+
+class StepTimes:
+    """Step times relative to the centre's, at half of the training, where every band of colour is in use.
+
+    Attributes:
+        seconds: per step of the centre.
+        compiling: seconds of compiling kernels.
+    """
+
+    def __init__(self, centre: RunConfig, dataset: Dataset) -> None:
+        self.dataset, self.compiling = dataset, 0.0
+        self._centre = self._prepare(centre)
+        self._identity = _identify_model(self._centre)
+        self.seconds = self._run_turns(self._centre)[1] / (_STEPS_PER_TURN * _TURNS)
+
+    def measure(self, config: RunConfig) -> float | None:
+        """Return the ratio of a configuration; None if it builds the same model as the centre."""
+        trainer = self._prepare(config)
+        if _identify_model(trainer) == self._identity:
+            return None
+        own, base = self._run_turns(trainer)
+        return own / base
+
+    def _prepare(self, config: RunConfig) -> Trainer:
+        population = replace(config.train.population, grow_from=1.0)  # all primitives exist by half of the training
+        config = replace(config, train=replace(config.train, population=population))
+        trainer = prepare_training(config, dataset=self.dataset).trainer
+        begun = time.perf_counter()
+        compile_for_run(trainer)
+        self.compiling += time.perf_counter() - begun
+        settings = trainer.settings
+        trainer.step, trainer.elapsed = (settings.iterations or 0) // 2, (settings.max_seconds or 0.0) / 2
+        return trainer
+
+    def _run_turns(self, trainer: Trainer) -> tuple[float, float]:
+        """Return the seconds of a trainer, and of the centre in the same turns."""
+        total = [0.0, 0.0]
+        with use_one_torch_thread():
+            for turn in range(_TURNS + 1):
+                for i, one in enumerate((trainer, self._centre)):
+                    begun = time.perf_counter()
+                    for _ in range(_STEPS_PER_TURN):
+                        one.train_step()
+                    total[i] += (time.perf_counter() - begun) * (turn > 0)  # the first turn warms up
+        return total[0], total[1]
+
+
+def _identify_model(trainer: Trainer) -> tuple[Any, ...]:
+    model = trainer.model
+    fields = [type(f).__name__ + repr(f.settings()) for f in (model.density, model.colour)]
+    return (model.count, trainer.settings.population.grow_to, *fields)
+
+
+def combine_models(points: Sequence[Point], most: int) -> list[tuple[str, ...]]:
+    """Return at most ``most`` combinations of single changes: towards fewer bytes, less time, and better quality."""
+    centre = points[0]
+    smaller, faster, better = [], [], []
+    for point in points[1:]:
+        if point.knob == COMBINED or point.length != 1.0 or len(point.turned) != 1:
+            continue
+        loss, bytes_gain = centre.quality["psnr"] - point.quality["psnr"], math.log(centre.bytes / point.bytes)
+        step = Step(point.knob, point.turned[0], bytes_gain, loss)
+        if bytes_gain > 0:
+            smaller.append(step)
+        if point.ratios and 0 < point.ratio < 1.0 - point.doubt:
+            faster.append(step._replace(gain=-math.log(point.ratio)))
+        if loss < -0.02:
+            better.append(step._replace(gain=-loss, loss=-bytes_gain))
+    known = [point.turned for point in points]
+    return combine_steps((smaller, faster, better), known, most)

@@ -1,0 +1,358 @@
+"""Measure models: images against ground truth and exact images, file size, memory, and frame times in rounds."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import platform
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.config import RunConfig, suspects_of
+from neuprim.core.channels import Channels, channels_of
+from neuprim.core.compute.threads import core_count, cpu_name
+from neuprim.core.data import Dataset, View
+from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
+from neuprim.core.metrics import psnr, ssim, ssim_3dgs
+from neuprim.core.metrics.lpips import Lpips
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import backends
+from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device
+from neuprim.runs.render_config import RenderConfig, estimate_file_bytes, parse_render_config
+from neuprim.search.eval_views import EvalView, eval_views, fill_masked
+from neuprim.search.points import Point
+
+__all__ = [
+    "MEMORY_UNKNOWN",
+    "EvaluationSetup",
+    "ExactImages",
+    "TimedPoint",
+    "describe_machine",
+    "load_setup",
+    "measure_memory",
+    "measure_point",
+    "render_exact",
+    "time_points",
+]
+
+_MAX_CACHED = 1 << 29
+"""Bytes of prepared models that are kept between rounds."""
+
+_PER_REFERENCE = 6
+"""Points per drawing of the reference in a round."""
+
+_WARM_UP_SIZE = 16
+"""Pixels of the side of a first image, so that compiling and loading are no part of a frame's time."""
+
+_MAX_PSNR = 400.0
+"""dB that stand for equal images, as JSON has no infinity."""
+
+_CHECK_SIZE = 48
+"""Pixels of the longer side of the image that checks exact images against float64."""
+
+MEMORY_UNKNOWN = "the peak of a process's memory can be reset on Linux alone"
+
+T = TypeVar("T")
+
+
+@dataclass
+class EvaluationSetup:
+    """A run's model, its evaluation views, and the reference configuration of rendering."""
+
+    config: RunConfig
+    model: Primitives
+    dataset: Dataset
+    channels: Channels
+    reference: RenderConfig
+    views: list[EvalView]
+    file: Path
+    lpips: Lpips | None = None
+    _prepared: dict[tuple[tuple[str, ...], str], Primitives] = field(default_factory=dict)
+
+    @property
+    def double(self) -> Primitives:
+        """The model in float64."""
+        params = {name: value.detach().double() for name, value in self.model.params.items()}
+        return Primitives(self.model.density, self.model.colour, params)
+
+    def small_view(self, longer: int) -> View:
+        """Return the first view with at most so many pixels on its longer side."""
+        view = self.views[0].view
+        width, height = view.camera.width, view.camera.height
+        scale = min(1.0, longer / max(width, height))
+        return replace(view, camera=view.camera.resized(max(1, round(scale * width)), max(1, round(scale * height))))
+
+    def overrides(self, config: RenderConfig) -> tuple[str, ...]:
+        """Return what reproduces a configuration with ``neuprim render``."""
+        return config.to_overrides(self.config.renderer)
+
+    def parse(self, overrides: Sequence[str]) -> RenderConfig:
+        return parse_render_config(overrides, self.config.renderer, self.model)
+
+    def prepare_model(self, config: RenderConfig) -> Primitives:
+        """Return the model as a configuration draws it, on its device; recent ones are cached."""
+        changes = RenderConfig(reduced=config.reduced, storage=config.storage).to_overrides(RenderConfig().settings)
+        key = changes, f"{config.settings.backend} {config.settings.device}"
+        if key not in self._prepared:
+            model = move_to_render_device(config.prepare_model(self.model), config.settings, self.views[0].view)
+            cached = (*self._prepared.values(), model)
+            if sum(v.numel() * v.element_size() for m in cached for v in m.params.values()) > _MAX_CACHED:
+                self._prepared.clear()
+            self._prepared[key] = model
+        return self._prepared[key]
+
+    def backend(self, config: RenderConfig) -> backends.Backend:
+        """Return the backend that draws a configuration."""
+        model, view = self.prepare_model(config), config.scale_view(self.views[0].view)
+        return backends.choose_backend(
+            model.lower_unchecked(view.camera, view.conditions), config.settings, view.camera
+        )
+
+    def unsupported(self, config: RenderConfig) -> str | None:
+        """Return why a configuration cannot be drawn here; None if it can."""
+        try:
+            backends.check_backend_device(config.settings)
+            self.backend(config)
+        except (BackendUnavailable, ConfigError) as error:
+            return str(error)
+        return None
+
+    def renderer(self, config: RenderConfig) -> Callable[[View], Tensor]:
+        """Return what draws views of a configuration, with its model prepared."""
+        model = self.prepare_model(config)
+        return lambda view: config.render_view(model, view, self.dataset.background)
+
+    def display(self, image: Tensor) -> Tensor:
+        """Return displayed values within [0, 1]."""
+        return self.channels.display(image).clamp(0.0, 1.0)
+
+
+def load_setup(
+    run_dir: Path,
+    overrides: Sequence[str] = (),
+    views: int = 5,
+    lpips: str | Path | None = None,
+    loaded: tuple[Dataset, list[EvalView]] | None = None,
+) -> EvaluationSetup:
+    """Load a finished run for measuring.
+
+    Args:
+        overrides: of the reference configuration, over how the run draws.
+        views: evaluation views, evenly spread.
+        lpips: weights for LPIPS; None for those of the run.
+        loaded: data set and evaluation views, if they are loaded already.
+
+    Raises:
+        NeuprimError: no such run, no test views, or invalid overrides.
+    """
+    config, task, model, _ = load_run(run_dir)
+    reference = parse_render_config(overrides, config.renderer, model)
+    weights = lpips or config.metrics.lpips
+    distance = None if weights is None else Lpips.load(weights)
+    if loaded is None:
+        dataset = load_dataset(config, task, run_dir=run_dir)
+        loaded = dataset, eval_views(dataset, views)
+    dataset, chosen = loaded
+    suspects_of(config).know(dataset)
+    if not chosen:
+        raise DataError(f"{run_dir}: {dataset.name} has no test views; expected some to measure on")
+    channels, file = channels_of(task, dataset), model_file(run_dir)
+    return EvaluationSetup(config, model, dataset, channels, reference, chosen, file, distance)
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return the machine and the versions, as records compare them."""
+    versions = {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__}
+    return {"machine": {"cpu": cpu_name(), "cores": core_count()}, "versions": versions}
+
+
+# ---------------------------------------------------------------- exact images
+
+
+class ExactImages(NamedTuple):
+    """Images without any cut-off.
+
+    Attributes:
+        images: (H, W, C) float64, one per view.
+        float64: whether the reference backend drew them in float64. Otherwise the reference configuration's backend
+            did in float32, and ``error`` is its PSNR against float64 on an image of ``checked`` pixels.
+        oracle_seconds: estimated seconds of an image of the reference backend.
+    """
+
+    images: list[Tensor]
+    float64: bool
+    error: float | None
+    checked: tuple[int, int]
+    oracle_seconds: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able facts."""
+        return {
+            "drawn_by": "reference backend, float64" if self.float64 else "nothing cut, float32",
+            "float64": self.float64,
+            "psnr_against_float64": self.error,
+            "checked_size": list(self.checked),
+            "oracle_seconds": self.oracle_seconds,
+        }
+
+
+def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = None) -> ExactImages:
+    """Render exact images of all views: by the float64 reference backend if ``allowed`` seconds suffice, else uncut.
+
+    Opacity clamp, order and samples per pixel are the reference configuration's: they define the image.
+
+    Args:
+        float64: whether to use the reference backend, where that is decided already.
+    """
+    settings = replace(setup.reference.settings, alpha_min=0.0, transmittance_min=0.0)
+    uncut, oracle = RenderConfig(settings), RenderConfig(replace(settings, backend=backends.REFERENCE, device="auto"))
+    double, small, background = setup.double, setup.small_view(_CHECK_SIZE), setup.dataset.background.double()
+    size = (small.camera.width, small.camera.height)
+    start = time.perf_counter()
+    check = oracle.render_view(double, small, background)
+    pixels = sum(v.view.camera.width * v.view.camera.height for v in setup.views) / len(setup.views)
+    expected = (time.perf_counter() - start) * pixels / (size[0] * size[1])
+    if float64 or (float64 is None and expected * len(setup.views) <= allowed):
+        start = time.perf_counter()
+        images = [oracle.render_view(double, v.view, background) for v in setup.views]
+        return ExactImages(images, True, None, size, (time.perf_counter() - start) / len(images))
+    draw = setup.renderer(uncut)
+    images = [draw(v.view).double() for v in setup.views]
+    return ExactImages(images, False, min(psnr(draw(small).double(), check), _MAX_PSNR), size, expected)
+
+
+# ---------------------------------------------------------------- one point
+
+
+def measure_point(setup: EvaluationSetup, knob: str, config: RenderConfig, exact: ExactImages) -> tuple[Point, float]:
+    """Measure images, size and memory of a configuration; returns the point, and the seconds of all images.
+
+    Numbers are means over views. ``psnr_exact`` is that of the mean squared error over all views, and at most the
+    accuracy of the exact images themselves.
+    """
+    model, draw = setup.prepare_model(config), setup.renderer(config)
+    rows: list[dict[str, float]] = []
+    peaks: list[int] = []
+    seconds = 0.0
+    _warm_up(draw, setup.views[0].view)
+    for view, ideal in zip(setup.views, exact.images, strict=True):
+        start = time.perf_counter()
+        image, peak = measure_memory(lambda: draw(view.view), model.device)  # noqa: B023 (called at once)
+        seconds += time.perf_counter() - start
+        peaks += [] if peak is None else [peak]
+        image = fill_masked(image, view)
+        shown, wanted = setup.display(image), setup.display(view.image)
+        row = {"psnr": psnr(image, view.image, view.mask), "ssim": ssim(image, view.image)}
+        row |= {"ssim_3dgs": ssim_3dgs(shown, wanted), "ssim_exact": ssim(image.double(), ideal)}
+        row["mse_exact"] = float((image.double() - ideal).square().mean())
+        if setup.lpips is not None and min(shown.shape[:2]) >= setup.lpips.least:
+            row |= {"lpips": setup.lpips(shown, wanted), "lpips_3dgs": setup.lpips.unmapped(shown, wanted)}
+        rows.append(row)
+    common = [name for name in rows[0] if all(name in row for row in rows)]
+    quality = {name: float(np.mean([row[name] for row in rows])) for name in common}
+    error = quality.pop("mse_exact")
+    exactness = -10.0 * math.log10(error) if error > 0 else math.inf
+    quality["psnr_exact"] = exactness if exact.error is None else min(exactness, exact.error)
+    size = estimate_file_bytes(setup.file, setup.model, model, config.storage)
+    return Point(knob, setup.overrides(config), quality, size, max(peaks, default=None)), seconds
+
+
+def measure_memory(call: Callable[[], T], device: torch.device) -> tuple[T, int | None]:
+    """Return a call's result, and the bytes by which memory rose at its peak; None where the system cannot tell.
+
+    On a GPU, memory allocated by torch. On the CPU, the resident set of the whole process.
+    """
+    if device.type != "cpu":
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        result = call()
+        return result, max(0, torch.cuda.max_memory_allocated(device) - before)
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+    except (OSError, AttributeError, TypeError):
+        pass  # another libc: freed memory may stay, and the rise looks smaller than it is
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
+    except OSError:
+        return call(), None
+    resident = _kilobytes("VmRSS")
+    result = call()
+    peak = _kilobytes("VmHWM")
+    return result, None if resident is None or peak is None else max(0, peak - resident) * 1024
+
+
+def _kilobytes(name: str) -> int | None:
+    for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
+        if line.startswith(f"{name}:"):
+            return int(line.split()[1])
+    return None
+
+
+# ---------------------------------------------------------------- frame times
+
+
+class TimedPoint(NamedTuple):
+    """A point to time: what returns its renderer, and how many rounds it should have."""
+
+    point: Point
+    renderer: Callable[[], Callable[[View], Tensor]]
+    rounds: int
+
+
+def time_points(
+    timed: Sequence[TimedPoint], views: Sequence[EvalView], deadline: float, done: Callable[[int, int], None]
+) -> None:
+    """Time points in rounds. The first is the reference, which is drawn several times in every round.
+
+    In a round every due point draws every view, in random order. Each frame is drawn twice and the second is timed, so
+    that its model is in the caches. A round adds to each point its mean milliseconds per frame, and a ratio: the median
+    over views of its time over the reference's in the same view, so that brief load of the machine has no effect.
+
+    Args:
+        deadline: of :func:`time.monotonic`; no round starts after it, except the first.
+        done: called with (round, of how many) after each.
+    """
+    reference, order = timed[0], torch.Generator().manual_seed(len(timed[0].point.ms))
+    most = max(one.rounds - len(one.point.ms) for one in timed)
+    for number in range(most):
+        due = [one for one in timed[1:] if len(one.point.ms) < one.rounds]
+        if number and not due:
+            return
+        start = time.monotonic()
+        turn = [reference, *due]
+        if number == 0:
+            for one in turn:
+                _warm_up(one.renderer(), views[0].view)
+        slots = torch.tensor([0] * (1 + len(due) // _PER_REFERENCE) + list(range(1, len(turn))))
+        milliseconds: list[list[float]] = [[] for _ in turn]
+        ratios: list[list[float]] = [[] for _ in turn]
+        for view in views:
+            seconds: list[list[float]] = [[] for _ in turn]
+            for i in slots[torch.randperm(len(slots), generator=order)].tolist():
+                draw = turn[i].renderer()
+                draw(view.view)
+                begin = time.perf_counter()
+                draw(view.view)
+                seconds[i].append(time.perf_counter() - begin)
+            base = statistics.median(seconds[0])
+            for i, own in enumerate(seconds):
+                milliseconds[i].append(1e3 * statistics.median(own))
+                ratios[i].append(statistics.median(own) / base)
+        for i, one in enumerate(turn):
+            one.point.ms.append(statistics.mean(milliseconds[i]))
+            one.point.ratios.append(statistics.median(ratios[i]))
+        done(number + 1, most)
+        if time.monotonic() + (time.monotonic() - start) > deadline:
+            return
+
+
+def _warm_up(draw: Callable[[View], Tensor], view: View) -> None:
+    draw(replace(view, camera=view.camera.resized(_WARM_UP_SIZE, _WARM_UP_SIZE)))

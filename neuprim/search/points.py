@@ -1,0 +1,292 @@
+"""Measured points of a trade-off, their record ``tradeoff.json``, and ``tradeoff.csv``.
+
+The table has the columns of the 3DGS compression survey.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import shlex
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.files import read_json, write_json, write_text
+from neuprim.core.metrics import from_json, to_json
+from neuprim.core.validation import Range, coerce, validate
+from neuprim.search.pareto import Objectives, pareto_front
+
+__all__ = [
+    "COMBINED",
+    "REFERENCE",
+    "TRADEOFF_FILE",
+    "TRADEOFF_FOLDER",
+    "LeftOut",
+    "Point",
+    "Record",
+    "read_record",
+    "write_csv",
+]
+
+FORMAT = 1
+
+TRADEOFF_FILE, TRADEOFF_FOLDER = "tradeoff.json", "tradeoff"
+"""Name of the record, and its folder in the directory of a finished run."""
+
+REFERENCE, COMBINED = "reference", "combined"
+"""In place of a knob's name: the point that others are compared with, and points that change several knobs."""
+
+_SURVEY_COLUMNS = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
+_COLUMNS = ("time ratio", "ms per frame", "frames/s", "PSNR against exact", "peak bytes", "speed front", "size front")
+_MODEL_COLUMNS = ("numbers per primitive", "training steps", "training seconds", "ms per step", "command")
+
+_DIGITS = 2
+"""Decimals of PSNR that count on a front."""
+
+_Positive = Annotated[float, Range(above=0)]
+
+_TRAINED = (
+    *("turned", "length", "primitives", "parameters_per_primitive", "steps", "seconds"),
+    *("centre_ms", "steps_in_turns", "seeds", "run_dir"),
+)
+
+
+@dataclass
+class Point:
+    """A measured point: a way to draw a finished model, or a trained model.
+
+    Attributes:
+        knob: what it changes; :data:`REFERENCE` and :data:`COMBINED` are none.
+        words: overrides that reproduce it.
+        quality: psnr, ssim, ssim_3dgs, psnr_exact, ssim_exact; lpips and lpips_3dgs where there are weights.
+        bytes: size of the model file.
+        peak_bytes: rise of memory while a frame is drawn; None where the system cannot tell.
+        ms: mean milliseconds per frame of each round of timing.
+        ratios: the same over the reference's of that round.
+        rounds: limit of rounds; None for the request's.
+        turned, length: of a trained model, the overrides over the centre's, and the share of the full training.
+        primitives, parameters_per_primitive, steps, seconds: of a trained model.
+        centre_ms: median milliseconds per frame of the centre over all rounds.
+        steps_in_turns: seconds per training step over the centre's.
+        seeds: PSNR of each seed; ``quality`` has the means.
+        run_dir: run directory of the first seed, relative to the record's folder; empty unless trained.
+    """
+
+    knob: str
+    words: tuple[str, ...]
+    quality: dict[str, float]
+    bytes: int
+    peak_bytes: int | None = None
+    ms: list[_Positive] = field(default_factory=list)
+    ratios: list[_Positive] = field(default_factory=list)
+    rounds: int | None = None
+    turned: tuple[str, ...] = ()
+    length: float = 1.0
+    primitives: int = 0
+    parameters_per_primitive: int = 0
+    steps: int = 0
+    seconds: float = 0.0
+    centre_ms: float = 0.0
+    steps_in_turns: tuple[float, ...] = ()
+    seeds: tuple[float, ...] = ()
+    run_dir: str = ""
+
+    @property
+    def name(self) -> str:
+        if self.run_dir:
+            return name_variant(self.turned, self.length)
+        return " ".join(word.removeprefix("renderer.") for word in self.words) or "as the run draws"
+
+    @property
+    def ratio(self) -> float:
+        """Median frame time over the reference's."""
+        return statistics.median(self.ratios) if self.ratios else float("nan")
+
+    @property
+    def time(self) -> float:
+        """Milliseconds per frame; of models the centre's times the ratio, as rounds differ in load."""
+        if self.centre_ms:
+            return self.ratio * self.centre_ms
+        return statistics.median(self.ms) if self.ms else float("nan")
+
+    @property
+    def ms_per_step(self) -> float:
+        return 1e3 * self.seconds / max(self.steps, 1)
+
+    @property
+    def seed_spread(self) -> float | None:
+        """Standard deviation of PSNR over seeds; None of one."""
+        return statistics.stdev(self.seeds) if len(self.seeds) > 1 else None
+
+    @property
+    def spread(self) -> float | None:
+        """Half of the interquartile range of the ratios; None of fewer than three."""
+        if len(self.ratios) < 3:
+            return None
+        low, _, high = statistics.quantiles(self.ratios, n=4, method="inclusive")
+        return (high - low) / 2
+
+    @property
+    def doubt(self) -> float:
+        """Uncertainty of the median ratio (McGill's notches); the ratio itself of fewer than three."""
+        if self.spread is None:
+            return self.ratio if self.ratios else 0.0
+        return 3.14 * self.spread / len(self.ratios) ** 0.5
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values; times are derived, for readers of the file."""
+        quality: dict[str, Any] = {}
+        for name, value in self.quality.items():
+            quality |= to_json(name, value)
+        data = {**asdict(self), "quality": quality}
+        if self.run_dir:
+            data |= {"name": self.name, "ms_per_step": self.ms_per_step}
+        else:
+            data = {name: value for name, value in data.items() if name not in _TRAINED}
+        if self.ms:
+            data |= {"ms_per_frame": self.time, "frames_per_second": 1e3 / self.time, "time_ratio": self.ratio}
+            data |= {"time_ratio_spread": self.spread, "time_ratio_doubt": self.doubt}
+        return data
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Point:
+        """Invert :meth:`to_dict`; raises KeyError, TypeError, ValueError or ConfigError for anything else."""
+        names = [name.removesuffix("_infinite") for name in data["quality"]]
+        quality = {name: value for name in names if (value := from_json(data["quality"], name)) is not None}
+        needed = ("knob", "words", "bytes", "peak_bytes", "ms", "ratios", "rounds")
+        own = {name: data[name] for name in (*needed, *(_TRAINED if data.get("run_dir") else ()))}
+        return replace(validate(cls, {**own, "quality": {}}, "points"), quality=quality)
+
+
+def name_variant(turned: Sequence[str], length: float) -> str:
+    """Return a readable name of a trained model."""
+    words = [word.removeprefix("model.") for word in turned]
+    return " ".join([*words, *([f"{length:g} of the length"] if length != 1.0 else [])]) or "centre"
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A point that was not measured, and why."""
+
+    knob: str
+    words: tuple[str, ...]
+    reason: str
+
+
+@dataclass
+class Record:
+    """Content of ``tradeoff.json``.
+
+    Attributes:
+        same: what must be equal to keep points: model or configuration, settings, views, versions, machine.
+        facts: further facts for readers: the run, its data, the exact images.
+        points: the reference first.
+        speed, size: numbers of the points on the fronts of time and of bytes against PSNR, best quality first.
+        marching: closed form against ray marching, of a finished run.
+    """
+
+    same: dict[str, Any]
+    facts: dict[str, Any] = field(default_factory=dict)
+    points: list[Point] = field(default_factory=list)
+    left_out: list[LeftOut] = field(default_factory=list)
+    speed: list[int] = field(default_factory=list)
+    size: list[int] = field(default_factory=list)
+    marching: dict[str, Any] = field(default_factory=dict)
+
+    def find(self, words: Sequence[str]) -> Point | None:
+        """Return the point of these overrides."""
+        return next((point for point in self.points if point.words == tuple(words)), None)
+
+    def leave_out(self, knob: str, words: Sequence[str], reason: str) -> None:
+        """Note that a point is not measured; replaces an earlier note."""
+        words = tuple(words)
+        others = [one for one in self.left_out if (one.knob, one.words) != (knob, words)]
+        self.left_out = [*others, LeftOut(knob, words, reason)]
+
+    def find_fronts(self, in_speed: Callable[[Point], bool], in_size: Callable[[Point], bool]) -> None:
+        """Compute both fronts, of the points that may be on each."""
+
+        def quality(i: int) -> float:
+            return round(self.points[i].quality["psnr"], _DIGITS)
+
+        def time(i: int) -> Objectives:
+            return Objectives(self.points[i].ratio, quality(i), self.points[i].doubt)
+
+        numbers = range(len(self.points))
+        self.speed = pareto_front([i for i in numbers if self.points[i].ratios and in_speed(self.points[i])], time)
+        sizes = [i for i in numbers if in_size(self.points[i])]
+        self.size = pareto_front(sizes, lambda i: Objectives(float(self.points[i].bytes), quality(i)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {
+            "format": FORMAT,
+            "same": self.same,
+            **self.facts,
+            "points": [point.to_dict() for point in self.points],
+            "left_out": [asdict(one) for one in self.left_out],
+            "front": {"speed": self.speed, "size": self.size},
+            "marching": self.marching,
+        }
+
+    def write(self, path: Path) -> None:
+        write_json(path, self.to_dict())
+
+
+def read_record(path: Path) -> Record | None:
+    """Read ``tradeoff.json``; None where there is none.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    data = read_json(path, "a record of `neuprim tradeoff`", "delete it to measure anew")
+    if data is None:
+        return None
+    try:
+        if data["format"] != FORMAT:
+            expected = f"this neuprim reads {FORMAT}; delete it to measure anew"
+            raise DataError(f"{path}: format {data['format']!r}; {expected}")
+        points = [Point.from_dict(entry) for entry in data["points"]]
+        left_out = [validate(LeftOut, entry, "left_out") for entry in data["left_out"]]
+        speed, size = (coerce(data["front"][name], list[int], f"front.{name}") for name in ("speed", "size"))
+        if not points or not all(0 <= number < len(points) for number in (*speed, *size)):
+            raise ValueError(f"front: expected numbers of the {len(points)} points")
+        known = ("format", "same", "points", "left_out", "front", "marching")
+        facts = {key: value for key, value in data.items() if key not in known}
+        return Record(dict(data["same"]), facts, points, left_out, speed, size, dict(data["marching"]))
+    except (KeyError, TypeError, AttributeError, ValueError, ConfigError) as error:
+        what = f"{type(error).__name__}: {error}"
+        raise DataError(f"{path}: not a record of `neuprim tradeoff` ({what}); delete it to measure anew") from error
+
+
+def write_csv(path: Path, record: Record, primitives: int = 0) -> None:
+    """Write the table, a row per point; empty cells are not measured.
+
+    Args:
+        primitives: of a finished run; trained models have their own numbers.
+    """
+    # The survey's LPIPS is that of VGG; another network's would not compare.
+    lpips = "lpips_3dgs" if record.same.get("lpips") == "vgg" else ""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    trained = any(point.run_dir for point in record.points)
+    writer.writerow((*_SURVEY_COLUMNS, *_COLUMNS, *(_MODEL_COLUMNS if trained else ())))
+    for number, point in enumerate(record.points):
+        quality = [_format(point.quality.get(name)) for name in ("psnr", "ssim_3dgs", lpips)]
+        row: list[object] = [point.name, *quality, point.bytes, point.primitives or primitives]
+        row += [f"{point.ratio:.4f}", f"{point.time:.4f}", f"{1e3 / point.time:.2f}"] if point.ms else [""] * 3
+        row += [_format(point.quality.get("psnr_exact")), "" if point.peak_bytes is None else point.peak_bytes]
+        row += [int(number in record.speed), int(number in record.size)]
+        if trained:
+            row += [point.parameters_per_primitive, point.steps, f"{point.seconds:.3f}", f"{point.ms_per_step:.4f}"]
+            row.append(shlex.join(["neuprim", "run", *point.words]))
+        writer.writerow(row)
+    write_text(path, buffer.getvalue())
+
+
+def _format(value: float | None) -> str:
+    return "" if value is None else f"{value:.6g}"

@@ -1,0 +1,388 @@
+"""Prune a finished run: cut, fine-tune, evaluate, and go back where the cut was too large; write the rest as a run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuprim.config import RunConfig, suspects_of
+from neuprim.core.channels import channels_of
+from neuprim.core.data import Dataset
+from neuprim.core.data.dataset import hold_out_views
+from neuprim.core.data.dataset_check import check_dataset
+from neuprim.core.errors import ConfigError
+from neuprim.core.io.files import refuse_existing, write_json, write_text
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.reduction import reduce_model
+from neuprim.core.task import TaskSpec
+from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
+from neuprim.core.train.trainer import Trainer
+from neuprim.runs.evaluate import evaluate_fitted
+from neuprim.runs.finetune import fine_tuner, steps_in
+from neuprim.runs.fit import Fitted, keep_model_settings, make_loss, use_one_torch_thread
+from neuprim.runs.kept import PRUNED, kept_shares
+from neuprim.runs.measure import measure_quality, render_image
+from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, move_to_render_device, read_metrics
+from neuprim.runs.training import save_training
+from neuprim.search.pruning_cuts import count_stored_numbers, cut_to_loss, list_reductions, price_cuts, zero_masks
+from neuprim.search.training_quality import TrainingQuality
+
+__all__ = ["ModelShrinker", "PruneRequest", "Pruning", "PruningStage", "prune_run"]
+
+MAX_ROUNDS, _LONG_ROUND, _MIN_ROUND = 3, 1300, 600
+"""Rounds of fine-tuning, unless a round would be longer than these steps; least steps of a round. Every round ends at
+the rates of the run's end, so that evaluated models are as well trained."""
+
+_PATIENCE = 2.0
+"""A model that lost at most this many tolerances is trained for another round before it is taken back."""
+
+_FIRST_CUT, _GROWTH, _LARGEST_CUT = 6.5, 1.5, 10.0
+"""Loss of the first cut over the tolerance; factor of the next cut; dB up to which a cut without effect is doubled."""
+
+_REMAINING, _BROUGHT = 0.3, 0.35
+"""Share of a cut's loss that remains after a round, and share of a round's own gain that the next one repeats."""
+
+_ENOUGH, _FREE = 0.1, 0.02
+"""Shares of the tolerance: below the first nothing more is cut, and the second counts as no loss."""
+
+_TIMED_FRAMES = 12
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class PruningStage:
+    """One round: reductions of fields, what is left, dB after the cut and after training, and whether it is kept."""
+
+    words: tuple[str, ...]
+    primitives: int
+    numbers: int
+    cut: float
+    trained: float
+    kept: bool
+
+
+@dataclass(frozen=True)
+class _State:
+    """A model on the way.
+
+    Attributes:
+        words: all reductions of its fields.
+        bite: dB that its last cut was to lose at once; cut: quality after it.
+        lost: dB since the beginning; rounds: of training since the cut.
+        fields_only: whether the cut was of whole fields alone.
+    """
+
+    model: Primitives
+    words: tuple[str, ...] = ()
+    bite: float = 0.0
+    cut: float = 0.0
+    lost: float = 0.0
+    rounds: int = 0
+    fields_only: bool = False
+
+    @property
+    def numbers(self) -> int:
+        return count_stored_numbers(self.model)
+
+
+def _saved_share(model: Primitives, smaller: Primitives, numbers: int) -> float:
+    """Return the share saved of a file's numbers, or of those that every frame evaluates."""
+    per_primitive = smaller.parameters_per_primitive / model.parameters_per_primitive
+    return max(1 - count_stored_numbers(smaller) / numbers, 1 - per_primitive)
+
+
+@dataclass
+class ModelShrinker:
+    """Search the smallest model whose training views lose at most a tolerance.
+
+    Attributes:
+        tolerance: dB.
+        steps: of fine-tuning in all; 0 for none.
+        base: dB of the full model, once evaluated.
+        stages: what was tried, in order.
+    """
+
+    config: RunConfig
+    task: TaskSpec
+    dataset: Dataset
+    tolerance: float
+    steps: int
+    progress: Progress = lambda text, fraction: None
+    stages: list[PruningStage] = field(default_factory=list)
+    base: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.quality, self._sensitivity_seed = TrainingQuality.of_run(self.config, self.dataset), 0
+
+    def shrink(self, model: Primitives) -> tuple[Primitives, tuple[str, ...]]:
+        """Return the smallest model found, and the reductions of its fields."""
+        self.base = self.quality(model)
+        best, tried = _State(model), None
+        untried: tuple[str, ...] = ()
+        rounds = min(max(self.steps // _MIN_ROUND, 1), max(MAX_ROUNDS, self.steps // _LONG_ROUND))
+        recovery = min(self.steps / rounds / _MIN_ROUND, 1.0) ** 2  # a few steps recover next to nothing
+        bite = self.tolerance * (1.0 + (_FIRST_CUT - 1.0) * recovery)
+        remains = 1.0 - (1.0 - _REMAINING) * recovery
+        for number in range(rounds):
+            if not best.model.count:
+                break
+            if tried is None:
+                tried, untried = self._next_state(best, untried, bite, number / rounds), ()
+                if tried is None:
+                    break
+                bite = tried.bite
+            before, smaller = tried, tried.numbers < best.numbers
+            tried = self._train(tried, number, rounds)
+            spent, kept = tried.lost - best.lost, tried.lost <= self.tolerance + 1e-9
+            trained = self.base - tried.lost
+            self.stages.append(PruningStage(tried.words, tried.model.count, tried.numbers, tried.cut, trained, kept))
+            if not smaller:
+                best, tried = min(best, tried, key=lambda state: state.lost), None
+            elif kept:
+                room = self.tolerance - tried.lost + _BROUGHT * max(remains * bite - spent, 0.0)
+                bite = min(max(room / remains, bite / _FIRST_CUT), _GROWTH * bite)
+                best, tried = replace(tried, bite=bite), None
+            elif tried.lost > self._max_loss(before, tried, best):
+                untried = () if tried.fields_only else tried.words[len(best.words) :]
+                if not tried.fields_only:
+                    bite *= min(max(0.7 * (self.tolerance - best.lost) / max(spent, 1e-9), 0.2), 0.7)
+                tried = None
+        last = {word.partition("=")[0]: word for word in best.words}  # degree 0 after degree 2 is degree 0
+        return best.model, tuple(last.values())
+
+    def _next_state(self, best: _State, untried: tuple[str, ...], bite: float, progress: float) -> _State | None:
+        """Return what to train next; None where nothing more can be cut."""
+        if untried:  # reductions that failed together with other cuts are tried alone
+            return self._reduce_fields(best, untried, bite)
+        left = self.tolerance - max(best.lost, 0.0)
+        if left < _ENOUGH * self.tolerance:  # a round of training wins a little back
+            return replace(best, cut=self.base - best.lost)
+        state = self._cut(best, bite if self.steps else left, progress)
+        while state.numbers >= best.numbers and 0.0 < state.bite < _LARGEST_CUT and self.steps:
+            state = self._cut(best, 2.0 * state.bite, progress)  # each of a few large parts costs more than the bite
+        return None if state.numbers >= best.numbers else state
+
+    def _max_loss(self, before: _State, now: _State, best: _State) -> float:
+        """Return the dB of loss after a round beyond which a cut is taken back: more than another round would win."""
+        if best.rounds and best.lost < 0:  # the model before has room, so a smaller cut saves something
+            return self.tolerance
+        return self.tolerance * _PATIENCE if now.rounds == 1 else self.tolerance + before.lost - now.lost
+
+    def _cut(self, state: _State, bite: float, progress: float) -> _State:
+        """Return a model that is ``bite`` dB worse before training."""
+
+        def quick(model: Primitives) -> float:
+            return self.quality(model, quick=bool(self.steps))
+
+        self.progress("choosing what to cut", progress)
+        model, size, start = state.model, state.numbers, quick(state.model)
+        by_price = self._cut_by_price(model, quick, bite)
+        price = bite / max(1 - count_stored_numbers(by_price) / size, 1e-9)
+        smaller, words, lost, again = model, list(state.words), 0.0, True
+        while again:  # whole parts of fields, while they cost no more than single numbers
+            again = False
+            for kind, name, value in list_reductions(smaller):
+                reduced = reduce_model(smaller, kind, name, value)
+                drop = start - quick(reduced)
+                cheap = drop <= min(bite, price * _saved_share(model, reduced, size))
+                if cheap or drop - lost <= _FREE * self.tolerance:
+                    smaller, lost, again = reduced, max(drop, lost), True
+                    words.append(f"{kind}.{name}={value}")
+                    break
+        result = by_price if smaller is model else self._cut_by_price(smaller, quick, bite - lost)
+        return _State(result, tuple(words), bite=bite, cut=self.quality(result))
+
+    def _reduce_fields(self, state: _State, words: tuple[str, ...], bite: float) -> _State:
+        model = state.model
+        for word in words:
+            place, _, value = word.partition("=")
+            kind, _, name = place.partition(".")
+            model = reduce_model(model, kind, name, int(value))
+        return _State(model, (*state.words, *words), bite=bite, cut=self.quality(model), fields_only=True)
+
+    def _cut_by_price(self, model: Primitives, quality: Callable[[Primitives], float], loss: float) -> Primitives:
+        if loss <= 0:
+            return model
+        self._sensitivity_seed += 1
+        seed, settings, draws = self._sensitivity_seed, self.config.renderer, self.quality.draws
+        views = sensitivity(model, self.dataset, self.quality.others, settings, seed=seed)
+        inside = inner_sensitivity(model, draws, seed=seed, threads=settings.threads) if draws else None
+        return cut_to_loss(model, price_cuts(model, views, inside, self.quality), quality, loss)
+
+    def _train(self, state: _State, number: int, rounds: int) -> _State:
+        """Return the state after a round of fine-tuning."""
+        model, steps = state.model, self.steps * (number + 1) // rounds - self.steps * number // rounds
+        if steps and model.count:
+            trainer = fine_tuner(self.config, self.task, self.dataset, model, steps)
+            trainer.zero_masks, left = zero_masks(trainer.model), state.numbers
+            for done in range(steps):
+                trainer.train_step()
+                if done % 20 == 0:
+                    self.progress(f"fine-tuning {left:,} numbers", (number + done / steps) / rounds)
+            params = {name: value.detach() for name, value in trainer.model.params.items()}
+            model = Primitives(model.density, model.colour, params)
+        after = self.quality(model) if steps else state.cut
+        return replace(state, model=model, lost=self.base - after, rounds=state.rounds + 1)
+
+
+# ---------------------------------------------------------------- a run
+
+
+@dataclass(frozen=True)
+class PruneRequest:
+    """What to prune.
+
+    Attributes:
+        tolerance: dB that training views may lose.
+        seconds: of fine-tuning, about.
+        steps: of fine-tuning instead, for the same model on every machine.
+        out: the new run directory; None for the run's name with "-pruned".
+        overwrite: whether existing files may be replaced.
+        hold_out: n > 1: leave every n-th training view out of training and decisions; 0: none.
+    """
+
+    run_dir: Path
+    tolerance: float = 0.1
+    seconds: float = 60.0
+    steps: int | None = None
+    out: Path | None = None
+    overwrite: bool = False
+    hold_out: int = 0
+
+
+@dataclass(frozen=True)
+class Pruning:
+    """Result of pruning.
+
+    Attributes:
+        run_dir: the new run; None where nothing could be removed, and nothing was written.
+        before, after: primitives, numbers, bytes, psnr and ssim of the test views, frames_per_second.
+        words: reductions of fields, as in ``model.reduced``.
+        kept: unit -> share of the primitives that have it.
+        judged: dB of the deciding training views, before and after.
+    """
+
+    run_dir: Path | None
+    before: dict[str, float]
+    after: dict[str, float]
+    words: tuple[str, ...]
+    kept: dict[str, float]
+    judged: tuple[float, float]
+    stages: tuple[PruningStage, ...]
+    steps: int
+    seconds: float
+
+
+def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction: None) -> Pruning:
+    """Remove primitives, units and parts of fields as far as training views allow, with fine-tuning in between.
+
+    Test views are measured before and after; they decide nothing.
+
+    Raises:
+        NeuprimError: no such run, data that cannot be read, or existing files.
+    """
+    final = request.out or request.run_dir.with_name(f"{request.run_dir.resolve().name}-pruned")
+    if final.exists() and not final.is_dir():
+        raise ConfigError(f"--out {final}: is a file; expected a new folder")
+    if final.exists() and final.resolve() == request.run_dir.resolve():
+        raise ConfigError(f"--out {final}: is the run itself; expected a new folder")
+    refuse_existing(final, request.overwrite)
+    config, task, model, header = load_run(request.run_dir)
+    config = replace(config, output_dir=request.run_dir)
+    suspects = suspects_of(config)
+    with suspects.watch(request.run_dir / LOGS), use_one_torch_thread():
+        progress("reading the run's data", 0.0)
+        dataset = load_dataset(config, task, run_dir=request.run_dir)
+        suspects.know(dataset)
+        check_dataset(dataset, task.conditions)
+        if request.hold_out:
+            dataset = replace(dataset, train=hold_out_views(dataset, request.hold_out).train)
+        begun = time.monotonic()
+        steps = request.steps
+        if steps is None:
+            steps = steps_in(request.seconds, config, task, dataset, model)
+        shrinker = ModelShrinker(config, task, dataset, request.tolerance, steps, progress)
+        small, words = shrinker.shrink(model)
+        seconds = time.monotonic() - begun
+        judged = (shrinker.base, shrinker.quality(small))
+        progress("measuring test views", 1.0)
+        rates = _frame_rates(config, dataset, (model, small))
+        measured = measure_quality(model, task, dataset, config.renderer)
+        before = _describe(model, model_file(request.run_dir), measured, rates[0])
+        stages = tuple(shrinker.stages)
+        if count_stored_numbers(small) >= count_stored_numbers(model):
+            return Pruning(None, before, before, (), kept_shares(model), judged, stages, steps, seconds)
+        progress("pictures and report", 1.0)
+        fitted = _fit_pruned(replace(config, output_dir=final), task, dataset, small, words)
+        fitted.trainer.step = int(header.get("iterations") or 0) + steps
+        fitted.trainer.elapsed = float(header.get("train_seconds") or 0.0) + seconds
+        final.mkdir(parents=True, exist_ok=True)
+        write_text(final / "config.yaml", fitted.config.to_yaml())
+        save_training(fitted)
+        evaluate_fitted(fitted, final)
+        metrics = read_metrics(final)
+        after = _describe(small, final / "model.safetensors", (metrics["psnr"], metrics["ssim"]), rates[1])
+    result = Pruning(final, before, after, words, kept_shares(small), judged, stages, steps, seconds)
+    write_json(final / PRUNED, _to_dict(request, result))
+    return result
+
+
+def _frame_rates(config: RunConfig, dataset: Dataset, models: Sequence[Primitives]) -> list[float]:
+    """Return median frames/s of test views, drawn in turns, so that load of the machine affects all models."""
+    models = [move_to_render_device(model, config.renderer, dataset.test.view(0)) for model in models]
+    seconds: list[list[float]] = [[] for _ in models]
+    for turn in range(_TIMED_FRAMES + 1):
+        view = dataset.test.view(turn * len(dataset.test) // (_TIMED_FRAMES + 1))
+        for model, own in zip(models, seconds, strict=True):
+            begun = time.perf_counter()
+            render_image(model, view, config.renderer, dataset.background)
+            if turn:  # the first frame loads and compiles
+                own.append(time.perf_counter() - begun)
+    return [1.0 / max(float(np.median(own)), 1e-9) for own in seconds]
+
+
+def _describe(model: Primitives, file: Path, measured: tuple[float, float], rate: float) -> dict[str, float]:
+    facts = {"primitives": model.count, "numbers": count_stored_numbers(model), "bytes": file.stat().st_size}
+    return {**facts, "psnr": measured[0], "ssim": measured[1], "frames_per_second": rate}
+
+
+def _fit_pruned(
+    config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primitives, words: tuple[str, ...]
+) -> Fitted:
+    """Return a pruned model as a fitted run, with the overrides that build it."""
+    reduced = [*config.model.reduced, *words]
+    own = [f"model.primitives={model.count}"]
+    own += [f"model.reduced=[{','.join(repr(word) for word in reduced)}]"] if reduced else []
+    replaced = ("model.primitives=", "model.reduced=", "output_dir=", "resume=")
+    config = replace(
+        config,
+        model=replace(config.model, primitives=model.count, reduced=reduced),
+        overrides=[*(word for word in config.overrides if not word.startswith(replaced)), *own],
+    )
+    settings = keep_model_settings(config.train, task, model)
+    trainer = Trainer(model, dataset, make_loss(config, task), settings, config.renderer, config.seed)
+    trainer.zero_masks = zero_masks(trainer.model)
+    return Fitted(config, task, dataset, channels_of(task, dataset), trainer)
+
+
+def _to_dict(request: PruneRequest, result: Pruning) -> dict[str, Any]:
+    """Return the content of ``pruned.json``."""
+    return {
+        "format": 1,
+        "pruned_from": str(request.run_dir),
+        "tolerance": request.tolerance,
+        "steps": result.steps,
+        "seconds": result.seconds,
+        "before": result.before,
+        "after": result.after,
+        "reduced": list(result.words),
+        "kept": result.kept,
+        "judged_psnr": list(result.judged),
+        "stages": [asdict(stage) for stage in result.stages],
+    }

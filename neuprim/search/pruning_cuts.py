@@ -1,0 +1,130 @@
+"""Choose which primitives, prunable units and parts of fields to remove: the least effect per number first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuprim.core.model.fields import prunable_units_by_name
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.prunable import PrunableUnit, count_numbers, nonzero_rows, zero_units
+from neuprim.core.model.reduction import reduce_model
+from neuprim.core.train.sensitivity import Sensitivity
+from neuprim.search.training_quality import TrainingQuality
+
+__all__ = ["count_stored_numbers", "cut_to_loss", "list_reductions", "price_cuts", "zero_masks"]
+
+_CONTRAST = 0.05
+"""Mean squared difference of a primitive's colour from its background, where :func:`price_cuts` cannot measure it."""
+
+_PROBE = 0.02
+"""Share of the primitives whose removal measures the contrast."""
+
+_HALVINGS = 14
+
+
+def _units(model: Primitives) -> dict[str, PrunableUnit]:
+    return prunable_units_by_name(model.density, model.colour)
+
+
+def count_stored_numbers(model: Primitives) -> int:
+    """Return how many numbers a file holds: all but units that are zero."""
+    zeros = sum(
+        count_numbers(unit, model.params) * int((~nonzero_rows(unit, model.params)).sum())
+        for unit in _units(model).values()
+    )
+    return model.count * model.parameters_per_primitive - zeros
+
+
+def zero_masks(model: Primitives) -> dict[str, Tensor]:
+    """Return parameter -> (N, ...) bool of the numbers in units that are zero."""
+    masks: dict[str, Tensor] = {}
+    for unit in _units(model).values():
+        gone = ~nonzero_rows(unit, model.params)
+        if bool(gone.any()):
+            for name, place in unit.places.items():
+                mask = masks.setdefault(name, torch.zeros_like(model.params[name], dtype=torch.bool))
+                mask[(gone, *place)] = True
+    return masks
+
+
+def list_reductions(model: Primitives) -> list[tuple[str, str, int]]:
+    """Return (kind, name, value) of all reductions of whole fields, the largest saving first."""
+    fields = (("density", model.density), ("colour", model.colour))
+    words = [
+        (kind, name, value) for kind, own in fields for name, values in own.reductions().items() for value in values
+    ]
+    return sorted(words, key=lambda word: reduce_model(model, *word).parameters_per_primitive)
+
+
+def price_cuts(
+    model: Primitives, views: Sensitivity, inside: Sensitivity | None, quality: TrainingQuality
+) -> Sensitivity:
+    """Return mean squared changes of images without each primitive and unit; changes inside count by their weight."""
+    priced = replace(views, whole=views.whole * _measure_contrast(model, views, quality))
+    return priced if inside is None else priced.beside(inside, quality.inside_weight(model))
+
+
+def _measure_contrast(model: Primitives, effects: Sensitivity, quality: TrainingQuality) -> float:
+    """Return the mean squared difference of colour, from the cost of removing the least primitives."""
+    count = max(int(_PROBE * model.count), 1)
+    order = effects.whole.where(effects.seen > 0, torch.inf).argsort(stable=True)
+    kept = order[count:].sort().values
+    if not len(kept):
+        return _CONTRAST
+    smaller = Primitives(model.density, model.colour, model.rows(kept.to(model.device)))
+    before, after = (quality.image_quality(one, quick=True) for one in (model, smaller))
+    more = 10 ** (-after / 10) - 10 ** (-before / 10)
+    expected = float(effects.whole[order[:count]].sum())
+    return min(max(more / expected, 1e-4), 1.0) if expected > 0 and more > 0 else _CONTRAST
+
+
+class _Sizes(NamedTuple):
+    """Nonzero numbers of each primitive, (N,); of each unit who has it, (N,) bool, and its numbers."""
+
+    whole: Tensor
+    present: dict[str, Tensor]
+    units: dict[str, int]
+
+
+def cut_to_loss(
+    model: Primitives, prices: Sensitivity, quality: Callable[[Primitives], float], loss: float
+) -> Primitives:
+    """Remove everything below a price per number, the price at which the model loses ``loss`` dB now.
+
+    Args:
+        prices: of this model, see :func:`price_cuts`.
+    """
+    units = _units(model)
+    present = {name: nonzero_rows(unit, model.params).cpu() for name, unit in units.items()}
+    numbers = {name: count_numbers(unit, model.params) for name, unit in units.items()}
+    whole = torch.full((model.count,), float(model.parameters_per_primitive))
+    for name, has in present.items():
+        whole -= numbers[name] * (~has).float()
+    sizes = _Sizes(whole, present, numbers)
+    dear = [prices.whole / whole, *(prices.pieces[name] / max(size, 1) for name, size in numbers.items())]
+    low, high = 0.0, max(1e-30, *(float(each.max()) for each in dear if len(each)))
+    start, best = quality(model), _cut_below(model, prices, sizes, 0.0)
+    for _ in range(_HALVINGS):
+        price = (max(low, high * 1e-9) * high) ** 0.5
+        tried = _cut_below(model, prices, sizes, price)
+        if tried.count and start - quality(tried) <= loss:
+            best, low = tried, price
+        else:
+            high = price
+    return best
+
+
+def _cut_below(model: Primitives, prices: Sensitivity, sizes: _Sizes, price: float) -> Primitives:
+    known = prices.seen > 0  # nothing is known of primitives in no view
+    kept = (~known | (prices.whole / sizes.whole >= price)).nonzero()[:, 0]
+    gone = {}
+    for name, unit in _units(model).items():
+        cheap = prices.pieces[name] / max(sizes.units[name], 1) < price
+        gone[name] = (unit, cheap & sizes.present[name] & known)
+    rows = Primitives(model.density, model.colour, zero_units(gone, model.params)).rows(kept.to(model.device))
+    return Primitives(model.density, model.colour, rows)

@@ -1,0 +1,212 @@
+"""Quantization-aware fine-tuning, and the coarsest quantization that images allow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from copy import copy
+from typing import NamedTuple
+
+from torch import Tensor
+
+from neuprim.config import RunConfig
+from neuprim.core.compression import (
+    BitTable,
+    Quantizers,
+    canonicalize,
+    fake_quantize,
+    fit_quantizers,
+    fit_quantizers_to_error,
+)
+from neuprim.core.data import Dataset
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.task import TaskSpec
+from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
+from neuprim.runs.finetune import fine_tuner
+from neuprim.search.pruning_cuts import zero_masks
+from neuprim.search.training_quality import TrainingQuality
+
+__all__ = [
+    "QuantizationSearch",
+    "QuantizedModel",
+    "TrainingData",
+    "dequantize",
+    "finetune_for_table",
+    "quantize_within",
+]
+
+Progress = Callable[[str, float], None]
+
+_SENSITIVITY_VIEWS = 48
+"""Training views for the effects of numbers; sums over all primitives need few."""
+
+_FIRST_LOSS = 2.0
+"""Tolerances that a model may lose at once before training, to begin with."""
+
+_ROUND_STEPS, _MAX_ROUNDS = 500, 3
+"""Least steps of a round, and most rounds; each shows how much training recovers."""
+
+_SLOPE, _AIM = 0.7, 0.95
+"""dB that a trained model loses for one more dB at once; share of the tolerance that the next round aims at."""
+
+_MAX_TRIES = 16
+
+_FINEST, _COARSEST = 1e-4, 30.0
+"""Limits of the added error, as shares of the model's squared error."""
+
+
+class TrainingData(NamedTuple):
+    """What fine-tuning trains with."""
+
+    config: RunConfig
+    task: TaskSpec
+    dataset: Dataset
+
+
+class QuantizedModel(NamedTuple):
+    """A canonical model, its quantizers, the steps that it was trained for, and notes for the user."""
+
+    model: Primitives
+    quantizers: Quantizers
+    steps: int
+    notes: tuple[str, ...] = ()
+
+
+def dequantize(model: Primitives, quantizers: Quantizers) -> Primitives:
+    """Return a canonical model as a file would hold it."""
+    params = {name: value.detach() for name, value in fake_quantize(model.params, quantizers).items()}
+    return Primitives(model.density, model.colour, params)
+
+
+class QuantizationSearch:
+    """Quantize by one number: the squared error that rounding may add, as a share of the model's own."""
+
+    def __init__(self, model: Primitives, dataset: Dataset, quality: TrainingQuality) -> None:
+        self.model = canonicalize(model)
+        effects = sensitivity(self.model, dataset, quality.others[:_SENSITIVITY_VIEWS], quality.settings)
+        if quality.draws:
+            inside = inner_sensitivity(self.model, quality.draws, threads=quality.settings.threads)
+            effects = effects.beside(inside, quality.inside_weight(self.model))
+        columns = sum(spec.size for spec in self.model.specs)
+        self._effects = effects.columns
+        self._error = 10 ** (-quality.image_quality(self.model) / 10) / max(columns, 1)
+
+    def with_model(self, trained: Primitives) -> QuantizationSearch:
+        """Return the same search for the model after training."""
+        other = copy(self)
+        other.model = trained
+        return other
+
+    def fit(self, share: float) -> Quantizers:
+        return fit_quantizers_to_error(self.model, self._effects, share * self._error)
+
+    def find_coarsest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
+        """Return the coarsest accepted quantizers, or the finest possible, and their share of the error."""
+        fine, _ = self._bisect(accept, start)
+        return self.fit(fine), fine
+
+    def find_finest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
+        """Return the finest accepted quantizers, or the coarsest possible, and their share of the error."""
+        _, coarse = self._bisect(lambda quantizers: not accept(quantizers), start)
+        return self.fit(coarse), coarse
+
+    def _bisect(self, is_fine: Callable[[Quantizers], bool], start: float) -> tuple[float, float]:
+        """Return two close shares, of which the first is fine enough and the second is not; or both limits."""
+        fine, coarse, share = 0.0, 0.0, start
+        for _ in range(_MAX_TRIES):
+            if is_fine(self.fit(share)):
+                fine = share
+            else:
+                coarse = share
+            if coarse == _FINEST or fine == _COARSEST or (fine and coarse and coarse < 1.08 * fine):
+                break
+            if fine and coarse:
+                share = math.sqrt(fine * coarse)
+            else:
+                share = min(2.0 * fine, _COARSEST) if fine else max(share / 2.0, _FINEST)
+        return fine or _FINEST, coarse or _COARSEST
+
+
+def finetune_for_table(
+    data: TrainingData, model: Primitives, table: BitTable, steps: int, progress: Progress
+) -> QuantizedModel:
+    """Train a model for the bits of a table; returns it untrained where training views are better so."""
+    whole = canonicalize(model)
+    quantizers, quality = fit_quantizers(whole, table), TrainingQuality.of_run(data.config, data.dataset)
+    before = quality(dequantize(whole, quantizers))
+    trained = _finetune(data, whole, quantizers, steps, lambda share: progress("training for few bits", share))
+    after = quality(dequantize(trained, quantizers))
+    if after > before:
+        return QuantizedModel(trained, quantizers, steps)
+    note = (
+        f"{steps:,} steps for few bits brought nothing ({after - before:+.3f} dB on training views); stored untrained"
+    )
+    return QuantizedModel(whole, quantizers, steps, (note,))
+
+
+def quantize_within(
+    data: TrainingData, model: Primitives, tolerance: float, steps: int, progress: Progress
+) -> QuantizedModel:
+    """Return the model in the fewest bits with which training views lose at most ``tolerance`` dB, trained for them.
+
+    Args:
+        steps: of training; 0 for none.
+    """
+    quality = TrainingQuality.of_run(data.config, data.dataset)
+    base = quality(model)
+    progress("measuring the effect of numbers", 0.0)
+    untrained = QuantizationSearch(model, data.dataset, quality)
+    search, at_once = untrained, _FIRST_LOSS * tolerance
+    best: tuple[Primitives, Quantizers, float] | None = None
+    rounds = min(max(steps // _ROUND_STEPS, 1), _MAX_ROUNDS) if steps else 0
+    for number in range(rounds):
+
+        def show(part: float, number: int = number) -> None:
+            progress("training for few bits", (number + part) / rounds)
+
+        share = _error_share(at_once)
+        quantizers = search.fit(share)
+        own = steps * (number + 1) // rounds - steps * number // rounds
+        search = search.with_model(_finetune(data, search.model, quantizers, own, show))
+        lost = base - quality(dequantize(search.model, quantizers))
+        if lost <= tolerance and (best is None or share > best[2]):
+            best = search.model, quantizers, share
+        at_once = max(at_once + (_AIM * tolerance - lost) / _SLOPE, 0.25 * at_once)
+    if best is None:  # of the trained and the untrained model the one that can be stored more coarsely
+        progress("looking for the coarsest numbers", 1.0)
+
+        def find(one: QuantizationSearch) -> tuple[Primitives, Quantizers, float]:
+            def accept(quantizers: Quantizers) -> bool:
+                return base - quality(dequantize(one.model, quantizers)) <= tolerance
+
+            return one.model, *one.find_coarsest(accept, _error_share(tolerance))
+
+        best = max(map(find, [untrained, search] if rounds else [untrained]), key=lambda each: each[2])
+    whole, quantizers, share = best
+    note = f"rounding may add {share:.1%} to the squared error; the last bit of every number is worth the same"
+    return QuantizedModel(whole, quantizers, steps, (note,))
+
+
+def _error_share(decibels: float) -> float:
+    """Return the added share of the squared error that loses so many dB."""
+    return float(min(max(10 ** (decibels / 10) - 1, _FINEST), _COARSEST))
+
+
+def _finetune(
+    data: TrainingData, model: Primitives, quantizers: Quantizers, steps: int, progress: Callable[[float], None]
+) -> Primitives:
+    """Train a canonical model, rendering every image from quantized numbers."""
+    trainer = fine_tuner(data.config, data.task, data.dataset, model, steps)
+    trainer.zero_masks = zero_masks(trainer.model)
+    on_device = {name: quantizer.to(trainer.device) for name, quantizer in quantizers.items()}
+
+    def quantize(params: dict[str, Tensor]) -> dict[str, Tensor]:
+        return fake_quantize(params, on_device)
+
+    trainer.fake_quantize = quantize
+    for done in range(steps):
+        trainer.train_step()
+        if done % 20 == 0:
+            progress(done / steps)
+    params = {name: value.detach().cpu() for name, value in trainer.model.params.items()}
+    return Primitives(model.density, model.colour, params)

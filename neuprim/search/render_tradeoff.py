@@ -1,0 +1,385 @@
+"""Trade-offs of a finished run: change every setting of rendering alone, then several, and find the Pareto fronts.
+
+Results go to ``RUN_DIR/tradeoff``; points that were measured before are kept.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import shlex
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from neuprim.config import suspects_of
+from neuprim.config.target import parse_duration
+from neuprim.core.compute import device
+from neuprim.core.compute.threads import core_count
+from neuprim.core.errors import ConfigError, NeuprimError, nearest
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import backends
+from neuprim.core.render.quadrature import compare_quadrature
+from neuprim.report.tradeoff import Picture, write_tradeoff
+from neuprim.runs.fit import use_one_torch_thread
+from neuprim.runs.open import LOGS
+from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RenderConfig
+from neuprim.search.eval_views import fill_masked
+from neuprim.search.measuring import (
+    MEMORY_UNKNOWN,
+    EvaluationSetup,
+    ExactImages,
+    TimedPoint,
+    describe_machine,
+    load_setup,
+    measure_point,
+    render_exact,
+    time_points,
+)
+from neuprim.search.pareto import Step, combine_steps
+from neuprim.search.points import (
+    COMBINED,
+    REFERENCE,
+    TRADEOFF_FILE,
+    TRADEOFF_FOLDER,
+    Point,
+    Record,
+    read_record,
+    write_csv,
+)
+from neuprim.version import __version__
+
+__all__ = ["TradeoffRequest", "format_render_command", "measure_tradeoff", "parse_budget"]
+
+_EXACT, _IMAGES, _TIMES, _COMBINED = 0.2, 0.45, 0.65, 0.85
+"""Shares of the budget by which exact images, images and times of single changes, and combinations should be done."""
+
+_ONE_POINT = 0.1
+"""Share of the budget that the times of one point may take."""
+
+_COMBINATIONS = 24
+
+_CHORDS_SIZE = 96
+"""Pixels of the longer side of the image that compares the closed form with sampled chords."""
+
+Progress = Callable[[str, float], None]
+
+
+def parse_budget(budget: str, prefix: str = "--budget ") -> float:
+    """Return the seconds of a budget such as 90s, 5m or 1h; messages begin with ``prefix``.
+
+    Raises:
+        ConfigError: an invalid budget.
+    """
+    return parse_duration(budget, f"{prefix}{budget}")
+
+
+def format_render_command(run_dir: str, overrides: Sequence[str]) -> str:
+    """Return the command that draws the test views so."""
+    return shlex.join(["neuprim", "render", run_dir, "--camera", "test", *overrides])
+
+
+@dataclass(frozen=True)
+class TradeoffRequest:
+    """What to measure.
+
+    Attributes:
+        views: evaluation views, evenly spread.
+        repeats: rounds of timing.
+        knobs: names of the settings to change; empty for all.
+        budget: seconds, about; points that do not fit are left out.
+        words: overrides of the reference configuration, over how the run draws.
+        lpips: weights for LPIPS; None for those of the run.
+    """
+
+    run_dir: Path
+    views: int = 5
+    repeats: int = 15
+    knobs: Sequence[str] = ()
+    budget: float = 300.0
+    words: Sequence[str] = ()
+    lpips: Path | None = None
+
+
+# ---------------------------------------------------------------- knobs
+
+_VALUES: dict[str, tuple[Any, ...]] = {
+    "alpha_min": (0.0, *(2.0**-k for k in (10, 9, 8, 7, 6, 5))),
+    "transmittance_min": (0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1),
+    "alpha_max": (0.9, 0.95, 0.99, 0.999, 0.9999),
+    "sort": ("center", "entry"),
+    "samples": (1, 2, 4),
+}
+"""Settings of the renderer and their values."""
+
+
+def list_knobs(reference: RenderConfig, model: Primitives) -> dict[str, list[RenderConfig]]:
+    """Return knob -> the configurations that change it alone; reductions of fields are density.NAME and colour.NAME."""
+
+    def change(name: str, value: Any) -> RenderConfig:
+        return replace(reference, settings=replace(reference.settings, **{name: value}))
+
+    def store(groups: Sequence[str], name: str) -> RenderConfig:
+        return replace(reference, storage=dict(sorted((dict(reference.storage) | dict.fromkeys(groups, name)).items())))
+
+    def reduce(kind: str, name: str, value: int) -> RenderConfig:
+        return replace(reference, reduced=dict(sorted({**reference.reduced, (kind, name): value}.items())))
+
+    cores = core_count()
+    threads = sorted({1, 0, *(2**k for k in range(1, 7) if 2**k < cores)}) if cores > 1 else []
+    knobs = {name: [change(name, value) for value in values] for name, values in _VALUES.items()}
+    knobs["resolution"] = [replace(reference, resolution=part) for part in (1.0, 0.75, 0.5, 0.25)]
+    knobs["backend"] = [change("backend", name) for name in backends.backend_names()]
+    knobs["threads"] = [change("threads", count) for count in threads]
+    formats = [name for name in FORMATS if name != FLOAT32]
+    knobs["store"] = [store(groups, name) for name in formats for groups in (*((g,) for g in GROUPS), GROUPS)]
+    for kind, own in (("density", model.density), ("colour", model.colour)):
+        for name, values in own.reductions().items():
+            knobs[f"{kind}.{name}"] = [reduce(kind, name, value) for value in values]
+    return {name: [one for one in configs if one != reference] for name, configs in knobs.items()}
+
+
+# ---------------------------------------------------------------- measuring
+
+
+def measure_tradeoff(
+    request: TradeoffRequest,
+    tell: Callable[[str], None] = lambda text: None,
+    progress: Progress = lambda text, fraction: None,
+) -> Record:
+    """Measure, and write ``tradeoff.json``, ``tradeoff.csv``, ``tradeoff.html`` and ``front.png``.
+
+    Args:
+        tell: called with lines for the user.
+        progress: called with (text, fraction 0..1 of what the text names).
+
+    Raises:
+        NeuprimError: no such run or knob, no test views, invalid overrides, or a damaged record.
+    """
+    setup = load_setup(request.run_dir, request.words, request.views, request.lpips)
+    knobs = list_knobs(setup.reference, setup.model)
+    for name in request.knobs:
+        if name not in knobs:
+            raise ConfigError(f"--knobs {name}: no such knob of this run{nearest(name, knobs)}")
+    folder = request.run_dir / TRADEOFF_FOLDER
+    record = _resume_record(folder / TRADEOFF_FILE, _identity(setup), tell)
+    with suspects_of(setup.config).watch(request.run_dir / LOGS), use_one_torch_thread():
+        reason = setup.unsupported(setup.reference)
+        if reason is not None:
+            raise ConfigError(reason)
+        session = _Session(request, setup, record, progress)
+        _describe(record, setup)
+        session.measure([(REFERENCE, setup.reference), *session.single_changes(knobs)], _IMAGES)
+        session.take_times(_TIMES)
+        session.measure([(COMBINED, config) for config in session.combinations()], _COMBINED)
+        session.take_times(1.0)
+        record.marching = record.marching or _compare_marching(setup)
+        record.find_fronts(session.draws_the_stored_model, session.draws_as_the_reference)
+        record.write(folder / TRADEOFF_FILE)
+        write_csv(folder / "tradeoff.csv", record, setup.model.count)
+        progress("pictures of the front", 0.0)
+        pictures = session.render_pictures()
+    write_tradeoff(folder, record.to_dict(), pictures, lambda w: format_render_command(str(request.run_dir), w))
+    return record
+
+
+class _Session:
+    """Measure points of one run within the budget."""
+
+    def __init__(self, request: TradeoffRequest, setup: EvaluationSetup, record: Record, progress: Progress) -> None:
+        self.request, self.setup, self.record, self.progress = request, setup, record, progress
+        self.begun, self.file = time.monotonic(), request.run_dir / TRADEOFF_FOLDER / TRADEOFF_FILE
+        self._exact: ExactImages | None = None
+
+    def _deadline(self, part: float) -> float:
+        return self.begun + part * self.request.budget
+
+    @property
+    def exact(self) -> ExactImages:
+        """Exact images, rendered when the first point needs them."""
+        if self._exact is None:
+            self.progress("exact images", 0.0)
+            known = self.record.facts.get("exact", {}).get("float64")
+            self._exact = render_exact(self.setup, _EXACT * self.request.budget, known)
+            self.record.facts.setdefault("exact", self._exact.to_dict())
+        return self._exact
+
+    def single_changes(self, knobs: dict[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
+        """Yield what can be drawn here and differs; the record says what is left out."""
+        base = self.setup.backend(self.setup.reference).name
+        for name, configs in knobs.items():
+            if self.request.knobs and name not in self.request.knobs:
+                continue
+            if not configs:
+                why = "this process has one core" if name == "threads" else "the run has no other value"
+                self.record.leave_out(name, (), why)
+            for config in configs:
+                reason = self.setup.unsupported(config)
+                if reason is not None:
+                    self.record.leave_out(name, self.setup.overrides(config), reason)
+                elif name != "backend" or self.setup.backend(config).name != base:
+                    yield name, config
+        for kind, own in (("density", self.setup.model.density), ("colour", self.setup.model.colour)):
+            if not self.request.knobs and not own.reductions():
+                self.record.leave_out(kind, (), f"{type(own).__name__} has no reductions as it is")
+
+    def measure(self, wanted: Sequence[tuple[str, RenderConfig]], part: float) -> None:
+        """Measure images, bytes and memory of the configurations that the record lacks."""
+        for number, (knob, config) in enumerate(wanted):
+            words = self.setup.overrides(config)
+            if self.record.find(words) is not None:
+                continue
+            reason = self._too_slow(knob, config)
+            if self.record.points and time.monotonic() > self._deadline(part):
+                reason = f"no time left of the budget of {self.request.budget:g} s"
+            if reason is None:
+                self.progress(f"images of point {number + 1} of {len(wanted)}", number / len(wanted))
+                try:
+                    point, seconds = measure_point(self.setup, knob, config, self.exact)
+                except ConfigError as error:  # a format that does not hold the model's values
+                    reason = str(error)
+            if reason is not None:
+                self.record.leave_out(knob, words, reason)
+                continue
+            most = max(1, int(_ONE_POINT * self.request.budget / max(seconds, 1e-9)))
+            point.rounds = most if most < self.request.repeats else None
+            self.record.points.append(point)
+            self.record.write(self.file)
+
+    def _too_slow(self, knob: str, config: RenderConfig) -> str | None:
+        """Return why a point is not drawn: the float64 reference backend may take a thousand times as long."""
+        names = [self.setup.backend(one).name for one in (config, self.setup.reference)]
+        if knob == REFERENCE or names[0] != backends.REFERENCE or names[1] == backends.REFERENCE:
+            return None
+        known = self.record.facts.get("exact") or self.exact.to_dict()
+        seconds, allowed = known["oracle_seconds"] * len(self.setup.views), _ONE_POINT * self.request.budget
+        if seconds <= allowed:
+            return None
+        return f"its images would take about {seconds:.0f} s, of {allowed:.0f} s that a point may have"
+
+    def take_times(self, part: float) -> None:
+        """Time all points that lack rounds."""
+        repeats = self.request.repeats
+        timed = []
+        for point in self.record.points:
+            config = self.setup.parse(point.words)
+            rounds = min(repeats, point.rounds or repeats)
+            timed.append(TimedPoint(point, lambda config=config: self.setup.renderer(config), rounds))  # type: ignore[misc]
+
+        def done(number: int, count: int) -> None:
+            self.record.write(self.file)
+            self.progress(f"round {number} of {count}, {len(timed)} points", number / count)
+
+        if any(len(one.point.ms) < one.rounds for one in timed):
+            time_points(timed, self.setup.views, self._deadline(part), done)
+
+    def draws_the_stored_model(self, point: Point) -> bool:
+        """Return whether a point stores the model as the reference does: storage does not change times."""
+        return self.setup.parse(point.words).storage == self.setup.reference.storage
+
+    def draws_as_the_reference(self, point: Point) -> bool:
+        """Return whether a point draws as the reference does, so that only its bytes differ."""
+        config, reference = self.setup.parse(point.words), self.setup.reference
+        return config.settings == reference.settings and config.resolution == reference.resolution
+
+    def combinations(self) -> list[RenderConfig]:
+        """Return promising combinations of single changes, for time and for bytes."""
+        base, *others = self.record.points
+        faster, smaller, known = [], [], []
+        for point in others:
+            turned = [word for word in point.words if word not in base.words]
+            known.append(turned)
+            if point.knob == COMBINED or len(turned) != 1:
+                continue
+            knob, loss = turned[0].partition("=")[0], base.quality["psnr"] - point.quality["psnr"]
+            if point.ratios and point.ratio < 1.0 - point.doubt and self.draws_the_stored_model(point):
+                faster.append(Step(knob, turned[0], -math.log(point.ratio), loss))
+            if point.bytes < base.bytes and self.draws_as_the_reference(point):
+                smaller.append(Step(knob, turned[0], math.log(base.bytes / point.bytes), loss))
+        ways = combine_steps((faster, smaller), known, _COMBINATIONS)
+        old = [self.setup.parse(point.words) for point in others if point.knob == COMBINED]
+        new = []
+        for way in ways:
+            changed = {word.partition("=")[0] for word in way}
+            kept = [word for word in base.words if word.partition("=")[0] not in changed]
+            new.append(self.setup.parse([*kept, *way]))
+        return [*old, *new]
+
+    def render_pictures(self) -> dict[int, Picture]:
+        """Return pictures of the fronts' points: of the view with most contrast, and its ground truth under -1."""
+        setup, record = self.setup, self.record
+        view = max(setup.views, key=lambda one: float(setup.channels.display(one.image).var()))
+        pictures = {-1: Picture(setup.display(view.image), None)}
+        for number in dict.fromkeys((0, *record.speed, *record.size)):
+            draw = setup.renderer(setup.parse(record.points[number].words))
+            shown = setup.display(fill_masked(draw(view.view), view))
+            pictures[number] = Picture(shown, None if number == 0 else pictures[0].image)
+        return pictures
+
+
+def _identity(setup: EvaluationSetup) -> dict[str, Any]:
+    """Return what must be equal to keep earlier points; JSON-able."""
+    camera, config = setup.views[0].view.camera, setup.config
+    about = describe_machine()
+    used = setup.backend(setup.reference).computing_on(setup.reference.settings)
+    return {
+        "model": hashlib.sha256(setup.file.read_bytes()).hexdigest(),
+        "settings": asdict(config.renderer),
+        "reference": list(setup.overrides(setup.reference)),
+        "scene": {"name": config.scene_name, **{key: str(value) for key, value in config.scene.items()}},
+        "views": [one.view.name for one in setup.views],
+        "image_size": [camera.width, camera.height],
+        "lpips": None if setup.lpips is None else setup.lpips.network,
+        "machine": {**about["machine"], "device": used},
+        "versions": {"neuprim": __version__, **about["versions"]},
+    }
+
+
+def _resume_record(path: Path, identity: dict[str, Any], tell: Callable[[str], None]) -> Record:
+    """Return the earlier record if nothing changed, else an empty one."""
+    before = read_record(path)
+    if before is None:
+        return Record(identity)
+    changed = [name for name in identity if before.same.get(name) != identity[name]]
+    if changed:
+        tell(f"{path}: made with another {' and '.join(changed)}; all is measured anew")
+        return Record(identity)
+    tell(f"{path}: {len(before.points)} points measured already are kept; delete it to measure anew")
+    before.left_out.clear()
+    return before
+
+
+def _describe(record: Record, setup: EvaluationSetup) -> None:
+    record.facts |= {
+        "task": setup.config.task,
+        "scene": setup.config.scene_name,
+        "dataset": setup.dataset.name,
+        "data_source": setup.dataset.data_source,
+        "primitives": setup.model.count,
+        "backend": setup.backend(setup.reference).name,
+        "shown": setup.channels.shown,
+        "not_measured": {} if setup.lpips is not None else {"lpips": "no weights were given (--lpips FILE)"},
+    }
+    on_cpu = setup.prepare_model(setup.reference).device.type == device.CPU
+    if on_cpu and not Path("/proc/self/clear_refs").exists():
+        record.facts["not_measured"]["peak_bytes"] = MEMORY_UNKNOWN
+
+
+def _compare_marching(setup: EvaluationSetup) -> dict[str, Any]:
+    """Compare the closed form with sampled chords, on a small view in float64."""
+    view, settings = setup.small_view(_CHORDS_SIZE), setup.reference.settings
+    try:
+        rows = compare_quadrature(setup.double.lower(view.camera, view.conditions, settings), view.camera, settings)
+    except NeuprimError as error:
+        return {"not_measured": str(error)}
+    data = [
+        {**{name: getattr(row, name) for name in ("samples", "max_abs", "seconds")}, "psnr": _finite(row.psnr)}
+        for row in rows
+    ]
+    return {"image_size": [view.camera.width, view.camera.height], "chords": rows[0].chords, "rows": data}
+
+
+def _finite(value: float) -> float | None:
+    return None if math.isinf(value) else value

@@ -1,0 +1,377 @@
+"""Search the smallest model that meets a target: short trials of several sizes, changed settings, then full runs.
+
+Every stage reads the record and requests the next training, so an interrupted search takes the same way again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from neuprim.config import RunConfig, task_of
+from neuprim.config.target import Target
+from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError
+from neuprim.core.task import TaskSpec
+from neuprim.core.used_settings import build_settings
+from neuprim.plugins.trading import traded
+from neuprim.search.config_values import get_setting, override_settings
+from neuprim.search.size_curve import Curve, Proposal, climb, fit_line, propose_size, to_decibels
+from neuprim.search.size_predictor import ALLOWANCE, MIN_MARGIN, SizePredictor, exceeded_limit, format_forecast
+from neuprim.search.target_record import Attempt, SettingChange, SettingValue, TargetRecord
+from neuprim.search.trial_runner import VIEWS, TrialRunner
+
+__all__ = ["SizeSearch"]
+
+_MAX_MARGIN, _NEAR = 0.3, 1.08
+"""A full run is good enough within these dB above the target, if at most this factor above the predicted size."""
+
+_TRIALS, _FULL = 0.33, 0.34
+"""Shares of the budget for trials and for a full run; the rest is for another one."""
+
+_SHORTER, _PACE_STEPS, _MIN_STEPS = 8, 24, 16
+"""Full runs have this many times the steps of a trial. Steps that measure the pace; least steps of a trial."""
+
+_MAX_SIZES, _MAX_CHANGES, _MAX_FULL = 6, 4, 5
+
+_MIN_SLOPE = 0.8
+"""dB that twice as many primitives gain in full runs, at least; short trials may show less."""
+
+_BEYOND, _BELOW = 2.0, 3.0
+"""A full run has at most and least this factor of the sizes tried."""
+
+_MIN_STEP, _MORE_STEPS = 1.07, 0.75
+"""Least factor between the sizes of two full runs, and least share of the steps of another to compare with it."""
+
+_MORE = 1.25
+"""Factor by which limits must allow more primitives for another full run."""
+
+_SLOWER = 1.5
+"""A full run that becomes this many times slower is cut short."""
+
+_PAYS = 0.97
+"""Share of the bytes that a changed setting must leave, at most."""
+
+_MAX_REFUSED = 2
+"""Values of a setting that may fail before it is left."""
+
+
+# ---------------------------------------------------------------- settings that save bytes
+
+
+def smaller_values(config: RunConfig, task: TaskSpec, dataset: Dataset) -> dict[str, tuple[SettingValue, ...]]:
+    """Return setting -> values with fewer numbers per primitive, the least first and the current one last.
+
+    The setting with the largest saving comes first.
+    """
+
+    def count_numbers(config: RunConfig) -> int:
+        settings = build_settings(task, config.model, config.options)
+        task.check(settings)
+        return sum(spec.size for field in task.build(settings, dataset) for spec in field.parameters())
+
+    whole = count_numbers(config)
+    values: dict[str, tuple[SettingValue, ...]] = {}
+    least: dict[str, int] = {}
+    for key, offered in traded(task, build_settings(task, config.model, config.options)).items():
+        now = get_setting(config, key)
+        if key in config.unused or now is None:
+            continue
+        if key in ("model.sh_degree", "model.neurons"):  # any whole number is possible
+            offered = tuple(range(min(offered), now))
+        sizes: dict[SettingValue, int] = {}
+        for value in offered:
+            try:
+                sizes[value] = count_numbers(override_settings(config, {key: value}))
+            except ConfigError:  # not with the other settings
+                continue
+        fewer = sorted((value for value in sizes if sizes[value] < whole), key=lambda value: sizes[value])
+        if fewer:
+            values[key], least[key] = (*fewer, now), sizes[fewer[0]]
+    return {key: values[key] for key in sorted(values, key=lambda key: least[key])}
+
+
+def next_change(
+    values: Mapping[str, Sequence[SettingValue]], turns: Sequence[SettingChange]
+) -> tuple[str, SettingValue, SettingValue] | None:
+    """Return (setting, current value, value to try); None when all are done.
+
+    A setting is halved along its values while that pays; where it does not, the value between is tried once.
+    """
+    for key, ladder in values.items():
+        own = [turn for turn in turns if turn.key == key]
+        now = min((ladder.index(turn.after) for turn in own if turn.adopted), default=len(ladder) - 1)
+        refused = [ladder.index(turn.after) for turn in own if not turn.adopted]
+        after = (now + max(refused, default=0)) // 2
+        if after < now and after not in refused and len(refused) < _MAX_REFUSED:
+            return key, ladder[now], ladder[after]
+    return None
+
+
+def change_pays(loss: float, size: float, slope: float) -> bool:
+    """Return whether a model is smaller with a change after primitives make up for the loss.
+
+    Args:
+        loss: dB at equal primitives.
+        size: bytes of a primitive over those before.
+        slope: dB that twice as many primitives gain.
+    """
+    return bool(size * 2 ** (max(loss, 0.0) / slope) < _PAYS)
+
+
+# ---------------------------------------------------------------- the search
+
+
+@dataclass
+class SizeSearch:
+    """One search; resumes from its record."""
+
+    config: RunConfig
+    target: Target
+    dataset: Dataset
+    record: TargetRecord
+    runner: TrialRunner
+
+    @property
+    def max_steps(self) -> float:
+        return self.config.train.iterations or math.inf
+
+    def full_steps(self, primitives: int) -> float:
+        """Return the steps of a full run in its share of the budget."""
+        return min(self.max_steps, max(_FULL * self.record.asked["budget"] / self.runner.pace(primitives), 1.0))
+
+    @property
+    def predictor(self) -> SizePredictor:
+        return SizePredictor(self.target, self.record, self.full_steps)
+
+    def run(self) -> None:
+        """Run all stages that the record does not have."""
+        kept = sum(a.outcome is not None for a in self.record.attempts)
+        if kept:
+            self.runner.tell(f"{kept} earlier trainings are kept")
+        stages = (self._measure_pace, self._try_sizes, self._report_reach, self._change_settings, self._run_full)
+        for number, stage in enumerate(stages, 1):
+            if self.record.stage < number:
+                stage()
+                self.record.stage = number
+
+    def _measure_pace(self) -> None:
+        """Choose the length of trials from a few steps."""
+        if self.record.length:
+            return
+        (first,) = self.runner.run(
+            Attempt("pace", {}, self.config.model.primitives, int(min(_PACE_STEPS, self.max_steps)))
+        )
+        possible, pace = self.full_steps(first.count), self.runner.pace(first.count)
+        needed = 2 * _MIN_STEPS * _SHORTER
+        if possible < needed:
+            enough = "" if self.max_steps < needed else f", or {needed * pace / _FULL:.0f} s"
+            raise ConfigError(
+                f"budget={self.record.asked['budget']:g}s: a full run of {first.count:,} primitives would have "
+                f"{possible:.0f} steps; expected {needed} or more{enough}, fewer "
+                "primitives to begin with (model.primitives) or smaller images"
+            )
+        self.record.length = round(possible / _SHORTER)
+        self.runner.tell(
+            f"{1e3 * pace:.1f} ms a step with {first.count:,} primitives: full runs of about {possible:,.0f} steps, "
+            f"trials of {self.record.length:,}; one of {self.record.hold_out} training views is held out"
+        )
+
+    def _highest(self) -> int:
+        """Return the primitives whose full run has twice the steps of a trial, and that limits allow."""
+        low = high = self.config.model.primitives
+        while self.full_steps(high) > 2 * self.record.length and high < 2**24:
+            low, high = high, 2 * high
+        while high - low > max(low // 50, 1):
+            middle = (low + high) // 2
+            low, high = (middle, high) if self.full_steps(middle) > 2 * self.record.length else (low, middle)
+        saturated = [a.count for a in self.record.finished("size") if a.count < 0.95 * a.primitives]
+        limit = self.predictor.limit()
+        return max(1, min([low, *saturated, *([] if limit is None else [limit])]))
+
+    def _try_size(self, primitives: int) -> None:
+        """Train a size for two lengths, so that the gain of more steps is known."""
+        length, words = self.record.length, self.record.words
+        attempts = [Attempt("size", words, primitives, steps) for steps in (length // 2, length)]
+        for several in [attempts] if self.runner.parallel else [[attempt] for attempt in attempts]:
+            known = [self.runner.is_finished(attempt) for attempt in several]
+            for before, done in zip(known, self.runner.run(*several), strict=True):
+                if not before:
+                    self.runner.tell(_describe(done, self.predictor.predict(done.count)))
+
+    def _try_sizes(self) -> None:
+        """Try sizes until the one for the target is known, the share of the budget is used, or nothing helps."""
+        first = min(self.config.model.primitives, self._highest())
+        self._try_size(first)
+        lengthened = False
+        while not self.record.turns and self.full_steps(first) >= 1.9 * _SHORTER * self.record.length:
+            self.record.length, lengthened = 2 * self.record.length, True  # steps are faster than the first few were
+        if lengthened:
+            self._try_size(first)
+        own = [a.primitives for a in self.record.attempts if a.purpose == "size" and a.words == self.record.words]
+        begun = list(dict.fromkeys(own))
+        for count in begun:  # before an interruption
+            self._try_size(count)
+        for _ in range(_MAX_SIZES - len(begun)):
+            proposal = self._propose()
+            if proposal.kind != "try" or proposal.primitives in begun:
+                return
+            if not self.runner.fits(proposal.primitives, 1.5 * self.record.length, _TRIALS):
+                self.record.add_reason("no time for more sizes")
+                return
+            begun.append(proposal.primitives)
+            self._try_size(proposal.primitives)
+
+    def _propose(self) -> Proposal:
+        predictor, highest = self.predictor, self._highest()
+        if not self.target.quality:
+            return climb(predictor.margins(), highest)
+        return propose_size(predictor.margins(), highest, ALLOWANCE, predictor.doubt)
+
+    def _wanted(self) -> int:
+        """Return the size that a full run should have, by what is known now."""
+        predictor, highest = self.predictor, self._highest()
+        margins = predictor.margins()
+        if not self.target.quality:
+            proposal = climb(margins, highest)
+            return proposal.primitives if proposal.kind == "take" else highest
+        counts = [n for n, _ in margins]
+        best = max(margins, key=lambda pair: pair[1])[0]
+        found = Curve.fit(margins).find_count(ALLOWANCE, highest)
+        if found is None and not self.record.finished("full") and max(counts) > best:
+            found = best  # a full run of it tells more than trials of larger ones
+        more = min(highest, round(_BEYOND * max(counts)))
+        if found is not None and found <= _BEYOND * max(counts):
+            found = max(found, min(round(min(counts) / _BELOW), highest), self._least_useful())
+        elif found is None and (
+            best < max(counts) or self.full_steps(more) < _MORE_STEPS * self.full_steps(max(counts))
+        ):
+            return min(best, highest)  # more primitives would have fewer steps
+        else:
+            found = more
+        for attempt in self.record.finished("full"):  # another full run must differ
+            margin = predictor.margin_of(attempt)
+            if margin < MIN_MARGIN:
+                found = max(found, math.ceil(attempt.count * _MIN_STEP))
+            elif margin > _MAX_MARGIN and attempt.count > 1:
+                found = min(found, math.floor(attempt.count / _MIN_STEP))
+        return max(found, 1)
+
+    def _least_useful(self) -> int:
+        """Return the least size of another full run while all have more than the target.
+
+        Short trials of different sizes are often alike, and full runs are not.
+        """
+        full = [(a.count, self.predictor.margin_of(a)) for a in self.record.finished("full")]
+        if not full or min(margin for _, margin in full) < MIN_MARGIN:
+            return 1
+        count, margin = min(full)
+        return round(count / 2 ** ((margin - MIN_MARGIN) / _MIN_SLOPE))
+
+    def _report_reach(self) -> None:
+        """Report a target that is out of reach as soon as trials show it."""
+        if not self.target.quality:
+            return
+        predictor, best = self.predictor, self._wanted()
+        margins = predictor.margins()
+        if max(Curve.fit(margins).at(best), *(m for _, m in margins)) + predictor.doubt >= ALLOWANCE:
+            return
+        expected = ", ".join(format_forecast(name, *pair) for name, pair in predictor.predict(best).items())
+        limited = predictor.limit() is not None and self._highest() == predictor.limit()
+        self.record.out_of_reach = (
+            f"{self.target} is out of reach: {expected} is the best that "
+            f"{'the limits allow' if limited else 'the budget can train'}, of {best:,} primitives; that is made"
+        )
+        self.runner.tell(self.record.out_of_reach)
+
+    def _change_settings(self) -> None:
+        """Try settings that save bytes, at the size nearest to the wanted one."""
+        if self.record.out_of_reach or not (self.target.quality or self.target.megabytes is not None):
+            return
+        values = smaller_values(self.config, task_of(self.config), self.dataset)
+        for _ in range(_MAX_CHANGES):
+            change = next_change(values, self.record.turns)
+            wanted = self._wanted()
+            bases = [
+                a
+                for a in self.record.finished("size", "knob")
+                if a.words == self.record.words and a.steps == self.record.length
+            ]
+            if change is None or not bases:
+                return
+            base = min(bases, key=lambda a: abs(math.log2(a.count / wanted)))
+            if not self.runner.fits(base.primitives, self.record.length, _TRIALS):
+                self.record.add_reason("no time to try other settings")
+                return
+            key, before, after = change
+            words = {**self.record.words, key: after}
+            (tried,) = self.runner.run(Attempt("knob", words, base.primitives, self.record.length))
+            loss = {n: to_decibels(n, base.measured(n)) - to_decibels(n, tried.measured(n)) for n in ("psnr", "ssim")}
+            size = (tried.packed / tried.count) / (base.packed / base.count)
+            slope = max(Curve.fit(self.predictor.margins()).slope_at(wanted), 0.2)
+            adopted = change_pays(max(loss[name] for name in self.predictor.measures), size, slope)
+            self.record.turns.append(SettingChange(key, before, after, loss, size, adopted))
+            self.runner.write()
+            end = "kept" if adopted else "not worth it"
+            self.runner.tell(f"{key}={after}: {size:.0%} of the bytes, {-loss['psnr']:+.2f} dB; {end}")
+
+    # ------------------------------------------------------------ full runs
+
+    def _run_full(self) -> None:
+        """Make a full run, and others while the target is missed or met by too much, and time is left."""
+        for _ in range(_MAX_FULL - (len(self.record.finished("full")) - self.record.before)):
+            unfinished = [a for a in self.record.attempts if a.purpose == "full" and a.outcome is None]
+            if not unfinished and any(self._is_good(a) for a in self.record.finished("full")):
+                return
+            attempt = unfinished[-1] if unfinished else self._plan_full()
+            if attempt is None:
+                return
+            expected = ", ".join(format_forecast(name, *pair) for name, pair in attempt.predicted.items())
+            text = f"full run: {attempt.primitives:,} primitives, {attempt.steps:,} steps; expected {expected}"
+            self.runner.tell(text)
+            self.runner.tell(_describe(self.runner.run(attempt)[0], {}))
+
+    def _is_good(self, attempt: Attempt) -> bool:
+        """Return whether a full run is about as good as another could be."""
+        if exceeded_limit(self.target, attempt) is not None:
+            return False
+        if not self.target.quality:
+            return self._wanted() <= _MORE * attempt.count
+        margin = self.predictor.margin_of(attempt)
+        return MIN_MARGIN <= margin <= _MAX_MARGIN and attempt.count <= _NEAR * self._wanted()
+
+    def _plan_full(self) -> Attempt | None:
+        """Return the next full run; None where another has no time or would not differ."""
+        finished, wanted, budget = self.record.finished("full"), self._wanted(), self.record.asked["budget"]
+        pace, left = self.runner.pace(wanted), self.runner.left - self._reserve(wanted)
+        share = left if finished else max(left / 2, min(left, _FULL * budget))
+        least = self.record.length * (4 if finished else 1)
+        steps = int(min(self.max_steps, share / pace))
+        if finished and steps < max(least, _MORE_STEPS * finished[-1].steps):
+            self.record.add_reason(f"no time for another full run: {max(left, 0):.0f} s are left")
+            return None
+        if finished and any(abs(math.log2(wanted / a.count)) < math.log2(_MIN_STEP) / 2 for a in finished):
+            self.record.add_reason("another size promises nothing better")
+            return None
+        steps = max(steps, least)
+        seconds = round(max(min(_SLOWER * steps * pace, left), 0.02 * budget, 1.0), 1)
+        return Attempt("full", self.record.words, wanted, steps, seconds, self.predictor.predict(wanted))
+
+    def _reserve(self, primitives: int) -> float:
+        """Return the seconds for what follows a full run: evaluation, pictures, quantization."""
+        trials = self.record.finished("size", "longer", "full")
+        frame = fit_line([(a.count, a.measured("ms_per_frame")) for a in trials], primitives) / 1e3
+        held_out = min(VIEWS, len(self.dataset.train) // self.record.hold_out)
+        frames = 6 * held_out + 3 * len(self.dataset.test) + 40
+        return 2 * frame * frames + 2 * max(self.runner.overhead(), 0.0)
+
+
+def _describe(attempt: Attempt, predicted: Mapping[str, Sequence[float]]) -> str:
+    changes = "".join(f" {key.rpartition('.')[2]}={value}" for key, value in sorted(attempt.words.items()))
+    expected = ", ".join(format_forecast(name, *pair) for name, pair in predicted.items())
+    measured = f"held out {attempt.measured('psnr'):.2f} dB, ssim {attempt.measured('ssim'):.4f}"
+    return (
+        f"{attempt.count:,} primitives{changes}, {attempt.steps:,} steps, {attempt.packed / 1e3:.1f} kB: {measured}"
+        f"{f'; a full run: {expected}' if expected else ''} ({attempt.seconds:.1f} s)"
+    )

@@ -1,0 +1,338 @@
+"""``neuprim run target.psnr=30 budget=10m``: find and train the smallest model that meets a target.
+
+Trials and full runs find the size; the chosen full run becomes the run directory; pruning and quantization then make
+its model smaller. Only training views decide, some of which are held out.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuprim.config import RunConfig, suspects_of, task_of
+from neuprim.config.launcher import LauncherSettings
+from neuprim.config.target import Target
+from neuprim.core.checkpoint import extra_of, load_model, save_compressed
+from neuprim.core.compression import Quantizers
+from neuprim.core.data import Dataset
+from neuprim.core.data.dataset import hold_out_views
+from neuprim.core.data.dataset_check import check_dataset
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.files import atomic_path, write_text
+from neuprim.core.metrics import psnr, ssim
+from neuprim.core.model.primitives import Primitives
+from neuprim.runs.evaluate import evaluate_fitted
+from neuprim.runs.events import Events, Finishing, Preparing, ignore_event
+from neuprim.runs.ground_truth import render_ground_truth_for_training
+from neuprim.runs.launch.launcher import use_launcher_threads
+from neuprim.runs.measure import measure_quality, render_image
+from neuprim.runs.open import COMPRESSED, LOGS, load_dataset, move_to_render_device, read_metrics
+from neuprim.runs.run_directory import lock_directory
+from neuprim.runs.training import train_in_directory
+from neuprim.search.eval_views import eval_views, fill_masked
+from neuprim.search.pruning import PruneRequest, prune_run
+from neuprim.search.quantized_finetune import QuantizationSearch, dequantize
+from neuprim.search.size_curve import to_decibels
+from neuprim.search.size_predictor import ALLOWANCE, MIN_MARGIN, SizePredictor, exceeded_limit
+from neuprim.search.size_search import SizeSearch
+from neuprim.search.target_record import TARGET_FILE, Attempt, TargetRecord, read_target_record
+from neuprim.search.training_quality import TrainingQuality
+from neuprim.search.trial_runner import VIEWS, TrialRunner, default_compressed_bytes
+
+__all__ = ["choose_full_run", "choose_hold_out", "run_target"]
+
+_FIRST_SHARE = 0.05
+"""Share of the squared error at which the search for coarse numbers begins."""
+
+_NOTABLE = 0.3
+"""dB between test views and held-out views that are reported."""
+
+_MAX_TUNING, _MIN_TUNING = 3, 600
+"""Most steps of fine-tuning over those of the full run, and least steps with which pruning is worth it."""
+
+_KEPT = ("model.safetensors", "checkpoint.safetensors", "metrics.jsonl")
+
+
+def run_target(
+    config: RunConfig,
+    target: Target,
+    budget: float,
+    events: Events = ignore_event,
+    clock: Callable[[], float] = time.monotonic,
+    launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
+) -> TargetRecord:
+    """Find and train the smallest model; leaves a run directory with ``target.json`` and ``model.neuprim``.
+
+    Args:
+        config: its primitives are the first size tried, its iterations the most of a run.
+        budget: seconds of search, training and measuring.
+        clock: seconds, monotonic.
+        launcher: where trainings run.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C; the same call with ``resume`` continues.
+        NeuprimError: invalid input, or a budget in which nothing can be trained.
+    """
+    _check_config(config)
+    record = _resume_record(config, {**target.given(), "budget": budget})
+    if record.achieved:
+        return record
+    suspects, begun = suspects_of(config), clock()
+    with (
+        lock_directory(config.output_dir, "search"),
+        suspects.watch(config.output_dir / LOGS),
+        use_launcher_threads(launcher),
+    ):
+        task = task_of(config)
+
+        def progress(text: str, fraction: float) -> None:
+            events(Preparing(text, fraction))
+
+        render_ground_truth_for_training(config, launcher, progress)
+        dataset = load_dataset(config, task, progress)
+        suspects.know(dataset)
+        check_dataset(dataset, task.conditions)
+        record.hold_out = choose_hold_out(dataset)
+        runner = TrialRunner(config, dataset, record, events, clock, launcher, begun - record.spent)
+        try:
+            search = SizeSearch(config, target, dataset, record, runner)
+            search.run()
+            _publish(runner, search.predictor)
+        finally:
+            runner.write()
+    return record
+
+
+def choose_hold_out(dataset: Dataset) -> int:
+    """Return n: every n-th training view is held out; one of eight, more of few views."""
+    count = len(dataset.train)
+    if count < 4:
+        raise DataError(f"{dataset.name}: {count} training views; a target needs 4 or more, as some are held out")
+    return min(8, max(2, count // 8))
+
+
+def _check_config(config: RunConfig) -> None:
+    train, population = config.train, config.train.population
+    if train.max_seconds is not None and "train.max_seconds" in config.non_default:
+        raise ConfigError(
+            f"train.max_seconds={train.max_seconds:g}: a run with a target has its seconds from budget=; expected one"
+        )
+    if train.iterations == 0:
+        raise ConfigError("train.iterations=0: a run with a target has to train; expected a positive number")
+    if population.strategy == "gradient":
+        raise ConfigError(
+            "train.population.strategy=gradient: it decides how many primitives there are, so that a target cannot; "
+            "expected relocate or fixed"
+        )
+    if population.grow_to is not None:
+        raise ConfigError(
+            f"train.population.grow_to={population.grow_to}: a target decides how many primitives there are; "
+            "expected null"
+        )
+
+
+def _resume_record(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
+    """Return the earlier record. Another target or budget keeps the trainings and starts its seconds anew."""
+    own = ("output_dir", "resume", "overrides", "non_default", "made_by")
+    same: dict[str, Any] = json.loads(json.dumps({k: v for k, v in config.to_dict().items() if k not in own}))
+    before = read_target_record(config.output_dir) if config.resume else None
+    if before is None:
+        if (config.output_dir / "config.yaml").exists():
+            raise ConfigError(
+                f"output_dir={config.output_dir}: holds a run without a target; expected a new directory, "
+                "or that of a target run"
+            )
+        return TargetRecord(asked, same)
+    different = [key for key in same if before.same.get(key) != same[key]]
+    if different:
+        raise ConfigError(
+            f"{config.output_dir / TARGET_FILE}: begun with another {', '.join(different)}; expected the same "
+            "overrides, or a new output_dir"
+        )
+    if before.asked == asked:
+        return before
+    finished = [a for a in before.attempts if a.outcome is not None]
+    return replace(
+        TargetRecord(asked, same), length=before.length, attempts=finished, before=len(before.finished("full"))
+    )
+
+
+# ---------------------------------------------------------------- the result
+
+
+@dataclass(frozen=True)
+class _Result:
+    """The result after a stage.
+
+    Attributes:
+        run_dir: the run directory, or that of the pruned model in it.
+        held: PSNR and SSIM of held-out views; test: of test views.
+        packed: bytes of the smallest file.
+    """
+
+    run_dir: Path
+    held: dict[str, float]
+    test: dict[str, float]
+    packed: int
+    facts: dict[str, Any]
+
+
+def choose_full_run(predictor: SizePredictor) -> Attempt:
+    """Return the smallest full run that meets the target, with room for quantization if possible; else the best."""
+    finished = predictor.record.finished("full")
+    within = [a for a in finished if exceeded_limit(predictor.target, a) is None] or finished
+    for room in (MIN_MARGIN, 0.0):
+        met = [a for a in within if predictor.target.quality and predictor.margin_of(a) >= room]
+        if met:
+            return min(met, key=lambda a: a.packed)
+    return max(within, key=predictor.margin_of)
+
+
+def _publish(runner: TrialRunner, predictor: SizePredictor) -> None:
+    """Write the run directory of the best full run, prune and quantize its model, and record what is achieved."""
+    record, target = runner.record, predictor.target
+    attempt = choose_full_run(predictor)
+    record.chosen = attempt.folder
+    result = _write_run(runner, attempt)
+    result = _prune(runner, predictor, attempt, result)
+    result = _quantize(runner, predictor, result)
+    limit = exceeded_limit(target, attempt, result.packed)
+    missed = [f"{n} {result.held[n]:.4g}" for n, goal in target.quality.items() if result.held[n] < goal]
+    record.warning = None
+    if limit is not None or missed:
+        reason = limit or f"{', '.join(missed)} on the views held out"
+        record.warning = f"{target} is missed: {reason}; the best found is made"
+        record.why += [record.out_of_reach] if record.out_of_reach else []
+    else:
+        record.why.append(f"{target} is met on the views held out")
+    for name, goal in target.quality.items():
+        test, held_value, wanted = (to_decibels(name, v) for v in (result.test[name], result.held[name], goal))
+        if abs(test - held_value) > _NOTABLE:
+            side = "above" if test >= wanted else "below"
+            record.why.append(
+                f"{name} of the test views is {test - held_value:+.2f} dB from that of the views held out, and {side} "
+                "the target; test views decide nothing"
+            )
+    metrics = read_metrics(result.run_dir)
+    record.achieved = {
+        "run_dir": str(result.run_dir),
+        "primitives": result.facts.get("pruned", {}).get("primitives", attempt.count),
+        "held_out": result.held,
+        "test_before_storing": {name: metrics[name] for name in ("psnr", "ssim")},
+        "test": result.test,
+        "fps": 1e3 / attempt.measured("ms_per_frame"),
+        "model_bytes": (result.run_dir / "model.safetensors").stat().st_size,
+        "packed_bytes": result.packed,
+        **result.facts,
+        "predicted": attempt.predicted,
+        "seconds": runner.spent,
+    }
+
+
+def _write_run(runner: TrialRunner, attempt: Attempt) -> _Result:
+    """Write the run directory from the training's."""
+    config, folder = runner.configure(attempt), runner.config.output_dir
+    runner.events(Finishing("measuring test views"))
+    fitted, _ = train_in_directory(
+        replace(config, resume=True), suspects_of(config), dataset=runner.dataset, hold_out=runner.record.hold_out
+    )
+    for name in _KEPT:
+        with atomic_path(folder / name) as temporary:
+            shutil.copyfile(config.output_dir / name, temporary)
+    final = replace(fitted.config, output_dir=folder, resume=False)
+    write_text(folder / "config.yaml", final.to_yaml())
+    dataset = replace(runner.dataset, train=fitted.dataset.train)
+    metrics = evaluate_fitted(replace(fitted, config=final, dataset=dataset), folder)
+    names = ("psnr", "ssim")
+    held_out_values = {name: attempt.measured(name) for name in names}
+    metrics = read_metrics(folder)
+    return _Result(folder, held_out_values, {n: float(metrics[n]) for n in names}, int(metrics["model_bytes"]), {})
+
+
+def _measure_held_out(runner: TrialRunner, model: Primitives) -> dict[str, float]:
+    """Return PSNR and SSIM of the held-out views that evaluated the trainings."""
+    dataset, settings = hold_out_views(runner.dataset, runner.record.hold_out), runner.config.renderer
+    views, rows = eval_views(dataset, VIEWS), []
+    with torch.no_grad():
+        model = move_to_render_device(model, settings, views[0].view)
+        for one in views:
+            image = fill_masked(render_image(model, one.view, settings, dataset.background), one)
+            rows.append((psnr(image, one.image, one.mask), ssim(image, one.image)))
+    return dict(zip(("psnr", "ssim"), (float(np.mean(column)) for column in zip(*rows, strict=True)), strict=True))
+
+
+def _prune(runner: TrialRunner, predictor: SizePredictor, attempt: Attempt, before: _Result) -> _Result:
+    """Prune as far as the target allows, in half of the time left; returns the result before if that fails."""
+    record, margin = runner.record, predictor.margin(before.held)
+    if not predictor.target.quality or margin < 0:
+        return before
+    steps = int(min(runner.left / 2 / runner.pace(attempt.count), _MAX_TUNING * attempt.steps))
+    if steps < _MIN_TUNING:
+        record.why.append(f"no time to prune: {max(runner.left, 0):.0f} s are left")
+        return before
+    tolerance, folder = max(margin - MIN_MARGIN, MIN_MARGIN), before.run_dir / "pruned"
+    request = PruneRequest(before.run_dir, tolerance, 0.0, steps, folder, True, record.hold_out)
+    made = prune_run(request, lambda text, fraction: runner.events(Finishing(f"pruning: {text}")))
+    if made.run_dir is None:
+        record.why.append("nothing could be pruned")
+        return before
+    task = task_of(runner.config)
+    model, _ = load_model(made.run_dir / "model.safetensors", task)
+    held_values, metrics = _measure_held_out(runner, model), read_metrics(made.run_dir)
+    old, new = (default_compressed_bytes(one, task) for one in (before.run_dir, made.run_dir))
+    kept = predictor.margin(held_values) >= 0 and new < old
+    runner.tell(
+        f"pruned: {model.count:,} primitives, {new / 1e3:.1f} kB in place of {old / 1e3:.1f}, held out "
+        f"{held_values['psnr']:.2f} dB, ssim {held_values['ssim']:.4f}; {'kept' if kept else 'not worth it'}"
+    )
+    if not kept:
+        return before
+    test = {name: float(metrics[name]) for name in ("psnr", "ssim")}
+    pruned = {"primitives": model.count, "bytes_usual": new, "bytes_usual_before": old}
+    return _Result(made.run_dir, held_values, test, int(made.after["bytes"]), {**before.facts, "pruned": pruned})
+
+
+def _quantize(runner: TrialRunner, predictor: SizePredictor, before: _Result) -> _Result:
+    """Quantize as coarsely as the target allows, at little cost if it is missed anyway.
+
+    With a limit of bytes alone, quantize as finely as it allows.
+    """
+    target, task, file = predictor.target, task_of(runner.config), before.run_dir / COMPRESSED
+    model, header = load_model(before.run_dir / "model.safetensors", task)
+    text = (before.run_dir / "config.yaml").read_text(encoding="utf-8")
+    margin = predictor.margin(before.held)
+    least = 0.0 if margin >= 0 else margin - ALLOWANCE
+    runner.events(Finishing("quantizing"))
+    views = replace(runner.dataset, train=hold_out_views(runner.dataset, runner.record.hold_out).train)
+    search = QuantizationSearch(model, views, TrainingQuality.of_run(runner.config, views))
+
+    def save(quantizers: Quantizers) -> int:
+        save_compressed(file, search.model, task.name, extra_of(header), quantizers, text)
+        return file.stat().st_size
+
+    def accept(quantizers: Quantizers) -> bool:
+        values: Mapping[str, float] = _measure_held_out(runner, dequantize(search.model, quantizers))
+        return (
+            predictor.margin(values) >= least if target.quality else before.held["psnr"] - values["psnr"] <= ALLOWANCE
+        )
+
+    if target.quality or target.megabytes is None:
+        quantizers, share = search.find_coarsest(accept, _FIRST_SHARE)
+    else:
+        most = 1e6 * target.megabytes
+        quantizers, share = search.find_finest(lambda tried: save(tried) <= most, _FIRST_SHARE)
+    size = save(quantizers)
+    decoded, _ = load_model(file, task)
+    test = dict(
+        zip(("psnr", "ssim"), measure_quality(decoded, task, runner.dataset, runner.config.renderer), strict=True)
+    )
+    facts = {**before.facts, "rounding": share, "file": str(file)}
+    return replace(before, held=_measure_held_out(runner, decoded), packed=size, test=test, facts=facts)

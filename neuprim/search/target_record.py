@@ -1,0 +1,174 @@
+"""Record of a target search, ``target.json``: request, trainings, decisions and result; a search resumes from it."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.files import read_json, write_json
+from neuprim.core.validation import validate
+
+__all__ = ["TARGET_FILE", "Attempt", "Purpose", "SettingChange", "SettingValue", "TargetRecord", "read_target_record"]
+
+TARGET_FILE = "target.json"
+
+FORMAT = 1
+
+Purpose = Literal["pace", "size", "knob", "longer", "full"]
+
+SettingValue = int | float | str
+
+
+@dataclass
+class Attempt:
+    """One training of the search.
+
+    Attributes:
+        purpose: what it measures; "full" is a candidate for the result.
+        words: changed settings beside the number of primitives, e.g. {"model.sh_degree": 1}.
+        primitives, steps: as requested.
+        max_seconds: limit of a full run; None for trials.
+        predicted: measure -> [value, doubt], predicted before a full run.
+        outcome: of the training, on held-out training views; see :class:`neuprim.search.trials.Outcome`.
+        packed: bytes of the model compressed at the default level.
+        pace: seconds of a step.
+        seconds: of all of it, by the search's clock.
+    """
+
+    purpose: Purpose
+    words: dict[str, SettingValue]
+    primitives: int
+    steps: int
+    max_seconds: float | None = None
+    predicted: dict[str, list[float]] = field(default_factory=dict)
+    outcome: dict[str, Any] | None = None
+    packed: int = 0
+    pace: float | None = None
+    seconds: float = 0.0
+
+    @property
+    def folder(self) -> str:
+        """Name of its folder."""
+        changes = [f"{key.rpartition('.')[2]}-{value}" for key, value in sorted(self.words.items())]
+        limit = [] if self.max_seconds is None else [f"{self.max_seconds:g}s"]
+        first = f"{'full-' if self.purpose == 'full' else ''}{self.primitives}"
+        return "_".join([first, *changes, f"{self.steps}-steps", *limit])
+
+    def measured(self, name: str) -> float:
+        """Return a number of the outcome."""
+        assert self.outcome is not None
+        return float(self.outcome[name])
+
+    @property
+    def count(self) -> int:
+        """Primitives at the end."""
+        return int(self.measured("primitives"))
+
+    def repeats(self, other: Attempt) -> bool:
+        """Return whether both are the same training."""
+        same = (self.words, self.primitives, self.steps, self.max_seconds)
+        full = (self.purpose == "full") == (other.purpose == "full")
+        return full and same == (other.words, other.primitives, other.steps, other.max_seconds)
+
+
+@dataclass
+class SettingChange:
+    """A setting that was changed to save bytes.
+
+    Attributes:
+        loss: measure -> dB that it costs at equal primitives.
+        size: bytes of a primitive over those before.
+        adopted: whether the model is smaller with it, with the primitives that make up for the loss.
+    """
+
+    key: str
+    before: SettingValue
+    after: SettingValue
+    loss: dict[str, float]
+    size: float
+    adopted: bool
+
+
+@dataclass
+class TargetRecord:
+    """Content of ``target.json``.
+
+    Attributes:
+        asked: the target and its budget, seconds.
+        same: what must be equal to keep trainings.
+        hold_out: every n-th training view is held out and evaluates trainings.
+        stage: number of finished stages of the search.
+        length: steps of a trial; 0 until the step time is known.
+        spent: seconds of the budget.
+        before: full runs made for an earlier target.
+        turns: changed settings.
+        chosen: folder of the chosen full run.
+        achieved: result: quality of test and held-out views, bytes, frames per second.
+        out_of_reach: the message that the target is out of reach, if trials show it.
+        why: reasons why the search ended; warning: message that the target was missed.
+    """
+
+    asked: dict[str, float]
+    same: dict[str, Any]
+    hold_out: int = 0
+    stage: int = 0
+    length: int = 0
+    spent: float = 0.0
+    before: int = 0
+    attempts: list[Attempt] = field(default_factory=list)
+    turns: list[SettingChange] = field(default_factory=list)
+    chosen: str | None = None
+    achieved: dict[str, Any] = field(default_factory=dict)
+    out_of_reach: str | None = None
+    why: list[str] = field(default_factory=list)
+    warning: str | None = None
+
+    @property
+    def words(self) -> dict[str, SettingValue]:
+        """Settings changed so far."""
+        return {turn.key: turn.after for turn in self.turns if turn.adopted}
+
+    def history(self, key: str) -> list[SettingValue]:
+        """Return the values of a changed setting from the first to the current one."""
+        own = [turn for turn in self.turns if turn.adopted and turn.key == key]
+        return [own[0].before, *(turn.after for turn in own)] if own else []
+
+    def finished(self, *purposes: Purpose) -> list[Attempt]:
+        """Return the finished trainings of these purposes, in their order."""
+        return [a for a in self.attempts if a.purpose in purposes and a.outcome is not None]
+
+    def add_reason(self, text: str) -> None:
+        if text not in self.why:
+            self.why.append(text)
+
+    def write(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / TARGET_FILE, {"format": FORMAT, **dataclasses.asdict(self)})
+
+
+def read_target_record(folder: Path) -> TargetRecord | None:
+    """Read the record of a run directory; None where there is none.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    file = folder / TARGET_FILE
+    data = read_json(file, "the record of a target run", "delete it to search anew")
+    if data is None:
+        return None
+    try:
+        if data["format"] != FORMAT:
+            raise DataError(f"{file}: format {data['format']!r}; this neuprim reads {FORMAT}; delete it to search anew")
+        record = validate(TargetRecord, {f.name: data[f.name] for f in dataclasses.fields(TargetRecord)})
+        for attempt in record.attempts:
+            if not (attempt.primitives > 0 and attempt.steps > 0 and Path(attempt.folder).name == attempt.folder):
+                raise ValueError("attempts: expected positive primitives and steps, and settings that name a folder")
+            if attempt.outcome is not None:
+                [attempt.measured(name) for name in ("psnr", "ssim", "primitives", "bytes", "ms_per_frame")]
+        return record
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError, ConfigError) as error:
+        what = f"{type(error).__name__}: {error}"
+        raise DataError(f"{file}: not the record of a target run ({what}); delete it to search anew") from error

@@ -1,0 +1,200 @@
+"""``neuprim tradeoff task=…`` on a tiny scene: what it trains, measures, keeps, writes and refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neuprim.cli import main
+from neuprim.config import compose
+from neuprim.config.launcher import LauncherSettings
+from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError, DataError, NonFiniteError
+from neuprim.runs.events import Events
+from neuprim.runs.fit import fit
+from neuprim.runs.open import load_run
+from neuprim.search import ablation, ablation_plan
+from neuprim.search.ablation import run_ablation
+from neuprim.search.ablation_folder import TRIALS, AblationRequest
+from neuprim.search.ablation_plan import CENTRE, Plan, Variant, plan_lengths
+from neuprim.search.points import COMBINED, Record, read_record
+from neuprim.search.trials import Outcome, Trial, read_outcome, run_trial
+from tests.core import tiny
+from tests.short_runs import words
+
+STEPS = 40
+KNOBS = ("model.primitives", "model.neurons", "train.iterations")
+"""Knobs that compile nothing more."""
+
+SINGLES = {
+    *(CENTRE, "neurons=0", "neurons=2", "neurons=8", "0.5 of the length", "0.25 of the length"),
+    *("primitives=20", "primitives=80"),
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_sets() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ablation_plan, "_COUNTS", (0.5, 2.0))
+        patch.setattr(ablation, "_MAX_COMBINATIONS", 2)
+        yield
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny.write_blender(tmp_path_factory.mktemp("data") / "two")
+
+
+def request(scene: Path, folder: Path, *more: str, **changes: Any) -> AblationRequest:
+    values: dict[str, Any] = {"budget": 600.0, "views": 2, "repeats": 3, "knobs": KNOBS, **changes}
+    return AblationRequest([*words(scene, folder, STEPS), *more], **values)
+
+
+@pytest.fixture(scope="module")
+def measured(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
+    return run_ablation(request(scene, tmp_path_factory.mktemp("sets") / "a set"))
+
+
+def names(record: Record) -> set[str]:
+    return {point.name for point in record.points if point.knob != COMBINED}
+
+
+def test_the_centre_every_knob_alone_and_some_together(measured: tuple[Path, Record]) -> None:
+    folder, record = measured
+    assert record.points[0].name == CENTRE and names(record) == SINGLES and record.left_out == []
+    assert any(point.knob == COMBINED and len(point.turned) > 1 for point in record.points)
+    plan = Plan(**record.facts["plan"])
+    for point in record.points:
+        config, _, model, _ = load_run(folder / point.run_dir)
+        assert config.train.iterations == point.steps and model.count == point.primitives
+        assert point.steps == max(1, round(STEPS * point.length / plan.paces[point.name]))
+        assert point.bytes == (folder / point.run_dir / "model.safetensors").stat().st_size
+        assert point.seconds > 0 and len(point.ms) == len(point.ratios) >= 3 and point.seeds == (point.quality["psnr"],)
+    assert set(record.points[0].ratios) == {1.0} and read_record(folder / "tradeoff.json") == record
+    page = (folder / "tradeoff.html").read_text(encoding="utf-8")
+    assert "neuprim run" in page and (folder / "front.png").exists() and (folder / "tradeoff.csv").exists()
+
+
+def test_the_overrides_of_a_point_train_it(measured: tuple[Path, Record]) -> None:
+    point = measured[1].points[measured[1].size[-1]]
+    again = fit(compose([*point.words, "output_dir=null"], check_output=False)).metrics()
+    assert again["psnr"] == pytest.approx(point.quality["psnr"], abs=1e-6)
+    assert again["primitives"] == point.primitives
+
+
+def test_seeds_are_averaged_and_must_be_equal_to_continue(scene: Path, tmp_path: Path) -> None:
+    folder, record = run_ablation(request(scene, tmp_path / "set", knobs=("train.iterations",), seeds=2))
+    outcomes = [read_outcome(folder / TRIALS / name) for name in (CENTRE, f"{CENTRE}_seed-4")]
+    seeds = [outcome.psnr for outcome in outcomes if outcome is not None]
+    centre = record.points[0]
+    assert list(centre.seeds) == seeds and seeds[0] != seeds[1]
+    assert centre.quality["psnr"] == pytest.approx(sum(seeds) / 2)
+    with pytest.raises(ConfigError, match="holds a set with another seeds"):
+        run_ablation(request(scene, tmp_path / "set", knobs=("train.iterations",)))
+
+
+def test_what_does_not_fit_is_left_out_until_the_budget_grows(scene: Path, tmp_path: Path) -> None:
+    _, record = run_ablation(request(scene, tmp_path / "set", budget=1e-3))
+    assert names(record) == {CENTRE} and record.points[0].steps == STEPS // 20
+    assert {one.reason for one in record.left_out} == {"no time left of the budget of 0.001 s"}
+    _, larger = run_ablation(request(scene, tmp_path / "set"))
+    assert names(larger) == SINGLES and larger.left_out == [] and larger.points[0].steps == STEPS // 20
+    assert larger.points[0].ms[:1] == record.points[0].ms[:1], "earlier measurements stay"
+
+
+def test_failures_and_equal_models_are_left_out(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(trial: Trial, dataset: Dataset | None, events: Events) -> Outcome:
+        if trial.config.model.neurons == 8:
+            raise NonFiniteError("gradient of W1 is not finite")
+        return run_trial(trial, dataset, events)
+
+    monkeypatch.setattr(ablation, "run_trial", failing)
+    _, record = run_ablation(request(scene, tmp_path / "set", knobs=("model.neurons",)))
+    assert names(record) == {CENTRE, "neurons=0", "neurons=2"}
+    assert [(one.words, one.reason) for one in record.left_out] == [
+        (("model.neurons=8",), "gradient of W1 is not finite")
+    ]
+    _, record = run_ablation(request(scene, tmp_path / "paper", "preset=paper", knobs=("model.density.edge",)))
+    assert (("model.density.edge=0",), "the same model as the centre") in [(o.words, o.reason) for o in record.left_out]
+
+
+@pytest.mark.slow
+def test_launched_trainings_make_the_same_set(
+    scene: Path, measured: tuple[Path, Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batches: list[int] = []
+
+    def together(groups: list[list[Trial]], *args: Any) -> list[list[Outcome]]:
+        batches.append(len(groups))
+        return [[run_trial(trial) for trial in group] for group in groups]
+
+    monkeypatch.setattr(ablation, "launch_trials", together)
+    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
+    _, record = run_ablation(request(scene, tmp_path / "set", launcher=LauncherSettings("processes")))
+    assert max(batches) > 1 and names(record) == SINGLES
+    assert record.points[0].quality["psnr"] == measured[1].points[0].quality["psnr"]
+
+
+def test_an_interrupted_set_continues(
+    scene: Path, measured: tuple[Path, Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained: list[str] = []
+
+    def stopped(trial: Trial, dataset: Dataset | None, events: Events) -> Outcome:
+        if len(trained) == 3:
+            raise KeyboardInterrupt
+        trained.append(trial.config.output_dir.name)
+        return run_trial(trial, dataset, events)
+
+    monkeypatch.setattr(ablation, "run_trial", stopped)
+    knobs = ("model.neurons",)
+    with pytest.raises(KeyboardInterrupt):
+        run_ablation(request(scene, tmp_path / "set", knobs=knobs))
+    monkeypatch.undo()
+    half = read_record(tmp_path / "set" / "tradeoff.json")
+    assert half is not None and len(half.points) == 3
+    _, record = run_ablation(request(scene, tmp_path / "set", knobs=knobs))
+    assert names(record) == {CENTRE, "neurons=0", "neurons=2", "neurons=8"}
+    assert record.points[0].quality["psnr"] == measured[1].points[0].quality["psnr"]
+
+
+def test_folders_that_hold_something_else_are_refused(
+    scene: Path, tmp_path: Path, measured: tuple[Path, Record]
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "a").touch()
+    with pytest.raises(ConfigError, match="holds something else"):
+        run_ablation(request(scene, tmp_path / "mine"))
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="is a file"):
+        run_ablation(request(scene, tmp_path / "file"))
+    with pytest.raises(ConfigError, match="holds a set with another centre"):
+        run_ablation(request(scene, measured[0], "model.neurons=3"))
+    Record({}, {}, measured[1].points[:1]).write(tmp_path / "tradeoff.json")
+    with pytest.raises(DataError, match="of a finished run"):
+        run_ablation(request(scene, tmp_path))
+    with pytest.raises(ConfigError, match="no such knob of a model"):
+        run_ablation(request(scene, tmp_path / "set", knobs=("model.neuron",)))
+
+
+def test_the_command(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    typed = words(scene, tmp_path / "set", 20)
+    flags = ["--views", "1", "--repeats", "1", "--knobs", "train.iterations"]
+    assert main(["tradeoff", *typed, "budget=60s", *flags]) == 0
+    out = capsys.readouterr().out
+    assert "Every model trains for the same time" in out and "front of size" in out and "neuprim run" in out
+    assert main(["tradeoff", *typed, "budget=60s", "--budget", "1m"]) == 2
+    assert "expected one of them" in capsys.readouterr().err
+
+
+def test_lengths_fit_the_budget(scene: Path, tmp_path: Path) -> None:
+    centre = compose(words(scene, tmp_path / "a", 1000), check_output=False)
+    assert plan_lengths(centre, 0.1, 60.0, [1.0, 0.5, 0.5]).steps == 300
+    assert plan_lengths(centre, 0.1, 1e9, [1.0]).steps == 1000 and plan_lengths(centre, 0.1, 0.0, [1.0]).steps == 50
+    plan = plan_lengths(centre, 0.1, 60.0, [1.0, 0.5, 0.5])
+    plan.paces["neurons=8"] = 2.0
+    trained = plan.overrides(Variant("model.neurons", ("model.neurons=8",)), ["model.neurons=4", "seed=3"], centre)
+    assert trained[:3] == ["seed=3", "model.neurons=8", "train.iterations=150"]

@@ -1,0 +1,165 @@
+"""The end of a run once more: rates, what stays as it is, and training for few bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from neuprim.core.compression import Quantizers, bit_table, canonicalize, fake_quantize, fit_quantizers
+from neuprim.core.compression.quantizers import Columns
+from neuprim.core.data import Dataset
+from neuprim.core.model.primitives import Primitives
+from neuprim.runs.finetune import COOL, LEAST_START, LONG, START, fine_tuner
+from neuprim.runs.open import load_dataset, load_run
+from neuprim.search.quantized_finetune import (
+    QuantizationSearch,
+    TrainingData,
+    finetune_for_table,
+    quantize_within,
+)
+from neuprim.search.training_quality import TrainingQuality
+from tests.core import tiny
+from tests.short_runs import fit, words
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    return fit(words(tiny.write_blender(folder / "two"), folder / "run", 300, "renderer.threads=1"))
+
+
+@pytest.fixture(scope="module")
+def dataset(run_dir: Path) -> Dataset:
+    config, task, _, _ = load_run(run_dir)
+    return load_dataset(config, task, run_dir=run_dir)
+
+
+def test_rates_begin_above_those_of_the_run_s_end_and_fall_to_next_to_nothing(run_dir: Path, dataset: Dataset) -> None:
+    config, task, model, _ = load_run(run_dir)
+    assert 40 / LONG * START < LEAST_START
+    trainer = fine_tuner(config, task, dataset, model, 40)
+    spec = next(s for s in model.specs if s.name == "b2")
+    usual = config.train.rates.get("b2", spec.lr) * config.train.final_rate
+    assert trainer.rates()["b2"] == pytest.approx(LEAST_START * usual, rel=1e-6)
+    means = config.train.rates["means"] * config.train.final_rate * dataset.extent
+    assert trainer.rates()["means"] == pytest.approx(LEAST_START * means, rel=1e-6)
+    for _ in range(40):
+        trainer.train_step()
+    assert trainer.finished and trainer.rates()["b2"] == pytest.approx(COOL * LEAST_START * usual, rel=1e-6)
+    for steps, start in (
+        (LONG, START),
+        (3 * LONG, START),
+        (2 * LONG // 3, 2 * START / 3),
+    ):  # of many steps they begin higher
+        assert fine_tuner(config, task, dataset, model, steps).rates()["b2"] == pytest.approx(start * usual, rel=1e-3)
+
+
+def test_the_model_itself_stays_as_it_is_and_no_primitive_is_born_or_moved(run_dir: Path, dataset: Dataset) -> None:
+    config, task, model, _ = load_run(run_dir)
+    before = {name: value.clone() for name, value in model.params.items()}
+    eager = replace(
+        config, train=replace(config.train, population=replace(config.train.population, every=1, start=0.0, stop=1.0))
+    )
+    trainer = fine_tuner(eager, task, dataset, model, 30)
+    changes = [trainer.train_step().change for _ in range(30)]
+    assert set(changes) == {None} and trainer.model.count == model.count
+    assert all(torch.equal(model.params[name], value) for name, value in before.items())
+    assert not torch.equal(trainer.model.params["means"], before["means"])
+
+
+def test_what_is_to_stay_zero_does_and_nothing_else(run_dir: Path, dataset: Dataset) -> None:
+    config, task, model, _ = load_run(run_dir)
+    zero = torch.zeros_like(model.params["sh_rest"], dtype=torch.bool)
+    zero[::2, 3:] = True
+    pruned = Primitives(
+        model.density, model.colour, {**model.params, "sh_rest": model.params["sh_rest"].masked_fill(zero, 0.0)}
+    )
+    trainer = fine_tuner(config, task, dataset, pruned, 20)
+    trainer.zero_masks = {"sh_rest": zero}
+    for _ in range(20):
+        trainer.train_step()
+    after = trainer.model.params["sh_rest"].detach()
+    assert bool((after[zero] == 0).all()) and not torch.equal(after[~zero], pruned.params["sh_rest"][~zero])
+    tensors, header = trainer.state()
+    again = fine_tuner(config, task, dataset, pruned, 20)
+    again.load_state(tensors, header, "state")
+    assert torch.equal(again.zero_masks["sh_rest"], zero)
+
+
+# ---------------------------------------------------------------- few bits
+
+
+def test_training_for_few_bits_wins_back_what_they_cost(run_dir: Path, dataset: Dataset) -> None:
+    config, task, model, _ = load_run(run_dir)
+    table = bit_table(5, [], model.specs)
+    judge = TrainingQuality(dataset, config.renderer)
+
+    def read_back(one: Primitives, made: dict) -> float:  # type: ignore[type-arg]
+        return judge(
+            Primitives(one.density, one.colour, {n: v.detach() for n, v in fake_quantize(one.params, made).items()})
+        )
+
+    plain = canonicalize(model)
+    at_once = read_back(plain, fit_quantizers(plain, table))
+    fewer = finetune_for_table(TrainingData(config, task, dataset), model, table, 150, lambda text, fraction: None)
+    assert fewer.steps == 150 and fewer.notes == ()
+    assert read_back(fewer.model, fewer.quantizers) > at_once + 0.2
+    again = finetune_for_table(
+        TrainingData(config, task, dataset), model, table, 150, lambda text, fraction: None
+    ).model
+    assert all(torch.equal(again.params[name], value) for name, value in fewer.model.params.items())
+
+
+@pytest.mark.parametrize("steps", [0, 200])
+def test_a_tolerance_is_kept(run_dir: Path, dataset: Dataset, steps: int) -> None:
+    config, task, model, _ = load_run(run_dir)
+    judge = TrainingQuality(dataset, config.renderer)
+    base = judge(model)
+    for allowed in (0.1, 0.5):
+        fewer = quantize_within(TrainingData(config, task, dataset), model, allowed, steps, lambda text, fraction: None)
+        back = {n: v.detach() for n, v in fake_quantize(fewer.model.params, fewer.quantizers).items()}
+        assert base - judge(Primitives(fewer.model.density, fewer.model.colour, back)) <= allowed + 1e-6
+        assert torch.equal(fewer.model.params["W1"], canonicalize(model).params["W1"]) == (steps == 0)
+
+
+def test_training_that_spoils_the_model_is_not_stored(
+    run_dir: Path, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, task, model, _ = load_run(run_dir)
+    plain = quantize_within(TrainingData(config, task, dataset), model, 0.2, 0, lambda text, fraction: None)
+    monkeypatch.setattr("neuprim.runs.finetune.LEAST_START", 300.0)
+    found = quantize_within(TrainingData(config, task, dataset), model, 0.2, 20, lambda text, fraction: None)
+    assert all(torch.equal(found.model.params[name], value) for name, value in plain.model.params.items())
+    assert found.notes == plain.notes and found.steps == 20
+
+
+@pytest.mark.parametrize("start", [1e-3, 0.1, 20.0])
+def test_the_coarsest_numbers_that_are_enough_are_found(run_dir: Path, dataset: Dataset, start: float) -> None:
+    config, _, model, _ = load_run(run_dir)
+    rounding = QuantizationSearch(model, dataset, TrainingQuality(dataset, config.renderer))
+
+    def width(made: Quantizers) -> float:
+        scheme = made["sh_dc"]
+        assert isinstance(scheme, Columns)
+        return float((scheme.high - scheme.low).double() @ (1.0 / scheme.last).double())
+
+    wanted = width(rounding.fit(0.3))
+    coarse, above = rounding.find_finest(lambda m: width(m) > wanted, start)
+    assert width(coarse) > wanted and 0.2999 <= above < 0.4
+    made, share = rounding.find_coarsest(lambda m: width(m) <= wanted, start)
+    assert width(made) <= wanted < width(rounding.fit(1.1 * share)) and 0.2 < share <= 0.3001
+
+
+def test_where_training_brings_nothing_the_model_is_stored_as_it_is(
+    run_dir: Path, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, task, model, _ = load_run(run_dir)
+    monkeypatch.setattr("neuprim.runs.finetune.START", 3e4)  # rates that spoil everything
+    fewer = finetune_for_table(
+        TrainingData(config, task, dataset), model, bit_table(1, [], model.specs), 20, lambda text, fraction: None
+    )
+    assert fewer.steps == 20 and len(fewer.notes) == 1 and "brought nothing" in fewer.notes[0]
+    assert all(torch.equal(fewer.model.params[name], value) for name, value in canonicalize(model).params.items())

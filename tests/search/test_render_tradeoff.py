@@ -1,0 +1,169 @@
+"""``neuprim tradeoff RUN_DIR`` on a tiny run: what it measures, keeps, writes and refuses."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from neuprim.cli import main
+from neuprim.core.errors import ConfigError
+from neuprim.core.metrics import psnr
+from neuprim.runs.measure import evaluate_run
+from neuprim.search import render_tradeoff as engine
+from neuprim.search.measuring import TimedPoint, load_setup, measure_memory, measure_point, render_exact, time_points
+from neuprim.search.points import Point, Record, read_record
+from neuprim.search.render_tradeoff import TradeoffRequest, measure_tradeoff
+from tests.search.tradeoff_runs import copied, tiny_run
+
+QUICK = ("alpha_min", "resolution", "store", "colour.degree", "density.neurons")
+"""Knobs that compile nothing more."""
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny_run(tmp_path_factory.mktemp("tradeoff"))
+
+
+@pytest.fixture(scope="module")
+def measured(bare: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
+    run_dir = copied(bare, tmp_path_factory.mktemp("measured") / "run it")
+    return run_dir, measure_tradeoff(TradeoffRequest(run_dir, 2, 3, QUICK, 120.0))
+
+
+def test_every_value_of_every_knob_is_measured(measured: tuple[Path, Record]) -> None:
+    _, record = measured
+    knobs = [point.knob for point in record.points]
+    counts = {name: knobs.count(name) for name in ("reference", "alpha_min", "resolution", "store", *QUICK[3:])}
+    assert counts == {
+        "reference": 1,
+        "alpha_min": 7,
+        "resolution": 3,
+        "store": 10,
+        "colour.degree": 3,
+        "density.neurons": 4,
+    }
+    assert "combined" in knobs and len({point.words for point in record.points}) == len(record.points)
+    for point in record.points:
+        assert len(point.ms) == len(point.ratios) >= 3 and min(point.ms) > 0
+        assert {"psnr", "ssim", "ssim_3dgs", "psnr_exact", "ssim_exact"} == point.quality.keys()
+        assert (point.knob == "combined") == (len(point.words) > 1 and point.knob != "store")
+    assert record.speed and record.size and set(record.points[0].ratios) == {1.0}
+
+
+def test_the_reference_has_the_numbers_of_eval(measured: tuple[Path, Record]) -> None:
+    run_dir, record = measured
+    metrics, reference = evaluate_run(run_dir), record.points[0]
+    assert all(reference.quality[name] == metrics[name] for name in ("psnr", "ssim", "ssim_3dgs"))
+    assert reference.bytes == (run_dir / "model.safetensors").stat().st_size
+
+
+def test_coarser_points_are_farther_from_the_exact_image(measured: tuple[Path, Record]) -> None:
+    _, record = measured
+
+    def exactness(*words: str) -> float:
+        point = record.find(words)
+        assert point is not None
+        return point.quality["psnr_exact"]
+
+    values = [exactness(f"renderer.alpha_min={v}") for v in ("0", "0.0009765625", "0.0078125", "0.03125")]
+    assert values == sorted(values, reverse=True) and values[0] > 90
+    sizes = [exactness(f"resolution={v}") for v in ("0.75", "0.5", "0.25")]
+    assert sizes == sorted(sizes, reverse=True) and record.facts["exact"]["float64"] is True
+
+
+def test_exact_images_without_float64_know_their_error(bare: Path) -> None:
+    setup = load_setup(bare, (), 1)
+    fast, slow = render_exact(setup, 0.0), render_exact(setup, 1e9)
+    assert slow.float64 and slow.error is None and not fast.float64 and fast.checked == (24, 24)
+    assert fast.error is not None and 100 < fast.error <= psnr(fast.images[0], slow.images[0]) + 1e-6
+    uncut = setup.parse(["renderer.alpha_min=0", "renderer.transmittance_min=0"])
+    assert measure_point(setup, "alpha_min", uncut, fast)[0].quality["psnr_exact"] == fast.error
+
+
+def test_outputs_and_what_is_kept(measured: tuple[Path, Record], monkeypatch: pytest.MonkeyPatch) -> None:
+    run_dir, record = measured
+    folder = run_dir / "tradeoff"
+    assert read_record(folder / "tradeoff.json") == record
+    page = (folder / "tradeoff.html").read_text(encoding="utf-8")
+    assert "neuprim render" in page and (folder / "front.png").stat().st_size > 1000
+    assert len((folder / "tradeoff.csv").read_text().splitlines()) == len(record.points) + 1
+    monkeypatch.setattr(engine, "measure_point", lambda *args: pytest.fail("measured again"))
+    told: list[str] = []
+    again = measure_tradeoff(TradeoffRequest(run_dir, 2, 3, QUICK, 120.0), told.append)
+    assert len(told) == 1 and "are kept" in told[0] and again.points == record.points
+
+
+def test_another_reference_is_measured_anew_and_nothing_fits_no_budget(bare: Path, tmp_path: Path) -> None:
+    run_dir = copied(bare, tmp_path / "run")
+    measure_tradeoff(TradeoffRequest(run_dir, 1, 1, ("sort",), 0.001))
+    told: list[str] = []
+    words = ["resolution=0.5"]
+    record = measure_tradeoff(TradeoffRequest(run_dir, 1, 1, ("resolution",), 0.001, words), told.append)
+    assert "made with another reference" in told[0] and [p.words for p in record.points] == [("resolution=0.5",)]
+    assert {one.reason for one in record.left_out} == {"no time left of the budget of 0.001 s"}
+
+
+def test_the_command_prints_the_fronts(bare: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_dir = copied(bare, tmp_path / "run")
+    words = [
+        "tradeoff",
+        str(run_dir),
+        "--views",
+        "1",
+        "--repeats",
+        "1",
+        "--knobs",
+        "resolution",
+        "renderer.alpha_min=0.01",
+    ]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert (
+        "front of speed" in out
+        and "front of size" in out
+        and str(run_dir / "tradeoff" / "tradeoff.html") in out.replace("\n", "")
+    )
+    assert json.loads((run_dir / "tradeoff" / "tradeoff.json").read_text())["same"]["reference"] == [
+        "renderer.alpha_min=0.01"
+    ]
+    for more, text in (
+        (["--knobs", "alpha"], "no such knob"),
+        (["--seeds", "2"], "--seeds"),
+        (["--budget", "x"], "--budget x"),
+    ):
+        assert main(["tradeoff", str(run_dir), *more]) == 2
+        assert text in capsys.readouterr().err
+
+
+def test_a_word_that_cannot_be_drawn_is_refused(bare: Path) -> None:
+    with pytest.raises(ConfigError, match=r"colour\.degree"):
+        measure_tradeoff(TradeoffRequest(bare, 1, 1, words=["colour.degree=9"]))
+
+
+def test_rounds_time_the_reference_beside_each_point(bare: Path) -> None:
+    setup = load_setup(bare, (), 2)
+
+    def renderer(seconds: float):  # type: ignore[no-untyped-def]
+        def draw(view: object) -> torch.Tensor:
+            time.sleep(seconds)
+            return torch.zeros(1)
+
+        return lambda: draw
+
+    points = [Point(name, (), {}, 0) for name in ("reference", "slow", "short")]
+    timed = [TimedPoint(p, renderer(s), n) for p, s, n in zip(points, (0.002, 0.008, 0.002), (3, 3, 1), strict=True)]
+    rounds: list[tuple[int, int]] = []
+    time_points(timed, setup.views, time.monotonic() + 60, lambda *one: rounds.append(one))
+    assert [len(p.ms) for p in points] == [3, 3, 1] and rounds == [(1, 3), (2, 3), (3, 3)]
+    assert set(points[0].ratios) == {1.0} and all(2 < ratio < 6 for ratio in points[1].ratios)
+    time_points([one._replace(rounds=9) for one in timed], setup.views, 0.0, lambda *one: None)
+    assert len(points[0].ms) == 4, "one round after the deadline"
+
+
+def test_memory_rises_by_what_a_call_allocates() -> None:
+    _, peak = measure_memory(lambda: torch.ones(1 << 24), torch.device("cpu"))
+    assert peak is None or (1 << 26) * 0.9 < peak < (1 << 26) * 1.5

@@ -1,0 +1,123 @@
+"""Volumes that are known inside: what images do not show is not lost."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from neuprim.core.data import Dataset, PointSamples, PointSupervision
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import RenderSettings
+from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
+from neuprim.core.volumes.points import values_at
+from neuprim.search.pruning_cuts import cut_to_loss, price_cuts
+from neuprim.search.training_quality import TrainingQuality
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests.core import tiny
+
+SETTINGS = RenderSettings(threads=1)
+
+
+def hidden() -> Primitives:
+    """An opaque ball, and ten smaller ones inside that no image shows."""
+    generator = torch.Generator().manual_seed(2)
+    means = torch.cat([torch.zeros(1, 3), 0.3 * (torch.rand(10, 3, generator=generator) - 0.5)])
+    sizes = torch.tensor([[0.9]] + [[0.15]] * 10).expand(11, 3)
+    params = {
+        "means": means,
+        "log_scales": sizes.log(),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(11, 1),
+        "W1": torch.zeros(11, 0, 3),
+        "b1": torch.zeros(11, 0),
+        "w2": torch.zeros(11, 0),
+        "b2": torch.tensor([[60.0]] + [[20.0]] * 10),
+        "sh_dc": torch.zeros(11, 3),
+    }
+    return Primitives(CosineDensity(0, edge=2), SphericalHarmonics(0), params)
+
+
+class Known(PointSupervision):
+    """Extinction of a model, in frames of the names that are given."""
+
+    def __init__(self, model: Primitives, names: tuple[str, ...] = ("a", "b", "c")) -> None:
+        self.model, self.names = model, names
+
+    def draw(self, count: int, generator: torch.Generator) -> PointSamples:
+        name = self.names[int(torch.randint(len(self.names), (), generator=generator))]
+        points = 0.5 * (torch.rand(count, 3, generator=generator) - 0.5)
+        with torch.no_grad():
+            sigma = values_at(self.model, {}, points, False, 1).sigma
+        return PointSamples(name, {}, points, sigma, None, float(sigma.max()))
+
+
+def known() -> tuple[Primitives, Dataset]:
+    model = hidden()
+    return model, tiny.two_primitives(points=Known(model))
+
+
+def without(model: Primitives, rows: list[int]) -> Primitives:
+    kept = torch.tensor([i for i in range(model.count) if i not in rows])
+    return Primitives(model.density, model.colour, model.rows(kept))
+
+
+def test_frames_decide_once_each() -> None:
+    _, dataset = known()
+    assert [draw.name for draw in TrainingQuality(dataset, SETTINGS, inside=True).draws] == ["a", "b", "c"]
+    assert TrainingQuality(dataset, SETTINGS).draws == []
+
+
+def test_what_is_lost_inside_counts_as_what_is_lost_in_images() -> None:
+    model, dataset = known()
+    off = Primitives(model.density, model.colour, {**model.params, "b2": 1.01 * model.params["b2"]})
+    quality = TrainingQuality(dataset, SETTINGS, inside=True)
+    start = quality(off)
+    assert start == pytest.approx(quality.image_quality(off))
+    less = without(off, [3, 4])
+    assert abs(quality.image_quality(less) - quality.image_quality(off)) < 0.01  # no image shows them
+    assert quality(less) < start - 3.0
+    assert quality(less) == pytest.approx(start + quality.inside_quality(less) - quality.inside_quality(off))
+    worse = Primitives(model.density, model.colour, {**off.params, "sh_dc": off.params["sh_dc"] - 1.0})
+    assert quality(worse) == pytest.approx(quality.image_quality(worse))  # inside nothing changed
+
+
+def test_inside_the_signs_find_each_primitive_s_share() -> None:
+    model, dataset = known()
+    draws = TrainingQuality(dataset, SETTINGS, inside=True).draws
+    found = torch.stack([inner_sensitivity(model, draws, seed, 1).whole for seed in range(40)]).mean(0)
+    for row in range(model.count):
+        true = 0.0
+        for samples in draws:
+            with torch.no_grad():
+                both = [values_at(m, {}, samples.points, False, 1).sigma for m in (model, without(model, [row]))]
+            true += float(((both[0] - both[1]) / samples.sigma_scale).square().mean()) / len(draws)
+        assert math.isclose(float(found[row]), true, rel_tol=0.5)
+
+
+def test_primitives_that_no_image_shows_go_only_where_nothing_is_known_inside() -> None:
+    model, dataset = known()
+    seen = sensitivity(model, dataset, list(range(len(dataset.train))), SETTINGS)
+    plain, quality = TrainingQuality(dataset, SETTINGS), TrainingQuality(dataset, SETTINGS, inside=True)
+    off = Primitives(model.density, model.colour, {**model.params, "b2": 1.01 * model.params["b2"]})
+    quality(off)
+    inside = inner_sensitivity(off, quality.draws, 0, 1)
+    blind = cut_to_loss(off, price_cuts(off, seen, None, plain), plain.image_quality, 0.1)
+    knowing = cut_to_loss(off, price_cuts(off, seen, inside, quality), quality, 0.1)
+    assert blind.count < knowing.count == model.count
+
+
+def test_what_no_view_shows_is_left_alone() -> None:
+    """A primitive behind all cameras: nothing is known of it, so it is not for pruning to say that it is worth
+    nothing."""
+    model, dataset = known()
+    params = {name: value.clone() for name, value in model.params.items()}
+    params["means"][5] = torch.tensor([0.0, 0.0, 50.0])
+    aside = Primitives(model.density, model.colour, params)
+    views = list(range(len(dataset.train)))
+    found = sensitivity(aside, dataset, views, SETTINGS)
+    assert int(found.seen[5]) == 0 and float(found.whole[5]) == 0.0 and int(found.seen[0]) == len(views)
+    quality = TrainingQuality(dataset, SETTINGS)
+    left = cut_to_loss(aside, price_cuts(aside, found, None, quality), quality.image_quality, 1.0)
+    assert bool((left.params["means"][:, 2] == 50.0).any())

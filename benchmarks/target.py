@@ -34,7 +34,7 @@ from typing import Any
 from shared.tables import ROOT, Table, between_markers
 
 from neuprim.config import compose, task_of
-from neuprim.config.target import Target
+from neuprim.config.command_settings import Target
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.compute.threads import cpu_name

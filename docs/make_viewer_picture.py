@@ -15,7 +15,7 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from neuprim.config.viewer import ViewerSettings
+from neuprim.config.command_settings import ViewerSettings
 from neuprim.viewer.view import view_run
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

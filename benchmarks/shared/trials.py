@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from neuprim.config import compose
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.checkpoint import save_model
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.events import Events

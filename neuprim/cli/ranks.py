@@ -71,9 +71,7 @@ def run_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
 def _compose(words: list[str], more: bool, group: ProcessGroup) -> RunConfig:
     """Compose the configuration; all ranks take the output directory of rank 0, which writes there."""
     from neuprim.config import compose
-    from neuprim.config.launcher import take_launcher
-    from neuprim.config.target import take_target
-    from neuprim.config.viewer import take_viewer
+    from neuprim.config.command_settings import take_launcher, take_target, take_viewer
 
     elsewhere = any(len(split(words)[1]) < len(words) for split in (take_target, take_launcher, take_viewer))
     if group.is_first and (more or elsewhere):

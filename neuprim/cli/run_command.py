@@ -13,9 +13,8 @@ from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
-    from neuprim.config.launcher import LauncherSettings
+    from neuprim.config.command_settings import LauncherSettings, ViewerSettings
     from neuprim.config.overrides import CommandLine
-    from neuprim.config.viewer import ViewerSettings
 
 __all__ = ["COMMAND", "run_one"]
 
@@ -73,10 +72,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all, read_stored_config
-    from neuprim.config.launcher import LauncherSettings, take_launcher
+    from neuprim.config.command_settings import LauncherSettings, take_launcher, take_target, take_viewer
     from neuprim.config.overrides import CommandLine, drop_place
-    from neuprim.config.target import take_target
-    from neuprim.config.viewer import take_viewer
     from neuprim.core.train.distributed.torchrun import read_torchrun_rank
     from neuprim.runs.fit import is_chunked, refuse_chunks
 
@@ -143,7 +140,7 @@ def run_one(
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import RunProgress
     from neuprim.cli.view_command import run_viewed
-    from neuprim.config.launcher import LauncherSettings
+    from neuprim.config.command_settings import LauncherSettings
     from neuprim.runs.run import run
 
     try:

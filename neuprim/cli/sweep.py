@@ -19,7 +19,7 @@ from rich.text import Text
 
 from neuprim.cli.console import plain_console
 from neuprim.config import RunConfig
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.overrides import CommandLine
 from neuprim.runs.ground_truth import render_ground_truth_of_runs
 from neuprim.runs.launch.jobs import ENDED, JobStatus, Result

@@ -10,9 +10,8 @@ from rich.console import Console
 from neuprim.cli.console import plain_console
 from neuprim.cli.progress import RunProgress
 from neuprim.config import RunConfig
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings, Target
 from neuprim.config.overrides import CommandLine
-from neuprim.config.target import Target
 from neuprim.runs.events import Event, Note, Step
 from neuprim.search.size_predictor import format_forecast
 from neuprim.search.target import run_target

@@ -106,7 +106,7 @@ def _compare_rendering(args: argparse.Namespace) -> int:
 def _compare_models(args: argparse.Namespace) -> int:
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
-    from neuprim.config.launcher import take_launcher
+    from neuprim.config.command_settings import take_launcher
     from neuprim.config.overrides import parse
     from neuprim.search.ablation import format_run_command, run_ablation
     from neuprim.search.ablation_folder import AblationRequest

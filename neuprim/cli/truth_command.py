@@ -31,7 +31,7 @@ def _truth(args: argparse.Namespace) -> int:
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import RunProgress
     from neuprim.config import compose, compose_all
-    from neuprim.config.launcher import take_launcher
+    from neuprim.config.command_settings import take_launcher
     from neuprim.runs.ground_truth import render_ground_truth
 
     launcher, rest = take_launcher(args.overrides)

@@ -13,7 +13,7 @@ from neuprim.core.errors import ConfigError
 if TYPE_CHECKING:
     from neuprim.cli.progress import RunProgress
     from neuprim.config import RunConfig
-    from neuprim.config.viewer import ViewerSettings
+    from neuprim.config.command_settings import ViewerSettings
 
 __all__ = ["COMMAND", "run_viewed"]
 
@@ -29,7 +29,7 @@ def _view(args: argparse.Namespace) -> int:
     """Show the run until Ctrl-C."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import LineProgress
-    from neuprim.config.viewer import ViewerSettings
+    from neuprim.config.command_settings import ViewerSettings
     from neuprim.viewer.view import view_run
 
     settings = ViewerSettings(port=args.port) if args.host is None else ViewerSettings(args.host, args.port)
@@ -64,7 +64,7 @@ def run_viewed(config: RunConfig, events: RunProgress, settings: ViewerSettings)
 
 
 def _warn_of_open_host(settings: ViewerSettings) -> None:
-    from neuprim.config.viewer import LOOPBACK
+    from neuprim.config.command_settings import LOOPBACK
     from neuprim.viewer.server import is_loopback
 
     if is_loopback(settings.host):

@@ -1,13 +1,14 @@
 """A run's configuration: Hydra's key=value words and the tasks' YAML files in, one validated :class:`RunConfig` out."""
 
 from neuprim.config.compose import compose, compose_all, preset_settings
+from neuprim.config.job import Job, made_now, scene_of, suspects_of, task_of
 from neuprim.config.overrides import expand_sweep
 from neuprim.config.run_config import RunConfig, RunSettings
-from neuprim.config.stored import made_now, scene_of, suspects_of, task_of
 from neuprim.config.stored_run import read_stored_config
 from neuprim.config.task_files import check_groups, check_scene, presets, task_choices
 
 __all__ = [
+    "Job",
     "RunConfig",
     "RunSettings",
     "check_groups",

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig, scene_of, suspects_of, task_of
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.overrides import drop_place, quote_override
 from neuprim.core.checkpoint import load_model
 from neuprim.core.data import Dataset

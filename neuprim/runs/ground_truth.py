@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig, scene_of, suspects_of, task_of
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.data.dataset import GroundTruth
 from neuprim.core.errors import DataError, NeuprimError
 from neuprim.core.io.store import WAIT_MESSAGE

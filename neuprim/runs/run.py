@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from neuprim.config import RunConfig, suspects_of
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.metrics.image import format_metrics
 from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.runs.chunks import train_in_chunks

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.overrides import drop_place, parse, swept_keys
 from neuprim.core.errors import ConfigError, DataError, cut
 from neuprim.core.io.files import read_json, write_json, write_text

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig, compose
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.outputs import ROOT
 from neuprim.config.overrides import parse
 from neuprim.core.data import Dataset

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import suspects_of
-from neuprim.config.target import parse_duration
+from neuprim.config.command_settings import parse_duration
 from neuprim.core.compute import device
 from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import ConfigError, NeuprimError, nearest

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from neuprim.config.target import Target
+from neuprim.config.command_settings import Target
 from neuprim.search.size_curve import (
     FIRST_GAIN,
     STEP_RATIO,

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from neuprim.config import RunConfig, task_of
-from neuprim.config.target import Target
+from neuprim.config.command_settings import Target
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import TaskSpec

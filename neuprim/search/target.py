@@ -18,8 +18,7 @@ import numpy as np
 import torch
 
 from neuprim.config import RunConfig, suspects_of, task_of
-from neuprim.config.launcher import LauncherSettings
-from neuprim.config.target import Target
+from neuprim.config.command_settings import LauncherSettings, Target
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
 from neuprim.core.compression import Quantizers
 from neuprim.core.data import Dataset

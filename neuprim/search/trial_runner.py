@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from neuprim.config import RunConfig, task_of
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.data import Dataset

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from neuprim.config import RunConfig, made_now, suspects_of, task_of
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.data import Dataset
 from neuprim.core.errors import DataError, NeuprimError
 from neuprim.core.io.files import read_json, write_json

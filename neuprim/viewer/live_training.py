@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from neuprim.config import RunConfig
-from neuprim.config.viewer import ViewerSettings
+from neuprim.config.command_settings import ViewerSettings
 from neuprim.runs.events import Evaluated, Event, Events, Finishing, Note, Preparing, Step
 from neuprim.runs.fit import Fitted
 from neuprim.runs.training import save_training

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-from neuprim.config.viewer import ViewerSettings
+from neuprim.config.command_settings import ViewerSettings
 from neuprim.core.errors import BackendUnavailable, ConfigError
 
 __all__ = ["PageServer", "is_loopback", "require_viser"]

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from neuprim.config import suspects_of
-from neuprim.config.viewer import ViewerSettings
+from neuprim.config.command_settings import ViewerSettings
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import stored_channels
 from neuprim.core.data import Dataset, View

@@ -17,10 +17,8 @@ from neuprim.cli import COMMANDS
 from neuprim.cli.render_overrides import split_render_overrides
 from neuprim.cli.tradeoff_command import is_override
 from neuprim.config import compose, compose_all
-from neuprim.config.launcher import take_launcher
+from neuprim.config.command_settings import take_launcher, take_target, take_viewer
 from neuprim.config.overrides import drop_place
-from neuprim.config.target import take_target
-from neuprim.config.viewer import take_viewer
 from neuprim.core.cameras.camera_files import read_cameras
 from neuprim.core.conditions import read_conditions, split_words
 from neuprim.core.data.dataset_check import check_dataset

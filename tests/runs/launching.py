@@ -11,7 +11,7 @@ from typing import Any
 
 import neuprim.runs.evaluate
 import neuprim.runs.training
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import DataError
 from neuprim.runs.events import Event, Events, Finishing, Preparing, Step

@@ -15,7 +15,7 @@ import pytest
 
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.data.dataset import GroundTruth
 from neuprim.core.errors import DataError
 from neuprim.core.io import store as stores

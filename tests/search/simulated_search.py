@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from neuprim.config.target import Target
+from neuprim.config.command_settings import Target
 from neuprim.search import size_search
 from neuprim.search.size_predictor import SizePredictor
 from neuprim.search.size_search import SizeSearch

@@ -10,7 +10,7 @@ import pytest
 
 from neuprim.cli import main
 from neuprim.config import compose
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError, NonFiniteError
 from neuprim.runs.events import Events

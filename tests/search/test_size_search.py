@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuprim.config.target import Target
+from neuprim.config.command_settings import Target
 from neuprim.search.size_curve import (
     Curve,
     climb,

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from neuprim.config import RunConfig, compose
-from neuprim.config.launcher import LauncherSettings
-from neuprim.config.target import Target
+from neuprim.config.command_settings import LauncherSettings, Target
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.runs.events import Event, Note, Step, ignore_event
 from neuprim.runs.launch.jobs import Job, Result, perform

@@ -19,7 +19,7 @@ from PIL import Image
 pytest.importorskip("viser", reason="the package viser is not installed")
 
 from neuprim.config import compose
-from neuprim.config.viewer import ViewerSettings
+from neuprim.config.command_settings import ViewerSettings
 from neuprim.runs.events import Event
 from neuprim.runs.run import run
 from neuprim.viewer.live_training import LiveTraining

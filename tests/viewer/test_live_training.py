@@ -17,7 +17,7 @@ pytest.importorskip("viser", reason="the package viser is not installed")
 
 import neuprim.viewer.session as sessions
 from neuprim.config import RunConfig, compose
-from neuprim.config.viewer import ViewerSettings
+from neuprim.config.command_settings import ViewerSettings
 from neuprim.core import checkpoint
 from neuprim.runs.events import Event, Note, Step
 from neuprim.runs.fit import Fitted

@@ -23,7 +23,7 @@ from websockets.asyncio import server as websocket_server
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from neuprim.config.viewer import ViewerSettings
+from neuprim.config.command_settings import ViewerSettings
 from neuprim.core.channels import Channels
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import machine_cores
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.runs.launch.jobs import Result

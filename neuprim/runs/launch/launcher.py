@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.errors import BackendUnavailable, NeuprimError
 from neuprim.runs.events import Event

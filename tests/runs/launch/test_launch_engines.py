@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.errors import BackendUnavailable, ConfigError, NeuprimError
 from neuprim.runs.launch.jobs import JobStatus
 from neuprim.runs.launch.launcher import check_launcher, launch

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from neuprim.config import compose
-from neuprim.config.launcher import LauncherSettings
+from neuprim.config.command_settings import LauncherSettings
 from neuprim.core import checkpoint
 from neuprim.core.compute.threads import core_count, limit_process_threads
 from neuprim.core.errors import ConfigError

@@ -1,8 +1,8 @@
-"""Task and scene of a run's configuration, from the packages that made the run and not from whatever has their names by
-now."""
+"""A run to do or to open: its configuration, and the task and scene of the packages that made it."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,15 +14,42 @@ from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_sce
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
+    from neuprim.core.data import Dataset
+    from neuprim.core.model.primitives import Primitives
     from neuprim.core.task import TaskSpec
 
-__all__ = ["made_now", "scene_of", "suspects_of", "task_of"]
+
+@dataclass(frozen=True)
+class Job:
+    """A configuration with what its names stand for, looked up once and handed on together.
+
+    Attributes:
+        dataset, model: None until they are loaded or made.
+    """
+
+    config: RunConfig
+    task: TaskSpec
+    dataset: Dataset | None = None
+    model: Primitives | None = None
+
+    @classmethod
+    def of(cls, config: RunConfig) -> Job:
+        """Load the task of a configuration. Raises as :func:`task_of`."""
+        return cls(config, task_of(config, config.source))
+
+    @property
+    def scene(self) -> FoundScene:
+        """The scene, of the task or of another package."""
+        return scene_of(self.config, self.task, self.config.source)
+
+    @property
+    def plugins(self) -> Suspects:
+        """The plugins of the run, which errors in their code name."""
+        return suspects_of(self.config)
 
 
 def task_of(config: RunConfig, file: Path | None = None) -> TaskSpec:
-    """The task of a run's configuration, from the package that made the run.
-
-    Warns of another version of it.
+    """Load the task of a run's configuration from the package that made the run; warn of another version of it.
 
     Raises:
         ConfigError: the package is not installed; names it and ``file``, where the configuration was read from.
@@ -34,8 +61,10 @@ def task_of(config: RunConfig, file: Path | None = None) -> TaskSpec:
 
 
 def scene_of(config: RunConfig, task: TaskSpec, file: Path | None = None) -> FoundScene:
-    """The scene of a run's configuration, the task's own or from the package that made the run; raises as
-    :func:`task_of`."""
+    """Find the scene of a run's configuration, the task's own or of the package that made the run.
+
+    Raises as :func:`task_of`.
+    """
     if config.made_by is None:
         return find_scene(task, config.scene_name)
     if config.made_by.scene is None:
@@ -46,7 +75,7 @@ def scene_of(config: RunConfig, task: TaskSpec, file: Path | None = None) -> Fou
 
 
 def made_now(config: RunConfig, task: TaskSpec) -> MadeBy:
-    """The makers of a run that starts or goes on now: the same packages, in the versions that are installed."""
+    """Return the record of a run that starts or goes on now: the same packages, in the versions that are installed."""
     made, scene = config.made_by, scene_of(config, task).added_by
     task_info = TASKS.find(config.task if made is None else qualified(made.task.package, made.task.name))
     loss = None if config.train.loss is None else Maker.of(LOSSES.find(config.train.loss))
@@ -54,7 +83,7 @@ def made_now(config: RunConfig, task: TaskSpec) -> MadeBy:
 
 
 def suspects_of(config: RunConfig) -> Suspects:
-    """The plugins of a run, whose crashes are told in one line."""
+    """Find the plugins of a run, which errors in their code name."""
     made = config.made_by
     if made is None:
         return Suspects(config.task, config.scene_name, config.train.loss)

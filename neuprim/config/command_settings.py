@@ -1,0 +1,171 @@
+"""Settings of the command line that no configuration of a run holds: launcher, live viewer, and target with budget."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, get_args
+
+from neuprim.config.overrides import take_settings
+from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.validation import Range, coerce, format_value, nonempty_text, validate_fields
+
+LOOPBACK = "127.0.0.1"
+LauncherName = Literal["inline", "processes", "ray", "slurm"]
+LAUNCHERS: tuple[str, ...] = get_args(LauncherName)
+_POSITIVE = Range(1, says="a positive whole number")
+_TARGETS = "target.psnr=DB, target.ssim=S, target.megabytes=M, target.fps=F"
+
+
+@dataclass(frozen=True)
+class LauncherSettings:
+    """Where runs work, and how many at once: ``launcher=NAME launcher.KEY=VALUE``.
+
+    Attributes:
+        workers: runs at once; None: as many as there are, and as the cores of this machine or the cluster allow.
+        threads: of each run; None shares the cores.
+        retries: how often a run continues from its checkpoint after its worker died.
+        address: of Ray, as ``ray.init`` takes it; of Slurm, submitit's executor ("slurm" or "local"). None: the Ray of
+            ``RAY_ADDRESS``, else one on this machine; Slurm.
+        options: for the engine: Ray's options of a task, such as ``num_gpus``; submitit's, such as ``slurm_partition``.
+    """
+
+    name: LauncherName = "inline"
+    workers: Annotated[int, _POSITIVE] | None = None
+    threads: Annotated[int, _POSITIVE] | None = None
+    retries: Annotated[int, Range(0, 1000, says="a whole number from 0 to 1000")] = 2
+    address: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        validate_fields(self, "launcher")
+
+    def given(self) -> dict[str, Any]:
+        """Name -> value of what differs from the defaults, and the launcher's own name."""
+        values, default = dataclasses.asdict(self), dataclasses.asdict(LauncherSettings())
+        return {name: value for name, value in values.items() if name == "name" or value != default[name]}
+
+
+@dataclass(frozen=True)
+class ViewerSettings:
+    """Where the live viewer of a training listens: ``viewer=true viewer.port=8080``.
+
+    Attributes:
+        host: an address of this machine; the default is reached from this machine alone.
+        port: 0 for any that is free.
+    """
+
+    host: Annotated[str, nonempty_text("an address of this machine")] = LOOPBACK
+    port: Annotated[int, Range(0, 65535, says="a port, 1 to 65535, or 0 for any")] = 8080
+
+    def __post_init__(self) -> None:
+        validate_fields(self, "viewer")
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a model is to reach: ``target.psnr=30``.
+
+    With ``psnr`` or ``ssim``, or both, the smallest model that has them is wanted, and ``megabytes`` and ``fps`` are
+    limits; without, the best model within the limits is.
+
+    Attributes:
+        psnr, ssim: means over views; dB.
+        megabytes: at most; millions of bytes of the compressed model, ``model.neuprim``.
+        fps: at least; frames per second on this machine, at the size of the views.
+    """
+
+    psnr: Annotated[float, Range(above=0, at_most=100, says="decibels, above 0 and at most 100")] | None = None
+    ssim: Annotated[float, Range(above=0, below=1, says="a number between 0 and 1")] | None = None
+    megabytes: Annotated[float, Range(above=0, says="a positive number of megabytes")] | None = None
+    fps: Annotated[float, Range(above=0, says="a positive number of frames per second")] | None = None
+
+    def given(self) -> dict[str, float]:
+        """Name -> value of what was asked for."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
+
+    @property
+    def quality(self) -> dict[str, float]:
+        """Name -> value of the measures of quality among them."""
+        return {name: value for name, value in self.given().items() if name in ("psnr", "ssim")}
+
+    def __str__(self) -> str:
+        return " ".join(f"target.{name}={value:g}" for name, value in self.given().items())
+
+
+def take_launcher(overrides: Sequence[str]) -> tuple[LauncherSettings, list[str]]:
+    """Return the launcher that overrides ask for, and the other overrides.
+
+    Raises:
+        ConfigError: no such launcher or setting of it, an impossible value, or one that this launcher does not use.
+    """
+    name, settings, others = take_settings(overrides, "launcher", LauncherSettings)
+    if name is not None:
+        if name not in LAUNCHERS:
+            raise ConfigError(f"launcher={format_value(name)}: no such launcher{nearest(str(name), LAUNCHERS)}")
+        settings = dataclasses.replace(settings, name=name)
+    given = settings.given()
+    engines, pools = "ray or launcher=slurm", "processes, launcher=ray or launcher=slurm"
+    users = {"address": engines, "options": engines, "workers": pools, "retries": pools}
+    for key, launchers in users.items():
+        if key in given and settings.name not in launchers:
+            raise ConfigError(
+                f"launcher.{key}: launcher={settings.name} does not use it; expected it with launcher={launchers}"
+            )
+    return settings, others
+
+
+def take_viewer(overrides: Sequence[str]) -> tuple[ViewerSettings | None, list[str]]:
+    """Return the viewer that is asked for, None for none, and the other overrides; a host or port asks for one, too.
+
+    Raises:
+        ConfigError: no such setting, several values, or an impossible one.
+    """
+    shown, settings, others = take_settings(overrides, "viewer", ViewerSettings)
+    if shown is None:
+        shown = len(others) < len(overrides)
+    return (settings if coerce(shown, bool, "viewer") else None), others
+
+
+def take_target(overrides: Sequence[str]) -> tuple[tuple[Target, float] | None, list[str]]:
+    """Return the target and its budget in seconds, None where none is asked for, and the other overrides.
+
+    Raises:
+        ConfigError: a target without a budget or the reverse, no such target, or an impossible value.
+    """
+    budget, _, rest = take_settings(overrides, "budget", _Budget)
+    whole, target, others = take_settings(rest, "target", Target)
+    if len(others) == len(overrides):
+        return None, others
+    if whole is not None:
+        raise ConfigError(f"target={format_value(whole)}: expected one of {_TARGETS}")
+    asked = "target" if budget is None else f"budget={format_value(budget)}"
+    if not target.given():
+        raise ConfigError(f"{asked}: no target; expected one of {_TARGETS}, or train.max_seconds=S without a target")
+    if budget is None:
+        raise ConfigError(
+            f"{target}: expected a budget beside it, the time for search and training together, such as budget=10m"
+        )
+    return (target, parse_duration(budget if isinstance(budget, str) else "", asked)), others
+
+
+@dataclass(frozen=True)
+class _Budget:
+    """The group of ``budget=10m``, which has no settings of its own."""
+
+
+def parse_duration(text: str, asked: str) -> float:
+    """Return the seconds of a time such as 90s, 5m or 1h.
+
+    Args:
+        asked: what the user typed, for the message.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
+    if match is None or float(match[1]) == 0:
+        raise ConfigError(f"{asked}: expected a time such as 90s, 5m or 1h")
+    return float(match[1]) * {"s": 1.0, "m": 60.0, "h": 3600.0}[match[2]]

@@ -1,6 +1,6 @@
 """Worst errors of every backend over the named extremes of the input space, for the three edges.
 
-    python benchmarks/numerics.py [--coarse] [--cases N] [--regions NAME ...] [--edges 0 1 2] [--markdown FILE]
+    python benchmarks/numerics.py [--coarse] [--cases N] [--regions NAME ...] [--edges 0 1 2] [--record]
     python benchmarks/numerics.py --run RUN_DIR [--near 0.01 3 3.5 4]
 
 Prints one line per region, backend and precision, with the edges' numbers side by side; exits with status 1 when a
@@ -13,8 +13,7 @@ with the float64 reference's.
 - thin: on shorter chords, misses included, error/S_c (S_c/S)^(2p - 1), S_c the central chord's S.
 - gradient: error of a parameter's gradient over the gradient's norm, over four random functionals of the image.
 
---markdown writes the table with an introduction; docs/numerical_limits.md is made that way. --run looks at a trained
-model instead: from a dozen of its held-out views, with the near plane at each of --near, how many primitives the cpu
+--record writes the table to docs/numerical_limits.md. --run looks at a trained model instead: from a dozen of its held-out views, with the near plane at each of --near, how many primitives the cpu
 backend draws in float64, and the largest error of three small images against the reference backend.
 """
 
@@ -26,13 +25,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from shared.tables import ROOT, Table, between_markers
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from neuprim.core.model.edge import EDGES
 from neuprim.core.render import RenderSettings, render
+from neuprim.core.render.backends import REFERENCE
 from neuprim.runs.open import load_dataset, load_run
-from tests.numerics.extremes.sweep import document, line, sweep, table
+from tests.numerics.extremes.sweep import Result, sweep
 
 VIEWS, COMPARED, SMALL = 12, 3, 50
 """Of a run: views to count in, how many of them to compare, and those images' sides."""
@@ -67,6 +68,31 @@ def trained(folder: Path, planes: Sequence[float]) -> None:
         )
 
 
+def cells(row: Sequence[Result]) -> list[str]:
+    """One region on one backend, what was found for each edge side by side; a dash where the region has no edge."""
+    region, backend = row[0].region, row[0].backend
+
+    def beside(numbers: Sequence[str]) -> str:
+        found = dict(zip((r.edge for r in row), numbers, strict=True))
+        return " / ".join(found.get(edge, "–") for edge in (EDGES if len(region.edges) < len(EDGES) else found))
+
+    def once(texts: Sequence[str]) -> str:
+        return texts[0] if len(set(texts)) == 1 else " / ".join(texts)
+
+    thin = gradient = wide = ""
+    bounds = [f"{region.forward:.0e}"]
+    if not region.whole:
+        thin = beside([f"{r.errors.thin:.1e}" for r in row])
+        bounds.append(once([f"{region.thin_at(r.edge):.0e}" for r in row]))
+    if backend != REFERENCE:
+        gradient = beside([f"{r.errors.gradient:.1e}" for r in row])
+        wide = beside([f"{r.errors.wide}" for r in row]) + f" of {row[0].errors.primitives}"
+        bounds.append(once([f"{region.gradient_at(r.edge):.0e}" for r in row]))
+    state = "**broken**" if any(r.broken for r in row) else "ok"
+    forward = beside([f"{r.errors.forward:.1e}" for r in row])
+    return [region.name, f"{backend} {row[0].precision}", forward, thin, gradient, wide, ", ".join(bounds), state]
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--coarse", action="store_true", help="3 cases per region instead of 40")
@@ -75,23 +101,22 @@ def main() -> int:
     parser.add_argument("--edges", nargs="*", type=int, choices=EDGES, default=EDGES)
     parser.add_argument("--run", type=Path, help="a finished run's directory, instead of the regions")
     parser.add_argument("--near", nargs="*", type=float, default=[0.01], help="of --run: near planes, scene units")
-    parser.add_argument("--markdown", type=Path, help="write the documentation page here")
+    parser.add_argument("--record", action="store_true", help="write the table to docs/numerical_limits.md")
     args = parser.parse_args()
     torch.set_num_threads(1)
     if args.run:
         trained(args.run, args.near)
         return 0
     rows = []
-    cases = args.cases or (3 if args.coarse else 40)
-    print(table([]), flush=True)
-    for row in sweep(cases, args.regions, args.edges):
-        print(line(row), flush=True)
+    table = Table("region", "backend", "error/S", "thin", "gradient", "drawn in float64", "bounds", "")
+    for row in sweep(args.cases or (3 if args.coarse else 40), args.regions, args.edges):
+        table.row(*cells(row))
         rows.append(row)
     if not rows:
         print(f"no region contains {args.regions}", file=sys.stderr)
         return 2
-    if args.markdown:
-        args.markdown.write_text(document(rows, cases))
+    if args.record:
+        between_markers(ROOT / "docs" / "numerical_limits.md", "limits", str(table))
     broken = [result for row in rows for result in row if result.broken]
     for result in broken:
         print(f"broken: {result.label}: {', '.join(result.broken)}", file=sys.stderr)

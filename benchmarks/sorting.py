@@ -6,7 +6,7 @@ the joint volume.
 
 Draws a random scene of overlapping primitives (benchmarks/render.py) and, with --run, the model of a finished run from
 one of its test views. Errors are those of an image ``size`` pixels wide against the marched sum of densities
-(neuprim.core.render.unsorted_volume): "order" keeps every primitive's opacity, so that only the order differs; "field" is the sum
+(benchmarks/shared/unsorted_volume.py): "order" keeps every primitive's opacity, so that only the order differs; "field" is the sum
 of the densities as they are, clamped at zero, so that it also counts the renderer's clamps and cuts. Times are ratios
 to sort=center at the full size, the fastest of
 ``rounds``, taken in turns in one process; the backward column is the backward pass alone. --record writes the table to
@@ -26,12 +26,12 @@ import torch
 from shared.scenes import lower, random_scene, view
 from shared.tables import PERFORMANCE, Table, between_markers
 from shared.timing import fastest
+from shared.unsorted_volume import measure_sorting_errors
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.unsorted_volume import measure_sorting_errors
 
 RESULTS = Path(__file__).parent / "results" / "sorting.json"
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -22,6 +22,8 @@ from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import measure_views, render_image, summarize_metrics
 from neuprim.webpage.scene import held_out, scene_page, start_of
 
+__all__ = ["evaluate_fitted"]
+
 _SHOWN_VIEWS = 8  # held-out views in renders/ and the report
 _ORBIT_FRAMES = 36
 

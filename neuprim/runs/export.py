@@ -27,6 +27,8 @@ from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load
 from neuprim.runs.open import COMPRESSED, load_run, open_run
 from neuprim.version import __version__
 
+__all__ = ["EXPORTS_FILE", "export_run", "import_model", "import_run"]
+
 Progress = Callable[[str, float], None]
 
 EXPORTS_FILE = "exports.json"

@@ -37,6 +37,22 @@ from neuprim.runs.events import Evaluated, Events, Note, Preparing, Step, ignore
 from neuprim.runs.measure import measure_views, summarize_metrics
 from neuprim.runs.open import LOGS, load_dataset
 
+__all__ = [
+    "Fitted",
+    "TrainerFactory",
+    "train_to_end",
+    "fit",
+    "is_chunked",
+    "refuse_chunks",
+    "make_loss",
+    "make_trainer",
+    "use_one_torch_thread",
+    "prepare_training",
+    "train_steps",
+    "compile_kernels",
+]
+
+
 TrainerFactory = Callable[[RunConfig, TaskSpec, Dataset, Loss], Trainer]
 """(configuration, its task, its data, its loss) -> the trainer of a model that is there already."""
 

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+__all__ = ["interruptible"]
+
 
 @contextmanager
 def interruptible(terminated: bool = False) -> Iterator[threading.Event]:

@@ -29,6 +29,8 @@ from neuprim.plugins.judging import layer_of
 from neuprim.runs.render_config import RenderConfig
 from neuprim.version import __version__
 
+__all__ = ["DATATYPES", "Layers", "linear_light"]
+
 DATATYPES = ("half", "float")
 """Of light and alpha in a file; other numbers are 32-bit floats in either."""
 

@@ -42,6 +42,16 @@ from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, move_to_
 from neuprim.runs.render_config import estimate_file_bytes, parse_render_config
 from neuprim.version import __version__
 
+__all__ = [
+    "ViewMetrics",
+    "render_image",
+    "render_light_sum",
+    "evaluate_run",
+    "measure_views",
+    "measure_quality",
+    "summarize_metrics",
+]
+
 _VISIBLE = 20 * math.log10(255)
 """dB: smaller errors than one of 255 levels are not visible, and an empty frame's black image has no error at all."""
 

@@ -25,6 +25,18 @@ from neuprim.plugins.blame import blamed
 from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.provenance import warn_of_neuprim
 
+__all__ = [
+    "COMPRESSED",
+    "LOGS",
+    "make_scene_context",
+    "load_dataset",
+    "load_run",
+    "model_file",
+    "open_run",
+    "move_to_render_device",
+    "read_metrics",
+]
+
 LOGS = "logs"
 """Folder of a run directory for tracebacks of plugins."""
 

@@ -17,6 +17,8 @@ from neuprim.runs.open import LOGS
 from neuprim.runs.run_directory import lock_directory
 from neuprim.runs.training import BetweenSteps, do_nothing_between, train_in_directory
 
+__all__ = ["run"]
+
 
 def run(
     config: RunConfig,

@@ -29,6 +29,20 @@ from neuprim.runs.launch.launcher import LAUNCH_FOLDER, OnStatus, check_launcher
 from neuprim.runs.open import model_file
 from neuprim.runs.run_directory import lock_directory
 
+__all__ = [
+    "SWEEP_FILE",
+    "SweepRecord",
+    "SweepRow",
+    "fit_job",
+    "is_complete",
+    "read_sweep",
+    "read_sweep_overrides",
+    "read_sweep_runs",
+    "run_job",
+    "run_sweep",
+    "write_csv",
+]
+
 SWEEP_FILE = "sweep.json"
 """Of a sweep's directory."""
 

@@ -41,6 +41,8 @@ from neuprim.runs.fit import (
 from neuprim.runs.interrupt import interruptible
 from neuprim.runs.run_directory import discard_results
 
+__all__ = ["COMPILING", "BetweenSteps", "do_nothing_between", "compile_for_run", "save_training", "train_in_directory"]
+
 BetweenSteps = Callable[[Fitted, threading.Event], None]
 """Called on the training's thread before its first step and after every one, with what is trained and the event that
 ends the training as

@@ -21,6 +21,8 @@ from urllib.parse import parse_qs, urlsplit
 
 from neuprim.viewer.messages import MAX_MESSAGE_BYTES, CheckedConnection
 
+__all__ = ["TokenAuth"]
+
 _HOST = re.compile(r"[A-Za-z0-9.\-]+(:\d+)?|\[[0-9A-Fa-f:.]+\](:\d+)?")
 
 # viser's client is one inline script, and its WebAssembly needs 'unsafe-eval'.

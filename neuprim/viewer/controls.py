@@ -19,6 +19,8 @@ from neuprim.core.settings import SortOrder
 from neuprim.viewer.session import DEFAULT_LONGEST, Pose, Session
 from neuprim.viewer.viewer_scene import list_quantities
 
+__all__ = ["ConditionControls", "RenderControls", "ViewControls", "format_condition"]
+
 _MAX_SLIDER_RANGE = 1e4
 _PLAY_FPS = 12.0
 _NUMBERS = ("samples", "alpha_max", "alpha_min", "transmittance_min", "near")

@@ -21,6 +21,15 @@ from neuprim.inspect.shapes import unit_sphere
 from neuprim.viewer.session import Session
 from neuprim.viewer.viewer_scene import Viewpoint
 
+__all__ = [
+    "Ellipsoids",
+    "PrimitiveControls",
+    "describe_primitive",
+    "list_ellipsoids",
+    "make_ellipsoid",
+    "pick_primitive",
+]
+
 _MAX_NUMBERS = 24  # of a parameter that are written out
 _NONE, _WIRE, _SOLID = "none", "wire", "solid"
 _MAX_ELLIPSOIDS, _DEFAULT_ELLIPSOIDS = 20_000, 1_000

@@ -27,6 +27,8 @@ from neuprim.viewer.session import Session
 from neuprim.viewer.view import SessionManager
 from neuprim.viewer.viewer_scene import ViewerScene
 
+__all__ = ["Curve", "LiveTraining", "TrainingControls", "TrainingProgress"]
+
 _UPDATE_SECONDS = 0.5  # between updates of a page's numbers
 _PAUSE_SECONDS = 0.1  # between checks of a paused training
 _PLOT_HEIGHT = 150  # pixels

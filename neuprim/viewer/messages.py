@@ -19,6 +19,8 @@ from websockets.asyncio.server import ServerConnection
 
 from neuprim.core.validation import Range
 
+__all__ = ["MAX_MESSAGE_BYTES", "CheckedConnection", "is_known_protocol", "refuse_message", "refuse_value"]
+
 MAX_MESSAGE_BYTES = 2**16  # a page sends some hundred
 
 _MAX_TEXT = 4096

@@ -13,6 +13,8 @@ from typing import Any
 from neuprim.config.command_settings import ViewerSettings
 from neuprim.core.errors import BackendUnavailable, ConfigError
 
+__all__ = ["PageServer", "is_loopback", "require_viser"]
+
 
 def require_viser() -> Any:
     """Import viser.

@@ -22,7 +22,6 @@ from neuprim.core.model.fields import Constant, Cosine, CustomColour, CustomDens
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.model.tensors import MOST_UNITS
 from neuprim.core.render import RenderSettings, render, render_lowered
-from neuprim.core.render.unsorted_volume import render_unsorted_volume
 from neuprim.core.volumes.grid import density_at, density_grid
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
@@ -88,12 +87,6 @@ WRONG: dict[str, tuple[type[CosineDensity], str]] = {
         lowers("w2", lambda v: v[:5]),
         r"Cosine: w2 has shape \(5, 8\); expected \(20, 8\), as means has N=20 and W1 has K=8",
     ),
-    "w2 flat": (lowers("w2", lambda v: v[:, 0]), r"Cosine: w2 has shape \(20,\); expected \(20, 8\)"),
-    "b1 too short": (lowers("b1", lambda v: v[:7]), r"Cosine: b1 has shape \(7, 8\); expected \(20, 8\)"),
-    "b2 wide": (
-        lowers("b2", lambda v: v.expand(-1, 2)),
-        r"Cosine: b2 has shape \(20, 2\); expected \(20, 1\) or \(20,\)",
-    ),
     "no [:, None]": (
         lowers("W1", lambda v: v[:, 0]),
         r"Cosine: W1 has shape \(20, 3\); expected \(N, K, 3\) with N=20 as in means",
@@ -102,38 +95,19 @@ WRONG: dict[str, tuple[type[CosineDensity], str]] = {
         lowers("W1", lambda v: v.repeat(1, 33, 1)),
         r"Cosine: W1 has shape \(20, 264, 3\); .* K at most 256",
     ),
-    "whole numbers": (
-        lowers("W1", lambda v: v.int()),
-        r"Cosine: W1 has dtype torch\.int32; expected torch\.float32 or torch\.float64",
-    ),
     "another device": (lowers("b1", lambda v: v.to("meta")), r"Cosine: b1 has device meta; expected cpu"),
-    "sparse": (
-        lowers("w2", lambda v: v.to_sparse()),
-        r"Cosine: w2 has layout torch\.sparse_coo; expected a dense tensor",
-    ),
-    "nested": (
-        lowers("w2", lambda v: torch.nested.nested_tensor(list(v), layout=torch.jagged)),
-        r"Cosine: w2 has layout nested; expected a dense tensor",
-    ),
-    "no tensor": (lowers("b2", lambda v: 1.0), r"Cosine: b2 has type float; expected a torch tensor"),
     "omega0": (lowers("omega0", lambda v: NAN), r"Cosine: omega0 has value nan; expected a finite number"),
-    "a huge omega0": (lowers("omega0", lambda v: 10**400), r"Cosine: omega0 has value beyond the range of float64"),
     "nothing": (waves(lower=lambda *a: None), r"NoneType; expected Cosine or CustomDensity"),
 }
+"""One of each kind; the fuzz draws the others, on every backend."""
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", WRONG)
-def test_a_wrong_density_names_its_field(name: str, backend: str) -> None:
+def test_a_wrong_density_names_its_field(name: str) -> None:
     density, message = WRONG[name]
     with pytest.raises(FormError, match=rf"^density field Waves lowered to {message}") as caught:
-        render(model(density), CAMERA, settings=settings(backend))
+        render(model(density), CAMERA)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_a_wrong_density_does_not_reach_the_grid(name: str) -> None:
-    density, message = WRONG[name]
     with pytest.raises(FormError, match=rf"^density field Waves lowered to {message}"):
         density_grid(model(density), {}, torch.eye(4, dtype=torch.float64), (4, 4, 4))
 
@@ -180,8 +154,6 @@ def test_a_wrong_opaque_density_is_named_wherever_it_is_asked() -> None:
     )
     with pytest.raises(FormError, match=message):
         render(wrong, CAMERA)
-    with pytest.raises(FormError, match=message):
-        render_unsorted_volume(wrong.lower(CAMERA, {}), CAMERA)
     both = model(waves(lower=lambda *a: CustomDensity(column), density=lambda self, p, g, prim, x, c: x))
     for ask in (
         lambda: density_grid(both, {}, torch.eye(4, dtype=torch.float64) * 0.1, (4, 4, 4)),
@@ -231,19 +203,18 @@ def test_rows_and_places_name_their_method(methods: dict[str, Any], message: str
             ask()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_wrong_shade_names_its_field(backend: str) -> None:
-    wrong = model(colour=paint(shade=lambda *a: Shading(pixels=lambda points: points)))
-    with pytest.raises(FormError, match=r"^colour field Paint: shade returned shape \((\d+), 3\); expected \(\1,\)"):
-        render(wrong, CAMERA, settings=settings(backend))
-    with pytest.raises(FormError, match=r"^colour field Paint: shade has type float; expected a function or None"):
-        render(model(colour=paint(shade=lambda *a: Shading(pixels=0.5))), CAMERA, settings=settings(backend))
-    with pytest.raises(FormError, match=r"^colour field Paint: shade returned type float; expected Shading or None"):
-        render(model(colour=paint(shade=lambda *a: 0.5)), CAMERA, settings=settings(backend))
-    with pytest.raises(
-        FormError, match=r"^colour field Paint: shade: primitives returned shape \(1,\); expected \(\d+,\)"
-    ):
-        render(model(colour=paint(shade=lambda *a: Shading(torch.ones(1)))), CAMERA, settings=settings(backend))
+@pytest.mark.parametrize(
+    ("shade", "message"),
+    [
+        (Shading(pixels=lambda points: points), r"shade returned shape \((\d+), 3\); expected \(\1,\)"),
+        (Shading(pixels=0.5), "shade has type float; expected a function or None"),  # type: ignore[arg-type]
+        (0.5, "shade returned type float; expected Shading or None"),
+        (Shading(torch.ones(1)), r"shade: primitives returned shape \(1,\); expected \(\d+,\)"),
+    ],
+)
+def test_a_wrong_shade_names_its_field(shade: Any, message: str) -> None:
+    with pytest.raises(FormError, match=f"^colour field Paint: {message}"):
+        render(model(colour=paint(shade=lambda *a: shade)), CAMERA)
 
 
 def test_the_colour_never_sees_a_wrong_density() -> None:
@@ -259,10 +230,8 @@ def test_the_colour_never_sees_a_wrong_density() -> None:
 # ---------------------------------------------------------------- what surrounds the forms
 
 
-@pytest.mark.parametrize("samples", [1, 2])
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_backgrounds_rows_and_cameras(backend: str, samples: int) -> None:
-    lowered, s = scenes.lowered(scenes.tensors(N)), settings(backend, samples=samples)
+def test_backgrounds_rows_and_cameras() -> None:
+    lowered, s = scenes.lowered(scenes.tensors(N)), RenderSettings()
     with pytest.raises(
         FormError, match=r"^background has shape \(1,\); expected \(3,\), as colour lowered to Constant has C=3"
     ):
@@ -273,8 +242,6 @@ def test_backgrounds_rows_and_cameras(backend: str, samples: int) -> None:
         render_lowered(replace(lowered, rows=torch.arange(19)), CAMERA, s)
     with pytest.raises(FormError, match=r"^geometry has type NoneType; expected Geometry"):
         render_lowered(replace(lowered, geometry=None), CAMERA, s)  # type: ignore[arg-type]
-    with pytest.raises(FormError, match=r"^background has shape \(2,\)"):
-        render_unsorted_volume(lowered, CAMERA, background=torch.ones(2))
 
 
 @pytest.mark.parametrize("samples", [1, 2])

@@ -13,7 +13,6 @@ from neuprim.core.errors import BackendUnavailable
 from neuprim.core.model.fields import Constant, CustomColour, CustomDensity, RayNet
 from neuprim.core.render import RenderSettings, choose_backend, render_lowered
 from neuprim.core.render.reference.rays import pixel_directions
-from neuprim.core.render.unsorted_volume import render_unsorted_volume
 from tests import scenes
 from tests.backends import BACKENDS, FAST, by
 from tests.numerics.cases import case
@@ -101,9 +100,6 @@ def test_a_colour_network_is_its_formula(sort: str) -> None:
     for settings in (s, replace(s, near=2.9), replace(s, samples=2)):
         a, b = (render_lowered(x, camera, settings).rgb for x in (low, other))
         assert a.max() > 0.2 and (a - b).abs().max() < 1e-12
-    assert (
-        render_unsorted_volume(low, camera, s, steps=4).rgb - render_unsorted_volume(other, camera, s, steps=4).rgb
-    ).abs().max() < 1e-12
     rays = RayCamera(camera.viewmat, pixel_directions(camera))
     assert choose_backend(low, RenderSettings(), rays).name == "reference"
     near = replace(s, near=1e-6)

@@ -26,11 +26,8 @@ from neuprim.core.notices import warn_once
 from neuprim.core.render.draw import Draw
 from neuprim.core.settings import RenderSettings
 
-AUTO = "auto"
-"""The setting that takes the first backend of the table that can draw the frame."""
-
-REFERENCE = "reference"
-"""The backend that draws every form, in float64, and that the others are compared with."""
+AUTO = "auto"  # takes the first backend of the table that can draw the frame
+REFERENCE = "reference"  # draws every form, in float64; the others are compared with it
 
 _FEW = 64  # primitives that stand for a model, as only its forms count
 
@@ -46,34 +43,26 @@ def _processor_name() -> str:
 
 @dataclass(frozen=True)
 class Backend:
-    """One way to draw.
-
-    Attributes:
-        name: of the setting ``renderer.backend``.
-        load: imports it and returns its :data:`~neuprim.core.render.draw.Draw`.
-        unsupported: what it cannot draw of a model through a camera (None: any pinhole), as the rest of a sentence that
-            starts with "cannot draw"; None if it can.
-        device_name: what it computes on, for a run's numbers.
-        missing: why this machine lacks what it needs, such as a package; None if it has it. Cheap.
-        compiles: whether it compiles something once per installation, which a run then does during its other
-            preparations.
-        checks: whether it refuses numbers that are not finite while it prepares a frame; the others get
-            :func:`~neuprim.core.render.non_finite.refuse_non_finite`.
-        differentiates_intrinsics: whether gradients reach focal lengths and the principal point.
-        devices: kinds of device that it draws tensors of, its own first.
-        slabs: loads and returns what draws the slabs of a set of primitives in one frame; None without.
-    """
+    """One way to draw; ``name`` is of the setting ``renderer.backend``."""
 
     name: str
     load: Callable[[], Draw]
+    """Imports it and returns its :data:`~neuprim.core.render.draw.Draw`."""
     unsupported: Callable[[Lowered, AnyCamera | None], str | None] = _no_reason
+    """What it cannot draw of a model through a camera (None: any pinhole), as the rest of a sentence that starts with
+    "cannot draw"; None if it can."""
     device_name: Callable[[], str] = _processor_name
     missing: Callable[[], str | None] = _no_reason
+    """Why this machine lacks what it needs, such as a package; None if it has it. Cheap."""
     compiles: bool = False
+    """Whether it compiles something once per installation, which a run then does during its other preparations."""
     checks: bool = False
+    """Whether it refuses numbers that are not finite while it prepares a frame."""
     differentiates_intrinsics: bool = False
     devices: tuple[str, ...] = (hardware.CPU,)
+    """Kinds of device that it draws tensors of, its own first."""
     slabs: Callable[[], Callable[..., tuple[Tensor, Tensor]] | None] = _no_reason
+    """Loads and returns what draws the slabs of a set of primitives in one frame; None without."""
 
     def drawing_device(self, settings: RenderSettings) -> str:
         """Return the kind of device that it draws on under these settings."""
@@ -89,8 +78,7 @@ class Backend:
         return (hardware.cuda_unavailable() if device == hardware.CUDA else None) or self.missing()
 
     def cannot_draw(self, lowered: Lowered, camera: AnyCamera | None, device: str | None = None) -> str | None:
-        """Return why it does not draw this on a kind of device, None: its own, as the rest of a sentence; None if it
-        does."""
+        """Return why it does not draw this on a kind of device, as the rest of a sentence; None if it does."""
         device = device or self.devices[0]
         if device not in self.devices:
             return f"draws on the {' or '.join(self.devices)}, but renderer.device is {device}"
@@ -217,11 +205,7 @@ def check_backend_device(settings: RenderSettings) -> None:
 
 
 def check_device(settings: RenderSettings) -> None:
-    """Refuse a GPU that is not there.
-
-    Raises:
-        BackendUnavailable: naming the setting, and why.
-    """
+    """Raise :class:`BackendUnavailable` for a GPU that is not there."""
     if settings.device == hardware.CUDA:
         reason = gpu_unavailable() if settings.backend == AUTO else hardware.cuda_unavailable()
         if reason is not None:
@@ -237,8 +221,7 @@ def check_device(settings: RenderSettings) -> None:
 
 
 def with_available_device(settings: RenderSettings) -> RenderSettings:
-    """Return the settings for drawing a finished run, perhaps on another machine: a GPU that is not there is not
-    insisted on."""
+    """Return the settings for drawing a finished run, perhaps on a machine without the run's GPU."""
     gone = settings.device == hardware.CUDA and gpu_unavailable() is not None and settings.backend == AUTO
     return replace(settings, device="auto") if gone else settings
 
@@ -257,19 +240,17 @@ def device_of(model: Primitives, settings: RenderSettings, camera: AnyCamera, co
         BackendUnavailable, ConfigError: see :func:`check_device`.
     """
     check_device(settings)
-    kind: str = settings.device
-    if kind == AUTO and settings.backend != AUTO:
-        kind = find_backend(settings.backend).devices[0]
-        if kind == hardware.CUDA and hardware.cuda_unavailable() is not None:
-            kind = hardware.CPU  # the first frame says why it is not drawn
-    elif kind == AUTO:
-        kind = hardware.CPU
-        if gpu_unavailable() is None:
-            rows = model.rows(torch.arange(min(model.count, _FEW), device=model.device))
-            lowered = Primitives(model.density, model.colour, rows).lower_unchecked(camera, conditions)
-            if any(b.cannot_draw(lowered, camera) is None for b in TABLE if b.devices[0] == hardware.CUDA):
-                kind = hardware.CUDA
-    return hardware.current_device(kind)
+    if settings.device != AUTO:
+        return hardware.current_device(settings.device)
+    if settings.backend != AUTO:  # a first frame without a GPU says why it is not drawn
+        on_gpu = find_backend(settings.backend).devices[0] == hardware.CUDA and hardware.cuda_unavailable() is None
+        return hardware.current_device(hardware.CUDA if on_gpu else hardware.CPU)
+    if gpu_unavailable() is None:
+        rows = model.rows(torch.arange(min(model.count, _FEW), device=model.device))
+        lowered = Primitives(model.density, model.colour, rows).lower_unchecked(camera, conditions)
+        if any(b.cannot_draw(lowered, camera) is None for b in TABLE if b.devices[0] == hardware.CUDA):
+            return hardware.current_device(hardware.CUDA)
+    return hardware.HOST
 
 
 def computing_device(settings: RenderSettings) -> torch.device:

@@ -16,25 +16,15 @@ from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.core.render.draw import unproject_depth
 
-_CLEAR = 2e-4
-"""A pixel whose transmittance stays above this has no clamped primitive: one alone, at ``alpha_max`` = 0.9999, would
-take it to half of that."""
-
+_CLEAR = 2e-4  # a transmittance above has no clamped primitive: one, at alpha_max = 0.9999, would halve it
 _WEAKEN = 1 / 8
 _ROUNDS = 14  # at most: densities of 4e12 along a ray, and float32 knows hardly more
 
 
 @dataclass(frozen=True)
 class LayerFrame:
-    """One frame of a model as a layer sees it; nothing has a gradient, and everything is where the model is.
-
-    Attributes:
-        model: the primitives.
-        camera: the view.
-        conditions: of the frame, every one of the task's.
-        settings: how the frame is drawn.
-        color_space: "srgb" or "linear", that of the model's colours.
-    """
+    """One frame of a model as a layer sees it, under every condition of the task; nothing has a gradient, and
+    everything is where the model is."""
 
     model: Primitives
     camera: Camera
@@ -57,11 +47,9 @@ class LayerFrame:
     def emitted(self) -> Tensor | None:
         """(H, W, C) integral of sigma c along each ray, where each primitive has one colour in the frame; else None."""
         colours = self.lowered.colour.flat
-        return (
-            None
-            if colours is None
-            else torch.stack([self.integral(channel) for channel in colours.clamp_min(0.0).unbind(1)], -1)
-        )
+        if colours is None:
+            return None
+        return torch.stack([self.integral(channel) for channel in colours.clamp_min(0.0).unbind(1)], -1)
 
     @cached_property
     def unshaded(self) -> Tensor:
@@ -92,12 +80,8 @@ class LayerFrame:
         return torch.where(self.drawn.alpha > 0, factor, 0.0)
 
     def composite(self, colour: LoweredColour) -> Tensor:
-        """(H, W, C') the frame over black with other colours: the sum along each ray of a primitive's weight alpha_i
-        T_i times its colour.
-
-        Args:
-            colour: of the frame's primitives, those of :attr:`lowered`, any number of channels.
-        """
+        """(H, W, C') the frame over black with other colours of the primitives of :attr:`lowered`: the sum along each
+        ray of a primitive's weight alpha_i T_i times its colour."""
         return self._render(replace(self.lowered, colour=colour, shade=None), self.settings).rgb
 
     def integral(self, weights: Tensor | None = None) -> Tensor:
@@ -105,9 +89,8 @@ class LayerFrame:
         weight times sigma.
 
         Optical depths are those of whole chords behind the near plane, at least 0 each; nothing is clamped at
-        ``alpha_max``, left out below
-        ``alpha_min`` or cut where a ray ends. It is -log of the transmittance of a medium made as thin as that takes:
-        exact in the optical depths, in float32.
+        ``alpha_max``, left out below ``alpha_min`` or cut where a ray ends. It is -log of the transmittance of a medium
+        made as thin as that takes.
 
         Args:
             weights: (N,) at least 0, one for each primitive of :attr:`lowered`; None for 1.

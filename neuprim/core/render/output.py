@@ -14,17 +14,11 @@ from neuprim.core.model.checks import check_shape
 
 @dataclass
 class Contributions:
-    """What each of the N primitives of a frame contributed to it; zeros until the frame's backward pass fills them.
+    """What each of the N primitives of a frame contributed to it; zeros until the frame's backward pass fills them."""
 
-    Attributes:
-        weight: (N,) sum over pixels of alpha_i T_i; positive exactly for primitives that the view shows.
-        error_weight: (N,) sum over pixels of alpha_i T_i x error.
-        rows: which primitives of the model the sums belong to where some were left out of the frame; None for all.
-    """
-
-    weight: Tensor
-    error_weight: Tensor
-    rows: Tensor | None = None
+    weight: Tensor  # (N,) sum over pixels of alpha_i T_i; positive exactly for primitives that the view shows
+    error_weight: Tensor  # (N,) sum over pixels of alpha_i T_i x error
+    rows: Tensor | None = None  # of the model, where some primitives were left out of the frame
 
     def of_all(self, count: int) -> tuple[Tensor, Tensor]:
         """Return (count,) weight and error_weight of all primitives of the model, zero for those left out of the
@@ -49,16 +43,11 @@ def sum_contributions(frames: Sequence[Contributions], count: int) -> Contributi
 
 @dataclass
 class ContributionRequest:
-    """What a backend's backward pass reads and fills: sums over the rays that it drew.
+    """What a backend's backward pass reads and fills: sums over the rays that it drew."""
 
-    Attributes:
-        error: of each ray, in the shape of the frame as the backend drew it.
-        rays: of a pixel; sums are divided by their number, so that frames of any number compare.
-    """
-
-    error: Tensor
+    error: Tensor  # of each ray, in the shape of the frame as the backend drew it
     result: Contributions
-    rays: int = 1
+    rays: int = 1  # of a pixel; sums are divided by their number, so that frames of any number compare
     sums: tuple[Tensor, Tensor] | None = None
 
     def add(self, rows: Tensor, weight: Tensor, error_weight: Tensor) -> None:
@@ -81,25 +70,15 @@ class ContributionRequest:
 
 @dataclass
 class RenderStats:
-    """By-products of a frame.
-
-    Attributes:
-        backend: the backend that drew it.
-        count: primitives of the frame.
-        pairs: tile-primitive pairs (cpu, cuda) or ray-primitive pairs (reference) that were evaluated.
-        rows: which primitives of the model they are where some were left out of the frame; None for all.
-        samples: rays per pixel side.
-        drawn_on: the device that it was drawn on, where that is not the one its tensors are on.
-        contributions: what :meth:`RenderOutput.request_contributions` asks of the backward pass.
-    """
+    """By-products of a frame."""
 
     backend: str
-    count: int
-    pairs: int = 0
-    rows: Tensor | None = None
-    samples: int = 1
-    drawn_on: torch.device | None = None
-    contributions: ContributionRequest | None = None
+    count: int  # primitives of the frame
+    pairs: int = 0  # tile-primitive pairs (cpu, cuda) or ray-primitive pairs (reference) that were evaluated
+    rows: Tensor | None = None  # of the model, where some primitives were left out of the frame
+    samples: int = 1  # rays per pixel side
+    drawn_on: torch.device | None = None  # where that is not the device that its tensors are on
+    contributions: ContributionRequest | None = None  # see RenderOutput.request_contributions
     extra: dict[str, Any] = field(default_factory=dict)
 
     def request_contributions(self, error: Tensor) -> Contributions:

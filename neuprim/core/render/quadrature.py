@@ -28,20 +28,12 @@ from neuprim.core.settings import RenderSettings
 
 @dataclass(frozen=True)
 class Quadrature:
-    """One way to integrate.
+    """One way to integrate: errors are of the image against that of the closed form."""
 
-    Attributes:
-        samples: per chord; 0 is the closed form.
-        psnr: of the image against that of the closed form, dB; infinite for the closed form itself.
-        max_abs: largest difference of a colour.
-        seconds: that the integrals of all chords of the image take, median of all rounds.
-        chords: number of chords.
-    """
-
-    samples: int
-    psnr: float
+    samples: int  # per chord; 0 is the closed form
+    psnr: float  # dB; infinite for the closed form itself
     max_abs: float
-    seconds: float
+    seconds: float  # that the integrals of all chords of the image take, median of all rounds
     chords: int
 
 

@@ -29,32 +29,20 @@ NET = ("Wx", "bias", "Wout")
 
 @dataclass(frozen=True)
 class Request:
-    """One frame to draw: what is not a tensor.
-
-    Attributes:
-        turns: omega0 / 2 pi of the density; edge: exponent p of its edge.
-        differentiable: whether a backward pass may follow.
-    """
+    """One frame to draw: what is not a tensor."""
 
     camera: Camera
-    turns: float
-    edge: int
+    turns: float  # omega0 / 2 pi of the density
+    edge: int  # exponent p
     settings: RenderSettings
     stats: RenderStats
-    differentiable: bool = False
+    differentiable: bool = False  # whether a backward pass may follow
 
     @classmethod
-    def of(
-        cls,
-        lowered: Lowered,
-        camera: Camera,
-        settings: RenderSettings,
-        stats: RenderStats,
-        differentiable: bool = False,
-    ) -> Request:
+    def of(cls, lowered: Lowered, camera: Camera, settings: RenderSettings, stats: RenderStats, *rest: bool) -> Request:
         density = lowered.density
         assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
-        return cls(camera, density.omega0 / (2 * math.pi), density.edge, settings, stats, differentiable)
+        return cls(camera, density.omega0 / (2 * math.pi), density.edge, settings, stats, *rest)
 
 
 def parameters_of(lowered: Lowered) -> tuple[Tensor, ...]:
@@ -75,8 +63,8 @@ def rasterize(
     """Render a :class:`Cosine` density with :class:`Constant` or :class:`RayNet` colours by the ``operation`` of
     backend ``name``."""
     colour = lowered.colour
-    assert isinstance(colour, Constant | RayNet), "the caller chooses a backend that knows the forms"
     net: tuple[Tensor, ...] = ()
+    assert isinstance(colour, Constant | RayNet), "the caller chooses a backend that knows the forms"
     if isinstance(colour, RayNet):
         palette, net = colour.base, (colour.Wx, colour.bias, colour.Wout)
     else:

@@ -10,6 +10,8 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.schema import RateUnit
 from neuprim.core.validation import Accepts, Range, nonempty_text, validate_fields
 
+__all__ = ["ModelSettings", "PopulationSettings", "TrainSettings"]
+
 Share = Annotated[float, Range(0, 1, says="a fraction of the budget, 0 to 1")]
 NotNegative = Annotated[float, Range(at_least=0)]
 

@@ -20,18 +20,6 @@ from tests.backends import by
 from tests.numerics.equivalence import undecided
 from tests.numerics.extremes.oracle import Integrals, long_colours, long_integrals
 
-__all__ = [
-    "Case",
-    "Errors",
-    "colour_errors",
-    "compare",
-    "drawn",
-    "gradient_errors",
-    "gradients",
-    "integral_errors",
-    "integrals",
-]
-
 OPEN = RenderSettings(alpha_min=0.0, transmittance_min=0.0, alpha_max=0.9999)
 SOLID = 0.45  # shorter chords, as a share of the central one, are thin: D < 0.2, or cut by a near plane
 OPAQUE = 1.5  # optical depth beyond which alpha is compared instead
@@ -100,10 +88,9 @@ class Errors:
 def drawn(case: Case, backend: str) -> tuple[np.ndarray, int]:  # type: ignore[type-arg]
     """(H, W) opacity of the one primitive, float64, and how many primitives were drawn in float64."""
     t = dict(case.tensors)
-    t["colors"] = torch.ones_like(t["colors"][:, :1])
-    with torch.no_grad():
-        out = render_lowered(scenes.lowered(t), case.camera, replace(case.settings, **by(backend)))
-    return out.rgb[..., 0].double().numpy(), int(out.stats.extra.get("float64", 0))
+    t["colors"] = torch.ones_like(t["colors"]).requires_grad_()  # by the kernels that gradients need anyway
+    out = render_lowered(scenes.lowered(t), case.camera, replace(case.settings, **by(backend)))
+    return out.rgb[..., 0].detach().double().numpy(), int(out.stats.extra.get("float64", 0))
 
 
 def integral_errors(case: Case, backend: str, exact: Integrals | None = None) -> Errors:
@@ -144,20 +131,21 @@ def colour_errors(case: Case, backend: str, exact: Integrals) -> Errors:
     1 - T.
     """
     plain = case.tensors | {"Wout": 0 * case.tensors["Wout"], "base": torch.ones_like(case.tensors["base"])}
-    with torch.no_grad():
-        settings = replace(case.settings, **by(backend))
-        out, of_one = (render_lowered(scenes.lowered(t), case.camera, settings) for t in (case.tensors, plain))
-    opacity = of_one.rgb.double().numpy()
+    settings, images = replace(case.settings, **by(backend)), []
+    for t in (case.tensors, plain):  # by the kernels that gradients need anyway
+        leaf = t | {"base": t["base"].clone().requires_grad_()}
+        images.append(render_lowered(scenes.lowered(leaf), case.camera, settings))
+    found, opacity = (image.rgb.detach().double().numpy() for image in images)
     seen = exact.hit & (opacity[..., 0] > 1e-30)
     colour, size = long_colours(case.tensors, 0, exact)
-    found = out.rgb.double().numpy() / np.where(seen[..., None], opacity, 1)
+    found = found / np.where(seen[..., None], opacity, 1)
     error = np.where(seen[..., None], np.abs(found - colour) / size, 0).max(-1).astype(np.float64)
     error = np.where(np.isfinite(error), error, np.inf)
     short = exact.scale < SOLID * exact.central
     solid, thin = np.where(short, 0, error), np.where(short, error, 0)
     at = np.unravel_index(np.argmax(solid), solid.shape)
     where = float(exact.scale[at] / exact.central[at])
-    wide = int(out.stats.extra.get("float64", 0))
+    wide = int(images[0].stats.extra.get("float64", 0))
     return Errors(float(solid.max()), float(thin.max()), 0.0, "", where, int(seen.sum()), wide, 1)
 
 

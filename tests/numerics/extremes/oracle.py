@@ -17,8 +17,6 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 
-__all__ = ["Integrals", "long_colours", "long_integrals", "mp_integral"]
-
 L = np.longdouble
 Array = np.ndarray[Any, Any]
 OMEGA0 = 30.0

@@ -22,8 +22,6 @@ from tests.numerics.extremes.draw import (
 )
 from tests.numerics.extremes.measure import Case
 
-__all__ = ["COLOUR", "FORWARD", "GRADIENT", "REGIONS", "THIN", "Region"]
-
 FORWARD, GRADIENT, THIN = 1e-6, 1e-3, 4e-7
 COLOUR = 4e-6  # of a network's colour, at the fastest units that float32 draws
 IMAGE = 5e-6  # of a pixel under tens of primitives, whose errors add up

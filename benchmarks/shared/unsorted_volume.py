@@ -1,18 +1,11 @@
-"""Diagnostic: the volume that sorting approximates, integrated numerically. It measures the error of ``sort = "center"``
-and ``sort = "entry"``.
+"""The volume that sorting approximates, integrated numerically: it measures the error of ``sort = "center"`` and
+``sort = "entry"``.
 
 Compositing draws primitives one behind the other, also where they overlap. In the volume that the primitives describe,
 all of them absorb and emit together: the density at a point is the sum of theirs, its colour their density-weighted
-mean. Neither order of compositing is that volume; this module renders it, slowly, in float64.
-
-Two choices make the comparison one of order alone. A density may be negative somewhere along a chord. Compositing
-clamps the chord's integral; a march must clamp at every point. And compositing clamps and cuts opacities. With
-``keep = "opacity"`` each chord's density is therefore clamped pointwise and then scaled so that the primitive keeps
-exactly the opacity that the renderer gives it, alpha_max and alpha_min included: every ray then ends with the same
-transmittance in all three images, and only where along the ray the absorption happens differs. Without negative
-densities, clamps and cuts the scale is 1 and the image is that of the plain sum of densities. ``keep = "density"`` does
-not rescale: it draws the sum of the pointwise clamped densities, the field of an exported volume, so that the error
-also counts what the clamps and cuts do.
+mean. ``keep = "opacity"`` clamps each chord's density pointwise and scales it so that the primitive keeps exactly the
+opacity that the renderer gives it, so that only the order differs. ``keep = "density"`` draws the sum of the clamped
+densities, the field of an exported volume, so that the error also counts what the renderer's clamps and cuts do.
 """
 
 from __future__ import annotations
@@ -24,7 +17,6 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.errors import ConfigError
 from neuprim.core.metrics import psnr
 from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.pairs import Pairs
@@ -43,16 +35,10 @@ _ORDERS: tuple[SortOrder, ...] = ("center", "entry")
 
 @dataclass(frozen=True)
 class SortingError:
-    """Error of one order of compositing against the unsorted volume.
-
-    Attributes:
-        psnr: dB over all pixels and channels, infinite for equal images.
-        mean_abs, max_abs: absolute difference over all pixels and channels, in units of the colours.
-    """
+    """Error of one order of compositing: PSNR in dB over all pixels and channels, and mean absolute difference."""
 
     psnr: float
     mean_abs: float
-    max_abs: float
 
 
 def measure_sorting_errors(
@@ -71,7 +57,7 @@ def measure_sorting_errors(
         for order in _ORDERS:
             image = render_lowered(lowered, camera, replace(settings, sort=order), background).rgb.double()
             difference = (image - truth).abs()
-            errors[order] = SortingError(psnr(image, truth), difference.mean().item(), difference.max().item())
+            errors[order] = SortingError(psnr(image, truth), difference.mean().item())
     return errors
 
 
@@ -84,33 +70,12 @@ def render_unsorted_volume(
     steps: int = 64,
     keep: Keep = "opacity",
 ) -> RenderOutput:
-    """Render the emission-absorption image of the summed densities, float64, without gradients; see the module for
-    ``keep``.
+    """Render the emission-absorption image of the summed densities, float64, without gradients.
 
-    Each ray is cut into cells at the ends of all its chords and at ``steps`` even divisions from the first entry to the
-    last exit. Within a cell the set of primitives is fixed, the optical depth of each is its closed line integral, and only their
-    mixture is taken as constant. Constant densities are therefore exact for any ``steps``, others converge with
-    steps^-2.
-
-    Args:
-        lowered, camera, background: as for :func:`~neuprim.core.render.render_lowered`.
-        settings: near, samples, depth, and alpha_max and alpha_min under ``keep = "opacity"``; rays are not stopped
-            early.
-        steps: even divisions per ray, at least 1.
-        keep: "opacity" or "density".
-
-    Returns:
-        the frame. Its depth is the mean camera-z of where light is emitted, not of chord middles. A colour that varies
-        along the ray is taken at each chord's middle, as the renderer does.
-
-    Raises:
-        ConfigError: for ``steps`` below 1 or an unknown ``keep``.
-        FormError: as :func:`~neuprim.core.render.render`.
+    Each ray is cut into cells at the ends of all its chords and at ``steps`` even divisions. Within a cell the set of
+    primitives is fixed, the optical depth of each is its closed line integral, and only their mixture is taken as
+    constant: errors go as steps^-2.
     """
-    if steps < 1:
-        raise ConfigError(f"steps={steps}: expected at least 1")
-    if keep not in ("opacity", "density"):
-        raise ConfigError(f"keep={keep!r}: expected opacity or density")
     lowered.check(camera.viewmat, background)
     settings = resolve_near(settings or RenderSettings(near="auto"), lowered.geometry.means, [camera])
 

@@ -71,7 +71,7 @@ def test_an_address_that_others_reach_is_warned_of(
     monkeypatch.setattr("neuprim.viewer.view.view_run", lambda *args: None)
     assert main(["view", str(run_dir), "--host", "0.0.0.0"]) == 0
     error = capsys.readouterr().err
-    assert "other machines can reach the viewer at 0.0.0.0" in error and "ssh -L 8080:127.0.0.1:8080" in error
+    assert "reached from other machines, without encryption" in error and "ssh -L 8080:127.0.0.1:8080" in error
     assert main(["view", str(run_dir)]) == 0 and "warning" not in capsys.readouterr().err
 
 

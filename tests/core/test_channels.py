@@ -15,7 +15,7 @@ from torch import Tensor
 from neuprim.core.channels import Channels, channels_of, stored_channels
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.io import images
-from neuprim.core.io.exr import channel_name_error, default_channel_names, exr_channels, write_exr
+from neuprim.core.io.exr import default_channel_names, exr_channels, write_exr
 from neuprim.tasks.static import TASK
 from tests.core import tiny
 
@@ -27,21 +27,6 @@ def image(channels: int, height: int = 4, width: int = 6) -> Tensor:
 
 
 # ---------------------------------------------------------------- what pictures show
-
-
-def test_three_channels_without_a_display_are_shown_as_ever() -> None:
-    values = image(3)
-    assert Channels().display(values) is values and Channels().shown == ""
-    linear = Channels(color_space="linear")
-    assert torch.equal(linear.display(values), images.linear_to_srgb(values.clamp_min(0.0)))
-    assert linear.plain and not linear.partial and linear.rgb == (0, 1, 2)
-
-
-def test_one_channel_is_grey() -> None:
-    grey = Channels(default_channel_names(1), "linear")
-    assert torch.equal(grey.display(image(1)), images.linear_to_srgb(image(1).clamp_min(0.0)).expand(-1, -1, 3))
-    assert grey.shown == "" and not grey.partial and not grey.plain
-    assert Channels(("heat",)).shown == "heat as grey"
 
 
 @pytest.mark.parametrize(
@@ -119,22 +104,6 @@ def test_a_model_keeps_its_names_and_old_ones_get_some(tmp_path: Path) -> None:
             stored_channels(tmp_path, {"channels": damaged}, bands, 5)
 
 
-@pytest.mark.parametrize(
-    ("names", "text"),
-    [
-        (["a", 3], "[1] is of type int; expected text"),
-        (["a", "b", "a"], "[2] is 'a' once more; expected different names"),
-        (["A"], "[0] is 'A'; expected another name, as A is alpha"),
-        ([""], "expected 1 to 31 bytes of printable text"),
-        ([" a"], "without blanks around it"),
-        (["a\nb"], "printable"),
-        (["ü" * 16], "1 to 31 bytes"),
-    ],
-)
-def test_names_that_no_file_holds(names: list[Any], text: str) -> None:
-    assert text in (channel_name_error(names) or "")
-
-
 # ---------------------------------------------------------------- OpenEXR
 
 
@@ -153,12 +122,6 @@ def test_exr_gives_back_every_channel_by_its_name(tmp_path: Path, names: tuple[s
     assert torch.equal(images.read_image(path, channels=names[-1:]), expected[..., -1:])
     with OpenEXR.File(str(path), separate_channels=True) as file:
         assert set(file.channels()) == set(names)
-
-
-def test_rgb_by_name_is_the_file_that_it_was(tmp_path: Path) -> None:
-    write_exr(tmp_path / "a.exr", image(3))
-    write_exr(tmp_path / "b.exr", image(3), names=("R", "G", "B"))
-    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
 
 
 def test_exr_refusals_name_the_channels(tmp_path: Path) -> None:

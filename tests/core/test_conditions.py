@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.conditions import FRAMES, export_frames, flag, in_step, named, read_conditions, split_words
+from neuprim.core.conditions import FRAMES, export_frames, in_step, read_conditions, split_words
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.tasks.relight.lighting import orbit_in_frames, parse_lights
@@ -57,14 +57,6 @@ def test_every_spelling_is_the_same(words: list[str]) -> None:
     assert split_words(["a", *words, "b=1", "--c"], SPECS) == ({"wavelength_shift": "0.3"}, ["a", "b=1", "--c"])
 
 
-def test_words_of_others_keep_their_order_and_negative_values_are_values() -> None:
-    found, rest = split_words(["--wavelength-shift", "-0.5", "x", "--y", "z=1", "--sun", "-1,0,2"], SPECS)
-    assert found == {"wavelength_shift": "-0.5", "sun": "-1,0,2"} and rest == ["x", "--y", "z=1"]
-    assert split_words(["sun=1,2,3", "--sun", "0,0,0"], SPECS, bare=False) == ({"sun": "0,0,0"}, ["sun=1,2,3"])
-    assert flag("wavelength_shift") == "--wavelength-shift" and named("wavelength-shift", SPECS) == "wavelength_shift"
-    assert named("shift", SPECS) is None
-
-
 @pytest.mark.parametrize(
     ("words", "text"),
     [
@@ -94,11 +86,6 @@ def test_a_task_that_reads_ranges_itself_is_asked_first() -> None:
         return [torch.tensor(0.125), torch.tensor(1.0)] if ":" in text else number(text)
 
     assert shifts("0.5:1:9,0", replace(SHIFT, parse=cubes)) == [0.125, 1.0, 0.0]
-
-
-def test_other_shapes_are_the_tasks_altogether() -> None:
-    found = read_conditions(SPECS, {"sun": "1,2,0;0,0,1"})
-    assert list(found) == ["sun"] and [v.tolist() for v in found["sun"]] == [[1, 2, 0], [0, 0, 1]]
 
 
 @pytest.mark.parametrize(
@@ -209,12 +196,3 @@ def test_an_animation_without_a_length_takes_the_others(time: str, light: str, c
     assert in_step({}, found) == count
     assert float(found["time"][0]) == pytest.approx(float(time.replace(":", ",").split(",")[0]))
     assert len({tuple(place.tolist()) for place in found["light"]}) == count, "once round, no place twice"
-
-
-def test_lengths_that_differ_are_refused_with_both() -> None:
-    texts = {"time": "0:1:48", "light": "orbit:4:40:60"}
-    with pytest.raises(
-        ConfigError,
-        match=r"--time 0:1:48 has 48 frames and --light orbit:4:40:60 has 60 frames; expected as many of each",
-    ):
-        in_step(texts, read_conditions([TIME, LIGHT], texts))

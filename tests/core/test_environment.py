@@ -72,23 +72,7 @@ def test_other_upward_axes() -> None:
     )
 
 
-def test_a_rotation_turns_every_light() -> None:
-    image = wild(16)
-    still, turned = Environment(image).beams(20), Environment(image, rotation=90.0).beams(20)
-    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)  # +x to +y
-    assert torch.allclose(turned.directions, still.directions @ quarter.T, atol=1e-12)
-    assert torch.allclose(turned.irradiance, still.irradiance)
-    whole = Environment(image, rotation=360.0).beams(20)
-    assert torch.allclose(whole.directions, still.directions, atol=1e-9)
-
-
 # ---------------------------------------------------------------- energy
-
-
-@pytest.mark.parametrize("height", [1, 2, 16, 513, 700])
-def test_white_has_the_sphere(height: int) -> None:
-    environment = Environment(torch.full((height, 2 * height, 3), 0.75))
-    assert environment.irradiance.tolist() == pytest.approx([0.75 * 4 * math.pi] * 3, rel=1e-12)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 64, 500])
@@ -106,17 +90,6 @@ def test_energy_is_kept_for_any_number_of_lights(height: int, count: int) -> Non
     assert len(beams.directions) == min(count, shining)
     assert torch.allclose(beams.directions.norm(dim=1), torch.ones(len(beams.directions), dtype=torch.float64))
     assert bool((beams.irradiance >= 0).all()) and bool((beams.irradiance.sum(1) > 0).all())
-
-
-def test_one_bright_texel_is_one_light() -> None:
-    image = dark(8)
-    image[2, 5] = torch.tensor([3.0, 2.0, 1.0])
-    for count in (1, 64):
-        beams = Environment(image).beams(count)
-        assert beams.directions.shape == (1, 3)
-        assert beams.directions[0].tolist() == pytest.approx(direction(2, 5, 8), abs=1e-12)
-        solid = 2 * math.pi / 16 * (math.cos(math.pi * 2 / 8) - math.cos(math.pi * 3 / 8))
-        assert beams.irradiance[0].tolist() == pytest.approx([3 * solid, 2 * solid, solid])
 
 
 def test_many_lights_light_a_surface_like_the_whole() -> None:
@@ -139,17 +112,6 @@ def test_a_sun_gets_a_light_of_its_own() -> None:
     brightest = int(beams.irradiance.sum(1).argmax())
     assert float(beams.directions[brightest] @ sun) > math.cos(math.radians(2.0))
     assert len(beams.directions) == 32
-
-
-# ---------------------------------------------------------------- what was never seen
-
-
-@pytest.mark.parametrize("degrees", [10.0, 60.0, 120.0])
-def test_share_beyond_a_cap(degrees: float) -> None:
-    environment = Environment(torch.ones(128, 256, 3))
-    known = torch.tensor([[0.6, 0.0, 0.8], [0.6, 0.0, 0.8]])
-    expected = 1 - (1 - math.cos(math.radians(degrees))) / 2
-    assert environment.share_beyond(known, degrees) == pytest.approx(expected, abs=0.005)
 
 
 # ---------------------------------------------------------------- files

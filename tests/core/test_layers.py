@@ -10,7 +10,6 @@ import pytest
 from neuprim.core.errors import ConfigError
 from neuprim.core.layers import COMMON, LayerSpec, chosen_layers, layer_fault
 from neuprim.plugins.members import fault
-from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.static import TASK as STATIC
 
 HEAT = LayerSpec("heat", "temperature, kelvin", lambda frame: None, ("K",))
@@ -62,11 +61,3 @@ def test_what_a_task_declares_is_checked(layers: Any, words: str | None) -> None
     assert found is None if words is None else words in str(found)
     member = fault(replace(STATIC, layers=layers))
     assert member is None if words is None else str(member).startswith("layers") and words in str(member)
-
-
-def test_the_built_in_ones_are_sound() -> None:
-    assert (
-        fault(DYNAMIC) is None
-        and [spec.name for spec in DYNAMIC.layers] == ["emission", "absorption"]
-        and STATIC.layers == ()
-    )

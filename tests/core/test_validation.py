@@ -12,10 +12,8 @@ import pytest
 
 from neuprim.core.errors import ConfigError
 from neuprim.core.validation import (
-    Accepts,
     Range,
     coerce,
-    format_value,
     infer_type,
     nonempty_text,
     option_type,
@@ -102,41 +100,6 @@ def test_one_line_with_key_value_and_what_is_expected(values: dict[str, Any], me
     assert str(caught.value) == message
 
 
-@pytest.mark.parametrize(
-    ("bounds", "words"),
-    [
-        (Range(1, 16), "a number from 1 to 16"),
-        (Range(0, 2**63 - 1), "a number from 0 to 9223372036854775807"),
-        (Range(above=0, at_most=0.9999), "a number above 0 and at most 0.9999"),
-        (Range(at_least=0, below=1), "a number of at least 0 and below 1"),
-        (Range(above=0, below=1), "a number above 0 and below 1"),
-        (Range(above=1e-9), "a number above 1e-09"),
-        (Range(at_most=5), "a number of at most 5"),
-        (Range(below=5), "a number below 5"),
-        (Range(-math.inf, math.inf), "a number"),
-        (Range(at_least=2, also=(0,)), "0, or a number of at least 2"),
-    ],
-)
-def test_bounds_in_words(bounds: Range, words: str) -> None:
-    assert bounds.words("a number") == words
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (None, "null"),
-        (True, "true"),
-        ("8", "'8'"),
-        ("null", "'null'"),
-        ("a b", "a b"),
-        ([1, "x"], "[1, 'x']"),
-        ("", "''"),
-    ],
-)
-def test_values_are_shown_as_they_are_typed(value: object, text: str) -> None:
-    assert format_value(value) == text
-
-
 @dataclass(frozen=True)
 class Verified:
     low: Annotated[float, Range(at_least=0)] = 0.0
@@ -180,11 +143,3 @@ def test_options_have_the_type_of_their_default_or_their_own() -> None:
     assert coerce([3], infer_type([1, 2]), "x") == [3]
     with pytest.raises(ConfigError, match=r"^x=3: expected a list such as \[1, 2\]$"):
         coerce(3, infer_type([1, 2]), "x")
-
-
-def test_a_test_of_ones_own_says_what_it_expects() -> None:
-    even = Annotated[int, Accepts(lambda v: v % 2 == 0, "an even number")]
-    assert coerce(4, even, "x") == 4
-    for value in (3, "x", None):
-        with pytest.raises(ConfigError, match=r"expected an even number$"):
-            coerce(value, even, "x")

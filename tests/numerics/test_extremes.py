@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from neuprim.core.model.edge import EDGES
+from tests.backends import SLOW_HERE
 from tests.numerics.extremes.measure import integrals
 from tests.numerics.extremes.oracle import mp_integral
 from tests.numerics.extremes.regions import REGIONS, Region
@@ -26,7 +27,8 @@ EVERY = [
 
 @pytest.mark.parametrize(("region", "edge"), EVERY, ids=lambda x: getattr(x, "name", f"edge {x}"))
 def test_bounds_hold(region: Region, edge: int) -> None:
-    for result in measure(region, edge, 1 if region.whole or edge else COARSE):
+    left_out = SLOW_HERE if edge and region in NETWORKS else ()  # kernels of their own, and nothing else that is new
+    for result in measure(region, edge, 1 if region.whole or edge else COARSE, left_out):
         assert not result.broken, f"{result.label}: {result.broken}"
 
 

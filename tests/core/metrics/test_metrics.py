@@ -44,22 +44,11 @@ def plain_ssim(a: np.ndarray, b: np.ndarray, window: int, peak: float = 1.0) -> 
     return float(np.mean(values))
 
 
-@pytest.mark.parametrize(("offset", "expected"), [(0.1, 20.0), (0.01, 40.0), (1.0, 0.0), (2.0, -6.020599913279624)])
-def test_psnr_of_a_constant_offset(offset: float, expected: float) -> None:
-    truth = torch.zeros(4, 5, 3, dtype=torch.float64)
-    assert psnr(truth + offset, truth) == pytest.approx(expected, abs=1e-9)
-
-
 def test_psnr_averages_squares_over_pixels_and_channels() -> None:
     truth = torch.zeros(2, 2, 2)
     rendered = truth.clone()
     rendered[0, 1, 1] = 0.5  # MSE = 0.25 / 8
     assert psnr(rendered, truth) == pytest.approx(10 * math.log10(8 / 0.25))
-
-
-def test_psnr_peak() -> None:
-    truth = torch.zeros(3, 3, 1)
-    assert psnr(truth + 2.55, truth, peak=255.0) == pytest.approx(40.0, abs=1e-5)
 
 
 def test_psnr_mask_selects_pixels() -> None:
@@ -72,19 +61,6 @@ def test_psnr_mask_selects_pixels() -> None:
     assert psnr(rendered, truth, mask) == pytest.approx(20.0, abs=1e-5)
     mask[0, 1] = True
     assert psnr(rendered, truth, mask) == pytest.approx(20.0 + 10 * math.log10(2), abs=1e-5)
-
-
-def test_psnr_accumulates_in_double() -> None:
-    rng = np.random.default_rng(1)
-    rendered, truth = (rng.random((300, 400, 3), dtype=np.float32) for _ in range(2))
-    expected = -10 * math.log10(np.mean((rendered.astype(np.float64) - truth.astype(np.float64)) ** 2))
-    assert psnr(torch.from_numpy(rendered), torch.from_numpy(truth)) == pytest.approx(expected, abs=1e-12)
-
-
-def test_nothing_is_clipped_or_quantised() -> None:
-    truth = torch.ones(3, 3, 3)
-    assert psnr(truth + 1e-4, truth) == pytest.approx(80.0, abs=0.01)
-    assert psnr(truth + 1.0, truth) == pytest.approx(0.0)
 
 
 def test_identical_images() -> None:
@@ -130,23 +106,6 @@ def test_ssim_of_3dgs_equals_a_convolution_over_black(height: int, width: int, c
     assert ssim_3dgs(rendered, truth) == pytest.approx(float(np.mean(values)), abs=1e-12)
     assert abs(ssim_3dgs(rendered, truth) - ssim(rendered, truth)) > 1e-3, "another convention"
     assert ssim_3dgs(truth, truth) == pytest.approx(1.0, abs=1e-12)
-
-
-def test_ssim_peak_scales_with_the_images() -> None:
-    rendered, truth = pair(16, 16, 3)
-    assert ssim(rendered * 5, truth * 5, peak=5.0) == pytest.approx(ssim(rendered, truth), abs=1e-12)
-
-
-def test_ssim_of_inverted_structure_is_negative() -> None:
-    _, truth = pair(24, 24, 1)
-    assert ssim(1.0 - truth, truth) < 0
-
-
-def test_images_that_require_gradients_give_plain_floats() -> None:
-    rendered, truth = pair(12, 12, 3)
-    rendered.requires_grad_(True)
-    assert isinstance(psnr(rendered, truth), float)
-    assert isinstance(ssim(rendered, truth), float)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ import torch
 from torch import Tensor
 
 from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
@@ -157,24 +155,6 @@ def test_split_wraps_phases_at_the_density_s_own_turn(omega0: float) -> None:
     assert (before - after).abs().max() <= 1e-5 * before.abs().max()
 
 
-@pytest.mark.parametrize("wrong", [0.0, -30.0, math.nan, math.inf, "30", True, None])
-def test_omega0_is_a_positive_number(wrong: Any) -> None:
-    with pytest.raises(ValueError, match=r"omega0 .*; expected a positive number"):
-        CosineDensity(8, wrong)
-
-
-def test_split_follows_the_longest_axis() -> None:
-    t = scenes.tensors(30, 2, seed=2, dtype=torch.float64)
-    children = split_primitives(model(t), torch.arange(30), 0.5, 0.6, 0.9)
-    longest = t["log_scales"].argmax(1)
-    change = (children["log_scales"][:30] - t["log_scales"]).exp()
-    assert torch.allclose(change.gather(1, longest[:, None]), torch.tensor(0.6, dtype=torch.float64))
-    assert torch.allclose(change.sum(1), torch.tensor(0.6 + 0.9 + 0.9, dtype=torch.float64))
-    offset = children["means"][:30] - t["means"]
-    along = (geometry(t).rotations[torch.arange(30), :, longest] * offset).sum(1)
-    assert torch.allclose(along.abs(), offset.norm(dim=1))
-
-
 @pytest.mark.parametrize("neurons", [0, 5])
 def test_two_half_clones_are_the_original(neurons: int) -> None:
     t = scenes.tensors(12, neurons, seed=3, dtype=torch.float64)
@@ -204,16 +184,6 @@ def test_scaling_the_scene_leaves_the_image(scale: float) -> None:
     assert (second.rgb - first.rgb).abs().max() < 1e-11
     assert first.depth is not None and second.depth is not None
     assert torch.allclose(second.depth, first.depth * scale, rtol=1e-9)
-
-
-def test_omega0_multiplies_the_whole_phase() -> None:
-    t = scenes.tensors(10, 4, seed=6, dtype=torch.float64)
-    low = scenes.lowered(t)
-    assert isinstance(low.density, Cosine) and low.density.omega0 == 30.0
-    ten = Cosine(t["W1"] * 3, t["b1"] * 3, t["w2"], t["b2"], 10.0)
-    camera = scenes.camera(16, 12)
-    first, second = (render_lowered(replace(low, density=d), camera, EXACT).rgb for d in (low.density, ten))
-    assert (first - second).abs().max() < 1e-12
 
 
 @pytest.mark.parametrize("neurons", [0, 1, 8])

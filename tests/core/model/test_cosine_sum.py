@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import reduce
-from operator import add
 
 import pytest
 import torch
-from torch import Tensor
 
 from neuprim.conformance.integrals import chords, inside
 from neuprim.core.errors import FormError
 from neuprim.core.model.densities.cosine import cosine_density
-from neuprim.core.model.fields import Cosine, CustomDensity
+from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pairs import Pairs
-from neuprim.core.model.primitives import Lowered
 from neuprim.core.model.tensors import MOST_UNITS
-from neuprim.core.render import RenderSettings, render_lowered
 from tests import scenes
 
 COUNT = 12
-EXACT = RenderSettings(backend="reference", alpha_min=0.0, transmittance_min=0.0)
 
 
 def form(neurons: int, omega0: float, seed: int, flat: bool = False, dtype: torch.dtype = torch.float64) -> Cosine:
@@ -63,38 +57,6 @@ def test_densities_and_line_integrals_add_up(name: str) -> None:
     assert (whole - a - b).abs().max() <= 1e-12 * a.abs().max() and b.abs().max() > 0.01
 
 
-def test_a_sum_is_drawn_as_the_sum_of_the_integrals() -> None:
-    first, second = PAIRS["two of them"]
-    geometry, colour = where(), scenes.colour(scenes.tensors(COUNT, dtype=torch.float64))
-
-    def added(*ray: Tensor) -> Tensor:
-        return sum((f.optical_depth(Pairs.of(geometry, *ray)) for f in (first, second)), torch.zeros(()))
-
-    camera = scenes.camera(20, 15)
-    expected = render_lowered(Lowered(geometry, CustomDensity(added), colour), camera, EXACT).rgb
-    for backend, bound in (("reference", 1e-12), ("cpu", 2e-5)):
-        found = render_lowered(Lowered(geometry, first + second, colour), camera, replace(EXACT, backend=backend)).rgb
-        assert expected.max() > 0.3 and (found - expected).abs().max() < bound
-
-
-def test_gradients_reach_both() -> None:
-    geometry = where()
-    leaves = [[v.clone().requires_grad_() for v in (f.W1, f.b1, f.w2, f.b2)] for f in PAIRS["two of them"]]
-    first, second = (Cosine(*values, omega0) for values, omega0 in zip(leaves, (30.0, 4.5), strict=True))
-    prim = torch.arange(COUNT)
-    x = inside(geometry, prim, torch.Generator().manual_seed(2))
-    flat = [v for values in leaves for v in values]
-    found = torch.autograd.grad(cosine_density(first + second, geometry, prim, x).square().sum(), flat)
-    apart = cosine_density(first, geometry, prim, x) + cosine_density(second, geometry, prim, x)
-    for a, b in zip(found, torch.autograd.grad(apart.square().sum(), flat), strict=True):
-        assert b.abs().max() > 0 and torch.allclose(a, b, rtol=1e-10, atol=1e-12)
-
-
-def test_many_are_added_one_by_one() -> None:
-    forms = [form(2, omega0, seed) for seed, omega0 in enumerate((30.0, 3.0, 1.0))]
-    assert reduce(add, forms).W1.shape == (COUNT, 6, 3)
-
-
 @pytest.mark.parametrize(
     ("second", "message"),
     [
@@ -109,8 +71,3 @@ def test_many_are_added_one_by_one() -> None:
 def test_what_cannot_be_added_is_refused(second: Cosine, message: str) -> None:
     with pytest.raises(FormError, match=f"^sum of two Cosine forms: {message}"):
         form(3, 30.0, 1) + second
-
-
-def test_other_things_are_not_added() -> None:
-    with pytest.raises(TypeError, match="unsupported operand"):
-        form(3, 30.0, 1) + CustomDensity(lambda *a: a[0])  # type: ignore[operator]

@@ -9,9 +9,8 @@ from scipy import special
 from torch import Tensor
 
 from neuprim.config import compose
-from neuprim.core.errors import ConfigError, FormError
-from neuprim.core.model.densities.cosine import CosineDensity, amplified, cosine_density
-from neuprim.core.model.edge import EDGES, NORMS, chord_integral, fade, profile, spherical_bessel
+from neuprim.core.model.densities.cosine import CosineDensity, cosine_density
+from neuprim.core.model.edge import EDGES, NORMS, chord_integral, profile, spherical_bessel
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pairs import Pairs
@@ -114,43 +113,6 @@ def test_a_sphere_starts_as_opaque_whatever_its_edge() -> None:
         assert torch.allclose(1 - (-NORMS[edge] * offset).exp(), torch.full_like(offset, 0.8), atol=1e-6)
 
 
-def test_settings_name_only_what_is_unusual() -> None:
-    assert CosineDensity(4).settings() == {"neurons": 4}
-    soft = CosineDensity(2, 12.0, 1, True)
-    again = CosineDensity(**soft.settings())
-    assert (again.omega0, again.edge, again.gain) == (12.0, 1, True) and again.parameters()[-1].name == "log_gain"
-    assert CosineDensity(2).exact_split and not soft.exact_split
-
-
-@pytest.mark.parametrize("wrong", [3, -1, 1.0, True, "1", None])
-def test_the_edge_is_0_1_or_2(wrong: object) -> None:
-    with pytest.raises(ValueError, match=r"^edge .*; expected 0, 1 or 2"):
-        CosineDensity(8, edge=wrong)  # type: ignore[arg-type]
-    t = scenes.tensors(2, 1)
-    assert "; expected 0, 1 or 2" in str(Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 30.0, wrong).fault({}))  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["task=static", "model.density.edge=3"], "model.density.edge=3: expected 0, 1 or 2"),
-        (
-            ["task=relight", "model.density.edg=1"],
-            "model.density.edg: no such setting; did you mean 'model.density.edge'?",
-        ),
-        (["task=dynamic", "model.density.omega0=-1"], "model.density.omega0=-1: expected a number above 0"),
-        (["task=static", "model.density.gain=2"], "model.density.gain=2: expected true or false"),
-        (
-            ["task=static", "model.density.form=gaussian", "model.density.edge=1"],
-            "model.density.edge: of densities of the form cosine; .*gaussian",
-        ),
-    ],
-)
-def test_wrong_words_are_refused_before_data_load(words: list[str], message: str) -> None:
-    with pytest.raises(ConfigError, match=f"^{message}"):
-        compose(words, check_output=False)
-
-
 def test_another_form_takes_none_of_the_presets_settings() -> None:
     assert compose(["task=static"], check_output=False).model.density == {"form": "cosine", "edge": 2, "gain": True}
     for words in (["model.density.form=gaussian"], ["model.density={form: gaussian}"]):
@@ -159,33 +121,3 @@ def test_another_form_takes_none_of_the_presets_settings() -> None:
         ["task=static", "model.density.form=cosine", "model.density.edge=1"], check_output=False
     ).model.density
     assert own == {"form": "cosine", "edge": 1, "gain": True}
-
-
-def test_sums_keep_their_edge() -> None:
-    t = scenes.tensors(2, 3)
-    first, second = (Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 30.0, edge) for edge in (1, 2))
-    assert (first + first).edge == 1 and first.rows(torch.tensor([1])).edge == 1
-    with pytest.raises(FormError, match="edges 1 and 2; expected the same"):
-        _ = first + second
-
-
-def test_gains_beyond_the_limit_count_as_the_limit() -> None:
-    w2, b2 = torch.ones(5, 2), torch.ones(5, 1)
-    log_gain = torch.tensor([[-80.0], [-20.0], [0.0], [20.0], [80.0]], requires_grad=True)
-    wide, offset = amplified(w2, b2, log_gain)
-    assert (
-        torch.isfinite(wide).all()
-        and torch.equal(wide[0], wide[1])
-        and torch.equal(offset[4], offset[3])
-        and offset[2].item() == 1
-    )
-    offset.log().sum().backward()
-    grad = log_gain.grad
-    assert grad is not None and grad[:, 0].tolist() == pytest.approx([0, 1, 1, 1, 0])
-
-
-def test_fading_ends_at_the_edge() -> None:
-    u = torch.linspace(0, 2, 201, dtype=F64)
-    for edge in (1, 2):
-        weight = fade(u.square(), edge)
-        assert float(weight[0]) == 1 and not bool(weight[u >= 1].any()) and bool((weight.diff()[u[1:] <= 1] < 0).all())

@@ -7,8 +7,7 @@ import math
 import pytest
 import torch
 
-from neuprim.core.model.cosine_sums import canonicalize_cosines, canonicalize_gain
-from neuprim.core.model.fields import Constant
+from neuprim.core.model.cosine_sums import canonicalize_cosines
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from tests import scenes
@@ -76,23 +75,3 @@ def test_one_number_says_how_strong_a_density_without_neurons_is() -> None:
     for several in ("soft", "dynamic"):  # neurons, or terms in time, have strengths of their own
         whole = example(several)[1]
         assert torch.equal(folded(whole).params["log_gain"], whole.params["log_gain"])
-
-
-def test_strengths_that_do_not_fit_into_a_gain_stay() -> None:
-    b = torch.tensor([[0.0], [1e-30], [1e30], [-2.0], [3.0], [torch.nan], [torch.inf]])
-    g = torch.tensor([[1.0], [-19.0], [19.0], [0.0], [25.0], [0.0], [0.0]])  # beyond 20 a gain counts as 20
-    made = canonicalize_gain({"b": b, "g": g}, "b", "g", 20.0)
-    assert made["b"].flatten().tolist()[:5] == [0.0, b[1, 0].item(), b[2, 0].item(), -1.0, 3.0]
-    assert made["g"].flatten().tolist() == [1.0, -19.0, 19.0, pytest.approx(math.log(2.0)), 25.0, 0.0, 0.0]
-    assert torch.isnan(made["b"][5, 0]) and torch.isinf(made["b"][6, 0])
-
-
-def test_fields_without_cosines_stay_as_they_are() -> None:
-    model = example("harmonics")[1]
-    assert isinstance(
-        model.colour.lower(model.of(model.colour), model.geometry, scenes.camera(), CONDITIONS["relight"]), Constant
-    )
-    assert all(
-        torch.equal(value, model.params[key])
-        for key, value in model.colour.canonicalize(model.of(model.colour)).items()
-    )

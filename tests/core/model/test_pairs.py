@@ -3,17 +3,12 @@ tensors say."""
 
 from __future__ import annotations
 
-import ast
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
-import neuprim
-from neuprim.core.errors import FormError
 from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.fields import Constant, Cosine, CustomColour, CustomDensity, RayNet
 from neuprim.core.model.pairs import Pairs
@@ -99,43 +94,3 @@ def test_colours_along_chords_and_at_centres() -> None:
     assert torch.allclose(opaque.chord_colours(pairs), torch.cat([pairs.points, d[:, :1]], 1))
     towards = torch.nn.functional.normalize(low.geometry.means - position, dim=1)
     assert torch.allclose(opaque.center_colors(position), torch.cat([low.geometry.means, towards[:, :1]], 1))
-
-
-def test_code_that_returns_something_else_is_named() -> None:
-    low = model()
-    pairs = chords(low)[0]
-    with pytest.raises(
-        FormError,
-        match=rf"^density lowered to CustomDensity: line_integral returned shape \({M}, 1\); expected \({M},\)",
-    ):
-        replace(low, density=CustomDensity(lambda prim, o, d, t0, t1: t0[:, None])).optical_depth(pairs)
-    with pytest.raises(
-        FormError, match=rf"^colour lowered to CustomColour: radiance returned shape \({M}, 3\); expected \({M}, 2\)"
-    ):
-        replace(low, colour=CustomColour(lambda prim, x, d: x, 2)).chord_colours(pairs)
-
-
-KERNELS = {
-    "core/render/backends.py",
-    "core/render/quadrature.py",
-    "core/render/rasterize.py",
-    "core/volumes/grid.py",
-    "core/volumes/points.py",
-}
-"""Where code asks which form it has, as compiled kernels, and the samples that stand beside a closed form, know only
-some."""
-
-OWN = {"core/model/forms.py", "tasks/dynamic/evaluation.py"}
-"""A sum of two of a kind; a density that is the task's own."""
-
-
-def test_nobody_else_asks_which_form_it_is() -> None:
-    root, forms = Path(neuprim.__file__).parent, {"Cosine", "CustomDensity", "Constant", "RayNet", "CustomColour"}
-    asking = {
-        file.relative_to(root).as_posix()
-        for file in root.rglob("*.py")
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance"
-        if forms & {n.id for n in ast.walk(node.args[1]) if isinstance(n, ast.Name)}
-    }
-    assert asking == KERNELS | OWN

@@ -113,20 +113,6 @@ def test_files_leave_zeros_out_and_give_them_back(density: Field, colour: Field)
     assert sum(t.numel() * t.element_size() for t in stored.values()) < 4 * model.count * model.parameters_per_primitive
 
 
-def test_a_model_without_zeros_is_stored_as_ever() -> None:
-    model = made(*PAIRS[0])
-    stored, sparse = store_sparse(model.params, (*model.density.parameters(), *model.colour.parameters()))
-    assert sparse == [] and stored == model.params
-
-
-def test_a_zero_below_zero_keeps_its_sign() -> None:
-    model = pruned(made(*PAIRS[0]))
-    model.params["w2"][:, 0] = -0.0
-    own = (*model.density.parameters(), *model.colour.parameters())
-    again = load_sparse(*store_sparse(model.params, own), own, "file")
-    assert bool(torch.signbit(again["w2"][:, 0]).all())
-
-
 @pytest.fixture
 def task() -> TaskSpec:
     return load_task("static")
@@ -185,12 +171,3 @@ def test_files_that_lie_are_refused(lie: str, file: Path, task: TaskSpec) -> Non
     with pytest.raises(CheckpointError) as caught:
         checkpoint.load_model(file, task)
     assert expected in str(caught.value) and str(file) in str(caught.value)
-
-
-@pytest.mark.parametrize("names", ["sh_rest", ["sh_all"], ["means"], [3], {"sh_rest": 1}])
-def test_a_header_of_what_does_not_exist_is_refused(names: object, file: Path, task: TaskSpec) -> None:
-    header, tensors = checkpoint.read(file, "model")
-    header = {k: v for k, v in header.items() if k not in ("format", "kind", "sparse")}
-    checkpoint.write(file, "model", tensors, {**header, "sparse": names})
-    with pytest.raises(CheckpointError, match="header field 'sparse'"):
-        checkpoint.load_model(file, task)

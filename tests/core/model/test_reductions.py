@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.model.colours import sh
-from neuprim.core.model.cosine_sums import prune_neurons, smaller_neuron_counts
+from neuprim.core.model.cosine_sums import prune_neurons
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, cosine_density
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Field
@@ -68,13 +68,6 @@ def test_every_reduction_is_a_model_that_can_be_stored_and_drawn(density: Field,
     assert offered == {(kind, name) for kind in ("density", "colour") for name in getattr(model, kind).reductions()}
 
 
-def test_what_has_nothing_to_spare_offers_nothing() -> None:
-    assert GaussianDensity().reductions() == {} == LightNetwork(0).reductions()
-    assert SphericalHarmonics(0).reductions() == {} == CosineDensity(0).reductions()
-    with pytest.raises(NotImplementedError, match="GaussianDensity"):
-        GaussianDensity().reduce({}, made(*PAIRS[3]).geometry, "neurons", 1)
-
-
 # ---------------------------------------------------------------- bands
 
 
@@ -88,15 +81,6 @@ def test_dropped_bands_are_the_basis_cut_off() -> None:
 
 
 # ---------------------------------------------------------------- neurons
-
-
-def test_counts() -> None:
-    assert (
-        smaller_neuron_counts(8) == (6, 4, 2, 0)
-        and smaller_neuron_counts(2) == (1, 0)
-        and smaller_neuron_counts(1) == (0,)
-        and smaller_neuron_counts(3) == (2, 1, 0)
-    )
 
 
 def inside(geometry: Geometry, count: int, generator: torch.Generator) -> Tensor:
@@ -136,12 +120,6 @@ def test_dropped_neurons_leave_their_mean_and_those_that_stay_matter_most() -> N
         first = {name: model.params[name][:, :keep] for name in ("b1", "w2")} | {"W1": model.params["W1"][:, :keep]}
         naive = Primitives(CosineDensity(keep), model.colour, {**model.params, **first})
         assert (left - whole).square().mean() < (0.8 if keep else 1.0) * (sigma(naive, x) - whole).square().mean()
-
-
-def test_all_neurons_are_the_model_itself() -> None:
-    model = made(CosineDensity(4), SphericalHarmonics(0))
-    params = prune_neurons(model.of(model.density), model.geometry, 4, OMEGA0)
-    assert all(torch.equal(params[name], model.params[name]) for name in params)
 
 
 def test_means_of_phases_that_advance_are_those_over_the_sequence() -> None:

@@ -58,13 +58,6 @@ def test_strides_do_not_matter_and_what_nothing_is_asked_of_has_no_gradient() ->
     assert unused.grad is None
 
 
-def test_two_frames_of_one_model_add_up() -> None:
-    mine = tensors(torch.float32)
-    for rows in ([0, 1], [1, 7]):
-        take_rows(mine, torch.tensor(rows))["b2"].sum().backward()
-    assert mine["b2"].grad is not None and mine["b2"].grad[:, 0].tolist() == [1, 2, 0, 0, 0, 0, 0, 1, 0]
-
-
 @pytest.mark.parametrize("count", [3, 5000])
 def test_without_a_gradient_few_and_many_rows(count: int) -> None:
     g = torch.Generator().manual_seed(3)

@@ -36,15 +36,6 @@ def test_orthonormal() -> None:
     assert torch.allclose(gram, torch.eye(16, dtype=torch.float64), atol=1e-13)
 
 
-def test_bands_are_rotation_invariant() -> None:
-    """Each band's sum of squares is the same in every direction (the addition theorem)."""
-    d, _ = sphere()
-    values = sh.basis(d, 3)
-    for band in range(4):
-        power = values[:, band**2 : (band + 1) ** 2].square().sum(1)
-        assert torch.allclose(power, torch.full_like(power, (2 * band + 1) / (4 * math.pi)), atol=1e-13)
-
-
 def test_order_and_signs() -> None:
     """Those of 3D Gaussian splatting: y, z, x with signs -, +, - in band 1."""
     x, y, z = torch.eye(3, dtype=torch.float64)[:, None]
@@ -55,20 +46,6 @@ def test_order_and_signs() -> None:
     assert sh.basis(z, 2)[0, 6].item() == pytest.approx(0.6307831305050401)
     assert sh.basis(x, 2)[0, 8].item() == pytest.approx(0.5462742152960396)
     assert sh.basis(x, 3)[0, 15].item() == pytest.approx(-0.5900435899266435)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_degrees_nest(degree: int) -> None:
-    d, _ = sphere(4, 8)
-    values = sh.basis(d, degree)
-    assert values.shape == (32, sh.coefficient_count(degree)) == (32, (degree + 1) ** 2)
-    assert torch.equal(values, sh.basis(d, 3)[:, : values.shape[1]])
-
-
-@pytest.mark.parametrize("degree", [-1, 4])
-def test_degree_out_of_range(degree: int) -> None:
-    with pytest.raises(ValueError, match=rf"degree {degree}; expected 0..3"):
-        sh.basis(torch.zeros(1, 3), degree)
 
 
 def fresh(degree: int, channels: int, sh_every: float = 0.0) -> tuple[Primitives, SphericalHarmonics, torch.Tensor]:
@@ -130,17 +107,6 @@ def test_bands_are_unlocked_one_by_one() -> None:
     assert torch.equal(seen(model), first), "locked bands play no part"
     model.params["sh_rest"][:, :3] = 7.0
     assert not torch.equal(seen(model), first)
-
-
-def test_without_a_schedule_all_bands_are_open_at_once() -> None:
-    _, colour, _ = fresh(2, 3, sh_every=0.0)
-    colour.set_progress(0.0)
-    assert colour.active == 2
-
-
-def test_settings_rebuild_the_field() -> None:
-    again = SphericalHarmonics(**SphericalHarmonics(2, 4, 0.1).settings())
-    assert (again.degree, again.channels, again.active) == (2, 4, 2)
 
 
 def on_blocks(

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError, NonFiniteError
 from neuprim.core.model.fields import Constant, CustomDensity
 from neuprim.core.model.primitives import Lowered
-from neuprim.core.render import RenderOutput, RenderSettings, backends, probe_backend, render_lowered
+from neuprim.core.render import RenderOutput, RenderSettings, backends, render_lowered
 from neuprim.core.render.backends import Backend, choose_backend
 from neuprim.core.render.draw import Draw
 from neuprim.core.render.reference.backend import render as reference
@@ -116,14 +114,6 @@ def test_a_refusal_names_it_and_one_that_can(fake: Fake) -> None:
         render_lowered(low, camera, settings)
 
 
-def test_a_probe_draws_and_compares(fake: Fake) -> None:
-    assert probe_backend("fake") is None and probe_backend("reference") is None and fake.frames == 1
-    fake.dim = 0.5
-    assert "drew 0.43" in str(probe_backend("fake"))
-    fake.broken = "no such device"
-    assert probe_backend("fake") == "no such device"
-
-
 def test_gradients_of_intrinsics_are_asked_of_the_row(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
     t = scenes.tensors(4)
     t["b2"] = t["b2"][:, 0]
@@ -142,35 +132,9 @@ def test_gradients_of_intrinsics_are_asked_of_the_row(fake: Fake, monkeypatch: p
     assert K.grad is not None and K.grad.abs().max() > 0
 
 
-def test_what_compiles_is_compiled_ahead(fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
-    ahead = backends.precompiled_backend
-    assert ahead(RenderSettings(backend="fake")) is None and ahead(RenderSettings(backend="reference")) is None
-    assert ahead(RenderSettings()).name == "cpu"  # type: ignore[union-attr]
-    monkeypatch.setattr(backends, "TABLE", (replace(backends.TABLE[0], compiles=True), *backends.TABLE[1:]))
-    assert ahead(RenderSettings()).name == ahead(RenderSettings(backend="fake")).name == "fake"  # type: ignore[union-attr]
-
-
 def test_the_table_imports_no_backend() -> None:
     """Numba alone takes a second to import."""
     program = "import sys, neuprim.core.render.backends as b, neuprim.cli; b.available_backends(); b.gpu_unavailable()"
     program += "; print('numba' in sys.modules, 'warp' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert found.stdout.split() == ["False", "False"]
-
-
-def named(file: Path) -> Iterator[int]:
-    """Lines on which code compares a backend with a name, or passes one."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.keyword) and node.arg == "backend":
-            values = [node.value]
-        elif isinstance(node, ast.Compare) and "backend" in ast.unparse(node):
-            values = [node.left, *node.comparators]
-        else:
-            continue
-        constants = (n for value in values for n in ast.walk(value) if isinstance(n, ast.Constant))
-        yield from (n.lineno for n in constants if isinstance(n.value, str) and n.value in backends.backend_names())
-
-
-def test_no_code_decides_by_a_backends_name() -> None:
-    root = Path(neuprim.__file__).parent
-    assert [f"{file.relative_to(root)}:{line}" for file in sorted(root.rglob("*.py")) for line in named(file)] == []

@@ -14,10 +14,10 @@ import neuprim
 from neuprim.config import compose
 from neuprim.core.compute import device
 from neuprim.core.compute.device import HOST
-from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, FormError
+from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.model.fields import CustomDensity
 from neuprim.core.render import RenderSettings, backends, render_lowered
-from neuprim.core.render.backends import Backend, choose_backend, computing_device, device_of
+from neuprim.core.render.backends import choose_backend, computing_device, device_of
 from neuprim.runs.fit import prepare_training
 from tests import scenes
 from tests.core import tiny
@@ -73,21 +73,6 @@ def test_without_a_gpu_everything_is_computed_on_the_cpu(monkeypatch: pytest.Mon
     assert backends.with_available_device(RenderSettings(device="cuda", near=0.5)) == RenderSettings(near=0.5)
 
 
-def test_a_gpu_that_nothing_draws_on_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "cuda_unavailable", lambda: None)
-    monkeypatch.setattr(backends, "TABLE", tuple(b for b in backends.TABLE if b.devices[0] == "cpu"))
-    assert backends.gpu_unavailable() == "no backend draws there"
-    assert tiny.trainer(tiny.two_primitives(), 1).device == HOST
-    broken = Backend("card", lambda: pytest.fail("loaded"), missing=lambda: "no package", devices=("cuda",))
-    monkeypatch.setattr(backends, "TABLE", (broken, *backends.TABLE))
-    assert backends.gpu_unavailable() == "no package"
-    with pytest.raises(BackendUnavailable, match=r"^renderer\.device=cuda: no package; expected cpu or auto$"):
-        backends.check_device(RenderSettings(device="cuda"))
-    working = replace(broken, missing=lambda: None)
-    monkeypatch.setattr(backends, "TABLE", (working, *backends.TABLE))
-    assert backends.with_available_device(RenderSettings(device="cuda")) == RenderSettings(device="cuda")
-
-
 def test_what_is_no_frame_is_computed_where_frames_are(card: Card) -> None:
     for settings, wanted in (
         (RenderSettings(), CARD),
@@ -126,12 +111,6 @@ def test_tensors_go_where_the_setting_says_and_the_frame_comes_back(own: str, ki
     assert torch.equal(output.alpha.detach().cpu(), wanted.alpha)
 
 
-def test_a_backend_by_name_takes_tensors_to_its_device(card: Card) -> None:
-    low, camera = frame()
-    assert render_lowered(low, camera, RenderSettings(backend="card")).rgb.device.type == "cpu"
-    assert render_lowered(low.to(CARD), camera, RenderSettings(backend="reference")).rgb.device == CARD
-
-
 def test_code_of_a_model_stays_where_it_is(card: Card) -> None:
     """What only the reference draws is not moved to it; a run keeps such a model on the CPU in the first place."""
     low, camera = frame()
@@ -157,15 +136,6 @@ def test_a_run_keeps_a_model_where_it_is_drawn(card: Card, monkeypatch: pytest.M
     row = replace(backends.TABLE[0], unsupported=lambda low, camera: "this model")
     monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE[1:]))
     assert device_of(model, RenderSettings(), camera, {}) == HOST
-
-
-def test_tensors_of_two_devices_are_refused_by_name(card: Card) -> None:
-    low, camera = frame()
-    mixed = replace(low, density=low.density.to(CARD))
-    with pytest.raises(FormError, match=r"^density lowered to Cosine: W1 has device meta; expected cpu, as means has$"):
-        render_lowered(mixed, camera, RenderSettings())
-    with pytest.raises(FormError, match=r"^viewmat has device meta; expected cpu, as means has, or cpu$"):
-        render_lowered(low, replace(camera, viewmat=camera.viewmat.to(CARD)), RenderSettings())
 
 
 def test_rasterize_takes_tensors_of_a_gpu(card: Card) -> None:

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.errors import FormError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Constant, DensityField
@@ -80,9 +79,3 @@ def test_other_colours_depth_and_alpha() -> None:
     depth = torch.where(alpha > 0, (found.weight * found.middle).sum(0) / alpha.clamp_min(1e-30), 0.0)
     clear = alpha > 1e-3  # a mean over next to nothing has no digits
     assert off(torch.where(clear, one.drawn.depth, 0.0), torch.where(clear, depth, 0.0)) < 1e-4
-
-
-@pytest.mark.parametrize("weights", [torch.ones(COUNT + 1), -torch.ones(COUNT), torch.full((COUNT,), torch.inf)])
-def test_impossible_weights_are_refused(weights: Tensor) -> None:
-    with pytest.raises(FormError, match=r"integral: weights .* expected \(14,\) finite numbers, at least 0"):
-        frame().integral(weights)

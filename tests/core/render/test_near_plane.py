@@ -7,7 +7,7 @@ import torch
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.projections import RayCamera
-from neuprim.core.render.near_plane import nearest_and_median_depth, resolve_near, scene_extent
+from neuprim.core.render.near_plane import nearest_and_median_depth, resolve_near
 from neuprim.core.settings import RenderSettings
 
 AUTO = RenderSettings(near="auto")
@@ -43,8 +43,3 @@ def test_a_number_wins_and_there_is_always_a_plane() -> None:
     assert resolve_near(AUTO, points(1.0)[:0], cameras(4.0)).near_plane > 0
     fisheye = RayCamera.fisheye(8, 8, cameras(4.0)[0].viewmat)
     assert resolve_near(AUTO, points(1.0), [fisheye]).near_plane == pytest.approx(0.01, rel=0.1)
-
-
-def test_cameras_on_a_tripod_take_their_extent_from_the_depth() -> None:
-    assert scene_extent(4.4, points(1.0), cameras(4.0)) == 4.4 and scene_extent(0.1, points(1.0), cameras(4.0)) == 0.1
-    assert scene_extent(3e-7, points(1.0), cameras(4.0)) == pytest.approx(4.1, rel=0.1)

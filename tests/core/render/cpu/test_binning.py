@@ -31,15 +31,3 @@ def test_slots_lead_from_every_primitive_to_its_pairs() -> None:
     assert sorted(lists.slots.tolist()) == list(range(lists.pairs))
     for i in range(700):
         assert (lists.ids[lists.slots[lists.first[i] : lists.first[i + 1]]] == i).all()
-
-
-def test_many_large_primitives_fill_every_tile() -> None:
-    """More pairs in one unit of work than its buffer starts with, on one thread and two."""
-    t, camera = scenes.tensors(600, 0, seed=5, radius=9.0), scenes.camera(90, 70)
-    t["log_scales"][:], t["b2"] = 3.0, t["b2"].abs() + 0.01  # all of them can be seen
-    for threads in (1, 2):
-        lists = frame_of(t, camera, threads).lists
-        tiles = -(-90 // TILE) * -(-70 // TILE)
-        assert lists.pairs == 600 * tiles > 4096
-        for k in range(tiles):
-            assert sorted(lists.ids[lists.starts[k] : lists.starts[k + 1]].tolist()) == list(range(600))

@@ -13,7 +13,7 @@ from torch import Tensor
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
 from neuprim.core.compute import warp
-from neuprim.core.render.cuda import backend, binning, colour_net, forward, frame, passes, prepare_backward
+from neuprim.core.render.cuda import backend, binning, colour_net, frame, passes, prepare_backward
 from neuprim.core.render.cuda import layout as L
 from tests.core.render.cuda.frames import SCENES, Args, Launch, assert_same_bits, everything, intercept
 
@@ -29,20 +29,6 @@ def test_a_rerun_gives_the_same_bits(name: str, plain: dict[str, dict[str, Tenso
     assert (
         plain[name]["alpha"].max() > 0.5 and plain[name]["means"].abs().max() > 0 and plain[name]["weight"].max() > 0.5
     )
-
-
-@pytest.mark.parametrize("rows", [1, 7, 64])
-def test_rows_are_read_in_batches_of_any_size(
-    rows: int, plain: dict[str, dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A tile's end is looked for after each batch: pairs behind it are composited or not, and change nothing."""
-    name = "center, depth"
-    monkeypatch.setattr(forward, "BATCH", rows)
-    forward.forward_kernel.cache_clear()
-    try:
-        assert_same_bits(plain[name], everything(name))
-    finally:
-        forward.forward_kernel.cache_clear()
 
 
 def _alone(starts: Tensor, tile: int) -> Tensor:
@@ -157,28 +143,6 @@ def test_what_is_read_was_written(
         monkeypatch.setattr(module, "torch", Torch())
     assert_same_bits(plain[name], everything(name))
     assert sum(filled) > 10000
-
-
-def test_the_scenes_have_pairs_of_every_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In float64 and not, with tiles that end early and those that do not, and with fewer and more pairs than a
-    batch."""
-    found: dict[str, list[tuple[int, int, int, int, int]]] = {}
-    genuine = backend.forward
-
-    def looked(*args: Any) -> Any:
-        drawn, lists = genuine(*args), args[0].lists
-        ended, most = (drawn.reached < lists.starts[1:]).sum(), (lists.starts[1:] - lists.starts[:-1]).max()
-        found[name] = [(lists.pairs, len(drawn.in_float64), int(ended), len(drawn.reached), int(most))]
-        return drawn
-
-    monkeypatch.setattr(backend, "forward", looked)
-    for name in SCENES:
-        everything(name)
-    for name, ((pairs, few, ended, tiles, most),) in found.items():
-        assert pairs - few > 20 and most > forward.BATCH, name
-        assert (few > 20) == (name in ("inside", "colour networks", "entry")), (name, few)
-        assert ended < tiles
-    assert any(ended for ((_, _, ended, _, _),) in found.values())
 
 
 # ---------------------------------------------------------------- the launch

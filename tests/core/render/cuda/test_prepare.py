@@ -15,9 +15,8 @@ from neuprim.core.render import layout as P
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.frame import Frame, NotFinite
 from neuprim.core.render.cuda.prepare_backward import prepare_backward
-from neuprim.core.render.limits import CULLED
 from neuprim.core.render.rasterize import PARAMETERS
-from tests.core.render.cuda.twin import CASES, DEVICES, Array, Case, both, frame_of, numba_frame, numpy, ulps
+from tests.core.render.cuda.twin import CASES, DEVICES, Array, both, frame_of, numpy, ulps
 
 PLACES = {
     P.E0: (L.E0, 0), P.EX: (L.EX, 0), P.EY: (L.EY, 0), P.XA: (L.XA, 0), P.XU: (L.XU, 0), P.XV: (L.XV, 0),
@@ -124,20 +123,6 @@ def test_the_first_primitive_that_is_not_finite_is_named(name: str, value: float
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_small_discs_beyond_float32_are_not_seen(device: str) -> None:
-    """So thin and small that float32 has no number for a ray in their axes, which is no error."""
-    case = CASES["K=8"]
-    t = case.tensors()
-    t["log_scales"][::2] = torch.tensor([-129.5, -40.0, -40.0])
-    numba, frame = numba_frame(case, t), frame_of(case, t, device)
-    assert (
-        (numpy(frame.status) == numba.projected.status).all()
-        and (numba.projected.status[::2] == CULLED).all()
-        and not numpy(frame.boxes)[::2].any()
-    )
-
-
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", CASES)
 def test_gradients_are_numbas(name: str, device: str) -> None:
     numba, frame = both(name, device)
@@ -166,37 +151,3 @@ def test_gradients_are_numbas(name: str, device: str) -> None:
     assert found_view is not None and found_view.dtype == torch.float64
     assert (np.abs(numpy(found_view) - view.sum(0)) <= 1e-12 * np.abs(view).sum(0)).all()
     assert prepare_backward(frame, grads.to(device))[1] is None
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_rows_that_nothing_was_seen_of_give_zeros(device: str) -> None:
-    case = Case(3)
-    frame = frame_of(case, case.tensors(), device)
-    grads = torch.full((case.count, L.gradient_width(3, 3)), math.nan, device=device)
-    grads[:, L.G_WEIGHT] = 0.0
-    grads[7] = 1.0
-    found, view = prepare_backward(frame, grads, True)
-    assert view is not None and torch.isfinite(view).all() and view.abs().max() > 0
-    for own in found:
-        assert own[7].abs().max() > 0
-        assert (own[torch.arange(case.count, device=device) != 7] == 0).all()
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_float64_parameters_are_not_rounded(device: str) -> None:
-    """A mix of dtypes is computed as float64 throughout."""
-    case = CASES["K=8"]
-    t = case.tensors()
-    mixed = t | {"means": t["means"].double() + 1e-9}
-    numba = numba_frame(case, {key: value.double() for key, value in mixed.items()})
-    frame = frame_of(case, mixed, device)
-    assert frame.double and np.abs(numpy(frame.depth) - numba.projected.depth).max() < 1e-13
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_no_primitives(device: str) -> None:
-    case = Case(2, count=0)
-    frame = frame_of(case, case.tensors(), device)
-    assert frame.lists.pairs == 0 and frame.lists.first.tolist() == [0] and not frame.lists.starts.any()
-    found, view = prepare_backward(frame, torch.empty(0, L.gradient_width(2, 3), device=device), True)
-    assert all(len(own) == 0 for own in found) and view is not None and not view.any()

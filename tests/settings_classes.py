@@ -19,6 +19,9 @@ REQUIRED: dict[str, Any] = {
     "simulation": "smoke_fire",
     "direction": (0.0, 0.0, 1.0),
     "irradiance": (1.0, 1.0, 1.0),
+    "task": {"name": "static"},
+    "scene": {"name": "solids"},
+    "preset": "quick",
 }
 """What a dataclass needs beside its defaults."""
 
@@ -83,6 +86,8 @@ def bad_values(hint: Any) -> list[Any]:
     if _mapping(hint):
         inner = next(args for args in [get_args(hint)])[1]
         return [3, "x", [1], *({"a": bad} for bad in bad_values(inner))]
+    if get_origin(hint) is list:
+        return [3, "x", {"a": 1}]
     if len(kinds) == 1 and dataclasses.is_dataclass(kinds[0]):
         return [3, "x", [1], {"no_such_setting": 1}]
     found: list[Any] = [[1], {"a": 1}]

@@ -40,7 +40,6 @@ def within(name: str, package: str) -> bool:
 
 ROOMS: dict[str, set[str]] = {
     "version": set(),
-    "conf": set(),
     "core": {"version"},
     "scenes": {"core"},
     "tasks": {"core", "scenes"},

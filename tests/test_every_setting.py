@@ -16,6 +16,7 @@ FIELDS = [(cls, name) for cls in CLASSES for name in field_types(cls)]
 
 GROUPS = {
     "RunSettings": "",
+    "_StoredConfig": "",
     "RenderSettings": "renderer",
     "MetricsSettings": "metrics",
     "ModelSettings": "model",

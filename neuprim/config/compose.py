@@ -1,13 +1,12 @@
-"""Compose a :class:`RunConfig` from what users type after ``neuprim run``.
+"""Compose a :class:`RunConfig` from the overrides of ``neuprim run``.
 
-Values win in this order: what the user typed, a stored run's settings, the level of effort, the preset, the defaults of
-the settings dataclasses. Hydra reads the overrides and composes the YAML files; OmegaConf merges them; the settings
-dataclasses say which keys exist.
+Values win in this order: what the user typed, the level of effort, a stored run's settings, the preset, the defaults of
+the settings dataclasses. Hydra reads the overrides; OmegaConf merges them with the YAML files and resolves ``${...}``;
+the settings dataclasses say which keys exist.
 """
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,22 +15,18 @@ from typing import TYPE_CHECKING, Any
 
 from neuprim.config.checks import (
     CHOICES,
-    GROUPS,
-    REQUIRED,
     check_key,
     check_names,
-    check_preset,
-    check_typed,
     complete_options,
-    differences,
-    flatten,
-    like_default,
     options_of,
+    refuse_unused,
     unused_settings,
 )
+from neuprim.config.job import refuse_missing_plugins
 from neuprim.config.outputs import DEFAULT_TASK, output_directory, run_name
 from neuprim.config.overrides import (
     Assignment,
+    drop_place,
     expand_sweep,
     key_of,
     parse,
@@ -39,93 +34,75 @@ from neuprim.config.overrides import (
     sweep_names,
     swept_keys,
 )
-from neuprim.config.run_config import RunConfig, RunSettings
+from neuprim.config.run_config import RunConfig, RunSettings, flatten
 from neuprim.config.stored_run import (
-    changed_overrides,
-    explain_missing_plugin,
     find_resumed_run,
-    hide_references,
-    launch_settings,
-    merge_overrides,
     refuse_contradictions,
-    resume_choices,
-    stored_assignments,
+    resumed_choices,
+    show_references,
     stored_choices,
-    was_begun_with,
+    stored_settings,
 )
 from neuprim.config.task_files import (
     EFFORT,
     LEVELS,
-    GroupReader,
+    PRESET_GROUPS,
     Level,
-    TaskChoices,
     check_groups,
     check_scene,
     choose_level,
     presets,
+    read_group,
     task_choices,
     to_plain,
 )
-from neuprim.config.trust import check_stored, refuse_links
+from neuprim.config.trust import check_stored
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
 from neuprim.core.used_settings import build_settings
-from neuprim.core.validation import format_value, validate
+from neuprim.core.validation import coerce, format_value, infer_type, refuse_unknown, validate
 from neuprim.plugins.blame import blamed
+from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy, Maker
 from neuprim.plugins.registry import LOSSES, TASKS, FoundScene, PluginInfo, UnknownPlugin, find_scene, load_loss
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
-    from neuprim.core.extensions import LossExtension
     from neuprim.core.task import TaskSpec
 
-__all__ = ["compose", "compose_all", "preset_settings"]
-
-PATHS = "_paths_"
+_PATHS = "_paths_"
 """Key of a scene's YAML that lists its settings which are paths: they are made absolute, with ``~`` expanded."""
 
+_REQUIRED = "???"
+"""How a scene's YAML says that a setting has no default (OmegaConf's mark for a missing value)."""
+
 
 @dataclass(frozen=True)
-class _Request:
-    """What one configuration is made of.
+class _Selection:
+    """Task, scene, preset and level of a configuration, loaded.
 
     Attributes:
-        overrides, assignments: what was typed, as words and as values; the latter without what a resumed run has.
-        chosen: task, scene, preset and effort by what was typed or stored; None where nothing says.
-        begun: the run that goes on; None for a new one.
-        stored: the run of ``--config``.
+        name: of the run's directory, where users choose none.
+        options: the task's own options without the user's.
     """
 
-    overrides: Sequence[str]
-    assignments: Sequence[Assignment]
-    chosen: Mapping[str, str | None]
-    begun: RunConfig | None = None
-    stored: RunConfig | None = None
-
-    @property
-    def values(self) -> list[Assignment]:
-        """What was typed for settings."""
-        return [a for a in self.assignments if a.key not in CHOICES]
-
-
-@dataclass(frozen=True)
-class _Choice:
-    """Task, scene, preset and level of a configuration, loaded."""
-
-    task_word: str
-    scene_word: str
     task_info: PluginInfo
     spec: TaskSpec
-    defaults: TaskChoices
     scene: FoundScene
     preset: str
+    default_preset: str
     level: Level | None
+    name: str
+    options: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class _Base:
-    """Everything below a user's settings, unresolved; ``paths`` are the scene's settings that are paths."""
+    """Everything below a user's settings: defaults, preset, scene and options, with ``${...}`` as it is.
+
+    Attributes:
+        paths: the scene's settings that are paths.
+    """
 
     tree: dict[str, Any]
     paths: list[str]
@@ -142,7 +119,27 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
     Raises:
         ConfigError: one line that names the key, what was found and what was expected.
     """
-    return _compose(overrides, check_output, GroupReader(), stored)
+    assignments = parse(overrides)
+    typed = {a.key: a.value for a in assignments}
+    choices: dict[str, str | None] = {key: _read_choice(assignments, key) for key in CHOICES}
+    begun = find_resumed_run(typed, choices, stored is not None)
+    if begun is not None:
+        choices = resumed_choices(begun, choices)
+    elif stored is not None:
+        check_stored(stored, typed)
+        choices = stored_choices(stored, choices)
+    values = [a for a in assignments if a.key not in CHOICES]
+    earlier = [config for config in (begun, stored) if config is not None]
+    try:
+        config, paths = _make_config(_select(choices), values, earlier, check_output)
+    except UnknownPlugin:
+        if begun is not None:
+            refuse_missing_plugins(begun)  # naming the package says more
+        raise
+    if begun is not None:
+        refuse_contradictions(begun, config, paths)
+    config.overrides = _merge_overrides(earlier[0], overrides) if earlier else list(overrides)
+    return config
 
 
 def compose_all(
@@ -155,275 +152,259 @@ def compose_all(
     swept = set(swept_keys(overrides))
     if not swept:
         return [compose(overrides, check_output, stored)]
-    combinations, reader = expand_sweep(overrides), GroupReader()
-    # resume=true means the sweep's directory, and each of its runs below
-    resume = [word for word in overrides if key_of(word) == "resume"]
-    runs = [[word for word in words if key_of(word) != "resume"] for words in combinations]
-    configs = [_compose([*words, "output_dir=null"], False, reader, stored) for words in runs]
-    first, typed = configs[0], parse(combinations[0])
-    goes_on = any(a.value is True for a in parse(resume)[-1:])
-    asked = [a.value for a in typed if a.key == "output_dir"]
-    explicit = str(_compose(runs[0], False, reader, stored).output_dir) if asked and asked[-1] is not None else None
-    choices = [(key, _choice(typed, key) or name) for key, name in (("task", first.task), ("scene", first.scene_name))]
-    fixed = [run_name(name, "") for key, name in choices if not swept & {key, "task"}]
-    base = output_directory(explicit, "-".join([*fixed, "sweep"]), goes_on, check_output)
-    recorded = (base / "sweep.json").is_file()
+    combinations = expand_sweep(overrides)
+    place = {a.key: a for a in parse([text for text in overrides if key_of(text) in ("output_dir", "resume")])}
+    resume = "resume" in place and place["resume"].value is True
+    asked = place["output_dir"].text if "output_dir" in place and place["output_dir"].value is not None else None
+    first = compose([*drop_place(combinations[0]), *([] if asked is None else [asked])], False, stored)
+    typed = parse(combinations[0])
+    names = [("task", first.task), ("scene", first.scene_name)]
+    fixed = [run_name(_read_choice(typed, key) or name, "") for key, name in names if not swept & {key, "task"}]
+    explicit = None if asked is None else str(first.output_dir)
+    folder = output_directory(explicit, "-".join([*fixed, "sweep"]), resume, check_output)
     made = []
-    for config, words, name in zip(configs, runs, sweep_names(overrides, combinations), strict=True):
-        place = quote_override("output_dir", str(base / name))
-        begun = was_begun_with(base / name, words) if goes_on else None
-        if begun is True or (begun is False and not recorded):  # else the sweep's record refuses other words
-            config = _compose([*words, "resume=true", place], False, reader, stored)
-        own = [*(word for word in config.overrides if key_of(word) != "resume"), *resume]
-        own = [word for word in own if word not in ("output_dir=null", place)]
-        made.append(dataclasses.replace(config, output_dir=base / name, resume=goes_on, overrides=own))
+    for texts, name in zip(combinations, sweep_names(overrides, combinations), strict=True):
+        own = drop_place(texts)
+        directory = folder / name
+        goes_on = resume and _goes_on(directory, own, (folder / "sweep.json").is_file())
+        output_dir = quote_override("output_dir", str(directory))
+        config = compose([*own, output_dir, *(["resume=true"] if goes_on else [])], False, stored)
+        typed_now = [text for text in config.overrides if text not in (output_dir, "resume=true")]
+        typed_now += [a.text for a in place.values()]
+        made.append(dataclasses.replace(config, resume=resume, overrides=typed_now))
     return made
+
+
+def _goes_on(directory: Path, own: Sequence[str], recorded: bool) -> bool:
+    """Whether a run of a sweep goes on from its own configuration; the sweep's record refuses other overrides."""
+    if not (directory / "config.yaml").is_file():
+        return False
+    return not recorded or drop_place(RunConfig.from_yaml(directory).overrides) == list(own)
 
 
 def preset_settings(spec: TaskSpec, preset: str, scene: str, level: Level | None = None) -> RunSettings:
     """Return the settings of a preset, or of a level of effort over it; the task need not be registered.
 
     Raises:
-        ConfigError: its files lack something, do not compose, or hold an impossible value.
+        ConfigError: its files lack something, cannot be read, or hold an impossible value.
     """
     check_groups(spec)
-    base = _read_base(spec, scene, preset, {}, spec.config_package, GroupReader())
-    return _validate_settings(_merge(base.tree, [], () if level is None else level.settings)[1])
+    base = _read_base(spec, scene, spec.config_package, preset, {})
+    for assignment in level.settings if level is not None else ():
+        check_key(assignment, base.tree["scene"], scene)
+    return _validate_settings(_resolve(base, {}, level))
 
 
-def _compose(overrides: Sequence[str], check_output: bool, reader: GroupReader, stored: RunConfig | None) -> RunConfig:
-    assignments = parse(overrides)
-    chosen = {key: _choice(assignments, key) for key in CHOICES}
-    try:
-        request = _read_request(overrides, assignments, chosen, stored)
-        return _make_config(request, _load_choice(request.chosen), check_output, reader)
-    except UnknownPlugin as error:
-        explained = explain_missing_plugin(assignments, chosen["task"], chosen["scene"])
-        if explained is None:
-            raise
-        raise explained from error
-
-
-def _choice(assignments: Sequence[Assignment], key: str) -> str | None:
+def _read_choice(assignments: Sequence[Assignment], key: str) -> str | None:
     """Return what was typed for a choice; None where nothing was."""
     given = [a for a in assignments if a.key == key]
     if not given or given[-1].value is None:
         return None
     value = given[-1].value
     if not isinstance(value, (str, int, float)) or isinstance(value, bool) or not str(value):
-        expected = (
-            f"a level from {LEVELS[0]} (fast) to {LEVELS[-1]} (good)" if key == EFFORT else f"the name of a {key}"
-        )
-        raise ConfigError(f"{given[-1].text}: expected {expected}")
+        level = f"a level from {LEVELS[0]} (fast) to {LEVELS[-1]} (good)"
+        raise ConfigError(f"{given[-1].text}: expected {level if key == EFFORT else f'the name of a {key}'}")
     return str(value)
 
 
-def _read_request(
-    overrides: Sequence[str],
-    assignments: Sequence[Assignment],
-    chosen: Mapping[str, str | None],
-    stored: RunConfig | None,
-) -> _Request:
-    """Find the run that goes on, and check what a stored configuration may reach."""
-    begun = find_resumed_run(assignments, chosen, stored is not None)
-    typed = {a.key: a.value for a in assignments}
-    if begun is not None:
-        assert begun.source is not None, "it was read from its directory"
-        new = parse(changed_overrides(begun, overrides) if stored is None else overrides)
-        refuse_links(begun.source.parent)
-        check_stored(begun, typed)
-        return _Request(overrides, new, {**resume_choices(begun, chosen), EFFORT: _choice(new, EFFORT)}, begun, stored)
-    if stored is not None:
-        check_stored(stored, typed)
-        chosen = stored_choices(stored, chosen)
-    return _Request(overrides, assignments, chosen, None, stored)
-
-
-def _load_choice(chosen: Mapping[str, str | None]) -> _Choice:
+def _select(choices: Mapping[str, str | None]) -> _Selection:
     """Load the task, and find its scene, preset and level."""
-    task_word = chosen["task"] or DEFAULT_TASK
-    info, spec = TASKS.loaded(task_word)
+    task_name = choices["task"] or DEFAULT_TASK
+    info, spec = TASKS.loaded(task_name)
     check_groups(spec)
     defaults, names = task_choices(spec), presets(spec)
-    level = choose_level(spec, chosen[EFFORT], chosen["preset"], names)
-    preset = chosen["preset"] or (defaults.preset if level is None else level.preset)
-    scene_word = chosen["scene"] or defaults.scene
-    scene = find_scene(spec, scene_word)
+    level = choose_level(spec, choices[EFFORT], choices["preset"], names)
+    preset = choices["preset"] or (defaults.preset if level is None else level.preset)
+    scene_name = choices["scene"] or defaults.scene
+    scene = find_scene(spec, scene_name)
     check_scene(spec, scene.spec.name, scene.config_package)
     if preset not in names:
         raise ConfigError(f"preset={preset}: task {spec.name!r} has no such preset{nearest(preset, names)}")
-    return _Choice(task_word, scene_word, info, spec, defaults, scene, preset, level)
+    name = run_name(task_name, scene_name)
+    return _Selection(info, spec, scene, preset, defaults.preset, level, name, defaults.options)
 
 
-def _make_config(request: _Request, choice: _Choice, check_output: bool, reader: GroupReader) -> RunConfig:
-    spec, scene_name, values = choice.spec, choice.scene.spec.name, request.values
-    base = _read_base(spec, scene_name, choice.preset, choice.defaults.options, choice.scene.config_package, reader)
-    below = _settings_below(request, choice)
-    for assignment in (*below, *values):
-        check_key(assignment, base.tree, scene_name)
-    plain, full = _merge(base.tree, values, below)
+def _make_config(
+    chosen: _Selection, values: Sequence[Assignment], earlier: Sequence[RunConfig], check_output: bool
+) -> tuple[RunConfig, list[str]]:
+    """Return a valid configuration, still without its overrides, and the scene's settings that are paths.
+
+    Args:
+        values: what was typed for settings.
+        earlier: runs whose settings stand below, the first lowest.
+    """
+    spec, scene = chosen.spec, chosen.scene
+    base = _read_base(spec, scene.spec.name, scene.config_package, chosen.preset, chosen.options)
+    declared = base.tree["scene"]
+    for assignment in (*(() if chosen.level is None else chosen.level.settings), *values):
+        check_key(assignment, declared, scene.spec.name)
+    below: dict[str, Any] = {}
+    for config in earlier:
+        same_scene = scene.spec.name == split(config.scene_name)[1]
+        below |= stored_settings(config, same_scene)
+        if same_scene:
+            refuse_unknown(config.scene, declared, "scene")
+    plain = _resolve(base, {})
+    full = _resolve(base, below, chosen.level, values)
     settings = _validate_settings(full)
-    loss = None if settings.train.loss is None else LOSSES.loaded(settings.train.loss)
-    declared = None if loss is None else loss[1]
-    check_typed(spec, declared, values)
-    options = _complete_options(choice, declared, plain, full)
+    loss_info, loss = (None, None) if settings.train.loss is None else LOSSES.loaded(settings.train.loss)
+    refuse_unused(flatten({a.key: a.value for a in values}), spec, loss)
+    available = options_of(spec, loss)
+    owner = f"task {spec.name!r}" + (f" with loss {loss.name!r}" if loss is not None and loss.options else "")
+    for tree in (plain, full):
+        tree["task"]["options"] = complete_options(available, tree["task"]["options"], owner)
+    options = full["task"]["options"]
     check_names(spec, settings)
-    with blamed(choice.task_info, f"check of task {spec.name!r}"):
+    with blamed(chosen.task_info, f"check of task {spec.name!r}"):
         spec.check(build_settings(spec, settings.model, options))
-    full["scene"] = _validate_scene(full["scene"], base.tree["scene"], base.paths)
+    full["scene"] = _validate_scene(full["scene"], declared, base.paths)
     if settings.metrics.lpips is not None:
         settings.metrics = MetricsSettings(str(Path(settings.metrics.lpips).expanduser().absolute()))
-    changed = differences(_flatten_typed(plain), _flatten_typed(full, settings))
-    if choice.preset != choice.defaults.preset:
-        changed = {"preset": (choice.defaults.preset, choice.preset), **changed}
-    name = run_name(choice.task_word, choice.scene_word)
-    before = request.begun or request.stored
-    made = RunConfig(
+    preset = {"preset": (chosen.default_preset, chosen.preset)} if chosen.preset != chosen.default_preset else {}
+    added = scene.added_by
+    made_by = MadeBy(
+        __version__,
+        Maker.of(chosen.task_info),
+        None if added is None else Maker.of(added, scene.spec.name),
+        None if loss_info is None else Maker.of(loss_info),
+    )
+    config = RunConfig(
         task=spec.name,
-        scene_name=scene_name,
+        scene_name=scene.spec.name,
         scene=full["scene"],
-        preset=choice.preset,
+        preset=chosen.preset,
         model=settings.model,
         train=settings.train,
         renderer=settings.renderer,
         metrics=settings.metrics,
-        output_dir=output_directory(settings.output_dir, name, settings.resume, check_output),
+        output_dir=output_directory(settings.output_dir, chosen.name, settings.resume, check_output),
         seed=settings.seed,
         resume=settings.resume,
         options=options,
-        unused=unused_settings(spec, declared),
-        overrides=list(request.overrides) if before is None else merge_overrides(before, request.overrides),
-        non_default=changed,
-        made_by=_record_makers(choice, loss),
+        unused=unused_settings(spec, loss),
+        non_default=preset | _find_differences(_flatten(plain, _validate_settings(plain)), _flatten(full, settings)),
+        made_by=made_by,
     )
-    if request.begun is not None:
-        refuse_contradictions(request.begun, made, base.paths)
-    return made
+    return config, base.paths
 
 
-def _settings_below(request: _Request, choice: _Choice) -> list[Assignment]:
-    """Return what stands under the typed settings: of the run that goes on, of ``--config`` and of the level."""
-    values, below = request.values, []
-    if request.begun is not None:
-        skipped = launch_settings(request.overrides)
-        below += [a for a in stored_assignments(request.begun, choice.scene_word, values) if a.key not in skipped]
-    if request.stored is not None:
-        below += stored_assignments(request.stored, choice.scene_word, values)
-    return below + ([] if choice.level is None else list(choice.level.settings))
-
-
-def _record_makers(choice: _Choice, loss: tuple[PluginInfo, LossExtension] | None) -> MadeBy:
-    added = choice.scene.added_by
-    scene = None if added is None else Maker.of(added, choice.scene.spec.name)
-    return MadeBy(__version__, Maker.of(choice.task_info), scene, None if loss is None else Maker.of(loss[0]))
+def _merge_overrides(earlier: RunConfig, overrides: Sequence[str]) -> list[str]:
+    """Return what was typed for a run by now: of overrides with one key, the later."""
+    again = {key_of(text) for text in overrides}
+    return [*(text for text in drop_place(earlier.overrides) if key_of(text) not in again), *overrides]
 
 
 # ---------------------------------------------------------------- merging
 
 
-def _read_base(
-    spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], package: str, reader: GroupReader
-) -> _Base:
-    """Merge defaults, preset and scene; a scene of another ``package`` cannot replace a preset of the task."""
+def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: dict[str, Any]) -> _Base:
+    """Merge defaults, preset and scene, whose file is in ``package``."""
     from omegaconf import OmegaConf
 
-    scene_node = reader.read_scene(spec, scene, package)
-    preset_node, common = reader.read_preset(spec, preset)
-    place, scene_place = f"preset/{spec.name}/{preset}.yaml", f"scene/{spec.name}/{scene}.yaml"
+    scene_node, preset_node = read_group(spec, "scene", scene, package), read_group(spec, "preset", preset)
+    place = f"preset/{spec.name}/{preset}.yaml"
     for key in preset_node:
-        if key not in GROUPS:
-            raise ConfigError(f"{place}: {key}: a preset may only set {', '.join(GROUPS)}")
-    paths = scene_node.pop(PATHS, None) or []
+        if key not in PRESET_GROUPS:
+            raise ConfigError(f"{place}: {key}: a preset may only set {', '.join(PRESET_GROUPS)}")
+    paths = scene_node.pop(_PATHS, None) or []
     if not isinstance(paths, list) or any(name not in scene_node for name in paths) or "name" in scene_node:
-        raise ConfigError(f"{scene_place}: {PATHS} must list keys of the file, and name is no setting")
-    merged = OmegaConf.merge(dataclasses.asdict(RunSettings()), common, preset_node)
-    tree = {**to_plain(merged, resolve=False), "scene": scene_node, "task": {"options": options}}
+        raise ConfigError(
+            f"scene/{spec.name}/{scene}.yaml: {_PATHS} must list keys of the file, and name is no setting"
+        )
+    merged = OmegaConf.merge(dataclasses.asdict(RunSettings()), preset_node)
+    base = _Base({**to_plain(merged, resolve=False), "scene": scene_node, "task": {"options": options}}, paths)
     try:
-        loss = _validate_settings(to_plain(OmegaConf.create(tree))).train.loss
-        check_preset(spec, None if loss is None else load_loss(loss), preset_node)
+        loss = _validate_settings(_resolve(base, {})).train.loss
+        # while another loss is chosen, a preset may also set what the task's own reads
+        unused = unused_settings(spec, None if loss is None else load_loss(loss))
+        refuse_unused([name for name in flatten(preset_node) if name in unused], spec, None)
     except ConfigError as error:
         raise ConfigError(f"{place}: {error}") from error
-    return _Base(tree, paths)
+    return base
 
 
-def _merge(
-    base: Mapping[str, Any], values: Sequence[Assignment], below: Sequence[Assignment] = ()
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the resolved configuration without and with the user's ``values``, which stand over ``below``."""
+def _resolve(
+    base: _Base, earlier: Mapping[str, Any], level: Level | None = None, values: Sequence[Assignment] = ()
+) -> dict[str, Any]:
+    """Return the configuration with everything in it that stands over its base, resolved.
+
+    Args:
+        earlier: keys and values of earlier runs, which replace what was there.
+    """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    tree = OmegaConf.create(copy.deepcopy(dict(base)))
-    if _chooses_other_form(base, values):
-        OmegaConf.update(tree, "model.density", {}, merge=False)
-    for a in (*below, *values):
-        value = hide_references(a.value) if a.whole else a.value
+    tree = OmegaConf.create(base.tree)
+    for key, value in earlier.items():
+        OmegaConf.update(tree, key, value, merge=False, force_add=True)
+    form, strategy = _typed_value(values, "model.density", "form"), _typed_value(values, "train.population", "strategy")
+    if form is not None and tree.model.density.get("form", None if earlier else form) != form:
+        OmegaConf.update(tree, "model.density", {}, merge=False)  # settings of another form mean nothing to it
+    other_strategy = strategy is not None and tree.train.population.strategy != strategy
+    for a in (*(() if level is None else level.settings), *values):
         try:
-            OmegaConf.update(tree, a.key, value, merge=not a.whole, force_add=True)
+            OmegaConf.update(tree, a.key, a.value, force_add=True)
         except (OmegaConfBaseException, ValueError, TypeError, AssertionError) as error:
             raise ConfigError(f"{a.text}: {' '.join(str(error).split())}") from error
-    seconds = _typed_values(values, "max_seconds")
-    if seconds and seconds[-1] is not None and not _typed_values(values, "iterations"):
+    seconds, steps = _typed_value(values, "train", "max_seconds"), _typed_value(values, "train", "iterations")
+    if seconds is not None and steps is None:
         OmegaConf.update(tree, "train.iterations", None)  # a budget in seconds is used up, however fast the machine
-    strategy = _typed_values(values, "strategy", "train.population")
-    other = bool(strategy) and strategy[-1] != base["train"]["population"]["strategy"]
-    if other and not _typed_values(values, "grow_from", "train.population"):
-        OmegaConf.update(tree, "train.population.grow_from", 1.0)  # the preset's is for populations that grow that way
-    return to_plain(OmegaConf.create(dict(base))), hide_references(to_plain(tree), back=True)
+    if steps is not None and seconds is None and earlier:
+        OmegaConf.update(tree, "train.max_seconds", None)  # the other budget was the earlier run's
+    if other_strategy and _typed_value(values, "train.population", "grow_from") is None:
+        OmegaConf.update(
+            tree, "train.population.grow_from", 1.0
+        )  # what was there is for populations that grow that way
+    plain: dict[str, Any] = show_references(to_plain(tree))
+    return plain
 
 
-def _typed_values(values: Sequence[Assignment], name: str, group: str = "train") -> list[Any]:
-    """Return what was typed for a setting of a group, alone or within the group, in order."""
-    whole = [{name: a.value} if a.key == f"{group}.{name}" else a.value if a.key == group else {} for a in values]
-    return [given[name] for given in whole if isinstance(given, Mapping) and name in given]
-
-
-def _chooses_other_form(base: Mapping[str, Any], values: Sequence[Assignment]) -> bool:
-    """Whether another form of density was typed than the preset's, whose settings would mean nothing to it."""
-    own = (base["model"].get("density") or {}).get("form")
-    typed = _typed_values(values, "form", "model.density")
-    return own is not None and bool(typed) and typed[-1] not in (None, own)
+def _typed_value(values: Sequence[Assignment], group: str, name: str) -> Any:
+    """Return what was typed last for a setting of a group, alone or within the group."""
+    found = None
+    for a in values:
+        if a.key == f"{group}.{name}":
+            found = a.value
+        elif a.key == group and isinstance(a.value, Mapping) and name in a.value:
+            found = a.value[name]
+    return found
 
 
 # ---------------------------------------------------------------- validating
 
 
-def _validate_settings(full: Mapping[str, Any]) -> RunSettings:
-    return validate(RunSettings, {key: value for key, value in full.items() if key not in ("scene", "task")})
-
-
-def _complete_options(
-    choice: _Choice, loss: LossExtension | None, plain: dict[str, Any], full: dict[str, Any]
-) -> dict[str, Any]:
-    """Return all of ``task.options``; ``plain`` and ``full`` get those without and with the user's values."""
-    declared = options_of(choice.spec, loss)
-    owner = f"task {choice.spec.name!r}"
-    if loss is not None and loss.options:
-        owner += f" with loss {loss.name!r}"
-    for tree, given in ((plain, choice.defaults.options), (full, full["task"]["options"])):
-        tree["task"] = {"options": complete_options(declared, given, owner)}
-    options: dict[str, Any] = full["task"]["options"]
-    return options
+def _validate_settings(tree: Mapping[str, Any]) -> RunSettings:
+    return validate(RunSettings, {key: value for key, value in tree.items() if key not in ("scene", "task")})
 
 
 def _validate_scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths: Sequence[str]) -> dict[str, Any]:
+    """Return a scene's settings, each as the type of its default; a null or required default accepts anything."""
     result: dict[str, Any] = {}
     for key, value in node.items():
-        where = f"scene.{key}"
-        if key in paths and value is not None and value != REQUIRED:
+        where, default = f"scene.{key}", declared[key]
+        if default == _REQUIRED and value in (None, _REQUIRED):
+            expected = f"a directory or file, as {where}=PATH" if key in paths else f"{where}=VALUE"
+            raise ConfigError(f"{where}: required and not given; expected {expected}")
+        if key in paths and value is not None:
             if not isinstance(value, (str, int)) or isinstance(value, bool) or not str(value).strip():
                 raise ConfigError(f"{where}={format_value(value)}: expected a path (quote it: {where}='...')")
             value = str(value) if "://" in str(value) else str(Path(str(value)).expanduser().absolute())
-        if declared[key] == REQUIRED and (value is None or value == REQUIRED):
-            expected = f"expected a directory or file, as {where}=PATH" if key in paths else f"expected {where}=VALUE"
-            raise ConfigError(f"{where}: required and not given; {expected}")
-        result[key] = like_default(value, declared[key], where)
+        result[key] = value if default == _REQUIRED else coerce(value, infer_type(default), where)
     return result
 
 
-def _flatten_typed(full: Mapping[str, Any], settings: RunSettings | None = None) -> dict[str, Any]:
+def _flatten(tree: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
     """Return flat dotted values, with the settings in their own types, so that 1 and 1.0 are the same rate."""
-    made = dataclasses.asdict(settings or _validate_settings(full))
-    tree = {**made, "scene": full["scene"], "task": full["task"]}
-    del tree["output_dir"], tree["resume"]
-    return flatten(tree)
+    values = {**dataclasses.asdict(settings), "scene": tree["scene"], "task": tree["task"]}
+    return flatten({key: value for key, value in values.items() if key not in ("output_dir", "resume")})
+
+
+def _find_differences(default: Mapping[str, Any], actual: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Return key -> (default, value) of the flat settings that differ."""
+    found: dict[str, tuple[Any, Any]] = {}
+    for key in {**default, **actual}:
+        before, after = default.get(key), actual.get(key)
+        before = None if before == _REQUIRED else before
+        if before != after:
+            found[key] = (before, after)
+    return found

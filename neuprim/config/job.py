@@ -89,3 +89,10 @@ def suspects_of(config: RunConfig) -> Suspects:
         return Suspects(config.task, config.scene_name, config.train.loss)
     scene = config.scene_name if made.scene is None else qualified(made.scene.package, made.scene.name)
     return Suspects(qualified(made.task.package, made.task.name), scene, config.train.loss)
+
+
+def refuse_missing_plugins(config: RunConfig) -> None:
+    """Raise ConfigError for a package that made a stored run and is not installed."""
+    scene_of(config, task_of(config, config.source), config.source)
+    if config.made_by is not None and config.made_by.loss is not None:
+        load_recorded(LOSSES, config.made_by.loss, config.source)

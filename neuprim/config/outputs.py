@@ -9,8 +9,6 @@ from pathlib import Path
 from neuprim.core.errors import ConfigError
 from neuprim.plugins.names import split
 
-__all__ = ["DEFAULT_TASK", "output_directory", "run_name"]
-
 ROOT = Path("outputs")
 DEFAULT_TASK = "static"
 

@@ -17,13 +17,11 @@ from neuprim.core.settings import MetricsSettings, RenderSettings
 from neuprim.core.train import population
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.used_settings import OPTIONAL
-from neuprim.core.validation import Range, refuse_unknown, validate, validate_fields
+from neuprim.core.validation import Range, join_key, validate, validate_fields
 from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy
 
-__all__ = ["RunConfig", "RunSettings"]
-
-MAX_BYTES = 1_000_000
+_MAX_BYTES = 1_000_000
 """A configuration has a few kilobytes; anything larger is another file."""
 
 
@@ -121,7 +119,7 @@ class RunConfig:
             file = file / "config.yaml"
         elif file.name != "config.yaml" and not file.exists():
             raise CheckpointError(f"{path}: no such run directory")
-        data = _read(file)
+        data = _read_mapping(file)
         try:
             return dataclasses.replace(cls.from_dict(data), source=file)
         except ConfigError as error:
@@ -129,70 +127,64 @@ class RunConfig:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
-        """What :meth:`to_dict` gave.
+        """Read what :meth:`to_dict` gave.
 
         Raises:
             ConfigError: a setting in it does not exist or has an impossible value.
         """
-        known = [
-            "task",
-            "scene",
-            "preset",
-            *(f.name for f in dataclasses.fields(RunSettings)),
-            "overrides",
-            "non_default",
-            "made_by",
-        ]
-        refuse_unknown(data, known, "")
-        task, scene = _node(data, "task"), _node(data, "scene")
-        common = validate(
-            RunSettings, {f.name: data[f.name] for f in dataclasses.fields(RunSettings) if f.name in data}
-        )
-        if common.output_dir is None:
+        unused = tuple(name for name in OPTIONAL if _lacks(data, name))
+        stored = validate(_StoredConfig, data)
+        if stored.output_dir is None:
             raise ConfigError("output_dir: missing; expected a directory")
-        overrides, non_default = data.get("overrides", []), data.get("non_default", {})
-        if not isinstance(overrides, list) or not all(isinstance(o, str) for o in overrides):
-            raise ConfigError("overrides: expected a list of texts")
-        if not isinstance(non_default, dict) or not all(
-            isinstance(p, list) and len(p) == 2 for p in non_default.values()
-        ):
-            raise ConfigError("non_default: expected KEY: [default, value] pairs")
-        options = task.get("options", {})
-        if not isinstance(options, dict):
-            raise ConfigError("task.options: expected a mapping")
-        made = cls(
-            task=_text(task.get("name"), "task.name"),
-            scene_name=_text(scene.get("name"), "scene.name"),
-            scene={str(k): v for k, v in scene.items() if k != "name"},
-            preset=_text(data.get("preset"), "preset"),
-            model=common.model,
-            train=common.train,
-            renderer=common.renderer,
-            metrics=common.metrics,
-            output_dir=Path(common.output_dir),
-            seed=common.seed,
-            resume=common.resume,
-            options=options,
-            unused=tuple(name for name in OPTIONAL if not _has(data, name)),
-            overrides=overrides,
-            non_default={str(key): (pair[0], pair[1]) for key, pair in non_default.items()},
-            made_by=MadeBy.from_dict(data["made_by"]) if data.get("made_by") is not None else None,
-        )
-        made._check_made_by()
-        return made
-
-    def _check_made_by(self) -> None:
-        """Raises ConfigError for a record of makers that is not this run's."""
-        record = self.made_by
-        loss = None if self.train.loss is None else split(self.train.loss)[1]
-        for kind, key, name in (
-            ("task", "task.name", self.task),
-            ("scene", "scene.name", self.scene_name),
-            ("loss", "train.loss", loss),
-        ):
-            maker = None if record is None else getattr(record, kind)
+        scene = dict(stored.scene)
+        scene_name = scene.pop("name", None)
+        if not isinstance(scene_name, str):
+            raise ConfigError("scene.name: missing; expected a name")
+        made_by = None if stored.made_by is None else MadeBy.from_dict(stored.made_by)
+        loss = None if stored.train.loss is None else split(stored.train.loss)[1]
+        names = {"task.name": stored.task.name, "scene.name": scene_name, "train.loss": loss}
+        for (key, name), kind in zip(names.items(), ("task", "scene", "loss"), strict=True):
+            maker = None if made_by is None else getattr(made_by, kind)
             if maker is not None and maker.name != name:
                 raise ConfigError(f"made_by.{kind}.name: found {maker.name!r}; expected {name!r}, as {key} says")
+        return cls(
+            task=stored.task.name,
+            scene_name=scene_name,
+            scene=scene,
+            preset=stored.preset,
+            model=stored.model,
+            train=stored.train,
+            renderer=stored.renderer,
+            metrics=stored.metrics,
+            output_dir=Path(stored.output_dir),
+            seed=stored.seed,
+            resume=stored.resume,
+            options=stored.task.options,
+            unused=unused,
+            overrides=stored.overrides,
+            non_default=stored.non_default,
+            made_by=made_by,
+        )
+
+
+@dataclass
+class _StoredTask:
+    """The group ``task`` of a file."""
+
+    name: str
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(kw_only=True)
+class _StoredConfig(RunSettings):
+    """The content of a run's ``config.yaml``."""
+
+    task: _StoredTask
+    scene: dict[str, Any]
+    preset: str
+    overrides: list[str] = field(default_factory=list)
+    non_default: dict[str, tuple[Any, Any]] = field(default_factory=dict)
+    made_by: Any = None
 
 
 class _PlainDumper(yaml.SafeDumper):
@@ -202,10 +194,10 @@ class _PlainDumper(yaml.SafeDumper):
         return True
 
 
-def _read(file: Path) -> Mapping[str, Any]:
+def _read_mapping(file: Path) -> Mapping[str, Any]:
     try:
-        if file.stat().st_size > MAX_BYTES:
-            raise CheckpointError(f"{file}: larger than {MAX_BYTES} bytes; not a run's configuration")
+        if file.stat().st_size > _MAX_BYTES:
+            raise CheckpointError(f"{file}: larger than {_MAX_BYTES} bytes; not a run's configuration")
         data = load_yaml(file.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise CheckpointError(f"{file}: missing; expected a directory written by `neuprim run`") from error
@@ -221,19 +213,18 @@ def _read(file: Path) -> Mapping[str, Any]:
     return data
 
 
-def _has(data: Mapping[str, Any], name: str) -> bool:
+def _lacks(data: Mapping[str, Any], name: str) -> bool:
     group, _, key = name.partition(".")
-    return key in (data.get(group) or {})
+    return key not in (data.get(group) or {})
 
 
-def _node(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    node = data.get(key)
-    if not isinstance(node, Mapping):
-        raise ConfigError(f"{key}: missing or not a mapping")
-    return node
-
-
-def _text(value: object, key: str) -> str:
-    if not isinstance(value, str) or not value:
-        raise ConfigError(f"{key}: missing; expected a name")
-    return value
+def flatten(node: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """Return dotted names and values of nested settings."""
+    found: dict[str, Any] = {}
+    for key, value in node.items():
+        name = join_key(where, str(key))
+        if isinstance(value, Mapping):
+            found |= flatten(value, name)
+        else:
+            found[name] = value
+    return found

@@ -16,8 +16,6 @@ from neuprim.config.run_config import RunConfig
 from neuprim.core.errors import ConfigError, cut
 from neuprim.core.io.trust import ENVIRONMENT, FLAG, trusted
 
-__all__ = ["check_stored", "refuse_links"]
-
 _WRITTEN = "cache"
 """The setting of scenes that is written to."""
 

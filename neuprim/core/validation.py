@@ -40,6 +40,7 @@ _KINDS = {
     str: "text",
     Path: "a path",
     list: "a list",
+    Any: "any value",
 }
 
 
@@ -288,14 +289,16 @@ def _words(hint: Any, where: str) -> str:
         return ", or ".join("null" if a is type(None) else _words(a, where) for a in args)
     if origin is Literal:
         return _either(args)
-    if origin is tuple:
+    if origin in (tuple, list):
         return (
             f"a list, each {_words(args[0], where)}"
-            if args[-1] is ...
+            if origin is list or args[-1] is ...
             else f"a list of {', '.join(_words(a, where) for a in args)}"
         )
     if plain is str:
         return f"text (quote it: {where}='...')"
+    if dataclasses.is_dataclass(plain) or origin is dict:
+        return "a mapping"
     kind = _KINDS.get(plain, getattr(plain, "__name__", str(plain)))
     bounds = next((note for note in notes if isinstance(note, Range)), None)
     return kind if bounds is None else bounds.words(kind)

@@ -72,7 +72,7 @@ def test_no_such_level(levels: Path, word: str) -> None:
     ("text", "expected"),
     [
         ("preset: [", r"cannot be read"),
-        ("- 1", r"expected a mapping$"),
+        ("- 1", r"expected a mapping, found a list"),
         ("preset: quik\nlevels: {}", r"preset=quik: no such preset; did you mean 'quick'"),
         ("preset: quick\nlevel: {}", r"level: no such setting; did you mean 'levels'"),
         ("preset: quick\nlevels: {1: {model.primitives: 3}}", r"levels: found \[1\]; expected 1 to 9, in this order"),

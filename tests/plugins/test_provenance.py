@@ -133,22 +133,6 @@ def test_without_the_package_every_command_names_it(made: Path, site: Path, caps
     )
 
 
-def test_a_run_that_was_not_told_where_is_found_to_resume(
-    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    glow(site)
-    for word in ("glow", "neuprim-glow:glow"):
-        config = compose([f"task={word}"])
-        config.output_dir.mkdir(parents=True)
-        (config.output_dir / "config.yaml").write_text(config.to_yaml())
-    uninstall(site, "neuprim-glow")
-    text = "config.yaml: this run was made by neuprim-glow 0.1 (task glow), which is not installed"
-    assert text in error(["run", "task=glow", "resume=true"], capsys)
-    assert f"outputs/neuprim-glow-glow-ball/{text}" in error(["run", "task=neuprim-glow:glow", "resume=true"], capsys)
-    assert "task=../glow: no such task" in error(["run", "task=../glow", "resume=true"], capsys)
-
-
 def test_without_the_package_of_the_scene_or_the_loss(
     site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,1 +1,0 @@
-"""Hydra's primary configuration; a package, because Hydra looks for one."""

@@ -1,4 +1,4 @@
-"""Image sets on disk: settings, camera poses, pixel rays, and writing them once into the cache."""
+"""Image sets on disk: camera poses, pixel rays, and writing a data set once into the cache."""
 
 from __future__ import annotations
 
@@ -22,26 +22,15 @@ from neuprim.core.io.files import publish_folder
 from neuprim.core.validation import Range
 from neuprim.scenes.raycast import Scene
 
-__all__ = [
-    "ImageSet",
-    "ImageSize",
-    "Progress",
-    "Supersampling",
-    "THREADS",
-    "ray_bands",
-    "write_cached_folder",
-    "camera_pose",
-    "unit_direction",
-    "average_rays",
-    "hash_settings",
-    "draw_in_parallel",
-]
-
 ImageSize = Annotated[int, Range(8, 4096)]
-"""Width and height in pixels."""
-
 Supersampling = Annotated[int, Range(1, 16)]
-"""Rays per pixel along each axis."""
+Progress = Callable[[str, float], None]
+
+RAYS_AT_ONCE = 1 << 15  # small enough for the arrays to stay in the CPU's cache
+_MAX_THREADS = 4  # images in work at once need memory
+
+T = TypeVar("T")
+V = TypeVar("V")
 
 
 def hash_settings(settings: Any, version: int) -> str:
@@ -60,10 +49,6 @@ def camera_pose(eye: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4) camera-to-world matrix, OpenGL axes, of a camera at ``eye`` (3,) that looks at the origin, z up."""
     view = look_at(torch.from_numpy(np.asarray(eye, dtype=np.float64)), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     return torch.linalg.inv(view).numpy() @ np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-RAYS_AT_ONCE = 1 << 15
-"""Small enough for the arrays to stay in the processor's cache."""
 
 
 def ray_bands(
@@ -95,18 +80,9 @@ def average_rays(values: NDArray[np.float32], size: int, samples: int) -> NDArra
     return across.reshape(rows, size, samples, channels).mean(axis=2)
 
 
-T = TypeVar("T")
-
-THREADS = 4
-"""At most; images in work at once need memory."""
-
-
 def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: Callable[[float], None]) -> None:
-    """Do the work for every job; ``progress`` is told the fraction done after each, in their order.
-
-    What a piece of work or ``progress`` raises ends it all, once the pieces already begun are done.
-    """
-    pool = ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1))
+    """Do the work for every job in threads; ``progress`` receives the fraction done. Errors cancel what has not begun."""
+    pool = ThreadPoolExecutor(min(_MAX_THREADS, os.cpu_count() or 1))
     try:
         for done, _ in enumerate(pool.map(work, jobs), start=1):
             progress(done / len(jobs))
@@ -114,18 +90,19 @@ def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: C
         pool.shutdown(cancel_futures=True)  # on an interrupt, wait for the running ones only
 
 
+def drawing_text(name: str, scene: Scene, width: int, height: int) -> str:
+    """What progress shows while images are drawn."""
+    slow = "" if scene.engine == "embree" else " (without embreex, which would be faster)"
+    return f"{name}: drawing {width}x{height} images{slow}"
+
+
 def write_cached_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
     """Have ``write`` fill the folder ``final`` unless all ``files`` exist; return it.
 
     The folder appears under its name only when complete, so an interrupted run leaves nothing.
 
-    Args:
-        files: all files of the folder, relative to it.
-        write: fills the empty folder that it gets, with equal files at every call.
-        what: for messages, e.g. ``"scene solids: cannot write the generated images"``.
-
     Raises:
-        DataError: the cache directory cannot be written.
+        DataError: ``what`` cannot be written.
     """
     names = tuple(files)
     try:
@@ -135,23 +112,15 @@ def write_cached_folder(final: Path, files: Iterable[str], write: Callable[[Path
     return final
 
 
-V = TypeVar("V")
-Progress = Callable[[str, float], None]
-
-
 @dataclass(frozen=True)
 class ImageSet(Generic[V]):
-    """Description of the images of a scene, written as ``transforms_SPLIT.json`` and ``SPLIT/...``.
-
-    ``V`` is the type of a view.
+    """The images of a scene, written as ``transforms_SPLIT.json`` and ``SPLIT/...``; ``V`` is the type of a view.
 
     Attributes:
-        name: of the scene.
         key: hash of everything the files depend on.
         size: width and height in pixels, for messages.
         splits: views of each split, in order.
         lens: fields of a transforms file before its frames.
-        build: makes the scene.
         frame: (split, view) -> entry in the transforms file.
         files: view -> names of its files in the folder of its split.
         draw: (scene, view, paths) writes these files; called from several threads.
@@ -175,21 +144,15 @@ class ImageSet(Generic[V]):
         Raises:
             DataError: the cache directory cannot be written.
         """
-        files = [f"transforms_{split}.json" for split in self.splits]
-        files += [
-            f"{split}/{file}" for split, views in self.splits.items() for view in views for file in self.files(view)
-        ]
+        names = [f"transforms_{split}.json" for split in self.splits]
+        names += [f"{split}/{file}" for split, views in self.splits.items() for v in views for file in self.files(v)]
+        folder = Path(cache_dir) / f"{self.name}-{self.key}"
         what = f"scene {self.name}: cannot write the generated images"
-        return write_cached_folder(
-            Path(cache_dir) / f"{self.name}-{self.key}", files, lambda folder: self._write(folder, progress), what
-        )
+        return write_cached_folder(folder, names, lambda folder: self._write(folder, progress), what)
 
     def _write(self, folder: Path, progress: Progress) -> None:
         progress(f"{self.name}: building the scene", 0.0)
         scene = self.build()
-        text = f"{self.name}: drawing {self.size}x{self.size} images"
-        if scene.engine != "embree":
-            text += " (without embreex, which would be faster)"
         for split, views in self.splits.items():
             (folder / split).mkdir()
             layout = {**self.lens, **self.facts(scene), "frames": [self.frame(split, view) for view in views]}
@@ -200,4 +163,5 @@ class ImageSet(Generic[V]):
             self.draw(scene, view, [place / file for file in self.files(view)])
 
         jobs = [(folder / split, view) for split, views in self.splits.items() for view in views]
+        text = drawing_text(self.name, scene, self.size, self.size)
         draw_in_parallel(draw, jobs, lambda fraction: progress(text, fraction))

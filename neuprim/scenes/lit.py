@@ -18,7 +18,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -43,52 +43,37 @@ from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shading import dot, reflectance_lobes
 from neuprim.scenes.shapes import FLOOR, Solid, build_solids, lathe, ring, uniform_colour
 
-__all__ = [
-    "BRIGHT",
-    "CIRCLE_FRAMES",
-    "DISTANCE",
-    "GENERATOR_VERSION",
-    "INTENSITY",
-    "LitSettings",
-    "LitView",
-    "NEAR_LIGHTS",
-    "PARTS",
-    "LitImage",
-    "RADIUS",
-    "ShadedRays",
-    "generate_lit_solids",
-    "draw_lit_solids",
-    "shade_point_light",
-    "build_lit_solids",
-    "place_cameras_and_lights",
-]
-
 GENERATOR_VERSION = 1
-"""Part of the cache's key: to be raised with every change to solids, rig, shading or file layout."""
+"""Part of the cache's key: raise it with every change to solids, cameras, lights, shading or file layout."""
 
 DISTANCE = (4.0, 5.0)
-"""Of cameras and lights from the origin, least and most, scene units."""
+"""Least and largest distance of cameras and lights from the origin, scene units."""
 
-RADIUS = 1.19
-"""A sphere about the origin that holds everything, scene units."""
-
-FIELD_OF_VIEW = 2 * float(np.arcsin(RADIUS / DISTANCE[0]))
-"""Radians; holds the whole scene from the nearest camera."""
+FIELD_OF_VIEW = 2 * float(np.arcsin(1.19 / DISTANCE[0]))
+"""Radians; from the nearest camera it holds the sphere of radius 1.19 about the whole scene."""
 
 INTENSITY = 69.2
 """Radiant intensity of the lights over the exposure: it makes 1 the 99.5th percentile of the training images at the
 default settings."""
 
+PARTS = ("new_view", "new_light", "new_both")
+"""Parts of the test split: new camera under a training light, training camera under a new light, and both new."""
+
+NEAR_LIGHTS = 25
+"""The baseline "nearest light" knows the lights of this many training images, the first ones."""
+
+CIRCLE_FRAMES = 36
+_CAMERA_POLAR, _LIGHT_POLAR = math.radians(75.0), math.radians(60.0)
+
+_BRIGHT = 0.5 / (np.pi * (sum(DISTANCE) / 2) ** 2)
+"""Radiance per unit intensity from which a highlight counts as one, 1/length^2."""
+
+_LIT, _CAST, _ATTACHED, _HIGHLIGHT = map(PIXEL_CLASSES.index, ("lit", "cast_shadow", "attached_shadow", "highlight"))
+
 
 @dataclass(frozen=True)
 class LitSettings:
-    """Settings of ``scene=lit_solids`` that change the images.
-
-    Attributes:
-        size: width and height of the images in pixels.
-        train_views, test_views: images of each split.
-        supersampling: rays per pixel along each axis.
-    """
+    """Settings of ``scene=lit_solids`` that change the images: size in pixels, images a split, rays per pixel side."""
 
     size: ImageSize = 160
     train_views: Annotated[int, Range(1, 100000)] = 500
@@ -99,19 +84,21 @@ class LitSettings:
         validate_fields(self, "scene")
 
     def key(self) -> str:
-        """Hash all settings and the version of the generator."""
         return hash_settings(self, GENERATOR_VERSION)
 
 
-@dataclass(frozen=True)
-class LitImage:
-    """One image.
+class LitView(NamedTuple):
+    """One image to take: (3,) positions of camera and light, of test views also of the nearest baseline light."""
 
-    Attributes:
-        rgba: (size, size, 4) float32 linear radiance and coverage, premultiplied.
-        unshadowed: the same without cast shadows.
-        classes: (size, size) uint8, index into :data:`neuprim.scenes.PIXEL_CLASSES`.
-    """
+    name: str
+    camera: NDArray[np.float64]
+    light: NDArray[np.float64]
+    near_light: NDArray[np.float64] | None = None
+
+
+class LitImage(NamedTuple):
+    """One image: (size, size, 4) premultiplied linear radiance and coverage, the same without cast shadows, and
+    (size, size) indices into :data:`neuprim.scenes.PIXEL_CLASSES`."""
 
     rgba: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
@@ -126,59 +113,28 @@ def generate_lit_solids(
     Raises:
         DataError: the cache directory cannot be written.
     """
-    lens = {"camera_angle_x": FIELD_OF_VIEW, "camera_near": DISTANCE[0] - 1.5, "camera_far": DISTANCE[1] + 1.5}
 
     def draw(scene: Scene, view: LitView, paths: Sequence[Path]) -> None:
-        pose = camera_pose(view.camera)
-        taken = draw_lit_solids(scene, pose, view.light, settings.size, settings.supersampling)
-        file, unshadowed, classes, *nearest_light = paths
-        write_exr(file, torch.from_numpy(taken.rgba), half=True)
-        write_exr(unshadowed, torch.from_numpy(taken.unshadowed), half=True)
-        Image.fromarray(taken.classes).save(classes)
-        for path in nearest_light:
-            assert view.near_light is not None
-            write_exr(
-                path,
-                torch.from_numpy(
-                    draw_lit_solids(scene, pose, view.near_light, settings.size, settings.supersampling).rgba
-                ),
-                half=True,
-            )
+        pose, quality = camera_pose(view.camera), (settings.size, settings.supersampling)
+        taken = draw_lit_solids(scene, pose, view.light, *quality)
+        Image.fromarray(taken.classes).save(paths[2])
+        images = [taken.rgba, taken.unshadowed]
+        if view.near_light is not None:
+            images.append(draw_lit_solids(scene, pose, view.near_light, *quality).rgba)
+        for path, image in zip([*paths[:2], *paths[3:]], images, strict=True):
+            write_exr(path, torch.from_numpy(image), half=True)
 
     return ImageSet(
         name="lit_solids",
         key=settings.key(),
         size=settings.size,
         splits=place_cameras_and_lights(settings.train_views, settings.test_views),
-        lens=lens,
+        lens={"camera_angle_x": FIELD_OF_VIEW, "camera_near": DISTANCE[0] - 1.5, "camera_far": DISTANCE[1] + 1.5},
         build=lambda: Scene(build_lit_solids()),
         frame=_frame,
         files=_files,
         draw=draw,
     ).generate(cache_dir, progress)
-
-
-def draw_lit_solids(
-    scene: Scene, pose: NDArray[np.float64], light: NDArray[np.float64], size: int, supersampling: int
-) -> LitImage:
-    """Draw the view at ``pose`` (camera to world, OpenGL axes) under a light at ``light`` (3,) of :data:`INTENSITY`."""
-    parts = []
-    for directions in ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
-        seen = shade_point_light(scene, pose[:3, 3], directions, light, INTENSITY)
-        kinds = seen.classes[:, None] == np.arange(len(PIXEL_CLASSES), dtype=np.uint8)
-        parts.append(
-            average_rays(
-                np.concatenate([seen.rgb, seen.unshadowed, kinds], axis=1, dtype=np.float32), size, supersampling
-            )
-        )
-    mean = np.concatenate(parts)
-    shares = mean[..., 6:]
-    alpha = shares[..., 1:].sum(axis=-1, keepdims=True)
-    classes = np.where(alpha[..., 0] < 0.5, 0, PIXEL_CLASSES.index("lit")).astype(np.uint8)
-    for value in range(2, len(PIXEL_CLASSES)):
-        classes[(classes > 0) & (shares[..., value] > alpha[..., 0] / 2)] = value
-    rgba, unshadowed = (np.concatenate([colour, alpha], axis=-1) for colour in (mean[..., :3], mean[..., 3:6]))
-    return LitImage(rgba, unshadowed, classes)
 
 
 def _files(view: LitView) -> list[str]:
@@ -196,46 +152,24 @@ def _frame(split: str, view: LitView) -> dict[str, Any]:
     }
 
 
-CAMERA_POLAR = math.radians(75.0)
-LIGHT_POLAR = math.radians(60.0)
-PARTS = ("new_view", "new_light", "new_both")
-CIRCLE_FRAMES = 36
-
-NEAR_LIGHTS = 25
-"""The baseline "nearest light" knows the lights of this many training images, the first ones."""
-
-
-@dataclass(frozen=True)
-class LitView:
-    """One image to take.
-
-    Attributes:
-        camera, light: (3,) float64 positions, scene units.
-        near_light: (3,) the baseline light nearest in direction; test views only.
-    """
-
-    name: str
-    camera: NDArray[np.float64]
-    light: NDArray[np.float64]
-    near_light: NDArray[np.float64] | None = None
+# ---------------------------------------------------------------- cameras and lights
 
 
 def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, list[LitView]]:
     """Return all views by split: "train", "test", "circle".
 
     Cameras look at the origin from 4 to 5 units, at most 75 degrees from the zenith; lights are as far away, at most
-    60 degrees from it. Directions are uniform on their cap, distances on their range. The test split has three equal
-    parts: ``new_view`` (new camera, training light), ``new_light`` (training camera, new light) and ``new_both``.
-    ``circle`` is a film: one new camera and a light that goes round once, 45 degrees from the zenith.
+    60 degrees from it. Directions are uniform on their cap, distances on their range. The test split has the three
+    equal :data:`PARTS`. ``circle`` is a film: one new camera and a light that goes round once.
     """
     digits = max(4, len(str(train_views)))
     cameras, lights = _draw(1, train_views)
     train = [LitView(f"r_{i:0{digits}d}", cameras[i], lights[i]) for i in range(train_views)]
-    known = lights[:NEAR_LIGHTS]
     new_cameras, new_lights = _draw(2, test_views)
-    # The baseline's own lights are no test of it, so seen ones come from the rest where there is one.
+    # The baseline's own lights are no test of it, so training ones come from the rest where there is one.
     first = NEAR_LIGHTS if train_views > NEAR_LIGHTS else 0
     counts = [(test_views + 2 - part) // 3 for part in range(3)]
+    digits = max(2, len(str(test_views)) - 1)
     test = []
     for part, name in enumerate(PARTS):
         for i in range(counts[part]):
@@ -243,23 +177,20 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
             seen = first + i * (train_views - first) // max(counts[part], 1)
             camera = cameras[seen] if name == "new_light" else new_cameras[fresh]
             light = lights[seen] if name == "new_view" else new_lights[fresh]
-            test.append(
-                LitView(f"{name}_{i:0{max(2, len(str(test_views)) - 1)}d}", camera, light, _nearest(known, light))
-            )
+            near = max(lights[:NEAR_LIGHTS], key=lambda known: float(known @ light / np.linalg.norm(known)))
+            test.append(LitView(f"{name}_{i:0{digits}d}", camera, light, near))
     middle = sum(DISTANCE) / 2
     eye = middle * unit_direction(math.cos(math.radians(58.0)), -1.1)
     turns = [2 * math.pi * i / CIRCLE_FRAMES for i in range(CIRCLE_FRAMES)]
-    circle = [
-        LitView(f"light_{i:02d}", eye, middle * unit_direction(math.cos(math.radians(45.0)), turn))
-        for i, turn in enumerate(turns)
-    ]
+    around = [middle * unit_direction(math.cos(math.radians(45.0)), turn) for turn in turns]
+    circle = [LitView(f"light_{i:02d}", eye, light) for i, light in enumerate(around)]
     return {"train": train, "test": test, "circle": circle}
 
 
 def _draw(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
     """Positions of ``count`` cameras and lights; longer lists begin with shorter ones."""
     numbers = np.random.default_rng([20241208, key]).random((count, 6))
-    return [_position(n[:3], CAMERA_POLAR) for n in numbers], [_position(n[3:], LIGHT_POLAR) for n in numbers]
+    return [_position(n[:3], _CAMERA_POLAR) for n in numbers], [_position(n[3:], _LIGHT_POLAR) for n in numbers]
 
 
 def _position(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]:
@@ -268,43 +199,45 @@ def _position(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]
     return (DISTANCE[0] + numbers[2] * (DISTANCE[1] - DISTANCE[0])) * unit_direction(cosine, 2 * math.pi * numbers[1])
 
 
-def _nearest(lights: list[NDArray[np.float64]], light: NDArray[np.float64]) -> NDArray[np.float64]:
-    cosines = [float(known @ light / np.linalg.norm(known)) for known in lights]
-    return lights[int(np.argmax(cosines))]
-
-
-_THICK, _EDGE = 0.1, 0.012
-_MAJOR, _MINOR = 0.235, 0.1
+# ---------------------------------------------------------------- drawing
 
 
 def build_lit_solids() -> list[Solid]:
     """Build the solids without their plate, a bright slab that shows shadows, and a dark ring that shows highlights."""
-    profile = [(0.0, 1.0 - _EDGE), (_EDGE, 1.0), (_THICK - _EDGE, 1.0), (_THICK, 1.0 - _EDGE)]
-    slab = Solid(
-        "slab", lathe([0, 0, FLOOR - _THICK], [0, 0, 1], profile, sections=256), uniform_colour("#c9c2b4"), 0.0
-    )
-    polished = ring([-0.66, 0.2, FLOOR + _MAJOR + _MINOR], [1.0, 0.35, 0.0], _MAJOR, _MINOR)
-    others = [solid for solid in build_solids() if solid.name != "plate"]
-    return [slab, *others, Solid("glossy ring", polished, uniform_colour("#3a1c4a"), 0.35, specular=2.8)]
+    thick, edge, major, minor = 0.1, 0.012, 0.235, 0.1
+    profile = [(0.0, 1.0 - edge), (edge, 1.0), (thick - edge, 1.0), (thick, 1.0 - edge)]
+    slab = lathe([0, 0, FLOOR - thick], [0, 0, 1], profile, sections=256)
+    polished = ring([-0.66, 0.2, FLOOR + major + minor], [1.0, 0.35, 0.0], major, minor)
+    return [
+        Solid("slab", slab, uniform_colour("#c9c2b4"), 0.0),
+        *(solid for solid in build_solids() if solid.name != "plate"),
+        Solid("glossy ring", polished, uniform_colour("#3a1c4a"), 0.35, specular=2.8),
+    ]
 
 
-BRIGHT = 0.5 / (np.pi * (sum(DISTANCE) / 2) ** 2)
-"""Radiance per unit intensity from which a highlight counts as one, 1/length^2."""
+def draw_lit_solids(
+    scene: Scene, pose: NDArray[np.float64], light: NDArray[np.float64], size: int, supersampling: int
+) -> LitImage:
+    """Draw the view at ``pose`` (camera to world, OpenGL axes) under a light at ``light`` (3,) of :data:`INTENSITY`."""
+    parts = []
+    for directions in ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
+        seen = shade_point_light(scene, pose[:3, 3], directions, light, INTENSITY)
+        kinds = seen.classes[:, None] == np.arange(len(PIXEL_CLASSES), dtype=np.uint8)
+        values = np.concatenate([seen.rgb, seen.unshadowed, kinds], axis=1, dtype=np.float32)
+        parts.append(average_rays(values, size, supersampling))
+    mean = np.concatenate(parts)
+    shares = mean[..., 6:]
+    alpha = shares[..., 1:].sum(axis=-1, keepdims=True)
+    classes = np.where(alpha[..., 0] < 0.5, 0, _LIT).astype(np.uint8)
+    for value in range(2, len(PIXEL_CLASSES)):
+        classes[(classes > 0) & (shares[..., value] > alpha[..., 0] / 2)] = value
+    rgba, unshadowed = (np.concatenate([colour, alpha], axis=-1) for colour in (mean[..., :3], mean[..., 3:6]))
+    return LitImage(rgba, unshadowed, classes)
 
-_LIT, _CAST, _ATTACHED, _HIGHLIGHT = (
-    PIXEL_CLASSES.index(n) for n in ("lit", "cast_shadow", "attached_shadow", "highlight")
-)
 
-
-@dataclass(frozen=True)
-class ShadedRays:
-    """Radiance of N rays.
-
-    Attributes:
-        rgb: (N, 3) float32 linear radiance, zero where nothing is hit.
-        unshadowed: (N, 3) the same without cast shadows.
-        classes: (N,) uint8, index into :data:`neuprim.scenes.PIXEL_CLASSES`.
-    """
+class ShadedRays(NamedTuple):
+    """Of N rays: (N, 3) linear radiance, zero where nothing is hit, the same without cast shadows, and (N,) indices
+    into :data:`neuprim.scenes.PIXEL_CLASSES`."""
 
     rgb: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
@@ -314,17 +247,11 @@ class ShadedRays:
 def shade_point_light(
     scene: Scene, origins: ArrayLike, directions: ArrayLike, light: ArrayLike, intensity: float
 ) -> ShadedRays:
-    """Cast N rays and shade them under one point light.
+    """Cast N rays and shade them under one point light at ``light`` (3,).
 
     Radiance is (albedo / pi + highlight) cosine intensity / distance^2, or 0 in shadow. Classes: attached shadow, where
     the surface or its shading normal faces away; cast shadow, where something lies between; highlight, where it is
-    brighter than the diffuse part and :data:`BRIGHT`; lit otherwise.
-
-    Args:
-        origins: (N, 3) or (3,).
-        directions: (N, 3) unit vectors.
-        light: (3,) position of the point light.
-        intensity: radiant intensity of the light.
+    brighter than the diffuse part and :data:`_BRIGHT`; lit otherwise.
     """
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)
@@ -339,7 +266,7 @@ def shade_point_light(
     visible = facing.copy()
     visible[facing] = ~scene.occluded(starts, np.asarray(light, dtype=np.float32) - starts, 1.0)
     gleam = highlight * irradiance
-    shining = visible & (highlight > hits.albedo.max(axis=1)) & (gleam > np.float32(BRIGHT * intensity))
+    shining = visible & (highlight > hits.albedo.max(axis=1)) & (gleam > np.float32(_BRIGHT * intensity))
     classes = np.where(facing, np.where(visible, np.where(shining, _HIGHLIGHT, _LIT), _CAST), _ATTACHED)
     shaded = ShadedRays(np.zeros(d.shape, np.float32), np.zeros(d.shape, np.float32), np.zeros(len(d), np.uint8))
     shaded.rgb[hits.hit] = unshadowed * visible[:, None]

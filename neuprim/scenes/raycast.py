@@ -9,149 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import numba
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from neuprim.core.errors import BackendUnavailable
 from neuprim.scenes.shapes import Solid, corner_normals
 
-__all__ = ["Engine", "Hierarchy", "Hits", "Scene"]
-
-LEAF = 4
-DEPTH = 64  # of the traversal's stack; median splits of 2^31 triangles need 32
-
-
-class Hierarchy:
-    """Triangles ``faces`` (F, 3) of ``vertices`` (V, 3). Queries release the interpreter lock."""
-
-    def __init__(self, vertices: NDArray, faces: NDArray) -> None:
-        corners = vertices[faces].astype(np.float64)
-        self._order, self._low, self._high, self._links = _build(corners.min(1), corners.max(1))
-        self._corners = corners[self._order]  # leaves read neighbouring memory
-
-    def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """(N,) each: triangle or -1, barycentric u and v, distance in lengths of ``d`` (N, 3)."""
-        limit = np.full(len(o), np.inf)
-        index, u, v, distance = _trace(self._corners, self._low, self._high, self._links, o, d, limit, False)
-        return np.where(index >= 0, self._order[index], -1), u, v, distance
-
-    def any(self, o: NDArray, d: NDArray, distance: NDArray) -> NDArray[np.bool_]:
-        """(N,) whether a triangle is nearer than ``distance`` (N,)."""
-        return (
-            _trace(self._corners, self._low, self._high, self._links, o, d, distance.astype(np.float64), True)[0] >= 0
-        )
-
-
-def _build(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Order of triangles, node boxes, and per node (first child, 0) or (first triangle, count).
-
-    Children are neighbours. Plain numpy: compiling a sort takes longer than this takes.
-    """
-    order = np.arange(len(low))
-    middle = (low + high) / 2
-    boxes: list[tuple[NDArray, NDArray]] = [(low[:0], high[:0])]
-    links = [(0, 0)]
-    pending = [(0, 0, len(low))]
-    while pending:
-        node, begin, end = pending.pop()
-        part = order[begin:end]
-        box = low[part].min(0), high[part].max(0)
-        boxes[node] = box
-        if end - begin <= LEAF:
-            links[node] = begin, end - begin
-            continue
-        half = (end - begin) // 2
-        longest = int(np.argmax(box[1] - box[0]))
-        order[begin:end] = part[np.argpartition(middle[part, longest], half)]
-        child = len(boxes)
-        links[node] = child, 0
-        boxes += [box, box]
-        links += [(0, 0), (0, 0)]
-        pending += [(child, begin, begin + half), (child + 1, begin + half, end)]
-    return order, np.array([b[0] for b in boxes]), np.array([b[1] for b in boxes]), np.array(links, dtype=np.int64)
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def _box(low, high, node, o, inverse, limit):  # type: ignore[no-untyped-def]
-    """Distance at which a ray enters the box of a node, or infinity."""
-    near, far = 0.0, limit
-    for axis in range(3):
-        a, b = (low[node, axis] - o[axis]) * inverse[axis], (high[node, axis] - o[axis]) * inverse[axis]
-        if a > b:
-            a, b = b, a
-        near = a if a > near else near
-        far = b if b < far else far
-    return near if near <= far * (1 + 1e-12) else np.inf
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def _trace(corners, low, high, links, origins, directions, limits, any_hit):  # type: ignore[no-untyped-def]
-    rays = len(origins)
-    found = np.full(rays, -1, np.int64)
-    us, vs, distances = np.zeros(rays, np.float32), np.zeros(rays, np.float32), np.full(rays, np.inf, np.float32)
-    stack, entry = np.empty(DEPTH, np.int64), np.empty(DEPTH)
-    o, d, inverse = np.empty(3), np.empty(3), np.empty(3)
-    for ray in range(rays):
-        for axis in range(3):
-            o[axis], d[axis] = origins[ray, axis], directions[ray, axis]
-            # A huge number instead of infinity: 0 times infinity would be NaN for an origin in the plane of a box.
-            inverse[axis] = 1 / d[axis] if abs(d[axis]) > 1e-30 else 1e30
-        best = limits[ray]
-        stack[0], entry[0], top = 0, _box(low, high, 0, o, inverse, best), 1
-        while top > 0:
-            top -= 1
-            if entry[top] >= best:
-                continue
-            node = stack[top]
-            if links[node, 1] == 0:
-                a = links[node, 0]
-                near_a, near_b = _box(low, high, a, o, inverse, best), _box(low, high, a + 1, o, inverse, best)
-                nearer = a if near_a <= near_b else a + 1
-                near, far = min(near_a, near_b), max(near_a, near_b)
-                if far < best:  # below the nearer one
-                    stack[top], entry[top] = 2 * a + 1 - nearer, far
-                    top += 1
-                if near < best:
-                    stack[top], entry[top] = nearer, near
-                    top += 1
-                continue
-            for i in range(links[node, 0], links[node, 0] + links[node, 1]):
-                e1x, e1y, e1z = (
-                    corners[i, 1, 0] - corners[i, 0, 0],
-                    corners[i, 1, 1] - corners[i, 0, 1],
-                    corners[i, 1, 2] - corners[i, 0, 2],
-                )
-                e2x, e2y, e2z = (
-                    corners[i, 2, 0] - corners[i, 0, 0],
-                    corners[i, 2, 1] - corners[i, 0, 1],
-                    corners[i, 2, 2] - corners[i, 0, 2],
-                )
-                px, py, pz = d[1] * e2z - d[2] * e2y, d[2] * e2x - d[0] * e2z, d[0] * e2y - d[1] * e2x
-                determinant = e1x * px + e1y * py + e1z * pz
-                if determinant == 0:
-                    continue
-                sx, sy, sz = o[0] - corners[i, 0, 0], o[1] - corners[i, 0, 1], o[2] - corners[i, 0, 2]
-                u = (sx * px + sy * py + sz * pz) / determinant
-                qx, qy, qz = sy * e1z - sz * e1y, sz * e1x - sx * e1z, sx * e1y - sy * e1x
-                v = (d[0] * qx + d[1] * qy + d[2] * qz) / determinant
-                t = (e2x * qx + e2y * qy + e2z * qz) / determinant
-                if u >= 0 and v >= 0 and u + v <= 1 and 0 < t < best:
-                    best = t
-                    found[ray], us[ray], vs[ray], distances[ray] = i, u, v, t
-            if any_hit and found[ray] >= 0:
-                break
-    return found, us, vs, distances
-
-
 Engine = Literal["auto", "embree", "numba"]
 
 LIFT = 2e-4
-"""How far a shadow ray starts above the surface, in scene units: a hundred times the rounding of single precision in
-the unit box."""
+"""How far a shadow ray starts above the surface, in scene units: a hundred times the rounding of float32 there."""
+
+_LEAF = 4  # triangles
+_DEPTH = 64  # of the traversal's stack; median splits of 2^31 triangles need 32
 
 
 @dataclass(frozen=True)
@@ -162,13 +35,10 @@ class Hits:
         hit: (N,) bool.
         position: (M, 3) float32, scene units.
         distance: (M,) float32, in lengths of the ray direction.
-        normal: (M, 3) float32 unit shading normal.
-        face: (M, 3) float32 unit normal of the triangle.
+        normal, face: (M, 3) float32 unit normals: for shading, and of the triangle.
         albedo: (M, 3) float32 linear RGB.
-        gloss: (M,) float32, 0..1.
-        specular: (M,) float32 strength of the highlight.
-        solid: (M,) index of the solid.
-        triangle: (M,) index among the faces of all solids.
+        gloss, specular: (M,) float32, see :class:`~neuprim.scenes.shapes.Solid`.
+        solid, triangle: (M,) indices of the solid, and among the faces of all solids.
         weight: (M, 3) float32 barycentric coordinates.
         emission: (M, 3) float32 linear RGB of emitted light, if any.
     """
@@ -192,7 +62,7 @@ class Hits:
 
 
 class Scene:
-    """Solids ready for ray queries. Read-only after construction, so threads may share it.
+    """Solids ready for ray queries; read-only after construction, so threads may share it.
 
     Attributes:
         engine: "embree" or "numba".
@@ -205,25 +75,18 @@ class Scene:
         self.solids = tuple(solids)
         meshes = [solid.mesh for solid in self.solids]
         start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-        self._vertices = np.concatenate([mesh.vertices.view(np.ndarray) for mesh in meshes]).astype(np.float32)
-        self._faces = np.concatenate(
-            [mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start, strict=False)]
-        ).astype(np.int32)
+        vertices = np.concatenate([mesh.vertices.view(np.ndarray) for mesh in meshes]).astype(np.float32)
+        faces = [mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start, strict=False)]
+        normals = [corner_normals(s.mesh) if s.normals is None else s.normals for s in self.solids]
         self._face_normals = np.concatenate([mesh.face_normals.view(np.ndarray) for mesh in meshes]).astype(np.float32)
-        self._corner_normals = np.concatenate(
-            [corner_normals(s.mesh) if s.normals is None else s.normals for s in self.solids]
-        ).astype(np.float32)
+        self._corner_normals = np.concatenate(normals).astype(np.float32)
         self._owner = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         self._gloss = np.array([solid.gloss for solid in self.solids], dtype=np.float32)
         self._specular = np.array([solid.specular for solid in self.solids], dtype=np.float32)
-        self.engine, self._search = _open(self._vertices, self._faces, engine)
+        self.engine, self._search = _open_engine(vertices, np.concatenate(faces).astype(np.int32), engine)
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """Return the first surface that each ray meets.
-
-        Args:
-            origins, directions: (N, 3) in scene units; directions need not have unit length.
-        """
+        """The first surface that each ray meets; (N, 3) scene units, directions of any length."""
         o, d = _rays(origins, directions)
         triangle, u, v, distance = self._first(o, d)
         hit = triangle >= 0
@@ -253,26 +116,22 @@ class Scene:
         o, d = _rays(points, directions)
         return self._search.any(o, d, np.broadcast_to(np.asarray(distance, dtype=np.float32), len(o)))
 
-    def surface_points(self, count: int, generator: torch.Generator) -> NDArray[np.float32]:
-        """(count, 3) points spread evenly over all surfaces; where solids overlap, some lie inside."""
-        triangles = self._vertices[self._faces].astype(np.float64)
-        a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-        area = np.linalg.norm(np.cross(a, b), axis=1)
-        draw = torch.rand(count, 3, dtype=torch.float64, generator=generator).numpy()
-        index = np.minimum(np.searchsorted(np.cumsum(area) / area.sum(), draw[:, 0], side="right"), len(area) - 1)
-        beyond = draw[:, 1] + draw[:, 2] > 1  # the other half of the parallelogram folds back
-        uv = np.where(beyond[:, None], 1 - draw[:, 1:], draw[:, 1:])
-        return (triangles[index, 0] + uv[:, :1] * a[index] + uv[:, 1:] * b[index]).astype(np.float32)
+
+def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    d = np.ascontiguousarray(directions, dtype=np.float32)
+    return np.ascontiguousarray(np.broadcast_to(np.asarray(origins, dtype=np.float32), d.shape)), d
 
 
-class _Search(Protocol):
-    """Float32 rays (N, 3) against one triangle soup."""
-
-    def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """As :meth:`Hierarchy.first`."""
-
-    def any(self, o: NDArray, d: NDArray, distance: NDArray) -> NDArray[np.bool_]:
-        """As :meth:`Hierarchy.any`."""
+def _open_engine(vertices: NDArray, faces: NDArray, engine: Engine) -> tuple[Literal["embree", "numba"], Any]:
+    if engine != "numba":
+        try:
+            return "embree", _Embree(vertices, faces)
+        except ImportError as error:
+            if engine == "embree":
+                raise BackendUnavailable(
+                    f"ray casting with embree needs the package 'embreex' (pip install embreex): {error}"
+                ) from error
+    return "numba", _Hierarchy(vertices, faces)
 
 
 class _Embree:
@@ -294,18 +153,121 @@ class _Embree:
         return self.scene.run(o, d, dists=limit, query="OCCLUDED") >= 0
 
 
-def _open(vertices: NDArray, faces: NDArray, engine: Engine) -> tuple[Literal["embree", "numba"], _Search]:
-    if engine != "numba":
-        try:
-            return "embree", _Embree(vertices, faces)
-        except ImportError as error:
-            if engine == "embree":
-                raise BackendUnavailable(
-                    f"ray casting with embree needs the package 'embreex' (pip install embreex): {error}"
-                ) from error
-    return "numba", Hierarchy(vertices, faces)
+# ---------------------------------------------------------------- the hierarchy in numba
 
 
-def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    d = np.ascontiguousarray(directions, dtype=np.float32)
-    return np.ascontiguousarray(np.broadcast_to(np.asarray(origins, dtype=np.float32), d.shape)), d
+class _Hierarchy:
+    """Triangles ``faces`` (F, 3) of ``vertices`` (V, 3), with the queries of :class:`_Embree`."""
+
+    def __init__(self, vertices: NDArray, faces: NDArray) -> None:
+        corners = vertices[faces].astype(np.float64)
+        self._order, *boxes_and_links = _build_boxes(corners.min(1), corners.max(1))
+        self._tree = (corners[self._order], *boxes_and_links)  # leaves read neighbouring memory
+
+    def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        index, u, v, distance = _trace(*self._tree, o, d, np.full(len(o), np.inf), False)
+        return np.where(index >= 0, self._order[index], -1), u, v, distance
+
+    def any(self, o: NDArray, d: NDArray, distance: NDArray) -> NDArray[np.bool_]:
+        return _trace(*self._tree, o, d, distance.astype(np.float64), True)[0] >= 0
+
+
+def _build_boxes(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Order of triangles, node boxes, and per node (first child, 0) or (first triangle, count).
+
+    Children are neighbours. Plain numpy: compiling a sort takes longer than this takes.
+    """
+    order = np.arange(len(low))
+    middle = (low + high) / 2
+    boxes: list[tuple[NDArray, NDArray]] = [(low[:0], high[:0])]
+    links = [(0, 0)]
+    pending = [(0, 0, len(low))]
+    while pending:
+        node, begin, end = pending.pop()
+        part = order[begin:end]
+        box = low[part].min(0), high[part].max(0)
+        boxes[node] = box
+        if end - begin <= _LEAF:
+            links[node] = begin, end - begin
+            continue
+        half = (end - begin) // 2
+        longest = int(np.argmax(box[1] - box[0]))
+        order[begin:end] = part[np.argpartition(middle[part, longest], half)]
+        child = len(boxes)
+        links[node] = child, 0
+        boxes += [box, box]
+        links += [(0, 0), (0, 0)]
+        pending += [(child, begin, begin + half), (child + 1, begin + half, end)]
+    return order, np.array([b[0] for b in boxes]), np.array([b[1] for b in boxes]), np.array(links, dtype=np.int64)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _enter_box(low, high, node, o, inverse, limit):  # type: ignore[no-untyped-def]
+    """Distance at which a ray enters the box of a node, or infinity."""
+    near, far = 0.0, limit
+    for axis in range(3):
+        a, b = (low[node, axis] - o[axis]) * inverse[axis], (high[node, axis] - o[axis]) * inverse[axis]
+        if a > b:
+            a, b = b, a
+        near = a if a > near else near
+        far = b if b < far else far
+    return near if near <= far * (1 + 1e-12) else np.inf
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _meet_triangle(corner, o, d):  # type: ignore[no-untyped-def]
+    """Barycentric u and v of a ray's meeting with a triangle (3, 3), and its distance; -1 where there is none."""
+    ex, ey, ez = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
+    fx, fy, fz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
+    px, py, pz = d[1] * fz - d[2] * fy, d[2] * fx - d[0] * fz, d[0] * fy - d[1] * fx
+    determinant = ex * px + ey * py + ez * pz
+    if determinant == 0:
+        return 0.0, 0.0, -1.0
+    sx, sy, sz = o[0] - corner[0, 0], o[1] - corner[0, 1], o[2] - corner[0, 2]
+    u = (sx * px + sy * py + sz * pz) / determinant
+    qx, qy, qz = sy * ez - sz * ey, sz * ex - sx * ez, sx * ey - sy * ex
+    v = (d[0] * qx + d[1] * qy + d[2] * qz) / determinant
+    t = (fx * qx + fy * qy + fz * qz) / determinant
+    return u, v, t if u >= 0 and v >= 0 and u + v <= 1 else -1.0
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _trace(corners, low, high, links, origins, directions, limits, any_hit):  # type: ignore[no-untyped-def]
+    rays = len(origins)
+    found = np.full(rays, -1, np.int64)
+    us, vs, distances = np.zeros(rays, np.float32), np.zeros(rays, np.float32), np.full(rays, np.inf, np.float32)
+    stack, entry = np.empty(_DEPTH, np.int64), np.empty(_DEPTH)
+    o, d, inverse = np.empty(3), np.empty(3), np.empty(3)
+    for ray in range(rays):
+        for axis in range(3):
+            o[axis], d[axis] = origins[ray, axis], directions[ray, axis]
+            # A huge number instead of infinity: 0 times infinity would be NaN for an origin in the plane of a box.
+            inverse[axis] = 1 / d[axis] if abs(d[axis]) > 1e-30 else 1e30
+        best = limits[ray]
+        stack[0], entry[0], top = 0, _enter_box(low, high, 0, o, inverse, best), 1
+        while top > 0:
+            top -= 1
+            if entry[top] >= best:
+                continue
+            node = stack[top]
+            if links[node, 1] == 0:
+                a = links[node, 0]
+                near_a = _enter_box(low, high, a, o, inverse, best)
+                near_b = _enter_box(low, high, a + 1, o, inverse, best)
+                nearer = a if near_a <= near_b else a + 1
+                near, far = min(near_a, near_b), max(near_a, near_b)
+                if far < best:  # below the nearer one
+                    stack[top], entry[top] = 2 * a + 1 - nearer, far
+                    top += 1
+                if near < best:
+                    stack[top], entry[top] = nearer, near
+                    top += 1
+                continue
+            for i in range(links[node, 0], links[node, 0] + links[node, 1]):
+                u, v, t = _meet_triangle(corners[i], o, d)
+                if 0 < t < best:
+                    best = t
+                    found[ray], us[ray], vs[ray], distances[ray] = i, u, v, t
+            if any_hit and found[ray] >= 0:
+                break
+    return found, us, vs, distances

@@ -1,4 +1,4 @@
-"""How the solids reflect a light: Lambert's reflectance plus Blinn and Phong's highlight in its energy-scaled form,
+"""How the solids reflect light: Lambert's reflectance plus Blinn and Phong's highlight in its energy-scaled form,
 
 f = albedo / pi + k (n + 8) / (8 pi) (N.H)^n,     k = specular gloss,  n = 6 + 110 gloss^2.
 """
@@ -12,67 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from neuprim.scenes.raycast import Hits, Scene
 
-__all__ = [
-    "Colour",
-    "DAYLIGHT",
-    "Daylight",
-    "add_surroundings",
-    "dot",
-    "encode_srgb",
-    "reflectance_lobes",
-    "daylight_radiance",
-    "reflect_light",
-    "visible_light",
-]
-
 Array = NDArray[np.float32]
-
-
-def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Array]:
-    """The cosine to the light, zero where the surface faces away, and pi times the highlight's reflectance; (M,)
-    float32 each.
-
-    Args:
-        to_eye, to_light: (M, 3) or (3,) unit vectors away from the surface.
-    """
-    eye, light = np.asarray(to_eye, dtype=np.float32), np.asarray(to_light, dtype=np.float32)
-    cosine = np.maximum(dot(hits.normal, light), 0)
-    half: Array = eye + light
-    half /= np.sqrt(np.maximum(dot(half, half), np.float32(1e-12)))[:, None]
-    exponent = 6 + 110 * hits.gloss**2
-    highlight = hits.specular * hits.gloss * (exponent + 8) / 8 * np.maximum(dot(hits.normal, half), 0) ** exponent
-    return cosine, highlight.astype(np.float32, copy=False)
-
-
-def reflect_light(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
-    """(M, 3) linear RGB radiance towards the eye per unit irradiance of a surface facing the light: reflectance times
-    cosine.
-
-    Args:
-        to_eye, to_light: (M, 3) or (3,) unit vectors away from the surface.
-    """
-    cosine, highlight = reflectance_lobes(hits, to_eye, to_light)
-    return ((hits.albedo + highlight[:, None]) * (cosine / np.float32(np.pi))[:, None]).astype(np.float32)
-
-
-def dot(a: Array, b: Array) -> Array:
-    """(M,) products of (M, 3) rows with (M, 3) rows or one (3,) vector."""
-    return np.einsum(
-        "nc,nc->n", a, np.broadcast_to(b, a.shape)
-    )  # several times faster than a sum over an axis of three
-
-
 Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Daylight:
-    """The fixed light of the static scene.
+    """Sun and sky.
 
     Attributes:
         direction: (3,) towards the sun; any length.
-        sun: (3,) linear RGB irradiance of a surface facing it.
-        sky, ground: (3,) linear RGB radiance from straight above and straight below, blended in between.
+        sun: linear RGB irradiance of a surface facing it.
+        sky, ground: linear RGB radiance from straight above and straight below, blended in between.
     """
 
     direction: tuple[float, float, float] = (0.42, -0.62, 0.92)
@@ -84,14 +35,37 @@ class Daylight:
 DAYLIGHT = Daylight()
 
 
+def dot(a: Array, b: Array) -> Array:
+    """(M,) products of (M, 3) rows with (M, 3) rows or one (3,) vector."""
+    return np.einsum("nc,nc->n", a, np.broadcast_to(b, a.shape))  # several times faster than a sum over three
+
+
+def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Array]:
+    """(M,) cosine to the light, at least 0, and (M,) pi times the highlight's reflectance.
+
+    ``to_eye`` and ``to_light`` are (M, 3) or (3,) unit vectors away from the surface.
+    """
+    eye, light = np.asarray(to_eye, dtype=np.float32), np.asarray(to_light, dtype=np.float32)
+    cosine = np.maximum(dot(hits.normal, light), 0)
+    half: Array = eye + light
+    half /= np.sqrt(np.maximum(dot(half, half), np.float32(1e-12)))[:, None]
+    exponent = 6 + 110 * hits.gloss**2
+    highlight = hits.specular * hits.gloss * (exponent + 8) / 8 * np.maximum(dot(hits.normal, half), 0) ** exponent
+    return cosine, highlight.astype(np.float32, copy=False)
+
+
+def reflect_light(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
+    """(M, 3) linear RGB radiance towards the eye per unit irradiance of a surface that faces the light."""
+    cosine, highlight = reflectance_lobes(hits, to_eye, to_light)
+    return ((hits.albedo + highlight[:, None]) * (cosine / np.float32(np.pi))[:, None]).astype(np.float32)
+
+
 def daylight_radiance(
     scene: Scene, origins: ArrayLike, directions: ArrayLike, light: Daylight = DAYLIGHT
 ) -> tuple[Array, NDArray[np.bool_]]:
     """What N rays see: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits.
 
-    Args:
-        origins: (N, 3) or (3,).
-        directions: (N, 3) unit vectors.
+    ``origins`` are (N, 3) or (3,), ``directions`` (N, 3) unit vectors.
     """
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)
@@ -115,31 +89,23 @@ def visible_light(scene: Scene, hits: Hits, to_light: Array, away: ArrayLike) ->
     return lit
 
 
-def encode_srgb(linear: Array) -> Array:
-    """Display values 0..1 of linear ones, clipped (IEC 61966-2-1)."""
-    x = np.clip(linear, 0, 1)
-    return np.where(
-        x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, np.float32(0.0031308)) ** np.float32(1 / 2.4) - 0.055
-    ).astype(np.float32)
-
-
 def add_surroundings(rgb: Array, hits: Hits, to_eye: Array, sky: Colour, ground: Colour) -> None:
-    """Add to ``rgb`` (M, 3) what soft light from all around, ``sky`` above and ``ground`` below, makes the surfaces
-    send to the eye.
+    """Add to ``rgb`` (M, 3) the reflection of soft light from all around: ``sky`` above, ``ground`` below."""
 
-    Args:
-        to_eye: (M, 3) unit vectors away from the surface.
-        sky, ground: (3,) linear RGB radiance from straight above and straight below, blended in between.
-    """
-    rgb += hits.albedo * _surroundings(sky, ground, hits.normal[:, 2])
+    def surroundings(height: Array) -> Array:
+        t = (0.5 + 0.5 * height)[:, None]
+        return t * np.array(sky, dtype=np.float32) + (1 - t) * np.array(ground, dtype=np.float32)
+
+    rgb += hits.albedo * surroundings(hits.normal[:, 2])
     # Polished things mirror the surroundings faintly, more so at grazing angles (Schlick).
     facing = np.clip(dot(hits.normal, to_eye), 0, 1)
     mirrored = 2 * facing * hits.normal[:, 2] - to_eye[:, 2]
     strength = hits.gloss * (0.06 + 0.5 * (1 - facing) ** 5)
-    rgb += strength[:, None] * _surroundings(sky, ground, mirrored)
+    rgb += strength[:, None] * surroundings(mirrored)
 
 
-def _surroundings(sky: Colour, ground: Colour, height: Array) -> Array:
-    """(M, 3) radiance of sky and ground seen towards a direction of z component ``height`` (M,)."""
-    t = (0.5 + 0.5 * height)[:, None]
-    return t * np.array(sky, dtype=np.float32) + (1 - t) * np.array(ground, dtype=np.float32)
+def encode_srgb(linear: Array) -> Array:
+    """Display values 0..1 of linear ones, clipped (IEC 61966-2-1)."""
+    x = np.clip(linear, 0, 1)
+    curve = 1.055 * np.maximum(x, np.float32(0.0031308)) ** np.float32(1 / 2.4) - 0.055
+    return np.where(x <= 0.0031308, 12.92 * x, curve).astype(np.float32)

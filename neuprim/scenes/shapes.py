@@ -1,4 +1,4 @@
-"""Closed triangle meshes the solids are cut from, and the vertex normals that keep edges sharp and curves smooth.
+"""Closed triangle meshes, their normals, and the solids that are built from them.
 
 Every builder returns a watertight :class:`trimesh.Trimesh` in scene units with outward faces.
 """
@@ -14,36 +14,20 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-__all__ = [
-    "Albedo",
-    "FLOOR",
-    "Solid",
-    "arc_tube",
-    "ball",
-    "build_solids",
-    "chamfered_box",
-    "corner_normals",
-    "lathe",
-    "merge_meshes",
-    "uniform_colour",
-    "pyramid",
-    "ring",
-    "rod",
-    "parse_srgb",
-    "two_tone",
-]
+Albedo = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+"""(M, 3) positions in scene units -> (M, 3) linear RGB reflectance 0..1."""
 
-CREASE_DEGREES = 24.0
-"""Faces that meet at more than this angle keep their own normals: chamfers and caps stay hard, facets of round parts
-blend."""
+FLOOR = -0.52
+"""Height of the plate's upper side, on which everything stands."""
 
-CORNERS_AT_ONCE = 1 << 18
-"""Bounds the memory for pairs of corners."""
+_CREASE = np.cos(np.radians(24.0))
+"""Faces that meet at a larger angle keep their own normals: chamfers stay hard, facets of round parts blend."""
+
+_CORNERS_AT_ONCE = 1 << 18  # bounds the memory for pairs of corners
 
 
 def chamfered_box(size: ArrayLike, centre: ArrayLike, chamfer: float) -> trimesh.Trimesh:
-    """An axis-aligned box of edge lengths ``size`` (3,) about ``centre`` (3,), every edge cut at 45 degrees by
-    ``chamfer``."""
+    """An axis-aligned box of edge lengths ``size`` about ``centre``, every edge cut at 45 degrees by ``chamfer``."""
     half = np.asarray(size, dtype=np.float64) / 2
     # Each corner becomes a triangle: one axis at full extent, the other two drawn in. Their hull is the chamfered box.
     pulls = sorted(set(permutations((0.0, chamfer, chamfer))))
@@ -54,13 +38,11 @@ def chamfered_box(size: ArrayLike, centre: ArrayLike, chamfer: float) -> trimesh
 
 
 def pyramid(base: float, height: float, centre: ArrayLike, turn: float) -> trimesh.Trimesh:
-    """A four-sided pyramid: square of edge ``base`` about ``centre`` (3,) turned by ``turn`` radians about z, apex
-    ``height`` above."""
+    """A pyramid over a square of edge ``base`` about ``centre`` that is turned by ``turn`` radians about z."""
     angles = turn + np.pi / 4 + np.pi / 2 * np.arange(4)
     square = np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1) * base / np.sqrt(2)
     vertices = np.concatenate([square, [[0.0, 0.0, height]]]) + np.asarray(centre, dtype=np.float64)
-    faces = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [2, 1, 0], [3, 2, 0]]
-    return trimesh.Trimesh(vertices, faces)
+    return trimesh.Trimesh(vertices, [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [2, 1, 0], [3, 2, 0]])
 
 
 def ball(centre: ArrayLike, radius: float, fine: bool = True) -> trimesh.Trimesh:
@@ -71,8 +53,7 @@ def ball(centre: ArrayLike, radius: float, fine: bool = True) -> trimesh.Trimesh
 
 
 def ring(centre: ArrayLike, axis: ArrayLike, major: float, minor: float) -> trimesh.Trimesh:
-    """A torus about ``centre`` (3,): circle of radius ``major`` in the plane normal to ``axis`` (3,), tube radius
-    ``minor``."""
+    """A torus: circle of radius ``major`` in the plane normal to ``axis``, tube of radius ``minor``."""
     mesh = trimesh.creation.torus(major, minor, major_sections=128, minor_sections=48)
     mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis))
     mesh.apply_translation(centre)
@@ -80,7 +61,7 @@ def ring(centre: ArrayLike, axis: ArrayLike, major: float, minor: float) -> trim
 
 
 def rod(start: ArrayLike, end: ArrayLike, radius: float) -> trimesh.Trimesh:
-    """A thin straight rod with flat ends from ``start`` (3,) to ``end`` (3,)."""
+    """A thin straight rod with flat ends."""
     length = float(np.linalg.norm(np.subtract(end, start)))
     return lathe(start, np.subtract(end, start), [(0.0, radius), (length, radius)], sections=24)
 
@@ -88,17 +69,15 @@ def rod(start: ArrayLike, end: ArrayLike, radius: float) -> trimesh.Trimesh:
 def lathe(
     start: ArrayLike, axis: ArrayLike, profile: Sequence[tuple[float, float]], sections: int = 96
 ) -> trimesh.Trimesh:
-    """A solid of revolution: ``profile`` lists (distance along ``axis`` from ``start``, radius); equal distances make a
-    shoulder."""
+    """A solid of revolution; ``profile`` lists (distance along ``axis`` from ``start``, radius)."""
     direction = np.asarray(axis, dtype=np.float64)
     direction = direction / np.linalg.norm(direction)
     side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
     side /= np.linalg.norm(side)
     heights, radii = np.array(profile, dtype=np.float64).T
     path = np.asarray(start, dtype=np.float64) + heights[:, None] * direction
-    return _tube(
-        path, np.broadcast_to(side, path.shape), np.cross(direction, side), np.stack([radii, radii], axis=1), sections
-    )
+    sides, half = np.broadcast_to(side, path.shape), np.stack([radii, radii], axis=1)
+    return _tube(path, sides, np.cross(direction, side), half, sections)
 
 
 def arc_tube(
@@ -110,14 +89,13 @@ def arc_tube(
     radii: ArrayLike,
     sections: int = 64,
 ) -> trimesh.Trimesh:
-    """A tube swept along a circular arc, with a radius that may change on the way.
+    """A tube swept along a circular arc.
 
     Args:
-        centre, first, second: (3,) circle centre and orthonormal axes of its plane; angle 0 lies on ``first``, 90
-        degrees on ``second``. radius: of the arc.
+        first, second: orthonormal axes of the circle's plane; angle 0 lies on ``first``, 90 degrees on ``second``.
         angles: (n,) ascending, in radians.
         radii: (n, 2) half axes of the elliptic cross-section, in the arc's plane and across it; (n,) or a number for a
-        round one.
+            round one.
     """
     one, two = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     outward = np.cos(angles)[:, None] * one + np.sin(angles)[:, None] * two
@@ -129,27 +107,21 @@ def arc_tube(
 
 
 def _tube(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sections: int) -> trimesh.Trimesh:
-    """Rings of ``sections`` points about ``path`` (n, 3) in the planes of ``side`` (n, 3) and ``across`` (3,), joined
-    and capped."""
+    """Rings about ``path`` (n, 3) in the planes of ``side`` (n, 3) and ``across`` (3,), joined and capped."""
     turn = 2 * np.pi * np.arange(sections) / sections
-    rings = (
-        path[:, None]
-        + (half[:, :1] * np.cos(turn))[..., None] * side[:, None]
-        + (half[:, 1:] * np.sin(turn))[..., None] * across
-    )  # (n, sections, 3)
+    in_plane = (half[:, :1] * np.cos(turn))[..., None] * side[:, None]
+    rings = path[:, None] + in_plane + (half[:, 1:] * np.sin(turn))[..., None] * across  # (n, sections, 3)
     n = len(path)
-    here = (np.arange(n - 1)[:, None] * sections + np.arange(sections)).ravel()
-    right = (np.arange(n - 1)[:, None] * sections + (np.arange(sections) + 1) % sections).ravel()
-    walls = np.concatenate(
-        [np.stack([here, right, right + sections], 1), np.stack([here, right + sections, here + sections], 1)]
-    )
     rim, following = np.arange(sections), (np.arange(sections) + 1) % sections
-    first, last = n * sections, n * sections + 1
-    bottom = np.stack([np.full(sections, first), following, rim], 1)
-    top = np.stack([np.full(sections, last), rim + (n - 1) * sections, following + (n - 1) * sections], 1)
+    here = (np.arange(n - 1)[:, None] * sections + rim).ravel()
+    right = (np.arange(n - 1)[:, None] * sections + following).ravel()
+    bottom = np.stack([np.full(sections, n * sections), following, rim], 1)
+    top = np.stack([np.full(sections, n * sections + 1), rim + (n - 1) * sections, following + (n - 1) * sections], 1)
+    lower = np.stack([here, right, right + sections], 1)
+    upper = np.stack([here, right + sections, here + sections], 1)
     vertices = np.concatenate([rings.reshape(-1, 3), path[:1], path[-1:]])
     # Rings of radius zero (points of cones) collapse to one vertex; `validate` drops the faces that vanish with them.
-    return trimesh.Trimesh(vertices, np.concatenate([walls, bottom, top]), process=True, validate=True)
+    return trimesh.Trimesh(vertices, np.concatenate([lower, upper, bottom, top]), process=True, validate=True)
 
 
 def merge_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
@@ -159,38 +131,27 @@ def merge_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces), process=False)
 
 
-def corner_normals(mesh: trimesh.Trimesh, crease: float = CREASE_DEGREES) -> NDArray[np.float64]:
-    """(F, 3, 3) unit normals at each face's corners: the mean over faces around the vertex that turn by less than
-    ``crease`` degrees.
+def corner_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
+    """(F, 3, 3) unit normals at each face's corners: the mean over faces around the vertex that turn by little.
 
-    Faces are weighted by their angle at the vertex, so the result does not depend on how a flat part was cut into
-    triangles.
+    Faces are weighted by their angle at the vertex, so that it does not matter how a flat part is cut into triangles.
     """
     faces, flat = mesh.faces.view(np.ndarray), mesh.face_normals.view(np.ndarray)
     corners, angles = faces.size, mesh.face_angles.view(np.ndarray).ravel()
-    around = sparse.csr_matrix(
-        (np.ones(corners), (np.arange(corners), faces.ravel())), shape=(corners, len(mesh.vertices))
-    )
+    places = (np.arange(corners), faces.ravel())
+    around = sparse.csr_matrix((np.ones(corners), places), shape=(corners, len(mesh.vertices)))
     touching = around.T.tocsr()
     normals = np.empty((corners, 3))
-    for begin in range(0, corners, CORNERS_AT_ONCE):
-        pairs = (around[begin : begin + CORNERS_AT_ONCE] @ touching).tocoo()  # corners that share a vertex
+    for begin in range(0, corners, _CORNERS_AT_ONCE):
+        pairs = (around[begin : begin + _CORNERS_AT_ONCE] @ touching).tocoo()  # corners that share a vertex
         own, other = (begin + pairs.row) // 3, pairs.col // 3
-        smooth = (flat[own] * flat[other]).sum(1) > np.cos(np.radians(crease))
+        smooth = (flat[own] * flat[other]).sum(1) > _CREASE
         blend = sparse.csr_matrix((angles[pairs.col] * smooth, (pairs.row, other)), shape=(pairs.shape[0], len(faces)))
-        normals[begin : begin + CORNERS_AT_ONCE] = blend @ flat
+        normals[begin : begin + _CORNERS_AT_ONCE] = blend @ flat
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.where(
-        length > 0, normals / np.where(length > 0, length, 1.0), np.repeat(flat, 3, axis=0)
-    )  # of needles, which have no angle
+    own_face = np.repeat(flat, 3, axis=0)  # for needles, which have no angle
+    normals = np.where(length > 0, normals / np.where(length > 0, length, 1.0), own_face)
     return normals.reshape(-1, 3, 3)
-
-
-Albedo = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-"""(M, 3) positions in scene units -> (M, 3) linear RGB reflectance 0..1."""
-
-FLOOR = -0.52
-"""Height of the plate's upper side, on which everything stands."""
 
 
 @dataclass(frozen=True)
@@ -198,12 +159,11 @@ class Solid:
     """One closed body.
 
     Attributes:
-        name: for messages and tests.
         mesh: watertight, scene units.
         albedo: diffuse reflectance as a function of position.
         gloss: 0 (matt) to 1 (polished); see :mod:`neuprim.scenes.shading`.
         specular: strength of the highlight of a polished solid.
-        normals: (F, 3, 3) unit normals at the faces' corners; None: what the angles between faces suggest.
+        normals: (F, 3, 3) unit normals at the faces' corners; None: :func:`corner_normals`.
     """
 
     name: str
@@ -226,10 +186,13 @@ def uniform_colour(code: str) -> Albedo:
     return lambda position: np.broadcast_to(colour, position.shape)
 
 
-def two_tone(code: str, other: str, is_other: Callable[[NDArray[np.float32]], NDArray[np.bool_]]) -> Albedo:
+def _two_tone(code: str, other: str, is_other: Callable[[NDArray[np.float32]], NDArray[np.bool_]]) -> Albedo:
     """``other`` where ``is_other`` (positions (M, 3) -> (M,) bool) holds, else ``code``."""
     first, second = parse_srgb(code), parse_srgb(other)
     return lambda position: np.where(is_other(position)[:, None], second, first)
+
+
+# ---------------------------------------------------------------- the solids
 
 
 def build_solids() -> list[Solid]:
@@ -265,70 +228,40 @@ def _plate() -> Solid:
 
 def _drill() -> list[Solid]:
     """The drill in its own frame: bit along +x, symmetric in y, standing on its battery."""
-    axis_z = 0.44
-    slope = np.linspace(np.radians(149.0), np.radians(211.0), 64)
-    grip_centre, grip_radius = np.array([0.33, 0.0, -0.05]), 0.695
+    x, z, axis_z = [1, 0, 0], [0, 0, 1], 0.44
+    grip_arc, grip_centre = np.linspace(np.radians(149.0), np.radians(211.0), 64), np.array([0.33, 0.0, -0.05])
+    guard_arc = np.linspace(np.radians(-96.0), np.radians(14.0), 64)
 
-    def grip_ribs(p: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def turn(p: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.arctan2(p[:, 1], p[:, 2] - axis_z) / (2 * np.pi)
+
+    def is_rib(p: NDArray[np.float32]) -> NDArray[np.bool_]:
         angle = np.degrees(np.arctan2(p[:, 2] - grip_centre[2], p[:, 0] - grip_centre[0])) % 360
         return (np.abs(angle - 184) < 14) & ((angle / 4) % 1 < 0.45)
 
-    def helix(p: NDArray[np.float32]) -> NDArray[np.bool_]:
-        return (np.arctan2(p[:, 1], p[:, 2] - axis_z) / (2 * np.pi) + p[:, 0] / 0.11) % 1 < 0.4
-
-    def knurl(p: NDArray[np.float32]) -> NDArray[np.bool_]:
-        turn = np.arctan2(p[:, 1], p[:, 2] - axis_z) / (2 * np.pi)
-        return (p[:, 0] < 0.44) & ((turn * 18) % 1 < 0.35)
-
-    guard = np.linspace(np.radians(-96.0), np.radians(14.0), 64)
-    parts = [
-        Solid(
-            "body",
-            chamfered_box([0.72, 0.30, 0.34], [-0.22, 0, 0.42], 0.05),
-            two_tone("#f2600c", "#fff4e0", lambda p: np.abs(p[:, 2] - 0.37) < 0.022),
-            0.5,
-        ),
-        Solid(
-            "gearbox",
-            lathe([0.12, 0, axis_z], [1, 0, 0], [(0, 0.125), (0.05, 0.15), (0.13, 0.15), (0.19, 0.1)]),
-            uniform_colour("#2b2d42"),
-            0.6,
-        ),
-        Solid(
-            "chuck",
-            lathe([0.29, 0, axis_z], [1, 0, 0], [(0, 0.07), (0.02, 0.09), (0.15, 0.09), (0.22, 0.05), (0.24, 0.032)]),
-            two_tone("#b8c0cc", "#5c6675", knurl),
-            0.9,
-        ),
-        Solid(
-            "bit",
-            lathe([0.5, 0, axis_z], [1, 0, 0], [(0, 0.022), (0.44, 0.022), (0.5, 0.0)], sections=32),
-            two_tone("#ffc93c", "#6b4a12", helix),
-            0.8,
-        ),
-        Solid(
-            "grip",
-            arc_tube(grip_centre, [1, 0, 0], [0, 0, 1], grip_radius, slope, np.broadcast_to([0.085, 0.07], (64, 2))),
-            two_tone("#2a3bb8", "#19c3e6", grip_ribs),
-            0.3,
-        ),
-        Solid(
-            "guard",
-            arc_tube([-0.27, 0, 0.22], [1, 0, 0], [0, 0, 1], 0.3, guard, 0.014, sections=32),
-            uniform_colour("#d7263d"),
-            0.6,
-        ),
-        Solid("trigger", chamfered_box([0.06, 0.07, 0.14], [-0.19, 0, 0.19], 0.012), uniform_colour("#d7263d"), 0.6),
-        Solid(
-            "battery",
-            chamfered_box([0.46, 0.28, 0.15], [-0.23, 0, FLOOR + 0.075], 0.03),
-            two_tone("#2454d6", "#ffd23f", lambda p: np.abs(p[:, 2] - FLOOR - 0.075) < 0.014),
-            0.5,
-        ),
-    ]
+    body_paint = _two_tone("#f2600c", "#fff4e0", lambda p: np.abs(p[:, 2] - 0.37) < 0.022)
+    knurl = _two_tone("#b8c0cc", "#5c6675", lambda p: (p[:, 0] < 0.44) & ((turn(p) * 18) % 1 < 0.35))
+    helix = _two_tone("#ffc93c", "#6b4a12", lambda p: (turn(p) + p[:, 0] / 0.11) % 1 < 0.4)
+    battery_paint = _two_tone("#2454d6", "#ffd23f", lambda p: np.abs(p[:, 2] - FLOOR - 0.075) < 0.014)
+    gearbox = lathe([0.12, 0, axis_z], x, [(0, 0.125), (0.05, 0.15), (0.13, 0.15), (0.19, 0.1)])
+    chuck = lathe([0.29, 0, axis_z], x, [(0, 0.07), (0.02, 0.09), (0.15, 0.09), (0.22, 0.05), (0.24, 0.032)])
+    bit = lathe([0.5, 0, axis_z], x, [(0, 0.022), (0.44, 0.022), (0.5, 0.0)], sections=32)
+    grip = arc_tube(grip_centre, x, z, 0.695, grip_arc, np.broadcast_to([0.085, 0.07], (64, 2)))
+    guard = arc_tube([-0.27, 0, 0.22], x, z, 0.3, guard_arc, 0.014, sections=32)
+    trigger = chamfered_box([0.06, 0.07, 0.14], [-0.19, 0, 0.19], 0.012)
     # Slats stand proud of both flanks: thin dark boxes right through the body.
     slats = [chamfered_box([0.022, 0.312, 0.13], [-0.50 + 0.05 * i, 0, 0.47], 0.003) for i in range(5)]
-    return [*parts, Solid("slats", merge_meshes(slats), uniform_colour("#22223b"), 0.2)]
+    return [
+        Solid("body", chamfered_box([0.72, 0.30, 0.34], [-0.22, 0, 0.42], 0.05), body_paint, 0.5),
+        Solid("gearbox", gearbox, uniform_colour("#2b2d42"), 0.6),
+        Solid("chuck", chuck, knurl, 0.9),
+        Solid("bit", bit, helix, 0.8),
+        Solid("grip", grip, _two_tone("#2a3bb8", "#19c3e6", is_rib), 0.3),
+        Solid("guard", guard, uniform_colour("#d7263d"), 0.6),
+        Solid("trigger", trigger, uniform_colour("#d7263d"), 0.6),
+        Solid("battery", chamfered_box([0.46, 0.28, 0.15], [-0.23, 0, FLOOR + 0.075], 0.03), battery_paint, 0.5),
+        Solid("slats", merge_meshes(slats), uniform_colour("#22223b"), 0.2),
+    ]
 
 
 def _wire_cube() -> list[Solid]:
@@ -337,16 +270,12 @@ def _wire_cube() -> list[Solid]:
     centre = np.array([0.46, 0.46, FLOOR + side / 2 + 2 * thick])
     turn = trimesh.transformations.rotation_matrix(np.radians(20.0), [0, 0, 1])[:3, :3]
     corner = {sign: centre + turn @ (np.array(sign) * side / 2) for sign in product((-1, 1), repeat=3)}
-    rods = [
-        rod(corner[a], corner[b], thick)
-        for a in corner
-        for b in corner
-        if a < b and sum(x != y for x, y in zip(a, b, strict=True)) == 1
-    ]
-    knots = [ball(point, 2 * thick, fine=False) for point in corner.values()]
+    edges = [(a, b) for a in corner for b in corner if a < b and sum(x != y for x, y in zip(a, b, strict=True)) == 1]
+    rods = merge_meshes([rod(corner[a], corner[b], thick) for a, b in edges])
+    knots = merge_meshes([ball(point, 2 * thick, fine=False) for point in corner.values()])
     return [
-        Solid("wire cube", merge_meshes(rods), uniform_colour("#0fa34a"), 0.5),
-        Solid("knots", merge_meshes(knots), uniform_colour("#0b5d2c"), 0.5),
+        Solid("wire cube", rods, uniform_colour("#0fa34a"), 0.5),
+        Solid("knots", knots, uniform_colour("#0b5d2c"), 0.5),
         Solid("ball", ball([centre[0], centre[1], FLOOR + 0.13], 0.13), uniform_colour("#e0218a"), 1.0),
     ]
 
@@ -366,26 +295,17 @@ def _pins() -> list[Solid]:
 def _small_things() -> list[Solid]:
     major, minor = 0.21, 0.068
     span = np.radians(np.linspace(20.0, 140.0, 96))
-    place = np.linspace(0.0, 1.0, 96)
-    thickness = 0.012 + 0.062 * np.abs(np.sin(np.pi * place)) ** 0.6
+    thickness = 0.012 + 0.062 * np.abs(np.sin(np.pi * np.linspace(0.0, 1.0, 96))) ** 0.6
     bend = np.array([-0.38, -0.8, FLOOR + 0.074])
 
-    def tips(p: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def is_tip(p: NDArray[np.float32]) -> NDArray[np.bool_]:
         angle = np.degrees(np.arctan2(p[:, 1] - bend[1], p[:, 0] - bend[0]))
         return (angle < 25) | (angle > 133)
 
+    torus = ring([0.46, -0.42, FLOOR + major + minor], [0.8, -0.6, 0.0], major, minor)
+    banana = arc_tube(bend, [1, 0, 0], [0, 1, 0], 0.34, span, thickness)
     return [
-        Solid(
-            "ring",
-            ring([0.46, -0.42, FLOOR + major + minor], [0.8, -0.6, 0.0], major, minor),
-            uniform_colour("#8f35e8"),
-            0.8,
-        ),
-        Solid(
-            "banana",
-            arc_tube(bend, [1, 0, 0], [0, 1, 0], 0.34, span, thickness),
-            two_tone("#ffd60a", "#5b3a12", tips),
-            0.3,
-        ),
+        Solid("ring", torus, uniform_colour("#8f35e8"), 0.8),
+        Solid("banana", banana, _two_tone("#ffd60a", "#5b3a12", is_tip), 0.3),
         Solid("pyramid", pyramid(0.24, 0.32, [0.66, 0.03, FLOOR], np.radians(15.0)), uniform_colour("#12b5e5"), 0.4),
     ]

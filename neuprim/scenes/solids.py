@@ -1,9 +1,9 @@
-"""The scene ``solids`` as a data set on disk, in the NeRF-synthetic (Blender) layout that any loader of it reads.
+"""The scene ``solids`` on disk, in the NeRF-synthetic (Blender) layout.
 
     transforms_train.json, transforms_test.json    camera_angle_x in radians, camera-to-world matrices with OpenGL axes
     train/r_0.png ..., test/r_0.png ...            RGBA, sRGB, straight alpha, transparent where nothing is hit
 
-The scene, its cameras and its light are fixed: equal settings give equal files whatever the seed.
+Scene, cameras and light are fixed: equal settings give equal files for any seed.
 """
 
 from __future__ import annotations
@@ -34,37 +34,20 @@ from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shading import daylight_radiance, encode_srgb
 from neuprim.scenes.shapes import build_solids
 
-__all__ = [
-    "FIELD_OF_VIEW",
-    "GENERATOR_VERSION",
-    "Radiance",
-    "SolidsSettings",
-    "solids_camera_poses",
-    "generate_solids",
-    "make_image_set",
-    "draw_solids",
-]
-
 Radiance = Callable[[Any, NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float32], NDArray[np.bool_]]]
 """(scene, origins, directions) -> what :func:`~neuprim.scenes.shading.daylight_radiance` returns."""
 
 GENERATOR_VERSION = 1
-"""Part of the cache's key: to be raised with every change to shapes, light, cameras or file layout."""
+"""Part of the cache's key: raise it with every change to shapes, light, cameras or file layout."""
 
-DISTANCE = 4.0
 FIELD_OF_VIEW = math.radians(40.0)
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+_DISTANCE = 4.0
+_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 @dataclass(frozen=True)
 class SolidsSettings:
-    """Settings of ``scene=solids``.
-
-    Attributes:
-        size: width and height of the images in pixels.
-        train_views, test_views: images of each split.
-        supersampling: rays per pixel along each axis.
-    """
+    """Settings of ``scene=solids``: image size in pixels, images of each split, and rays per pixel side."""
 
     size: ImageSize = 200
     train_views: Annotated[int, Range(1, 10000)] = 80
@@ -75,13 +58,12 @@ class SolidsSettings:
         validate_fields(self, "scene")
 
     def key(self) -> str:
-        """Hash all settings and the version of the generator."""
         return hash_settings(self, GENERATOR_VERSION)
 
 
 class _View(NamedTuple):
     name: str
-    eye: NDArray[np.float64]
+    pose: NDArray[np.float64]
 
 
 def generate_solids(
@@ -92,9 +74,8 @@ def generate_solids(
     Raises:
         DataError: the cache directory cannot be written.
     """
-    return make_image_set("solids", settings.key(), settings, lambda: Scene(build_solids())).generate(
-        cache_dir, progress
-    )
+    images = make_image_set("solids", settings.key(), settings, lambda: Scene(build_solids()))
+    return images.generate(cache_dir, progress)
 
 
 def make_image_set(
@@ -106,26 +87,21 @@ def make_image_set(
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {},
 ) -> ImageSet[_View]:
     """Describe images of the scene that ``build`` makes, taken by the cameras of the solids."""
-    counts = {"train": settings.train_views, "test": settings.test_views}
+
+    def views(split: str, count: int) -> list[_View]:
+        return [_View(f"r_{i}", pose) for i, pose in enumerate(solids_camera_poses(split, count))]
 
     def draw(scene: Scene, view: _View, paths: Sequence[Path]) -> None:
-        image = draw_solids(scene, camera_pose(view.eye), settings.size, settings.supersampling, seen)
-        Image.fromarray(image).save(paths[0])
+        Image.fromarray(draw_solids(scene, view.pose, settings.size, settings.supersampling, seen)).save(paths[0])
 
     return ImageSet(
         name=name,
         key=key,
         size=settings.size,
-        splits={
-            split: [_View(f"r_{i}", eye) for i, eye in enumerate(_eyes(split, count))]
-            for split, count in counts.items()
-        },
+        splits={"train": views("train", settings.train_views), "test": views("test", settings.test_views)},
         lens={"camera_angle_x": FIELD_OF_VIEW},
         build=build,
-        frame=lambda split, view: {
-            "file_path": f"./{split}/{view.name}",
-            "transform_matrix": camera_pose(view.eye).tolist(),
-        },
+        frame=lambda split, view: {"file_path": f"./{split}/{view.name}", "transform_matrix": view.pose.tolist()},
         files=lambda view: [f"{view.name}.png"],
         draw=draw,
         facts=facts,
@@ -138,29 +114,21 @@ def solids_camera_poses(split: str, count: int) -> list[NDArray[np.float64]]:
     "train" is a Fibonacci lattice of equal area from 9 degrees below the horizon to 78 above. "test" turns the other
     way, from 3 to 64 degrees, so that its views fall between the training views.
     """
-    return [camera_pose(eye) for eye in _eyes(split, count)]
-
-
-def _eyes(split: str, count: int) -> list[NDArray[np.float64]]:
-    low, high, phase, turn = {"train": (-0.16, 0.98, 0.0, GOLDEN_ANGLE), "test": (0.05, 0.9, 1.0, -GOLDEN_ANGLE)}[split]
-    return [DISTANCE * unit_direction(low + (high - low) * (i + 0.5) / count, phase + i * turn) for i in range(count)]
+    low, high, phase, turn = (-0.16, 0.98, 0.0, _GOLDEN_ANGLE) if split == "train" else (0.05, 0.9, 1.0, -_GOLDEN_ANGLE)
+    cosines = [low + (high - low) * (i + 0.5) / count for i in range(count)]
+    return [camera_pose(_DISTANCE * unit_direction(cosine, phase + i * turn)) for i, cosine in enumerate(cosines)]
 
 
 def draw_solids(
     scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int, seen: Radiance = daylight_radiance
 ) -> NDArray[np.uint8]:
     """(size, size, 4) RGBA, sRGB with straight alpha. Rays are averaged premultiplied and linear, then encoded."""
-    bands_of_rays = ray_bands(pose, FIELD_OF_VIEW, size, supersampling)
-    mean = np.concatenate([average_rays(_rgba(scene, pose, d, seen), size, supersampling) for d in bands_of_rays])
+    bands = []
+    for directions in ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
+        rgb, hit = seen(scene, pose[:3, 3], directions)
+        rgba = np.concatenate([rgb, hit[:, None].astype(np.float32)], axis=1)
+        bands.append(average_rays(rgba, size, supersampling))
+    mean = np.concatenate(bands)
     alpha = mean[..., 3:]
     straight = (mean[..., :3] / np.maximum(alpha, np.float32(1e-6))).astype(np.float32, copy=False)
-    colour = encode_srgb(straight)
-    return np.round(np.concatenate([colour, alpha], axis=-1) * 255).astype(np.uint8)
-
-
-def _rgba(
-    scene: Scene, pose: NDArray[np.float64], directions: NDArray[np.float64], seen: Radiance
-) -> NDArray[np.float32]:
-    """(N, 4) premultiplied linear RGBA of N rays."""
-    rgb, hit = seen(scene, pose[:3, 3], directions)
-    return np.concatenate([rgb, hit[:, None].astype(np.float32)], axis=1)
+    return np.round(np.concatenate([encode_srgb(straight), alpha], axis=-1) * 255).astype(np.uint8)

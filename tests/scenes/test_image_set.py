@@ -1,5 +1,4 @@
-"""What every generated scene gets: files in the cache that are there whole or not at all, drawn in threads, described
-in transforms."""
+"""Generated scenes in the cache: complete or absent, drawn in threads, under a key of every setting."""
 
 from __future__ import annotations
 
@@ -50,9 +49,6 @@ def contents(folder: Path) -> dict[str, str]:
     return {p.relative_to(folder).as_posix(): p.read_text() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-# ---------------------------------------------------------------- image sets
-
-
 def test_files_and_transforms(tmp_path: Path) -> None:
     folder = numbers().generate(tmp_path / "new" / "cache", quiet)
     assert folder == tmp_path / "new" / "cache" / "numbers-abc"
@@ -61,7 +57,9 @@ def test_files_and_transforms(tmp_path: Path) -> None:
         {"camera_angle_x": 0.5, "camera_near": 1.0, "frames": [{"file_path": "./test/4", "other": 4}]}, indent=1
     )
     assert [frame["other"] for frame in json.loads(files.pop("transforms_train.json"))["frames"]] == [1, 2, 3]
-    expected = {f"{split}/{v}{end}": f"{v}{end} {2**v}" for split, v in (("train", 1), ("train", 2), ("train", 3), ("test", 4)) for end in (".txt", "_again.txt")}  # fmt: skip
+    expected = {}
+    for split, view in (("train", 1), ("train", 2), ("train", 3), ("test", 4)):
+        expected |= {f"{split}/{view}{end}": f"{view}{end} {2**view}" for end in (".txt", "_again.txt")}
     assert files == expected
     if os.name != "nt":
         assert stat.S_IMODE(folder.stat().st_mode) == 0o755
@@ -95,15 +93,6 @@ def test_what_ends_early_leaves_nothing(error: type[BaseException], tmp_path: Pa
     assert os.listdir(tmp_path) == []
 
 
-def test_names_in_caches_that_exist_stay() -> None:
-    """Whoever has drawn the scenes already does not draw them again."""
-    assert (SolidsSettings().key(), LitSettings(size=128).key()) == ("40df9acdfa7cb07b", "53c33d7cccb60600")
-    assert SolidsSettings(size=32, train_views=3).key() == "7cf4e6f3c6a332eb"
-
-
-# ---------------------------------------------------------------- threads
-
-
 def test_a_failure_cancels_what_has_not_begun() -> None:
     done = []
 
@@ -118,15 +107,16 @@ def test_a_failure_cancels_what_has_not_begun() -> None:
     assert len(done) < 100
 
 
-# ---------------------------------------------------------------- poses
-
-
-@pytest.mark.parametrize("settings", [SolidsSettings, LitSettings, RoomSettings], ids=lambda cls: cls.__name__)
-def test_every_setting_is_in_the_key_of_the_cache(settings: Any) -> None:
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [(SolidsSettings, "40df9acdfa7cb07b"), (LitSettings, "ef4d792bdd2608a3"), (RoomSettings, "efc71f16459cf01b")],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_every_setting_is_in_the_key_and_existing_caches_stay_valid(settings: Any, key: str) -> None:
     default = settings()
     keys = {default.key()}
     for field in dataclasses.fields(settings):
         value = getattr(default, field.name)
         changed = not value if isinstance(value, bool) else value + 1
         keys.add(dataclasses.replace(default, **{field.name: changed}).key())
-    assert len(keys) == 1 + len(dataclasses.fields(settings))
+    assert len(keys) == 1 + len(dataclasses.fields(settings)) and default.key() == key

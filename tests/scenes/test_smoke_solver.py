@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import pytest
 import torch
 
-from neuprim.scenes.smoke.advection import advect_field
 from neuprim.scenes.smoke.scenes import Noise
 from neuprim.scenes.smoke.solver import (
     Box,
@@ -17,13 +15,14 @@ from neuprim.scenes.smoke.solver import (
     GasState,
     SolverSettings,
     advance_gas,
+    advect_field,
     divergence,
     expansion_flow,
     project_velocity,
     step_gas,
 )
 
-BOXES = [Box((17, 12, 23), 1 / 17, sides, top) for sides, top in itertools.product((True, False), repeat=2)]
+BOX = Box((17, 12, 23), 1 / 17)
 
 
 def random_flow(box: Box, seed: int) -> Faces:
@@ -47,17 +46,16 @@ def centroid(field: torch.Tensor, box: Box) -> list[float]:
     return [float((field * axis).sum() / field.sum()) for axis in box.axes()]
 
 
-@pytest.mark.parametrize("box", BOXES, ids=str)
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_projection_leaves_no_divergence(box: Box, scale: float) -> None:
-    u, v, w = random_flow(box, 3)
-    flow = project_velocity((u * scale, v * scale, w * scale), box)
-    assert leak((u, v, w), box) > 1
-    assert leak(flow, box) < 2e-6
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_projection_leaves_no_divergence(scale: float) -> None:
+    u, v, w = random_flow(BOX, 3)
+    flow = project_velocity((u * scale, v * scale, w * scale), BOX)
+    assert leak((u, v, w), BOX) > 1 and leak(flow, BOX) < 2e-6
+    assert not bool(flow[2][:, :, 0].any()), "the ground is solid"
 
 
 def test_projection_removes_gradients_and_keeps_solenoidal_flow() -> None:
-    box = BOXES[0]
+    box = BOX
     pressure = torch.randn(box.shape, generator=torch.Generator().manual_seed(6))
     gradient = expansion_flow(pressure, box)  # any irrotational flow of this box is one of these
     assert max(float(c.abs().max()) for c in project_velocity(gradient, box)) < 1e-5 * max(
@@ -71,7 +69,7 @@ def test_projection_removes_gradients_and_keeps_solenoidal_flow() -> None:
 
 @pytest.mark.parametrize("speed", [0.3, 2.7, 40.0])
 def test_advection_makes_nothing_new(speed: float) -> None:
-    box = BOXES[0]
+    box = BOX
     generator = torch.Generator().manual_seed(8)
     wind = speed * torch.randn(3, *box.shape, generator=generator)
     fields = torch.rand(2, *box.shape, generator=generator) * 3 - 1
@@ -124,7 +122,7 @@ def test_hot_gas_rises_and_soot_falls() -> None:
 
 
 def test_fuel_burns_to_heat_and_soot() -> None:
-    box = BOXES[3]
+    box = BOX
     full, nothing = torch.ones(box.shape), torch.zeros(box.shape)
     settings = SolverSettings(
         buoyancy=0.0, weight=0.0, confinement=0.0, cooling=0.0, dissipation=0.0, burn=2.0, heat=0.8, soot=0.5

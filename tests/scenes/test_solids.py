@@ -1,4 +1,4 @@
-"""The built-in scene: its geometry, what rays meet, and the data set it becomes."""
+"""The built-in solids: their geometry, what rays meet, and the data set."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 from neuprim.core.cameras import Camera
@@ -16,16 +17,9 @@ from neuprim.core.task import SceneContext
 from neuprim.scenes import solids as generator
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shading import DAYLIGHT, daylight_radiance
-from neuprim.scenes.shapes import (
-    Solid,
-    ball,
-    build_solids,
-    chamfered_box,
-    parse_srgb,
-    uniform_colour,
-)
+from neuprim.scenes.shapes import Solid, ball, build_solids, chamfered_box, parse_srgb, uniform_colour
 from neuprim.scenes.solids import SolidsSettings, generate_solids
-from neuprim.tasks.static.generated import load_solids as load
+from neuprim.tasks.static.generated import load_solids
 
 SMALL = {"size": 32, "train_views": 3, "test_views": 2, "supersampling": 2}
 
@@ -33,11 +27,6 @@ SMALL = {"size": 32, "train_views": 3, "test_views": 2, "supersampling": 2}
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     return Scene(build_solids())
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
 
 
 @pytest.fixture(autouse=True)
@@ -48,8 +37,10 @@ def one_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+def surface_points(scene: Scene, count: int) -> np.ndarray:
+    """(count, 3) points spread evenly over all surfaces."""
+    whole = trimesh.util.concatenate([solid.mesh for solid in scene.solids])
+    return trimesh.sample.sample_surface(whole, count, seed=0)[0].astype(np.float32)
 
 
 def project(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -60,23 +51,13 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     return (image[:, :2] / image[:, 2:]).numpy()
 
 
-# Geometry
-# ------------------------------------------------------------------------------------------------------------------------------
-
-
-def test_solids_are_closed_outward_and_in_the_box() -> None:
-    solids = build_solids()
-    assert len({s.name for s in solids}) == len(solids)
-    for solid in solids:
-        assert solid.mesh.is_watertight and solid.mesh.volume > 0, solid.name
+def test_solids_are_closed_outward_and_in_the_box(scene: Scene) -> None:
+    assert len({s.name for s in scene.solids}) == len(scene.solids)
+    for solid in scene.solids:
+        assert solid.mesh.is_watertight and solid.mesh.volume > 0 and 0 <= solid.gloss <= 1, solid.name
         assert np.abs(solid.mesh.vertices).max() <= 1.0, solid.name
-        assert 0.0 <= solid.gloss <= 1.0
         albedo = solid.albedo(solid.mesh.vertices.view(np.ndarray).astype(np.float32))
         assert albedo.shape == solid.mesh.vertices.shape and 0.0 <= albedo.min() and albedo.max() <= 1.0, solid.name
-
-
-# Rays
-# ----------------------------------------------------------------------------------------------------------------------------------
 
 
 def test_rays_meet_a_ball_where_the_equation_says() -> None:
@@ -97,13 +78,12 @@ def test_both_engines_agree(scene: Scene) -> None:
         pytest.skip("embreex is not installed: there is nothing to compare with")
     solids = [s for s in scene.solids if s.name in ("plate", "body", "grip", "chuck", "wire cube", "banana")]
     scene, other = Scene(solids, "embree"), Scene(solids, "numba")
-    targets = scene.surface_points(4000, torch.Generator().manual_seed(1))
+    targets = surface_points(scene, 4000)
     origins = np.tile(np.array([[2.5, -2.0, 1.5]], np.float32), (4000, 1))
     # Half of them from within the scene, where rays pass many boxes, but not from the surface itself.
     origins[::2] = targets[1::2] + np.array([0.012, 0.017, 0.023], np.float32)
     a, b = scene.intersect(origins, targets - origins), other.intersect(origins, targets - origins)
-    same = a.hit == b.hit
-    assert same.mean() > 0.998  # rays to points on silhouettes may go either way
+    assert (a.hit == b.hit).mean() > 0.998  # rays to points on silhouettes may go either way
     both_a, both_b = b.hit[a.hit], a.hit[b.hit]
     close = np.abs(a.distance[both_a] - b.distance[both_b]) < 1e-3
     assert close.mean() > 0.998
@@ -112,48 +92,35 @@ def test_both_engines_agree(scene: Scene) -> None:
     assert (shadows[0] == shadows[1]).mean() > 0.998
 
 
-# Light
-# ---------------------------------------------------------------------------------------------------------------------------------
-
-
 def test_shadow_takes_the_sun_away() -> None:
     floor = Solid("floor", chamfered_box([2, 2, 0.1], [0, 0, -0.05], 0.01), uniform_colour("#808080"), 0.0)
-    lamp = np.array(DAYLIGHT.direction) / np.linalg.norm(DAYLIGHT.direction)
-    blocker = Solid("blocker", ball(lamp * 0.8, 0.2), uniform_colour("#ffffff"), 0.0)
+    sun = np.array(DAYLIGHT.direction) / np.linalg.norm(DAYLIGHT.direction)
+    blocker = Solid("blocker", ball(sun * 0.8, 0.2), uniform_colour("#ffffff"), 0.0)
     origins, down = np.array([[0.0, 0, 0.3], [-0.8, 0.8, 0.3]]), np.tile([[0.0, 0, -1]], (2, 1))
     rgb, hit = daylight_radiance(Scene([floor, blocker]), origins, down)
     assert hit.all()
-    grey = parse_srgb("#808080")
-    np.testing.assert_allclose(rgb[0], grey * DAYLIGHT.sky, rtol=1e-5)
-    np.testing.assert_allclose(
-        rgb[1], grey * (np.array(DAYLIGHT.sky) + np.array(DAYLIGHT.sun) * lamp[2] / np.pi), rtol=1e-5
-    )
+    grey, sky = parse_srgb("#808080"), np.array(DAYLIGHT.sky)
+    np.testing.assert_allclose(rgb[0], grey * sky, rtol=1e-5)
+    np.testing.assert_allclose(rgb[1], grey * (sky + np.array(DAYLIGHT.sun) * sun[2] / np.pi), rtol=1e-5)
 
 
-# The data set
-# --------------------------------------------------------------------------------------------------------------------------
-
-
-def test_layout_and_alpha(cache: Path) -> None:
-    folder = generate_solids(SolidsSettings(**SMALL), cache)
+def test_layout_and_alpha(tmp_path: Path) -> None:
+    folder = generate_solids(SolidsSettings(**SMALL), tmp_path)
     for split, count in (("train", 3), ("test", 2)):
         layout = json.loads((folder / f"transforms_{split}.json").read_text())
         assert layout["camera_angle_x"] == pytest.approx(np.radians(40)) and len(layout["frames"]) == count
         for frame in layout["frames"]:
             image = np.asarray(Image.open(folder / f"{frame['file_path']}.png"))
-            assert image.shape == (32, 32, 4)
             alpha = image[..., 3] / 255
-            assert 0.1 < alpha.mean() < 0.6
+            assert image.shape == (32, 32, 4) and 0.1 < alpha.mean() < 0.6
             assert (alpha == 1).mean() > 0.05 and ((alpha > 0) & (alpha < 1)).any()
-            assert not alpha[[0, -1]].any() and not alpha[:, [0, -1]].any()
-            assert not image[alpha == 0].any()
+            assert not alpha[[0, -1]].any() and not alpha[:, [0, -1]].any() and not image[alpha == 0].any()
             assert 40 < image[alpha == 1][:, :3].mean() < 200 and image[alpha == 1][:, :3].std() > 30
 
 
-def test_silhouette_lies_where_the_loaders_cameras_project_it(scene: Scene, cache: Path) -> None:
-    dataset = load({**SMALL, "size": 96}, SceneContext(seed=0, cache_dir=cache))
-    vertices = np.concatenate([s.mesh.vertices for s in scene.solids])
-    points = scene.surface_points(4000, torch.Generator().manual_seed(0))
+def test_silhouette_lies_where_the_loaders_cameras_project_it(scene: Scene, tmp_path: Path) -> None:
+    dataset = load_solids({**SMALL, "size": 96}, SceneContext(seed=0, cache_dir=tmp_path))
+    vertices, points = np.concatenate([s.mesh.vertices for s in scene.solids]), surface_points(scene, 4000)
     for views in (dataset.train, dataset.test):
         for index in range(len(views)):
             camera, alpha = views.view(index).camera, views.pixels(index).alpha
@@ -164,7 +131,3 @@ def test_silhouette_lies_where_the_loaders_cameras_project_it(scene: Scene, cach
             np.testing.assert_allclose(found, [*corners.min(0), *corners.max(0)], atol=1.5)
             x, y = np.floor(project(camera, points)).astype(int).T
             assert (alpha.numpy()[y, x] > 0).mean() > 0.99
-
-
-# The cache
-# -----------------------------------------------------------------------------------------------------------------------------

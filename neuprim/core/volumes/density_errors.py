@@ -19,8 +19,6 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.grid import density_grid
 
-__all__ = ["NUMBERS", "Comparison", "DensityTruth", "TruthFrame", "measure_frame_errors", "split_planes"]
-
 NUMBERS = ("correlation", "relative_l2", "psnr_active", "max_error")
 """What :func:`measure_frame_errors` gives."""
 

@@ -23,8 +23,6 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions, Cosine
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["POINTS_LIMIT", "agreement", "density_at", "density_grid", "lattice", "voxels_within"]
-
 _SLAB = 8  # planes per unit of work; fixed, and the result does not depend on it
 _PAIRS = 1 << 17  # of points and primitives that a density in torch code is asked for at once
 

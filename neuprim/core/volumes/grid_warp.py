@@ -21,8 +21,6 @@ from torch import Tensor
 from neuprim.core.compute import device
 from neuprim.core.compute.warp import OPTIONS, array, launch, wp
 
-__all__ = ["filled"]
-
 d, f = wp.float64, wp.float32
 
 _TILE = (4, 8, 8)

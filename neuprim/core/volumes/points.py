@@ -28,8 +28,6 @@ from neuprim.core.volumes.points_cpu import add_values, count_pairs, fill_pairs,
 from neuprim.core.volumes.points_prepare import merge_parts, prepare_axes, prepare_values, pull_parameters, sort_points
 from neuprim.core.volumes.points_torch import cosine_values, numbers_finite, pairs_on, summed
 
-__all__ = ["PointValues", "Shares", "cells_of", "pairs_of", "values_at"]
-
 _SUMS = 8
 """Parts of the primitives whose sums are kept apart, so that the result does not depend on the number of threads."""
 

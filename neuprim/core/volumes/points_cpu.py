@@ -7,8 +7,6 @@ import numpy as np
 
 from neuprim.core.compute.kernels import inline, kernel
 
-__all__ = ["add_values", "count_pairs", "fill_pairs", "pull_values"]
-
 
 @inline
 def _first(center, reach, low, step, count):  # type: ignore[no-untyped-def]

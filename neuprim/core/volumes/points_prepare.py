@@ -8,8 +8,6 @@ import numpy as np
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.model.rotation import rotation, rotation_backward
 
-__all__ = ["merge_parts", "prepare_axes", "prepare_values", "pull_parameters", "sort_points"]
-
 
 @exact_kernel
 def prepare_axes(start, stop, means, log_scales, quats, centers, A, m, reach):  # type: ignore[no-untyped-def]

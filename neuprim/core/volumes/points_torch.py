@@ -13,9 +13,6 @@ from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.forms import Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 
-__all__ = ["cosine_values", "numbers_finite", "pairs_on", "summed"]
-
-
 Grid = tuple[np.ndarray, np.ndarray, float, np.ndarray]
 
 

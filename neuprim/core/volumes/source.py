@@ -13,8 +13,6 @@ import numpy as np
 from neuprim.core.errors import DataError
 from neuprim.core.volumes.density_errors import DensityTruth
 
-__all__ = ["Extent", "Placement", "VolumeSource"]
-
 
 class Extent(NamedTuple):
     """What the absorbing grid of a frame holds: its largest value, and the (2, 3) box around its active voxels, world

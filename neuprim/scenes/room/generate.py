@@ -1,49 +1,48 @@
-"""What a reconstruction from the photographs would know of the surfaces: points where there is something to recognise,
-a few of them wrong."""
+"""The scene ``room`` on disk: photographs through a lens, from a walk around the solids, and reconstructed points.
+
+transforms.json, images/...    the layout of nerfstudio, with OpenCV's distortion and a split
+points.ply                     what a reconstruction would know: points where there is detail, a few of them wrong
+exposures.json                 the factor that each image is multiplied by
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data.distortion import Radial
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import write_json
 from neuprim.core.io.ply import write_ply
 from neuprim.core.validation import Range, validate_fields
 from neuprim.scenes.image_set import (
+    RAYS_AT_ONCE,
     ImageSize,
     Progress,
     Supersampling,
     average_rays,
     draw_in_parallel,
+    drawing_text,
     hash_settings,
     write_cached_folder,
 )
-from neuprim.scenes.room.cameras import LENS, Lens, lens_ray_bands, room_camera_poses
 from neuprim.scenes.room.interior import Room, furnish_room, lamplight_radiance
 from neuprim.scenes.shading import encode_srgb
 from neuprim.scenes.shapes import build_solids
 
-__all__ = [
-    "ReconstructedPoints",
-    "GENERATOR_VERSION",
-    "NOISE",
-    "OUTLIERS",
-    "RoomSettings",
-    "reconstruct_points",
-    "exposure_gains",
-    "generate_room",
-    "room_lens",
-    "photograph_room",
-    "build_room",
-]
+GENERATOR_VERSION = 1
+"""Part of the cache's key: raise it with every change to the room, its light, cameras or file layout."""
+
+LENS = Radial(k1=-0.08, k2=0.02, p1=0.001, p2=-0.0005)
 
 NOISE = 0.005
 """Root of the mean squared displacement of a point, over its distance to the camera that found it."""
@@ -54,152 +53,21 @@ OUTLIERS = 0.02
 _PLAIN = 0.03
 """Chance of a pixel without detail to become a point, over that of one with the mean detail."""
 
-_SEED = 20250313
-_ROUNDS = 40
-
-
-@dataclass(frozen=True)
-class ReconstructedPoints:
-    """N points.
-
-    Attributes:
-        surface: (N, 3) float64 where they really are.
-        position: (N, 3) float64 where they are said to be.
-        rgb: (N, 3) uint8 sRGB of the surface as its camera sees it, without the photograph's own exposure.
-        camera: (N,) index of the training camera that found them.
-        outlier: (N,) bool, see :data:`OUTLIERS`.
-    """
-
-    surface: NDArray[np.float64]
-    position: NDArray[np.float64]
-    rgb: NDArray[np.uint8]
-    camera: NDArray[np.intp]
-    outlier: NDArray[np.bool_]
-
-
-def reconstruct_points(
-    room: Room,
-    lens: Lens,
-    poses: Sequence[NDArray[np.float64]],
-    luma: Callable[[int], NDArray[np.float32]],
-    count: int,
-) -> ReconstructedPoints:
-    """``count`` points, each seen by the camera that found it and at least one other.
-
-    Args:
-        poses: (4, 4) camera to world, OpenGL axes, of the training cameras.
-        luma: camera -> (H, W) brightness of its photograph, in which detail is looked for.
-
-    Raises:
-        ConfigError: the cameras have too little in view together.
-    """
-    chances = [_chances(luma(i)) for i in range(len(poses))]
-    batches: list[tuple[NDArray, NDArray]] = []
-    have = 0
-    for attempt in range(_ROUNDS):
-        random = np.random.default_rng([_SEED, attempt])
-        each = -(-count // len(poses))
-        for camera, pose in enumerate(poses):
-            pixels = _drawn(chances[camera], lens.width, random.random((each, 3)))
-            directions = lens.rays(pose, pixels)
-            kept = directions[_seen_by_another(room, lens, poses, camera, directions)]
-            batches.append((kept, np.full(len(kept), camera)))
-            have += len(kept)
-        if have >= count:
-            break
-    else:
-        raise ConfigError(
-            f"scene.points={count}: only {have} points found that two of {len(poses)} training views see; "
-            "expected more views"
-        )
-    directions = np.concatenate([found for found, _ in batches])
-    finder = np.concatenate([by for _, by in batches])
-    random = np.random.default_rng([_SEED, _ROUNDS])
-    chosen = np.sort(random.permutation(have)[:count])
-    return _measured(
-        room, np.stack([p[:3, 3] for p in poses])[finder[chosen]], directions[chosen], finder[chosen], random
-    )
-
-
-def _chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(H * W,) running sum, up to 1, of the chance of every pixel: as much as brightness changes there."""
-    down, across = np.gradient(luma.astype(np.float64))
-    detail = np.hypot(down, across)
-    chance = (detail + _PLAIN * max(detail.mean(), 1e-6)).ravel()
-    total = np.cumsum(chance)
-    return total / total[-1]
-
-
-def _drawn(chances: NDArray[np.float64], width: int, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(M, 2) positions in the photograph, anywhere in the pixels that ``numbers`` (M, 3) of 0..1 draw."""
-    index = np.minimum(np.searchsorted(chances, numbers[:, 0], side="right"), len(chances) - 1)
-    return np.stack([index % width + numbers[:, 1], index // width + numbers[:, 2]], axis=1)
-
-
-def _seen_by_another(
-    room: Room,
-    lens: Lens,
-    poses: Sequence[NDArray[np.float64]],
-    camera: int,
-    directions: NDArray[np.float64],
-) -> NDArray[np.bool_]:
-    """(M,) whether what ``camera`` sees in these directions (M, 3) lies open to one of the other cameras, within its
-    picture."""
-    hits = room.intersect(poses[camera][:3, 3], directions)
-    starts = hits.lifted()
-    seen = np.zeros(len(starts), dtype=np.bool_)
-    for other, pose in enumerate(poses):
-        open_ = np.flatnonzero(~seen)  # those that nobody has seen yet
-        if other == camera or not len(open_):
-            continue
-        local = (hits.position[open_] - pose[:3, 3]) @ pose[:3, :3]
-        before = local[:, 2] < -1e-3
-        open_, local = open_[before], local[before]
-        x, y = lens.pixels(np.stack([local[:, 0], -local[:, 1]], axis=1) / -local[:, 2:]).T
-        open_ = open_[(x >= 0) & (x <= lens.width) & (y >= 0) & (y <= lens.height)]
-        to_eye = pose[:3, 3] - starts[open_]
-        seen[open_] = ~room.occluded(starts[open_], to_eye, 1.0)
-    visible = np.zeros(len(directions), dtype=np.bool_)
-    visible[hits.hit] = seen
-    return visible
-
-
-def _measured(
-    room: Room,
-    origins: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    camera: NDArray[np.intp],
-    random: np.random.Generator,
-) -> ReconstructedPoints:
-    """The points that these rays (N, 3) meet, with the errors of a measurement."""
-    hits = room.intersect(origins, directions)
-    colours = encode_srgb(lamplight_radiance(room, origins, directions))
-    surface, depth = hits.position.astype(np.float64), hits.distance.astype(np.float64)[:, None]
-    position = surface + depth * NOISE / np.sqrt(3) * random.standard_normal(surface.shape)
-    count = len(surface)
-    outlier = np.zeros(count, dtype=np.bool_)
-    outlier[random.permutation(count)[: round(OUTLIERS * count)]] = True
-    nearer = random.uniform(0.25, 0.9, (count, 1))
-    position = np.where(outlier[:, None], origins + nearer * depth * directions, position)
-    return ReconstructedPoints(surface, position, np.round(colours * 255).astype(np.uint8), camera, outlier)
-
-
-GENERATOR_VERSION = 1
-"""Part of the cache's key: to be raised with every change to the room, its light, cameras or file layout."""
-
-_EXPOSURE_SEED = 20250314
+_ROUNDS = 40  # of drawing points
+_WALKS_SEEDS = {"train": 20250311, "test": 20250312}
+_POINTS_SEED, _EXPOSURE_SEED = 20250313, 20250314
 _LUMA = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+
 _Shot = tuple[str, NDArray[np.float64], float]
 """Name of the image's file, pose, gain."""
 
 
 @dataclass(frozen=True)
 class RoomSettings:
-    """What the user may set for ``scene=room``.
+    """Settings of ``scene=room``.
 
     Attributes:
         size: width of the images in pixels; the height is three quarters of it.
-        train_views, test_views: images of each split.
         supersampling: rays per pixel along each axis.
         exposure: stops by which training images are brighter or darker at most.
         points: how many points a reconstruction has found.
@@ -218,31 +86,24 @@ class RoomSettings:
         validate_fields(self, "scene")
 
     def key(self) -> str:
-        """A short hash of every setting and the generator's version."""
         return hash_settings(self, GENERATOR_VERSION)
 
 
 def generate_room(settings: RoomSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:
-    """Write the data set unless a complete one is there; returns its folder ``cache_dir/room-KEY``.
+    """Write the data set unless it is complete; return its folder ``cache_dir/room-KEY``.
 
     Raises:
         ConfigError: too few views for the points.
         DataError: the cache directory cannot be written.
     """
-    shots = _shots(settings)
+    poses = room_camera_poses(settings.train_views, settings.test_views)
+    gains = exposure_gains(settings.train_views, settings.exposure).tolist()
+    shots = [(f"train_{i:04d}.png", pose, gains[i]) for i, pose in enumerate(poses["train"])]
+    shots += [(f"test_{i:04d}.png", pose, 1.0) for i, pose in enumerate(poses["test"])]
     files = ["transforms.json", "points.ply", "exposures.json", *(f"images/{name}" for name, _, _ in shots)]
+    folder = Path(cache_dir) / f"room-{settings.key()}"
     what = "scene room: cannot write the generated images"
-    return write_cached_folder(
-        Path(cache_dir) / f"room-{settings.key()}",
-        files,
-        lambda folder: _write(folder, settings, shots, progress),
-        what,
-    )
-
-
-def room_lens(settings: RoomSettings) -> Lens:
-    """The lens that the images are taken with."""
-    return Lens(settings.size, LENS if settings.distortion else Radial())
+    return write_cached_folder(folder, files, lambda folder: _write(folder, settings, shots, progress), what)
 
 
 def build_room(settings: RoomSettings) -> Room:
@@ -251,49 +112,21 @@ def build_room(settings: RoomSettings) -> Room:
 
 
 def exposure_gains(count: int, stops: float) -> NDArray[np.float64]:
-    """(count,) what training images are multiplied by, their logarithms even between minus and plus ``stops`` to the
-    base of 2."""
+    """(count,) factors of training images, whose binary logarithms are even between minus and plus ``stops``."""
     return 2.0 ** (stops * (2 * np.random.default_rng(_EXPOSURE_SEED).random(count) - 1))
-
-
-def photograph_room(
-    scene: Room, seen: Lens, pose: NDArray[np.float64], supersampling: int, gain: float = 1.0
-) -> NDArray[np.uint8]:
-    """(H, W, 3) sRGB, of linear light that is averaged over the rays of each pixel and multiplied by ``gain``."""
-    parts = [
-        average_rays(lamplight_radiance(scene, pose[:3, 3], d), seen.width, supersampling)
-        for d in lens_ray_bands(seen, pose, supersampling)
-    ]
-    return np.round(encode_srgb(np.concatenate(parts) * np.float32(gain)) * 255).astype(np.uint8)
-
-
-def _shots(settings: RoomSettings) -> list[_Shot]:
-    """All images, those to train on first."""
-    poses = room_camera_poses(settings.train_views, settings.test_views)
-    factor = {
-        "train": exposure_gains(settings.train_views, settings.exposure).tolist(),
-        "test": [1.0] * settings.test_views,
-    }
-    return [
-        (f"{split}_{i:04d}.png", pose, factor[split][i])
-        for split in ("train", "test")
-        for i, pose in enumerate(poses[split])
-    ]
 
 
 def _write(folder: Path, settings: RoomSettings, shots: list[_Shot], progress: Progress) -> None:
     progress("room: building the scene", 0.0)
-    scene, seen = build_room(settings), room_lens(settings)
-    text = f"room: drawing {seen.width}x{seen.height} images"
-    if scene.engine != "embree":
-        text += " (without embreex, which would be faster)"
+    room, lens = build_room(settings), room_lens(settings)
     images = folder / "images"
     images.mkdir()
 
     def draw(shot: _Shot) -> None:
         name, pose, gain = shot
-        Image.fromarray(photograph_room(scene, seen, pose, settings.supersampling, gain)).save(images / name)
+        Image.fromarray(photograph_room(room, lens, pose, settings.supersampling, gain)).save(images / name)
 
+    text = drawing_text("room", room, lens.width, lens.height)
     draw_in_parallel(draw, shots, lambda fraction: progress(text, fraction))
 
     def luma(index: int) -> NDArray[np.float32]:
@@ -302,14 +135,19 @@ def _write(folder: Path, settings: RoomSettings, shots: list[_Shot], progress: P
         return bright / np.float32(255)
 
     poses = [pose for _, pose, _ in shots[: settings.train_views]]
-    _write_points(folder / "points.ply", reconstruct_points(scene, seen, poses, luma, settings.points))
+    points = reconstruct_points(room, lens, poses, luma, settings.points)
+    rows = np.empty(
+        len(points.position), [*((n, "<f4") for n in "xyz"), *((n, "u1") for n in ("red", "green", "blue"))]
+    )
+    for i, (axis, channel) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
+        rows[axis], rows[channel] = points.position[:, i], points.rgb[:, i]
+    write_ply(folder / "points.ply", rows)
     write_json(folder / "exposures.json", {f"images/{name}": gain for name, _, gain in shots})
-    write_json(folder / "transforms.json", _layout(seen, shots))
+    write_json(folder / "transforms.json", _transforms(lens, shots))
 
 
-def _layout(seen: Lens, shots: list[_Shot]) -> dict[str, Any]:
-    camera = seen.camera
-    names = [f"images/{name}" for name, _, _ in shots]
+def _transforms(lens: Lens, shots: list[_Shot]) -> dict[str, Any]:
+    camera, names = lens.camera, [f"images/{name}" for name, _, _ in shots]
     return {
         "camera_model": "OPENCV",
         "fl_x": camera.fx,
@@ -318,23 +156,221 @@ def _layout(seen: Lens, shots: list[_Shot]) -> dict[str, Any]:
         "cy": camera.cy,
         "w": camera.width,
         "h": camera.height,
-        **{key: value for key, value in asdict(seen.distortion).items() if value},
+        **{key: value for key, value in asdict(lens.distortion).items() if value},
         "ply_file_path": "points.ply",
         "train_filenames": [name for name in names if "/train_" in name],
         "test_filenames": [name for name in names if "/test_" in name],
-        "frames": [
-            {"file_path": name, "transform_matrix": pose.tolist()}
-            for name, (_, pose, _) in zip(names, shots, strict=True)
-        ],
+        "frames": [{"file_path": f"images/{name}", "transform_matrix": pose.tolist()} for name, pose, _ in shots],
     }
 
 
-def _write_points(path: Path, points: ReconstructedPoints) -> None:
-    rows = np.empty(
-        len(points.position), dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
-    )
-    for axis, name in enumerate("xyz"):
-        rows[name] = points.position[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        rows[name] = points.rgb[:, channel]
-    write_ply(path, rows)
+# ---------------------------------------------------------------- the lens
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of images ``width`` pixels wide; the height is three quarters of it.
+
+    ``distortion`` is OpenCV's model; all zeros is a pinhole.
+    """
+
+    width: int
+    distortion: Radial = LENS
+
+    @property
+    def height(self) -> int:
+        return round(0.75 * self.width)
+
+    @property
+    def focal(self) -> float:
+        """In pixels, along both axes: 75 degrees of view across."""
+        return 0.65 * self.width
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole of the undistorted image, in its own frame; the principal point is a little off the middle."""
+        centre = 0.504 * self.width, 0.495 * self.height
+        return Camera(torch.eye(4, dtype=torch.float64), self.focal, self.focal, *centre, self.width, self.height)
+
+    def pixels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(M, 2) photographed pixels of (M, 2) undistorted directions (x/z, y/z), OpenCV axes; centres at +0.5."""
+        return self.distortion.project(points, self.camera)
+
+    def rays(self, pose: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(M, 3) unit directions in the scene of (M, 2) photographed pixels; ``pose`` is camera to world, OpenGL axes."""
+        x, y = self._undistort(pixels).T
+        local = np.stack([x, -y, -np.ones_like(x)], axis=1)
+        local /= np.sqrt(np.einsum("nc,nc->n", local, local))[:, None]
+        return local @ pose[:3, :3].T
+
+    def _undistort(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The inverse of :meth:`pixels`, by fixed-point iteration: the lens moves nothing far."""
+        middle = [self.camera.cx, self.camera.cy]
+        bent = (pixels - middle) / self.focal
+        points = bent.copy()
+        for _ in range(60):
+            excess = (self.pixels(points) - middle) / self.focal - bent
+            points -= excess
+            if np.abs(excess).max(initial=0.0) < 1e-13:
+                break
+        return points
+
+    def ray_bands(self, pose: NDArray[np.float64], samples: int) -> Iterator[NDArray[np.float64]]:
+        """(N, 3) unit directions in the scene, whole rows of pixels at a time, ``samples`` rays per pixel side."""
+        across = (np.arange(self.width * samples) + 0.5) / samples
+        down = (np.arange(self.height * samples) + 0.5) / samples
+        rows = max(1, RAYS_AT_ONCE // (len(across) * samples)) * samples
+        for top in range(0, len(down), rows):
+            x, y = np.meshgrid(across, down[top : top + rows])
+            yield self.rays(pose, np.stack([x, y], axis=-1).reshape(-1, 2))
+
+
+def room_lens(settings: RoomSettings) -> Lens:
+    """The lens that the images are taken with."""
+    return Lens(settings.size, LENS if settings.distortion else Radial())
+
+
+def photograph_room(
+    room: Room, lens: Lens, pose: NDArray[np.float64], supersampling: int, gain: float = 1.0
+) -> NDArray[np.uint8]:
+    """(H, W, 3) sRGB, of linear light that is averaged over the rays of each pixel and multiplied by ``gain``."""
+    bands = (lamplight_radiance(room, pose[:3, 3], d) for d in lens.ray_bands(pose, supersampling))
+    mean = np.concatenate([average_rays(band, lens.width, supersampling) for band in bands])
+    return np.round(encode_srgb(mean * np.float32(gain)) * 255).astype(np.uint8)
+
+
+# ---------------------------------------------------------------- the walk
+
+
+def camera_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
+    """Where on the walk, 0 to 1, the photographs of each split are taken: (train,) and (test,).
+
+    The test ones divide the walk evenly, whatever the training ones are; these fill the gaps, evenly in each.
+    """
+    held_out = (np.arange(test) + 0.5) / test
+    gap = np.arange(train) * test // train
+    first = np.searchsorted(gap, gap)
+    within = (np.arange(train) - first + 1) / (np.bincount(gap, minlength=test)[gap] + 1)
+    return {"train": (gap - 0.5 + within) / test, "test": held_out}
+
+
+def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float64]]]:
+    """Camera-to-world matrices (4, 4), OpenGL axes, of both splits; the test ones depend on their own number alone."""
+    poses = {}
+    for split, times in camera_positions(train, test).items():
+        shake = 2 * np.random.default_rng(_WALKS_SEEDS[split]).random((len(times), 7)) - 1
+        poses[split] = [_pose(float(t), s) for t, s in zip(times, shake, strict=True)]
+    return poses
+
+
+def _pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) at ``t`` of the walk, two rounds; ``shake`` (7,) of -1..1 moves the hand, the aim and the horizon.
+
+    The subject's middle, the origin, is 2.6 to 4.5 units away and 0.3 to 2 units below.
+    """
+    turn = 2 * math.pi
+    distance = 3.55 + 0.8 * math.sin(turn * (5 * t + 0.15)) + 0.12 * shake[0]
+    height = 1.1 - 0.6 * math.cos(turn * t) + 0.1 * math.sin(turn * 7 * t) + 0.06 * shake[1]
+    azimuth = turn * 2 * t + 0.06 * shake[2]
+    across = math.sqrt(distance**2 - height**2)
+    eye = np.array([across * math.cos(azimuth), across * math.sin(azimuth), height])
+    aim = 0.14 * shake[3:6] + [0, 0, -0.05]
+    roll = math.radians(2.5) * shake[6]
+    sideways = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+    up = math.cos(roll) * np.array([0, 0, 1.0]) + math.sin(roll) * sideways
+    view = look_at(*(torch.from_numpy(np.asarray(v, dtype=np.float64)) for v in (eye, aim, up)))
+    return torch.linalg.inv(view).numpy() @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+# ---------------------------------------------------------------- reconstructed points
+
+
+class ReconstructedPoints(NamedTuple):
+    """N points.
+
+    Attributes:
+        surface, position: (N, 3) float64 where they really are, and where they are said to be.
+        rgb: (N, 3) uint8 sRGB of the surface as its camera sees it, without the photograph's own exposure.
+        camera: (N,) index of the training camera that found them.
+    """
+
+    surface: NDArray[np.float64]
+    position: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    camera: NDArray[np.intp]
+
+
+def reconstruct_points(
+    room: Room, lens: Lens, poses: Sequence[NDArray[np.float64]], luma: Callable[[int], NDArray[np.float32]], count: int
+) -> ReconstructedPoints:
+    """``count`` points, each seen by the camera that found it and at least one other.
+
+    Args:
+        poses: (4, 4) camera to world, OpenGL axes, of the training cameras.
+        luma: camera -> (H, W) brightness of its photograph, in which detail is looked for.
+
+    Raises:
+        ConfigError: the cameras have too little in view together.
+    """
+    chances = [_detail_chances(luma(i)) for i in range(len(poses))]
+    directions, finders = np.zeros((0, 3)), np.zeros(0, np.intp)
+    each = -(-count // len(poses))
+    for attempt in range(_ROUNDS):
+        random = np.random.default_rng([_POINTS_SEED, attempt])
+        for camera, pose in enumerate(poses):
+            numbers = random.random((each, 3))
+            index = np.searchsorted(chances[camera], numbers[:, 0], side="right").clip(max=len(chances[camera]) - 1)
+            pixels = np.stack([index % lens.width + numbers[:, 1], index // lens.width + numbers[:, 2]], axis=1)
+            rays = lens.rays(pose, pixels)
+            rays = rays[_seen_by_another(room, lens, poses, camera, rays)]
+            directions = np.concatenate([directions, rays])
+            finders = np.concatenate([finders, np.full(len(rays), camera)])
+        if len(directions) >= count:
+            break
+    else:
+        raise ConfigError(
+            f"scene.points={count}: only {len(directions)} points found that two of {len(poses)} training views see; "
+            "expected more views"
+        )
+    random = np.random.default_rng([_POINTS_SEED, _ROUNDS])
+    chosen = np.sort(random.permutation(len(directions))[:count])
+    directions, finders = directions[chosen], finders[chosen]
+    origins = np.stack([p[:3, 3] for p in poses])[finders]
+    hits = room.intersect(origins, directions)
+    colours = encode_srgb(lamplight_radiance(room, origins, directions))
+    surface, depth = hits.position.astype(np.float64), hits.distance.astype(np.float64)[:, None]
+    position = surface + depth * NOISE / np.sqrt(3) * random.standard_normal(surface.shape)
+    wrong = np.zeros((count, 1), dtype=np.bool_)
+    wrong[random.permutation(count)[: round(OUTLIERS * count)]] = True
+    position = np.where(wrong, origins + random.uniform(0.25, 0.9, (count, 1)) * depth * directions, position)
+    return ReconstructedPoints(surface, position, np.round(colours * 255).astype(np.uint8), finders)
+
+
+def _detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(H * W,) running sum, up to 1, of the chance of every pixel: as much as brightness changes there."""
+    down, across = np.gradient(luma.astype(np.float64))
+    detail = np.hypot(down, across)
+    total = np.cumsum((detail + _PLAIN * max(detail.mean(), 1e-6)).ravel())
+    return total / total[-1]
+
+
+def _seen_by_another(
+    room: Room, lens: Lens, poses: Sequence[NDArray[np.float64]], camera: int, directions: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """(M,) whether what ``camera`` sees in these directions (M, 3) is visible to another camera, in its picture."""
+    hits = room.intersect(poses[camera][:3, 3], directions)
+    starts = hits.lifted()
+    seen = np.zeros(len(starts), dtype=np.bool_)
+    for other, pose in enumerate(poses):
+        rows = np.flatnonzero(~seen)
+        if other == camera or not len(rows):
+            continue
+        local = (hits.position[rows] - pose[:3, 3]) @ pose[:3, :3]
+        before = local[:, 2] < -1e-3
+        rows, local = rows[before], local[before]
+        x, y = lens.pixels(np.stack([local[:, 0], -local[:, 1]], axis=1) / -local[:, 2:]).T
+        rows = rows[(x >= 0) & (x <= lens.width) & (y >= 0) & (y <= lens.height)]
+        seen[rows] = ~room.occluded(starts[rows], pose[:3, 3] - starts[rows], 1.0)
+    visible = np.zeros(len(directions), dtype=np.bool_)
+    visible[hits.hit] = seen
+    return visible

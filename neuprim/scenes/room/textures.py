@@ -1,8 +1,6 @@
-"""Patterns evaluated where a ray hits, averaged over the width that the ray stands for, so that distant detail blurs
-and does not flicker.
+"""Patterns evaluated where a ray hits, averaged over the width that the ray stands for, so that they do not flicker.
 
-Everything is a function of position; nothing is stored, nothing is random but by the hash of a cell's whole
-coordinates.
+Everything is a function of position; randomness is a hash of a cell's integer coordinates.
 """
 
 from __future__ import annotations
@@ -14,34 +12,16 @@ from numpy.typing import NDArray
 
 from neuprim.scenes.shapes import parse_srgb
 
-__all__ = [
-    "Texture",
-    "books",
-    "bricks",
-    "cells",
-    "checks",
-    "chequered",
-    "marble",
-    "mix",
-    "noise",
-    "painting",
-    "planks",
-    "plaster",
-    "rug",
-    "sky",
-    "speckled",
-    "stripes",
-    "wallpaper",
-]
-
 Array = NDArray[np.float32]
+
+Texture = Callable[[Array, Array], Array]
+"""(M, 3) positions in scene units and (M,) widths in the same -> (M, 3) linear RGB reflectance 0..1."""
 
 _PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
 
 
 def stripes(x: Array, period: float, part: float, width: Array) -> Array:
-    """(M,) share of the intervals of ``width`` (M,) about ``x`` (M,) that the first ``part`` (0..1) of every ``period``
-    covers."""
+    """(M,) share of intervals of ``width`` about ``x`` that the first ``part`` (0..1) of every ``period`` covers."""
     half = np.maximum(width / np.float32(period), np.float32(1e-4)) / 2
     t = x / np.float32(period)
     return ((_filled(t + half, part) - _filled(t - half, part)) / (2 * half)).astype(np.float32, copy=False)
@@ -54,18 +34,10 @@ def _filled(t: Array, part: float) -> NDArray[np.float64]:
     return whole * part + np.minimum(wide - whole, part)
 
 
-def checks(x: Array, y: Array, cell: float, width: Array) -> Array:
-    """(M,) share of the light squares of a chequerboard of edge ``cell``."""
-    return (0.5 + 2 * (stripes(x, 2 * cell, 0.5, width) - 0.5) * (stripes(y, 2 * cell, 0.5, width) - 0.5)).astype(
-        np.float32
-    )
-
-
 def noise(points: Array, width: Array, cell: float, seed: int, octaves: int = 4, fall: float = 0.55) -> Array:
-    """(M,) smooth noise about -1..1 of mean 0 at ``points`` (M, D): lattices of edge ``cell``, ``cell``/2, ..., each
-    ``fall`` times weaker.
+    """(M,) smooth noise about -1..1 of mean 0 at ``points`` (M, D), on lattices of edge ``cell``, ``cell``/2, ...
 
-    An octave is left out where its cells are smaller than about ``width`` (M,), having averaged out.
+    Each is ``fall`` times weaker. An octave is left out where its cells are smaller than about ``width`` (M,).
     """
     total = np.zeros(len(points), dtype=np.float32)
     strength = 1.0
@@ -101,8 +73,7 @@ def mix(one: Array, other: Array, share: Array) -> Array:
 
 
 def _lattice(points: Array, seed: int) -> Array:
-    """(M,) values of -1..1 at whole coordinates, blended in between by the quintic whose first and second derivatives
-    vanish there."""
+    """(M,) values of -1..1 at integer coordinates, blended in between by a quintic with two smooth derivatives."""
     base = np.floor(points)
     t = points - base
     t = t * t * t * (t * (t * 6 - 15) + 10)
@@ -117,8 +88,7 @@ def _lattice(points: Array, seed: int) -> Array:
     return 2 * total - 1
 
 
-Texture = Callable[[Array, Array], Array]
-"""(M, 3) positions in scene units and (M,) widths in the same -> (M, 3) linear RGB reflectance 0..1."""
+# ---------------------------------------------------------------- textures
 
 
 def speckled(code: str, seed: int, strength: float = 0.12, cell: float = 0.5) -> Texture:
@@ -140,9 +110,8 @@ def planks(
         grain = noise(np.stack([x / 9, p[:, across]], axis=1), w, 0.12, seed + 1, octaves=3, fall=0.7)
         knots = noise(np.stack([x / 3, p[:, across]], axis=1), w, 0.5, seed + 7, octaves=2)
         tone = 0.15 + 0.6 * cells(board, seed + 2) + 0.22 * grain + 0.15 * knots
-        gap = np.maximum(
-            stripes(p[:, across] + 0.007, width, 0.014 / width, w), stripes(x + 0.007, length, 0.014 / length, w)
-        )
+        side = stripes(p[:, across] + 0.007, width, 0.014 / width, w)
+        gap = np.maximum(side, stripes(x + 0.007, length, 0.014 / length, w))
         return mix(one, other, tone) * (1 - np.float32(0.75) * gap)[:, None]
 
     return texture
@@ -157,12 +126,8 @@ def bricks(u: int, v: int, seed: int, width: float = 0.62, height: float = 0.22,
         x = p[:, u] + np.float32(width / 2) * (row % 2)
         brick = np.stack([np.floor(x / width), row], axis=1).astype(np.int64)
         flat = p[:, [u, v]]
-        tone = (
-            0.1
-            + 0.8 * cells(brick, seed)
-            + 0.2 * noise(flat, w, 0.12, seed + 1, octaves=3)
-            + 0.15 * noise(flat, w, 2.5, seed + 2, 2)
-        )
+        fine, coarse = noise(flat, w, 0.12, seed + 1, octaves=3), noise(flat, w, 2.5, seed + 2, 2)
+        tone = 0.1 + 0.8 * cells(brick, seed) + 0.2 * fine + 0.15 * coarse
         joint = 1 - stripes(x, width, 1 - mortar / width, w) * stripes(p[:, v], height, 1 - mortar / height, w)
         return mix(mix(dark, light, tone), grout, joint)
 
@@ -175,7 +140,8 @@ def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> T
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
-        colour = mix(first, second, checks(p[:, u], p[:, v], cell, w))
+        across, up = stripes(p[:, u], 2 * cell, 0.5, w) - 0.5, stripes(p[:, v], 2 * cell, 0.5, w) - 0.5
+        colour = mix(first, second, (0.5 + 2 * across * up).astype(np.float32))
         joint = np.maximum(stripes(p[:, u] + 0.01, cell, 0.02 / cell, w), stripes(p[:, v] + 0.01, cell, 0.02 / cell, w))
         worn = 1 + 0.14 * noise(flat, w, 1.4, seed, octaves=6, fall=0.7)
         return np.clip(colour * (worn * (1 - 0.5 * joint))[:, None], 0, 1)
@@ -185,12 +151,7 @@ def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> T
 
 def wallpaper(u: int, v: int, seed: int) -> Texture:
     """Broad and narrow stripes with a row of dots in every broad one."""
-    ground, broad, narrow, dot = (
-        parse_srgb("#e9dcc0"),
-        parse_srgb("#9db8a2"),
-        parse_srgb("#4f7a6b"),
-        parse_srgb("#b5533c"),
-    )
+    ground, broad, narrow, dot = map(parse_srgb, ("#e9dcc0", "#9db8a2", "#4f7a6b", "#b5533c"))
 
     def texture(p: Array, w: Array) -> Array:
         x, y = p[:, u], p[:, v]
@@ -210,36 +171,30 @@ def wallpaper(u: int, v: int, seed: int) -> Texture:
 
 def plaster(u: int, v: int, seed: int, panel: float) -> Texture:
     """Rough plaster in clouds of ochre; below the height ``panel`` a wainscot of upright boards."""
-    light, dark, board, seam = (
-        parse_srgb("#e6c98c"),
-        parse_srgb("#b0764a"),
-        parse_srgb("#5d6f86"),
-        parse_srgb("#2f3a4a"),
-    )
+    light, dark, board, seam, edge = map(parse_srgb, ("#e6c98c", "#b0764a", "#5d6f86", "#2f3a4a", "#efe9dc"))
+    narrow = np.array([1, 0.2], np.float32)
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
         rough = mix(light, dark, 0.45 + 0.5 * noise(flat, w, 1.6, seed, octaves=7, fall=0.72))
         boards = mix(board, seam, stripes(p[:, u], 0.32, 0.12, w))
-        boards = (
-            boards * (1 + 0.1 * noise(flat * np.array([1, 0.2], np.float32), w, 0.12, seed + 9, octaves=2))[:, None]
-        )
+        boards = boards * (1 + 0.1 * noise(flat * narrow, w, 0.12, seed + 9, octaves=2))[:, None]
         rail: Array = np.clip((0.06 - np.abs(p[:, v] - panel)) / np.maximum(w, 0.005) + 0.5, 0, 1)
         below: Array = np.clip((panel - p[:, v]) / np.maximum(w, 0.005) + 0.5, 0, 1)
-        return np.clip(mix(mix(rough, boards, below), parse_srgb("#efe9dc"), rail), 0, 1)
+        return np.clip(mix(mix(rough, boards, below), edge, rail), 0, 1)
 
     return texture
 
 
 def painting(u: int, v: int, seed: int) -> Texture:
     """A picture: three colours flow into each other, with contours where one gives way to the next."""
-    palette = [parse_srgb(code) for code in ("#12355b", "#e4572e", "#f3a712", "#76b041")]
+    ground, *colours = map(parse_srgb, ("#12355b", "#e4572e", "#f3a712", "#76b041"))
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
         fields = [noise(flat, w, 0.7, seed + 17 * i, octaves=4, fall=0.5) for i in range(3)]
-        colour = np.broadcast_to(palette[0], p.shape)
-        for field, other in zip(fields, palette[1:], strict=True):
+        colour = np.broadcast_to(ground, p.shape)
+        for field, other in zip(fields, colours, strict=True):
             colour = mix(colour, other, 0.5 + 1.6 * field)
         lines = stripes(fields[0], 0.35, 0.14, 3 * w)
         return np.clip(colour * (1 - 0.55 * lines)[:, None], 0, 1)
@@ -249,12 +204,8 @@ def painting(u: int, v: int, seed: int) -> Texture:
 
 def books(u: int, v: int, seed: int, thickness: float = 0.11, shelf: float = 0.5) -> Texture:
     """Spines side by side: each of its own colour, with a band, and a dark line to the next."""
-    colours = np.stack(
-        [
-            parse_srgb(c)
-            for c in ("#8c2f39", "#1d3557", "#e0b04c", "#3a5a40", "#d8d0c0", "#5e3a78", "#c8553d", "#247ba0")
-        ]
-    )
+    codes = ("#8c2f39", "#1d3557", "#e0b04c", "#3a5a40", "#d8d0c0", "#5e3a78", "#c8553d", "#247ba0")
+    colours = np.stack([parse_srgb(code) for code in codes])
 
     def texture(p: Array, w: Array) -> Array:
         index = np.stack([np.floor(p[:, u] / thickness), np.floor(p[:, v] / shelf)], axis=1).astype(np.int64)

@@ -32,22 +32,11 @@ from neuprim.scenes.image_set import write_cached_folder
 from neuprim.scenes.smoke.scenes import SCENES, SmokeScene, Stage
 from neuprim.scenes.smoke.solver import Box, GasState, advance_gas
 
-__all__ = [
-    "SOLVER_VERSION",
-    "THRESHOLD",
-    "TIMESTEPS",
-    "Resolution",
-    "simulation_box",
-    "simulation_key",
-    "make_vdb_grids",
-    "simulate_smoke",
-]
-
 SOLVER_VERSION = 1
-"""Part of the cache's key: to be raised with every change to the solver, the scenes' sources or the files' layout."""
+"""Part of the cache's key: raise it with every change to the solver, the scenes' sources or the files' layout."""
 
 THRESHOLD = 2e-3
-"""Values below are background: nobody sees them, and files stay small."""
+"""Values below are background: they are invisible, and files stay small."""
 
 Resolution = Annotated[int, Range(16, 192)]
 """Cells across the box; advection counts cells in float32, which is exact up to 2^24."""
@@ -75,23 +64,23 @@ def simulate_smoke(
         frames: number of frames from the start; None for all.
         resolution: cells across the box, which is half as high again as it is wide.
         seed: of the turbulence; not negative.
-        progress: receives (text, fraction done).
 
     Raises:
         ConfigError: unknown scene or impossible value.
         DataError: the cache directory cannot be written.
     """
-    scene = _scene(name)
-    count: int = coerce(
-        scene.timesteps if frames is None else frames, Annotated[int, Range(*TIMESTEPS)], "scene.timesteps"
-    )
+    if name not in SCENES:
+        raise ConfigError(f"scene {name!r} is not simulated{nearest(str(name), SCENES)}")
+    scene = SCENES[name]
+    count = scene.timesteps if frames is None else frames
+    count = coerce(count, Annotated[int, Range(*TIMESTEPS)], "scene.timesteps")
     resolution = coerce(resolution, Resolution, "scene.resolution")
     seed = coerce(seed, Annotated[int, Range(0, 2**63 - 1)], "seed")
     final = Path(cache_dir) / f"sim-{name}-{simulation_key(scene, count, resolution, seed)}"
     files = [f"{name}_{i}.vdb" for i in range(count)]
 
     def write(folder: Path) -> None:
-        _write(scene, count, resolution, seed, folder, progress)
+        _write(scene, [folder / file for file in files], resolution, seed, progress)
 
     return write_cached_folder(final, files, write, f"scene {name}: cannot write the simulated frames")
 
@@ -119,14 +108,17 @@ def simulation_box(resolution: int) -> Box:
 
 def make_vdb_grids(state: GasState, scene: SmokeScene, box: Box) -> list[Grid]:
     """Convert a state to the grids of the scene, in half floats, with faint values set to the background."""
-    half = (box.cell * 0.5, box.cell * 0.5)
-    corner = (half[0] - box.shape[0] * half[0], half[1] - box.shape[1] * half[1], half[0])  # the centre of voxel 0
+    half = box.cell * 0.5
+    corner = (half - box.shape[0] * half, half - box.shape[1] * half, half)  # the centre of voxel 0
     transform = scale_transform(box.cell, corner)
     fields = {"density": state.density, "temperature": state.temperature, "flames": state.fuel}
     grids = []
     for name in scene.grids:
         if name == "color":
-            values = _albedo(state)
+            assert state.colour is not None
+            straight = (state.colour / state.density.clamp_min(THRESHOLD)).clamp(0, 1)
+            straight = torch.where(state.density < THRESHOLD, 0.0, straight)
+            values = np.ascontiguousarray(straight.permute(1, 2, 3, 0).numpy())
         else:
             values = fields[name].numpy()
             values = np.where(values < THRESHOLD, np.float32(0), values)
@@ -134,31 +126,25 @@ def make_vdb_grids(state: GasState, scene: SmokeScene, box: Box) -> list[Grid]:
     return grids
 
 
-def _albedo(state: GasState) -> np.ndarray:
-    """(X, Y, Z, 3) in 0..1 where there is smoke."""
-    assert state.colour is not None
-    density = state.density
-    straight = (state.colour / density.clamp_min(THRESHOLD)).clamp(0, 1)
-    straight = torch.where(density < THRESHOLD, 0.0, straight)
-    return np.ascontiguousarray(straight.permute(1, 2, 3, 0).numpy())
-
-
-def _write(scene: SmokeScene, count: int, resolution: int, seed: int, folder: Path, progress: Progress) -> None:
-    text = f"{scene.name}: simulating {count} frames"
+def _write(scene: SmokeScene, paths: list[Path], resolution: int, seed: int, progress: Progress) -> None:
+    """Simulate, and write each frame while the next one is computed."""
+    text = f"{scene.name}: simulating {len(paths)} frames"
     progress(text, 0.0)
     box = simulation_box(resolution)
     stage, state = Stage(box, seed), GasState.empty(box, scene.coloured)
     metadata = {"creator": "neuprim simulation", "comment": f"simulated by neuprim: {scene.name}, seed {seed}"}
-    pool, writing = ThreadPoolExecutor(1), None
+    writing: Future[None] | None = None
+    pool = ThreadPoolExecutor(1)
     try:
-        for frame in range(count):
+        for frame, path in enumerate(paths, start=1):
             with _one_torch_thread():
                 state = advance_gas(state, scene.solver, box, scene.forcing(stage, state.time), scene.frame_time)
-            _finish(writing)
-            path = folder / f"{scene.name}_{frame}.vdb"
+            if writing is not None:
+                writing.result()  # raises what the writer raised
             writing = pool.submit(write_vdb, path, make_vdb_grids(state, scene, box), metadata=metadata)
-            progress(text, (frame + 1) / count)
-        _finish(writing)
+            progress(text, frame / len(paths))
+        if writing is not None:
+            writing.result()
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -172,14 +158,3 @@ def _one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _finish(writing: Future[None] | None) -> None:
-    if writing is not None:
-        writing.result()  # raises what the writer raised
-
-
-def _scene(name: str) -> SmokeScene:
-    if name not in SCENES:
-        raise ConfigError(f"scene {name!r} is not simulated{nearest(str(name), SCENES)}")
-    return SCENES[name]

@@ -1,4 +1,4 @@
-"""Smooth random fields over space and time, fixed by a seed: the turbulence in sources."""
+"""The built-in scenes: sources and forces over time, with smooth random turbulence."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from torch import Tensor
 
 from neuprim.scenes.smoke.solver import Box, Forcing, SolverSettings, Source
 
-__all__ = ["Noise", "SCENES", "SmokeScene", "Stage"]
+Axes = tuple[Tensor, Tensor, Tensor]
+"""World coordinates (X, 1, 1), (1, Y, 1), (1, 1, Z), which broadcast against fields."""
 
-PERIOD = 16
-"""Lattice nodes per axis before the pattern repeats."""
+_PERIOD = 16  # lattice nodes per axis before the noise repeats
 
 
 class Noise:
@@ -24,7 +24,8 @@ class Noise:
     nodes.
 
     A pure function of seed, channel, place and time, so that it is the same however a frame is divided into steps, and
-    at any resolution the same pattern.
+    at any resolution the same pattern. Different channels are independent. ``cells`` are lattice cells per world unit;
+    ``tempo`` is how often per second the field is another one, and in between one turns into the next.
     """
 
     def __init__(self, seed: int) -> None:
@@ -32,82 +33,46 @@ class Noise:
         self._seed = seed
 
     def _draw(self, channel: int, key: int) -> Tensor:
-        numbers = np.random.default_rng([self._seed, channel, key]).standard_normal((PERIOD,) * 3)
+        numbers = np.random.default_rng([self._seed, channel, key]).standard_normal((_PERIOD,) * 3)
         return torch.from_numpy(numbers.astype(np.float32))
 
-    def field(
-        self, channel: int, axes: tuple[Tensor, Tensor, Tensor], cells: float, tempo: float, time: float
-    ) -> Tensor:
-        """(X, Y, Z) values.
-
-        Args:
-            channel: different ones are independent.
-            axes: world coordinates (X, 1, 1), (1, Y, 1), (1, 1, Z).
-            cells: lattice cells per world unit.
-            tempo: how often per second the field is another one; in between, one turns into the next.
-        """
+    def field(self, channel: int, axes: Axes, cells: float, tempo: float, time: float) -> Tensor:
+        """(X, Y, Z) values."""
         phase = max(time, 0.0) * tempo
         key = math.floor(phase)
         angle = (phase - key) * math.pi / 2
         lattice = math.cos(angle) * self._lattice(channel, key) + math.sin(angle) * self._lattice(channel, key + 1)
         x, y, z = (_weights(axis.reshape(-1) * cells) for axis in axes)
-        return torch.matmul(x, torch.matmul(y, torch.matmul(lattice, z.T)).reshape(PERIOD, -1)).reshape(
-            len(x), len(y), len(z)
-        )
+        planes = torch.matmul(y, torch.matmul(lattice, z.T)).reshape(_PERIOD, -1)
+        return torch.matmul(x, planes).reshape(len(x), len(y), len(z))
 
-    def fractal(
-        self,
-        channel: int,
-        axes: tuple[Tensor, Tensor, Tensor],
-        cells: float,
-        tempo: float,
-        time: float,
-        octaves: int = 3,
-    ) -> Tensor:
+    def fractal(self, channel: int, axes: Axes, cells: float, tempo: float, time: float, octaves: int = 3) -> Tensor:
         """Octaves of :meth:`field`, each twice as fine, half as strong and faster by half."""
-        parts = [
-            self.field(channel + 101 * k, axes, cells * 2**k, tempo * 1.5**k, time) * 0.5**k for k in range(octaves)
-        ]
-        return torch.stack(parts).sum(0)
+        fields = (self.field(channel + 101 * k, axes, cells * 2**k, tempo * 1.5**k, time) for k in range(octaves))
+        return torch.stack([field * 0.5**k for k, field in enumerate(fields)]).sum(0)
 
-    def vector(
-        self,
-        channel: int,
-        axes: tuple[Tensor, Tensor, Tensor],
-        cells: float,
-        tempo: float,
-        time: float,
-        octaves: int = 2,
-    ) -> Tensor:
+    def vector(self, channel: int, axes: Axes, cells: float, tempo: float, time: float, octaves: int = 2) -> Tensor:
         """(3, X, Y, Z): three independent :meth:`fractal` fields."""
-        return torch.stack(
-            [self.fractal(channel + 1009 * (k + 1), axes, cells, tempo, time, octaves) for k in range(3)]
-        )
+        channels = (channel + 1009 * (k + 1) for k in range(3))
+        return torch.stack([self.fractal(c, axes, cells, tempo, time, octaves) for c in channels])
 
 
 def _weights(places: Tensor) -> Tensor:
-    """(n, PERIOD) what each lattice node counts at each place; cubic fade, so that slopes are continuous."""
+    """(n, _PERIOD) what each lattice node counts at each place; cubic fade, so that slopes are continuous."""
     lower = places.floor()
     part = places - lower
     part = part * part * (3 - 2 * part)
-    index = lower.long() % PERIOD
-    weights = torch.zeros(len(places), PERIOD)
+    index = lower.long() % _PERIOD
+    weights = torch.zeros(len(places), _PERIOD)
     rows = torch.arange(len(places))
     weights[rows, index] = 1 - part
-    weights[rows, (index + 1) % PERIOD] = part
+    weights[rows, (index + 1) % _PERIOD] = part
     return weights
 
 
-Axes = tuple[Tensor, Tensor, Tensor]
-
-
 class Stage:
-    """A box, its coordinates, and the noise: where a scene plays.
-
-    Attributes:
-        axes: world coordinates of the cells' centres, (X, 1, 1), (1, Y, 1), (1, 1, Z).
-        fade: (X, Y, Z) per second: near the sides and the top gas vanishes, so that nothing is cut off there.
-    """
+    """A box, the coordinates of its cells' centres, the noise, and (X, Y, Z) ``fade`` per second: near the sides and
+    the top gas vanishes, so that nothing is cut off there."""
 
     def __init__(self, box: Box, seed: int) -> None:
         self.box, self.noise, self.axes = box, Noise(seed), box.axes()
@@ -133,15 +98,8 @@ class Stage:
 
 @dataclass(frozen=True)
 class SmokeScene:
-    """A simulation with a name.
-
-    Attributes:
-        timesteps: frames of the whole sequence.
-        frame_time: seconds between two of them.
-        grids: what is written; see :mod:`neuprim.scenes.smoke.generate`.
-        solver: what the gas is like.
-        forcing: sources and forces at a time in seconds.
-    """
+    """A simulation: frames of the whole sequence, seconds between two of them, the grids that are written
+    (:mod:`neuprim.scenes.smoke.generate`), what the gas is like, and sources and forces at a time in seconds."""
 
     name: str
     timesteps: int
@@ -186,19 +144,11 @@ SMOKE_FIRE = SmokeScene(
     1 / 25,
     ("density", "temperature", "flames"),
     SolverSettings(
-        buoyancy=4.0,
-        weight=0.2,
-        confinement=0.5,
-        cooling=0.7,
-        dissipation=0.35,
-        burn=1.9,
-        heat=0.7,
-        soot=0.8,
-        expansion=1.5,
-        drag=0.1,
+        buoyancy=4.0, weight=0.2, confinement=0.5, cooling=0.7, dissipation=0.35, burn=1.9, heat=0.7, soot=0.8,
+        expansion=1.5, drag=0.1,
     ),
     _smoke_fire,
-)
+)  # fmt: skip
 
 # ---------------------------------------------------------------- coloured jets
 
@@ -213,9 +163,8 @@ def _colorful_smoke(stage: Stage, time: float) -> Forcing:
         strength = 0.5 + 0.5 * math.sin(2 * math.pi * (0.55 * time + 0.37 * k + 0.1))  # they puff, one after another
         where, axes = stage.region((cx - 0.1, cy - 0.1, 0.0), (cx + 0.1, cy + 0.1, 0.2))
         x, y, z = axes
-        distance = torch.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2) - 0.012 * stage.noise.fractal(
-            10 * k, axes, 12.0, 4.0, time, octaves=2
-        )
+        lumps = stage.noise.fractal(10 * k, axes, 12.0, 4.0, time, octaves=2)
+        distance = torch.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2) - 0.012 * lumps
         rate = 60.0 * _soft(distance - 0.045, 0.035) * min(1.0, 0.2 + strength)
         push = 0.25 * stage.noise.vector(10 * k + 3, axes, 11.0, 6.0, time, octaves=1)
         speed = 0.5 + 0.75 * strength
@@ -223,9 +172,8 @@ def _colorful_smoke(stage: Stage, time: float) -> Forcing:
         push[0] += speed * (-inward * math.cos(angle) - around * math.sin(angle))
         push[1] += speed * (-inward * math.sin(angle) + around * math.cos(angle))
         push[2] += speed * 0.9
-        sources.append(
-            Source(where, rate, density=0.25 + 0.75 * strength, temperature=0.35, colour=albedo, velocity=push)
-        )
+        amount = 0.25 + 0.75 * strength
+        sources.append(Source(where, rate, density=amount, temperature=0.35, colour=albedo, velocity=push))
     gusts = 1.2 * stage.noise.vector(200, stage.axes, 6.0, 2.0, time)
     return Forcing(sources, gusts, fade=stage.fade)
 

@@ -17,8 +17,6 @@ from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.tasks.dynamic.density import get_time
 
-__all__ = ["TimeHarmonics"]
-
 FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
 """Angle of the first Fourier term at xi = 1. The paper prints i xi, whose basis is nearly rank-deficient on [0, 1]
 (condition 5e13); whole periods are well conditioned (2e5)."""

@@ -44,8 +44,6 @@ from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.train.splitting import SPLIT_LONG, SPLIT_SHIFT
 
-__all__ = ["PARTS", "ChunkOverlaps", "TimeDensity", "chunk_weights", "drop_time_terms", "get_time", "validate_overlaps"]
-
 PARTS = ("phase", "offset", "window", "motion")
 """What may vary in time."""
 

@@ -23,7 +23,6 @@ from neuprim.core.model.primitives import Primitives
 if TYPE_CHECKING:
     from neuprim.tasks.dynamic.volume.dataset import Recording
 
-__all__ = ["LAYERS", "clips", "diagnose", "invisible_fraction", "mask", "recording_of"]
 
 _MIN_OPACITY = 1.0 / 255.0  # of a visible primitive
 

@@ -47,8 +47,6 @@ from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import Accepts, validate
 
-__all__ = ["MultiviewSettings", "load", "moving_points"]
-
 _AUTO = "auto"
 _NAMES = ("train", "val", "test")
 

@@ -14,8 +14,6 @@ from neuprim.core.compute.operation import apply_autograd
 from neuprim.core.model.densities.gain_cpu import scale_backward
 from neuprim.core.model.edge import fade
 
-__all__ = ["WINDOW_EDGE", "move_means", "apply_window", "rows_in_window"]
-
 WINDOW_EDGE = 2  # exponent of the window in time
 
 

@@ -31,17 +31,6 @@ from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.relight.visibility import light_visibility
 
-__all__ = [
-    "FORMS",
-    "VISIBILITY",
-    "LightHarmonics",
-    "LightNetwork",
-    "min_squared_distance",
-    "normalize_direction",
-    "prune_hidden_units",
-    "real_harmonics",
-]
-
 FORMS = ("additive", "multiplicative")
 
 VISIBILITY = ("none", "primitive", "pixel")

@@ -25,20 +25,6 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.scenes import PIXEL_CLASSES
 from neuprim.tasks.relight.lighting import lighting_of, summarize_lights
 
-__all__ = [
-    "LAYERS",
-    "baselines",
-    "class_errors",
-    "class_shares",
-    "clips",
-    "diagnose",
-    "facts",
-    "mask",
-    "metrics",
-    "orbit",
-    "scores",
-]
-
 _MIN_ALPHA = 1.0 / 255.0  # of a pixel that shows matter
 
 

@@ -24,21 +24,6 @@ from neuprim.core.io.json_reader import JsonReader
 if TYPE_CHECKING:
     from neuprim.core.data.image_views import ImageViews
 
-__all__ = [
-    "EXPOSURE_PERCENTILE",
-    "MAX_LIGHT_ANGLE",
-    "ORBIT",
-    "Falloff",
-    "Lighting",
-    "illuminate",
-    "lighting_of",
-    "orbit_in_frames",
-    "parse_intensities",
-    "parse_lights",
-    "percentile_exposure",
-    "summarize_lights",
-    "typical_light",
-]
 
 Falloff = Literal["none", "inverse_square"]
 

@@ -65,8 +65,6 @@ from neuprim.core.task import SceneContext
 from neuprim.core.validation import Range, validate
 from neuprim.tasks.relight.lighting import Lighting, percentile_exposure
 
-__all__ = ["OlatSettings", "load", "read_split"]
-
 _KEYS = ("camera_near", "camera_far", "img_path", "file_ext", "pl_pos", "pl_intensity", "R_opt", "T_opt")
 
 

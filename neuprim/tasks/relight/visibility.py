@@ -32,8 +32,6 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.slabs import render_slabs
 
-__all__ = ["BIAS", "SIZE", "SOFTNESS", "light_visibility", "sample_visibility"]
-
 SIZE = 192
 """Pixels of the depth images, square."""
 

@@ -6,8 +6,6 @@ import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel
 
-__all__ = ["arriving_light"]
-
 
 @exact_kernel
 def arriving_light(start, stop, points, view, near, focal, alphas, depths, bias, softness, found):  # type: ignore[no-untyped-def]

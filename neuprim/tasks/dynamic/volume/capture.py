@@ -35,8 +35,6 @@ from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics
 from neuprim.tasks.dynamic.volume.raymarch import render_medium
 from neuprim.tasks.dynamic.volume.survey import GridReader, Normalisation
 
-__all__ = ["LAST_FILE", "POINTS", "RENDERER_VERSION", "Capture", "RenderedFrames", "hemisphere_cameras"]
-
 RENDERER_VERSION = 2
 """Part of the cache's key: raise it with every change to the march, the optics, the cameras or the files' layout."""
 

@@ -21,8 +21,6 @@ from neuprim.core.task import Chunk, Chunks
 from neuprim.tasks.dynamic.density import ChunkOverlaps, TimeDensity
 from neuprim.tasks.dynamic.volume.capture import Capture
 
-__all__ = ["MAX_FRAMES", "MIN_FRAMES", "count_chunks", "join_chunks", "plan_chunks"]
-
 MAX_FRAMES = 100
 """Most frames of an automatic chunk."""
 

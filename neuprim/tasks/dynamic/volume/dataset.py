@@ -28,17 +28,6 @@ from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.ground_truth import placement_of
 from neuprim.tasks.dynamic.volume.medium import Medium
 
-__all__ = [
-    "TRAINING_MEMORY",
-    "FrameViews",
-    "FrameVoxels",
-    "Recording",
-    "TrainingFrames",
-    "Voxels",
-    "read_points_file",
-    "volume_dataset",
-]
-
 TRAINING_MEMORY, _TEST_MEMORY, _VOXEL_MEMORY = 6 / 11, 1 / 11, 4 / 11
 """Shares of the memory for training images, test images (read in order) and voxels."""
 

@@ -21,8 +21,6 @@ from neuprim.core.volumes.source import Placement, VolumeSource
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.medium import Medium
 
-__all__ = ["CaptureSource", "VolumeTruth", "compare_extinction", "placement_of", "sample_extinction"]
-
 THIRDS = ("early", "middle", "late")
 
 
@@ -80,8 +78,7 @@ class VolumeTruth(DensityTruth):
         self._cached: tuple[int, Medium] | None = None
         self.frames = [
             TruthFrame(
-                file.path.name,
-                {"time": torch.tensor(capture.time(file))} if first <= file.number <= last else {},
+                file.path.name, {"time": torch.tensor(capture.time(file))} if first <= file.number <= last else {}
             )
             for file in files
         ]

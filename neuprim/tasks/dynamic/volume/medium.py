@@ -19,8 +19,6 @@ from neuprim.tasks.dynamic.volume.optics import Optics
 from neuprim.tasks.dynamic.volume.raymarch import light_transmittance
 from neuprim.tasks.dynamic.volume.survey import Normalisation
 
-__all__ = ["Medium", "black_body_rgb", "build_medium"]
-
 _NEGLIGIBLE = 1e-7
 """Below this optical depth across a cell, and this fraction of the strongest source, a voxel counts as empty."""
 

@@ -9,20 +9,6 @@ from typing import Annotated, Any, Literal, get_args
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.validation import Accepts, Range, Unbounded, field_types, refuse_unknown, validate_fields
 
-__all__ = [
-    "DATA_DEPENDENT",
-    "EMBERGEN_FIRE",
-    "GRIDS",
-    "OPTICS_PRESETS",
-    "UP_AXES",
-    "Axis",
-    "GridMeaning",
-    "Light",
-    "Optics",
-    "optics_preset",
-    "override_optics",
-]
-
 Axis = Literal["y", "z"]
 """The upward axis of a sequence's files."""
 
@@ -103,10 +89,7 @@ class Optics:
 
     extinction_grids: Annotated[
         tuple[str, ...], Accepts(_are_grids, f"a list of {', '.join(GRIDS)} (scene.grids says which grid that is)")
-    ] = (
-        "density",
-        "temperature",
-    )
+    ] = ("density", "temperature")
     extinction: NotNegative = 10.0
     albedo: RGB = (1.0, 1.0, 1.0)
     ambient: RGB = (0.0, 0.0, 0.0)
@@ -117,10 +100,7 @@ class Optics:
     ] = (0.0, 1.0)
     kelvin: Annotated[
         tuple[Kelvin, Kelvin], Accepts(lambda k: k[0] <= k[1], "two rising numbers within 0..1e5, as [1000, 2000]")
-    ] = (
-        1000.0,
-        2000.0,
-    )
+    ] = (1000.0, 2000.0)
     emission: NotNegative = 0.0
     flame_extinction: NotNegative = 0.0
     color_grid: GridMeaning | None = None

@@ -26,8 +26,6 @@ from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import ConfigError
 
-__all__ = ["light_transmittance", "render_medium"]
-
 _ROWS_PER_JOB, _SLICES_PER_JOB = 4, 2
 
 

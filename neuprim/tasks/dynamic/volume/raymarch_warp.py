@@ -15,8 +15,6 @@ from torch import Tensor
 
 from neuprim.core.compute.warp import OPTIONS, array, launch, wp
 
-__all__ = ["depths", "extinctions", "radiances"]
-
 d, f = wp.float64, wp.float32
 _LOW, _HIGH = 0.5 - math.sqrt(3.0) / 6.0, 0.5 + math.sqrt(3.0) / 6.0
 _LESS, _MORE = math.sqrt(1.0 / 3.0) - 0.5, math.sqrt(1.0 / 3.0) + 0.5

@@ -36,8 +36,6 @@ from neuprim.tasks.dynamic.volume.optics import (
 )
 from neuprim.tasks.dynamic.volume.survey import Normalisation, data_dependent_optics, find_grids, survey_frames
 
-__all__ = ["VolumeSettings", "choose_frames", "load_dataset", "open_ground_truth", "open_volumes", "split_chunks"]
-
 _AUTOMATIC_LOOKS = ("smoke_fire", "embergen_fire")
 """Presets of ``scene.look=auto`` for files with a density, and for those where the hot gas itself absorbs."""
 

@@ -16,8 +16,6 @@ from neuprim.core.io.vdb import Grid, VdbFrame, read_grids, read_header
 from neuprim.core.volumes.source import Extent
 from neuprim.tasks.dynamic.volume.optics import Optics
 
-__all__ = ["GridReader", "Normalisation", "SequenceSurvey", "data_dependent_optics", "find_grids", "survey_frames"]
-
 USUAL_NAMES = {
     "density": ("density", "smoke", "soot"),
     "temperature": ("temperature", "heat", "temp"),

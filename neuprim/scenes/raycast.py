@@ -162,7 +162,7 @@ class _Hierarchy:
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
         corners = vertices[faces].astype(np.float64)
         self._order, *boxes_and_links = _build_boxes(corners.min(1), corners.max(1))
-        self._tree = (corners[self._order], *boxes_and_links)  # leaves read neighbouring memory
+        self._tree: Any = (corners[self._order], *boxes_and_links)  # leaves read neighbouring memory
 
     def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         index, u, v, distance = _trace(*self._tree, o, d, np.full(len(o), np.inf), False)

@@ -75,4 +75,4 @@ def point_loss(
             loss = loss + _COMPONENT * part
     peak = max(float(samples.sigma.max()), 1e-30) / samples.sigma_scale
     psnr = -10 * math.log10(max(parts["voxel_sigma"] / peak**2, 1e-20))
-    return PointResult(loss, parts, psnr, samples.name, found.rows, found.watch(wrong.detach().abs()))
+    return PointResult(loss, parts, psnr, samples.name, found.rows, found.request_shares(wrong.detach().abs()))

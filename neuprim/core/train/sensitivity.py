@@ -126,7 +126,7 @@ def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: in
         )
         signs = (2 * torch.randint(0, 2, (len(samples.points),), generator=generator) - 1).float()
         signs = device.copy_from_host(signs / samples.sigma_scale / len(signs) ** 0.5, values.sigma.device)
-        shares = values.watch(signs)
+        shares = values.request_shares(signs)
         (values.sigma * signs).sum().backward()
         rows = torch.arange(model.count) if values.rows is None else values.rows.cpu()
         whole[rows] += shares.error_weight.cpu().square()

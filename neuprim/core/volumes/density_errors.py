@@ -1,7 +1,4 @@
-"""Errors of a model's extinction against the extinction that a data set was made from.
-
-Points are compared in blocks of planes, so a comparison needs a few tens of MB besides the ground truth itself.
-"""
+"""Errors of a model's extinction against the extinction that a data set was made from, in blocks of planes."""
 
 from __future__ import annotations
 
@@ -22,21 +19,16 @@ from neuprim.core.volumes.grid import density_grid
 NUMBERS = ("correlation", "relative_l2", "psnr_active", "max_error")
 """What :func:`measure_frame_errors` gives."""
 
-_BLOCK = 1 << 22
-"""Points at a time, 16 MiB of each grid."""
+_BLOCK = 1 << 22  # points at a time, 16 MiB of each grid
 
 _NO_ERROR = 1e-20
-"""An error below this share of the peak, squared, counts as this: 200 dB, as no number may be infinite."""
+"""Smallest squared error as a share of the peak's square: 200 dB, as no number may be infinite."""
 
 
 @dataclass(frozen=True)
 class TruthFrame:
-    """One frame of the ground truth.
-
-    Attributes:
-        name: to show, such as that of a file.
-        conditions: that give the same frame of a model; empty if unknown.
-    """
+    """One frame of the ground truth: a name to show, and the conditions of the same frame of a model; empty if
+    unknown."""
 
     name: str
     conditions: Conditions
@@ -55,19 +47,17 @@ class DensityTruth(ABC):
 
     @abstractmethod
     def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
-        """(4, 4) float64 scene_from_index and shape of the regular grid on which models are compared with a frame: of
-        files, all their own voxels in the box. None where the frame holds nothing.
-        """
+        """(4, 4) float64 scene_from_index and shape of the grid on which models are compared with a frame: all voxels
+        of a file in the box. None where the frame holds nothing."""
 
     @abstractmethod
     def grid(
         self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
     ) -> Tensor:
-        """(X, Y, Z) float32 extinction of a frame at the points ``scene_from_index @ (i, j, k, 1)``, float64 (4, 4).
+        """(X, Y, Z) float32 extinction of a frame at the points ``scene_from_index @ (i, j, k, 1)``.
 
         Args:
-            component: the part alone that comes from the source grid of this name
-            (:meth:`~neuprim.core.model.fields.DensityField.components`).
+            component: only the part from the source grid of this name.
         """
 
 
@@ -123,21 +113,19 @@ def measure_frame_errors(
     where: torch.device = device.HOST,
     component: str | None = None,
 ) -> dict[str, float] | None:
-    """The model under ``conditions`` against a frame of the truth, see :meth:`Comparison.numbers`; None where there is
-    nothing to compare with.
+    """Compare the model under ``conditions`` with a frame of the truth, see :meth:`Comparison.numbers`.
 
     Args:
         where: the device that computes the model's extinction.
-        component: what is compared is this part of both extinctions, against the truth's own values of it.
+        component: compare this part of both extinctions.
     """
     place = truth.points(frame)
     if place is None:
         return None
     model = model if component is None else model.component(component)
-    part = {} if component is None else {"component": component}
     found = Comparison()
     for matrix, shape in split_planes(*place):
-        sigma = truth.grid(frame, matrix, shape, **part).numpy()
+        sigma = truth.grid(frame, matrix, shape, component).numpy()
         found.add(sigma, density_grid(model, conditions, matrix, shape, threads, where).numpy())
     return found.numbers()
 

@@ -24,7 +24,7 @@ from neuprim.core.model.fields import Conditions, Cosine
 from neuprim.core.model.primitives import Primitives
 
 _SLAB = 8  # planes per unit of work; fixed, and the result does not depend on it
-_PAIRS = 1 << 17  # of points and primitives that a density in torch code is asked for at once
+_PAIRS = 1 << 17  # of points and primitives that torch code evaluates at once
 
 POINTS_LIMIT = 2**30
 """Most points of a grid, 4 GiB of float32."""
@@ -43,12 +43,8 @@ def lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, tuple
 
 
 def voxels_within(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> tuple[Tensor, tuple[int, int, int]]:
-    """(4, 4) scene_from_index and shape of the voxels whose centres lie in a (2, 3) box of the scene; of turned ones
-    all in a box around it.
-
-    Args:
-        scene_from_index: (4, 4) float64, of the voxels' own indices.
-    """
+    """(4, 4) scene_from_index and shape of the voxels whose centres lie in a (2, 3) box of the scene, or in a box of
+    voxels around it if they are turned."""
     corners = np.stack(np.meshgrid(*np.asarray(bounds, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
     back = np.linalg.inv(scene_from_index)
     index = corners @ back[:3, :3].T + back[:3, 3]
@@ -59,16 +55,6 @@ def voxels_within(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> 
     return torch.from_numpy(matrix), (x, y, z)
 
 
-def agreement(truth: np.ndarray, found: np.ndarray) -> dict[str, float] | None:
-    """Pearson ``correlation`` and ``relative_l2`` = |found - truth| / |truth| of two grids; None where the truth is the
-    same everywhere."""
-    a, b = truth.astype(np.float64), found.astype(np.float64)
-    if a.std() == 0:
-        return None
-    correlation = float(np.corrcoef(a.ravel(), b.ravel())[0, 1]) if b.std() > 0 else 0.0
-    return {"correlation": correlation, "relative_l2": float(np.linalg.norm(b - a) / np.linalg.norm(a))}
-
-
 def density_grid(
     model: Primitives,
     conditions: Conditions,
@@ -77,17 +63,16 @@ def density_grid(
     threads: int = 0,
     where: torch.device = device.HOST,
 ) -> Tensor:
-    """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``; on the processor.
+    """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``; on the CPU.
 
-    What lowers to a :class:`~neuprim.core.model.forms.Cosine` runs in compiled code on all cores, or on a card; any
-    other density is asked point by point, in blocks, on the processor. Beside the grid it takes a few MB, of a card's
-    memory up to 500.
+    A density that lowers to a :class:`~neuprim.core.model.forms.Cosine` runs in compiled code on all cores, or on a
+    GPU; any other density is evaluated in blocks on the CPU. It takes a few MB besides the grid; up to 500 MB of a GPU.
 
     Args:
         conditions: of the frame, e.g. ``{"time": tensor(0.5)}``.
         scene_from_index: (4, 4) float64 affine map, invertible.
         threads: 0 for all cores; the result does not depend on it.
-        where: the device that computes, wherever the model is. A card's sums are the processor's but for rounding.
+        where: the device that computes, wherever the model is; devices differ by rounding.
 
     Raises:
         ConfigError: more than :data:`POINTS_LIMIT` points, or a map that is singular or not finite.
@@ -103,29 +88,26 @@ def density_grid(
     with torch.no_grad():
         geometry, form = model.lower_density(conditions)
         ellipsoids = (geometry.means.double(), geometry.scales.double(), geometry.rotations.double())
-        if isinstance(form, Cosine):
-            neurons = (form.W1.double(), form.b1.double(), form.w2.double(), form.b2.reshape(-1).double())
-            if device.has_warp(where):
-                from neuprim.core.volumes import grid_warp
-
-                ways = torch.from_numpy(forward[:3]), torch.from_numpy(back[:3])
-                return torch.from_numpy(
-                    grid_warp.filled(ellipsoids, neurons, form.omega0, form.edge, *ways, shape, where)
-                )
-        wide = [x.detach().numpy() for x in ellipsoids]
         grid = np.zeros(shape, np.float32)
         if not isinstance(form, Cosine):
-            _ask(model, conditions, wide, forward, back, grid)
+            _add_any_density(model, conditions, ellipsoids, forward, back, grid)
             return torch.from_numpy(grid)
-        wide += [x.detach().numpy() for x in neurons]
-    arguments = [np.ascontiguousarray(x) for x in (*wide, forward[:3], back[:3])]
+        neurons = (form.W1.double(), form.b1.double(), form.w2.double(), form.b2.reshape(-1).double())
+        if device.has_warp(where):
+            from neuprim.core.volumes import grid_warp
+
+            maps = torch.from_numpy(forward[:3]), torch.from_numpy(back[:3])
+            return torch.from_numpy(
+                grid_warp.fill_grid(ellipsoids, neurons, form.omega0, form.edge, *maps, shape, where)
+            )
+        tensors = [x.detach().numpy() for x in (*ellipsoids, *neurons)]
+    arguments = [np.ascontiguousarray(x) for x in (*tensors, forward[:3], back[:3])]
     parallel_for(_fill, shape[0], _SLAB, threads, *arguments, form.omega0, form.edge, grid)
     return torch.from_numpy(grid)
 
 
 def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Tensor:
-    """(M,) float64 extinction, 1/scene unit, at (M, 3) points: every primitive at every point, in float64. Slow, short,
-    and the oracle."""
+    """(M,) float64 extinction, 1/scene unit, at (M, 3) points: every primitive at every point. Slow; the reference."""
     with torch.no_grad():
         active = model.to(device.HOST).active(conditions, torch.float64)
         geometry = active.geometry
@@ -139,13 +121,12 @@ def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Ten
     return total
 
 
-def _ask(
-    model: Primitives, conditions: Conditions, wide: list[Any], P: np.ndarray, Q: np.ndarray, grid: np.ndarray
+def _add_any_density(
+    model: Primitives, conditions: Conditions, ellipsoids: Any, P: np.ndarray, Q: np.ndarray, grid: np.ndarray
 ) -> None:
-    """Adds a density in torch code, primitive by primitive in a fixed order, so that the sums are the same every
-    time."""
+    """Add a density in torch code, primitive by primitive in a fixed order, so that sums are the same every time."""
     active = model.active(conditions, torch.float64)
-    means, scales, R = wide
+    means, scales, R = (x.detach().numpy() for x in ellipsoids)
     limit = np.array(grid.shape)
     for n in range(len(means)):
         center = Q[:3, :3] @ means[n] + Q[:3, 3]
@@ -175,12 +156,8 @@ def _fill(
     K = W1.shape[1]
     longest = max(grid.shape[1], grid.shape[2], stop - start)
     low, high, steps, y = np.empty(3, np.int64), np.empty(3, np.int64), np.empty((3, 3)), np.empty(3)
-    cosines, sines, row, origin = (
-        np.empty((3, K, longest)),
-        np.empty((3, K, longest)),
-        np.empty(grid.shape[2]),
-        np.empty(3),
-    )
+    cosines, sines = np.empty((3, K, longest)), np.empty((3, K, longest))
+    row, origin = np.empty(grid.shape[2]), np.empty(3)
     for n in range(means.shape[0]):
         empty = False
         for a in range(3):  # the ellipsoid's box in indices

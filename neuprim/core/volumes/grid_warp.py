@@ -1,17 +1,15 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Extinction on a regular grid on a card: the twin of the kernel in :mod:`neuprim.core.volumes.grid`. Warp is imported
-with it.
+"""Extinction on a regular grid on a GPU: the twin of the kernel in :mod:`neuprim.core.volumes.grid`.
 
 A block adds up a tile of the grid, a thread a point, primitive by primitive in their order, float64 inside and float32
-sums, as the processor does it. Which primitives reach which tile is listed by sorting whole numbers, so that no bit
-depends on which block comes first, nor on how much of the grid or how many primitives are taken at a time.
+sums, as the CPU does it. Primitives of each tile are listed by sorting integers, so that no bit depends on the order of
+blocks, nor on how much of the grid or how many primitives are taken at a time. Warp is imported with this module.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,11 +24,8 @@ d, f = wp.float64, wp.float32
 _TILE = (4, 8, 8)
 _THREADS = 256  # points of a tile
 
-_POINTS = 1 << 26
-"""Most points on the card at a time, 256 MiB."""
-
-_PAIRS = 1 << 22
-"""Most pairs of tiles and primitives that are listed at a time, but for those of one primitive."""
+_POINTS = 1 << 26  # most points on the GPU at a time, 256 MiB
+_PAIRS = 1 << 22  # most pairs of tiles and primitives that are listed at a time, but for those of one primitive
 
 
 @functools.cache
@@ -75,39 +70,24 @@ def _kernel() -> Any:
     return add_primitives
 
 
-@dataclass(frozen=True)
-class _Boxes:
-    """Which tiles the ellipsoids' boxes of indices touch: (N, 3) int64 first ones, and ones behind the last; none where
+def _tile_boxes(
+    means: Tensor, scales: Tensor, rotations: Tensor, Q: Tensor, shape: tuple[int, ...]
+) -> tuple[Tensor, Tensor]:
+    """Tiles that the ellipsoids' boxes of indices touch: (N, 3) int64 first ones, and ones behind the last, 0 where
     there is no point."""
-
-    low: Tensor
-    high: Tensor
-
-    @classmethod
-    def of(cls, means: Tensor, scales: Tensor, rotations: Tensor, Q: Tensor, shape: tuple[int, ...]) -> _Boxes:
-        center = means @ Q[:, :3].T + Q[:, 3]
-        reach = ((Q[:, :3] @ rotations) * scales[:, None, :]).norm(dim=2)
-        limit, tile = (torch.tensor(x, device=means.device) for x in (shape, _TILE))
-        low = (center - reach).nan_to_num(nan=1e9).clamp(-1e9, 1e9).ceil().long().clamp_min(0)
-        high = ((center + reach).nan_to_num(nan=-1e9).clamp(-1e9, 1e9).floor().long() + 1).minimum(limit)
-        there = (low < high).all(1, keepdim=True)
-        return cls(
-            low.div(tile, rounding_mode="floor"), torch.where(there, (high - 1).div(tile, rounding_mode="floor") + 1, 0)
-        )
-
-    def within(self, first: int, end: int) -> tuple[Tensor, Tensor]:
-        """First tiles and numbers of tiles, (N, 3) each, in the planes ``first`` to ``end`` - 1 of tiles; the planes
-        are counted from ``first``."""
-        low, high = self.low.clone(), self.high.clone()
-        low[:, 0], high[:, 0] = low[:, 0].clamp_min(first) - first, high[:, 0].clamp_max(end) - first
-        return low, (high - low).clamp_min(0)
+    center = means @ Q[:, :3].T + Q[:, 3]
+    reach = ((Q[:, :3] @ rotations) * scales[:, None, :]).norm(dim=2)
+    limit, tile = (torch.tensor(x, device=means.device) for x in (shape, _TILE))
+    low = (center - reach).nan_to_num(nan=1e9).clamp(-1e9, 1e9).ceil().long().clamp_min(0)
+    high = ((center + reach).nan_to_num(nan=-1e9).clamp(-1e9, 1e9).floor().long() + 1).minimum(limit)
+    last = (high - 1).div(tile, rounding_mode="floor") + 1
+    return low.div(tile, rounding_mode="floor"), torch.where((low < high).all(1, keepdim=True), last, 0)
 
 
-def _lists(
+def _list_primitives(
     low: Tensor, wide: Tensor, counts: Tensor, tiles: tuple[int, ...], begin: int, end: int
 ) -> tuple[Tensor, Tensor]:
-    """``starts`` (tiles + 1,) and ``ids``, int32: of every tile the primitives begin … end - 1 that reach it, in their
-    order."""
+    """``starts`` (tiles + 1,) and ``ids``, int32: of every tile the primitives begin:end that reach it, in order."""
     own = counts[begin:end]
     prim = torch.repeat_interleave(torch.arange(begin, end, device=low.device), own)
     number = torch.arange(len(prim), device=low.device) - (own.cumsum(0) - own)[prim - begin]
@@ -120,8 +100,7 @@ def _lists(
 
 
 def _parts(counts: Tensor) -> Iterator[tuple[int, int]]:
-    """Ranges of primitives that reach at most so many tiles together, in order; those that reach none at all left
-    out."""
+    """Ranges of primitives that reach at most ``_PAIRS`` tiles together, in order; those that reach none left out."""
     ends = np.cumsum(counts.cpu().numpy())
     begin = 0
     while begin < len(ends):
@@ -132,16 +111,15 @@ def _parts(counts: Tensor) -> Iterator[tuple[int, int]]:
         begin = end
 
 
-def filled(
+def fill_grid(
     ellipsoids: tuple[Tensor, Tensor, Tensor], neurons: tuple[Tensor, Tensor, Tensor, Tensor], omega0: float, edge: int, P: Tensor, Q: Tensor,
     shape: tuple[int, int, int], where: torch.device,
 ) -> np.ndarray:  # fmt: skip
     """(X, Y, Z) float32 extinction, computed on ``where``.
 
     Args:
-        ellipsoids: means (N, 3), scales (N, 3) and rotations (N, 3, 3), float64, on the processor. neurons: W1 (N, K,
-        3), b1 (N, K),
-            w2 (N, K) and b2 (N,), the same.
+        ellipsoids: means (N, 3), scales (N, 3) and rotations (N, 3, 3), float64, on the CPU.
+        neurons: W1 (N, K, 3), b1 (N, K), w2 (N, K) and b2 (N,), the same.
         P: (3, 4) float64, indices to the scene. Q: (3, 4), back.
     """
     W1, b1, w2, b2 = (device.copy_from_host(x, where) for x in neurons)
@@ -154,19 +132,21 @@ def filled(
         array((w2 / m[:, None]).contiguous(), d), array((b2 / m).contiguous(), d),
     )  # fmt: skip
     rows = array(device.copy_from_host(P.contiguous(), where), wp.vec4d)
-    boxes = _Boxes.of(means, scales, rotations, device.copy_from_host(Q.contiguous(), where), shape)
+    first_tile, end_tile = _tile_boxes(means, scales, rotations, device.copy_from_host(Q.contiguous(), where), shape)
     tiles = tuple(-(-n // t) for n, t in zip(shape, _TILE, strict=True))
     planes = max(1, _POINTS // (_TILE[0] * shape[1] * shape[2]))
     grid = np.empty(shape, np.float32)
     for plane in range(0, tiles[0], planes):
         end = min(plane + planes, tiles[0])
-        low, wide = boxes.within(plane, end)
+        low, high = first_tile.clone(), end_tile.clone()  # counted from this plane of tiles
+        low[:, 0], high[:, 0] = low[:, 0].clamp_min(plane) - plane, high[:, 0].clamp_max(end) - plane
+        wide = (high - low).clamp_min(0)
         counts = wide.prod(1)
         first, last = plane * _TILE[0], min(end * _TILE[0], shape[0])
         part = torch.zeros((last - first, *shape[1:]), dtype=torch.float32, device=where)
         for some in _parts(counts):
             own = (end - plane, *tiles[1:])
-            starts, ids = _lists(low, wide, counts, own, *some)
+            starts, ids = _list_primitives(low, wide, counts, own, *some)
             lists = array(starts, wp.int32), array(ids, wp.int32)
             launch(
                 _kernel(), (len(starts) - 1, _THREADS), (*lists, wp.vec2i(own[1], own[2]), first, rows, *prims, edge, array(part, f)), where,

@@ -15,8 +15,8 @@ from neuprim.core.volumes.density_errors import DensityTruth
 
 
 class Extent(NamedTuple):
-    """What the absorbing grid of a frame holds: its largest value, and the (2, 3) box around its active voxels, world
-    units; None: nothing."""
+    """Largest value of the absorbing grid of a frame, and the (2, 3) box around its active voxels, world units, or
+    None."""
 
     largest: float
     box: np.ndarray | None
@@ -40,9 +40,8 @@ class Placement:
         sigma_per_unit: extinction, 1/scene unit, of a grid value of 1.
         grid: name of the grid that absorbs.
         exact: whether that grid alone makes the extinction; if not, other grids add to it.
-        component: the name of that grid's part of the extinction in models
-        (:meth:`~neuprim.core.model.fields.DensityField.components`). extents: of that grid in every frame; none: not
-        known.
+        component: the name of that grid's part of the extinction in models.
+        extents: of that grid in every frame; empty if unknown.
     """
 
     scene_from_world: np.ndarray
@@ -76,11 +75,15 @@ class Placement:
 
     @staticmethod
     def from_json(record: Mapping[str, Any], where: str) -> Placement:
-        """What :meth:`to_json` gave; ``where`` names the file in errors.
+        """Read what :meth:`to_json` gave; ``where`` names the file in errors.
 
         Raises:
             DataError: anything else.
         """
+
+        def extent(largest: Any, box: Any) -> Extent:
+            return Extent(float(largest), None if box is None else np.array(box, np.float64).reshape(2, 3))
+
         try:
             made = Placement(
                 np.array(record["scene_from_world"], np.float64).reshape(4, 4),
@@ -90,20 +93,23 @@ class Placement:
                 str(record["grid"]),
                 bool(record["exact"]),
                 str(record.get("component", "density")),
-                [
-                    Extent(float(largest), None if box is None else np.array(box, np.float64).reshape(2, 3))
-                    for largest, box in record.get("extents", ())
-                ],
+                [extent(*pair) for pair in record.get("extents", ())],
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DataError(f"{where}: header field 'world' is damaged ({error!r})") from None
-        matrix = made.scene_from_world
-        sound = np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all() and abs(np.linalg.det(matrix)) > 0
-        sound = sound and all(
-            0 <= one.largest < np.inf and (one.box is None or np.isfinite(one.box).all()) for one in made.extents
+        matrix, count = made.scene_from_world, len(made.numbers)
+        sound = (
+            np.isfinite(matrix).all()
+            and (matrix[3] == (0, 0, 0, 1)).all()
+            and abs(np.linalg.det(matrix)) > 0
+            and 0 < made.sigma_per_unit < np.inf
+            and all(
+                0 <= one.largest < np.inf and (one.box is None or np.isfinite(one.box).all()) for one in made.extents
+            )
+            and all(len(values) == count for values in made.times.values())
+            and len(made.extents) in (0, count)
         )
-        per_frame = [*made.times.values(), *([made.extents] if made.extents else [])]
-        if not sound or not 0 < made.sigma_per_unit < np.inf or any(len(v) != len(made.numbers) for v in per_frame):
+        if not sound:
             raise DataError(
                 f"{where}: header field 'world' is damaged; expected an invertible affine matrix, and a time per frame"
             )
@@ -111,11 +117,7 @@ class Placement:
 
 
 class VolumeSource(DensityTruth):
-    """The files themselves, one frame at a time; ``frames`` are those of the placement.
-
-    Attributes:
-        placement: see :class:`Placement`.
-    """
+    """The files themselves, one frame at a time; ``frames`` are those of the placement."""
 
     placement: Placement
 

@@ -269,8 +269,9 @@ def step_gas(state: GasState, settings: SolverSettings, box: Box, forcing: Forci
         state, after = _emit(state, after, source, time)
     if forcing.fade is not None:
         keep = torch.exp(-time * forcing.fade)
-        kept = {name: getattr(state, name) * keep for name in ("density", "temperature", "fuel")}
-        state = replace(state, **kept, colour=None if state.colour is None else state.colour * keep)
+        density, temperature, fuel = (x * keep for x in (state.density, state.temperature, state.fuel))
+        colour = None if state.colour is None else state.colour * keep
+        state = replace(state, density=density, temperature=temperature, fuel=fuel, colour=colour)
     # Faces take the *change* at the centres, as the mean of means would blur all motion at every step. The little
     # smoothing removes what the centres cannot see: motion that alternates from face to face.
     u, v, w = (

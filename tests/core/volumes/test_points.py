@@ -9,64 +9,55 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.core.volumes import points as at_points
 from neuprim.core.volumes.grid import density_at
-from neuprim.core.volumes.points import cells_of, pairs_of, values_at
+from neuprim.core.volumes.points import find_pairs, sort_into_cells, values_at
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.static.fields import SphericalHarmonics
-from tests import scenes
+from tests.cosine_models import model as cosine_model
 
 pytestmark = pytest.mark.usefixtures("either_way")
 
 
-def static(neurons: int, edge: int, seed: int = 2, count: int = 40) -> Primitives:
-    """Parameters in float64, so that only the arithmetic is compared."""
-    t = scenes.tensors(count, neurons, seed=seed)
-    params = {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]}
-    return wide(Primitives(CosineDensity(neurons, edge=edge), SphericalHarmonics(0), params))
+def static(neurons: int, edge: int, count: int = 40) -> Primitives:
+    return wide(cosine_model(neurons, edge, count=count))
 
 
-def moving(seed: int = 0) -> Primitives:
-    generator = torch.Generator().manual_seed(seed)
-    density, colour = TimeDensity(3, "window+motion+offset", edge=2, gain=True), TimeHarmonics(0, powers=2, waves=1)
-    means, times = torch.rand(60, 3, generator=generator) - 0.5, torch.rand(60, generator=generator)
-    context = InitContext(
-        means, torch.full((60,), 0.3), torch.rand(60, 3, generator=generator), generator, conditions={"time": times}
-    )
-    model = Primitives.initialise(density, colour, context)
-    for value in model.params.values():
+def initialised(model: tuple, count: int, extent: float, scale: float) -> Primitives:
+    generator = torch.Generator().manual_seed(0)
+    means, colors = (torch.rand(count, 3, generator=generator) for _ in range(2))
+    times = {"time": torch.rand(count, generator=generator)}
+    context = InitContext(extent * (means - 0.5), torch.full((count,), scale), colors, generator, conditions=times)
+    made = Primitives.initialise(*model, context)
+    for value in made.params.values():
         value += 0.05 * torch.randn(value.shape, generator=generator)
-    return wide(model)
+    return wide(made)
+
+
+def moving() -> Primitives:
+    density, colour = TimeDensity(3, "window+motion+offset", edge=2, gain=True), TimeHarmonics(0, powers=2, waves=1)
+    return initialised((density, colour), 60, 1.0, 0.3)
 
 
 def gaussians() -> Primitives:
-    generator = torch.Generator().manual_seed(0)
-    context = InitContext(
-        0.3 * torch.rand(5, 3, generator=generator),
-        torch.full((5,), 0.4),
-        torch.rand(5, 3, generator=generator),
-        generator,
-    )
-    return wide(Primitives.initialise(GaussianDensity(), SphericalHarmonics(0), context))
+    return initialised((GaussianDensity(), SphericalHarmonics(0)), 5, 0.3, 0.4)
 
 
 def wide(model: Primitives) -> Primitives:
-    model.params = {name: value.double().requires_grad_() for name, value in model.params.items()}
+    """Parameters in float64, so that only the arithmetic is compared."""
+    model.params = {name: value.detach().double().requires_grad_() for name, value in model.params.items()}
     return model
 
 
-def oracle(model: Primitives, conditions: Conditions, x: Tensor) -> tuple[Tensor, Tensor]:
+def reference(model: Primitives, conditions: Conditions, x: Tensor) -> tuple[Tensor, Tensor]:
     """Sigma (M,) and source (M, 3) by all pairs, in float64 with autograd."""
     active = model.active(conditions)
     g = active.geometry
-    own = {spec.name: active.params[spec.name] for spec in model.colour.parameters()}
-    harmonics = model.colour.harmonics(own, conditions)
+    harmonics = model.colour.harmonics({s.name: active.params[s.name] for s in model.colour.parameters()}, conditions)
     assert harmonics is not None
     colors = (harmonics[0] * 0.28209479177387814 + 0.5).clamp_min(0)
     point, prim = (i.reshape(-1) for i in torch.meshgrid(torch.arange(len(x)), torch.arange(g.count), indexing="ij"))
@@ -76,36 +67,41 @@ def oracle(model: Primitives, conditions: Conditions, x: Tensor) -> tuple[Tensor
     return total, torch.zeros(len(x), 3, dtype=torch.float64).index_add(0, point, sigma[:, None] * colors[prim])
 
 
-def gradients(model: Primitives, sigma: Tensor, source: Tensor, seed: int = 5) -> dict[str, Tensor]:
+def gradients(model: Primitives, sigma: Tensor, source: Tensor) -> dict[str, Tensor]:
     """Of a random weighted sum of both."""
-    generator = torch.Generator().manual_seed(seed)
-    a = torch.randn(sigma.shape, generator=generator, dtype=torch.float64)
-    b = torch.randn(source.shape, generator=generator, dtype=torch.float64)
-    made = torch.autograd.grad((a * sigma).sum() + (b * source).sum(), list(model.params.values()), allow_unused=True)
-    return {
-        name: torch.zeros_like(v) if g is None else g for (name, v), g in zip(model.params.items(), made, strict=True)
-    }
+    generator = torch.Generator().manual_seed(5)
+    a, b = (torch.randn(x.shape, generator=generator, dtype=torch.float64) for x in (sigma, source))
+    loss = (a * sigma.double()).sum() + (b * source.double()).sum()
+    made = torch.autograd.grad(loss, list(model.params.values()), allow_unused=True)
+    named = zip(model.params.items(), made, strict=True)
+    return {name: torch.zeros_like(value) if g is None else g for (name, value), g in named}
 
 
-def agree(model: Primitives, conditions: Conditions, x: Tensor, tolerance: float = 2e-6) -> None:
-    found, (sigma, source) = values_at(model, conditions, x), oracle(model, conditions, x)
-    assert found.source is not None and float(sigma.detach().max()) > 0
+def agree(
+    model: Primitives, conditions: Conditions, x: Tensor, tolerance: float = 2e-6, exact: Primitives | None = None
+) -> None:
+    exact = exact or model
+    found, (sigma, source) = values_at(model, conditions, x), reference(exact, conditions, x)
+    assert found.source is not None and float(sigma.detach().max()) > 0 and found.sigma.dtype == torch.float32
     for fast, slow in ((found.sigma, sigma), (found.source, source)):
         assert torch.allclose(fast.double(), slow, rtol=tolerance, atol=tolerance * float(slow.detach().abs().max()))
-    fast_g, slow_g = gradients(model, found.sigma.double(), found.source.double()), gradients(model, sigma, source)
-    for name, expected in slow_g.items():
+    fast_gradients = gradients(model, found.sigma, found.source)
+    for name, expected in gradients(exact, sigma, source).items():
         scale = float(expected.abs().max()) if expected.numel() else 0.0
-        assert torch.allclose(fast_g[name], expected, rtol=1e-5, atol=max(1e-5 * scale, 1e-12)), name
+        assert fast_gradients[name].dtype == model.params[name].dtype
+        assert torch.allclose(fast_gradients[name].double(), expected, rtol=1e-5, atol=max(1e-5 * scale, 1e-12)), name
 
 
-def cloud(count: int = 300, seed: int = 1, size: float = 2.0) -> Tensor:
-    return size * (torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 0.5)
+def cloud(count: int = 300, size: float = 2.0) -> Tensor:
+    return size * (torch.rand(count, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.5)
 
 
 @pytest.mark.parametrize("edge", [0, 1, 2])
 @pytest.mark.parametrize("neurons", [0, 1, 5, 16])
 def test_it_equals_all_pairs_forward_and_backward(neurons: int, edge: int) -> None:
-    agree(static(neurons, edge), {}, cloud())
+    model, x = static(neurons, edge), cloud()
+    agree(model, {}, x)
+    assert torch.allclose(values_at(model, {}, x).sigma.double(), density_at(model, {}, x), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.37, 1.0])
@@ -117,41 +113,34 @@ def test_a_density_in_torch_code() -> None:
     agree(gaussians(), {}, cloud(size=1.0))
 
 
-def test_it_is_the_density_that_grids_show() -> None:
-    model, x = static(4, 1), cloud()
-    assert torch.allclose(values_at(model, {}, x).sigma.double(), density_at(model, {}, x), rtol=1e-6, atol=1e-6)
-
-
 @pytest.mark.parametrize("case", ["needles", "huge", "tiny", "far", "one place", "one point", "a line", "on the rim"])
 def test_extremes(case: str) -> None:
     model, x = static(2, 2), cloud()
+    params = model.params
     with torch.no_grad():
         if case == "needles":
-            model.params["log_scales"][:, 0] += 4
-            model.params["log_scales"][:, 1:] -= 4
-            x = model.params["means"][:, None].expand(-1, 5, -1).reshape(-1, 3) + 1e-3 * cloud(200)
+            params["log_scales"] += torch.tensor([4.0, -4.0, -4.0])
+            x = params["means"][:, None].expand(-1, 5, -1).reshape(-1, 3) + 1e-3 * cloud(200)
         elif case == "huge":
-            model.params["log_scales"][::3] = 12.0
+            params["log_scales"][::3] = 12.0
         elif case == "tiny":
-            model.params["log_scales"][::2] = -14.0
-            x = torch.cat([x, model.params["means"].detach() + 2e-7])
+            params["log_scales"][::2] = -14.0
+            x = torch.cat([x, params["means"].detach() + 2e-7])
         elif case == "far":
-            model.params["means"][3:6] = torch.tensor([1e25, -1e25, 0.0], dtype=torch.float64)
+            params["means"][3:6] = torch.tensor([1e25, -1e25, 0.0], dtype=torch.float64)
         elif case == "one place":
-            x = model.params["means"].detach()[:1].expand(50, 3)
+            x = params["means"].detach()[:1].expand(50, 3)
         elif case == "one point":
-            x = model.params["means"].detach()[:1] + 0.01
+            x = params["means"].detach()[:1] + 0.01
         elif case == "a line":
-            x = torch.linspace(-1, 1, 80, dtype=torch.float64)[:, None] * torch.tensor(
-                [1.0, 0.0, 0.0], dtype=torch.float64
-            )
+            x = torch.linspace(-1, 1, 80).double()[:, None] * torch.tensor([1.0, 0.0, 0.0]).double()
         else:
             axes = model.geometry.rotations[:, :, 0] * model.geometry.scales[:, :1]
-            x = torch.cat([model.params["means"] + s * axes for s in (1 - 1e-9, 1.0, 1 + 1e-9, -1.0, 0.5)])
+            x = torch.cat([params["means"] + s * axes for s in (1 - 1e-9, 1.0, 1 + 1e-9, -1.0, 0.5)])
     agree(model, {}, x.contiguous(), 1e-5)
 
 
-def test_nothing_lives_or_nothing_is_asked() -> None:
+def test_nothing_is_active_or_no_point_is_given() -> None:
     model = moving()
     with torch.no_grad():
         model.params["window_center"].fill_(0.1)
@@ -166,10 +155,12 @@ def test_nothing_lives_or_nothing_is_asked() -> None:
 def test_shares_are_sums_over_points(model: Primitives) -> None:
     x, error = cloud(), torch.rand(300, generator=torch.Generator().manual_seed(3))
     found = values_at(model, {}, x)
-    shares = found.watch(error)
+    shares = found.request_shares(error)
     assert not bool(shares.weight.any())
     found.sigma.sum().backward()
-    point, prim = pairs_of(model.geometry, x.numpy())
+    cells = sort_into_cells(x.numpy())
+    row, prim = find_pairs(model.geometry, cells)
+    point = torch.from_numpy(cells.order)[row]
     own = model.active({}).sigma(prim, x[point]).clamp_min(0).detach()
     for sums, value in ((shares.weight, own), (shares.error_weight, own * error[point])):
         expected = torch.zeros(model.count, dtype=torch.float64).index_add_(0, prim, value)
@@ -179,15 +170,14 @@ def test_shares_are_sums_over_points(model: Primitives) -> None:
 def test_it_does_not_depend_on_the_number_of_threads() -> None:
     model, x = static(3, 1, count=150), cloud()
     found = [values_at(model, {}, x, threads=n) for n in (1, 2, 5)]
-    made = [gradients(model, f.sigma.double(), f.sigma.double()[:, None]) for f in found]
+    made = [gradients(model, f.sigma, f.sigma[:, None]) for f in found]
     for other, grads in zip(found[1:], made[1:], strict=True):
         assert torch.equal(found[0].sigma, other.sigma)
         assert all(torch.equal(value, grads[name]) for name, value in made[0].items())
 
 
 def test_parameters_in_float32_lose_nothing_on_the_way() -> None:
-    """Turned needles, whose axes are a thousand apart: what is found of float32 parameters is right to the last
-    rounding."""
+    """Turned needles, whose axes are a thousand apart: values of float32 parameters are right to the last rounding."""
     model = static(2, 2)
     generator = torch.Generator().manual_seed(6)
     with torch.no_grad():
@@ -195,68 +185,52 @@ def test_parameters_in_float32_lose_nothing_on_the_way() -> None:
         model.params["b2"] += 3
         axes = model.geometry.rotations * model.geometry.scales[:, None, :]
         inside = 0.5 * torch.rand(20, 40, 3, generator=generator, dtype=torch.float64) - 0.25
-    narrow = Primitives(
-        model.density, model.colour, {n: v.detach().float().requires_grad_() for n, v in model.params.items()}
-    )
-    exact = wide(Primitives(model.density, model.colour, {n: v.detach() for n, v in narrow.params.items()}))
+    params = {name: value.detach().float().requires_grad_() for name, value in model.params.items()}
+    narrow = Primitives(model.density, model.colour, params)
+    exact = wide(Primitives(model.density, model.colour, dict(params)))
     x = (exact.params["means"].detach() + torch.einsum("nij,pnj->pni", axes, inside)).reshape(-1, 3)
-    found, (sigma, source) = values_at(narrow, {}, x), oracle(exact, {}, x)
-    assert found.source is not None and found.sigma.dtype == torch.float32
-    assert torch.allclose(found.sigma.double(), sigma, rtol=1e-6, atol=1e-6 * float(sigma.detach().max()))
-    fast, slow = gradients(narrow, found.sigma.double(), found.source.double()), gradients(exact, sigma, source)
-    for name, wanted in slow.items():
-        assert fast[name].dtype == torch.float32
-        assert torch.allclose(fast[name].double(), wanted, rtol=1e-5, atol=2e-6 * float(wanted.abs().max())), name
+    agree(narrow, {}, x, 1e-6, exact)
 
 
 def test_pairs_are_all_and_once() -> None:
     model, x = static(0, 0), cloud()
-    point, prim = pairs_of(model.geometry, x.numpy())
-    g = model.geometry
+    cells, g = sort_into_cells(x.numpy()), model.geometry
+    row, prim = find_pairs(g, cells)
     y = torch.einsum("mna,nab->mnb", x[:, None] - g.means, g.rotations) / g.scales
     expected = {tuple(pair) for pair in (y.square().sum(-1) < 1).nonzero().tolist()}
-    assert len(point) == len(expected) > 100 and set(zip(point.tolist(), prim.tolist(), strict=True)) == expected
+    found = list(zip(cells.order[row.numpy()].tolist(), prim.tolist(), strict=True))
+    assert len(found) == len(expected) > 100 and set(found) == expected
 
 
 def test_cells_hold_every_point() -> None:
     x = cloud().numpy()
-    cells = cells_of(x)
-    assert (
-        sorted(cells.order) == list(range(300))
-        and cells.starts[-1] == 300
-        and len(cells.starts) == cells.counts.prod() + 1
-    )
-    corner = (
-        cells.low
-        + np.stack(np.unravel_index(np.repeat(np.arange(cells.counts.prod()), np.diff(cells.starts)), cells.counts), 1)
-        * cells.step
-    )
-    away = x[cells.order] - corner
+    cells = sort_into_cells(x)
+    count = int(cells.counts.prod())
+    assert sorted(cells.order) == list(range(300)) and cells.starts[-1] == 300 and len(cells.starts) == count + 1
+    owner = np.repeat(np.arange(count), np.diff(cells.starts))
+    away = x[cells.order] - (cells.low + np.stack(np.unravel_index(owner, cells.counts), 1) * cells.step)
     assert (away >= -1e-12).all() and (away <= cells.step * (1 + 1e-12)).all()
-    assert (cells.placed == x[cells.order]).all()
-    inner = np.repeat(np.arange(cells.counts.prod()), np.diff(cells.starts))
-    assert (np.diff(cells.order)[np.diff(inner) == 0] > 0).all(), "in a cell they keep their order"
+    assert (cells.points == x[cells.order]).all()
+    assert (np.diff(cells.order)[np.diff(owner) == 0] > 0).all(), "in a cell they keep their order"
 
 
-def test_what_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [("b2", float("nan"), "b2 of primitive 7"), ("log_scales", -800.0, "product of finite parameters")],
+)
+def test_what_is_not_finite_is_named(name: str, value: float, message: str) -> None:
     model = static(2, 1)
     with torch.no_grad():
-        model.params["b2"][7] = float("nan")
-    with pytest.raises(NonFiniteError, match="b2 of primitive 7"):
-        values_at(model, {}, cloud())
-    model = static(2, 1)
-    with torch.no_grad():
-        model.params["log_scales"][4] = -800.0
-    with pytest.raises(NonFiniteError, match="product of finite parameters"):
+        model.params[name][7] = value
+    with pytest.raises(NonFiniteError, match=message):
         values_at(model, {}, cloud())
 
 
-def test_colour_is_left_out_where_it_is_not_wanted_or_has_no_part_without_direction(
+def test_colour_is_left_out_where_it_is_not_requested_or_depends_on_direction(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     model, x = static(2, 1), cloud()
-    assert values_at(model, {}, x, colour=False).source is None
+    sigma, source = values_at(model, {}, x, colour=False)[:2]
     monkeypatch.setattr(SphericalHarmonics, "harmonics", lambda self, params, conditions: None)
     found = values_at(model, {}, x)
-    assert found.source is None and torch.equal(found.sigma, values_at(model, {}, x, colour=False).sigma)
-    assert at_points._SUMS > 1
+    assert source is None and found.source is None and torch.equal(found.sigma, sigma)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes import density_errors
 from neuprim.core.volumes.density_errors import (
     NUMBERS,
@@ -20,25 +16,17 @@ from neuprim.core.volumes.density_errors import (
     measure_frame_errors,
     split_planes,
 )
-from neuprim.core.volumes.grid import agreement, density_grid, voxels_within
-from neuprim.tasks.static.fields import SphericalHarmonics
-from tests import scenes
+from neuprim.core.volumes.grid import density_grid, voxels_within
+from tests.cosine_models import model
 
 SHAPE = (20, 14, 17)
-
-
-def model() -> Primitives:
-    t = scenes.tensors(40, 5, seed=2)
-    return Primitives(
-        CosineDensity(5), SphericalHarmonics(0), {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]}
-    )
 
 
 class Known(DensityTruth):
     """One frame of numbers on voxels of edge 0.1, another that is empty."""
 
     def __init__(self, values: np.ndarray) -> None:
-        self.values, self.frames, self.asked = values, [TruthFrame("a", {}), TruthFrame("b", {})], 0
+        self.values, self.frames, self.blocks = values, [TruthFrame("a", {}), TruthFrame("b", {})], 0
         self.bounds = torch.tensor([[-1.0, -0.7, -0.9], [1.0, 0.7, 0.8]], dtype=torch.float64)
         self.matrix = torch.diag(torch.tensor([0.1, 0.1, 0.1, 1.0], dtype=torch.float64))
         self.matrix[:3, 3] = self.bounds[0] + 0.05
@@ -46,8 +34,10 @@ class Known(DensityTruth):
     def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
         return None if frame else (self.matrix, SHAPE)
 
-    def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int]) -> Tensor:
-        self.asked += 1
+    def grid(
+        self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
+    ) -> Tensor:
+        self.blocks += 1
         low = ((scene_from_index[:3, 3] - self.matrix[:3, 3]) / 0.1).round().long().tolist()
         return torch.from_numpy(self.values[tuple(slice(a, a + n) for a, n in zip(low, shape, strict=True))].copy())
 
@@ -57,35 +47,7 @@ def ball() -> np.ndarray:
     return np.clip(3 - 0.6 * np.linalg.norm(index, axis=0), 0, None).astype(np.float32)
 
 
-@pytest.mark.parametrize("block", [1, 14 * 17 * 3, 1 << 22])
-def test_numbers_are_those_of_the_whole_grids(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
-    monkeypatch.setattr(density_errors, "_BLOCK", block)
-    truth, m = Known(ball()), model()
-    found = measure_frame_errors(m, {}, truth, 0)
-    assert found is not None and tuple(found) == NUMBERS
-    sigma = density_grid(m, {}, truth.matrix, SHAPE).numpy().astype(float)
-    wrong, both = sigma - truth.values, agreement(truth.values, sigma)
-    assert both is not None and {k: found[k] for k in both} == pytest.approx(both, rel=1e-6)
-    assert found["max_error"] == pytest.approx(np.abs(wrong).max() / truth.values.max(), rel=1e-6)
-    active = wrong[truth.values > 0]
-    assert 0 < len(active) < truth.values.size
-    assert found["psnr_active"] == pytest.approx(-10 * np.log10((active**2).mean() / truth.values.max() ** 2), rel=1e-6)
-    assert truth.asked == {1: 20, 714: 7, 1 << 22: 1}[block]
-
-
-def test_false_matter_in_empty_voxels_counts() -> None:
-    a = ball()
-    b = a.copy()
-    b[0, 0, 0] = 5.0
-    here, there = (_numbers(a, x) for x in (a, b))
-    assert a[0, 0, 0] == 0 and here["relative_l2"] == here["max_error"] == 0 and here["psnr_active"] == 200
-    assert there["relative_l2"] == pytest.approx(5 / np.linalg.norm(a), rel=1e-6) and there[
-        "max_error"
-    ] == pytest.approx(5 / a.max())
-    assert there["psnr_active"] == 200
-
-
-def _numbers(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
+def numbers(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     compared = Comparison()
     compared.add(a, b)
     found = compared.numbers()
@@ -93,25 +55,50 @@ def _numbers(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     return found
 
 
+@pytest.mark.parametrize(("block", "blocks"), [(1, 20), (14 * 17 * 3, 7), (1 << 22, 1)])
+def test_numbers_are_those_of_the_whole_grids(monkeypatch: pytest.MonkeyPatch, block: int, blocks: int) -> None:
+    monkeypatch.setattr(density_errors, "_BLOCK", block)
+    truth, m = Known(ball()), model()
+    found = measure_frame_errors(m, {}, truth, 0)
+    assert found is not None and tuple(found) == NUMBERS and truth.blocks == blocks
+    a, b = truth.values.astype(float), density_grid(m, {}, truth.matrix, SHAPE).numpy().astype(float)
+    active = (b - a)[a > 0]
+    assert 0 < len(active) < a.size
+    assert found == pytest.approx(
+        {
+            "correlation": np.corrcoef(a.ravel(), b.ravel())[0, 1],
+            "relative_l2": np.linalg.norm(b - a) / np.linalg.norm(a),
+            "psnr_active": -10 * np.log10((active**2).mean() / a.max() ** 2),
+            "max_error": np.abs(b - a).max() / a.max(),
+        },
+        rel=1e-6,
+    )
+
+
+def test_false_matter_in_empty_voxels_counts() -> None:
+    a = ball()
+    b = a.copy()
+    b[0, 0, 0] = 5.0
+    same, wrong = numbers(a, a), numbers(a, b)
+    assert a[0, 0, 0] == 0 and same["relative_l2"] == same["max_error"] == 0 and same["psnr_active"] == 200
+    assert wrong["relative_l2"] == pytest.approx(5 / np.linalg.norm(a), rel=1e-6) and wrong["psnr_active"] == 200
+    assert wrong["max_error"] == pytest.approx(5 / a.max())
+
+
 def test_nothing_to_compare_with() -> None:
     assert measure_frame_errors(model(), {}, Known(ball()), 1) is None
     assert measure_frame_errors(model(), {}, Known(np.zeros(SHAPE, np.float32)), 0) is None
-    assert _numbers(ball(), np.zeros(SHAPE))["correlation"] == 0
+    assert numbers(ball(), np.zeros(SHAPE))["correlation"] == 0
 
 
 def test_blocks_are_the_points_in_their_order() -> None:
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = torch.tensor([[0.1, 0.02, 0], [0, 0.2, 0], [0.05, 0, 0.1]])
-    parts: list[Any] = split_planes(matrix, (5000, 60, 50))
-    assert (
-        sum(shape[0] for _, shape in parts) == 5000
-        and len(parts) > 2
-        and all(shape[1:] == (60, 50) for _, shape in parts)
-    )
-    first = parts[0][1][0]
-    assert torch.allclose(
-        parts[1][0] @ torch.tensor([0, 1, 2, 1.0]).double(), matrix @ torch.tensor([first, 1, 2, 1.0]).double()
-    )
+    parts = split_planes(matrix, (5000, 60, 50))
+    assert sum(shape[0] for _, shape in parts) == 5000 and len(parts) > 2
+    assert all(shape[1:] == (60, 50) for _, shape in parts)
+    point = torch.tensor([parts[0][1][0], 1, 2, 1.0], dtype=torch.float64)
+    assert torch.allclose(parts[1][0] @ torch.tensor([0, 1, 2, 1.0]).double(), matrix @ point)
 
 
 def test_voxels_of_a_box_are_those_whose_centres_lie_in_it() -> None:

@@ -1,5 +1,4 @@
-"""The kernel of a card that fills a grid, on Warp's CPU blocks: which block comes first, and how much is taken at a
-time, change no bit."""
+"""The GPU kernel that fills a grid, on Warp's CPU blocks: the order and size of blocks change no bit."""
 
 from __future__ import annotations
 
@@ -10,15 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-pytest.importorskip("warp", reason="the kernels of a card are written in Warp: pip install 'neuprim[cuda]'")
+pytest.importorskip("warp", reason="GPU kernels are written in Warp: pip install 'neuprim[cuda]'")
 
 from neuprim.core.compute import device
-from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes import grid_warp
 from neuprim.core.volumes.grid import density_grid
-from neuprim.tasks.static.fields import SphericalHarmonics
-from tests import scenes
+from tests.cosine_models import model as cosine_model
 
 SHAPE = (21, 18, 25)
 MATRIX = torch.diag(torch.tensor([0.08, 0.09, 0.07, 1.0], dtype=torch.float64))
@@ -32,12 +29,11 @@ def on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def model(neurons: int = 3, edge: int = 2) -> Primitives:
     """Small and large ones, one around the whole grid, and some beside it."""
-    t = scenes.tensors(60, neurons, seed=4)
-    t["log_scales"][:5] += 2.0
-    t["log_scales"][5] += 6.0
-    t["means"][6:9] += 5.0
-    params = {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]}
-    return Primitives(CosineDensity(neurons, edge=edge), SphericalHarmonics(0), params)
+    m = cosine_model(neurons, edge, seed=4, count=60)
+    m.params["log_scales"][:5] += 2.0
+    m.params["log_scales"][5] += 6.0
+    m.params["means"][6:9] += 5.0
+    return m
 
 
 def filled() -> Tensor:
@@ -46,7 +42,7 @@ def filled() -> Tensor:
 
 @pytest.mark.parametrize("edge", [0, 1, 2])
 @pytest.mark.parametrize("neurons", [0, 8])
-def test_it_is_the_processors(edge: int, neurons: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_the_cpus(edge: int, neurons: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sums of the same float32 numbers in the same order: most points have the same bits."""
     m = model(neurons, edge)
     found = density_grid(m, {}, MATRIX, SHAPE)

@@ -1,0 +1,257 @@
+"""Kernels of :mod:`neuprim.core.volumes.points`: preparation of primitives and points, sums, and their gradients."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neuprim.core.compute.kernels import exact_kernel, inline, kernel
+from neuprim.core.model.rotation import rotation, rotation_backward
+
+
+@exact_kernel
+def prepare_axes(start, stop, means, log_scales, quats, centers, A, m, reach):  # type: ignore[no-untyped-def]
+    """Fill of ellipsoids start:stop ``centers`` (N, 3), A (N, 3, 3) with y = A (x - mu), longest semi-axes m (N,) and
+    half sides of their boxes, ``reach`` (N, 3). Returns whether all are finite."""
+    R, s, total = np.empty((3, 3)), np.empty(3), 0.0
+    for n in range(start, stop):
+        rotation(quats[n], R)
+        for a in range(3):
+            s[a] = np.exp(np.float64(log_scales[n, a]))
+        m[n] = max(s[0], s[1], s[2])
+        for j in range(3):
+            centers[n, j] = means[n, j]
+            reach[n, j] = np.sqrt((R[j, 0] * s[0]) ** 2 + (R[j, 1] * s[1]) ** 2 + (R[j, 2] * s[2]) ** 2)
+            total += centers[n, j] + reach[n, j]
+            for a in range(3):
+                A[n, a, j] = R[j, a] / s[a]
+                total += A[n, a, j]
+    return np.isfinite(total)
+
+
+@exact_kernel
+def prepare_values(start, stop, W1, b1, w2, b2, colors, omega0, m, rate, phase, amplitude, offset, shown):  # type: ignore[no-untyped-def]
+    """Fill of primitives start:stop rate (N, K, 3), phase and amplitude (N, K), and offset (N,), so that f/m =
+    offset + sum of amplitude cos(phase + rate . (x - mu)), and colours in float64. Returns whether all are finite."""
+    total = 0.0
+    for n in range(start, stop):
+        for k in range(W1.shape[1]):
+            for j in range(3):
+                rate[n, k, j] = omega0 * W1[n, k, j] / m[n]
+                total += rate[n, k, j]
+            phase[n, k], amplitude[n, k] = omega0 * b1[n, k], w2[n, k] / m[n]
+            total += phase[n, k] + amplitude[n, k]
+        offset[n] = b2[n] / m[n]
+        total += offset[n]
+        for c in range(colors.shape[1]):
+            shown[n, c] = colors[n, c]
+            total += shown[n, c]
+    return np.isfinite(total)
+
+
+@exact_kernel
+def pull_parameters(start, stop, log_scales, quats, omega0, m, prims, pulled, gradients):  # type: ignore[no-untyped-def]
+    """Gradients of (log_scales, quats, W1, b1, w2, b2) of primitives start:stop from those of ``prims``, (A, rate,
+    phase, amplitude, offset)."""
+    A, rate, phase, amplitude, offset = prims
+    p_A, p_rate, p_phase, p_amplitude, p_offset = pulled
+    g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2 = gradients
+    R, gR, q, gq = np.empty((3, 3)), np.empty((3, 3)), np.empty(4), np.empty(4)
+    for n in range(start, stop):
+        for j in range(4):
+            q[j] = quats[n, j]
+        inverse = rotation(q, R)
+        longest, first = p_offset[n] * offset[n], 0
+        for k in range(phase.shape[1]):
+            longest += p_amplitude[n, k] * amplitude[n, k]
+            for j in range(3):
+                longest += p_rate[n, k, j] * rate[n, k, j]
+                g_W1[n, k, j] = omega0 * p_rate[n, k, j] / m[n]
+            g_b1[n, k], g_w2[n, k] = omega0 * p_phase[n, k], p_amplitude[n, k] / m[n]
+        g_b2[n] = p_offset[n] / m[n]
+        for a in range(3):
+            if log_scales[n, a] > log_scales[n, first]:  # of equals the first, as in Geometry.log_length_scale
+                first = a
+        for a in range(3):
+            s, total = np.exp(np.float64(log_scales[n, a])), 0.0
+            for j in range(3):
+                total += p_A[n, a, j] * A[n, a, j]
+                gR[j, a] = p_A[n, a, j] / s
+            g_log_scales[n, a] = -total - (longest if a == first else 0.0)
+        rotation_backward(q, inverse, gR, gq)
+        for j in range(4):
+            g_quats[n, j] = gq[j]
+
+
+@exact_kernel
+def sort_points(points, low, step, counts, starts, order, placed):  # type: ignore[no-untyped-def]
+    """A counting sort by cell: fill ``starts`` (X Y Z + 1,), zeros before, ``order`` (M,), and the sorted ``placed``."""
+    cells = np.empty(points.shape[0], np.int64)
+    for p in range(points.shape[0]):
+        cell = 0
+        for j in range(3):
+            cell = cell * counts[j] + min(max(np.int64(np.floor((points[p, j] - low[j]) / step)), 0), counts[j] - 1)
+        cells[p] = cell
+        starts[cell + 1] += 1
+    for c in range(starts.shape[0] - 1):
+        starts[c + 1] += starts[c]
+    fill = starts[:-1].copy()
+    for p in range(points.shape[0]):
+        at = fill[cells[p]]
+        fill[cells[p]] = at + 1
+        order[at] = p
+        for j in range(3):
+            placed[at, j] = points[p, j]
+
+
+@exact_kernel
+def merge_parts(start, stop, parts, order, merged):  # type: ignore[no-untyped-def]
+    """Sum the ``parts`` (P, M, W) of sorted points start:stop, in order, into ``merged`` (M, W) of the given points."""
+    for p in range(start, stop):
+        for q in range(parts.shape[2]):
+            total = 0.0
+            for part in range(parts.shape[0]):
+                total += parts[part, p, q]
+            merged[order[p], q] = total
+
+
+# ---------------------------------------------------------------- points
+
+
+@inline
+def _span(center, reach, low, step, count):  # type: ignore[no-untyped-def]
+    """First and last cell of an axis that a box meets; beyond the last, or -1, if none."""
+    first = int(np.floor(min(max((center - reach - low) / step, 0.0), float(count))))
+    return first, int(np.floor(min(max((center + reach - low) / step, -1.0), float(count - 1))))
+
+
+@inline
+def _met(cells, reach, means, n):  # type: ignore[no-untyped-def]
+    """First and last cell along each axis that the box of primitive n meets."""
+    _, low, step, counts = cells
+    x0, x1 = _span(means[n, 0], reach[n, 0], low[0], step, counts[0])
+    y0, y1 = _span(means[n, 1], reach[n, 1], low[1], step, counts[1])
+    z0, z1 = _span(means[n, 2], reach[n, 2], low[2], step, counts[2])
+    return x0, x1, y0, y1, z0, z1
+
+
+@inline
+def _inside(A, n, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Whitened coordinates of an offset from the mean."""
+    y0 = A[n, 0, 0] * dx + A[n, 0, 1] * dy + A[n, 0, 2] * dz
+    y1 = A[n, 1, 0] * dx + A[n, 1, 1] * dy + A[n, 1, 2] * dz
+    y2 = A[n, 2, 0] * dx + A[n, 2, 1] * dy + A[n, 2, 2] * dz
+    return y0, y1, y2
+
+
+@inline
+def _field(rate, phase, amplitude, offset, n, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """f/m at an offset from the mean."""
+    f = offset[n]
+    for k in range(phase.shape[1]):
+        f += amplitude[n, k] * np.cos(phase[n, k] + rate[n, k, 0] * dx + rate[n, k, 1] * dy + rate[n, k, 2] * dz)
+    return f
+
+
+@kernel
+def add_values(start, stop, points, cells, reach, prims, edge, chunk, sums):  # type: ignore[no-untyped-def]
+    """Add sigma and source of primitives start:stop to part ``start // chunk`` of ``sums`` (parts, M, 1 + C).
+
+    Args:
+        points: (M, 3) float64, cell by cell. cells: ``Cells.grid``.
+        reach: (N, 3) half sides of the primitives' boxes.
+        prims: means (N, 3), A (N, 3, 3), and what :func:`prepare_values` fills.
+    """
+    starts, counts = cells[0], cells[3]
+    means, A, rate, phase, amplitude, offset, colors = prims
+    own = sums[start // chunk]
+    C = colors.shape[1]
+    for n in range(start, stop):
+        x0, x1, y0, y1, z0, z1 = _met(cells, reach, means, n)
+        if z0 > z1:
+            continue
+        for i in range(x0, x1 + 1):
+            for j in range(y0, y1 + 1):
+                row = (i * counts[1] + j) * counts[2]
+                for p in range(starts[row + z0], starts[row + z1 + 1]):
+                    dx, dy, dz = points[p, 0] - means[n, 0], points[p, 1] - means[n, 1], points[p, 2] - means[n, 2]
+                    a, b, c = _inside(A, n, dx, dy, dz)
+                    inner = 1.0 - (a * a + b * b + c * c)
+                    if inner <= 0.0:
+                        continue
+                    f = _field(rate, phase, amplitude, offset, n, dx, dy, dz)
+                    if f <= 0.0:
+                        continue
+                    sigma = f if edge == 0 else f * inner if edge == 1 else f * inner * inner
+                    own[p, 0] += sigma
+                    for q in range(C):
+                        own[p, 1 + q] += sigma * colors[n, q]
+
+
+@kernel
+def pull_values(start, stop, points, cells, reach, prims, edge, pulled, error, gradients, shares):  # type: ignore[no-untyped-def]
+    """Gradients of primitives start:stop, a tuple like ``prims``, from those of the sums, ``pulled`` (M, 1 + C), and
+    the sums of sigma and sigma x error, ``shares`` (N, 2)."""
+    starts, counts = cells[0], cells[3]
+    means, A, rate, phase, amplitude, offset, colors = prims
+    g_means, g_A, g_rate, g_phase, g_amplitude, g_offset, g_colors = gradients
+    K, C = phase.shape[1], colors.shape[1]
+    for n in range(start, stop):
+        x0, x1, y0, y1, z0, z1 = _met(cells, reach, means, n)
+        if z0 > z1:
+            continue
+        m0, m1, m2, whole, weight, wrong = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        a00, a01, a02, a10, a11, a12, a20, a21, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(x0, x1 + 1):
+            for j in range(y0, y1 + 1):
+                row = (i * counts[1] + j) * counts[2]
+                for p in range(starts[row + z0], starts[row + z1 + 1]):
+                    dx, dy, dz = points[p, 0] - means[n, 0], points[p, 1] - means[n, 1], points[p, 2] - means[n, 2]
+                    a, b, c = _inside(A, n, dx, dy, dz)
+                    inner = 1.0 - (a * a + b * b + c * c)
+                    if inner <= 0.0:
+                        continue
+                    f = _field(rate, phase, amplitude, offset, n, dx, dy, dz)
+                    if f <= 0.0:
+                        continue
+                    fade = 1.0 if edge == 0 else inner if edge == 1 else inner * inner
+                    sigma = f * fade
+                    weight += sigma
+                    wrong += sigma * error[p]
+                    g = pulled[p, 0]
+                    for q in range(C):
+                        g += pulled[p, 1 + q] * colors[n, q]
+                        g_colors[n, q] += pulled[p, 1 + q] * sigma
+                    gf = g * fade
+                    whole += gf
+                    for k in range(K):
+                        angle = phase[n, k] + rate[n, k, 0] * dx + rate[n, k, 1] * dy + rate[n, k, 2] * dz
+                        g_amplitude[n, k] += gf * np.cos(angle)
+                        turn = -gf * amplitude[n, k] * np.sin(angle)
+                        g_phase[n, k] += turn
+                        g_rate[n, k, 0] += turn * dx
+                        g_rate[n, k, 1] += turn * dy
+                        g_rate[n, k, 2] += turn * dz
+                        m0 -= turn * rate[n, k, 0]
+                        m1 -= turn * rate[n, k, 1]
+                        m2 -= turn * rate[n, k, 2]
+                    if edge == 0:
+                        continue
+                    s = -2.0 * g * f if edge == 1 else -4.0 * g * f * inner  # dL/d|y|^2, twice
+                    a, b, c = s * a, s * b, s * c
+                    a00 += a * dx
+                    a01 += a * dy
+                    a02 += a * dz
+                    a10 += b * dx
+                    a11 += b * dy
+                    a12 += b * dz
+                    a20 += c * dx
+                    a21 += c * dy
+                    a22 += c * dz
+                    m0 -= a * A[n, 0, 0] + b * A[n, 1, 0] + c * A[n, 2, 0]
+                    m1 -= a * A[n, 0, 1] + b * A[n, 1, 1] + c * A[n, 2, 1]
+                    m2 -= a * A[n, 0, 2] + b * A[n, 1, 2] + c * A[n, 2, 2]
+        g_means[n, 0], g_means[n, 1], g_means[n, 2], g_offset[n] = m0, m1, m2, whole
+        g_A[n, 0, 0], g_A[n, 0, 1], g_A[n, 0, 2] = a00, a01, a02
+        g_A[n, 1, 0], g_A[n, 1, 1], g_A[n, 1, 2] = a10, a11, a12
+        g_A[n, 2, 0], g_A[n, 2, 1], g_A[n, 2, 2] = a20, a21, a22
+        shares[n, 0], shares[n, 1] = weight, wrong

@@ -18,7 +18,7 @@ from shared.tables import ROOT, Table, between_markers
 
 from neuprim.config import compose
 from neuprim.core.model.edge import EDGES
-from neuprim.export.gaussians import SIZES
+from neuprim.export.gaussian_ply import SIZES
 from neuprim.runs.export import export_run
 from neuprim.runs.run import run
 

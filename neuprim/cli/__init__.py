@@ -1,13 +1,14 @@
 """The ``neuprim`` command: parse, call, print.
 
 Exit status: 0 done, 1 no backend works (``doctor``), 2 the input's fault (one line on standard error), 130 interrupted.
-A bug in neuprim keeps its traceback.
+A bug in neuprim keeps its traceback. ``NEUPRIM_TRACEBACK=1`` shows the traceback of every error, for authors of plugins.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 
 from neuprim.cli import (
@@ -74,6 +75,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         line = one_line(error)
         if line is None:
             raise
+        if os.environ.get("NEUPRIM_TRACEBACK"):
+            traceback.print_exception(error)
         print(f"neuprim: error: {line}", file=sys.stderr)
         return 2
     except SystemExit as stop:  # argparse, after --help and --version

@@ -79,21 +79,20 @@ def _format(words: Sequence[str]) -> str | None:
 
 
 def _of_all() -> Iterator[str]:
-    from neuprim.plugins.registry import list_exporters
+    from neuprim.plugins.registry import EXPORTERS
 
     yield "formats:"
-    for info in list_exporters():
+    for info in EXPORTERS.list_plugins():
         yield f"  {info.name}  ({info.origin})"
     yield ""
     yield "KEY=VALUE is an option of the format: `neuprim export --format NAME --help` lists them with their defaults."
 
 
 def _of_one(name: str) -> Iterator[str]:
-    from neuprim.plugins.blame import origin_of
-    from neuprim.plugins.registry import EXPORTERS, load_exporter
+    from neuprim.plugins.registry import EXPORTERS
 
-    exporter = load_exporter(name)
-    yield f"--format {name}  ({origin_of(EXPORTERS, name).origin}): {exporter.summary}"
+    info, exporter = EXPORTERS.load_with_info(name)
+    yield f"--format {name}  ({info.origin}): {exporter.summary}"
     rows = [(f"{option}={_shown(default)}", help_) for option, (default, help_) in exporter.options.items()]
     yield f"options of --format {name}, with their defaults:" if rows else f"--format {name} has no options"
     indent = 4 + max((len(first) for first, _ in rows), default=0)

@@ -37,7 +37,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _inspect(arguments: argparse.Namespace) -> int:
     from neuprim.cli.progress import print_notes
-    from neuprim.inspect import ViewOptions, corners
+    from neuprim.inspect import ViewOptions, parse_box
     from neuprim.runs.inspect import Request, inspect_run
 
     names = [name.strip() for name in arguments.show.split(",") if name.strip()]
@@ -47,7 +47,7 @@ def _inspect(arguments: argparse.Namespace) -> int:
         names or ["volume"],
         arguments.conditions,
         arguments.grid,
-        None if arguments.box is None else corners(arguments.box),
+        None if arguments.box is None else parse_box(arguments.box),
         options=ViewOptions(tuple(arguments.level), arguments.primitive),
         against=arguments.against,
         out=arguments.out,

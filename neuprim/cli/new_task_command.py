@@ -18,9 +18,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _new_task(arguments: argparse.Namespace) -> int:
-    from neuprim.plugins.new_task import new_task
+    from neuprim.plugins.new_task import write_task_package
 
-    print(*new_task(arguments.name, arguments.out), sep="\n")
+    print(*write_task_package(arguments.name, arguments.out), sep="\n")
     return 0
 
 

@@ -56,7 +56,7 @@ def _help(words: Sequence[str]) -> str:
         return ""
     from neuprim.plugins.registry import TASKS, list_tasks
 
-    tasks = [f"  {TASKS.word(info)}  ({info.origin})" for info in list_tasks()] or ["  none is installed"]
+    tasks = [f"  {TASKS.shortest_name(info)}  ({info.origin})" for info in list_tasks()] or ["  none is installed"]
     return "\n\n".join([_COMMON_KEYS, "\n".join(["tasks:", *tasks]), _EXAMPLES])
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from neuprim.cli.command import Command
 from neuprim.core.errors import ConfigError, NeuprimError
-from neuprim.plugins.registry import EXPORTERS, INSPECTORS, LOSSES, SCENES, Group, PluginReport, list_tasks, survey
+from neuprim.plugins.registry import EXPORTERS, INSPECTORS, LOSSES, SCENES, TASKS, PluginGroup, PluginReport, list_tasks
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension, SceneExtension
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["COMMAND", "list_plugins"]
 
-_OTHERS: tuple[tuple[str, Group[Any]], ...] = (
+_OTHERS: tuple[tuple[str, PluginGroup[Any]], ...] = (
     ("losses (train.loss=NAME)", LOSSES),
     ("exporters (neuprim export --format NAME)", EXPORTERS),
     ("inspectors (neuprim inspect --show NAME)", INSPECTORS),
@@ -26,7 +26,7 @@ def list_plugins() -> list[str]:
     """The lines of ``neuprim tasks``; a broken plugin is one of them, with its error, and stops no other."""
     lines: list[str] = []
     added = SCENES.survey()
-    for report in survey():
+    for report in TASKS.survey():
         title, note = f"{report.info.name}  ({report.info.origin})", _note(report)
         try:
             if report.spec is None:

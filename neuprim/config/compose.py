@@ -61,10 +61,19 @@ from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
 from neuprim.core.used_settings import build_settings
 from neuprim.core.validation import coerce, format_value, infer_type, refuse_unknown, validate
-from neuprim.plugins.blame import blamed
-from neuprim.plugins.names import split
-from neuprim.plugins.provenance import MadeBy, Maker
-from neuprim.plugins.registry import LOSSES, TASKS, FoundScene, PluginInfo, UnknownPlugin, find_scene, load_loss
+from neuprim.plugins.attribution import attribute_errors, find_plugin_source
+from neuprim.plugins.provenance import PluginVersion, Provenance
+from neuprim.plugins.registry import (
+    LOSSES,
+    TASKS,
+    FoundScene,
+    PluginInfo,
+    UnknownPlugin,
+    find_scene,
+    load_loss,
+    qualified_plugin_name,
+    split_plugin_name,
+)
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
@@ -210,7 +219,7 @@ def _read_choice(assignments: Sequence[Assignment], key: str) -> str | None:
 def _select(choices: Mapping[str, str | None]) -> _Selection:
     """Load the task, and find its scene, preset and level."""
     task_name = choices["task"] or DEFAULT_TASK
-    info, spec = TASKS.loaded(task_name)
+    info, spec = TASKS.load_with_info(task_name)
     check_groups(spec)
     defaults, names = task_choices(spec), presets(spec)
     level = choose_level(spec, choices[EFFORT], choices["preset"], names)
@@ -240,14 +249,14 @@ def _make_config(
         check_key(assignment, declared, scene.spec.name)
     below: dict[str, Any] = {}
     for config in earlier:
-        same_scene = scene.spec.name == split(config.scene_name)[1]
+        same_scene = scene.spec.name == split_plugin_name(config.scene_name)[1]
         below |= stored_settings(config, same_scene)
         if same_scene:
             refuse_unknown(config.scene, declared, "scene")
     plain = _resolve(base, {})
     full = _resolve(base, below, chosen.level, values)
     settings = _validate_settings(full)
-    loss_info, loss = (None, None) if settings.train.loss is None else LOSSES.loaded(settings.train.loss)
+    loss_info, loss = (None, None) if settings.train.loss is None else LOSSES.load_with_info(settings.train.loss)
     refuse_unused(flatten({a.key: a.value for a in values}), spec, loss)
     available = options_of(spec, loss)
     owner = f"task {spec.name!r}" + (f" with loss {loss.name!r}" if loss is not None and loss.options else "")
@@ -255,18 +264,19 @@ def _make_config(
         tree["task"]["options"] = complete_options(available, tree["task"]["options"], owner)
     options = full["task"]["options"]
     check_names(spec, settings)
-    with blamed(chosen.task_info, f"check of task {spec.name!r}"):
+    source = find_plugin_source(TASKS, qualified_plugin_name(chosen.task_info.distribution, spec.name))
+    with attribute_errors(source, "check"):
         spec.check(build_settings(spec, settings.model, options))
     full["scene"] = _validate_scene(full["scene"], declared, base.paths)
     if settings.metrics.lpips is not None:
         settings.metrics = MetricsSettings(str(Path(settings.metrics.lpips).expanduser().absolute()))
     preset = {"preset": (chosen.default_preset, chosen.preset)} if chosen.preset != chosen.default_preset else {}
     added = scene.added_by
-    made_by = MadeBy(
+    made_by = Provenance(
         __version__,
-        Maker.of(chosen.task_info),
-        None if added is None else Maker.of(added, scene.spec.name),
-        None if loss_info is None else Maker.of(loss_info),
+        PluginVersion.of(chosen.task_info),
+        None if added is None else PluginVersion.of(added, scene.spec.name),
+        None if loss_info is None else PluginVersion.of(loss_info),
     )
     config = RunConfig(
         task=spec.name,

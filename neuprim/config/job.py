@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuprim.config.run_config import RunConfig
-from neuprim.plugins.blame import Suspects
-from neuprim.plugins.names import qualified
-from neuprim.plugins.provenance import MadeBy, Maker, load_recorded
-from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_scene, load_task
+from neuprim.plugins.attribution import RunPlugins
+from neuprim.plugins.provenance import PluginVersion, Provenance, load_recorded_plugin
+from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_scene, load_task, qualified_plugin_name
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
@@ -43,9 +42,9 @@ class Job:
         return scene_of(self.config, self.task, self.config.source)
 
     @property
-    def plugins(self) -> Suspects:
+    def plugins(self) -> RunPlugins:
         """The plugins of the run, which errors in their code name."""
-        return suspects_of(self.config)
+        return find_run_plugins(self.config)
 
 
 def task_of(config: RunConfig, file: Path | None = None) -> TaskSpec:
@@ -57,7 +56,7 @@ def task_of(config: RunConfig, file: Path | None = None) -> TaskSpec:
     """
     if config.made_by is None:
         return load_task(config.task)
-    return load_recorded(TASKS, config.made_by.task, file)[1]
+    return load_recorded_plugin(TASKS, config.made_by.task, file)[1]
 
 
 def scene_of(config: RunConfig, task: TaskSpec, file: Path | None = None) -> FoundScene:
@@ -70,29 +69,34 @@ def scene_of(config: RunConfig, task: TaskSpec, file: Path | None = None) -> Fou
     if config.made_by.scene is None:
         own = [scene for scene in task.scenes if scene.name == config.scene_name]
         return FoundScene(own[0], task.config_package) if own else find_scene(task, config.scene_name)
-    info, extension = load_recorded(SCENES, config.made_by.scene, file, f"{config.task}.{config.scene_name}")
+    info, extension = load_recorded_plugin(SCENES, config.made_by.scene, file, f"{config.task}.{config.scene_name}")
     return FoundScene(extension.scene, extension.config_package, info)
 
 
-def made_now(config: RunConfig, task: TaskSpec) -> MadeBy:
+def made_now(config: RunConfig, task: TaskSpec) -> Provenance:
     """Return the record of a run that starts or goes on now: the same packages, in the versions that are installed."""
     made, scene = config.made_by, scene_of(config, task).added_by
-    task_info = TASKS.find(config.task if made is None else qualified(made.task.package, made.task.name))
-    loss = None if config.train.loss is None else Maker.of(LOSSES.find(config.train.loss))
-    return MadeBy(__version__, Maker.of(task_info), None if scene is None else Maker.of(scene, config.scene_name), loss)
+    task_info = TASKS.find(config.task if made is None else qualified_plugin_name(made.task.package, made.task.name))
+    loss = None if config.train.loss is None else PluginVersion.of(LOSSES.find(config.train.loss))
+    return Provenance(
+        __version__,
+        PluginVersion.of(task_info),
+        None if scene is None else PluginVersion.of(scene, config.scene_name),
+        loss,
+    )
 
 
-def suspects_of(config: RunConfig) -> Suspects:
+def find_run_plugins(config: RunConfig) -> RunPlugins:
     """Find the plugins of a run, which errors in their code name."""
     made = config.made_by
     if made is None:
-        return Suspects(config.task, config.scene_name, config.train.loss)
-    scene = config.scene_name if made.scene is None else qualified(made.scene.package, made.scene.name)
-    return Suspects(qualified(made.task.package, made.task.name), scene, config.train.loss)
+        return RunPlugins(config.task, config.scene_name, config.train.loss)
+    scene = config.scene_name if made.scene is None else qualified_plugin_name(made.scene.package, made.scene.name)
+    return RunPlugins(qualified_plugin_name(made.task.package, made.task.name), scene, config.train.loss)
 
 
 def refuse_missing_plugins(config: RunConfig) -> None:
     """Raise ConfigError for a package that made a stored run and is not installed."""
     scene_of(config, task_of(config, config.source), config.source)
     if config.made_by is not None and config.made_by.loss is not None:
-        load_recorded(LOSSES, config.made_by.loss, config.source)
+        load_recorded_plugin(LOSSES, config.made_by.loss, config.source)

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from neuprim.core.errors import ConfigError
-from neuprim.plugins.names import split
+from neuprim.plugins.registry import split_plugin_name
 
 ROOT = Path("outputs")
 DEFAULT_TASK = "static"
@@ -16,7 +16,7 @@ DEFAULT_TASK = "static"
 def run_name(task: str, scene: str) -> str:
     """The name of a run's directory in the output root, where users chose none; ``PACKAGE:NAME`` becomes a part of
     it."""
-    return "-".join(part for word in (task, scene) for part in split(word) if part)
+    return "-".join(part for word in (task, scene) for part in split_plugin_name(word) if part)
 
 
 def output_directory(asked: str | None, name: str, resume: bool, check: bool = True) -> Path:

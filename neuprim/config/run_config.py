@@ -18,8 +18,8 @@ from neuprim.core.train import population
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.used_settings import OPTIONAL
 from neuprim.core.validation import Range, join_key, validate, validate_fields
-from neuprim.plugins.names import split
-from neuprim.plugins.provenance import MadeBy
+from neuprim.plugins.provenance import Provenance
+from neuprim.plugins.registry import split_plugin_name
 
 _MAX_BYTES = 1_000_000
 """A configuration has a few kilobytes; anything larger is another file."""
@@ -77,7 +77,7 @@ class RunConfig:
     unused: tuple[str, ...] = ()
     overrides: list[str] = field(default_factory=list)
     non_default: dict[str, tuple[Any, Any]] = field(default_factory=dict)
-    made_by: MadeBy | None = None
+    made_by: Provenance | None = None
     source: Path | None = field(default=None, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
@@ -140,8 +140,8 @@ class RunConfig:
         scene_name = scene.pop("name", None)
         if not isinstance(scene_name, str):
             raise ConfigError("scene.name: missing; expected a name")
-        made_by = None if stored.made_by is None else MadeBy.from_dict(stored.made_by)
-        loss = None if stored.train.loss is None else split(stored.train.loss)[1]
+        made_by = None if stored.made_by is None else Provenance.from_dict(stored.made_by)
+        loss = None if stored.train.loss is None else split_plugin_name(stored.train.loss)[1]
         names = {"task.name": stored.task.name, "scene.name": scene_name, "train.loss": loss}
         for (key, name), kind in zip(names.items(), ("task", "scene", "loss"), strict=True):
             maker = None if made_by is None else getattr(made_by, kind)

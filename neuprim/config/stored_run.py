@@ -14,9 +14,8 @@ from neuprim.config.trust import check_stored, refuse_links
 from neuprim.core.errors import ConfigError
 from neuprim.core.notices import warn_once
 from neuprim.core.validation import format_value
-from neuprim.plugins.names import BUILT_IN, qualified, split
-from neuprim.plugins.provenance import Maker
-from neuprim.plugins.registry import TASKS
+from neuprim.plugins.provenance import PluginVersion
+from neuprim.plugins.registry import BUILT_IN, TASKS, qualified_plugin_name, split_plugin_name
 
 Choices = Mapping[str, str | None]
 """Task, scene, preset and effort by what was typed; None where nothing was."""
@@ -86,8 +85,8 @@ def _choices_of(stored: RunConfig) -> dict[str, str | None]:
     """Task, scene and preset of a stored run; ``PACKAGE:NAME`` for those of another package."""
     made = stored.made_by
 
-    def name_of(name: str, maker: Maker | None) -> str:
-        return name if maker is None or maker.package in ("", BUILT_IN) else qualified(maker.package, name)
+    def name_of(name: str, maker: PluginVersion | None) -> str:
+        return name if maker is None or maker.package in ("", BUILT_IN) else qualified_plugin_name(maker.package, name)
 
     return {
         "task": name_of(stored.task, None if made is None else made.task),
@@ -98,7 +97,7 @@ def _choices_of(stored: RunConfig) -> dict[str, str | None]:
 
 
 def _differs(typed: str | None, own: str | None) -> bool:
-    return typed is not None and split(typed)[1] != split(own or "")[1]
+    return typed is not None and split_plugin_name(typed)[1] != split_plugin_name(own or "")[1]
 
 
 # ---------------------------------------------------------------- resume=true
@@ -123,7 +122,7 @@ def find_resumed_run(typed: Mapping[str, Any], choices: Choices, has_file: bool)
         directory = Path(str(typed["output_dir"])).expanduser()
     else:
         task = choices["task"] or DEFAULT_TASK
-        scene = choices["scene"] or task_choices(TASKS.loaded(task)[1]).scene
+        scene = choices["scene"] or task_choices(TASKS.load_with_info(task)[1]).scene
         directory = output_directory(None, run_name(task, scene), True)
     bare = not has_file and typed.keys() <= {"resume", "output_dir"}
     if (directory / "config.yaml").is_file() and (bare or not (directory / _SEARCH).exists()):

@@ -1,5 +1,4 @@
-"""What the channels of a task's images are, and how people see them: the one place that makes red, green and blue of
-them."""
+"""Names of the channels of a task's images, and their conversion to red, green and blue for display."""
 
 from __future__ import annotations
 
@@ -24,13 +23,14 @@ _LISTED = 8  # names that a line of text lists; of more, the first three and the
 
 @dataclass(frozen=True)
 class Channels:
-    """The channels of a task's images, for whoever shows or writes these.
+    """The channels of a task's images.
 
     Attributes:
         names: one per channel, in the order of the tensors' last axis.
         color_space: "srgb" or "linear", the data set's.
-        own: the task's display, or None: three channels are red, green and blue, one is grey, and of others some are
-        shown. task: its name, for messages.
+        own: the task's display. None: three channels are red, green and blue, one is grey, and of others the first
+            three are shown.
+        task: its name, for messages.
     """
 
     names: tuple[str, ...] = ("R", "G", "B")
@@ -40,31 +40,29 @@ class Channels:
 
     @property
     def count(self) -> int:
-        """C."""
+        """Number of channels, C."""
         return len(self.names)
 
     @property
     def rgb(self) -> tuple[int, int, int] | None:
-        """Which channels are red, green and blue: those of that name, else all three there are, or the only one three
-        times; None where that is not said."""
+        """Indices of red, green and blue: by name, or all three channels, or the only one three times; else None."""
         if {"R", "G", "B"} <= set(self.names):
             return self.names.index("R"), self.names.index("G"), self.names.index("B")
         return {1: (0, 0, 0), 3: (0, 1, 2)}.get(self.count)
 
     @property
     def plain(self) -> bool:
-        """Whether an image is red, green and blue and nothing else, so that the sRGB curve has its meaning for all of
-        it."""
+        """Whether an image is red, green and blue and nothing else, so that the sRGB curve applies to all of it."""
         return self.own is None and sorted(self.names) == ["B", "G", "R"]
 
     @property
     def partial(self) -> bool:
-        """Whether pictures leave channels out, or have too few, as the task has no display."""
+        """Whether pictures leave channels out or have too few, because the task has no display."""
         return self.own is None and self.count not in (1, 3)
 
     @property
     def shown(self) -> str:
-        """What pictures show, in words; empty for red, green and blue, or grey, without a display of the task's own."""
+        """What pictures show, in words; empty for plain red, green and blue or grey."""
         if self.own is not None:
             return f"{self.listed} through the display of task {self.task!r}"
         if self.names == default_channel_names(self.count) and not self.partial:
@@ -87,7 +85,7 @@ class Channels:
         return self.rgb or tuple(range(min(self.count, 3)))
 
     def display(self, image: Tensor) -> Tensor:
-        """(H, W, 3) display-referred sRGB copy of an image (H, W, C) in the data set's colour space.
+        """Convert an image (H, W, C) in the data set's colour space to display-referred sRGB (H, W, 3).
 
         The task's own display ends in 0..1. Without one, linear values get the sRGB curve, and nothing is clamped at 1.
 
@@ -97,7 +95,7 @@ class Channels:
         if image.shape[-1] != self.count:
             raise ValueError(f"an image of shape {tuple(image.shape)} for {self.count} channels, {self.listed}")
         if self.own is not None:
-            return self._checked(self.own(image), image)
+            return self._check_display(self.own(image), image)
         if self.count == 1:
             image = image.expand(-1, -1, 3)
         elif self.count != 3 or self._chosen != (0, 1, 2):
@@ -105,11 +103,10 @@ class Channels:
         return linear_to_srgb(image.clamp_min(0.0)) if self.color_space == "linear" else image
 
     def display_rows(self, colours: Tensor) -> Tensor:
-        """(M, 3) display-referred sRGB values 0..1 of M colours (M, C), e.g. those of primitives: the same as of an
-        image one pixel high."""
+        """Convert M colours (M, C), e.g. of primitives, to display-referred sRGB (M, 3), 0..1."""
         return self.display(colours[None])[0].clamp(0.0, 1.0)
 
-    def _checked(self, found: Any, image: Tensor) -> Tensor:
+    def _check_display(self, found: Any, image: Tensor) -> Tensor:
         expected = (*image.shape[:2], 3)
         if not isinstance(found, Tensor) or tuple(found.shape) != expected or not found.is_floating_point():
             what = f"{found.dtype} of shape {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
@@ -124,28 +121,30 @@ class Channels:
         return found.clamp(0.0, 1.0)
 
 
-def channels_of(task: TaskSpec, dataset: Dataset) -> Channels:
-    """The channels of a task's data set.
+def find_channels(task: TaskSpec, dataset: Dataset) -> Channels:
+    """Return the channels of a task's data set.
 
     Raises:
         DataError: the task names another number of channels, or the background does not have one number for each.
     """
     if task.channels and len(task.channels) != dataset.channels:
         raise DataError(
-            f"{dataset.name}: {dataset.channels} channels; expected {len(task.channels)}, which task {task.name!r} names: "
+            f"{dataset.name}: {dataset.channels} channels; expected {len(task.channels)}, which task "
+            f"{task.name!r} names: "
             f"{', '.join(task.channels)}"
         )
     if tuple(dataset.background.shape) != (dataset.channels,):
         raise DataError(
-            f"{dataset.name}: the background has shape {tuple(dataset.background.shape)}; expected ({dataset.channels},), a number per channel"
+            f"{dataset.name}: the background has shape {tuple(dataset.background.shape)}; "
+            f"expected ({dataset.channels},), a number per channel"
         )
     return Channels(
         tuple(task.channels) or default_channel_names(dataset.channels), dataset.color_space, task.display, task.name
     )
 
 
-def stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec, count: int) -> Channels:
-    """The channels of a model out of its header, without its data.
+def read_stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec, count: int) -> Channels:
+    """Return the channels of a model from its header, without its data.
 
     Args:
         where: the model's run directory, for messages.

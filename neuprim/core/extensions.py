@@ -1,8 +1,6 @@
-"""What a plugin can add beside whole tasks: scenes and losses of a task, file formats to export to, ways of looking
-into a density.
+"""Interfaces of plugins other than tasks: scenes and losses, export formats, and ways to show a density.
 
-Each is registered under an entry-point group of its own, found and loaded by :mod:`neuprim.plugins.registry`; the
-built-in ones come through the same groups as anybody's.
+Each kind has its own entry-point group; :mod:`neuprim.plugins.registry` finds and loads them.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ import numpy as np
 from torch import Tensor
 
 from neuprim.core.cameras.world import World
-from neuprim.core.channels import Channels, stored_channels
+from neuprim.core.channels import Channels, read_stored_channels
 from neuprim.core.conditions import export_frames
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
@@ -29,16 +27,15 @@ from neuprim.core.volumes.source import VolumeSource
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """A run's model with what is known about it.
+    """A run's model and what is known about it.
 
     Attributes:
         directory: of the run.
         header: of ``model.safetensors``: background, colour space, data source, iterations, ...
-        scene: settings of the scene it was fitted to.
+        scene: settings of the scene that it was fitted to.
         settings: how the run renders.
-        dataset: loads the scene again; raises :class:`~neuprim.core.errors.DataError` where its files are gone.
-        volume: the voxel files of the scene, without drawing anything; None for scenes that have none. Raises as
-        ``dataset``.
+        dataset: loads the scene again; raises :class:`~neuprim.core.errors.DataError` if its files are gone.
+        volume: opens the voxel files of the scene; None for scenes without. Raises as ``dataset``.
     """
 
     directory: Path
@@ -52,7 +49,7 @@ class TrainedModel:
 
     @property
     def world(self) -> World:
-        """How its scene lies in the world of the user's files, in whose coordinates everything is exported.
+        """The transform between the scene and the user's files, in whose coordinates everything is exported.
 
         Raises:
             DataError: the header says something else.
@@ -61,12 +58,12 @@ class TrainedModel:
 
     @property
     def channels(self) -> Channels:
-        """What its colours are called, and what they look like.
+        """The channels of its colours.
 
         Raises:
-            CheckpointError: the header names others than the model has.
+            CheckpointError: the header names other channels than the model has.
         """
-        return stored_channels(self.directory, self.header, self.task, self.model.colour.channels)
+        return read_stored_channels(self.directory, self.header, self.task, self.model.colour.channels)
 
 
 @dataclass(frozen=True)
@@ -74,13 +71,12 @@ class ExportJob:
     """One call of ``neuprim export``.
 
     Attributes:
-        out: the file to write, or the folder to make; files beside it count too. It has the name that the user will
-        find but lies in a
-            private folder: what is written there is moved to its place when all is done and if nothing is in the way
-            there, so an exporter need not know about ``--force``, and one that fails leaves nothing behind.
-        options: every option of the exporter: what the user gave, numbers and booleans as such, or else its default.
-        conditions: condition name -> text, already read and held against its range once; empty unless the exporter
-        takes conditions. progress: called with (text, fraction 0..1).
+        out: the file to write, or the folder to make; files beside it count, too. It has the final name but lies in a
+            private folder. Its content is moved to its place afterwards if nothing is in the way, so an exporter need
+            not handle ``--force``, and one that fails leaves nothing behind.
+        options: every option of the exporter: the user's value as a number or boolean if it is one, or the default.
+        conditions: condition name -> text, already checked; empty unless the exporter takes conditions.
+        progress: called with (text, fraction 0..1).
     """
 
     run: TrainedModel
@@ -90,8 +86,7 @@ class ExportJob:
     progress: Callable[[str, float], None] = lambda text, fraction: None
 
     def frames(self, several: bool = False) -> list[dict[str, Tensor]]:
-        """Every condition of the task per frame that the user asked for; one frame unless ``several``, and for tasks
-        without conditions.
+        """Return the task's conditions of each frame that the user named; one frame unless ``several``.
 
         Raises:
             ConfigError: a condition is missing, or has several values where one is wanted.
@@ -99,25 +94,21 @@ class ExportJob:
         return export_frames(self.run.task.conditions, self.conditions, several)
 
     def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
-        """An option that is a finite number from ``low`` to ``high``, or None where it is not set.
-
-        Raises:
-            ConfigError: it is something else.
-        """
+        """Return an option that is a finite number from ``low`` to ``high``, or None; raises ConfigError otherwise."""
         value: float | None = coerce(self.options[name], Annotated[float, Range(low, high)] | None, name)
         return value
 
     def count(self, name: str, low: int, high: int) -> int | None:
-        """As :meth:`number`, a whole one."""
+        """Return an option that is a whole number, as :meth:`number`."""
         value: int | None = coerce(self.options[name], Annotated[int, Range(low, high)] | None, name)
         return value
 
     def choice(self, name: str, *offered: str) -> str:
-        """An option that is one of those offered; raises as :meth:`number`."""
+        """Return an option that is one of those offered; raises ConfigError otherwise."""
         return str(coerce(self.options[name], Literal[offered], name))
 
     def flag(self, name: str) -> bool:
-        """An option that is true or false; raises as :meth:`number`."""
+        """Return an option that is true or false; raises ConfigError otherwise."""
         return bool(coerce(self.options[name], bool, name))
 
 
@@ -160,15 +151,13 @@ class Exporter:
     Attributes:
         options: option name -> (default, one line of help); shown by ``neuprim export --format NAME --help``.
         write: writes :attr:`ExportJob.out`; raises a :class:`~neuprim.core.errors.NeuprimError` for what the format
-        cannot hold. conditions: whether it takes values of the task's conditions (``time=0.5``).
-        read: for lossless formats, ``neuprim import``: what ``write`` wrote, from an untrusted file; raises
-            :class:`~neuprim.core.errors.DataError`. Chosen by the file's suffix, which is then the exporter's name.
-        default: name of the file or folder in ``RUN_DIR/export`` where the user names none; "" for the exporter's name
-        with the first
-            suffix. It ends in one of these, where there are any.
-        suffixes: what the name of its one file may end in, as ``(".glb", ".ply")``; other names, and folders, are
-        refused before it is
-            called. Empty: it takes any name, also that of a folder.
+            cannot hold.
+        conditions: whether it takes values of the task's conditions (``time=0.5``).
+        read: for lossless formats, ``neuprim import``: reads what ``write`` wrote from an untrusted file; raises
+            :class:`~neuprim.core.errors.DataError`. It is chosen by the file's suffix, which is the exporter's name.
+        default: name of the file or folder in ``RUN_DIR/export``; "" for the exporter's name with the first suffix.
+        suffixes: what the name of its one file may end in, as ``(".glb", ".ply")``; other names and folders are
+            refused. Empty: it takes any name, also that of a folder.
     """
 
     api: int
@@ -187,13 +176,11 @@ class Inspector:
     """A way of showing a density in ``neuprim inspect --show NAME``; group ``neuprim.inspectors``.
 
     Attributes:
-        layers: a :class:`~neuprim.inspect.field.FieldFrame` -> a list of layers of
-        :mod:`neuprim.inspect.layers`, which
+        layers: a :class:`~neuprim.inspect.field.FieldFrame` -> a list of layers of :mod:`neuprim.inspect.layers`, which
             a window, a picture, a film and a page draw; called once per frame and panel.
-        shows: "sigma" for the extinction on the frame's grid, asked a second time with the ground truth where there is
-        one; "model"
-            for the primitives themselves; "primitive" for a single one, with a camera of its own; "both" for what needs
-            the truth.
+        shows: "sigma" for the extinction on the frame's grid, shown a second time for the ground truth if there is
+            one; "model" for the primitives; "primitive" for a single one, with a camera of its own; "both" for what
+            needs the ground truth.
     """
 
     api: int
@@ -224,8 +211,7 @@ class LossExtension:
 
     Attributes:
         make: the settings under ``train``, and this loss's options as "options" -> the loss.
-        options: name -> (default, one line of help), perhaps with a type, set as ``task.options.NAME`` while the loss
-        is chosen; as
+        options: name -> (default, one line of help), set as ``task.options.NAME`` while the loss is chosen; as
             :attr:`~neuprim.core.task.TaskSpec.options`.
         uses: the settings of :data:`neuprim.core.used_settings.OPTIONAL` under ``train`` that ``make`` reads.
     """

@@ -1,7 +1,6 @@
-"""Layers of an image: what ``neuprim render --format exr`` can write of a frame beside its beauty.
+"""Layers that ``neuprim render --format exr`` can write besides the image itself.
 
-Every task's frames have those of :data:`COMMON`; a task says which others its frames have
-(:attr:`neuprim.core.task.TaskSpec.layers`).
+Every task has those of :data:`COMMON`; :attr:`neuprim.core.task.TaskSpec.layers` adds others.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.exr import channel_name_error
 from neuprim.core.render.layer_frame import LayerFrame
 
 
@@ -21,15 +19,12 @@ class LayerSpec:
     """One layer.
 
     Attributes:
-        name: what the user types after ``--layers``, and the prefix of its channels in the file: letters, digits and _.
-        summary: one line that says what a value is and in which unit; it is written into the file, too.
-        draw: :class:`~neuprim.core.render.layer_frame.LayerFrame` -> (H, W, C) finite values; (H, W) where there is one
-        channel. None where the frame's
-            model has no such thing.
-        channels: their names; empty: light, with the channels of the task's images, over black, that is premultiplied
-        by alpha. Light is left
-            to models whose colours are linear light, as sums of it mean nothing else; and it adds up over the lights of
-            an environment.
+        name: what the user types after ``--layers``, and the prefix of its channels in the file: letters, digits, _.
+        summary: one line with the meaning and unit of a value; it is written into the file, too.
+        draw: :class:`~neuprim.core.render.layer_frame.LayerFrame` -> (H, W, C) finite values, or (H, W) for one channel;
+            None if the frame's model has no such layer.
+        channels: their names. Empty for layers of light, which have the channels of the task's images over black,
+            premultiplied by alpha, and are sums over the lights of an environment. They need linear colours.
     """
 
     name: str
@@ -44,15 +39,16 @@ class LayerSpec:
 
 
 LIGHTS = "lights"
-"""Stands for a layer per light, ``light_000`` and so on, where several are on."""
+"""Stands for one layer per light, ``light_000`` and so on, if several are on."""
 
 COMMON: tuple[LayerSpec, ...] = (
     LayerSpec("beauty", "the image, linear light, premultiplied by alpha", lambda frame: frame.drawn.rgb),
     LayerSpec("alpha", "accumulated opacity, 0 to 1", lambda frame: frame.drawn.alpha, ("A",)),
     LayerSpec(
         "depth",
-        "distance from the camera's plane (camera z), in the units of the data's files: the mean over the chord middles of what the pixel shows, weighted by its "
-        "part in the pixel; 0 where alpha is 0",
+        "distance from the camera's plane (camera z), in the units of the data's files: the mean over the chord "
+        "middles "
+        "of what the pixel shows, weighted by its part in the pixel; 0 where alpha is 0",
         lambda frame: frame.drawn.depth,
         ("Z",),
     ),
@@ -63,50 +59,19 @@ COMMON: tuple[LayerSpec, ...] = (
         ("Y",),
     ),
 )
-"""Those of every task."""
+"""Layers of every task."""
 
 
-def layer_fault(layers: object) -> str | None:
-    """``"WHAT; expected WHAT"`` of the first fault of what a task says its layers are; None if all is well."""
-    if not isinstance(layers, tuple | list):
-        return f" is of type {type(layers).__name__}; expected a tuple of LayerSpec"
-    taken = {spec.name for spec in COMMON} | {LIGHTS}
-    for i, spec in enumerate(layers):
-        if not isinstance(spec, LayerSpec):
-            return f"[{i}] is of type {type(spec).__name__}; expected a LayerSpec"
-        if (
-            not isinstance(spec.name, str)
-            or not spec.name.isidentifier()
-            or not spec.name.isascii()
-            or len(spec.name) > 31
-        ):
-            return f"[{i}].name is {spec.name!r}; expected at most 31 letters, digits and _"
-        if spec.name in taken or spec.name.startswith("light_"):
-            return f"[{i}].name is {spec.name!r}, which is taken; expected another name"
-        if not isinstance(spec.summary, str) or not spec.summary.strip():
-            return f"[{i}].summary is {spec.summary!r}; expected text"
-        if not callable(spec.draw):
-            return f"[{i}].draw is of type {type(spec.draw).__name__}; expected a function"
-        if not isinstance(spec.channels, tuple | list):
-            return f"[{i}].channels is of type {type(spec.channels).__name__}; expected a tuple of names"
-        wrong = channel_name_error(spec.channels)
-        if wrong:
-            return f"[{i}].channels{wrong}"
-        taken.add(spec.name)
-    return None
-
-
-def chosen_layers(text: str | None, own: Sequence[LayerSpec], several: bool) -> tuple[LayerSpec, ...]:
-    """The layers that ``--layers`` names, in the order of the list of all; all of them without it.
+def select_layers(text: str | None, own: Sequence[LayerSpec], several: bool) -> tuple[LayerSpec, ...]:
+    """Select the layers that ``--layers`` names, in the order of the list of all; without it, all layers.
 
     Args:
         text: names separated by commas, or None.
-        own: the task's.
-        several: whether several lights are on. Then what is not light and depends on one of them, a task's own numbers,
-        is not offered.
+        own: the task's layers.
+        several: whether several lights are on. Then the task's layers that are not light are not offered.
 
     Raises:
-        ConfigError: a name that is none of them, or nothing.
+        ConfigError: an unknown name, or no name.
     """
     offered = (*COMMON, *(spec for spec in own if spec.light or not several))
     if text is None:

@@ -28,11 +28,9 @@ from neuprim.core.io.files import write_text
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
-from neuprim.export.appearance import comparison_views, rgb_of
+from neuprim.export.shared import choose_comparison_views, find_rgb_channels
 from neuprim.webpage.page import Condition, PageView, fullest
 from neuprim.webpage.scene import Draw, held_out, scene_page, start_of
-
-__all__ = ["EXPORTER"]
 
 OPTIONS = {
     "level": (
@@ -49,7 +47,7 @@ def _write(job: ExportJob) -> ExportReport:
     run = job.run
     if run.channels.own is not None:
         raise ConfigError(f"{run.directory}: pictures show {run.channels.shown}; a page shows red, green and blue")
-    rgb_of(run)
+    find_rgb_channels(run)
     level, most = job.count("level", 0, 5) or 0, job.count("views", 0, 100) or 0
     views, notes = _views(job, most)
     start = start_of(run.task.conditions, views, job.frames()[0] if job.conditions else {})
@@ -60,7 +58,7 @@ def _write(job: ExportJob) -> ExportReport:
         run.model,
         run.channels,
         run.settings,
-        _draw(run),
+        _make_draw(run),
         specs=run.task.conditions,
         start=start,
         views=views,
@@ -73,20 +71,21 @@ def _write(job: ExportJob) -> ExportReport:
     )
     job.progress("measuring", 0.7)
     moment = fullest(run.model, [Condition(spec, start[spec.name]) for spec in run.task.conditions])
-    errors = {} if level == 0 else {"psnr": _error(job, page.model, views, moment)}
+    errors = {} if level == 0 else {"psnr": _measure_psnr(job, page.model, views, moment)}
     write_text(job.out, page.text)
     notes.append(
         f"{len(page.text.encode()) / 1e6:.2f} MB, {page.numbers / 1e6:.2f} MB of them the model's numbers before base64"
     )
     if run.settings.sort != "center" or run.settings.samples > 1:
         notes.append(
-            f"the run draws with sort={run.settings.sort} samples={run.settings.samples}; the page by centres, one ray a pixel"
+            f"the run draws with sort={run.settings.sort} samples={run.settings.samples}; the page by centres, "
+            "one ray a pixel"
         )
     return ExportReport((job.out,), False, errors, tuple(notes))
 
 
 def _views(job: ExportJob, most: int) -> tuple[list[PageView], list[str]]:
-    """Held-out views, and why there are none."""
+    """Return held-out views, or the reason why there are none."""
     if most == 0:
         return [], []
     job.progress("reading the scene", 0.0)
@@ -96,7 +95,7 @@ def _views(job: ExportJob, most: int) -> tuple[list[PageView], list[str]]:
         return [], [f"no held-out cameras: {error}"]
 
 
-def _draw(run: TrainedModel) -> Draw:
+def _make_draw(run: TrainedModel) -> Draw:
     background = torch.tensor(run.header["background"])
 
     @torch.no_grad()
@@ -106,12 +105,12 @@ def _draw(run: TrainedModel) -> Draw:
     return draw
 
 
-def _error(job: ExportJob, held: Primitives, views: Sequence[PageView], moment: Mapping[str, Tensor]) -> float:
-    """dB over some views of the page, or over an orbit where it has none."""
+def _measure_psnr(job: ExportJob, held: Primitives, views: Sequence[PageView], moment: Mapping[str, Tensor]) -> float:
+    """Return the PSNR over some views of the page, or over an orbit if it has none, dB."""
     if not views and not job.run.model.active_geometry(moment)[1].count:
         return math.inf  # nothing is active anywhere: both are the background
-    draw, shown = _draw(job.run), [(view.camera, view.conditions) for view in views[:_MEASURED]]
-    shown = shown or [(view.camera, moment) for view in comparison_views(job, "orbit", moment)[0]]
+    draw, shown = _make_draw(job.run), [(view.camera, view.conditions) for view in views[:_MEASURED]]
+    shown = shown or [(view.camera, moment) for view in choose_comparison_views(job, "orbit", moment)[0]]
     wrong = [(draw(job.run.model, *view) - draw(held, *view)).double().square().mean() for view in shown]
     mean = float(torch.stack(wrong).mean())
     return -10.0 * math.log10(mean) if mean else math.inf

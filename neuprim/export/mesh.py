@@ -40,10 +40,7 @@ from neuprim.core.render import render
 from neuprim.core.render.backends import computing_device
 from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.grid import density_grid
-from neuprim.export.appearance import Harmonics, comparison_views, harmonics_of, rgb_of
-from neuprim.export.common import model_box
-
-__all__ = ["EXPORTER", "best_level"]
+from neuprim.export.shared import Harmonics, choose_comparison_views, ellipsoid_box, find_rgb_channels, fit_harmonics
 
 OPTIONS = {
     "grid": (192, "voxels along the longest side, 8 to 1024"),
@@ -55,7 +52,8 @@ OPTIONS = {
     "keep": (0.01, "least area of a piece, as a part of the largest one's"),
     "up": (
         "auto",
-        "upward axis of the data, z or y; only .glb files are turned by it (auto: that of a mesh that was fitted, else z)",
+        "upward axis of the data, z or y; only .glb files are turned by it (auto: that of a mesh that was "
+        "fitted, else z)",
     ),
 }
 _SUFFIXES = (".glb", ".ply", ".obj")
@@ -72,9 +70,9 @@ def _write(job: ExportJob) -> ExportReport:
     rgb = (
         None
         if channels.own is not None
-        else rgb_of(job.run, f", and task {job.run.task.name!r} has no display that makes these")
+        else find_rgb_channels(job.run, f", and task {job.run.task.name!r} has no display that makes these")
     )
-    contour = _contour()
+    contour = _load_contouring()
     smooth, keep, up = (
         job.number("smooth", 0, 4) or 0.0,
         job.number("keep", 0, 1) or 0.0,
@@ -85,32 +83,33 @@ def _write(job: ExportJob) -> ExportReport:
         up = (
             "y" if turn is not None and float(turn[2, 1]) > 0.5 else "z"
         )  # of the world's axes, the one that is the scene's z
-    seen = harmonics_of(job.run, conditions)
+    seen = fit_harmonics(job.run, conditions)
     job.progress("sampling the density", 0.0)
     sigma, scene_from_index = _sample(job, conditions, job.count("grid", 8, 1024) or 192)
     step = float(scene_from_index[0, 0])
     given = job.number("level", 1e-9, 1e9)
-    level = best_level(sigma, step) if given is None else given
+    level = find_surface_level(sigma, step) if given is None else given
     notes = [f"surface at an extinction of {level:.4g} per scene unit" + ", chosen by silhouettes" * (given is None)]
     field = ndimage.gaussian_filter(sigma, smooth) if smooth else sigma
     job.progress("contouring", 0.3)
     points, faces = contour(field, level)
     if not len(faces):
         raise ConfigError(
-            f"level={level:.4g}: no surface; the densest of the sampled points has {float(field.max()):.4g} per scene unit"
+            f"level={level:.4g}: no surface; the densest of the sampled points has {float(field.max()):.4g} per "
+            "scene unit"
         )
     import trimesh
 
     mesh = trimesh.Trimesh(points @ scene_from_index[:3, :3].T + scene_from_index[:3, 3], faces, process=False)
-    mesh, dropped = _larger_pieces(mesh, keep)
+    mesh, dropped = _drop_small_pieces(mesh, keep)
     if mesh.volume < 0:
         mesh.invert()
     job.progress("colouring", 0.5)
     colours = torch.from_numpy(
-        _colours(job, conditions, seen, np.array(mesh.vertices), np.array(mesh.vertex_normals))
+        _vertex_colours(job, conditions, seen, np.array(mesh.vertices), np.array(mesh.vertex_normals))
     ).float()
     colours = channels.display_rows(colours) if rgb is None else colours[:, list(rgb)]
-    iou = _silhouettes(job, conditions, mesh)
+    iou = _compare_silhouettes(job, conditions, mesh)
     _save(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up, job.run.world)
     notes.append(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles; {dropped} small pieces left out")
     notes.append(
@@ -126,8 +125,8 @@ def _write(job: ExportJob) -> ExportReport:
 # ---------------------------------------------------------------- surface
 
 
-def _contour() -> Any:
-    """(values (X, Y, Z), level) -> points (V, 3) in indices, triangles (F, 3)."""
+def _load_contouring() -> Any:
+    """Return a function (values (X, Y, Z), level) -> points (V, 3) in indices, triangles (F, 3)."""
     try:
         import pyvista
     except ImportError as error:
@@ -147,8 +146,8 @@ def _contour() -> Any:
 
 
 def _sample(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Extinction on a lattice with an empty border, and (4, 4) scene_from_index."""
-    low, high = (v.numpy() for v in model_box(job, [conditions]))
+    """Sample the extinction on a lattice with an empty border; return it and (4, 4) scene_from_index."""
+    low, high = (v.numpy() for v in ellipsoid_box(job, [conditions]))
     step = float((high - low).max()) / count
     shape = tuple(math.ceil(n) + 7 for n in (high - low) / step)
     if math.prod(shape) > _MOST_VOXELS:
@@ -162,11 +161,10 @@ def _sample(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndar
     return sigma.numpy(), matrix
 
 
-def best_level(sigma: np.ndarray, step: float) -> float:
-    """The level at which "the column's densest voxel passes it" agrees in most columns with "the column is more than
-    half opaque".
+def find_surface_level(sigma: np.ndarray, step: float) -> float:
+    """Find the level at which most columns agree: their densest voxel passes it if they are more than half opaque.
 
-    Columns along all three axes count. Where nothing is half opaque, half of the largest optical depth stands for ln 2.
+    Columns along all three axes count. If nothing is half opaque, half of the largest optical depth replaces ln 2.
 
     Args:
         sigma: (X, Y, Z) extinction, 1/scene unit; step: edge of a voxel, scene units.
@@ -184,8 +182,8 @@ def best_level(sigma: np.ndarray, step: float) -> float:
     return max((below + float(peaks[order[i]])) / 2, 1e-9)
 
 
-def _larger_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
-    """The mesh without pieces of less than ``keep`` of the largest one's area, and how many these were."""
+def _drop_small_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
+    """Drop pieces of less than ``keep`` of the largest one's area; return the mesh and the number of dropped pieces."""
     import trimesh
 
     if keep <= 0:
@@ -200,10 +198,10 @@ def _larger_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
 # ---------------------------------------------------------------- colour
 
 
-def _colours(
+def _vertex_colours(
     job: ExportJob, conditions: Conditions, colours: Harmonics, points: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
-    """(V, C) of the primitives around each point, weighted by density; of the nearest one where none reaches."""
+    """Return (V, C) colours of the primitives around each point, weighted by density, or of the nearest primitive."""
     with torch.no_grad():
         active = job.run.model.active(conditions)
         moved = active.geometry
@@ -223,13 +221,13 @@ def _colours(
             inside = y.square().sum(-1) < 1
             prim, vertex, x = prim[inside], vertex[inside], x[inside]
             rho = active.sigma(prim, x.float()).double().clamp_min(0)
-            seen = colours.towards(prim, -torch.from_numpy(normals)[vertex])
+            seen = colours.evaluate(prim, -torch.from_numpy(normals)[vertex])
             total.index_add_(0, vertex, rho[:, None] * seen)
             weight.index_add_(0, vertex, rho)
         bare = (weight <= 0).nonzero()[:, 0]
         if len(bare):  # the blur puts a vertex a little outside
             nearest = torch.from_numpy(cKDTree(moved.means.double().numpy()).query(points[bare.numpy()])[1])
-            total[bare] = colours.towards(nearest, -torch.from_numpy(normals)[bare])
+            total[bare] = colours.evaluate(nearest, -torch.from_numpy(normals)[bare])
             weight[bare] = 1.0
     result: np.ndarray = (total / weight[:, None]).numpy()
     return result
@@ -253,13 +251,13 @@ def _save(mesh: Any, colours: Tensor, space: str, path: Path, up: str, world: Wo
         linear, offset = _TO_GLTF @ linear, _TO_GLTF[:3, :3] @ offset
     if (linear != np.eye(4)).any():
         written.apply_transform(linear)
-    data: Any = _far(written, suffix, offset) if offset.any() else written.export(file_type=suffix[1:])
+    data: Any = _export_far_mesh(written, suffix, offset) if offset.any() else written.export(file_type=suffix[1:])
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
 
 
-def _far(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
-    """The file's content with its vertices moved by ``offset`` (3,) float64, which none of them is rounded by."""
+def _export_far_mesh(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
+    """Export the mesh moved by ``offset`` (3,) float64 without rounding its vertices to float32 of the offset."""
     import trimesh
 
     if suffix == ".glb":
@@ -284,9 +282,9 @@ def _far(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
 # ---------------------------------------------------------------- error
 
 
-def _silhouettes(job: ExportJob, conditions: Conditions, mesh: Any) -> float:
-    """Intersection over union of the mesh's and the model's half-opaque silhouettes, pooled over views of an orbit."""
-    views, _ = comparison_views(job, "orbit", conditions)
+def _compare_silhouettes(job: ExportJob, conditions: Conditions, mesh: Any) -> float:
+    """Return the intersection over union of the mesh's and the model's silhouettes, pooled over an orbit."""
+    views, _ = choose_comparison_views(job, "orbit", conditions)
     both = either = 0
     for i, view in enumerate(views):
         job.progress("comparing silhouettes", i / len(views))

@@ -9,32 +9,32 @@ import`` reads it back bit for bit.
 
 from __future__ import annotations
 
+import json
 import math
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from neuprim.core.errors import DataError
+from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
 from neuprim.core.io.files import atomic_path
+from neuprim.core.io.plain import load_json
 from neuprim.core.task import API_VERSION
-from neuprim.export.common import pack_header, unpack_header
-
-__all__ = ["EXPORTER"]
 
 _HEADER_BYTES = 4 * 2**20 * 4  # numpy stores text as four bytes per character
 _ARRAY_HEADER = 4096
+LOSSLESS_NOTE = (
+    "holds the text of config.yaml with paths to the run's data; `neuprim import` makes a run directory of it"
+)
 
 
 def _write(job: ExportJob) -> ExportReport:
     arrays = {name: value.detach().float().contiguous().numpy() for name, value in job.run.model.params.items()}
     with atomic_path(job.out) as temporary, open(temporary, "wb") as file:
         np.savez(file, header=np.array(pack_header(job)), **arrays)  # type: ignore[arg-type]
-    note = (
-        "holds the text of config.yaml, paths to the run's data included; `neuprim import` makes a run directory of it"
-    )
-    return ExportReport((job.out,), True, notes=(note,))
+    return ExportReport((job.out,), True, notes=(LOSSLESS_NOTE,))
 
 
 def _read(path: Path) -> StoredModel:
@@ -59,7 +59,8 @@ def _read(path: Path) -> StoredModel:
                 )  # arrays are stored as they are, so no file is smaller
                 if value.dtype != np.float32 or value.ndim != len(shape) + 1 or value.shape[1:] != shape:
                     raise DataError(
-                        f"{path}: {name} is {value.dtype} of shape {value.shape}; expected float32 of (N, {str(shape)[1:]}"
+                        f"{path}: {name} is {value.dtype} of shape {value.shape}; expected float32 of (N, "
+                        f"{str(shape)[1:]}"
                     )
                 tensors[name] = np.ascontiguousarray(value)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
@@ -70,7 +71,7 @@ def _read(path: Path) -> StoredModel:
 
 
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path, most: int) -> np.ndarray:
-    """One array; a claim beyond ``most`` bytes, packed or not, is refused before anything is taken for it."""
+    """Read one array. A size beyond ``most`` bytes, packed or not, is refused before memory is allocated."""
     if entry.file_size > most + _ARRAY_HEADER:
         raise DataError(f"{path}: {entry.filename} claims {entry.file_size} bytes; expected at most {most}")
     with archive.open(entry) as file:
@@ -84,6 +85,51 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path, most: i
     with archive.open(entry) as file:
         result: np.ndarray = np.lib.format.read_array(file, allow_pickle=False)
     return result
+
+
+# ---------------------------------------------------------------- the header, which ply has too
+
+_FORMAT = 1
+
+
+def pack_header(job: ExportJob) -> str:
+    """Return one line of JSON: the model's header, its parameters' shapes, and the text of ``config.yaml``."""
+    run = job.run
+    path = run.directory / "config.yaml"
+    try:
+        config = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"{path}: cannot be read ({error})") from error
+    record = {
+        "format": _FORMAT,
+        "model": dict(run.header),
+        "parameters": {spec.name: list(spec.shape) for spec in run.model.specs},
+        "config": config,
+    }
+    return json.dumps(record, allow_nan=False)
+
+
+def unpack_header(text: str, path: Path) -> tuple[dict[str, Any], dict[str, tuple[int, ...]], str]:
+    """Read model header, parameter shapes and configuration from an untrusted :func:`pack_header` line.
+
+    Raises:
+        DataError: it is something else.
+    """
+    try:
+        record = load_json(text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: the neuprim header is not valid JSON ({error})") from error
+    if not isinstance(record, dict) or record.get("format") != _FORMAT:
+        found = record.get("format") if isinstance(record, dict) else type(record).__name__
+        raise DataError(f"{path}: the neuprim header has format {found!r}; this neuprim reads {_FORMAT}")
+    header, shapes, config = record.get("model"), record.get("parameters"), record.get("config")
+    if not isinstance(header, dict) or not isinstance(shapes, dict) or not isinstance(config, str):
+        raise DataError(f"{path}: the neuprim header lacks model, parameters or config")
+    for name, shape in shapes.items():
+        whole = isinstance(shape, list) and len(shape) <= 4 and all(type(n) is int and 0 <= n <= 10_000 for n in shape)
+        if not whole or math.prod(shape) > 10_000:
+            raise DataError(f"{path}: parameter {name[:40]!r} has shape {str(shape)[:60]}; expected up to 4 sizes")
+    return header, {name: tuple(shape) for name, shape in shapes.items()}, config
 
 
 EXPORTER = Exporter(

@@ -22,9 +22,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
 from neuprim.core.io.ply import read_ply, write_ply
 from neuprim.core.task import API_VERSION
-from neuprim.export.common import pack_header, unpack_header
-
-__all__ = ["EXPORTER"]
+from neuprim.export.npz import LOSSLESS_NOTE, pack_header, unpack_header
 
 _MARK = "neuprim "
 
@@ -39,10 +37,7 @@ def _write(job: ExportJob) -> ExportReport:
     for name, column in columns.items():
         rows[name] = column
     write_ply(job.out, rows, [_MARK + pack_header(job)])
-    note = (
-        "holds the text of config.yaml, paths to the run's data included; `neuprim import` makes a run directory of it"
-    )
-    return ExportReport((job.out,), True, notes=(note,))
+    return ExportReport((job.out,), True, notes=(LOSSLESS_NOTE,))
 
 
 def _read(path: Path) -> StoredModel:

@@ -36,9 +36,7 @@ from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.density_errors import Comparison, measure_frame_errors, split_planes
 from neuprim.core.volumes.grid import density_grid
 from neuprim.core.volumes.source import Extent, Placement, VolumeSource
-from neuprim.export.common import model_box
-
-__all__ = ["EXPORTER", "sampled_grid"]
+from neuprim.export.shared import ellipsoid_box
 
 OPTIONS = {
     "grid": (None, "voxels along the longest side, 8 to 2048 (default: the source's own voxels, else 128)"),
@@ -58,7 +56,7 @@ _MOST_VOXELS = 2**34
 
 @dataclass(frozen=True)
 class _GridFrame:
-    """``number`` is of its file name; ``source`` its index in the scene's files, None where it has none."""
+    """A frame to write: the number in its file's name, and its index in the scene's files, if it has one."""
 
     number: int
     conditions: Conditions
@@ -66,7 +64,7 @@ class _GridFrame:
 
 
 def _write(job: ExportJob) -> ExportReport:
-    source, placement, notes = _origin(job, job.flag("source"))
+    source, placement, notes = _find_source(job, job.flag("source"))
     frames = _frames(job, placement)
     paths = _paths(job, frames)
     units = job.choice("units", "auto", "source", "world", "scene")
@@ -77,7 +75,7 @@ def _write(job: ExportJob) -> ExportReport:
     scene_from_world = job.run.world.scene_from_world.numpy() if placement is None else placement.scene_from_world
     per_world = abs(np.linalg.det(scene_from_world[:3, :3])) ** (1 / 3)
     factor = {"source": 1 / placement.sigma_per_unit if placement else 1.0, "world": per_world, "scene": 1.0}[units]
-    box = np.stack([v.numpy() for v in model_box(job, [f.conditions for f in frames])])
+    box = np.stack([v.numpy() for v in ellipsoid_box(job, [f.conditions for f in frames])])
     threshold = job.number("threshold", 0.0, 1e9)
     threshold = 1e-3 / float((box[1] - box[0]).max()) * factor if threshold is None else threshold
     name = str(job.options["name"])
@@ -85,7 +83,7 @@ def _write(job: ExportJob) -> ExportReport:
     fallback = _transform(
         job, box, scene_from_world, np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy()
     )
-    model = _component(job, placement)
+    sampler = _Sampler(job, _component(job, placement), scene_from_world, name, factor, threshold)
     cut = _Cut(0, 0)
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
     errors: dict[str, float] = {}
@@ -93,43 +91,43 @@ def _write(job: ExportJob) -> ExportReport:
         job.progress("writing frames", i / len(frames))
         transform = source.transform(frame.source) if own and source is not None and frame.source is not None else None
         transform = fallback if transform is None else transform
-        grid = sampled_grid(job, model, frame.conditions, transform, scene_from_world, name, factor, threshold)
+        grid = sampler.sample_grid(frame.conditions, transform)
         if placement is not None and placement.extents:
-            grid, more_cut = _within(grid, _extent(placement, frame), placement.sigma_per_unit * factor)
+            grid, more_cut = _clamp_to_extent(grid, _extent(placement, frame), placement.sigma_per_unit * factor)
             cut = _Cut(*(a + b for a, b in zip(cut, more_cut, strict=True)))
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
         grid = replace(grid, half=job.flag("half"), metadata={**metadata, **more})
         write_vdb(path, [grid])
         if source is not None and frame.source is not None:
             errors |= _errors(job, source, frame, path, scene_from_world, factor)
-    what = placement.grid if placement else ""
-    said = {
-        "source": f"in the units of the source's grid {what!r}",
-        "world": "extinction per world unit",
-        "scene": "extinction per scene unit",
-    }
-    notes.append(
-        f"grid {name!r} is {said[units]}: extinction per scene unit = value x {1 / factor:g}; clamped at 0 per primitive"
-    )
-    if placement is not None and not placement.exact:
-        notes.append(f"flames absorb, too: written is the part of the extinction that comes from {what!r} alone")
+    notes += _describe(placement, units, factor, name)
     if cut != _Cut(0, 0):
         notes.append(
-            f"{cut.above} voxels were above the source's largest value and are set to it; {cut.outside} outside its bounds are left out"
+            f"{cut.above} voxels were above the source's largest value and are set to it; "
+            f"{cut.outside} outside its bounds are left out"
         )
-    where = (
-        "the source's own voxels and world"
-        if own
-        else "cubic voxels in " + ("the source's world" if placement else "the coordinates of the run's data")
-    )
+    world = "the source's world" if placement else "the coordinates of the run's data"
+    where = "the source's own voxels and world" if own else f"cubic voxels in {world}"
     notes.append(f"on {where}; values below {threshold:.3g} are left out")
-    if errors:
+    if errors and placement is not None:
         notes.append(
-            f"errors: the model's extinction from {what!r} against the files' own values of that grid, on all their voxels, as in metrics.json; "
-            "file_*: what was written against them; "
-            "psnr_active over voxels with matter, max_error as a share of the frame's largest sigma: a proxy with a measured error, no bound"
+            f"errors: the model's extinction from {placement.grid!r} against the files' own values of that grid, "
+            "on all their voxels, as in metrics.json; file_*: what was written against them; psnr_active over voxels "
+            "with matter, max_error as a share of the frame's largest sigma"
         )
     return ExportReport(tuple(paths), False, errors, tuple(notes))
+
+
+def _describe(placement: Placement | None, units: str, factor: float, name: str) -> list[str]:
+    """Say what the values of the written grid mean."""
+    unit = f"extinction per {units} unit"
+    if units == "source" and placement is not None:
+        unit = f"in the units of the source's grid {placement.grid!r}"
+    notes = [f"grid {name!r} is {unit}: extinction per scene unit = value x {1 / factor:g}; clamped at 0 per primitive"]
+    if placement is not None and not placement.exact:
+        source = repr(placement.grid)
+        notes.append(f"flames absorb, too: written is the part of the extinction that comes from {source} alone")
+    return notes
 
 
 class _Cut(NamedTuple):
@@ -140,7 +138,7 @@ class _Cut(NamedTuple):
 
 
 def _component(job: ExportJob, placement: Placement | None) -> Primitives:
-    """The model, or its part that comes from the source's grid where other grids absorb, too.
+    """Return the model, or its part that comes from the source's grid if other grids absorb, too.
 
     Raises:
         ConfigError: the model does not know that part.
@@ -150,19 +148,21 @@ def _component(job: ExportJob, placement: Placement | None) -> Primitives:
         return model
     if placement.component not in model.density.components(model.params):
         raise ConfigError(
-            f"{job.run.directory}: flames absorb beside grid {placement.grid!r}, and the model has learned no share of it in its extinction, so "
-            "its density is not known; train again with voxels (train.supervision=both, scene.optics.extinction above 0)"
+            f"{job.run.directory}: flames absorb beside grid {placement.grid!r}, and the model has learned no "
+            "share of it in its extinction, so "
+            "its density is not known; train again with voxels (train.supervision=both, scene.optics.extinction "
+            "above 0)"
         )
     return model.component(placement.component)
 
 
 def _extent(placement: Placement, frame: _GridFrame) -> Extent:
-    """That of the source's frame, or of all of them for a time between."""
+    """Return the extent of the source's frame, or of all frames for a time between them."""
     return Extent.around(placement.extents) if frame.source is None else placement.extents[frame.source]
 
 
-def _within(grid: Grid, extent: Extent, per_unit: float) -> tuple[Grid, _Cut]:
-    """The grid with no value above the extent's largest and none outside its box; and how many voxels that changed.
+def _clamp_to_extent(grid: Grid, extent: Extent, per_unit: float) -> tuple[Grid, _Cut]:
+    """Clamp a grid to an extent: no value above its largest, none outside its box; and count what that changed.
 
     Args:
         per_unit: what a source value of 1 is in the grid.
@@ -187,8 +187,8 @@ def _within(grid: Grid, extent: Extent, per_unit: float) -> tuple[Grid, _Cut]:
 # ---------------------------------------------------------------- which frames, and where
 
 
-def _origin(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placement | None, list[str]]:
-    """The scene's files, how the model lies in their world, and what to tell the user about it."""
+def _find_source(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placement | None, list[str]]:
+    """Find the scene's files, how the model lies in their world, and notes about it."""
     notes: list[str] = []
     source = None
     if wanted:
@@ -202,19 +202,20 @@ def _origin(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placemen
         kept = Placement.from_json(record, str(job.run.directory / "model.safetensors"))
     if source is not None and kept is not None and not kept.same(source.placement):
         notes.append(
-            "the source's files are not those that the model was fitted to, so neither their voxels nor errors against them"
+            "the source's files are not those that the model was fitted to, so neither their voxels nor errors "
+            "against them"
         )
         source = None
     return source, kept if source is None else source.placement, notes
 
 
 def _frames(job: ExportJob, placement: Placement | None) -> list[_GridFrame]:
-    """Those the user names, else those of the run; a model without conditions has one."""
+    """List the frames that the user names, else those of the run; a model without conditions has one."""
     if not job.run.task.conditions:
         return [_GridFrame(0, {})]
     if job.conditions or placement is None:
         frames = [_GridFrame(i, c) for i, c in enumerate(job.frames(several=True))]
-        return [_GridFrame(f.number, f.conditions, _same(f.conditions, placement)) for f in frames]
+        return [_GridFrame(f.number, f.conditions, _source_frame(f.conditions, placement)) for f in frames]
     return [_GridFrame(n, _conditions(placement, i), i) for i, n in enumerate(placement.numbers)]
 
 
@@ -222,8 +223,8 @@ def _conditions(placement: Placement, frame: int) -> dict[str, Tensor]:
     return {name: torch.tensor(values[frame]) for name, values in placement.times.items()}
 
 
-def _same(conditions: Conditions, placement: Placement | None) -> int | None:
-    """The frame of the source with these conditions."""
+def _source_frame(conditions: Conditions, placement: Placement | None) -> int | None:
+    """Find the frame of the source with these conditions."""
     if placement is None:
         return None
     for i in range(len(placement.numbers)):
@@ -236,7 +237,7 @@ def _same(conditions: Conditions, placement: Placement | None) -> int | None:
 
 
 def _paths(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
-    """One file under its own name, or files in a folder."""
+    """Name the files: one, or one per frame in a folder."""
     suffix = job.out.suffix.lower()
     if suffix == ".vdb":
         if len(frames) > 1:
@@ -251,7 +252,7 @@ def _paths(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
 
 
 def _transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(4, 4) index to world of the user's voxels, with the origin of index space at ``origin`` (3,) of the world."""
+    """Return the (4, 4) matrix from index to world of the user's voxels, with the index origin at ``origin`` (3,)."""
     count, size = job.count("grid", 8, 2048), job.number("voxel_size", 1e-9, 1e9)
     if count is not None and size is not None:
         raise ConfigError("grid and voxel_size: expected one of them")
@@ -262,88 +263,75 @@ def _transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, or
 # ---------------------------------------------------------------- sampling
 
 
-def sampled_grid(
-    job: ExportJob,
-    model: Primitives,
-    conditions: Conditions,
-    transform: np.ndarray,
-    scene_from_world: np.ndarray,
-    name: str,
-    factor: float,
-    threshold: float,
-) -> Grid:
-    """The model's extinction x ``factor`` on voxels of a world, slab by slab; dense memory is that of one slab.
+class _Sampler(NamedTuple):
+    """Samples a model's extinction x ``factor`` on voxels; values below ``threshold`` are background."""
 
-    Args:
-        transform: (4, 4) index to world.
-        threshold: values below it are background.
+    job: ExportJob
+    model: Primitives
+    scene_from_world: np.ndarray
+    name: str
+    factor: float
+    threshold: float
 
-    Raises:
-        ConfigError: the box of the model has too many voxels.
-    """
-    try:
-        low, high = (v.numpy() for v in model_box(job, [conditions]))
-    except ConfigError:  # nothing lives in this frame: an empty grid is a frame too
-        low = high = (scene_from_world @ transform)[:3, 3]
-    scene_from_index = scene_from_world @ transform
-    corners = np.stack(np.meshgrid(*np.stack([low, high], -1), indexing="ij"), -1).reshape(-1, 3)
-    back = np.linalg.inv(scene_from_index)
-    index = corners @ back[:3, :3].T + back[:3, 3]
-    if not (np.abs(index) < 2**30).all():
-        raise ConfigError(f"the model reaches voxel {np.abs(index).max():.3g}; expected fewer (voxel_size, grid)")
-    first = np.floor(index.min(0)).astype(np.int64) & ~7
-    last = (np.ceil(index.max(0)).astype(np.int64) & ~7) + 8
-    size = last - first
-    if math.prod(size.tolist()) > _MOST_VOXELS:
-        raise ConfigError(
-            f"{' x '.join(map(str, size))} voxels around the model; expected at most {_MOST_VOXELS:.0e} (voxel_size, grid)"
+    def sample_grid(self, conditions: Conditions, transform: np.ndarray) -> Grid:
+        """Sample one frame block by block, so that dense memory is that of one block.
+
+        Args:
+            transform: (4, 4) index to world.
+
+        Raises:
+            ConfigError: the box of the model has too many voxels.
+        """
+        scene_from_index = self.scene_from_world @ transform
+        try:
+            low, high = (v.numpy() for v in ellipsoid_box(self.job, [conditions]))
+        except ConfigError:  # no primitive is active in this frame: an empty grid is a frame too
+            low = high = scene_from_index[:3, 3]
+        corners = np.stack(np.meshgrid(*np.stack([low, high], -1), indexing="ij"), -1).reshape(-1, 3)
+        back = np.linalg.inv(scene_from_index)
+        index = corners @ back[:3, :3].T + back[:3, 3]
+        if not (np.abs(index) < 2**30).all():
+            raise ConfigError(f"the model reaches voxel {np.abs(index).max():.3g}; expected fewer (voxel_size, grid)")
+        first = np.floor(index.min(0)).astype(np.int64) & ~7
+        size = (np.ceil(index.max(0)).astype(np.int64) & ~7) + 8 - first
+        if math.prod(size.tolist()) > _MOST_VOXELS:
+            voxels = " x ".join(map(str, size))
+            raise ConfigError(
+                f"{voxels} voxels around the model; expected at most {_MOST_VOXELS:.0e} (voxel_size, grid)"
+            )
+        parts = [g for g in self._sample_blocks(conditions, scene_from_index, first, size) if len(g.origins)]
+        leaves = (
+            np.concatenate([np.zeros((0, 3), np.int32), *(g.origins for g in parts)]),
+            np.concatenate([np.zeros((0, 8, 8, 8), np.float32), *(g.values for g in parts)]),
+            np.concatenate([np.zeros((0, 8, 8, 8), bool), *(g.masks for g in parts)]),
         )
-    parts = [
-        g
-        for g in _slabs(job, model, conditions, scene_from_index, first, size, name, factor, threshold)
-        if len(g.origins)
-    ]
-    leaves = (
-        np.concatenate([g.origins for g in parts]) if parts else np.zeros((0, 3), np.int32),
-        np.concatenate([g.values for g in parts]) if parts else np.zeros((0, 8, 8, 8), np.float32),
-        np.concatenate([g.masks for g in parts]) if parts else np.zeros((0, 8, 8, 8), bool),
-    )
-    return Grid(name, np.array(transform, np.float64), np.zeros((), np.float32), *leaves, Tiles.none())
+        return Grid(self.name, np.array(transform, np.float64), np.zeros((), np.float32), *leaves, Tiles.none())
 
-
-def _slabs(
-    job: ExportJob,
-    model: Primitives,
-    conditions: Conditions,
-    scene_from_index: np.ndarray,
-    first: np.ndarray,
-    size: np.ndarray,
-    name: str,
-    factor: float,
-    threshold: float,
-) -> Iterator[Grid]:
-    """Sparse grids of blocks of planes that fit in a bounded memory, each a multiple of 8 along the first two axes."""
-    settings = job.run.settings
-    where = computing_device(settings)
-    rows = max(8, min(int(size[1]), _SLAB_BYTES // (32 * int(size[2])) & ~7))
-    planes = max(8, min(int(size[0]), _SLAB_BYTES // (4 * rows * int(size[2])) & ~7))
-    for x in range(0, int(size[0]), planes):
-        for y in range(0, int(size[1]), rows):
-            corner = first + np.array([x, y, 0])
-            shape = (min(planes, int(size[0]) - x), min(rows, int(size[1]) - y), int(size[2]))
-            shifted = scene_from_index.copy()
-            shifted[:3, 3] += shifted[:3, :3] @ corner
-            sigma = density_grid(model, conditions, torch.from_numpy(shifted), shape, settings.threads, where).numpy()
-            values = sigma * np.float32(factor)
-            values[values < threshold] = 0.0
-            yield Grid.from_dense(name, values, lower=corner.tolist())
+    def _sample_blocks(
+        self, conditions: Conditions, scene_from_index: np.ndarray, first: np.ndarray, size: np.ndarray
+    ) -> Iterator[Grid]:
+        """Yield sparse grids of blocks of bounded memory, each a multiple of 8 along the first two axes."""
+        settings = self.job.run.settings
+        where = computing_device(settings)
+        rows = max(8, min(int(size[1]), _SLAB_BYTES // (32 * int(size[2])) & ~7))
+        planes = max(8, min(int(size[0]), _SLAB_BYTES // (4 * rows * int(size[2])) & ~7))
+        for x in range(0, int(size[0]), planes):
+            for y in range(0, int(size[1]), rows):
+                corner = first + np.array([x, y, 0])
+                shape = (min(planes, int(size[0]) - x), min(rows, int(size[1]) - y), int(size[2]))
+                shifted = scene_from_index.copy()
+                shifted[:3, 3] += shifted[:3, :3] @ corner
+                matrix = torch.from_numpy(shifted)
+                sigma = density_grid(self.model, conditions, matrix, shape, settings.threads, where).numpy()
+                values = sigma * np.float32(self.factor)
+                values[values < self.threshold] = 0.0
+                yield Grid.from_dense(self.name, values, lower=corner.tolist())
 
 
 def _errors(
     job: ExportJob, source: VolumeSource, frame: _GridFrame, path: Path, scene_from_world: np.ndarray, factor: float
 ) -> dict[str, float]:
-    """The model and the written file, each against the source on the source's own voxels, as ``metrics.json`` has
-    it."""
+    """Compare the model and the written file with the source, on the source's own voxels."""
     assert frame.source is not None
     settings = job.run.settings
     component = None if source.placement.exact else source.placement.component

@@ -1,7 +1,5 @@
-"""Looking inside a density field: volumes, isosurfaces, slices and primitives of a run, beside the ground truth where
-there is one."""
+"""Look inside a density: volumes, isosurfaces, slices and primitives of a run, beside the ground truth."""
 
-from neuprim.inspect.field import FieldFrame, ViewOptions
-from neuprim.inspect.frames import corners
+from neuprim.inspect.field import FieldFrame, ViewOptions, parse_box
 
-__all__ = ["FieldFrame", "ViewOptions", "corners"]
+__all__ = ["FieldFrame", "ViewOptions", "parse_box"]

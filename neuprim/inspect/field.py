@@ -1,8 +1,9 @@
-"""What an inspector looks at: one frame of a model's density, on a grid, beside the truth where there is one."""
+"""The frames that inspectors show: a model's density on a grid, with the ground truth if there is one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -13,25 +14,26 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.channels import Channels
 from neuprim.core.compute.device import HOST
-from neuprim.core.conditions import flag
-from neuprim.core.errors import ConfigError
-from neuprim.core.model.fields import Conditions
+from neuprim.core.conditions import Warn, flag, read_conditions
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.model.fields import Conditions, ConditionSpec
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import ActiveSet, Primitives
 from neuprim.core.volumes.grid import density_grid
 from neuprim.inspect.layers import Scale
 
-__all__ = ["FieldFrame", "ViewOptions", "absorbed"]
+_OUTSIDE = 0.002
+"""Part of all that is absorbed which may lie outside a model's box, at each of its faces."""
 
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """What the user may say about the views.
+    """Options of the built-in inspectors.
 
     Attributes:
         levels: of isosurfaces, 1/scene unit; empty for a tenth, a third and two thirds of the largest value shown.
-        primitive: row to look into; None for the one that absorbs most.
-        limit: ellipsoids that are drawn, those that absorb most.
+        primitive: row of the primitive to show alone; None for the one that absorbs most.
+        limit: number of ellipsoids to draw, those that absorb most.
     """
 
     levels: tuple[float, ...] = ()
@@ -41,19 +43,20 @@ class ViewOptions:
 
 @dataclass(frozen=True)
 class FieldFrame:
-    """One frame. The extinction on its grid is computed when first asked for.
+    """One frame. The extinction on its grid is computed at first use.
 
     Attributes:
         title: the conditions in words, e.g. "time 0.5".
-        scene_from_index, shape: of the grid; its axes are the scene's.
-        top: largest extinction shown, 1/scene unit; the same for all frames, so that colours mean the same.
+        scene_from_index, shape: of the grid, whose axes are the scene's.
+        top: largest extinction shown, 1/scene unit; the same for all frames.
+        gain: factor on a volume's opacity; the same for all frames.
         focus: (3,) middle of the matter of all frames, scene units.
         channels: of the model's colours.
-        gain: by which a volume's opacity is stronger than the density's own, for the same reason the same for all
-        frames. needed: names of the conditions of the model's task.
-        truth: (X, Y, Z) float32 ground truth on the grid, or None; computed when called.
-        device: what computes the extinction on the grid.
-        side: "model", or "truth" in the panel that shows the ground truth in the model's place.
+        needed: names of the conditions of the model's task.
+        truth: computes (X, Y, Z) float32 ground truth on the grid; None if there is none.
+        numbers: errors of the model against the ground truth.
+        device: that computes the extinction on the grid.
+        side: "model", or "truth" for a panel that shows the ground truth instead.
     """
 
     model: Primitives
@@ -72,10 +75,10 @@ class FieldFrame:
     numbers: Mapping[str, float] | None = None
     device: torch.device = HOST
     side: str = "model"
-    _kept: dict[str, np.ndarray] = field(default_factory=dict)  # shared by the panels of a frame
+    _grids: dict[str, np.ndarray] = field(default_factory=dict)  # shared by the panels of a frame
 
     def of_side(self, side: str) -> FieldFrame:
-        """The same frame with its "model" or its "truth" in the model's place; what was computed is shared."""
+        """Return the same frame showing its "model" or its "truth"; computed grids are shared."""
         return replace(self, side=side)
 
     @property
@@ -90,7 +93,7 @@ class FieldFrame:
 
     @property
     def box(self) -> np.ndarray:
-        """(2, 3) box that the grid's cells fill, scene units."""
+        """(2, 3) corners of the box that the grid's cells fill, scene units."""
         low = self.origin - self.step / 2
         return np.stack([low, low + self.step * np.array(self.shape)])
 
@@ -101,64 +104,58 @@ class FieldFrame:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(X, Y, Z) float32 extinction of the model, each primitive clamped at 0 from below; or of the truth in its
-        panel."""
-        if self.side not in self._kept:
-            if self.side == "truth":
-                if self.truth is None:
-                    raise ConfigError("there is no ground truth to show; give --against")
-                self._kept["truth"] = self.truth()
-            else:
-                self._kept["model"] = density_grid(
+        """(X, Y, Z) float32 extinction of the model, each primitive clamped at 0 from below, or of the truth."""
+        if self.side not in self._grids:
+            if self.side == "model":
+                grid = density_grid(
                     self.model, self.conditions, self.scene_from_index, self.shape, where=self.device
                 ).numpy()
-        return self._kept[self.side]
+            elif self.truth is None:
+                raise ConfigError("there is no ground truth to show; give --against")
+            else:
+                grid = self.truth()
+            self._grids[self.side] = grid
+        return self._grids[self.side]
 
     @property
     def difference(self) -> np.ndarray:
-        """(X, Y, Z) float32 model minus truth.
-
-        Raises:
-            ConfigError: there is no truth.
-        """
-        if self.truth is None:
-            raise ConfigError("--show difference: there is no ground truth; give --against")
+        """(X, Y, Z) float32 model minus truth."""
         return self.of_side("model").sigma - self.of_side("truth").sigma
 
     @cached_property
     def active(self) -> ActiveSet:
-        """The primitives that live in this frame, without gradients."""
+        """The primitives that are active in this frame, without gradients."""
         with torch.no_grad():
             return self.model.active(self.conditions)
 
     @cached_property
-    def alive(self) -> np.ndarray:
-        """(M,) int64 rows of the model that live in this frame, in the order of :attr:`geometry`."""
+    def rows(self) -> np.ndarray:
+        """(M,) int64 rows of the model that are active in this frame, in the order of :attr:`geometry`."""
         return np.arange(self.model.count) if self.active.rows is None else self.active.rows.numpy()
 
     @property
     def geometry(self) -> Geometry:
-        """Where the M primitives of :attr:`alive` are, float32."""
+        """Where the M active primitives are, float32."""
         return self.active.geometry
 
     def density(self, row: int, points: Tensor) -> np.ndarray:
-        """(P,) float64 unclamped extinction of one primitive of the model at (P, 3) points inside it."""
+        """Return (P,) float64 unclamped extinction of one primitive of the model at (P, 3) points inside it."""
         params = {name: value.detach()[row : row + 1].double() for name, value in self.model.params.items()}
         own = {s.name: params[s.name] for s in self.model.density.parameters()}
-        wide = {name: value.double() for name, value in self.conditions.items()}
+        conditions = {name: value.double() for name, value in self.conditions.items()}
         stored = Geometry(params["means"], params["log_scales"], params["quats"])
         with torch.no_grad():
             prim = torch.zeros(len(points), dtype=torch.int64)
-            return np.asarray(self.model.density.density(own, stored, prim, points.double(), wide).numpy())
+            return np.asarray(self.model.density.density(own, stored, prim, points.double(), conditions).numpy())
 
     @cached_property
     def masses(self) -> np.ndarray:
-        """(M,) float64 what each active primitive absorbs in all, see :func:`absorbed`."""
-        return absorbed(self.active)
+        """(M,) float64 total absorption of each active primitive; see :func:`measure_absorption`."""
+        return measure_absorption(self.active)
 
     @cached_property
     def colours(self) -> np.ndarray:
-        """(M, 3) float32 display-referred colours at the primitives' centres, as seen from the view's first direction.
+        """(M, 3) float32 display-referred colours at the primitives' centres, seen from the first viewpoint.
 
         Raises:
             ConfigError: a condition that the colours depend on was not given.
@@ -174,20 +171,19 @@ class FieldFrame:
             rgb = self.model.lower(camera, self.conditions).center_colors(eye)
         return np.asarray(self.channels.display_rows(rgb.float().clamp_min(0)).numpy())
 
-    def row(self) -> int:
-        """Position in :attr:`alive` of the primitive to look into.
+    def chosen_position(self) -> int:
+        """Return the position in :attr:`rows` of the primitive to show alone.
 
         Raises:
-            ConfigError: there is no such primitive, or it does not live in this frame.
+            ConfigError: there is no such primitive, or it is not active in this frame.
         """
         wanted = self.options.primitive
         if wanted is None:
             return int(self.masses.argmax())
         if wanted >= self.model.count:
-            raise ConfigError(
-                f"--primitive {wanted}: the model has {self.model.count} primitives, 0 to {self.model.count - 1}"
-            )
-        found = np.flatnonzero(self.alive == wanted)
+            count = self.model.count
+            raise ConfigError(f"--primitive {wanted}: the model has {count} primitives, 0 to {count - 1}")
+        found = np.flatnonzero(self.rows == wanted)
         if not len(found):
             raise ConfigError(
                 f"--primitive {wanted}: it absorbs nothing at {self.title}; choose another one or another frame"
@@ -195,22 +191,102 @@ class FieldFrame:
         return int(found[0])
 
 
-def absorbed(active: ActiveSet) -> np.ndarray:
-    """(M,) float64 what each active primitive absorbs in all: its clamped extinction times its volume, from 33 points
-    inside."""
+def measure_absorption(active: ActiveSet) -> np.ndarray:
+    """Return (M,) float64 clamped extinction times volume of each primitive, from 33 points inside it."""
+    i = torch.arange(33)
+    radius, height, angle = ((i + 0.5) / 33) ** (1 / 3), 1 - 2 * ((i * 0.618034 * 7 + 0.5) % 1), i * 2.399963
+    ring = (1 - height**2).clamp_min(0).sqrt()
+    ball = torch.stack([ring * angle.cos(), ring * angle.sin(), height], 1) * radius[:, None]
     geometry = active.geometry
     every = torch.arange(geometry.count)
     total = torch.zeros(len(every))
     with torch.no_grad():
-        for u in _ball():
+        for u in ball:
             x = geometry.means + (geometry.rotations @ (geometry.scales * u)[..., None])[..., 0]
             total += active.sigma(every, x).clamp_min(0)
-    return np.asarray((total / len(_ball()) * geometry.scales.prod(1) * 4.18879).double().numpy())
+    return np.asarray((total / len(ball) * geometry.scales.prod(1) * 4.18879).double().numpy())
 
 
-def _ball() -> Tensor:
-    """(33, 3) points spread evenly over the unit ball."""
-    i = torch.arange(33)
-    radius, height, angle = ((i + 0.5) / 33) ** (1 / 3), 1 - 2 * ((i * 0.618034 * 7 + 0.5) % 1), i * 2.399963
-    ring = (1 - height**2).clamp_min(0).sqrt()
-    return torch.stack([ring * angle.cos(), ring * angle.sin(), height], 1) * radius[:, None]
+# ---------------------------------------------------------------- which frames, and where
+
+
+class _GivenConditions(dict[str, Tensor]):
+    """Conditions of a frame; using one that was not given is an error that asks for it."""
+
+    def __missing__(self, name: str) -> Tensor:
+        raise ConfigError(f"this needs the {name}; give {flag(name)}")
+
+
+def read_condition_frames(
+    specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = lambda text: None
+) -> list[Conditions]:
+    """Read the conditions of each frame, e.g. of ``{"time": "0:1:5"}``.
+
+    A number that is not given is the middle of its range. Other conditions that are not given are left out. Of two
+    animated conditions, the shorter is stretched.
+
+    Raises:
+        ConfigError: as :func:`neuprim.core.conditions.read_conditions`.
+    """
+    given = read_conditions(specs, texts, warn)
+    found: dict[str, list[Tensor]] = {}
+    for spec in specs:
+        if spec.name in given:
+            found[spec.name] = given[spec.name]
+        elif not spec.shape and all(map(math.isfinite, spec.range)):
+            found[spec.name] = [torch.tensor(sum(spec.range) / 2)]
+    count = max((len(values) for values in found.values()), default=1)
+    return [
+        _GivenConditions({name: values[i * len(values) // count] for name, values in found.items()})
+        for i in range(count)
+    ]
+
+
+def describe_conditions(conditions: Conditions) -> str:
+    """Describe conditions in words, e.g. "time 0.5"."""
+    parts = []
+    for name, value in conditions.items():
+        numbers = [f"{x:.3g}" for x in value.flatten().tolist()]
+        parts.append(f"{name} {numbers[0] if len(numbers) == 1 else '(' + ', '.join(numbers[:4]) + ')'}")
+    return ", ".join(parts)
+
+
+def parse_box(numbers: Sequence[float]) -> np.ndarray:
+    """Return the (2, 3) box of ``--box``.
+
+    Raises:
+        ConfigError: not six numbers, or a box without a volume.
+    """
+    if len(numbers) != 6 or not all(a < b for a, b in zip(numbers[:3], numbers[3:], strict=True)):
+        given = ",".join(f"{x:g}" for x in numbers)
+        raise ConfigError(f"--box {given}: expected the lower and the upper corner, as -1,-1,-1,1,1,1")
+    return np.array(numbers, np.float64).reshape(2, 3)
+
+
+def find_matter_box(model: Primitives, frames: Sequence[Conditions]) -> np.ndarray:
+    """Return a (2, 3) float64 box around nearly all that the model absorbs in some of the frames.
+
+    A few far primitives do not widen it.
+
+    Raises:
+        DataError: the model absorbs nothing.
+    """
+    lows, highs = [], []
+    for conditions in frames[:: max(1, len(frames) // 5)]:
+        frame = FieldFrame(model, conditions, "", torch.eye(4, dtype=torch.float64), (1, 1, 1), 1.0, 1.0)
+        geometry, weights = frame.geometry, np.nan_to_num(frame.masses, posinf=0.0)
+        if not weights.sum() > 0:
+            continue
+        reach = (geometry.rotations * geometry.scales[:, None, :]).norm(dim=2).double().numpy()
+        means = geometry.means.double().numpy()
+        lows.append([_quantile(means[:, a] - reach[:, a], weights, _OUTSIDE) for a in range(3)])
+        highs.append([_quantile(means[:, a] + reach[:, a], weights, 1 - _OUTSIDE) for a in range(3)])
+    if not lows:
+        raise DataError("the model absorbs nothing in any of these frames; there is nothing to look at")
+    return np.stack([np.min(lows, 0), np.max(highs, 0)])
+
+
+def _quantile(values: np.ndarray, weights: np.ndarray, part: float) -> float:
+    order = values.argsort()
+    total = weights[order].cumsum()
+    return float(values[order[min(int(np.searchsorted(total, part * total[-1])), len(order) - 1)]])

@@ -1,41 +1,28 @@
 """What an inspector returns: a frame as layers, which a window, a picture, a film and a page draw alike.
 
 Positions are in scene units, in the scene's axes. Arrays are numpy arrays of finite numbers. Colours are
-display-referred (what a screen shows), red, green and blue from 0 to 1. The box of the frame's grid, its title and a
-bar for every :class:`Scale` that has a title are drawn around the layers; they need none of their own.
+display-referred red, green and blue from 0 to 1. The box of the frame's grid, its title and a bar for every
+:class:`Scale` with a title are drawn around the layers.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from numbers import Real
+from typing import Any, Literal, get_args
 
+import matplotlib
 import numpy as np
-
-__all__ = [
-    "Ellipsoids",
-    "Grid",
-    "Isosurfaces",
-    "Layer",
-    "Lines",
-    "Mesh",
-    "Painted",
-    "Points",
-    "Scale",
-    "Slices",
-    "Text",
-    "Volume",
-]
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Which colour a number has; numbers beyond an end have the colour of that end.
+    """The colours of numbers; numbers beyond an end have the colour of that end.
 
     Attributes:
-        low, high: its ends, the lower one first; the same for all frames, or colours mean something else in each.
+        low, high: its ends; give all frames the same, so that colours mean the same.
         colours: name of a colour map of matplotlib.
-        title, unit: what the numbers are, for the bar, as "extinction" and "1/scene unit"; no bar without a title.
+        title, unit: what the numbers are, for the bar, e.g. "extinction" and "1/scene unit"; no bar without a title.
     """
 
     low: float
@@ -45,18 +32,18 @@ class Scale:
     unit: str = ""
 
     @property
-    def words(self) -> str:
+    def label(self) -> str:
         """For example "extinction [1/scene unit]"."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Numbers at the points of a regular grid whose axes are the scene's; drawn as one of the three kinds below.
+    """Numbers at the points of a regular grid along the scene's axes; drawn as one of the three kinds below.
 
     Attributes:
         values: (X, Y, Z).
-        origin: (3,) where ``values[0, 0, 0]`` is, scene units.
+        origin: (3,) position of ``values[0, 0, 0]``, scene units.
         spacing: distance of neighbours, scene units: one number, or three along x, y and z.
     """
 
@@ -72,7 +59,7 @@ class Grid:
 
     @property
     def box(self) -> np.ndarray:
-        """(2, 3) float64 box that the grid's cells fill."""
+        """(2, 3) float64 corners of the box that the grid's cells fill."""
         low = np.asarray(self.origin, np.float64) - self.steps / 2
         return np.stack([low, low + self.steps * self.values.shape])
 
@@ -104,8 +91,7 @@ class Isosurfaces(Grid):
     """Surfaces of equal value, closed as if values were 0 outside the grid.
 
     Attributes:
-        levels: their values, at least one. A page shows one surface, of the level that its slider is at: of the lowest
-        of these at first.
+        levels: their values, at least one. A page shows one surface with a slider, which starts at the lowest level.
     """
 
     levels: tuple[float, ...] = ()
@@ -113,7 +99,7 @@ class Isosurfaces(Grid):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Painted:
-    """What the parts of a shape look like: numbers on a scale, or colours, or neither (white).
+    """The colours of a shape's parts: numbers on a scale, or colours, or neither (white).
 
     Attributes:
         values: (N,) one number per vertex, point or ellipsoid; with ``scale``.
@@ -129,11 +115,11 @@ class Painted:
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoids(Painted):
-    """N solid ellipsoids, those first that matter most: a page shows a limited number.
+    """N solid ellipsoids, the most important first: a page shows a limited number.
 
     Attributes:
         centres: (N, 3) scene units.
-        axes: (N, 3, 3) the semi-axes as vectors, ``axes[n, k]`` the k-th, scene units.
+        axes: (N, 3, 3) semi-axes as vectors, ``axes[n, k]`` the k-th, scene units.
     """
 
     centres: np.ndarray
@@ -142,7 +128,7 @@ class Ellipsoids(Painted):
 
 @dataclass(frozen=True, eq=False)
 class Mesh(Painted):
-    """Triangles; smooth where they share vertices, so an edge has vertices of its own on either side.
+    """Triangles, shaded smoothly where they share vertices.
 
     Attributes:
         vertices: (N, 3) scene units.
@@ -159,7 +145,7 @@ class Points(Painted):
 
     Attributes:
         centres: (N, 3) scene units.
-        size: their diameter in pixels.
+        size: diameter in pixels.
     """
 
     centres: np.ndarray
@@ -168,12 +154,12 @@ class Points(Painted):
 
 @dataclass(frozen=True, eq=False)
 class Lines(Painted):
-    """Straight pieces.
+    """Straight line segments.
 
     Attributes:
         vertices: (N, 3) scene units.
         pairs: (S, 2) integers, rows of ``vertices`` that are joined.
-        width: in pixels; a page's lines have one.
+        width: in pixels; ignored by a page.
     """
 
     vertices: np.ndarray
@@ -190,3 +176,137 @@ class Text:
 
 
 Layer = Volume | Slices | Isosurfaces | Ellipsoids | Mesh | Points | Lines | Text
+
+
+# ---------------------------------------------------------------- colours
+
+
+def colormap_bytes(name: str, count: int = 256) -> np.ndarray:
+    """Return (count, 3) uint8 colours of a colour map, from its lower to its upper end."""
+    return np.asarray(np.rint(255 * matplotlib.colormaps[name](np.linspace(0, 1, count))[:, :3]).astype(np.uint8))
+
+
+def layer_colours(layer: Painted, count: int) -> np.ndarray:
+    """Return (count, 3) uint8 colours of a layer's vertices, points or ellipsoids."""
+    if layer.values is not None and layer.scale is not None:
+        scale = layer.scale
+        part = np.clip((layer.values.astype(np.float64) - scale.low) / (scale.high - scale.low), 0.0, 1.0)
+        return colormap_bytes(scale.colours)[np.minimum((256 * part).astype(np.int64), 255)]
+    colours = np.ones(3) if layer.colours is None else layer.colours
+    return np.asarray(np.broadcast_to(np.rint(255 * colours).astype(np.uint8), (count, 3)))
+
+
+# ---------------------------------------------------------------- validation
+
+_KINDS = ", ".join(kind.__name__ for kind in get_args(Layer))
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+class _Invalid(Exception):
+    """A layer that cannot be drawn; the text says which member is what, and what was expected."""
+
+
+def validate_layers(found: Any) -> str | None:
+    """Find the first thing in an inspector's result that cannot be drawn. VTK would end the process on a wrong index.
+
+    Returns:
+        ``"returned WHAT; expected WHAT"``, or None if all layers are valid.
+    """
+    expected = f"of neuprim.inspect.layers: {_KINDS}"
+    if not isinstance(found, list | tuple):
+        return f"returned a {type(found).__name__}; expected a list of layers {expected}"
+    for i, layer in enumerate(found):
+        if not isinstance(layer, get_args(Layer)):
+            return f"returned a {type(layer).__name__} as layer {i}; expected one {expected}"
+        try:
+            _check_layer(layer)
+        except _Invalid as problem:
+            return f"returned layer {i}, a {type(layer).__name__}, whose {problem}"
+    return None
+
+
+def _require(ok: bool, name: str, found: object, expected: str) -> None:
+    if not ok:
+        raise _Invalid(f"{name} is {found}; expected {expected}")
+
+
+def _check_layer(layer: Any) -> None:
+    if isinstance(layer, Text):
+        _require(isinstance(layer.text, str), "text", repr(layer.text), "text")
+        corners = ("upper_right", "lower_right")
+        _require(layer.corner in corners, "corner", repr(layer.corner), " or ".join(corners))
+    elif isinstance(layer, Grid):
+        _check_grid(layer)
+    else:
+        points = _check_array(layer, "vertices" if isinstance(layer, Mesh | Lines) else "centres", (None, 3))
+        if isinstance(layer, Ellipsoids):
+            _check_array(layer, "axes", (len(points), 3, 3))
+        elif isinstance(layer, Points):
+            _require(_is_number(layer.size) and layer.size > 0, "size", repr(layer.size), "a positive number of pixels")
+        else:
+            name, width = ("faces", 3) if isinstance(layer, Mesh) else ("pairs", 2)
+            rows = _check_array(layer, name, (None, width))
+            _require(rows.dtype.kind in "iu", name, f"of type {rows.dtype}", "integers")
+            inside = not rows.size or 0 <= int(rows.min()) <= int(rows.max()) < len(points)
+            _require(inside, name, "an index beyond the vertices", f"rows 0 to {len(points) - 1} of them")
+        if isinstance(layer, Lines):
+            fine = _is_number(layer.width) and layer.width > 0
+            _require(fine, "width", repr(layer.width), "a positive number of pixels")
+        _check_paint(layer, len(points))
+
+
+def _check_grid(layer: Grid) -> None:
+    values = _check_array(layer, "values", (None, None, None))
+    _require(min(values.shape) > 0, "values", f"of shape {values.shape}", "at least one point along each axis")
+    _check_array(layer, "origin", (3,))
+    _check_scale(layer.scale)
+    several = isinstance(layer.spacing, tuple | list | np.ndarray) and len(layer.spacing) == 3
+    spacing: list[Any] = list(layer.spacing) if several else [layer.spacing]  # type: ignore[arg-type]
+    positive = all(_is_number(step) and step > 0 for step in spacing)
+    _require(positive, "spacing", repr(layer.spacing), "a positive number of scene units, or three")
+    if isinstance(layer, Volume):
+        _require(_is_number(layer.depth) and layer.depth >= 0, "depth", repr(layer.depth), "a number from 0")
+    if isinstance(layer, Slices) and layer.through is not None:
+        _check_array(layer, "through", (3,))
+    if isinstance(layer, Isosurfaces):
+        fine = isinstance(layer.levels, tuple | list) and bool(layer.levels) and all(map(_is_number, layer.levels))
+        _require(fine, "levels", repr(layer.levels), "a tuple of at least one number")
+
+
+def _check_paint(layer: Painted, count: int) -> None:
+    fine = _is_number(layer.opacity) and 0 <= layer.opacity <= 1
+    _require(fine, "opacity", repr(layer.opacity), "a number from 0 to 1")
+    if layer.values is not None:
+        _require(layer.colours is None, "colours", "given beside values", "one of them")
+        _check_array(layer, "values", (count,))
+        _check_scale(layer.scale)
+    elif layer.colours is not None:
+        colours = _check_array(layer, "colours", (3,) if np.ndim(layer.colours) == 1 else (count, 3))
+        fine = not colours.size or 0 <= colours.min() <= colours.max() <= 1
+        _require(bool(fine), "colours", "beyond 0 or 1", "numbers from 0 to 1")
+
+
+def _check_scale(scale: Any) -> None:
+    _require(isinstance(scale, Scale), "scale", f"a {type(scale).__name__}", "a Scale")
+    ends = _is_number(scale.low) and _is_number(scale.high) and scale.low < scale.high
+    _require(ends, "scale", f"from {scale.low!r} to {scale.high!r}", "a lower and a higher number")
+    texts = isinstance(scale.title, str) and isinstance(scale.unit, str)
+    _require(texts, "scale", f"of title {scale.title!r} and unit {scale.unit!r}", "texts")
+    known = isinstance(scale.colours, str) and scale.colours in matplotlib.colormaps
+    _require(known, "scale", f"of colours {scale.colours!r}", "a colour map of matplotlib, as 'inferno'")
+
+
+def _check_array(layer: Any, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    value = getattr(layer, name)
+    _require(isinstance(value, np.ndarray), name, f"a {type(value).__name__}", "a numpy array")
+    fits = len(value.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, value.shape, strict=True))
+    wanted = ", ".join("N" if n is None else str(n) for n in shape)
+    _require(fits, name, f"of shape {value.shape}", f"({wanted})")
+    _require(value.dtype.kind in "fiub", name, f"of type {value.dtype}", "real numbers")
+    finite = not value.size or -_LARGEST <= value.min() <= value.max() <= _LARGEST  # False for NaN, too
+    _require(bool(finite), name, "not finite in float32", "finite numbers")
+    return value  # type: ignore[no-any-return]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(abs(value) <= _LARGEST)  # type: ignore[operator]

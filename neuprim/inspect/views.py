@@ -1,24 +1,19 @@
-"""The built-in ways of showing a density: functions of one frame that return layers, as anybody's."""
+"""The built-in inspectors: functions of a frame that return layers."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from neuprim.core.extensions import Inspector
-from neuprim.core.model.edge import fade
 from neuprim.core.task import API_VERSION
 from neuprim.inspect.field import FieldFrame
-from neuprim.inspect.layers import Ellipsoids, Isosurfaces, Layer, Lines, Mesh, Scale, Slices, Text, Volume
-from neuprim.inspect.shapes import cut_ball, level_lines
-
-__all__ = ["DIFFERENCE", "ISOSURFACE", "PRIMITIVE", "PRIMITIVES", "SLICES", "VOLUME"]
+from neuprim.inspect.layers import Ellipsoids, Isosurfaces, Layer, Mesh, Scale, Slices, Text, Volume
 
 SURFACES = "plasma"  # brighter at its lower end, where the outermost surface is
 SIGNED = "coolwarm"
-_LIFT = 0.004  # of lines above the surface that they are on, so that it hides none of them; of the semi-axes
-_BELOW = 0.98  # how far out the sign of a density with a soft edge is looked for, in radii
-
 FAINT = 1.0 / 255.0
 """Opacity from which an ellipsoid is drawn."""
 
@@ -28,7 +23,7 @@ def _volume(frame: FieldFrame) -> list[Layer]:
 
 
 def _difference(frame: FieldFrame) -> list[Layer]:
-    reach = frame.top / 2  # errors are smaller than what they are errors of
+    reach = frame.top / 2  # errors are smaller than the values
     scale = Scale(-reach, reach, SIGNED, "model - truth", frame.scale.unit)
     return [Volume(frame.difference, frame.origin, frame.step, scale, depth=frame.gain)]
 
@@ -43,71 +38,45 @@ def _slices(frame: FieldFrame) -> list[Layer]:
     return [Slices(frame.sigma, frame.origin, frame.step, frame.scale, through=np.array(frame.focus))]
 
 
-def strongest(frame: FieldFrame) -> np.ndarray:
-    """Positions in ``frame.alive`` of the ellipsoids that are drawn: those that can be seen at all, those that absorb
-    most first."""
-    visible = opacity_of(frame) >= FAINT
+def strongest_primitives(frame: FieldFrame) -> np.ndarray:
+    """Return positions in ``frame.rows`` of the ellipsoids to draw: the visible ones, by what they absorb."""
     order = frame.masses.argsort()[::-1]
+    visible = estimate_opacity(frame) >= FAINT
     return np.asarray(order[visible[order]][: frame.options.limit])
 
 
-def opacity_of(frame: FieldFrame) -> np.ndarray:
-    """(M,) opacity 0..1 of primitives: of a ray along their mean radius through their mean extinction."""
+def estimate_opacity(frame: FieldFrame) -> np.ndarray:
+    """Return (M,) opacity 0..1 of a ray along each primitive's mean radius through its mean extinction."""
     volume = frame.geometry.scales.double().numpy().prod(1)
     return np.asarray(1 - np.exp(-2 * frame.masses / (4.18879 * volume) * volume ** (1 / 3)))
 
 
 def _primitives(frame: FieldFrame) -> list[Layer]:
-    chosen = strongest(frame)
-    one = frame.geometry[torch.from_numpy(chosen)]
-    axes = (one.rotations * one.scales[:, None, :]).transpose(1, 2).detach().numpy()
-    words = f"{len(chosen)} of {frame.model.count} primitives at their true size\nleft out: opacity below 1/255"
+    chosen = strongest_primitives(frame)
+    geometry = frame.geometry[torch.from_numpy(chosen)]
+    axes = (geometry.rotations * geometry.scales[:, None, :]).transpose(1, 2).detach().numpy()
+    text = f"{len(chosen)} of {frame.model.count} primitives at their true size\nleft out: opacity below 1/255"
     colours = np.clip(frame.colours[chosen], 0.0, 1.0)
-    return [Ellipsoids(one.means.detach().numpy(), axes, colours=colours), Text(words)]
-
-
-def _factor(frame: FieldFrame, position: int, unit: np.ndarray) -> np.ndarray:
-    """(P,) a primitive's density at points (P, 3) of the unit ball, less the weight that a soft edge fades it by: it
-    has the same zeros inside, but does not vanish with the weight, whose rounding would draw the line on the surface.
-    There, it is that of a point just below.
-    """
-    _, form = frame.model.lower_density(frame.conditions)
-    edge = form.edge
-    inner = torch.from_numpy(unit)
-    if edge:
-        radius = inner.norm(dim=1, keepdim=True)
-        inner = inner * (_BELOW / radius.clamp_min(_BELOW))
-    one = frame.geometry[position : position + 1]
-    axes = (one.rotations * one.scales[:, None, :])[0].double()
-    sigma = frame.density(int(frame.alive[position]), one.means[0].double() + inner @ axes.T)
-    return np.asarray(sigma / fade(inner.square().sum(1), edge).numpy())
+    return [Ellipsoids(geometry.means.detach().numpy(), axes, colours=colours), Text(text)]
 
 
 def _primitive(frame: FieldFrame) -> list[Layer]:
-    position, (unit, faces, normals) = frame.row(), cut_ball()
-    one = frame.geometry[position : position + 1]
-    axes = (one.rotations * one.scales[:, None, :])[0].double()
-    placed = one.means[0].double() + torch.from_numpy(unit) @ axes.T
-    sigma = frame.density(int(frame.alive[position]), placed)
+    position, (unit, faces) = frame.chosen_position(), make_cut_ball()
+    geometry = frame.geometry[position : position + 1]
+    axes = (geometry.rotations * geometry.scales[:, None, :])[0].double()
+    points = geometry.means[0].double() + torch.from_numpy(unit) @ axes.T
+    sigma = frame.density(int(frame.rows[position]), points)
     low, high = float(sigma.min()), float(sigma.max())
     reach = max(abs(low), abs(high)) or 1.0
-    scale = Scale(
-        -reach if low < 0 else 0.0,
-        reach,
-        SIGNED if low < 0 else frame.scale.colours,
-        frame.scale.title,
-        frame.scale.unit,
-    )
+    negative = low < 0
+    colours = SIGNED if negative else frame.scale.colours
+    scale = Scale(-reach if negative else 0.0, reach, colours, frame.scale.title, frame.scale.unit)
     used, surface = np.unique(faces, return_inverse=True)
-    points, sigma, surface = placed.numpy()[used], sigma[used], surface.reshape(faces.shape)
-    found: list[Layer] = [Mesh(points, surface, values=sigma, scale=scale)]
-    if low < 0 < high:
-        lifted, factor = points + _LIFT * normals[used] @ axes.numpy().T, _factor(frame, position, unit[used])
-        found.append(Lines(*level_lines(lifted, surface, factor), colours=np.zeros(3)))
-    scales = ", ".join(f"{s:.3g}" for s in frame.geometry.scales[position].tolist())
-    center = ", ".join(f"{s:.3g}" for s in frame.geometry.means[position].tolist())
-    words = f"primitive {frame.alive[position]}\ncentre ({center})\nradii ({scales})\nextinction {low:.3g} to {high:.3g}, unclamped"
-    return [*found, Text(words, "upper_right")]
+    mesh = Mesh(points.numpy()[used], surface.reshape(faces.shape), values=sigma[used], scale=scale)
+    scales = ", ".join(f"{s:.3g}" for s in geometry.scales[0].tolist())
+    center = ", ".join(f"{s:.3g}" for s in geometry.means[0].tolist())
+    text = f"primitive {frame.rows[position]}\ncentre ({center})\nradii ({scales})\n"
+    return [mesh, Text(f"{text}extinction {low:.3g} to {high:.3g}, unclamped", "upper_right")]
 
 
 VOLUME = Inspector(API_VERSION, "volume", "the extinction as a cloud", _volume)
@@ -118,3 +87,83 @@ PRIMITIVE = Inspector(
     API_VERSION, "primitive", "the density inside one primitive, cut open", _primitive, shows="primitive"
 )
 DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _difference, shows="both")
+
+
+# ---------------------------------------------------------------- viewpoints
+
+_DIRECTIONS = {"x": (-0.45, 1.0, -1.6), "y": (1.0, 0.45, 1.6), "z": (1.0, -1.6, 0.45)}
+"""From the middle to the camera, by the scene's upward axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """Where a view starts.
+
+    Attributes:
+        focus: (3,) what is looked at, scene units.
+        radius: of the ball around it that fills the picture, scene units.
+        direction: (3,) unit vector from there to the camera.
+        up: (3,) unit vector that points upward in the picture.
+    """
+
+    focus: np.ndarray
+    radius: float
+    direction: np.ndarray
+    up: np.ndarray
+
+
+def find_viewpoint(inspector: Inspector, frame: FieldFrame, up: str) -> Viewpoint:
+    """Choose where a view of a frame starts: before the whole box, or before a single primitive.
+
+    Args:
+        up: the scene's upward axis, "x", "y" or "z".
+    """
+    if inspector.shows == "primitive":
+        position = frame.chosen_position()
+        one = frame.geometry[position : position + 1]
+        axes = one.rotations[0].double().numpy()
+        direction = axes @ np.array([1.0, -1.0, 0.9])  # into the missing quarter, between the first two axes
+        direction /= np.linalg.norm(direction)
+        return Viewpoint(one.means[0].double().numpy(), 1.12 * float(one.length_scale), direction, axes[:, 2])
+    low, high = frame.box
+    radius, upward = float(np.linalg.norm(high - low)) / 2, np.eye(3)["xyz".index(up)]
+    direction = np.array(_DIRECTIONS[up]) / np.linalg.norm(_DIRECTIONS[up])
+    focus = (low + high) / 2 - 0.08 * radius * upward  # lower than the middle: the scalar bar is below
+    return Viewpoint(focus, 1.02 * radius, direction, upward)
+
+
+# ---------------------------------------------------------------- shapes
+
+
+def unit_sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return (V, 3) float64 points of norm 1 and (F, 3) int64 triangles, anticlockwise seen from outside."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions)
+    return np.asarray(ball.vertices), np.asarray(ball.faces, np.int64)
+
+
+def make_cut_ball(rings: int = 48) -> tuple[np.ndarray, np.ndarray]:
+    """Make the unit ball without the quarter x > 0 > y.
+
+    The sphere and the two planes of the cut share no points on their edges, so that these stay sharp.
+
+    Returns:
+        (P, 3) float64 points throughout the ball, and (F, 3) int64 triangles of its surface.
+    """
+    radius = np.linspace(0, 1, rings // 2)
+    around, down = np.radians(np.linspace(0, 270, 2 * rings + 1)), np.linspace(0, np.pi, rings)
+    r, a, d = np.meshgrid(radius, around, down, indexing="ij")
+    solid = np.stack([r * np.sin(d) * np.cos(a), r * np.sin(d) * np.sin(a), r * np.cos(d)], -1)
+    index = np.arange(r.size).reshape(r.shape)
+    edges = np.concatenate([solid[-1, 0], solid[-1, -1]])  # copies for the planes where they meet the sphere
+    first, last = index[:, 0].copy(), index[:, -1].copy()
+    first[-1], last[-1] = r.size + np.arange(rings), r.size + rings + np.arange(rings)
+    faces = [_sheet_triangles(index[-1].T), _sheet_triangles(first.T), _sheet_triangles(last)]
+    return np.concatenate([solid.reshape(-1, 3), edges]), np.concatenate(faces)
+
+
+def _sheet_triangles(index: np.ndarray) -> np.ndarray:
+    """Return (2 (A - 1) (B - 1), 3) triangles of an (A, B) sheet of points."""
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])

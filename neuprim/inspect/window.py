@@ -1,25 +1,43 @@
-"""Panels of inspectors in one pyvista window: on screen with a slider, or as pictures."""
+"""Draw panels of inspectors with pyvista: in a window with a slider, or as pictures off screen."""
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
 
+from neuprim.core.errors import BackendUnavailable
 from neuprim.core.extensions import Inspector
-from neuprim.inspect.drawing import add_box, add_layers
 from neuprim.inspect.field import FieldFrame
-from neuprim.inspect.stands import stand_of
-
-__all__ = ["Window", "panels_of"]
+from neuprim.inspect.layers import (
+    Ellipsoids,
+    Grid,
+    Isosurfaces,
+    Layer,
+    Lines,
+    Mesh,
+    Painted,
+    Points,
+    Scale,
+    Slices,
+    Text,
+    Volume,
+    layer_colours,
+)
+from neuprim.inspect.views import find_viewpoint, unit_sphere
 
 Panel = tuple[Inspector, str]
 _PANEL = (720, 640)
 
 
-def panels_of(inspectors: Sequence[Inspector], with_truth: bool) -> list[Panel]:
-    """(inspector, side) of each panel: a view of the extinction is shown twice where there is a truth."""
+def list_panels(inspectors: Sequence[Inspector], with_truth: bool) -> list[Panel]:
+    """List (inspector, side) of each panel. Views of the extinction are shown twice if there is a ground truth."""
     return [
         (i, side)
         for i in inspectors
@@ -28,8 +46,7 @@ def panels_of(inspectors: Sequence[Inspector], with_truth: bool) -> list[Panel]:
 
 
 class Window:
-    """A plotter with one panel per (inspector, side); panels of the scene share one camera, that of a single primitive
-    has its own.
+    """A plotter with one panel per (inspector, side). Panels of the scene share one camera.
 
     Args:
         size: of the picture in pixels; None for 720 x 640 per panel.
@@ -39,14 +56,12 @@ class Window:
         import pyvista
 
         self.panels = list(panels)
-        paired = any(
-            side == "truth" for _, side in panels
-        )  # then each row has a view of the model and the same of the truth
+        paired = any(side == "truth" for _, side in panels)  # then each row shows the model and the truth
         columns = len(panels) if len(panels) <= 3 else 2 if paired else -(-len(panels) // 2)
         self.shape = (-(-len(panels) // columns), columns)
-        asked = size or (columns * _PANEL[0], self.shape[0] * _PANEL[1])
+        pixels = size or (columns * _PANEL[0], self.shape[0] * _PANEL[1])
         make: Any = pyvista.Plotter
-        self.plotter = make(shape=self.shape, off_screen=off_screen, window_size=list(asked), border_color="#39424c")
+        self.plotter = make(shape=self.shape, off_screen=off_screen, window_size=list(pixels), border_color="#39424c")
         self._up, self._placed = up, False
         for panel in range(self.shape[0] * self.shape[1]):
             self._enter(panel)
@@ -56,16 +71,16 @@ class Window:
         self.plotter.subplot(*divmod(panel, self.shape[1]))
 
     def draw(self, frame: FieldFrame) -> None:
-        """Replaces what is in the panels."""
+        """Draw a frame in all panels."""
         for title in list(self.plotter.scalar_bars.keys()):
             self.plotter.remove_scalar_bar(title, render=False)
         for panel, (inspector, side) in enumerate(self.panels):
             self._enter(panel)
             self.plotter.renderer.clear_actors()
             part = frame.of_side(side)
-            add_layers(self.plotter, inspector.layers(part), panel)
+            _add_layers(self.plotter, inspector.layers(part), panel)
             if inspector.shows != "primitive":
-                add_box(self.plotter, part.box)
+                _add_box(self.plotter, part.box)
             self.plotter.add_text(
                 _caption(inspector, part), position="upper_left", font_size=10, color="white", name="caption"
             )
@@ -77,27 +92,27 @@ class Window:
         linked = [i for i, (inspector, _) in enumerate(self.panels) if inspector.shows != "primitive"]
         for panel, (inspector, _) in enumerate(self.panels):
             self._enter(panel)
-            stand, camera = stand_of(inspector, frame, self._up), self.plotter.camera
-            camera.focal_point, camera.up = stand.focus, stand.up
-            camera.position = stand.focus + stand.away * stand.radius / np.sin(np.radians(camera.view_angle) / 2)
+            point, camera = find_viewpoint(inspector, frame, self._up), self.plotter.camera
+            camera.focal_point, camera.up = point.focus, point.up
+            camera.position = point.focus + point.direction * point.radius / np.sin(np.radians(camera.view_angle) / 2)
             self.plotter.renderer.reset_camera_clipping_range()
         if len(linked) > 1:
             self.plotter.link_views(linked)
         self._placed = True
 
     def picture(self) -> np.ndarray:
-        """(H, W, 3) uint8 of what was drawn last."""
+        """Return (H, W, 3) uint8 of what was drawn last."""
         self.plotter.render()
         return np.asarray(self.plotter.screenshot(return_img=True))[..., :3]
 
     def interact(self, count: int, frame: Callable[[int], FieldFrame]) -> None:
-        """Shows the window, with a slider for more than one frame, until the user closes it."""
+        """Show the window until the user closes it, with a slider for more than one frame."""
         self.add_slider(count, frame)
         self.draw(frame(0))
         self.plotter.show()
 
     def add_slider(self, count: int, frame: Callable[[int], FieldFrame]) -> None:
-        """A slider over ``count`` frames; each is drawn when the slider comes to it."""
+        """Add a slider over ``count`` frames. A frame is drawn when the slider reaches it."""
         if count < 2:
             return
         shown = [0]
@@ -122,7 +137,7 @@ class Window:
         )
 
     def close(self) -> None:
-        """Frees the window."""
+        """Free the window."""
         self.plotter.close()
 
 
@@ -132,3 +147,251 @@ def _caption(inspector: Inspector, frame: FieldFrame) -> str:
     if frame.numbers and frame.side == "model" and inspector.shows in ("sigma", "both"):
         lines.append(f"correlation {frame.numbers['correlation']:.3f}   relative L2 {frame.numbers['relative_l2']:.3f}")
     return "\n".join(lines)
+
+
+# ---------------------------------------------------------------- layers to VTK's objects
+
+_STEPS = 256
+_FINE = 4000  # ellipsoids up to which each gets many triangles
+
+
+def _add_layers(plotter: Any, layers: Sequence[Layer], panel: int) -> None:
+    """Draw valid layers and a bar for each of their scales into the plotter's current panel.
+
+    Args:
+        panel: number of the panel; plotters identify bars by their titles only.
+    """
+    scales: dict[Scale, None] = {}
+    for layer in layers:
+        if isinstance(layer, Text):
+            plotter.add_text(layer.text, position=layer.corner, font_size=8, color="white")
+            continue
+        _ADD[type(layer)](plotter, layer)
+        scale = layer.scale if isinstance(layer, Grid) or layer.values is not None else None
+        if scale is not None and scale.title:
+            scales[scale] = None
+    for place, scale in enumerate(scales):
+        _add_bar(plotter, scale, panel, place)
+
+
+def _add_box(plotter: Any, box: np.ndarray) -> None:
+    """Draw the edges of a (2, 3) box."""
+    import pyvista
+
+    low, high = box
+    edges = pyvista.Box(np.stack([low, high], 1).ravel())
+    plotter.add_mesh(edges.outline(), color="#8894a0", line_width=1, lighting=False)
+
+
+def _add_bar(plotter: Any, scale: Scale, panel: int, place: int) -> None:
+    """Draw a scalar bar that does not depend on what is drawn. The first one is lowest."""
+    import pyvista
+
+    mapper = pyvista.DataSetMapper()
+    mapper.lookup_table = pyvista.LookupTable(scale.colours, scalar_range=(scale.low, scale.high))
+    look = {"title_font_size": 15, "label_font_size": 13, "n_labels": 2, "fmt": "%.3g", "color": "white"}
+    size = {"width": 0.6, "height": 0.09, "position_x": 0.2, "position_y": 0.02 + 0.11 * place}
+    title = scale.label + " " * panel + "\u200a" * place
+    plotter.add_scalar_bar(title, mapper=mapper, render=False, **size, **look)
+
+
+def _image(layer: Grid, values: np.ndarray, around: int = 0) -> Any:
+    """Make ``pyvista.ImageData`` of values at the layer's points, with some layers of zeros around."""
+    import pyvista
+
+    origin = np.asarray(layer.origin, np.float64) - around * layer.steps
+    found = pyvista.ImageData(dimensions=np.array(values.shape) + 2 * around, spacing=tuple(layer.steps), origin=origin)
+    found.point_data["values"] = np.pad(values.astype(np.float32, copy=False), around).ravel(order="F")
+    return found
+
+
+def _volume(plotter: Any, layer: Volume) -> None:
+    scale, step = layer.scale, float(layer.steps.min())
+    ramp = np.linspace(scale.low, scale.high, _STEPS)
+    plotter.add_volume(
+        _image(layer, np.clip(layer.values, scale.low, scale.high)),
+        scalars="values",
+        cmap=scale.colours,
+        clim=(scale.low, scale.high),
+        opacity=np.rint(255 * (1.0 - np.exp(-np.abs(ramp) * layer.depth * step))),
+        opacity_unit_distance=step,
+        shade=False,
+        mapper="smart",
+        show_scalar_bar=False,
+    )
+
+
+def _isosurfaces(plotter: Any, layer: Isosurfaces) -> None:
+    data, levels = _image(layer, layer.values, around=1), sorted(layer.levels)
+    for i, level in enumerate(levels):
+        surface = data.contour([level], scalars="values")
+        if surface.n_points:
+            opacity = 0.95 if i == len(levels) - 1 else min(0.22 + 0.2 * i, 0.95)
+            plotter.add_mesh(surface, opacity=opacity, smooth_shading=True, specular=0.25, **_numbers(layer.scale))
+
+
+def _slices(plotter: Any, layer: Slices) -> None:
+    x, y, z = layer.box.mean(0) if layer.through is None else layer.through
+    cut = _image(layer, layer.values).slice_orthogonal(x=x, y=y, z=z)
+    if any(part.n_points for part in cut):
+        plotter.add_mesh(cut, lighting=False, **_numbers(layer.scale))
+
+
+def _ellipsoids(plotter: Any, layer: Ellipsoids) -> None:
+    count = len(layer.centres)
+    points, faces = _ellipsoid_triangles(layer.centres, layer.axes, 2 if count <= _FINE else 1)
+    if count:
+        data, colours = (
+            _poly(points, faces=_cells(faces)),
+            np.repeat(layer_colours(layer, count), len(points) // count, 0),
+        )
+        look = {"smooth_shading": True, "ambient": 0.3, "diffuse": 0.8, "specular": 0.15, "opacity": layer.opacity}
+        plotter.add_mesh(data, **look, **_bytes(data, colours))
+
+
+def _mesh(plotter: Any, layer: Mesh) -> None:
+    if len(layer.faces):
+        data = _poly(layer.vertices, faces=_cells(layer.faces))
+        plotter.add_mesh(
+            data, smooth_shading=True, ambient=0.5, diffuse=0.6, opacity=layer.opacity, **_paint(layer, data)
+        )
+
+
+def _points(plotter: Any, layer: Points) -> None:
+    if len(layer.centres):
+        data = _poly(layer.centres)
+        look = {"render_points_as_spheres": True, "point_size": layer.size, "opacity": layer.opacity}
+        plotter.add_mesh(data, **look, **_paint(layer, data))
+
+
+def _lines(plotter: Any, layer: Lines) -> None:
+    if len(layer.pairs):
+        data = _poly(layer.vertices, lines=_cells(layer.pairs))
+        plotter.add_mesh(data, line_width=layer.width, lighting=False, opacity=layer.opacity, **_paint(layer, data))
+
+
+def _poly(points: np.ndarray, **cells: np.ndarray) -> Any:
+    import pyvista
+
+    return pyvista.PolyData(np.ascontiguousarray(points, np.float32), **cells)  # type: ignore[arg-type]
+
+
+def _cells(rows: np.ndarray) -> np.ndarray:
+    return np.c_[np.full(len(rows), rows.shape[1]), rows].ravel()
+
+
+def _paint(layer: Painted, data: Any) -> dict[str, Any]:
+    """Return arguments of ``add_mesh`` that colour a layer's vertices; numbers are interpolated before colouring."""
+    if layer.values is not None and layer.scale is not None:
+        data.point_data["values"] = layer.values.astype(np.float32)
+        return _numbers(layer.scale)
+    return _bytes(data, layer_colours(layer, data.n_points))
+
+
+def _bytes(data: Any, colours: np.ndarray) -> dict[str, Any]:
+    data.point_data["colours"] = colours
+    return {"scalars": "colours", "rgb": True, "show_scalar_bar": False}
+
+
+def _numbers(scale: Scale) -> dict[str, Any]:
+    return {"scalars": "values", "cmap": scale.colours, "clim": (scale.low, scale.high), "show_scalar_bar": False}
+
+
+def _ellipsoid_triangles(centres: np.ndarray, axes: np.ndarray, subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return (N V, 3) float32 points and (N F, 3) int64 triangles of N ellipsoids, one after the other."""
+    points, faces = unit_sphere(subdivisions)
+    placed = centres.astype(np.float64)[:, None, :] + np.einsum("nka,vk->nva", axes.astype(np.float64), points)
+    shifted = faces[None] + (np.arange(len(centres)) * len(points))[:, None, None]
+    return placed.reshape(-1, 3).astype(np.float32), shifted.reshape(-1, 3)
+
+
+_ADD: dict[type, Any] = {
+    Volume: _volume,
+    Isosurfaces: _isosurfaces,
+    Slices: _slices,
+    Ellipsoids: _ellipsoids,
+    Mesh: _mesh,
+    Points: _points,
+    Lines: _lines,
+}
+
+
+# ---------------------------------------------------------------- without a display
+
+_VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
+_PROBE = """
+from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper, vtkRenderer, vtkRenderWindow
+from vtkmodules.vtkRenderingCore import vtkWindowToImageFilter
+from vtkmodules.vtkFiltersSources import vtkSphereSource
+import vtkmodules.vtkRenderingOpenGL2
+window, renderer, actor, mapper, ball, image = (
+    vtkRenderWindow(), vtkRenderer(), vtkActor(), vtkPolyDataMapper(), vtkSphereSource(), vtkWindowToImageFilter()
+)
+mapper.SetInputConnection(ball.GetOutputPort())
+actor.SetMapper(mapper)
+renderer.AddActor(actor)
+window.SetOffScreenRendering(1)
+window.SetSize(32, 32)
+window.AddRenderer(renderer)
+window.Render()
+image.SetInput(window)
+image.Update()
+print("drawn" if image.GetOutput().GetScalarRange()[1] > 0 else "black")
+"""
+_SECONDS = 120.0
+
+
+def require_pyvista() -> None:
+    """Raise BackendUnavailable if the package is missing."""
+    try:
+        import pyvista  # noqa: F401
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"pyvista cannot be imported ({error}); pip install 'neuprim[viewer]', or --out FILE.html or .vdb"
+        ) from None
+
+
+def has_display() -> bool:
+    """Tell whether a window could be opened."""
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+@cache
+def prepare_headless() -> None:
+    """Choose the first of VTK's ways of drawing off screen that works here, for this process.
+
+    VTK ends the process if a library is missing, so another process tries first.
+
+    Raises:
+        BackendUnavailable: none of them works; names the packages to install.
+    """
+    chosen = os.environ.get(_VARIABLE)
+    ways = (chosen,) if chosen else (*([""] if has_display() else []), "vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
+    failures = []
+    for way in ways:
+        failure = _try(way)
+        if failure is None:
+            if way:
+                os.environ[_VARIABLE] = way
+            return
+        failures.append(f"{way or 'display'}: {failure}")
+    raise BackendUnavailable(
+        f"VTK cannot draw pictures here ({'; '.join(failures)}); on Debian or Ubuntu: "
+        "apt install libegl1 libgl1-mesa-dri; --out FILE.html and --out FILE.vdb need none of it"
+    )
+
+
+def _try(way: str) -> str | None:
+    """Try one way in another process; return why it does not work, or None."""
+    environment = {**os.environ, **({_VARIABLE: way} if way else {})}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True, timeout=_SECONDS
+        )
+    except subprocess.TimeoutExpired:
+        return f"no picture after {_SECONDS:.0f} s"
+    if done.returncode < 0:
+        return f"ended by {signal.Signals(-done.returncode).name}"
+    if done.returncode:
+        return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1][:200]
+    return None if "drawn" in done.stdout else "the picture is black"

@@ -6,8 +6,6 @@ from neuprim.core.extensions import LossExtension
 from neuprim.core.task import API_VERSION
 from neuprim.core.train.losses import compressed, l1, photometric, relative
 
-__all__ = ["COMPRESSED", "L1", "PHOTOMETRIC", "RELATIVE"]
-
 PHOTOMETRIC = LossExtension(
     API_VERSION,
     "photometric",

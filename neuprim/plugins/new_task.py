@@ -1,4 +1,4 @@
-"""``neuprim new-task``: a small package with a working task, to change into one's own."""
+"""``neuprim new-task``: write a small package with a working task, as a start for one's own."""
 
 from __future__ import annotations
 
@@ -14,13 +14,11 @@ from neuprim.core.io.files import publish_folder
 from neuprim.plugins.registry import list_tasks
 from neuprim.version import __version__
 
-__all__ = ["new_task"]
-
-_SUFFIX = ".in"
+_TEMPLATE_SUFFIX = ".in"
 
 
-def new_task(name: str, out: Path | None = None) -> list[str]:
-    """Write a package with the task ``name`` and return the lines that say what to do next.
+def write_task_package(name: str, out: Path | None = None) -> list[str]:
+    """Write a package with the task ``name`` and return lines that say what to do next.
 
     Args:
         out: the folder to make; None is ``neuprim-NAME`` in the working directory.
@@ -35,23 +33,21 @@ def new_task(name: str, out: Path | None = None) -> list[str]:
     for info in list_tasks():
         if info.name == name:
             raise ConfigError(f"new-task {name}: {info.origin} already has a task of this name; choose another")
-    words = {
+    variables = {
         "name": name,
         "package": f"neuprim_{name}",
         "distribution": f"neuprim-{name.replace('_', '-').strip('-')}",
         "version": __version__,
     }
-    folder = Path(words["distribution"]) if out is None else out
-    place = folder if folder.is_absolute() else f"./{folder}"  # pip takes a bare name for a package of the index
+    folder = Path(variables["distribution"]) if out is None else out
     if folder.exists() or folder.is_symlink():
         raise ConfigError(f"{folder}: exists; expected a folder to make (--out DIR)")
 
-    def write(draft: Path) -> None:
-        _write(resources.files("neuprim.plugins") / "template", draft, words)
-
-    publish_folder(folder, write, lambda path: path.exists())
+    template = resources.files("neuprim.plugins") / "template"
+    publish_folder(folder, lambda draft: _write(template, draft, variables), lambda path: path.exists())
+    place = folder if folder.is_absolute() else f"./{folder}"  # pip takes a bare name for a package of the index
     return [
-        f"wrote {folder}: a task {name!r} that works; change {words['package']}/fields.py and scene.py into yours",
+        f"wrote {folder}: a task {name!r} that works; change {variables['package']}/fields.py and scene.py into yours",
         "next:",
         f"  pip install -e '{place}[test]'",
         f"  neuprim run task={name}",
@@ -60,12 +56,12 @@ def new_task(name: str, out: Path | None = None) -> list[str]:
     ]
 
 
-def _write(source: Traversable, target: Path, words: dict[str, str]) -> None:
+def _write(source: Traversable, target: Path, variables: dict[str, str]) -> None:
     for entry in source.iterdir():
-        name = entry.name.replace("PACKAGE", words["package"]).replace("NAME", words["name"])
+        name = entry.name.replace("PACKAGE", variables["package"]).replace("NAME", variables["name"])
         if entry.is_dir():
             (target / name).mkdir()
-            _write(entry, target / name, words)
-        elif name.endswith(_SUFFIX):
-            text = Template(entry.read_text(encoding="utf-8")).substitute(words)
-            (target / name.removesuffix(_SUFFIX)).write_text(text, encoding="utf-8", newline="\n")
+            _write(entry, target / name, variables)
+        elif name.endswith(_TEMPLATE_SUFFIX):
+            text = Template(entry.read_text(encoding="utf-8")).substitute(variables)
+            (target / name.removesuffix(_TEMPLATE_SUFFIX)).write_text(text, encoding="utf-8", newline="\n")

@@ -1,62 +1,79 @@
-"""Who made a run: the packages that its task, scene and loss come from, with their versions, as kept in its
-``config.yaml``.
+"""Record which packages and versions made a run, and load the same plugins again.
 
-A stored run is read with the plugins of the packages that made it, whatever else has their names by now.
+``config.yaml`` keeps the record as ``made_by``. A stored run is read with the plugins of the packages that made it,
+whichever packages have their names now.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
+from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion, Version
 
-from neuprim.core.errors import CheckpointError, ConfigError, nearest
+from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.notices import warn_once
-from neuprim.plugins.editable import not_installed_yet
-from neuprim.plugins.mechanism import Group, PluginInfo, UnknownPlugin, installed
-from neuprim.plugins.names import BUILT_IN, normalised, qualified
+from neuprim.core.validation import Accepts, validate
+from neuprim.plugins.registry import (
+    BUILT_IN,
+    PluginGroup,
+    PluginInfo,
+    UnknownPlugin,
+    installed_version,
+    qualified_plugin_name,
+)
 from neuprim.version import __version__
-
-__all__ = ["MadeBy", "Maker", "check_resumed", "load_recorded", "missing", "warn_of_neuprim"]
 
 T = TypeVar("T")
 
 _LONGEST = 200
-"""Characters of a name or version in a file."""
+
+
+def _is_name(value: Any) -> bool:
+    return _is_version(value) and bool(value.strip()) and ":" not in value
+
+
+def _is_version(value: Any) -> bool:
+    return isinstance(value, str) and len(value) <= _LONGEST and value.isprintable()
+
+
+_Name = Annotated[str, Accepts(_is_name, f"a name of at most {_LONGEST} characters")]
+_Version = Annotated[str, Accepts(_is_version, f"a version of at most {_LONGEST} characters")]
 
 
 @dataclass(frozen=True)
-class Maker:
-    """Where one plugin of a run came from.
+class PluginVersion:
+    """The package and version that one plugin of a run came from.
 
     Attributes:
-        name: what it is called there: a task's, scene's or loss's name, without package.
-        package, version: the installed distribution; the version may be "".
+        name: of the task, scene or loss, without its package.
+        package, version: the installed distribution; the version may be empty.
     """
 
-    name: str
-    package: str
-    version: str
+    name: _Name
+    package: _Name
+    version: _Version
 
     @classmethod
-    def of(cls, info: PluginInfo, name: str | None = None) -> Maker:
-        """From what is registered; ``name`` where the entry point is called otherwise, as a scene's is."""
-        version = "".join(c for c in info.version if c.isprintable())[
-            :_LONGEST
-        ]  # what is written must be readable again
+    def of(cls, info: PluginInfo, name: str | None = None) -> PluginVersion:
+        """Record an installed plugin.
+
+        Args:
+            name: the plugin's name if its entry point has another, as a scene's has.
+        """
+        version = "".join(c for c in info.version if c.isprintable())[:_LONGEST]  # so that it can be read again
         return cls(info.name if name is None else name, info.distribution, version)
 
     @property
     def origin(self) -> str:
-        """For example ``"neuprim-spectral 0.1"``."""
+        """Package and version, e.g. ``"neuprim-spectral 0.1"``."""
         return f"{self.package} {self.version}".strip()
 
 
 @dataclass(frozen=True)
-class MadeBy:
+class Provenance:
     """Everything that made a run.
 
     Attributes:
@@ -65,86 +82,77 @@ class MadeBy:
         loss: of a loss chosen with ``train.loss``; None for the task's own.
     """
 
-    neuprim: str
-    task: Maker
-    scene: Maker | None = None
-    loss: Maker | None = None
+    neuprim: _Version
+    task: PluginVersion
+    scene: PluginVersion | None = None
+    loss: PluginVersion | None = None
+
+    @property
+    def plugins(self) -> dict[str, PluginVersion]:
+        """Kind -> plugin, without those that the run has not."""
+        found = {"task": self.task, "scene": self.scene, "loss": self.loss}
+        return {kind: plugin for kind, plugin in found.items() if plugin is not None}
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values; what is None is left out."""
-        makers = {"task": self.task, "scene": self.scene, "loss": self.loss}
-        return {
-            "neuprim": self.neuprim,
-            **{kind: vars(maker).copy() for kind, maker in makers.items() if maker is not None},
-        }
+        """Return plain values for YAML and JSON."""
+        return {"neuprim": self.neuprim, **{kind: asdict(plugin) for kind, plugin in self.plugins.items()}}
 
     @classmethod
-    def from_dict(cls, value: object) -> MadeBy:
-        """Reads :meth:`to_dict` back out of an untrusted file.
+    def from_dict(cls, value: object) -> Provenance:
+        """Read :meth:`to_dict`'s values from an untrusted file.
 
         Raises:
-            ConfigError: one line that names the key, what was found and what was expected.
+            ConfigError: names the key, what was found and what was expected.
         """
-        record = _mapping(value, "made_by", [f.name for f in fields(cls)])
-        makers = {
-            kind: _maker(record[kind], f"made_by.{kind}")
-            for kind in ("task", "scene", "loss")
-            if record.get(kind) is not None
-        }
-        if "task" not in makers:
-            raise ConfigError("made_by.task: missing; expected name, package and version")
-        return cls(_text(record.get("neuprim"), "made_by.neuprim"), **makers)
+        return validate(cls, value, "made_by")
 
-    def in_words(self) -> dict[str, str]:
+    def origins(self) -> dict[str, str]:
         """Kind -> package and version, for people."""
-        makers = {"task": self.task, "scene": self.scene, "loss": self.loss}
-        return {"neuprim": self.neuprim, **{kind: maker.origin for kind, maker in makers.items() if maker is not None}}
+        return {"neuprim": self.neuprim, **{kind: plugin.origin for kind, plugin in self.plugins.items()}}
 
 
-def load_recorded(
-    group: Group[T], maker: Maker, file: Path | None = None, entry: str | None = None
+def load_recorded_plugin(
+    group: PluginGroup[T], plugin: PluginVersion, file: Path | None = None, entry: str | None = None
 ) -> tuple[PluginInfo, T]:
-    """The plugin that a run was made by; another version of it is named in a warning.
+    """Load the plugin that made a run, and warn if another version of it is installed.
 
     Args:
         file: that holds the record, for messages.
-        entry: name of the entry point, where it is not the plugin's.
+        entry: name of the entry point, if it is not the plugin's.
 
     Raises:
-        ConfigError: the package is not installed, or has nothing of that name any more.
-        PluginError: it is broken, or was written for another version.
+        ConfigError: the package is not installed, or no longer has a plugin of that name.
+        PluginError: it is broken, or was written for another version of the interfaces.
     """
-    word = qualified(maker.package, entry or maker.name)
     try:
-        info, spec = group.loaded(word)
+        info, spec = group.load_with_info(qualified_plugin_name(plugin.package, entry or plugin.name))
     except UnknownPlugin as error:
-        raise ConfigError(_told(file, missing(group, maker, entry))) from error
-    if not info.built_in and info.version != maker.version:
-        warn_once(
-            _told(file, f"this run was made by {maker.origin} ({group.kind} {maker.name}); installed is {info.origin}")
-        )
+        raise ConfigError(_in_file(file, missing_plugin_message(group, plugin))) from error
+    if not info.built_in and info.version != plugin.version:
+        _warn_of_version(file, plugin, group.kind, info.origin)
     return info, spec
 
 
-def missing(group: Group[Any], maker: Maker, entry: str | None = None) -> str:
-    """The message for a plugin that made a run and is not there."""
-    who, there = f"this run was made by {maker.origin} ({group.kind} {maker.name})", installed(maker.package)
-    if there is None:
-        return f"{who}, which is not installed"
-    late = not_installed_yet(group.entry_points, entry or maker.name, normalised(maker.package))
-    return f"{who}; the installed {there} has no such {group.kind}{late}"
+def missing_plugin_message(group: PluginGroup[Any], plugin: PluginVersion) -> str:
+    """Say that the plugin which made a run is not there."""
+    who = f"this run was made by {plugin.origin} ({group.kind} {plugin.name})"
+    there = installed_version(plugin.package)
+    return (
+        f"{who}, which is not installed" if there is None else f"{who}; the installed {there} has no such {group.kind}"
+    )
 
 
-def warn_of_neuprim(made_by: MadeBy, file: Path | None = None) -> None:
-    """A warning where a run was made by another minor version of neuprim; patches keep results."""
-    if _minor(made_by.neuprim) != _minor(__version__):
-        warn_once(_told(file, f"this run was made by neuprim {made_by.neuprim}; this is neuprim {__version__}"))
+def warn_of_other_neuprim(made_by: Provenance, file: Path | None = None) -> None:
+    """Warn if another minor version of neuprim made a run; patch versions keep results."""
+    if _minor_version(made_by.neuprim) != _minor_version(__version__):
+        warn_once(_in_file(file, f"this run was made by neuprim {made_by.neuprim}; this is neuprim {__version__}"))
 
 
-def check_resumed(stored: object, now: MadeBy | None, file: Path) -> None:
-    """Whether a run may go on from a checkpoint that ``stored`` (its record) made.
+def check_resumed_provenance(stored: object, now: Provenance | None, file: Path) -> None:
+    """Check whether a run may go on from a checkpoint, and warn of other versions.
 
-    Warns of other versions.
+    Args:
+        stored: the checkpoint's record, as :meth:`Provenance.to_dict` wrote it.
 
     Raises:
         CheckpointError: its task comes from another package, or the record is damaged.
@@ -152,57 +160,36 @@ def check_resumed(stored: object, now: MadeBy | None, file: Path) -> None:
     if stored is None or now is None:
         return
     try:
-        before = MadeBy.from_dict(stored)
+        before = Provenance.from_dict(stored)
     except ConfigError as error:
         raise CheckpointError(f"{file}: {error}") from error
-    if normalised(before.task.package) != normalised(now.task.package):
+    if canonicalize_name(before.task.package) != canonicalize_name(now.task.package):
         raise CheckpointError(
-            f"{file}: written for task {before.task.name!r} of {before.task.origin}; this run's task is that of {now.task.origin}"
+            f"{file}: written for task {before.task.name!r} of {before.task.origin}; "
+            f"this run's task is that of {now.task.origin}"
         )
-    warn_of_neuprim(before, file)
-    for kind in ("task", "scene", "loss"):
-        old, new = getattr(before, kind), getattr(now, kind)
-        if old is None or new is None or normalised(old.package) in (BUILT_IN, "") or old.version == new.version:
-            continue
-        if (normalised(old.package), old.name) == (normalised(new.package), new.name):
-            warn_once(_told(file, f"this run was made by {old.origin} ({kind} {old.name}); installed is {new.origin}"))
+    warn_of_other_neuprim(before, file)
+    for kind, old in before.plugins.items():
+        new = now.plugins.get(kind)
+        same = new is not None and (canonicalize_name(old.package), old.name) == (
+            canonicalize_name(new.package),
+            new.name,
+        )
+        if new is not None and same and old.version != new.version and canonicalize_name(old.package) != BUILT_IN:
+            _warn_of_version(file, old, kind, new.origin)
 
 
-# ---------------------------------------------------------------- inside
+def _warn_of_version(file: Path | None, plugin: PluginVersion, kind: str, installed: str) -> None:
+    text = f"this run was made by {plugin.origin} ({kind} {plugin.name}); installed is {installed}"
+    warn_once(_in_file(file, text))
 
 
-def _told(file: Path | None, text: str) -> str:
+def _in_file(file: Path | None, text: str) -> str:
     return text if file is None else f"{file}: {text}"
 
 
-def _minor(version: str) -> object:
+def _minor_version(version: str) -> object:
     try:
         return Version(version).release[:2]
     except InvalidVersion:
         return version
-
-
-def _maker(value: object, where: str) -> Maker:
-    record = _mapping(value, where, ["name", "package", "version"])
-    name, package = (_text(record.get(key), f"{where}.{key}") for key in ("name", "package"))
-    if ":" in package:
-        raise ConfigError(f"{where}.package: found {package!r}; expected the name of a package")
-    return Maker(name, package, _text(record.get("version"), f"{where}.version", empty=True))
-
-
-def _mapping(value: object, where: str, known: list[str]) -> Mapping[str, Any]:
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"{where}: found {type(value).__name__}; expected a mapping of {', '.join(known)}")
-    for key in value:
-        if key not in known:
-            raise ConfigError(f"{where}.{str(key)[:_LONGEST]}: no such setting" + nearest(str(key), known))
-    return value
-
-
-def _text(value: object, where: str, empty: bool = False) -> str:
-    if not isinstance(value, str) or len(value) > _LONGEST or not value.isprintable() or not (empty or value.strip()):
-        found = (
-            repr(value) if len(repr(value)) <= _LONGEST else f"{type(value).__name__} of {len(repr(value))} characters"
-        )
-        raise ConfigError(f"{where}: found {found}; expected text of at most {_LONGEST} characters")
-    return value

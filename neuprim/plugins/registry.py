@@ -1,92 +1,314 @@
-"""Plugins by name, from entry points: tasks, and scenes, losses, exporters and inspectors for the tasks of others.
+"""Find and load plugins: tasks, scenes, losses, exporters and inspectors, registered as entry points.
 
-The built-in ones come through the same groups as anybody's. Listing reads package metadata only; a plugin is imported
-when it is asked for, so a broken one stops nothing but itself. A name is ``NAME``, or ``PACKAGE:NAME`` for the plugin
-of one package; a bare name that a built-in has is the built-in's. See :mod:`neuprim.plugins.mechanism`.
+Built-in plugins are registered like those of any other package. Listing reads package metadata only. A plugin is
+imported when it is chosen by name, so a broken plugin does not affect the others.
+
+A plugin is chosen by ``NAME`` or ``PACKAGE:NAME``. A bare name that a built-in plugin has means the built-in one,
+whoever else registers it.
 """
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from importlib import metadata
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from neuprim.core.errors import nearest
+from packaging.utils import canonicalize_name
+
+from neuprim.core.errors import ConfigError, NeuprimError, nearest
 from neuprim.core.notices import warn_once
-from neuprim.plugins.editable import not_installed_yet
-from neuprim.plugins.mechanism import Group, PluginError, PluginInfo, PluginReport, UnknownPlugin
-from neuprim.plugins.names import normalised, split
 
-if TYPE_CHECKING:  # importing the interfaces imports torch, which listing does not need
+if TYPE_CHECKING:  # these modules import torch, which listing does not need
     from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension
     from neuprim.core.task import SceneSpec, TaskSpec
 
-__all__ = [
-    "ALL",
-    "EXPORTERS",
-    "INSPECTORS",
-    "LOSSES",
-    "SCENES",
-    "TASKS",
-    "FoundScene",
-    "Group",
-    "PluginError",
-    "PluginInfo",
-    "PluginReport",
-    "UnknownPlugin",
-    "find_scene",
-    "list_exporters",
-    "list_inspectors",
-    "list_losses",
-    "list_scenes",
-    "list_tasks",
-    "load_exporter",
-    "load_inspector",
-    "load_loss",
-    "load_task",
-    "scene_names",
-    "survey",
-]
+T = TypeVar("T")
 
-TASKS: Group[TaskSpec] = Group("neuprim.tasks", "task", "task={}", "neuprim.core.task:TaskSpec")
-SCENES: Group[SceneExtension] = Group(
+BUILT_IN = "neuprim"
+"""The distribution whose plugins are the built-in ones."""
+
+
+class PluginError(NeuprimError):
+    """A plugin is installed but cannot be used; the message names the plugin, its package and the reason."""
+
+
+class UnknownPlugin(ConfigError):
+    """No installed package registers a plugin of that name."""
+
+
+def split_plugin_name(word: str) -> tuple[str | None, str]:
+    """Split ``PACKAGE:NAME`` into the normalised package and the name; the package is None for a bare name."""
+    package, colon, name = word.partition(":")
+    return (canonicalize_name(package.strip()), name.strip()) if colon else (None, word)
+
+
+def qualified_plugin_name(distribution: str, name: str) -> str:
+    """Return ``PACKAGE:NAME``, as a user types it."""
+    return f"{canonicalize_name(distribution)}:{name}"
+
+
+def installed_version(package: str) -> str | None:
+    """Return name and version of an installed distribution, or None if it is not installed."""
+    try:
+        found = metadata.distribution(package)
+    except (metadata.PackageNotFoundError, ValueError):  # ValueError: an empty name
+        return None
+    return f"{found.metadata['Name'] or package} {found.metadata['Version'] or ''}".strip()
+
+
+@dataclass(frozen=True)
+class PluginInfo:
+    """What package metadata says about a plugin.
+
+    Attributes:
+        name: of the entry point, such as what the user types after ``task=``.
+        distribution, version: the installed package that registers it.
+        target: ``module:attribute`` of its description, such as a :class:`~neuprim.core.task.TaskSpec`.
+    """
+
+    name: str
+    distribution: str
+    version: str
+    target: str
+
+    @property
+    def origin(self) -> str:
+        """Package and version, e.g. ``"neuprim 0.1.0"``."""
+        return f"{self.distribution} {self.version}".strip()
+
+    @property
+    def built_in(self) -> bool:
+        """Whether neuprim's own distribution registers it."""
+        return canonicalize_name(self.distribution) == BUILT_IN
+
+
+@dataclass(frozen=True)
+class PluginReport(Generic[T]):
+    """A registered plugin, loaded, or the reason why it could not be.
+
+    Attributes:
+        note: how to choose it if its bare name does not; else None.
+    """
+
+    info: PluginInfo
+    spec: T | None = None
+    error: str | None = None
+    note: str | None = None
+
+
+@dataclass(frozen=True)
+class PluginGroup(Generic[T]):
+    """One kind of plugin.
+
+    Attributes:
+        entry_points: the entry-point group.
+        kind: the word for one of them in messages.
+        typed: how a user names one, e.g. ``"task={}"``.
+        described_by: ``module:class`` of the descriptions. It is imported with the first plugin, because it imports
+            torch.
+        name_of: returns the name in a description; it must equal the entry point's.
+        typed_name: returns what a user types for an entry point's name.
+    """
+
+    entry_points: str
+    kind: str
+    typed: str
+    described_by: str
+    name_of: Callable[[Any], str] = lambda spec: str(spec.name)
+    typed_name: Callable[[str], str] = lambda name: name
+
+    def list_plugins(self) -> list[PluginInfo]:
+        """List all registered plugins by name without importing any. A name registered twice is listed twice."""
+        return [info for info, _ in self._entries()]
+
+    def find(self, word: str) -> PluginInfo:
+        """Find who registers the plugin that ``word`` chooses, without importing it. Raises as :meth:`load`."""
+        return self._find(word)[0]
+
+    def load(self, word: str) -> T:
+        """Import and check the plugin that ``NAME`` or ``PACKAGE:NAME`` chooses.
+
+        Raises:
+            UnknownPlugin: there is none.
+            PluginError: several packages register the bare name, or the plugin is broken or was written for another
+                version of the interfaces.
+        """
+        return self.load_with_info(word)[1]
+
+    def load_with_info(self, word: str) -> tuple[PluginInfo, T]:
+        """Return who registers a plugin, and the plugin. Raises as :meth:`load`."""
+        info, entry = self._find(word)
+        return info, self._load(info, entry)
+
+    def survey(self) -> list[PluginReport[T]]:
+        """Load every registered plugin. Broken ones come with their error."""
+        reports: list[PluginReport[T]] = []
+        for info, entry in self._entries():
+            note = self._name_clash_note(info)
+            try:
+                reports.append(PluginReport(info, self._load(info, entry), note=note))
+            except PluginError as error:
+                reports.append(PluginReport(info, error=str(error), note=note))
+        return reports
+
+    def choice(self, info: PluginInfo) -> str:
+        """Return what a user types to choose exactly this plugin, e.g. ``task=PACKAGE:NAME``."""
+        return self.typed.format(qualified_plugin_name(info.distribution, self.typed_name(info.name)))
+
+    def shortest_name(self, info: PluginInfo) -> str:
+        """Return the plugin's bare name if it is unambiguous, else ``PACKAGE:NAME``."""
+        name = self.typed_name(info.name)
+        return name if self._name_clash_note(info) is None else qualified_plugin_name(info.distribution, name)
+
+    def owner(self, spec: T) -> PluginInfo | None:
+        """Find who registers a description that is already imported. Built-in plugins come first."""
+        for info in sorted(self.list_plugins(), key=lambda info: not info.built_in):
+            module, _, path = info.target.partition("[")[0].partition(":")
+            found: Any = sys.modules.get(module.strip())
+            for part in path.strip().split("."):
+                found = inspect.getattr_static(found, part, None)
+            if found is spec:
+                return info
+        return None
+
+    def warn_of_hidden(self, info: PluginInfo, by: str) -> None:
+        """Warn that the name of ``info`` means another plugin, and how to choose it."""
+        what = f"{self.kind} {self.typed_name(info.name)!r} of {info.origin}"
+        warn_once(f"{what} has the name of {by}, which is used; {self.choice(info)} chooses the other")
+
+    def _find(self, word: str) -> tuple[PluginInfo, metadata.EntryPoint]:
+        entries = self._entries()
+        package, name = split_plugin_name(word)
+        found = [(i, e) for i, e in entries if i.name == name and package in (None, canonicalize_name(i.distribution))]
+        if not found:
+            raise UnknownPlugin(self._unknown(word, [info for info, _ in entries]))
+        if package is None and any(info.built_in for info, _ in found):
+            for info, _ in found:
+                if not info.built_in:
+                    self.warn_of_hidden(info, "neuprim's own")
+            found = [(info, entry) for info, entry in found if info.built_in]
+        if len(found) > 1:
+            origins = " and ".join(f"{info.origin} ({info.target})" for info, _ in found)
+            choices = list(dict.fromkeys(self.choice(info) for info, _ in found))
+            advice = f"choose {' or '.join(choices)}" if len(choices) > 1 else "a package may register a name once"
+            raise PluginError(f"{self.kind} {name!r} is registered by {origins}; {advice}")
+        return found[0]
+
+    def _unknown(self, word: str, registered: Sequence[PluginInfo]) -> str:
+        package, name = split_plugin_name(word)
+        names = {info.name for info in registered if package in (None, canonicalize_name(info.distribution))}
+        hint = nearest(name, names)
+        if package is not None and not names:
+            there = installed_version(package)
+            hint = f"; {package or 'the package'} is not installed" if there is None else f"; {there} registers none"
+        return f"{self.typed.format(word)}: no such {self.kind}{hint}"
+
+    def _name_clash_note(self, info: PluginInfo) -> str | None:
+        """Say how to choose a plugin whose bare name means another one or several; None if the name is enough."""
+        others = [other for other in self.list_plugins() if other.name == info.name and other != info]
+        if info.built_in or not others:
+            return None
+        if any(other.built_in for other in others):
+            return f"hidden by the built-in {self.kind}; {self.choice(info)} chooses it"
+        origins = " and ".join(other.origin for other in others)
+        return f"also registered by {origins}; {self.choice(info)} chooses this one"
+
+    def _entries(self) -> list[tuple[PluginInfo, metadata.EntryPoint]]:
+        """List the group's entry points by name, the built-in ones first."""
+        found, packages = [], set()
+        for dist in metadata.distributions():
+            try:
+                entries = [entry for entry in dist.entry_points if entry.group == self.entry_points]
+                name, version = str(dist.metadata["Name"] or ""), str(dist.metadata["Version"] or "")
+            except Exception:  # a half-removed package must not take the others along
+                continue
+            if canonicalize_name(name) in packages:  # a copy further down sys.path, which is not imported
+                continue
+            packages.add(canonicalize_name(name))
+            found += [(PluginInfo(entry.name, name, version, entry.value), entry) for entry in entries]
+        return sorted(found, key=lambda pair: (pair[0].name, not pair[0].built_in, pair[0].distribution))
+
+    def _load(self, info: PluginInfo, entry: metadata.EntryPoint) -> T:
+        from neuprim.core.task import API_VERSION
+        from neuprim.plugins.spec_validation import validate_spec
+
+        who = f"{self.kind} {info.name!r} of {info.origin}"
+        try:
+            spec = entry.load()
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # an import can fail in any way, and the message must name the package
+            text = " ".join(str(error).split())
+            raise PluginError(f"{who}: cannot import {info.target}: {type(error).__name__}: {text}") from error
+        module, _, class_name = self.described_by.partition(":")
+        expected = getattr(importlib.import_module(module), class_name)
+        if not isinstance(spec, expected):
+            raise PluginError(
+                f"{who}: {info.target} is of type {type(spec).__name__}; expected a {module}.{class_name}"
+            )
+        api = getattr(spec, "api", None)
+        if api != API_VERSION:
+            older = isinstance(api, int) and api < API_VERSION
+            upgrade = info.distribution if older else "neuprim"
+            raise PluginError(f"{who}: written for plugin API {api}, this neuprim has {API_VERSION}; upgrade {upgrade}")
+        problem = validate_spec(spec)
+        if problem is not None:
+            raise PluginError(f"{who}: {class_name}.{problem}")
+        if self.name_of(spec) != info.name:
+            own = self.name_of(spec)
+            raise PluginError(f"{who}: its {class_name} is named {own!r}; expected the name of the entry point")
+        return spec  # type: ignore[no-any-return]
+
+
+TASKS: PluginGroup[TaskSpec] = PluginGroup("neuprim.tasks", "task", "task={}", "neuprim.core.task:TaskSpec")
+SCENES: PluginGroup[SceneExtension] = PluginGroup(
     "neuprim.scenes",
     "scene",
     "scene={}",
     "neuprim.core.extensions:SceneExtension",
-    lambda s: f"{s.task}.{s.scene.name}",
+    lambda extension: f"{extension.task}.{extension.scene.name}",
     lambda name: name.partition(".")[2],
 )
-"""Entry points here are called ``TASK.SCENE``, so that metadata alone says what there is for a task."""
-LOSSES: Group[LossExtension] = Group("neuprim.losses", "loss", "train.loss={}", "neuprim.core.extensions:LossExtension")
-EXPORTERS: Group[Exporter] = Group("neuprim.exporters", "exporter", "--format {}", "neuprim.core.extensions:Exporter")
-INSPECTORS: Group[Inspector] = Group(
+"""Entry points of scenes are named ``TASK.SCENE``, so metadata alone says which scenes a task has."""
+LOSSES: PluginGroup[LossExtension] = PluginGroup(
+    "neuprim.losses", "loss", "train.loss={}", "neuprim.core.extensions:LossExtension"
+)
+EXPORTERS: PluginGroup[Exporter] = PluginGroup(
+    "neuprim.exporters", "exporter", "--format {}", "neuprim.core.extensions:Exporter"
+)
+INSPECTORS: PluginGroup[Inspector] = PluginGroup(
     "neuprim.inspectors", "inspector", "--show {}", "neuprim.core.extensions:Inspector"
 )
-
-# ---------------------------------------------------------------- tasks
+PLUGIN_GROUPS: tuple[PluginGroup[Any], ...] = (TASKS, SCENES, LOSSES, EXPORTERS, INSPECTORS)
 
 
 def list_tasks() -> list[PluginInfo]:
-    """All registered tasks by name, without importing any; a name claimed twice is listed twice."""
-    return TASKS.listed()
+    """List all registered tasks without importing any."""
+    return TASKS.list_plugins()
 
 
 def load_task(name: str) -> TaskSpec:
-    """The task that ``NAME`` or ``PACKAGE:NAME`` chooses; imports it and no other.
-
-    Raises:
-        UnknownPlugin: no such task.
-        PluginError: two packages claim the bare name, or the plugin is broken or was written for another version.
-    """
+    """Load the task that ``NAME`` or ``PACKAGE:NAME`` chooses. Raises as :meth:`PluginGroup.load`."""
     return TASKS.load(name)
 
 
-def survey() -> list[PluginReport[TaskSpec]]:
-    """Every registered task, loaded one by one; the broken ones come with their error."""
-    return TASKS.survey()
+def load_loss(name: str) -> LossExtension:
+    """Load a loss. Raises as :meth:`PluginGroup.load`."""
+    return LOSSES.load(name)
 
 
-# ---------------------------------------------------------------- scenes
+def load_exporter(name: str) -> Exporter:
+    """Load an export format. Raises as :meth:`PluginGroup.load`."""
+    return EXPORTERS.load(name)
+
+
+def load_inspector(name: str) -> Inspector:
+    """Load a way to show a density. Raises as :meth:`PluginGroup.load`."""
+    return INSPECTORS.load(name)
 
 
 @dataclass(frozen=True)
@@ -95,7 +317,7 @@ class FoundScene:
 
     Attributes:
         config_package: the package that holds its ``scene/TASK/NAME.yaml``.
-        added_by: who adds it; None for the task's own.
+        added_by: the plugin that adds it; None for the task's own.
     """
 
     spec: SceneSpec
@@ -103,94 +325,31 @@ class FoundScene:
     added_by: PluginInfo | None = None
 
 
-def list_scenes(task: str | None = None) -> list[PluginInfo]:
-    """Scenes that packages add to tasks of others (to ``task`` only, if given), without importing any; named
-    ``TASK.SCENE``."""
-    return [info for info in SCENES.listed() if task is None or info.name.startswith(f"{task}.")]
-
-
-def scene_names(task: TaskSpec) -> list[str]:
-    """Names of all scenes of a task: its own ones, then those that other packages add."""
-    own = [scene.name for scene in task.scenes]
-    return [
-        *own,
-        *dict.fromkeys(
-            n for n in (i.name.removeprefix(f"{task.name}.") for i in list_scenes(task.name)) if n not in own
-        ),
-    ]
-
-
 def find_scene(task: TaskSpec, word: str) -> FoundScene:
-    """The scene that ``NAME`` or ``PACKAGE:NAME`` chooses, the task's own or one that another package adds; imports no
-    other.
+    """Find the scene that ``NAME`` or ``PACKAGE:NAME`` chooses, among the task's own and those of other packages.
 
-    A bare name is the task's own scene where it has one; a package that adds another of that name is named in a
-    warning.
+    A bare name means the task's own scene if it has one of that name.
 
     Raises:
         UnknownPlugin: there is none.
         PluginError: two packages add the name, or the one that adds it is broken.
     """
-    package, name = split(word)
-    own = [scene for scene in task.scenes if scene.name == name]
-    if own and package is None:
-        for info in list_scenes(task.name):
-            if info.name == f"{task.name}.{name}":
-                warn_once(SCENES.hidden(info, f"one of task {task.name!r} itself"))
-    if own and (package is None or package == _package_of(task)):
-        return FoundScene(own[0], task.config_package)
-    added = f"{task.name}.{name}" if package is None else f"{package}:{task.name}.{name}"
+    package, name = split_plugin_name(word)
+    own = {scene.name: scene for scene in task.scenes}
+    added = [info for info in SCENES.list_plugins() if info.name.startswith(f"{task.name}.")]
+    if name in own:
+        owner = TASKS.owner(task)
+        if package is None:
+            for info in added:
+                if info.name == f"{task.name}.{name}":
+                    SCENES.warn_of_hidden(info, f"one of task {task.name!r} itself")
+        if package is None or (owner is not None and package == canonicalize_name(owner.distribution)):
+            return FoundScene(own[name], task.config_package)
+    entry = f"{task.name}.{name}"
     try:
-        info, extension = SCENES.loaded(added)
+        info, extension = SCENES.load_with_info(entry if package is None else f"{package}:{entry}")
     except UnknownPlugin:
-        offered = scene_names(task)
-        if package is not None:
-            offered = [scene.name for scene in task.scenes] if package == _package_of(task) else []
-            offered += [
-                SCENES.typed_name(i.name) for i in list_scenes(task.name) if normalised(i.distribution) == package
-            ]
-        whose = f"task {task.name!r} has no such scene" + (f" of {package}" if package else "")
-        late = not_installed_yet(SCENES.entry_points, f"{task.name}.{name}", package)
-        raise UnknownPlugin(f"scene={word}: {whose}{nearest(name, offered)}{late}") from None
+        names = [*own, *(SCENES.typed_name(info.name) for info in added)]
+        of = f" of {package}" if package else ""
+        raise UnknownPlugin(f"scene={word}: task {task.name!r} has no such scene{of}{nearest(name, names)}") from None
     return FoundScene(extension.scene, extension.config_package, info)
-
-
-def _package_of(task: TaskSpec) -> str | None:
-    owner = TASKS.owner(task)
-    return None if owner is None else normalised(owner.distribution)
-
-
-# ---------------------------------------------------------------- losses, exporters, inspectors
-
-
-def list_losses() -> list[PluginInfo]:
-    """Losses for any task, without importing any."""
-    return LOSSES.listed()
-
-
-def load_loss(name: str) -> LossExtension:
-    """The loss of that name; raises as :func:`load_task`."""
-    return LOSSES.load(name)
-
-
-def list_exporters() -> list[PluginInfo]:
-    """Export formats, without importing any."""
-    return EXPORTERS.listed()
-
-
-def load_exporter(name: str) -> Exporter:
-    """The export format of that name; raises as :func:`load_task`."""
-    return EXPORTERS.load(name)
-
-
-def list_inspectors() -> list[PluginInfo]:
-    """Ways of showing a density, without importing any."""
-    return INSPECTORS.listed()
-
-
-def load_inspector(name: str) -> Inspector:
-    """The way of showing a density of that name; raises as :func:`load_task`."""
-    return INSPECTORS.load(name)
-
-
-ALL: tuple[Group[Any], ...] = (TASKS, SCENES, LOSSES, EXPORTERS, INSPECTORS)

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import RunConfig, scene_of, suspects_of, task_of
+from neuprim.config import RunConfig, find_run_plugins, scene_of, task_of
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.overrides import drop_place, quote_override
 from neuprim.core.checkpoint import load_model
@@ -25,14 +25,14 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import Chunks, Loss, TaskSpec
 from neuprim.core.train.trainer import Trainer
 from neuprim.core.validation import coerce, validate
-from neuprim.plugins.blame import Suspects, blamed
+from neuprim.plugins.attribution import PluginSource, attribute_errors
 from neuprim.runs.events import Events, Note, Preparing, ignore_event
 from neuprim.runs.finetune import fine_tuner, steps_in
 from neuprim.runs.fit import Fitted
 from neuprim.runs.ground_truth import render_ground_truth_for_training
 from neuprim.runs.launch.jobs import ENDED, Job, JobStatus, Result
 from neuprim.runs.launch.launcher import LAUNCH_FOLDER, check_launcher, launch
-from neuprim.runs.open import LOGS, make_scene_context, model_file, read_metrics
+from neuprim.runs.open import make_scene_context, model_file, read_metrics
 from neuprim.runs.training import BetweenSteps, do_nothing_between, train_in_directory
 
 __all__ = [
@@ -104,8 +104,7 @@ def _load_chunks(config: RunConfig, events: Events) -> Chunks | None:
     load = scene_of(config, task_of(config)).spec.chunks
     assert load is not None, "the caller asked for chunks"
     context = make_scene_context(config, lambda text, fraction: events(Preparing(text, fraction)))
-    scene = suspects_of(config).scene
-    with blamed(scene.origin, f"chunks of {scene.what}", config.output_dir / LOGS):
+    with attribute_errors(find_run_plugins(config).scene, "chunks"):
         return load(config.to_dict(), context)
 
 
@@ -273,7 +272,6 @@ def _describe(rows: list[tuple[Any, ...]]) -> str:
 
 def train_in_chunks(
     config: RunConfig,
-    suspects: Suspects,
     events: Events = ignore_event,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
     between: BetweenSteps = do_nothing_between,
@@ -296,14 +294,12 @@ def train_in_chunks(
     chunks = _load_chunks(config, events)
     if chunks is None:
         events(Note(f"scene.chunks={config.scene['chunks']}: fitted as one run"))
-        return train_in_directory(
-            replace(config, scene={**config.scene, "chunks": None}), suspects, events, between=between
-        )
+        return train_in_directory(replace(config, scene={**config.scene, "chunks": None}), events, between=between)
     plan = _make_plan(config, chunks)
     record = _fit_chunks(config, plan, _start_record(plan, config.output_dir, config.resume), events, launcher)
 
     def make(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss) -> Trainer:
-        model = _join(plan, task, suspects)
+        model = _join(plan, task, find_run_plugins(config).scene)
         steps = record.joined_steps
         if steps is None:
             assert plan.seconds is not None, "a budget is in steps, in seconds or both"
@@ -313,7 +309,7 @@ def train_in_chunks(
         trainer.elapsed = sum(float(read_metrics(own.output_dir)["train_seconds"]) for own in plan.configs)
         return trainer
 
-    return train_in_directory(config, suspects, events, between=between, make=make)
+    return train_in_directory(config, events, between=between, make=make)
 
 
 def _fit_chunks(
@@ -369,11 +365,9 @@ def _is_done(record: ChunkRecord, number: int, config: RunConfig) -> bool:
     return record.rows[number].state == "done" and whole and model_file(config.output_dir).is_file()
 
 
-def _join(plan: ChunkPlan, task: TaskSpec, suspects: Suspects) -> Primitives:
+def _join(plan: ChunkPlan, task: TaskSpec, scene: PluginSource) -> Primitives:
     models = [load_model(model_file(config.output_dir), task)[0] for config in plan.configs]
-    with blamed(
-        suspects.scene.origin, f"join of {suspects.scene.what}", plan.configs[0].output_dir.parent.parent / LOGS
-    ):
+    with attribute_errors(scene, "join"):
         return plan.chunks.join(models)
 
 

@@ -15,7 +15,7 @@ from neuprim.core.io.animation import FrameSpool, write_animation
 from neuprim.core.io.files import write_json
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
-from neuprim.plugins.judging import clips_of, orbit_of
+from neuprim.plugins.returns import call_task_clips, call_task_orbit
 from neuprim.report import Viewer, error_map, write_report
 from neuprim.report.regions import Regions
 from neuprim.runs.fit import Fitted
@@ -37,7 +37,7 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
     folder = directory / "renders"
     folder.mkdir(exist_ok=True)
 
-    clips = clips_of(task, dataset)
+    clips = call_task_clips(task, dataset)
     spooled = {i: clip for clip in clips if clip.source is None for i in clip.views}
     open_spool: list[FrameSpool] = []
     regions = Regions(channels.display)
@@ -71,7 +71,7 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
     size = (directory / "model.safetensors").stat().st_size
     metrics = summarize_metrics(config, model, task, dataset, channels, views, size, fitted.training, fitted.lpips)
     write_json(directory / "metrics.json", metrics)
-    views_around = orbit_of(task, dataset, _ORBIT_FRAMES)
+    views_around = call_task_orbit(task, dataset, _ORBIT_FRAMES)
     frames = [channels.display(render_image(model, v, config.renderer, dataset.background)) for v in views_around]
     write_animation(folder / "orbit.webp", frames, fps=12.0)
     write_report(directory, task.conditions, _embedded_viewer(fitted, directory))

@@ -22,7 +22,7 @@ from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredMod
 from neuprim.core.io.files import StagedOutput, refuse_existing, staged, write_json
 from neuprim.core.io.plain import load_json
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.plugins.blame import origin_of, reported
+from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
 from neuprim.runs.open import COMPRESSED, load_run, open_run
 from neuprim.version import __version__
@@ -81,7 +81,7 @@ def export_run(
     read_conditions(run.task.conditions, conditions, notes.append)
     with staged(final, overwrite) as output:
         job = ExportJob(run, output.out, options, conditions, progress)
-        with reported(EXPORTERS, name, [run_dir / "logs", final.absolute().parent]):
+        with attribute_errors(find_plugin_source(EXPORTERS, name)):
             report = exporter.write(job)
         files = _final_files(report, output, name)
         output.publish()
@@ -101,7 +101,7 @@ def _destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
 
 def _final_files(report: Any, output: StagedOutput, name: str) -> tuple[Path, ...]:
     """Where the files of a report will be."""
-    who = f"exporter {name!r} of {origin_of(EXPORTERS, name).origin}"
+    who = find_plugin_source(EXPORTERS, name).label
     if not isinstance(report, ExportReport):
         raise PluginError(f"{who}: write returned {type(report).__name__}; expected an ExportReport")
     files = []
@@ -255,7 +255,7 @@ def import_run(path: Path, out: Path, name: str | None = None) -> Path:
         return _import_compressed(path, out)
     reader = _find_reader(path, name)
     assert reader.read is not None
-    with reported(EXPORTERS, name or reader.name, [out.absolute().parent]):
+    with attribute_errors(find_plugin_source(EXPORTERS, name or reader.name)):
         stored = reader.read(path)
     return import_model(stored, path, out)
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 
-from neuprim.config import RunConfig, made_now, scene_of, suspects_of, task_of
-from neuprim.core.channels import Channels, channels_of
+from neuprim.config import RunConfig, find_run_plugins, made_now, scene_of, task_of
+from neuprim.core.channels import Channels, find_channels
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.dataset_check import check_dataset
@@ -27,15 +27,13 @@ from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.core.used_settings import build_settings, loss_settings
-from neuprim.plugins.blame import Suspects, blamed
-from neuprim.plugins.checked import check_fields, checked_loss
-from neuprim.plugins.judging import clips_of, facts_of
-from neuprim.plugins.mechanism import PluginError
+from neuprim.plugins.attribution import attribute_errors, guard_loss
 from neuprim.plugins.registry import load_loss
+from neuprim.plugins.returns import call_task_clips, call_task_facts, check_fields
 from neuprim.runs.curve import evaluate_curve_point, next_evaluation_progress
 from neuprim.runs.events import Evaluated, Events, Note, Preparing, Step, ignore_event
 from neuprim.runs.measure import measure_views, summarize_metrics
-from neuprim.runs.open import LOGS, load_dataset
+from neuprim.runs.open import load_dataset
 
 __all__ = [
     "Fitted",
@@ -115,9 +113,8 @@ def fit(config: RunConfig, events: Events = ignore_event, dataset: Dataset | Non
     Raises:
         NeuprimError: the input's fault, or numbers that left the finite.
     """
-    suspects = suspects_of(config)
-    with suspects.watch(config.output_dir / LOGS):
-        return train_to_end(prepare_training(config, events, dataset, suspects), events)
+    with find_run_plugins(config).attribute_errors():
+        return train_to_end(prepare_training(config, events, dataset), events)
 
 
 def train_to_end(fitted: Fitted, events: Events = ignore_event) -> Fitted:
@@ -134,7 +131,6 @@ def prepare_training(
     config: RunConfig,
     events: Events = ignore_event,
     dataset: Dataset | None = None,
-    suspects: Suspects | None = None,
     hold_out: int = 0,
     make: TrainerFactory | None = None,
     group: ProcessGroup | None = None,
@@ -142,7 +138,6 @@ def prepare_training(
     """Everything up to the first step. Raises as :func:`fit`.
 
     Args:
-        suspects: who is watched for crashes around this call; told whose code the data set is.
         hold_out: n > 1: every n-th training view takes the place of the test views; 0: the data are taken as they are.
         What a task knows of
             its test views, and checks here, is of those that the data set came with.
@@ -158,12 +153,10 @@ def prepare_training(
     lpips = None if config.metrics.lpips is None else Lpips.load(config.metrics.lpips)
     if dataset is None:
         dataset = load_dataset(config, task, lambda text, fraction: events(Preparing(text, fraction)))
-    if suspects is not None:
-        suspects.know(dataset)
     check_dataset(dataset, task.conditions)
-    clips_of(task, dataset)  # what the task cannot make of these data must not cost a training
-    facts_of(task, dataset)
-    channels = channels_of(task, dataset)
+    call_task_clips(task, dataset)  # what the task cannot make of these data must not cost a training
+    call_task_facts(task, dataset)
+    channels = find_channels(task, dataset)
     if channels.partial:
         events(Note(f"shown: {channels.shown}; task {task.name!r} has no display that shows them all"))
     if hold_out:
@@ -220,14 +213,12 @@ def make_loss(config: RunConfig, task: TaskSpec) -> Loss:
         PluginError: it is another package's and cannot be made.
     """
     chosen = None if config.train.loss is None else load_loss(config.train.loss)
-    party = suspects_of(config).loss
-    with blamed(party.origin, party.what, config.output_dir / LOGS) as guard:
+    source = find_run_plugins(config).loss
+    with attribute_errors(source, "loss" if chosen is None else "make"):
         made = (task.loss if chosen is None else chosen.make)(
             loss_settings(chosen or task, config.train, config.options)
         )
-    if not callable(made):
-        raise PluginError(f"{party.who}: made a {type(made).__name__}; expected a function")
-    return checked_loss(made, guard)
+    return guard_loss(made, source)
 
 
 def make_trainer(
@@ -250,11 +241,12 @@ def make_trainer(
     """
     if config.train.supervision == "images":  # the model has nothing that only points could teach
         dataset = replace(dataset, points=None)
-    origin = suspects_of(config).task.origin
-    with blamed(origin, f"build of task {task.name!r}", config.output_dir / LOGS):
+    source = find_run_plugins(config).task
+    with attribute_errors(source, "build"):
         density, colour = task.build(build_settings(task, config.model, config.options), dataset)
     density, colour = reduce_fields(density, colour, config.model.reduced)
-    check_fields(density, colour, dataset, f"build of task {task.name!r} of {origin.origin}")
+    with attribute_errors(source):
+        check_fields(density, colour, dataset)
     model = initial_model(density, colour, dataset, replace(config.model, primitives=_first(config)), config.seed)
     population = config.train.population
     if population.grow_to is None:

@@ -9,17 +9,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import RunConfig, scene_of, suspects_of, task_of
+from neuprim.config import RunConfig, find_run_plugins, scene_of, task_of
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.data.dataset import GroundTruth
 from neuprim.core.errors import DataError, NeuprimError
 from neuprim.core.io.store import WAIT_MESSAGE
-from neuprim.plugins.blame import blamed
+from neuprim.plugins.attribution import attribute_errors
 from neuprim.runs.events import Events, Note, Preparing, ignore_event
 from neuprim.runs.launch.executors import count_parallel_jobs
 from neuprim.runs.launch.jobs import Job, JobStatus, Result
 from neuprim.runs.launch.launcher import OnStatus, launch
-from neuprim.runs.open import LOGS, make_scene_context
+from neuprim.runs.open import make_scene_context
 
 __all__ = [
     "render_ground_truth_of_runs",
@@ -50,8 +50,7 @@ def load_ground_truth(
     make = scene_of(config, task_of(config)).spec.truth
     if make is None:
         return None
-    scene = suspects_of(config).scene
-    with blamed(scene.origin, f"ground truth of {scene.what}", config.output_dir / LOGS):
+    with attribute_errors(find_run_plugins(config).scene, "truth"):
         return make(config.scene, make_scene_context(config, progress), known)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,15 +21,12 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.render.backends import computing_device
 from neuprim.core.volumes.density_errors import DensityTruth, measure_frame_errors
 from neuprim.core.volumes.grid import POINTS_LIMIT, density_grid, lattice
-from neuprim.inspect.against import open_truth, pair, write_volume
-from neuprim.inspect.field import FieldFrame, ViewOptions
-from neuprim.inspect.frames import box_of, condition_frames, in_words, round_up
-from neuprim.inspect.headless import has_display, prepare_headless, require_pyvista
-from neuprim.inspect.layer_checks import fault
-from neuprim.inspect.layers import Layer
-from neuprim.inspect.page import write_page
-from neuprim.inspect.window import Window, panels_of
-from neuprim.plugins.blame import reported
+from neuprim.inspect.field import FieldFrame, ViewOptions, describe_conditions, find_matter_box, read_condition_frames
+from neuprim.inspect.html_page import write_page
+from neuprim.inspect.layers import Layer, validate_layers
+from neuprim.inspect.truth_volumes import open_ground_truth, pair_frames, write_density_vdb
+from neuprim.inspect.window import Window, has_display, list_panels, prepare_headless, require_pyvista
+from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.registry import INSPECTORS, PluginError, load_inspector
 from neuprim.runs.events import Events, Note, ignore_event
 from neuprim.runs.kept import PRUNED, describe_kept_shares, kept_shares
@@ -46,14 +44,14 @@ _DEPTH = 6.0  # optical depth that a volume is shown with where it is deepest
 
 @dataclass(frozen=True)
 class Request:
-    """The words of the command.
+    """Arguments of ``neuprim inspect``.
 
     Attributes:
         show: names of inspectors.
         conditions: name -> text, as ``{"time": "0:1"}``.
         grid: points along the longest side of the box.
-        box: (2, 3) in the coordinates of the run's data; None: around the truth, or around what the model absorbs.
-        against: an OpenVDB file or folder, or "scene".
+        box: (2, 3) in the coordinates of the run's data; None: around the ground truth, or what the model absorbs.
+        against: ground truth, an OpenVDB file or folder, or "scene".
         up: "x", "y" or "z"; None: the scene's setting, or z.
         overwrite: whether files that exist may be replaced.
     """
@@ -72,23 +70,23 @@ class Request:
 
 
 def inspect_run(request: Request, events: Events = ignore_event) -> list[Path]:
-    """Does it, and returns the files that were written; none where a window was shown.
+    """Show a run's density in a window, or write files and return them.
 
     Several frames become numbered files for .png and .vdb, an animation for .webp, .gif and .mp4, and a slider in a
     page or a window.
 
     Args:
-        events: told, as notes, what is shown: the truth and each frame's agreement with it, the grid, warnings.
+        events: gets notes about what is shown: the ground truth, errors of each frame, the grid, warnings.
 
     Raises:
-        ConfigError, DataError, CheckpointError: the user's words or files, files in the way.
-        PluginError: an inspector that crashed, or returned what cannot be drawn.
+        ConfigError, DataError, CheckpointError: invalid arguments or files, or files in the way.
+        PluginError: an inspector returned what cannot be drawn.
         BackendUnavailable: pyvista is missing, VTK cannot draw here, or there is no display and no ``out``.
     """
     kind = "" if request.out is None else request.out.suffix.lower()
     if request.out is not None and kind not in OUTPUTS:
         raise ConfigError(f"--out {request.out}: expected a name that ends in {', '.join(OUTPUTS)}")
-    inspectors = [_watched(load_inspector(name), name, request) for name in dict.fromkeys(request.show)]
+    inspectors = [_checked_inspector(load_inspector(name), name) for name in dict.fromkeys(request.show)]
     if request.out is None and not has_display():
         raise BackendUnavailable("there is no display to open a window on; give --out FILE.png, .webp, .html or .vdb")
     if kind not in (".html", ".vdb"):
@@ -97,7 +95,7 @@ def inspect_run(request: Request, events: Events = ignore_event) -> list[Path]:
             prepare_headless()
     if request.against is None and any(i.shows == "both" for i in inspectors):
         raise ConfigError("--show difference: there is no ground truth; give --against FILE.vdb, DIR or scene")
-    film = _Film(request, events)
+    film = _FrameSequence(request, events)
     if film.channels.partial and any(i.shows == "model" for i in inspectors):
         events(Note(f"shown: {film.channels.shown}"))
     if kind == ".html":
@@ -105,8 +103,8 @@ def inspect_run(request: Request, events: Events = ignore_event) -> list[Path]:
         write_page(request.out, film, inspectors)
         return [request.out]
     if kind == ".vdb":
-        return _each(request, film, lambda path, frame: write_volume(path, frame, film.world))
-    window = Window(panels_of(inspectors, request.against is not None), film.up, bool(kind), request.size)
+        return _each(request, film, lambda path, frame: write_density_vdb(path, frame, film.world))
+    window = Window(list_panels(inspectors, request.against is not None), film.up, bool(kind), request.size)
     try:
         if not kind:
             window.interact(len(film), film.frame)
@@ -116,33 +114,32 @@ def inspect_run(request: Request, events: Events = ignore_event) -> list[Path]:
         window.close()
 
 
-def _watched(inspector: Inspector, name: str, request: Request) -> Inspector:
-    """The inspector under the name that the user gave it; its crashes are reported, and so is what cannot be drawn."""
-    folders = [request.run_dir / "logs", *([] if request.out is None else [request.out.absolute().parent])]
-    guard = reported(INSPECTORS, name, folders)
-    if guard.party.origin.built_in:
+def _checked_inspector(inspector: Inspector, name: str) -> Inspector:
+    """Return the inspector under the name that the user gave it, with errors attributed and layers checked."""
+    source = find_plugin_source(INSPECTORS, name)
+    if source.built_in:
         return inspector
 
     def layers(frame: FieldFrame) -> Sequence[Layer]:
-        with guard:
+        with attribute_errors(source):
             found = inspector.layers(frame)
-        wrong = fault(found)
-        if wrong:
-            raise PluginError(f"{guard.party.who}: {wrong}")
+        problem = validate_layers(found)
+        if problem is not None:
+            raise PluginError(f"{source.label}: {problem}")
         return found
 
     return replace(inspector, name=name, layers=layers)
 
 
 def _paths(out: Path, count: int) -> list[Path]:
-    """The files to write: of several frames numbered ones, or a film or page of all."""
+    """List the files to write: numbered ones for several frames, or one film or page of all."""
     suffix = out.suffix.lower()
     if count == 1 or suffix not in (".png", ".vdb"):
         return [out]
     return [out.with_name(f"{out.stem}_{i:04d}{suffix}") for i in range(count)]
 
 
-def _pictures(request: Request, film: _Film, window: Window, kind: str) -> list[Path]:
+def _pictures(request: Request, film: _FrameSequence, window: Window, kind: str) -> list[Path]:
     assert request.out is not None
 
     def drawn(frame: FieldFrame) -> Tensor:
@@ -156,7 +153,7 @@ def _pictures(request: Request, film: _Film, window: Window, kind: str) -> list[
     return [request.out]
 
 
-def _each(request: Request, film: _Film, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
+def _each(request: Request, film: _FrameSequence, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
     assert request.out is not None
     request.out.parent.mkdir(parents=True, exist_ok=True)
     paths = _paths(request.out, len(film))
@@ -165,8 +162,8 @@ def _each(request: Request, film: _Film, write: Callable[[Path, FieldFrame], Any
     return paths
 
 
-class _Film:
-    """The frames that were asked for, made one at a time; box and scale are the same for all."""
+class _FrameSequence:
+    """The requested frames, made one at a time, with one box and scale for all."""
 
     def __init__(self, request: Request, events: Events) -> None:
         run = open_run(request.run_dir)
@@ -176,12 +173,12 @@ class _Film:
         self.up = request.up or str(run.scene.get("up", "z"))
         self.up = self.up if self.up in ("x", "y", "z") else "z"
         self.options, self.name = request.options, request.run_dir.resolve().name
-        wanted = condition_frames(run.task.conditions, request.conditions, lambda text: events(Note(text)))
+        wanted = read_condition_frames(run.task.conditions, request.conditions, lambda text: events(Note(text)))
         pairs: list[tuple[Conditions, int]] = [(conditions, -1) for conditions in wanted]
         if request.against is not None:
-            self.truth, words = open_truth(request.against, run.volume, run.world)
+            self.truth, words = open_ground_truth(request.against, run.volume, run.world)
             events(Note(words))
-            pairs = pair(wanted, self.truth, bool(request.conditions))
+            pairs = pair_frames(wanted, self.truth, bool(request.conditions))
         self.pairs = pairs
         for path in [] if request.out is None else _paths(request.out, len(pairs)):
             refuse_existing(path, request.overwrite)
@@ -196,7 +193,8 @@ class _Film:
         on = f"{' x '.join(map(str, self.shape))} points from {low} to {high} {units}"
         events(
             Note(
-                f"extinction of {self.model.count} primitives on {on}, in 1/scene unit, each primitive clamped at 0 from below"
+                f"extinction of {self.model.count} primitives on {on}, in 1/scene unit, each primitive clamped at "
+                "0 from below"
             )
         )
         if (request.run_dir / PRUNED).exists():
@@ -209,21 +207,20 @@ class _Film:
     def _box(self) -> np.ndarray:
         if self.truth is not None:
             return np.asarray(self.truth.bounds.numpy())
-        return box_of(self.model, [conditions for conditions, _ in self.pairs])
+        return find_matter_box(self.model, [conditions for conditions, _ in self.pairs])
 
     def _compare(self, index: int, events: Events) -> dict[str, float] | None:
-        """The frame's errors against the truth on the truth's own points, whatever is shown."""
+        """Return the frame's errors against the truth, on the truth's own points."""
         if self.truth is None:
             return None
         conditions, number = self.pairs[index]
         numbers = measure_frame_errors(self.model, conditions, self.truth, number, where=self.device)
         words = "nothing to compare with" if numbers is None else "  ".join(f"{k} {v:.4f}" for k, v in numbers.items())
-        events(Note(f"{self.truth.frames[number].name}  {in_words(conditions)}  {words}"))
+        events(Note(f"{self.truth.frames[number].name}  {describe_conditions(conditions)}  {words}"))
         return numbers
 
     def _scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
-        """Largest extinction shown, by how much volumes are shown more or less opaque than they are, and the middle of
-        the matter."""
+        """Return the largest extinction shown, the factor on opacities of volumes, and the middle of the matter."""
         matrix, shape = lattice(box, _COARSE)
         most, depth, total = 0.0, 0.0, np.zeros(shape)
         for conditions, number in self.pairs:
@@ -240,27 +237,34 @@ class _Film:
             float(np.average(np.arange(n), weights=weights.sum(tuple({0, 1, 2} - {a})))) for a, n in enumerate(shape)
         ]
         focus = matrix[:3, :3].numpy() @ np.array(index) + matrix[:3, 3].numpy()
-        return round_up(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
+        return _round_up(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
 
     def frame(self, index: int) -> FieldFrame:
-        """A fresh frame; its grids live as long as it does."""
+        """Make a frame; its grids are computed once per frame object."""
         conditions, number = self.pairs[index]
-        made = FieldFrame(
-            self.model, conditions, in_words(conditions), self.matrix, self.shape, self.top, self.gain, self.focus
-        )
-        made = replace(
-            made,
+        truth = self.truth
+        return FieldFrame(
+            self.model,
+            conditions,
+            describe_conditions(conditions),
+            self.matrix,
+            self.shape,
+            self.top,
+            self.gain,
+            self.focus,
             channels=self.channels,
             needed=self.needed,
             options=self.options,
+            truth=None if truth is None else lambda: truth.grid(number, self.matrix, self.shape).numpy(),
+            truth_name="" if truth is None else truth.frames[number].name,
             numbers=self.numbers[index],
             device=self.device,
         )
-        truth = self.truth
-        if truth is None:
-            return made
-        return replace(
-            made,
-            truth=lambda: truth.grid(number, self.matrix, self.shape).numpy(),
-            truth_name=truth.frames[number].name,
-        )
+
+
+def _round_up(value: float) -> float:
+    """Return the next number of two digits, for the end of a scale; 1 for 0."""
+    if not value > 0:
+        return 1.0
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / unit - 1e-9) * unit:.6g}")

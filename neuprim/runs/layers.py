@@ -19,13 +19,13 @@ from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.exr import ExrChannel, write_exr_layers
 from neuprim.core.io.images import srgb_to_linear
-from neuprim.core.layers import LIGHTS, LayerFrame, LayerSpec, chosen_layers
+from neuprim.core.layers import LIGHTS, LayerFrame, LayerSpec, select_layers
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.near_plane import resolve_near
 from neuprim.core.render.output import mean_depth
 from neuprim.core.task import TaskSpec
-from neuprim.plugins.judging import layer_of
+from neuprim.plugins.returns import draw_task_layer
 from neuprim.runs.render_config import RenderConfig
 from neuprim.version import __version__
 
@@ -98,7 +98,7 @@ class Layers:
         Raises:
             ConfigError: a name of another one, or of light where the model's colours are no linear light.
         """
-        found = chosen_layers(self.names, self.task.layers, self.several)
+        found = select_layers(self.names, self.task.layers, self.several)
         if self.channels.color_space == "linear":
             return found
         if self.names is not None:
@@ -143,7 +143,7 @@ class Layers:
 
     def _drawn(self, spec: LayerSpec, frame: LayerFrame) -> Tensor | None:
         """(H, W, C) on the processor; float64 where several lights add up."""
-        image = layer_of(spec, frame, self.channels.count)
+        image = draw_task_layer(spec, frame, self.channels.count)
         if image is None:
             return None
         image = image.cpu()

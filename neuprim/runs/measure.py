@@ -23,8 +23,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.config import RunConfig, suspects_of
-from neuprim.core.channels import Channels, channels_of
+from neuprim.config import RunConfig, find_run_plugins
+from neuprim.core.channels import Channels, find_channels
 from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.dataset_check import check_dataset, check_pixels
@@ -37,8 +37,8 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.notices import warn_once
 from neuprim.core.render import RenderSettings, choose_backend, render
 from neuprim.core.task import TaskSpec
-from neuprim.plugins.judging import clips_of, diagnosed, judged, mask_of
-from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, move_to_render_device
+from neuprim.plugins.returns import call_task_clips, call_task_diagnose, call_task_judge, call_task_mask
+from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.render_config import estimate_file_bytes, parse_render_config
 from neuprim.version import __version__
 
@@ -142,13 +142,13 @@ def measure_views(
         empty = bool((rendered == background).all())
         if pixels.mask is not None:
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
-        counted = mask_of(task, dataset, i)
+        counted = call_task_mask(task, dataset, i)
         more = _more(rendered, truth, dataset, channels, counted, pixels.mask) | _as_others(
             rendered, truth, channels, lpips
         )
         if pixels.alpha is None:
             more["psnr_gain"] = psnr_gain(rendered, truth, pixels.mask)
-        more |= judged(task, dataset, i, rendered, truth)
+        more |= call_task_judge(task, dataset, i, rendered, truth)
         black = psnr(background.to(truth).expand_as(truth), truth, pixels.mask)
         score = psnr(rendered, truth, pixels.mask)
         result.append(ViewMetrics(view.name, score, ssim(rendered, truth), seconds, black, more, empty))
@@ -171,7 +171,7 @@ def measure_quality(
         task,
         dataset,
         settings,
-        channels_of(task, dataset),
+        find_channels(task, dataset),
     )
     return float(np.mean([v.psnr for v in views])), float(np.mean([v.ssim for v in views]))
 
@@ -217,14 +217,12 @@ def evaluate_run(run_dir: Path, lpips: str | Path | None = None, words: Sequence
     config = replace(config, renderer=point.settings)
     weights = lpips or config.metrics.lpips
     distance = None if weights is None else Lpips.load(weights)
-    suspects = suspects_of(config)
-    with suspects.watch(run_dir / LOGS):
+    with find_run_plugins(config).attribute_errors():
         dataset = load_dataset(config, task, run_dir=run_dir)
-        suspects.know(dataset)
         check_dataset(dataset, task.conditions)
         path = model_file(run_dir)
         training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
-        channels = channels_of(task, dataset)
+        channels = find_channels(task, dataset)
         part = point.prepare_model(model)
         size = estimate_file_bytes(path, model, part, point.storage)
         model = move_to_render_device(part, config.renderer, dataset.test.view(0))
@@ -268,7 +266,7 @@ def summarize_metrics(
         "worse_than_black_image": [v.name for v in views if v.psnr < min(v.black, _VISIBLE)],
         "per_view": [_entry(v) for v in views],
         **({"views_empty": sum(v.empty for v in views)} if any(v.empty for v in views) else {}),
-        **_per_frame(clips_of(task, dataset) if split == "test" else (), views),
+        **_per_frame(call_task_clips(task, dataset) if split == "test" else (), views),
         "primitives": model.count,
         "parameters": model.count * model.parameters_per_primitive,
         "parameters_per_primitive": model.parameters_per_primitive,
@@ -287,7 +285,7 @@ def summarize_metrics(
         "data_source": dataset.data_source,
         "train_views": len(dataset.train),
         "seed": config.seed,
-        **diagnosed(task, dataset, model.to(device.HOST)),
+        **call_task_diagnose(task, dataset, model.to(device.HOST)),
         "non_default": {key: list(pair) for key, pair in config.non_default.items()},
         "versions": {
             "neuprim": __version__,
@@ -295,7 +293,7 @@ def summarize_metrics(
             "torch": torch.__version__,
             "numpy": np.__version__,
         },
-        **({} if config.made_by is None else {"made_by": config.made_by.in_words()}),
+        **({} if config.made_by is None else {"made_by": config.made_by.origins()}),
     }
 
 

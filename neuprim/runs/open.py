@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import RunConfig, scene_of, suspects_of, task_of
+from neuprim.config import RunConfig, find_run_plugins, scene_of, task_of
 from neuprim.config.trust import check_stored, refuse_links
 from neuprim.core.cameras.world import World
 from neuprim.core.checkpoint import load_model, read_header
@@ -21,13 +21,12 @@ from neuprim.core.render import RenderSettings
 from neuprim.core.render.backends import computing_device, device_of, with_available_device
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.core.volumes.source import VolumeSource
-from neuprim.plugins.blame import blamed
-from neuprim.plugins.mechanism import PluginError
-from neuprim.plugins.provenance import warn_of_neuprim
+from neuprim.plugins.attribution import attribute_errors
+from neuprim.plugins.provenance import warn_of_other_neuprim
+from neuprim.plugins.registry import PluginError
 
 __all__ = [
     "COMPRESSED",
-    "LOGS",
     "make_scene_context",
     "load_dataset",
     "load_run",
@@ -37,8 +36,6 @@ __all__ = [
     "read_metrics",
 ]
 
-LOGS = "logs"
-"""Folder of a run directory for tracebacks of plugins."""
 
 COMPRESSED = "model.neuprim"
 """A run's model in few bits, as ``neuprim compress`` writes it."""
@@ -61,9 +58,7 @@ def load_dataset(
     """The data set of a run's configuration.
 
     Args:
-        run_dir: the finished run that the configuration was read from: messages name its file, and the traceback of a
-        loader of
-            another package is kept there, should it crash. None: a run that is only about to be made.
+        run_dir: the finished run that the configuration was read from: messages name its file. None: a run that is only about to be made.
 
     Raises:
         NeuprimError: what the loader refuses, or that it crashed.
@@ -74,12 +69,12 @@ def load_dataset(
     ):  # its cameras and points lie as they did for the model, whatever was added since
         context = replace(context, world=World.of(read_header(model_file(run_dir), "model"), str(model_file(run_dir))))
     load = scene_of(config, task, None if run_dir is None else run_dir / "config.yaml").spec.load
-    scene = suspects_of(config).scene
-    with blamed(scene.origin, scene.what, (config.output_dir if run_dir is None else run_dir) / LOGS):
+    scene = find_run_plugins(config).scene
+    with attribute_errors(scene, "load"):
         dataset = load(config.scene, context)
     if not isinstance(dataset, Dataset):
         found = f"a {type(dataset).__name__}" if dataset is not None else "None"
-        raise PluginError(f"{scene.who}: its loader returned {found}; expected a neuprim.core.data.Dataset")
+        raise PluginError(f"{scene.label}: its loader returned {found}; expected a neuprim.core.data.Dataset")
     return dataset
 
 
@@ -100,7 +95,7 @@ def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Pr
     config, place = RunConfig.from_yaml(file), file if named else None
     task = task_of(config, place)
     if config.made_by is not None:
-        warn_of_neuprim(config.made_by, place)
+        warn_of_other_neuprim(config.made_by, place)
     model, header = load_model(model_file(run_dir), task)
     world = World.of(header, str(model_file(run_dir)))
     if any(spec.place for spec in task.conditions) and not world.identity:
@@ -137,8 +132,7 @@ def open_run(run_dir: Path, progress: Progress = lambda text, fraction: None) ->
         load = scene_of(config, task, file).spec.volume
         if load is None:
             return None
-        scene = suspects_of(config).scene
-        with blamed(scene.origin, f"volume of {scene.what}", run_dir / LOGS):
+        with attribute_errors(find_run_plugins(config).scene, "volume"):
             return load(config.scene, make_scene_context(config, progress))
 
     def dataset() -> Dataset:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import torch
 
-from neuprim.config import suspects_of, task_of
+from neuprim.config import find_run_plugins, task_of
 from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.cameras.world import World
-from neuprim.core.channels import Channels, stored_channels
+from neuprim.core.channels import Channels, read_stored_channels
 from neuprim.core.conditions import flag, in_step, read_conditions
 from neuprim.core.data import View
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
@@ -24,10 +24,10 @@ from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
-from neuprim.plugins.judging import facts_of, orbit_of
+from neuprim.plugins.returns import call_task_facts, call_task_orbit
 from neuprim.runs.layers import Layers
 from neuprim.runs.measure import render_light_sum
-from neuprim.runs.open import LOGS, load_dataset, load_run, move_to_render_device
+from neuprim.runs.open import load_dataset, load_run, move_to_render_device
 from neuprim.runs.render_config import parse_render_config
 from neuprim.runs.run_directory import refuse_results
 
@@ -134,13 +134,12 @@ class _RenderSession:
         self.world = World.of(header, str(run_dir)) if in_world else World()
         self.task = task if in_world else task_of(config, run_dir / "config.yaml")
         self.render_config = parse_render_config(request.overrides, config.renderer, model)
-        self.suspects = suspects_of(config)
-        self.guard = self.suspects.watch(run_dir / LOGS)
+        self.plugins = find_run_plugins(config)
         self.background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
-        self.channels = stored_channels(run_dir, header, self.task, model.colour.channels)
+        self.channels = read_stored_channels(run_dir, header, self.task, model.colour.channels)
         self.lights = self._load_lights(request.environment)
         self.views, self.fps = self._load_views()
-        with self.guard:
+        with self.plugins.attribute_errors():
             self.views, animated = with_conditions(self.views, self.task, request.conditions, notify)
             model = self.render_config.prepare_model(model)
         self.model = move_to_render_device(model, self.render_config.settings, self.views[0])
@@ -172,7 +171,7 @@ class _RenderSession:
         """Conditions of the lights that stand for an environment; none without one."""
         if environment is None:
             return ()
-        with self.guard:
+        with self.plugins.attribute_errors():
             illumination = self._illuminate(environment)
         lights = illumination.frames(environment.guesses)
         if not lights:
@@ -192,7 +191,7 @@ class _RenderSession:
             )
         facts = self.header.get("data")
         if facts is None:  # a model of an imported file has none
-            facts = facts_of(self.task, load_dataset(self.config, self.task))
+            facts = call_task_facts(self.task, load_dataset(self.config, self.task))
         if not isinstance(facts, dict):
             raise DataError(f"the model's header: data is {type(facts).__name__}; expected an object")
         up = JsonReader(facts, "the model's header: data").array("up", (3,), "3 numbers")
@@ -214,10 +213,9 @@ class _RenderSession:
             views = [replace(view, camera=self.world.scene_camera(view.camera)) for view in views]
         else:
             dataset = load_dataset(self.config, self.task, run_dir=self.run_dir)
-            self.suspects.know(dataset)
-            with self.guard:
+            with self.plugins.attribute_errors():
                 if request.camera == "orbit":
-                    views = list(orbit_of(self.task, dataset, request.frames))
+                    views = list(call_task_orbit(self.task, dataset, request.frames))
                 else:
                     views = [dataset.test.view(i) for i in range(len(dataset.test))]
         if request.size is not None:
@@ -254,7 +252,7 @@ class _RenderSession:
             if self.layers is None:
                 _write(path, self.format, self._render(view), self.channels, self.fps)
             else:
-                with self.guard:
+                with self.plugins.attribute_errors():
                     self.layers.write(path, self.model, view, self._count_pass)
         try:
             self._check_visible()
@@ -265,7 +263,7 @@ class _RenderSession:
 
     def _render(self, view: View) -> torch.Tensor:
         config = self.render_config
-        with self.guard:
+        with self.plugins.attribute_errors():
             if not self.lights:
                 return config.render_view(self.model, view, self.background, self._count_pass)
             small = config.scale_view(view)

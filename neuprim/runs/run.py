@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 from pathlib import Path
 
-from neuprim.config import RunConfig, suspects_of
+from neuprim.config import RunConfig, find_run_plugins
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.metrics.image import format_metrics
 from neuprim.core.train.distributed.process_group import ProcessGroup
@@ -13,7 +13,6 @@ from neuprim.runs.chunks import train_in_chunks
 from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.events import Events, Finishing, Note, ignore_event
 from neuprim.runs.fit import is_chunked, refuse_chunks
-from neuprim.runs.open import LOGS
 from neuprim.runs.run_directory import lock_directory
 from neuprim.runs.training import BetweenSteps, do_nothing_between, train_in_directory
 
@@ -49,12 +48,11 @@ def run(
     first = group is None or group.is_first
     if group is not None:
         refuse_chunks(config, "several ranks train one model together")
-    suspects = suspects_of(config)
-    with lock_directory(directory) if first else nullcontext(), suspects.watch(directory / LOGS):
+    with lock_directory(directory) if first else nullcontext(), find_run_plugins(config).attribute_errors():
         if is_chunked(config):
-            fitted, interrupted = train_in_chunks(config, suspects, events, launcher, between)
+            fitted, interrupted = train_in_chunks(config, events, launcher, between)
         else:
-            fitted, interrupted = train_in_directory(config, suspects, events, between=between, group=group)
+            fitted, interrupted = train_in_directory(config, events, between=between, group=group)
         if first:
             events(Finishing("measuring held-out views"))
             events(Note(format_metrics(evaluate_fitted(fitted, directory))))

@@ -24,9 +24,8 @@ from neuprim.core.render.backends import choose_backend, precompiled_backend
 from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
 from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
-from neuprim.plugins.blame import Suspects
-from neuprim.plugins.judging import facts_of
-from neuprim.plugins.provenance import check_resumed
+from neuprim.plugins.provenance import check_resumed_provenance
+from neuprim.plugins.returns import call_task_facts
 from neuprim.runs.compile import compile_in_background, is_compiled, kernel_variant, mark_compiled
 from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Note, Preparing, ignore_event
@@ -57,7 +56,6 @@ def do_nothing_between(fitted: Fitted, stop: threading.Event) -> None:
 
 def train_in_directory(
     config: RunConfig,
-    suspects: Suspects,
     events: Events = ignore_event,
     dataset: Dataset | None = None,
     hold_out: int = 0,
@@ -69,7 +67,6 @@ def train_in_directory(
     model in the run's directory either way. Of several ranks the first one writes them.
 
     Args:
-        suspects: of the configuration, who is watched for crashes around this call.
         dataset: the scene of the configuration, if it is loaded already.
         hold_out: n > 1: every n-th training view is a test view, and no other is; see
         :func:`~neuprim.core.data.dataset.hold_out_views`. between: called between steps, see :data:`Between`.
@@ -88,7 +85,7 @@ def train_in_directory(
     edge = config.model.density.get("edge", 0)  # of a built-in density; another package may mean anything by it
     turn = nullcontext() if group is None else group.in_turn()
     with turn, compile_in_background(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
-        fitted = prepare_training(config, events, dataset, suspects, hold_out, make, group)
+        fitted = prepare_training(config, events, dataset, hold_out, make, group)
         trainer = fitted.trainer
         _resume(fitted, events)
         if trainer.rank == 0:
@@ -125,7 +122,7 @@ def _resume(fitted: Fitted, events: Events) -> None:
     header, tensors = checkpoint.read(saved, "checkpoint")
     if header.get("task") != config.task:
         raise CheckpointError(f"{saved}: written for task {header.get('task')!r}; this run's task is {config.task!r}")
-    check_resumed(header.get("made_by"), config.made_by, saved)
+    check_resumed_provenance(header.get("made_by"), config.made_by, saved)
     fitted.trainer.load_state(tensors, header, str(saved))
     was, now = World.of(header, str(saved)), fitted.dataset.world
     if ("world" in header or fitted.dataset.placement is None) and not torch.equal(
@@ -224,7 +221,7 @@ def save_training(fitted: Fitted) -> None:
         "color_space": dataset.color_space,
         "channels": list(fitted.channels.names),
         "data_source": dataset.data_source,
-        "data": facts_of(fitted.task, dataset),
+        "data": call_task_facts(fitted.task, dataset),
         **fitted.training,
         **place,
     }

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neuprim.config import RunConfig, compose, suspects_of, task_of
+from neuprim.config import RunConfig, compose, find_run_plugins, task_of
 from neuprim.config.overrides import parse, quote_override
 from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.data import Dataset
@@ -30,7 +30,7 @@ from neuprim.runs.fit import use_one_torch_thread
 from neuprim.runs.ground_truth import render_ground_truth_for_training
 from neuprim.runs.launch.executors import count_parallel_jobs
 from neuprim.runs.launch.launcher import use_launcher_threads
-from neuprim.runs.open import LOGS, load_dataset
+from neuprim.runs.open import load_dataset
 from neuprim.runs.run_directory import lock_directory
 from neuprim.search.ablation_folder import (
     TRIALS,
@@ -102,7 +102,7 @@ def run_ablation(
     words, folder, centre = compose_centre(request)
     task = task_of(centre)
     with use_one_torch_thread(), use_launcher_threads(request.launcher), ExitStack() as stack:
-        stack.enter_context(suspects_of(centre).watch(folder / LOGS))
+        stack.enter_context(find_run_plugins(centre).attribute_errors())
         variants = list_variants(centre, task)
         for name in request.knobs:
             if name not in variants:

@@ -13,7 +13,6 @@ from neuprim.config.outputs import ROOT
 from neuprim.config.overrides import parse
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.runs.open import LOGS
 from neuprim.search.ablation_plan import CENTRE, Plan
 from neuprim.search.eval_views import eval_views
 from neuprim.search.measuring import describe_machine
@@ -81,7 +80,7 @@ def _centre_settings(centre: RunConfig) -> dict[str, Any]:
 def check_folder(folder: Path, before: Record | None, centre: RunConfig, request: AblationRequest) -> None:
     """Refuse a folder that holds something else, or another set."""
     if before is None:
-        if folder.is_dir() and any(entry.name != LOGS for entry in folder.iterdir()) and not (folder / TRIALS).is_dir():
+        if folder.is_dir() and any(folder.iterdir()) and not (folder / TRIALS).is_dir():
             raise ConfigError(f"output_dir={folder}: holds something else; expected a new directory, or that of a set")
         return
     if before.same.get("kind") != "models":

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from neuprim.config import suspects_of
+from neuprim.config import find_run_plugins
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.data import Dataset
@@ -17,7 +17,7 @@ from neuprim.core.io.files import refuse_existing
 from neuprim.runs.finetune import steps_in
 from neuprim.runs.fit import use_one_torch_thread
 from neuprim.runs.measure import measure_quality
-from neuprim.runs.open import COMPRESSED, LOGS, load_dataset, load_run
+from neuprim.runs.open import COMPRESSED, load_dataset, load_run
 from neuprim.search.quantized_finetune import QuantizedModel, TrainingData, finetune_for_table, quantize_within
 
 __all__ = ["DEFAULT_TOLERANCE", "CompressRequest", "Compression", "StoredParameter", "compress_run"]
@@ -109,12 +109,12 @@ def compress_run(
     config = replace(config, output_dir=run_dir)
     table = bit_table(DEFAULT_LEVEL if request.level is None else request.level, request.bits, model.specs)
     notes = ["its primitives are in another order than the run's"]
-    suspects = suspects_of(config)
+    plugins = find_run_plugins(config)
     dataset: Dataset | None = None
     try:
         progress("reading the run's data", 0.0)
         dataset = load_dataset(config, task, run_dir=run_dir)
-        with suspects.watch(run_dir / LOGS):
+        with plugins.attribute_errors():
             check_dataset(dataset, task.conditions)
     except NeuprimError as error:
         dataset = None
@@ -123,7 +123,7 @@ def compress_run(
         if not by_level:
             notes.append(f"no training views decide the bits; they are of --level {DEFAULT_LEVEL}")
     start = time.perf_counter()
-    with suspects.watch(run_dir / LOGS):
+    with plugins.attribute_errors():
         quantized: QuantizedModel | None = None
         if dataset is not None and (request.trains or not by_level):
             with use_one_torch_thread():
@@ -149,8 +149,7 @@ def compress_run(
     measured: dict[str, tuple[float, float]] = {}
     if dataset is not None:
         decoded, _ = load_model(final, task)
-        with suspects.watch(run_dir / LOGS):
-            suspects.know(dataset)
+        with plugins.attribute_errors():
             progress("measuring test views", 0.0)
             before, after = (measure_quality(one, task, dataset, config.renderer) for one in (model, decoded))
         measured = {name: (before[i], after[i]) for i, name in enumerate(("psnr", "ssim"))}

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.config import RunConfig, suspects_of
-from neuprim.core.channels import Channels, channels_of
+from neuprim.config import RunConfig
+from neuprim.core.channels import Channels, find_channels
 from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
@@ -161,10 +161,9 @@ def load_setup(
         dataset = load_dataset(config, task, run_dir=run_dir)
         loaded = dataset, eval_views(dataset, views)
     dataset, chosen = loaded
-    suspects_of(config).know(dataset)
     if not chosen:
         raise DataError(f"{run_dir}: {dataset.name} has no test views; expected some to measure on")
-    channels, file = channels_of(task, dataset), model_file(run_dir)
+    channels, file = find_channels(task, dataset), model_file(run_dir)
     return EvaluationSetup(config, model, dataset, channels, reference, chosen, file, distance)
 
 

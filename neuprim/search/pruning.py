@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from neuprim.config import RunConfig, suspects_of
-from neuprim.core.channels import channels_of
+from neuprim.config import RunConfig, find_run_plugins
+from neuprim.core.channels import find_channels
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.dataset_check import check_dataset
@@ -27,7 +27,7 @@ from neuprim.runs.finetune import fine_tuner, steps_in
 from neuprim.runs.fit import Fitted, keep_model_settings, make_loss, use_one_torch_thread
 from neuprim.runs.kept import PRUNED, kept_shares
 from neuprim.runs.measure import measure_quality, render_image
-from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, move_to_render_device, read_metrics
+from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device, read_metrics
 from neuprim.runs.training import save_training
 from neuprim.search.pruning_cuts import count_stored_numbers, cut_to_loss, list_reductions, price_cuts, zero_masks
 from neuprim.search.training_quality import TrainingQuality
@@ -295,11 +295,10 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
     refuse_existing(final, request.overwrite)
     config, task, model, header = load_run(request.run_dir)
     config = replace(config, output_dir=request.run_dir)
-    suspects = suspects_of(config)
-    with suspects.watch(request.run_dir / LOGS), use_one_torch_thread():
+    plugins = find_run_plugins(config)
+    with plugins.attribute_errors(), use_one_torch_thread():
         progress("reading the run's data", 0.0)
         dataset = load_dataset(config, task, run_dir=request.run_dir)
-        suspects.know(dataset)
         check_dataset(dataset, task.conditions)
         if request.hold_out:
             dataset = replace(dataset, train=hold_out_views(dataset, request.hold_out).train)
@@ -368,7 +367,7 @@ def _fit_pruned(
     settings = keep_model_settings(config.train, task, model)
     trainer = Trainer(model, dataset, make_loss(config, task), settings, config.renderer, config.seed)
     trainer.zero_masks = zero_masks(trainer.model)
-    return Fitted(config, task, dataset, channels_of(task, dataset), trainer)
+    return Fitted(config, task, dataset, find_channels(task, dataset), trainer)
 
 
 def _to_dict(request: PruneRequest, result: Pruning) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import suspects_of
+from neuprim.config import find_run_plugins
 from neuprim.config.command_settings import parse_duration
 from neuprim.core.compute import device
 from neuprim.core.compute.threads import core_count
@@ -24,7 +24,6 @@ from neuprim.core.render import backends
 from neuprim.core.render.quadrature import compare_quadrature
 from neuprim.report.tradeoff import Picture, write_tradeoff
 from neuprim.runs.fit import use_one_torch_thread
-from neuprim.runs.open import LOGS
 from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RenderConfig
 from neuprim.search.eval_views import fill_masked
 from neuprim.search.measuring import (
@@ -165,7 +164,7 @@ def measure_tradeoff(
             raise ConfigError(f"--knobs {name}: no such knob of this run{nearest(name, knobs)}")
     folder = request.run_dir / TRADEOFF_FOLDER
     record = _resume_record(folder / TRADEOFF_FILE, _identity(setup), tell)
-    with suspects_of(setup.config).watch(request.run_dir / LOGS), use_one_torch_thread():
+    with find_run_plugins(setup.config).attribute_errors(), use_one_torch_thread():
         reason = setup.unsupported(setup.reference)
         if reason is not None:
             raise ConfigError(reason)

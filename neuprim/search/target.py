@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuprim.config import RunConfig, suspects_of, task_of
+from neuprim.config import RunConfig, find_run_plugins, task_of
 from neuprim.config.command_settings import LauncherSettings, Target
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
 from neuprim.core.compression import Quantizers
@@ -33,7 +33,7 @@ from neuprim.runs.events import Events, Finishing, Preparing, ignore_event
 from neuprim.runs.ground_truth import render_ground_truth_for_training
 from neuprim.runs.launch.launcher import use_launcher_threads
 from neuprim.runs.measure import measure_quality, render_image
-from neuprim.runs.open import COMPRESSED, LOGS, load_dataset, move_to_render_device, read_metrics
+from neuprim.runs.open import COMPRESSED, load_dataset, move_to_render_device, read_metrics
 from neuprim.runs.run_directory import lock_directory
 from neuprim.runs.training import train_in_directory
 from neuprim.search.eval_views import eval_views, fill_masked
@@ -84,10 +84,10 @@ def run_target(
     record = _resume_record(config, {**target.given(), "budget": budget})
     if record.achieved:
         return record
-    suspects, begun = suspects_of(config), clock()
+    plugins, begun = find_run_plugins(config), clock()
     with (
         lock_directory(config.output_dir, "search"),
-        suspects.watch(config.output_dir / LOGS),
+        plugins.attribute_errors(),
         use_launcher_threads(launcher),
     ):
         task = task_of(config)
@@ -97,7 +97,6 @@ def run_target(
 
         render_ground_truth_for_training(config, launcher, progress)
         dataset = load_dataset(config, task, progress)
-        suspects.know(dataset)
         check_dataset(dataset, task.conditions)
         record.hold_out = choose_hold_out(dataset)
         runner = TrialRunner(config, dataset, record, events, clock, launcher, begun - record.spent)
@@ -241,7 +240,7 @@ def _write_run(runner: TrialRunner, attempt: Attempt) -> _Result:
     config, folder = runner.configure(attempt), runner.config.output_dir
     runner.events(Finishing("measuring test views"))
     fitted, _ = train_in_directory(
-        replace(config, resume=True), suspects_of(config), dataset=runner.dataset, hold_out=runner.record.hold_out
+        replace(config, resume=True), dataset=runner.dataset, hold_out=runner.record.hold_out
     )
     for name in _KEPT:
         with atomic_path(folder / name) as temporary:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from neuprim.config import RunConfig, made_now, suspects_of, task_of
+from neuprim.config import RunConfig, find_run_plugins, made_now, task_of
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.data import Dataset
 from neuprim.core.errors import DataError, NeuprimError
@@ -29,7 +29,7 @@ from neuprim.runs.fit import Fitted
 from neuprim.runs.launch.jobs import ENDED, Job, JobStatus, Result
 from neuprim.runs.launch.launcher import LAUNCH_FOLDER, OnStatus, launch
 from neuprim.runs.measure import render_image
-from neuprim.runs.open import LOGS, load_dataset
+from neuprim.runs.open import load_dataset
 from neuprim.runs.run_directory import lock_directory
 from neuprim.runs.training import train_in_directory
 from neuprim.search.eval_views import eval_views, fill_masked
@@ -132,10 +132,10 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
             return _parse_outcome(folder / TRIAL_FILE, before["outcome"])
         record = {"format": FORMAT, "asked": asked, "views": trial.views, "outcome": None}
         write_json(folder / TRIAL_FILE, record)
-        suspects = suspects_of(trial.config)
-        with suspects.watch(folder / LOGS):
+        plugins = find_run_plugins(trial.config)
+        with plugins.attribute_errors():
             fitted, interrupted = train_in_directory(
-                replace(trial.config, resume=same), suspects, events, dataset, trial.hold_out
+                replace(trial.config, resume=same), events, dataset, trial.hold_out
             )
             if interrupted:
                 raise KeyboardInterrupt

@@ -16,8 +16,8 @@ from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.near_plane import resolve_near
-from neuprim.inspect.field import absorbed
-from neuprim.inspect.shapes import unit_sphere
+from neuprim.inspect.field import measure_absorption
+from neuprim.inspect.views import unit_sphere
 from neuprim.viewer.session import Session
 from neuprim.viewer.viewer_scene import Viewpoint
 
@@ -59,7 +59,7 @@ def list_ellipsoids(model: Primitives, viewpoint: Viewpoint, channels: Channels,
         count = lowered.geometry.count
         keep = torch.arange(count)
         if count > limit:
-            mass = absorbed(model.to(torch.device("cpu")).active(viewpoint.conditions))
+            mass = measure_absorption(model.to(torch.device("cpu")).active(viewpoint.conditions))
             keep = torch.from_numpy(np.sort(np.argsort(-mass, kind="stable")[:limit]))
         colours = channels.display_rows(
             lowered.center_colors(viewpoint.camera.position.to(lowered.geometry.means)).float().cpu().clamp_min(0)

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuprim.config import suspects_of
+from neuprim.config import find_run_plugins
 from neuprim.config.command_settings import ViewerSettings
 from neuprim.core.cameras.world import World
-from neuprim.core.channels import stored_channels
+from neuprim.core.channels import read_stored_channels
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import NeuprimError
 from neuprim.core.io.json_reader import JsonReader
-from neuprim.runs.open import LOGS, load_dataset, load_run
+from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.render_config import RenderConfig
 from neuprim.viewer.controls import ConditionControls, RenderControls, ViewControls
 from neuprim.viewer.ellipsoids import PrimitiveControls
@@ -108,7 +108,7 @@ def open_scene(
     config, task, model, header = load_run(run_dir)
     dataset: Dataset | None = None
     try:
-        with suspects_of(config).watch(run_dir / LOGS):
+        with find_run_plugins(config).attribute_errors():
             dataset = load_dataset(config, task, progress, run_dir)
     except NeuprimError as error:
         warn(f"no held-out views: {error}")
@@ -122,7 +122,7 @@ def open_scene(
         name=run_dir.resolve().name,
         task=task,
         model=lambda: model,
-        channels=stored_channels(run_dir, header, task, model.colour.channels),
+        channels=read_stored_channels(run_dir, header, task, model.colour.channels),
         settings=config.renderer,
         background=torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)]),
         up=(x, y, z),

@@ -21,7 +21,7 @@ from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import TaskSpec
-from neuprim.inspect.paint import table
+from neuprim.inspect.layers import colormap_bytes
 from neuprim.runs.measure import render_image
 from neuprim.runs.open import move_to_render_device
 from neuprim.runs.render_config import RenderConfig
@@ -125,7 +125,7 @@ def _colour_depth(depth: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, str
         return image, "nothing is in sight"
     near, far = (float(x) for x in np.percentile(depth[solid], (2.0, 98.0)))
     part = np.clip((depth[solid] - near) / max(far - near, 1e-12), 0.0, 1.0)
-    image[solid] = table("viridis")[np.minimum((256 * (1.0 - part)).astype(np.int64), 255)]
+    image[solid] = colormap_bytes("viridis")[np.minimum((256 * (1.0 - part)).astype(np.int64), 255)]
     return image, f"depth {near:.4g} (bright) to {far:.4g} scene units"
 
 

@@ -11,8 +11,6 @@ import torch
 
 from neuprim.core.model.edge import profile
 
-__all__ = ["shader_constants"]
-
 _DEGREE = 7
 _SAMPLES = 200
 _POINTS = 16

@@ -15,8 +15,6 @@ from neuprim.core.compression.quantizers import Rotations
 from neuprim.core.compression.sections import COLUMNS, ROTATIONS, pack
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["PackedModel", "pack_model"]
-
 
 @dataclass(frozen=True)
 class PackedModel:

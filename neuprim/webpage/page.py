@@ -28,8 +28,6 @@ from neuprim.core.settings import RenderSettings
 from neuprim.webpage.constants import shader_constants
 from neuprim.webpage.numbers import pack_model
 
-__all__ = ["Condition", "PageView", "WebPage", "camera_numbers", "fullest", "web_page"]
-
 _SHARED = ("lib.js", "codec.js", "sort.js", "prepare.js", "shadow.js", "worker.js")
 """Scripts that the worker runs, too."""
 

@@ -19,8 +19,6 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
 from neuprim.webpage.page import Condition, PageView, WebPage, web_page
 
-__all__ = ["Draw", "held_out", "scene_page", "start_of"]
-
 Draw = Callable[[Primitives, Camera, Mapping[str, Tensor]], Tensor]
 """(model, camera, conditions) -> (H, W, C), over the scene's background."""
 

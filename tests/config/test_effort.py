@@ -106,7 +106,7 @@ def test_conformance_holds_packages_to_their_levels(levels: Path) -> None:
         load_task("static"), name="toy", config_package="toytask.conf", scenes=load_task("toy").scenes, options={}
     )
     (levels / "conf" / "task" / "toy.yaml").write_text("scene: ball\n")
-    check = named_checks(task)["files"]
+    check = named_checks(task)["description"]
     check()
     file = levels / "conf" / "effort" / "toy.yaml"
     file.write_text(file.read_text().replace("model.primitives: 400", "train.rates.glow: 0.1"))

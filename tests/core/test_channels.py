@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.channels import Channels, channels_of, stored_channels
+from neuprim.core.channels import Channels, find_channels, read_stored_channels
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.io import images
 from neuprim.core.io.exr import default_channel_names, exr_channels, write_exr
@@ -82,26 +82,26 @@ def test_a_display_that_gives_no_picture_is_named(own: Any, words: Sequence[str]
 
 def test_a_data_set_must_have_the_channels_that_its_task_names() -> None:
     dataset = tiny.two_primitives()
-    assert channels_of(TASK, dataset).names == ("R", "G", "B")
-    assert channels_of(replace(TASK, channels=("a", "b", "c")), dataset).names == ("a", "b", "c")
+    assert find_channels(TASK, dataset).names == ("R", "G", "B")
+    assert find_channels(replace(TASK, channels=("a", "b", "c")), dataset).names == ("a", "b", "c")
     with pytest.raises(DataError, match=r"^two: 3 channels; expected 5, which task 'static' names: 450nm, 550 nm"):
-        channels_of(replace(TASK, channels=BANDS), dataset)
+        find_channels(replace(TASK, channels=BANDS), dataset)
     with pytest.raises(
         DataError, match=r"^two: the background has shape \(3,\); expected \(5,\), a number per channel"
     ):
-        channels_of(TASK, replace(dataset, channels=5))
+        find_channels(TASK, replace(dataset, channels=5))
 
 
 def test_a_model_keeps_its_names_and_old_ones_get_some(tmp_path: Path) -> None:
     bands = replace(TASK, channels=BANDS)
-    kept = stored_channels(tmp_path, {"channels": list("vwxyz"), "color_space": "linear"}, bands, 5)
+    kept = read_stored_channels(tmp_path, {"channels": list("vwxyz"), "color_space": "linear"}, bands, 5)
     assert (kept.names, kept.color_space) == (tuple("vwxyz"), "linear")
-    assert stored_channels(tmp_path, {}, bands, 5).names == BANDS
-    assert stored_channels(tmp_path, {}, bands, 4).names == ("c0", "c1", "c2", "c3")
-    assert stored_channels(tmp_path, {}, TASK, 3) == Channels(task="static")
+    assert read_stored_channels(tmp_path, {}, bands, 5).names == BANDS
+    assert read_stored_channels(tmp_path, {}, bands, 4).names == ("c0", "c1", "c2", "c3")
+    assert read_stored_channels(tmp_path, {}, TASK, 3) == Channels(task="static")
     for damaged in (list("abcd"), "abcde", list("abcdd"), [1, 2, 3, 4, 5], ["a", "b", "c", "d", "\n"]):
         with pytest.raises(CheckpointError, match=r"header names the channels .*; expected 5 different names"):
-            stored_channels(tmp_path, {"channels": damaged}, bands, 5)
+            read_stored_channels(tmp_path, {"channels": damaged}, bands, 5)
 
 
 # ---------------------------------------------------------------- OpenEXR

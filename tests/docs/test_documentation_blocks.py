@@ -27,7 +27,7 @@ from neuprim.core.io.images import write_png
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.task import SceneContext
-from neuprim.plugins.registry import load_exporter, survey
+from neuprim.plugins.registry import TASKS, load_exporter
 from neuprim.runs.run import run
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands, name_of
 
@@ -163,7 +163,7 @@ def test_json_blocks_are_json_and_the_cameras_are_cameras(tmp_path: Path) -> Non
 @pytest.fixture(scope="module")
 def conditions() -> list[ConditionSpec]:
     """The conditions of all tasks."""
-    specs = [report.spec for report in survey()]
+    specs = [report.spec for report in TASKS.survey()]
     return [c for spec in specs if spec is not None for c in spec.conditions]
 
 

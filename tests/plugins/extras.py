@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from neuprim.plugins.registry import EXPORTERS, INSPECTORS, LOSSES, SCENES, TASKS, Group
+from neuprim.plugins.registry import EXPORTERS, INSPECTORS, LOSSES, SCENES, TASKS, PluginGroup
 from tests.plugins.fakes import TOY, install
 
 __all__ = ["EXPORTER", "INSPECTOR", "KINDS", "LOSS", "SCENE", "add"]
@@ -44,7 +44,7 @@ INSPECTOR = """
 from neuprim.core.extensions import Inspector
 PLUGIN = Inspector(api=1, name="extra", summary="nothing at all", layers=lambda frame: [])
 """
-KINDS: dict[str, tuple[Group[Any], str, str, str]] = {
+KINDS: dict[str, tuple[PluginGroup[Any], str, str, str]] = {
     "task": (TASKS, "extra", TOY.replace('name="toy"', 'name="extra"').replace("TASK", "PLUGIN"), "TaskSpec"),
     "scene": (SCENES, "static.extra", SCENE, "SceneExtension"),
     "loss": (LOSSES, "extra", LOSS, "LossExtension"),

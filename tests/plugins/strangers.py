@@ -11,7 +11,7 @@ import torch
 
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.plugins.registry import EXPORTERS, INSPECTORS, TASKS, Group
+from neuprim.plugins.registry import EXPORTERS, INSPECTORS, TASKS, PluginGroup
 from tests.plugins import marked
 from tests.plugins.fakes import install, site
 from tests.plugins.spectral import install_spectral
@@ -45,7 +45,10 @@ PLUGIN = Inspector(api=1, name="crumbs", summary="points", layers=lambda frame: 
 def add(site: Path, kind: str, source: str) -> None:
     """The exporter ``centres`` of the distribution strange-exporter 0.3, or the inspector ``crumbs`` of
     strange-inspector."""
-    groups: dict[str, tuple[Group, str]] = {"exporter": (EXPORTERS, "centres"), "inspector": (INSPECTORS, "crumbs")}  # type: ignore[type-arg]
+    groups: dict[str, tuple[PluginGroup, str]] = {
+        "exporter": (EXPORTERS, "centres"),
+        "inspector": (INSPECTORS, "crumbs"),
+    }  # type: ignore[type-arg]
     group, name = groups[kind]
     install(
         site,

@@ -4,7 +4,6 @@ cannot be is refused."""
 from __future__ import annotations
 
 import io
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,25 +17,24 @@ from rich.console import Console
 from torch import Tensor
 
 import neuprim.runs.evaluate as finishing
-from neuprim.cli import main
 from neuprim.cli.progress import RunProgress
 from neuprim.conformance import check_task
 from neuprim.core import checkpoint
-from neuprim.core.channels import stored_channels
-from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimError
+from neuprim.core.channels import read_stored_channels
+from neuprim.core.errors import CheckpointError, ConfigError, NeuprimError
 from neuprim.core.io import images
 from neuprim.core.io.exr import exr_channels
 from neuprim.core.model.colours import sh
 from neuprim.core.render import render
-from neuprim.export import appearance, mesh
+from neuprim.export import mesh, shared
 from neuprim.plugins.registry import load_task
 from neuprim.runs.export import export_run, import_run
 from neuprim.runs.inspect import Request, inspect_run
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run, read_metrics
-from neuprim.runs.render_images import FORMATS, RenderRequest, render_run
+from neuprim.runs.render_images import RenderRequest, render_run
+from tests.inspect.pages import array, layers_of
 from tests.plugins.fakes import site
-from tests.plugins.pages import array, layers_of
 from tests.plugins.spectral import NAMES, fit, forget, install_spectral
 
 __all__ = ["site"]
@@ -49,7 +47,7 @@ THROUGH = ", ".join(NAMES) + " through the display of task 'spectral'"
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(finishing, "_ORBIT_FRAMES", 3)
-    monkeypatch.setattr(appearance, "_SIZE", 48)
+    monkeypatch.setattr(shared, "_SIZE", 48)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +79,7 @@ def first_view(run_dir: Path) -> tuple[Any, Tensor, Tensor]:
     view = dataset.test.view(0)
     with torch.no_grad():
         drawn = render(model, view.camera, view.conditions, config.renderer, dataset.background).rgb
-    return stored_channels(run_dir, header, task, 5), drawn, dataset.test.pixels(0).over(dataset.background)
+    return read_stored_channels(run_dir, header, task, 5), drawn, dataset.test.pixels(0).over(dataset.background)
 
 
 # ---------------------------------------------------------------- with a display
@@ -135,49 +133,6 @@ def test_exr_and_npy_hold_every_channel(trained: Path, tmp_path: Path) -> None:
     assert render_run(trained, RenderRequest("orbit", out=tmp_path / "one.npy", frames=1)) == [tmp_path / "one.npy"]
     with pytest.raises(ConfigError, match=r"2 views do not fit one \.npy file"):
         render_run(trained, RenderRequest("orbit", out=tmp_path / "two.npy", frames=2))
-
-
-def test_rendering_needs_no_data_for_the_names(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def gone(*_: object) -> None:
-        raise DataError("the data are gone")
-
-    monkeypatch.setattr("neuprim.runs.render_images.load_dataset", gone)
-    pose = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0.5], [0, 0, 0, 1]]
-    (tmp_path / "cameras.json").write_text(
-        json.dumps({"w": 20, "h": 16, "camera_angle_x": 0.7, "frames": [{"transform_matrix": pose}]})
-    )
-    (exr,) = render_run(
-        trained,
-        RenderRequest(
-            str(tmp_path / "cameras.json"),
-            format="exr",
-            out=tmp_path / "exr",
-            frames=1,
-            conditions=SHIFT,
-            layers="beauty",
-        ),
-    )
-    (png,) = render_run(
-        trained,
-        RenderRequest(str(tmp_path / "cameras.json"), format="png", out=tmp_path / "png", frames=1, conditions=SHIFT),
-    )
-    display = load_task("spectral").display
-    assert display is not None
-    shown = display(images.read_image(exr, (20, 16), NAMES))
-    assert (images.read_image(png).int() - images.to_uint8(shown).int()).abs().max() <= 1 and shown.std() > 0.1
-
-
-def test_webp_is_a_picture_of_the_display(trained: Path, tmp_path: Path) -> None:
-    channels, drawn, _ = first_view(trained)
-    said: list[str] = []
-    webp = render_run(
-        trained,
-        RenderRequest("test", format="webp", out=tmp_path / "film.webp", frames=1),
-        notify=said.append,
-    )
-    with Image.open(webp[0]) as film:
-        frame = torch.from_numpy(np.asarray(film.convert("RGB")).astype(np.float32) / 255)
-    assert (frame - channels.display(drawn)).abs().mean() < 0.03 and said == []
 
 
 def test_the_inspectors_page_has_the_displays_colours(trained: Path, tmp_path: Path) -> None:
@@ -235,7 +190,7 @@ def test_whole_models_keep_every_channel(trained: Path, tmp_path: Path) -> None:
 def test_gaussians_of_five_channels_are_refused_before_any_is_fitted(
     trained: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuprim.export.gaussian_ply.harmonics_of", lambda *a: pytest.fail("too late"))
+    monkeypatch.setattr("neuprim.export.gaussian_ply.fit_harmonics", lambda *a: pytest.fail("too late"))
     with pytest.raises(
         ConfigError, match=r"5 channels, 450nm, .*; this format has red, green and blue; --format ply and npz hold all"
     ):
@@ -278,8 +233,7 @@ def test_without_a_display_it_is_said_what_is_shown(
         export_run(out, "mesh", words=["wavelength_shift=0"])
 
 
-@pytest.mark.parametrize("count", [1, 2, 31])
-@pytest.mark.parametrize("space", ["linear", "srgb"])
+@pytest.mark.parametrize(("count", "space"), [(1, "linear"), (2, "srgb"), (31, "linear")])
 def test_any_number_of_channels_runs_and_is_written(site: Path, tmp_path: Path, count: int, space: str) -> None:
     words = (f"scene.bands={count}", f"scene.space={space}", "train.iterations=5")
     out, said = changed(site, tmp_path, *words, display="None", channels="()")
@@ -334,7 +288,7 @@ def test_red_green_and_blue_among_others_are_exported_by_name(site: Path, tmp_pa
         (
             (),
             {"build": "lambda m, d: (TwoScales(), ShiftedSpectrum(3))"},
-            "build of task 'spectral' of neuprim-spectral 0.1: the colour has channels=3; expected 5, as data set 'ball' has",
+            "task 'spectral' of neuprim-spectral 0.1: build: channels of the colour: found 3; expected 5, as data set 'ball' has",
         ),
     ],
 )
@@ -344,31 +298,3 @@ def test_contradictions_end_before_training(
     with pytest.raises(NeuprimError, match=re.escape(text)):
         changed(site, tmp_path, *words, **changes)
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"channels": "'RGB'"}, "TaskSpec.channels is of type str; expected a tuple of names"),
-        ({"channels": "('a', 'b', 'a')"}, "TaskSpec.channels[2] is 'a' once more; expected different names"),
-        ({"channels": "('a', 5)"}, "TaskSpec.channels[1] is of type int; expected text"),
-        ({"channels": "('A',)"}, "TaskSpec.channels[0] is 'A'; expected another name"),
-        ({"display": "3"}, "TaskSpec.display is of type int; expected a function or None"),
-    ],
-)
-def test_a_task_that_says_nonsense_is_refused(site: Path, changes: dict[str, str], text: str) -> None:
-    install_spectral(site, **changes)
-    with pytest.raises(NeuprimError, match=re.escape(text)):
-        load_task("spectral")
-
-
-def test_the_command_line_offers_every_format(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["render", str(trained), "--camera", "orbit", "--frames", "1", "--size", "8x8"]
-    for name in FORMATS:
-        if name != "mp4":
-            assert main([*words, "--format", name, "--out", str(tmp_path / name)]) == 0
-    capsys.readouterr()
-    assert main(["render", "--help"]) == 0
-    assert "{" + ",".join(FORMATS) + "}" in capsys.readouterr().out

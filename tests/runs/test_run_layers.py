@@ -22,7 +22,7 @@ from neuprim.core.layers import LayerSpec
 from neuprim.core.model.fields import Constant
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
-from neuprim.plugins.judging import TaskFault
+from neuprim.plugins.returns import ReturnError
 from neuprim.runs.layers import Layers
 from neuprim.runs.measure import render_light_sum
 from neuprim.runs.render_config import RenderConfig
@@ -184,13 +184,13 @@ def test_layers_of_others_in_any_channels(tmp_path: Path) -> None:
     for draw, words in (
         (
             lambda f: f.drawn.alpha,
-            r"twice is torch.float32 of shape \(16, 20\); expected floats of shape \(16, 20, 3\)",
+            r"twice: found torch.float32 of shape \(16, 20\); expected floats of shape \(16, 20, 3\)",
         ),
-        (lambda f: f.drawn.rgb / 0, "twice has .* NaN or infinite values"),
-        (lambda f: 3, "twice is a int; expected floats"),
+        (lambda f: f.drawn.rgb / 0, "twice: found .* NaN or infinite values"),
+        (lambda f: 3, "twice: found a int; expected floats"),
     ):
         task = replace(DYNAMIC, layers=(LayerSpec("twice", "wrong", draw),))
-        with pytest.raises(TaskFault, match=words):
+        with pytest.raises(ReturnError, match=words):
             layers(task=task).write(tmp_path / "b.exr", volume(), VIEW)
 
 

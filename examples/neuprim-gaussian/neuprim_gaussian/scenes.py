@@ -13,7 +13,7 @@ __all__ = ["SCENES"]
 
 def _like_static(name: str, summary: str) -> SceneSpec:
     def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-        from neuprim.plugins.registry import find_scene, load_task  # imported when used: listing tasks stays quick
+        from neuprim.plugins.registry import find_scene, load_task
 
         return find_scene(load_task("neuprim:static"), name).spec.load(settings, context)
 

@@ -25,7 +25,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import SceneContext
-from neuprim.plugins.judging import facts_of
+from neuprim.plugins.returns import call_task_facts
 from neuprim.runs.measure import render_light_sum
 from neuprim.scenes.lit import build_lit_solids, shade_point_light
 from neuprim.scenes.raycast import Scene
@@ -178,7 +178,7 @@ def test_damaged_headers(change: dict[str, Any], message: str) -> None:
 def test_a_data_set_tells_where_its_lights_were(tmp_path: Path) -> None:
     small = {"size": 8, "train_views": 100, "test_views": 3, "supersampling": 1}
     dataset = TASK.scene("lit_solids").load(small, SceneContext(0, tmp_path))
-    told = json.loads(json.dumps(facts_of(TASK, dataset)))
+    told = json.loads(json.dumps(call_task_facts(TASK, dataset)))
     assert told["up"] == [0, 0, 1] and len(told["lights"]["directions"]) == 100
     assert 4.0 < told["lights"]["distance"] < 5.0 and told["lights"]["falloff"] == "inverse_square"
     above = torch.zeros(32, 64, 3)

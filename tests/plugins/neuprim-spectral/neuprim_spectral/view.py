@@ -15,7 +15,7 @@ def bands(frame):
         raise ConfigError("--show bands: the model has no spectra, or --wavelength-shift is missing")
     with torch.no_grad():
         best = spectrum(model.params["logit"], frame.conditions["wavelength_shift"]).argmax(1)[
-            torch.as_tensor(frame.alive)
+            torch.as_tensor(frame.rows)
         ]
     scale = Scale(0, len(BANDS) - 1, "viridis", "strongest band")
     return [Points(frame.geometry.means.detach().numpy(), values=best.numpy(), scale=scale)]

@@ -1,0 +1,404 @@
+"""Check fields: lowered forms, integrals, gradients, and what changes a population."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.conformance.task_under_test import EXACT, TaskUnderTest
+from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.data import View
+from neuprim.core.model.fields import ColourField, Conditions, DensityField, Field, LoweredDensity, Shading
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pairs import Pairs
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.reduction import reduce_model
+from neuprim.core.model.schema import ParameterSpec, Params
+from neuprim.core.render import RenderSettings, render
+from neuprim.core.train.splitting import SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT
+
+_RAYS = 6  # per primitive
+_STEPS = (1e-5, 1e-6)
+"""Steps of the finite differences: a pixel that flips at a silhouette differs only at one of them."""
+
+
+def double_view(view: View) -> View:
+    """Return the view with camera and conditions in float64."""
+    conditions = {k: v.double() if v.is_floating_point() else v for k, v in view.conditions.items()}
+    return replace(view, camera=replace(view.camera, viewmat=view.camera.viewmat.double()), conditions=conditions)
+
+
+def check_forms(t: TaskUnderTest) -> None:
+    """Lowered tensors have the shapes of their form, the data set's channels, the parameters' dtype, finite numbers."""
+    for dtype in (torch.float32, torch.float64):
+        model = t.perturbed_model(dtype)
+        t.require(
+            model.colour.channels == t.dataset.channels, "colour.channels", model.colour.channels, t.dataset.channels
+        )
+        for view in t.views[:3]:
+            lowered = model.lower(view.camera, view.conditions)  # which refuses wrong shapes by name
+            for where, form in (("density.lower", lowered.density), ("colour.lower", lowered.colour)):
+                for name, value in vars(form).items():
+                    if isinstance(value, Tensor):
+                        expected = f"{dtype}, as the parameters"
+                        t.require(value.dtype == dtype, f"{where}: {name}", value.dtype, expected)
+                        t.require_finite(f"{where}: {name}", value)
+
+
+# ---------------------------------------------------------------- activity and integrals
+
+
+@dataclass(frozen=True)
+class ActiveDensity:
+    """The density of the primitives that are active in a frame.
+
+    Attributes:
+        rows: their rows in the model.
+        params: the density's tensors of these rows.
+        stored, moved: their geometry as stored, and where the frame's conditions put it.
+        form: their lowered density.
+    """
+
+    field: DensityField
+    conditions: Conditions
+    rows: Tensor
+    params: dict[str, Tensor]
+    stored: Geometry
+    moved: Geometry
+    form: LoweredDensity
+
+    @classmethod
+    def of(cls, model: Primitives, conditions: Conditions) -> ActiveDensity:
+        """Lower a model's density under some conditions."""
+        rows = model.density.active_rows(model.of(model.density), conditions)
+        rows = torch.arange(model.count) if rows is None else rows
+        params = {name: value[rows] for name, value in model.of(model.density).items()}
+        stored = model.geometry[rows]
+        moved = model.density.move(params, stored, conditions)
+        form = model.density.lower(params, moved, conditions)
+        return cls(model.density, conditions, rows, params, stored, moved, form)
+
+    def quadrature(self, prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor) -> tuple[Tensor, Tensor]:
+        """Integrate the field's ``density`` along chords by Gauss-Legendre quadrature on eight panels.
+
+        Returns:
+            the integrals and the greatest |sigma|, both (M,) float64.
+        """
+        x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(16))
+        nodes = ((x[None] + 1) / 2 + torch.arange(8)[:, None]).reshape(-1) / 8
+        t = t0[:, None] + (t1 - t0)[:, None] * nodes
+        points = (o[:, None] + t[..., None] * d[:, None]).reshape(-1, 3)
+        rows = prim.repeat_interleave(len(nodes))
+        sigma = self.field.density(self.params, self.stored, rows, points, self.conditions).reshape(t.shape)
+        return (sigma * (w / 16).repeat(8)).sum(-1) * (t1 - t0), sigma.abs().amax(-1)
+
+    def optical_depth(self, prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor) -> Tensor:
+        """Integrate the lowered form along chords."""
+        return self.form.optical_depth(Pairs.of(self.moved, prim, o, d, t0, t1))
+
+
+def points_inside(geometry: Geometry, rows: Tensor, generator: torch.Generator, reach: float = 0.95) -> Tensor:
+    """Draw (M, 3) float64 points, one uniform in ``reach`` of the ellipsoid of each of ``rows`` (M,)."""
+    direction = torch.nn.functional.normalize(
+        torch.randn(len(rows), 3, generator=generator, dtype=torch.float64), dim=-1
+    )
+    radius = reach * torch.rand(len(rows), 1, generator=generator, dtype=torch.float64) ** (1 / 3)
+    local = geometry.scales.double()[rows] * direction * radius
+    return geometry.means.double()[rows] + (geometry.rotations.double()[rows] @ local[:, :, None])[..., 0]
+
+
+def random_chords(
+    geometry: Geometry, rows: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Draw a ray from outside through the ellipsoid of each of ``rows`` (M,).
+
+    Returns:
+        origins, directions, and both ends of the chord along the ray, float64.
+    """
+    point = points_inside(geometry, rows, generator)
+    d = torch.nn.functional.normalize(torch.randn(len(rows), 3, generator=generator, dtype=torch.float64), dim=-1)
+    whiten = geometry.rotations.double()[rows].transpose(1, 2) / geometry.scales.double()[rows][:, :, None]
+    y, v = ((whiten @ x[:, :, None])[..., 0] for x in (point - geometry.means.double()[rows], d))
+    a, b = (v * v).sum(-1), (y * v).sum(-1)
+    root = (b * b + a * (1 - (y * y).sum(-1))).sqrt()
+    far = 3 * geometry.length_scale.double()[rows]
+    return point - far[:, None] * d, d, far + (-b - root) / a, far + (-b + root) / a
+
+
+def check_activity(t: TaskUnderTest) -> None:
+    """Primitives that the density leaves out of a frame absorb nothing in it; active rows are in ascending order."""
+    model = t.perturbed_model()
+    generator = torch.Generator().manual_seed(3)
+    params = model.of(model.density)
+    for view in map(double_view, t.views):
+        rows = model.density.active_rows(params, view.conditions)
+        if rows is None:
+            continue
+        fine = rows.dtype == torch.int64 and bool((rows[1:] > rows[:-1]).all())
+        t.require(fine, "density.active_rows", f"{rows.dtype} {rows.tolist()}", "ascending int64 rows")
+        left_out = torch.ones(model.count, dtype=torch.bool).index_fill_(0, rows, False).nonzero()[:, 0]
+        moved = model.density.move(params, model.geometry, view.conditions)
+        points = points_inside(moved, left_out, generator)
+        sigma = model.density.density(params, model.geometry, left_out, points, view.conditions)
+        where = "density.active_rows: density of a primitive that it leaves out"
+        t.require(not bool(sigma.any()), where, sigma.abs().max() if len(sigma) else 0, 0)
+
+
+def check_integral(t: TaskUnderTest) -> None:
+    """Optical depths of the lowered density equal the integral of ``density`` along whole chords and parts of them."""
+    model = t.perturbed_model()
+    generator = torch.Generator().manual_seed(4)
+    count = 0
+    with torch.no_grad():
+        for view in map(double_view, t.views):
+            active = ActiveDensity.of(model, view.conditions)
+            prim = torch.arange(len(active.rows)).repeat(_RAYS)
+            if not len(prim):
+                continue
+            count += len(prim)
+            o, d, t0, t1 = random_chords(active.moved, prim, generator)
+            middle = t0 + 0.4 * (t1 - t0)
+            whole = active.optical_depth(prim, o, d, t0, t1)
+            shape = tuple(whole.shape)
+            t.require(shape == tuple(prim.shape), "density.lower: integral", f"shape {shape}", tuple(prim.shape))
+            parts = [active.optical_depth(prim, o, d, a, b) for a, b in ((t0, middle), (middle, t1))]
+            expected, peak = active.quadrature(prim, o, d, t0, t1)
+            for where, found, wanted in (
+                ("chord", whole, expected),
+                ("part of a chord", parts[1], active.quadrature(prim, o, d, middle, t1)[0]),
+                ("chord in two parts", parts[0] + parts[1], whole),
+            ):
+                error = (found - wanted).abs() / ((t1 - t0) * peak + 1e-30)
+                i = int(error.argmax())
+                place = f"density.lower: integral of a {where}, primitive {int(active.rows[prim[i]])}, view {view.name}"
+                t.require(bool((error <= 1e-5).all()), place, f"{float(found[i]):.6g}", f"{float(wanted[i]):.6g}")
+    t.require(count > 0, "density.active_rows", "no primitive in any view", "some")
+
+
+# ---------------------------------------------------------------- gradients
+
+
+class _FixedShading(ColourField):
+    """A colour field whose shading is given; shading carries no gradient, so finite differences must not change it."""
+
+    def __init__(self, model: Primitives, conditions: Conditions) -> None:
+        self.colour, self.channels = model.colour, model.colour.channels
+        with torch.no_grad():
+            self.shading = self.colour.shade(*model.lower_density(conditions), conditions, RenderSettings())
+
+    def parameters(self) -> list[ParameterSpec]:
+        return self.colour.parameters()
+
+    def settings(self) -> dict[str, Any]:
+        return self.colour.settings()
+
+    def shade(self, *_: Any) -> Shading | None:
+        return self.shading
+
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Any:
+        return self.colour.lower(params, geometry, camera, conditions)
+
+
+def leaf_parameters(model: Primitives) -> dict[str, Tensor]:
+    """Replace the model's parameters by leaves that collect gradients, and return them."""
+    model.params = {name: value.detach().clone().requires_grad_() for name, value in model.params.items()}
+    return model.params
+
+
+def _objective(model: Primitives, view: View, seed: int) -> Tensor:
+    """Return a smooth scalar that depends on everything visible."""
+    out = render(model, view.camera, view.conditions, EXACT)
+    weight = torch.rand(out.rgb.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) + 0.5
+    return (out.rgb * weight).sum() + out.alpha.square().sum()
+
+
+def check_gradients(t: TaskUnderTest) -> None:
+    """Every parameter gets a gradient from some view, and gradients agree with finite differences in float64."""
+    model = t.perturbed_model()
+    params = leaf_parameters(model)
+    for i, view in enumerate(map(double_view, t.views)):
+        _objective(model, view, i).backward()
+    for name, value in params.items():
+        if value.numel():
+            where = f"{t.lower_method(name)}gradient of {name}"
+            t.require(value.grad is not None, where, "none: the image does not depend on it", "one")
+            t.require_finite(where, value.grad)
+            t.require(bool(value.grad.any()), where, "zero in all views", "other than zero")  # type: ignore[union-attr]
+    for view in list(map(double_view, t.views))[:2]:
+        frozen = Primitives(model.density, _FixedShading(model, view.conditions), model.params)
+        params = leaf_parameters(frozen)
+        _objective(frozen, view, 0).backward()
+        for name, value in params.items():
+            if value.numel():
+                grad = torch.zeros_like(value) if value.grad is None else value.grad
+                _compare_with_differences(t, frozen, view, name, grad.detach().reshape(-1))
+
+
+def _compare_with_differences(t: TaskUnderTest, model: Primitives, view: View, name: str, grad: Tensor) -> None:
+    leaves = model.params
+    constants = {n: v.detach() for n, v in leaves.items()}
+
+    def slope(entry: int, step: float) -> float:
+        values = []
+        for sign in (1.0, -1.0):
+            changed = constants[name].clone()
+            changed.reshape(-1)[entry] += sign * step
+            model.params = {**constants, name: changed}
+            with torch.no_grad():
+                values.append(float(_objective(model, view, 0)))
+        model.params = leaves
+        return (values[0] - values[1]) / (2 * step)
+
+    for entry in sorted({int(grad.abs().argmax()), len(grad) // 3}):
+        found = float(grad[entry])
+        slopes = [slope(entry, step) for step in _STEPS]
+        tolerance = 1e-4 * float(grad.abs().max()) + 1e-7
+        ok = any(abs(s - found) <= 1e-3 * max(abs(s), abs(found)) + tolerance for s in slopes)
+        row = entry // max(len(grad) // model.count, 1)
+        where = f"{t.lower_method(name)}gradient of {name}, primitive {row}, view {view.name}"
+        t.require(ok, where, f"{found:.6g}", f"{slopes[-1]:.6g} by finite differences")
+
+
+_MASS_EACH, _MASS_MEAN = 0.25, 0.05
+"""Relative error of the mass of one pair of children, and on average, where splits are not exact."""
+
+
+def check_scaling(t: TaskUnderTest) -> None:
+    """``scale_density`` multiplies the density by its factor, and two copies at half the density look like one."""
+    model = t.perturbed_model()
+    factor = torch.linspace(0.25, 2.0, model.count, dtype=torch.float64)
+    own = model.of(model.density)
+    before = {name: value.clone() for name, value in own.items()}
+    scaled = model.density.scale_density(own, factor)
+    _require_same_layout(t, "density.scale_density", scaled, before)
+    for name, value in own.items():
+        t.require(
+            torch.equal(value, before[name]), f"density.scale_density: {name}", "changed in place", "a new tensor"
+        )
+    half = model.density.scale_density(own, torch.full((model.count,), 0.5, dtype=torch.float64))
+    twice = {name: torch.cat([value, value]) for name, value in {**model.params, **half}.items()}
+    copies = Primitives(model.density, model.colour, twice)
+    with torch.no_grad():
+        for i, view in enumerate(map(double_view, t.views)):
+            active = ActiveDensity.of(model, view.conditions)
+            local = torch.arange(len(active.rows)).repeat(4)
+            rows, x = active.rows[local], points_inside(active.moved, local, torch.Generator().manual_seed(i))
+            one, other = (model.density.density(p, model.geometry, rows, x, view.conditions) for p in (own, scaled))
+            _require_close(t, "density.scale_density: density", other, one * factor[rows], rows)
+            a, b = (render(m, view.camera, view.conditions, EXACT).rgb for m in (model, copies))
+            change = float((a - b).abs().max())
+            ok = change <= 2e-4 * max(1.0, float(a.abs().max()))  # two clamps at 0.9999 let less through than one
+            t.require(
+                ok, f"density.scale_density by a half, twice over: view {view.name}", f"a change of {change:.3g}", 0
+            )
+
+
+def check_split(t: TaskUnderTest) -> None:
+    """Children continue their parent's density inside themselves, or hold its mass where ``exact_split`` is False."""
+    model = t.perturbed_model()
+    old, parents, colours = model.geometry, model.of(model.density), model.of(model.colour)
+    axis = torch.nn.functional.one_hot(old.log_scales.argmax(-1), 3).double()
+    step = SPLIT_SHIFT * (old.rotations * (axis * old.scales)[:, None]).sum(-1)
+    shrink = torch.where(axis > 0, SPLIT_LONG, SPLIT_OTHERS).double().log()
+    children = []
+    for sign in (1.0, -1.0):
+        new = Geometry(old.means + sign * step, old.log_scales + shrink, old.quats)
+        child = model.density.on_split(dict(parents), old, new)
+        _require_same_layout(t, "density.on_split", child, parents)
+        _require_same_layout(t, "colour.on_split", model.colour.on_split(dict(colours), old, new), colours)
+        children.append((child, new))
+    divided = model.density.divide(parents, old)
+    if divided is not None:
+        mask, halves, place = divided
+        t.require(
+            mask.dtype == torch.bool and mask.shape == (model.count,), "density.divide: mask", mask.dtype, "bool (N,)"
+        )
+        t.require(place.count == 2 * model.count, "density.divide: geometry", f"{place.count} rows", 2 * model.count)
+        _require_same_layout(t, "density.divide", halves, {k: torch.cat([v, v]) for k, v in parents.items()})
+    if not model.density.exact_split:
+        _compare_masses(t, model, children)
+        return
+    generator = torch.Generator().manual_seed(6)
+    for view in map(double_view, t.views):
+        rows = ActiveDensity.of(model, view.conditions).rows.repeat(4)
+        for child, new in children:
+            x = points_inside(model.density.move(child, new, view.conditions), rows, generator)
+            found = model.density.density(child, new, rows, x, view.conditions)
+            expected = model.density.density(parents, old, rows, x, view.conditions)
+            _require_close(t, "density.on_split: density of a child inside it", found, expected, rows)
+
+
+def _compare_masses(t: TaskUnderTest, model: Primitives, children: list[tuple[dict[str, Tensor], Geometry]]) -> None:
+    """Compare integrals of |sigma| over the ellipsoids of parents and children, on the same points in each.
+
+    A density that varies within a primitive continues in the children, whose supports contain other parts of it. So
+    one pair may be off, but all of them on average may not.
+    """
+    view = double_view(t.views[0])
+    ball = 2 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(8), dtype=torch.float64) - 1
+    ball = ball[ball.norm(dim=-1) < 1]
+
+    def mass(params: dict[str, Tensor], geometry: Geometry) -> Tensor:
+        result = []
+        for n in range(geometry.count):
+            x = geometry.means[n] + (ball * geometry.scales[n]) @ geometry.rotations[n].T
+            sigma = model.density.density(params, geometry, torch.full((len(ball),), n), x, view.conditions)
+            result.append(sigma.abs().mean() * geometry.scales[n].prod())
+        return torch.stack(result)
+
+    parents = mass(model.of(model.density), model.geometry)
+    both = mass(*children[0]) + mass(*children[1])
+    absent = (parents <= 0) & (both <= 0)
+    change = torch.where(absent, torch.zeros_like(both), both / parents.clamp_min(1e-30) - 1)
+    i, mean = int(change.abs().argmax()), float(change.mean())
+    where = "density.on_split: mass of both children of"
+    each = abs(float(change[i])) <= _MASS_EACH
+    t.require(each, f"{where} primitive {i}", f"{float(both[i]):.4g}", f"{float(parents[i]):.4g}")
+    t.require(abs(mean) <= _MASS_MEAN, f"{where} a primitive, on average", f"{1 + mean:.3f} times its parent's", 1)
+
+
+def check_reductions(t: TaskUnderTest) -> None:
+    """A field that can do with less of something becomes a field of the task that has fewer numbers and draws."""
+    model = t.perturbed_model(torch.float32)
+    for kind, field in (("density", model.density), ("colour", model.colour)):
+        for name, values in field.reductions().items():
+            where = f"{type(field).__name__}.reductions()[{name!r}]"
+            fine = bool(values) and all(type(v) is int and v >= 0 for v in values)
+            fine = fine and list(values) == sorted(set(values), reverse=True)
+            t.require(fine, where, values, "whole numbers from 0, the largest first")
+            for value in values:
+                _check_reduced(t, model, kind, field, name, value)
+
+
+def _check_reduced(t: TaskUnderTest, model: Primitives, kind: str, field: Field, name: str, value: int) -> None:
+    where = f"{type(field).__name__}.reduce({name!r}, {value})"
+    less = reduce_model(model, kind, name, value)
+    reduced = less.density if kind == "density" else less.colour
+    listed = type(reduced) in (t.task.fields or {}).values()
+    t.require(listed, where, type(reduced).__name__, "a field that TaskSpec.fields lists")
+    again = type(reduced)(**reduced.settings())
+    same = [(s.name, s.shape) for s in again.parameters()] == [(s.name, s.shape) for s in reduced.parameters()]
+    t.require(same, f"{where}.settings()", "other parameters", "settings that rebuild it")
+    count = less.parameters_per_primitive
+    t.require(count < model.parameters_per_primitive, where, f"{count} numbers", "fewer")
+    t.draw(where, less, t.views[0])
+
+
+def _require_same_layout(t: TaskUnderTest, where: str, found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    t.require(set(found) == set(expected), where, f"tensors {sorted(found)}", sorted(expected))
+    for name, value in expected.items():
+        a, b = (f"{x.dtype} {tuple(x.shape)}" for x in (found[name], value))
+        t.require(a == b, f"{where}: {name}", a, b)
+        t.require_finite(f"{where}: {name}", found[name])
+
+
+def _require_close(t: TaskUnderTest, where: str, found: Tensor, expected: Tensor, rows: Tensor) -> None:
+    if len(rows):
+        error = (found - expected).abs() / expected.abs().max().clamp_min(1e-30)
+        i = int(error.argmax())
+        place = f"{where}, primitive {int(rows[i])}"
+        t.require(float(error[i]) <= 1e-6, place, f"{float(found[i]):.6g}", f"{float(expected[i]):.6g}")

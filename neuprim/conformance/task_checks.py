@@ -1,0 +1,386 @@
+"""Check tasks: what they declare, what they take, their losses, and exact resuming and saving."""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.config import check_groups, preset_settings, presets, task_choices
+from neuprim.config.checks import complete_options
+from neuprim.config.task_files import Level, read_levels
+from neuprim.conformance.field_checks import leaf_parameters
+from neuprim.conformance.task_under_test import ConformanceError, TaskUnderTest, drawn_range, random_condition
+from neuprim.core import checkpoint
+from neuprim.core.channels import find_channels
+from neuprim.core.compression import LEVELS, canonicalize
+from neuprim.core.data import View
+from neuprim.core.errors import CheckpointError, ConfigError, FormError, NeuprimError
+from neuprim.core.layers import LayerFrame
+from neuprim.core.model.fields import ConditionSpec
+from neuprim.core.model.geometry import GEOMETRY_SPECS
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import ParameterSpec
+from neuprim.core.render import render
+from neuprim.core.task import API_VERSION, Supervision
+from neuprim.core.train.settings import ModelSettings
+from neuprim.core.used_settings import build_settings, loss_settings
+from neuprim.core.validation import validate
+from neuprim.plugins.returns import (
+    ReturnError,
+    call_task_clips,
+    call_task_diagnose,
+    call_task_facts,
+    call_task_judge,
+    call_task_mask,
+    call_task_orbit,
+    call_task_trade,
+    check_loss_returns,
+    draw_task_layer,
+)
+from neuprim.plugins.spec_validation import validate_spec
+
+
+def check_description(t: TaskUnderTest) -> None:
+    """The TaskSpec is valid, its scenes, presets, efforts and tunable settings compose, and typos are refused."""
+    problem = validate_spec(t.task)
+    t.require(problem is None, "TaskSpec", problem, "members as documented in neuprim.core.task.TaskSpec")
+    t.require(t.task.api == API_VERSION, "TaskSpec.api", t.task.api, API_VERSION)
+    t.require(bool(t.task.fields), "TaskSpec.fields", t.task.fields, "every field class by its name")
+    check_groups(t.task)
+    choice = task_choices(t.task)
+    known = t.task.parameter_names() | {s.name for s in GEOMETRY_SPECS}
+    chosen: list[tuple[str, str, Level | None]] = [(f"preset {preset}", preset, None) for preset in presets(t.task)]
+    levels = read_levels(t.task, presets(t.task)) or {}
+    chosen += [(f"effort {number}", level.preset, level) for number, level in levels.items()]
+    for where, preset, level in chosen:
+        settings = preset_settings(t.task, preset, choice.scene, level)
+        for group, given in (("rates", settings.train.rates), ("rate_units", settings.train.rate_units)):
+            for name in given:
+                t.require(
+                    name in known, f"{where}: train.{group}.{name}", "no such parameter", ", ".join(sorted(known))
+                )
+        _require_accepted(t, where, asdict(settings.model), choice.options)
+    for scene in t.task.scenes:
+        preset_settings(t.task, choice.preset, scene.name)
+    for name, values in call_task_trade(t.task, build_settings(t.task, t.settings.model, t.options)).items():
+        for value in values:
+            tree: dict[str, Any] = {"model": asdict(t.settings.model), "task": {"options": dict(t.options)}}
+            *path, last = name.split(".")
+            node = tree
+            for part in path:
+                node = node.setdefault(part, {})
+            node[last] = value
+            _require_accepted(t, f"trade: {name}={value}", tree["model"], tree["task"]["options"])
+    for group in ("density", "colour"):
+        changed: dict[str, Any] = {group: {**getattr(t.settings.model, group), "no_such_setting": 1}}
+        where = f"TaskSpec.check with model.{group}.no_such_setting=1"
+        try:
+            t.task.check(build_settings(t.task, replace(t.settings.model, **changed), t.options))
+        except ConfigError as error:
+            t.require("no_such_setting" in str(error), where, repr(str(error)), "a message that names the setting")
+        else:
+            t.require(
+                False, where, "it was accepted", "ConfigError (neuprim.core.validation.validate_choices raises it)"
+            )
+
+
+def _require_accepted(t: TaskUnderTest, where: str, model: dict[str, Any], options: dict[str, Any]) -> None:
+    try:
+        complete = complete_options(t.task.options, options, f"task {t.task.name!r}")
+        t.task.check(build_settings(t.task, validate(ModelSettings, model, "model"), complete))
+    except ConfigError as error:
+        t.require(False, where, f"a setting that is refused ({error})", "settings that the task accepts")
+
+
+def check_fields(t: TaskUnderTest) -> None:
+    """A field is rebuilt from its class and JSON-able settings with the same parameters; other settings are refused."""
+    for kind, field in zip(("density", "colour"), t.build_fields(), strict=True):
+        name, listed = type(field).__name__, t.task.fields or {}
+        where = f"TaskSpec.fields[{name!r}]"
+        t.require(listed.get(name) is type(field), where, listed.get(name), f"the class of the {kind} that build makes")
+        settings = field.settings()
+        try:
+            same = json.loads(json.dumps(settings, allow_nan=False)) == settings
+        except (TypeError, ValueError):
+            same = False
+        t.require(same, f"{name}.settings()", settings, "values that JSON holds unchanged")
+        before, after = ([(s.name, tuple(s.shape)) for s in f.parameters()] for f in (field, type(field)(**settings)))
+        t.require(before == after, f"{name}(**settings)", f"parameters {after}", before)
+        try:
+            type(field)(**{**settings, "no_such_setting": 1})
+        except (TypeError, ValueError):
+            continue
+        t.require(
+            False, f"{name}(no_such_setting=1)", "it was accepted", "TypeError, so that damaged files are noticed"
+        )
+
+
+def check_parameters(t: TaskUnderTest) -> None:
+    """Names of parameters are unique; shapes, rates and start values are valid and depend on nothing but the seed."""
+    taken = {s.name for s in GEOMETRY_SPECS}
+    for kind, spec in t.parameter_specs():
+        where = f"{kind}.parameters: {spec.name!r}"
+        t.require(isinstance(spec, ParameterSpec), where, type(spec).__name__, "ParameterSpec")
+        t.require(str(spec.name).isidentifier(), where, repr(spec.name), "a name of letters, digits and _")
+        t.require(spec.name not in taken, where, "a name used twice", "a unique one")
+        taken.add(spec.name)
+        fits = isinstance(spec.shape, tuple) and all(isinstance(n, int) and n >= 0 for n in spec.shape)
+        t.require(fits, f"{where}: shape", spec.shape, "a tuple of whole numbers, () for a scalar")
+        t.require(math.isfinite(spec.lr) and spec.lr > 0, f"{where}: lr", spec.lr, "a positive rate")
+        t.require(spec.lr_unit in ("absolute", "extent"), f"{where}: lr_unit", spec.lr_unit, "absolute or extent")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(1)
+        one = t.initial_model()
+        torch.manual_seed(2)
+        other = t.initial_model()
+    for kind, spec in t.parameter_specs():
+        where, value = f"{kind}.parameters: {spec.name!r}: start value", one.params[spec.name]
+        expected = (one.count, *spec.shape)
+        t.require(tuple(value.shape) == expected, where, f"shape {tuple(value.shape)}", expected)
+        t.require_finite(where, value)
+        t.require(torch.equal(value, other.params[spec.name]), f"{where}s of one seed", "different ones", "equal ones")
+
+
+def check_evaluation(t: TaskUnderTest) -> None:
+    """What the task measures, films and displays of its example can be used, and its orbit has every condition."""
+    task, data, model = t.task, t.dataset, t.perturbed_model(torch.float32)
+    channels = find_channels(task, data)
+    image = data.test.pixels(0).over(data.background)
+    shown, rows = channels.display(image.clone()), [channels.display(row[None]) for row in image.clone()]
+    off = float((shown - torch.cat(rows)).abs().max())
+    t.require(
+        off < 1e-4, "display of an image", f"{off:.3g} off its rows one by one", "the same for each pixel by itself"
+    )
+    before = {name: value.clone() for name, value in model.params.items()}
+    try:
+        call_task_clips(task, data)
+        call_task_facts(task, data)
+        for i in range(len(data.test)):
+            truth = data.test.pixels(i).over(data.background)
+            call_task_mask(task, data, i)
+            call_task_judge(task, data, i, 0.5 * truth, truth)
+        call_task_diagnose(task, data, model)
+        orbit = call_task_orbit(task, data, 3)
+        for spec in task.layers:
+            for view in t.views:
+                frame = LayerFrame(model, view.camera, view.conditions, t.settings.renderer, data.color_space)
+                one, two = (draw_task_layer(spec, frame, data.channels) for _ in range(2))
+                same = one is two is None or (one is not None and two is not None and torch.equal(one, two))
+                t.require(same, f"layer {spec.name!r} of view {view.name}", "other values the second time", "the same")
+    except ReturnError as error:  # it says what was found and what was expected
+        raise ConformanceError(f"task {task.name!r}: {t.check}: {error}") from error
+    changed = [name for name, value in model.params.items() if not torch.equal(value, before[name])]
+    t.require(not changed, "diagnose or layers", f"parameters {', '.join(changed)} changed", "the model as it was")
+    for view in orbit:
+        missing = [spec.name for spec in task.conditions if spec.name not in view.conditions]
+        t.require(not missing, f"orbit: view {view.name}", f"no {', '.join(missing)}", "every condition of the task")
+
+
+def check_channels(t: TaskUnderTest) -> None:
+    """A colour built for grey images has one channel and for five bands five, or ``build`` refuses such data."""
+    if t.task.example is not None or t.task.channels:
+        return  # only the task knows what data of other channels would look like, or there are no others
+    subjects = {count: t.with_channels(count) for count in (1, 5)}
+    declared = {}
+    for count, other in subjects.items():
+        try:
+            declared[count] = other.build_fields()[1].channels
+        except (NeuprimError, ValueError):  # refused
+            continue
+    if len(declared) == len(subjects) and len(set(declared.values())) == 1:
+        return  # a fixed number, which the renderer compares with every background
+    for count, found in declared.items():
+        data = f"with data of {count} channel{'s' * (count > 1)}"
+        t.require(found == count, f"colour.channels {data}", found, count)
+        other = subjects[count]
+        view = other.views[0]
+        try:
+            render(other.perturbed_model(torch.float32), view.camera, view.conditions, other.settings.renderer)
+        except FormError as error:
+            raise FormError(f"{data}: {error}") from error
+        for _ in other.trainer(2).run():
+            pass
+
+
+# ---------------------------------------------------------------- conditions
+
+
+def check_conditions(t: TaskUnderTest) -> None:
+    """Each condition parses text and refuses nonsense, any value in its range draws, and a missing one is refused."""
+    model = t.perturbed_model(torch.float32)
+    view = t.views[0]
+    for spec in t.task.conditions:
+        where = f"condition {spec.name!r}"
+        t.require(spec.name.isidentifier(), where, repr(spec.name), "letters, digits and _, as it becomes a flag")
+        _check_parsing(t, spec, where)
+        generator = torch.Generator().manual_seed(9)
+        ends = [torch.full(spec.shape, float(end)) for end in spec.range]
+        for value in (*ends, random_condition(spec, generator)):
+            t.draw(f"{where} = {value.tolist()}", model, _with_condition(view, spec, value))
+        others = {name: value for name, value in view.conditions.items() if name != spec.name}
+        try:
+            render(model, view.camera, others, t.settings.renderer)
+        except (KeyError, NeuprimError) as error:
+            t.require(spec.name in str(error), f"message without {where}", repr(str(error)), "one that names it")
+            continue
+        values = [random_condition(spec, generator) for _ in range(2)]
+        images = [t.draw(where, model, _with_condition(view, spec, value)) for value in values]
+        t.require(torch.equal(*images), f"a frame without {where}", "it was drawn", "KeyError or ConfigError")
+
+
+def _with_condition(view: View, spec: ConditionSpec, value: Tensor) -> View:
+    return replace(view, conditions={**view.conditions, spec.name: value})
+
+
+def _check_parsing(t: TaskUnderTest, spec: ConditionSpec, where: str) -> None:
+    low, high = drawn_range(spec)
+    expected = torch.full(spec.shape, low + 0.25 * (high - low))
+    text = ",".join(f"{x:g}" for x in expected.flatten().tolist())
+    values = spec.parse(text)
+    fits = len(values) >= 1 and all(tuple(value.shape) == spec.shape for value in values)
+    shapes = [tuple(value.shape) for value in values]
+    t.require(fits, f"{where}: parse({text!r})", f"shapes {shapes}", f"frames of shape {spec.shape}")
+    near = torch.allclose(values[0].float(), expected, rtol=1e-4, atol=1e-6)
+    t.require(near, f"{where}: parse({text!r})", values[0].tolist(), expected.tolist())
+    if spec.sweep:
+        count = len(spec.parse(spec.sweep))
+        t.require(count > 1, f"{where}: frames of its sweep {spec.sweep!r}", count, "two or more, an animation")
+    try:
+        spec.parse("no such value")
+    except NeuprimError:
+        return
+    t.require(False, f"{where}: parse('no such value')", "it was accepted", "ConfigError")
+
+
+# ---------------------------------------------------------------- extremes
+
+_EXTREME_SCALES = {
+    "tiny primitives": (-14.0, -14.0, -14.0),
+    "huge primitives": (9.0, 9.0, 9.0),
+    "needles": (0.0, -9.0, -9.0),
+    "discs": (0.0, 0.0, -9.0),
+}
+"""What is added to the logarithms of the semi-axes."""
+
+
+def check_extremes(t: TaskUnderTest) -> None:
+    """Colours and gradients stay finite for huge, tiny and needle-like primitives, an inner camera, and no density."""
+    for name in (*_EXTREME_SCALES, "a camera inside a primitive", "no density"):
+        model, view = t.perturbed_model(torch.float32), t.views[0]
+        if name in _EXTREME_SCALES:
+            model.params["log_scales"] = model.params["log_scales"] + torch.tensor(_EXTREME_SCALES[name])
+        elif name == "no density":
+            model.params.update(model.density.scale_density(model.of(model.density), torch.zeros(model.count)))
+        else:
+            pose = view.camera.viewmat.double().clone()
+            pose[:3, 3] = -pose[:3, :3] @ model.params["means"][0].double()
+            view = replace(view, camera=replace(view.camera, viewmat=pose))
+        params = leaf_parameters(model)
+        rgb = t.draw(name, model, view)
+        if rgb.requires_grad:
+            rgb.sum().backward()
+        for parameter, value in params.items():
+            t.require_finite(f"{t.lower_method(parameter)}gradient of {parameter}, {name}", value.grad)
+
+
+_STEPS = 4  # before the checkpoint and again after it; the population changes twice in each half
+
+
+def _supervision(t: TaskUnderTest, index: int) -> Supervision:
+    pixels = t.dataset.train.pixels(index)
+    return Supervision(t.dataset.train.view(index), pixels.mask, pixels.alpha)
+
+
+def check_loss(t: TaskUnderTest) -> None:
+    """The loss is one finite number with a finite gradient, least where image and truth agree, also under a mask."""
+    loss = t.task.loss(loss_settings(t.task, t.settings.train, t.options))
+    frame = _supervision(t, 0)
+    truth = t.dataset.train.pixels(0).over(t.dataset.background)
+    off = (truth + 0.2 * torch.rand(truth.shape, generator=torch.Generator().manual_seed(2))).requires_grad_()
+    value, parts = loss(off, truth, frame)
+    check_loss_returns(value, parts, off)
+    t.require(math.isfinite(value.item()), "loss", value.item(), "a finite number")
+    value.backward()
+    t.require_finite("gradient of the loss", off.grad)
+    t.require(off.grad is not None and bool(off.grad.any()), "gradient of the loss", "none or zero", "another one")
+    mask = torch.zeros(truth.shape[:2], dtype=torch.bool)
+    mask[: max(1, len(mask) // 2)] = True
+    masked = torch.where(mask[..., None], off.detach(), truth).requires_grad_()
+    part = loss(masked, truth, replace(frame, mask=mask))[0].item()
+    t.require(math.isfinite(part), "loss of a frame with a mask", part, "a finite number")
+    least = loss(truth.clone().requires_grad_(), truth, frame)[0].item()
+    t.require(least < value.item(), "loss of the truth itself", f"{least:g}", f"less than {value.item():g}")
+
+
+def check_resume(t: TaskUnderTest) -> None:
+    """2N steps equal N steps, a checkpoint on disk and N more steps, bit for bit."""
+    whole, first, second = (t.trainer(2 * _STEPS) for _ in range(3))
+    for _ in range(2 * _STEPS):
+        whole.train_step()
+    for _ in range(_STEPS):
+        first.train_step()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "checkpoint.safetensors"
+        tensors, header = first.state()
+        checkpoint.write(path, "checkpoint", tensors, {"task": t.task.name, **header})
+        header, tensors = checkpoint.read(path, "checkpoint")
+        second.load_state(tensors, header, str(path))
+    for _ in range(_STEPS):
+        second.train_step()
+    expected, found = whole.state()[0], second.state()[0]
+    where = f"{2 * _STEPS} steps against {_STEPS} + resume + {_STEPS}"
+    t.require(set(expected) == set(found), where, f"tensors {sorted(set(expected) ^ set(found))} in one", "the same")
+    _require_equal(t, where, expected, found)
+
+
+def _require_equal(t: TaskUnderTest, where: str, a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
+    for name, value in a.items():
+        same = value.shape == b[name].shape and torch.equal(value, b[name])
+        t.require(same, f"{where}: {name}", "different values", "equal bits")
+
+
+def check_save_load(t: TaskUnderTest) -> None:
+    """A model comes back from its files with the same bits and picture; compressing it again changes nothing more."""
+    model = t.perturbed_model(torch.float32)
+    canonical = canonicalize(model)
+    with tempfile.TemporaryDirectory() as folder, torch.no_grad():
+        path = Path(folder) / "model.safetensors"
+        checkpoint.save_model(path, model, t.task.name, {})
+        loaded = checkpoint.load_model(path, t.task)[0]
+        _require_equal(t, "after loading", model.params, loaded.params)
+        _require_equal(t, "after folding twice", canonical.params, canonicalize(canonical).params)
+        for view in t.views[:3]:
+            image = t.draw("saved", model, view)
+            for where, other, tolerance in (("loading", loaded, 0.0), ("folding", canonical, 1e-4)):
+                change = float((t.draw(where, other, view) - image).abs().max())
+                t.require(
+                    change <= tolerance, f"view {view.name} after {where}", f"a change of {change:.3g}", tolerance
+                )
+        _require_foreign_refused(t, path)
+        stored = [canonical.params]
+        for _ in range(2):
+            again = Primitives(model.density, model.colour, stored[-1])
+            checkpoint.save_compressed(Path(folder) / "model.neuprim", again, t.task.name, {}, LEVELS[1])
+            stored.append(checkpoint.load_model(Path(folder) / "model.neuprim", t.task)[0].params)
+        _require_equal(t, "compressed twice", stored[1], stored[2])
+
+
+def _require_foreign_refused(t: TaskUnderTest, path: Path) -> None:
+    header, tensors = checkpoint.read(path, "model")
+    rest = {key: value for key, value in header.items() if key not in ("format", "kind")}
+    for kind in ("density", "colour"):
+        settings = {**header[kind]["settings"], "no_such_setting": 1}
+        other = path.with_name("other.safetensors")
+        checkpoint.write(other, "model", tensors, {**rest, kind: {**header[kind], "settings": settings}})
+        try:
+            checkpoint.load_model(other, t.task)
+        except CheckpointError:
+            continue
+        t.require(False, f"{header[kind]['class']}(no_such_setting=1) of a file", "it was loaded", "CheckpointError")

@@ -1,0 +1,237 @@
+"""The task that the checks examine, and what they build from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.config import RunSettings, preset_settings, task_choices
+from neuprim.core.cameras import Camera, look_at
+from neuprim.core.data import Dataset, Pixels, PointCloud, View, ViewSet, camera_extent
+from neuprim.core.errors import NonFiniteError
+from neuprim.core.model.fields import ColourField, ConditionSpec, Constant, Cosine, DensityField
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Lowered, Primitives
+from neuprim.core.model.schema import ParameterSpec
+from neuprim.core.render import RenderSettings, render, render_lowered
+from neuprim.core.render.backends import REFERENCE
+from neuprim.core.task import TaskSpec
+from neuprim.core.train.initial_model import initial_model
+from neuprim.core.train.settings import PopulationSettings, TrainSettings
+from neuprim.core.train.trainer import Trainer
+from neuprim.core.used_settings import build_settings, loss_settings
+
+PRIMITIVES = 12
+EXACT = RenderSettings(backend=REFERENCE, alpha_max=0.9999, alpha_min=0.0, transmittance_min=0.0, depth_floor=1e-12)
+"""Render settings that skip nothing and clamp only what must be clamped."""
+
+
+class ConformanceError(AssertionError):
+    """A task does not do what the framework relies on; names task, check, place, what was found and expected."""
+
+
+class TaskUnderTest:
+    """One task with one choice of settings.
+
+    Args:
+        check: name of the check, for messages.
+        preset: whose model settings are used; None is the task's default.
+        model: changes to them by name, e.g. ``{"density": {"form": "gaussian"}}``.
+    """
+
+    def __init__(
+        self, task: TaskSpec, check: str = "", preset: str | None = None, model: Mapping[str, Any] | None = None
+    ) -> None:
+        self.task, self.check, self.preset, self.changes = task, check, preset, dict(model or {})
+
+    def named(self, check: str) -> TaskUnderTest:
+        """Return the same for another check; what was read from files is shared."""
+        other = copy(self)
+        other.check = check
+        return other
+
+    def with_channels(self, channels: int) -> TaskUnderTest:
+        """Return the same with a synthetic data set of this number of colour channels."""
+        other = copy(self)
+        other.dataset = synthetic_dataset(self.task.conditions, channels)
+        return other
+
+    def require(self, ok: bool, where: str, found: object, expected: object) -> None:
+        """Raise :class:`ConformanceError` unless ``ok``."""
+        if not ok:
+            raise ConformanceError(
+                f"task {self.task.name!r}: {self.check}: {where}: found {found}; expected {expected}"
+            )
+
+    def require_finite(self, where: str, value: Tensor | None) -> None:
+        """Raise :class:`ConformanceError` for NaN or infinity."""
+        ok = value is None or bool(torch.isfinite(value).all())
+        self.require(ok, where, "NaN or infinity", "finite numbers")
+
+    def draw(self, where: str, model: Primitives, view: View) -> Tensor:
+        """Draw (H, W, C) colours of a view, which must be finite."""
+        try:
+            rgb = render(model, view.camera, view.conditions, self.settings.renderer).rgb
+        except NonFiniteError as error:
+            raise ConformanceError(f"task {self.task.name!r}: {self.check}: {where}: found {error}") from error
+        self.require_finite(f"{where}: image", rgb)
+        return rgb
+
+    @cached_property
+    def settings(self) -> RunSettings:
+        """The preset's settings with a few primitives and the reference backend."""
+        choice = task_choices(self.task)
+        found = preset_settings(self.task, self.preset or choice.preset, choice.scene)
+        model = replace(found.model, **{"primitives": PRIMITIVES, **self.changes})
+        return replace(found, model=model, renderer=RenderSettings(backend=REFERENCE))
+
+    @cached_property
+    def options(self) -> dict[str, Any]:
+        """The task's own options at their defaults."""
+        return task_choices(self.task).options
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """The task's own example, or a synthetic one with the conditions and channels that it declares."""
+        if self.task.example is not None:
+            return self.task.example()
+        return synthetic_dataset(self.task.conditions, len(self.task.channels) or 3)
+
+    @property
+    def views(self) -> list[View]:
+        """The training views."""
+        return [self.dataset.train.view(i) for i in range(len(self.dataset.train))]
+
+    def build_fields(self) -> tuple[DensityField, ColourField]:
+        """Build fresh fields."""
+        return self.task.build(build_settings(self.task, self.settings.model, self.options), self.dataset)
+
+    def parameter_specs(self) -> list[tuple[str, ParameterSpec]]:
+        """List ("density" or "colour", spec) of every parameter other than the geometry's."""
+        density, colour = self.build_fields()
+        return [*(("density", s) for s in density.parameters()), *(("colour", s) for s in colour.parameters())]
+
+    def lower_method(self, parameter: str) -> str:
+        """Return e.g. ``"density.lower: "``, the method through which the image depends on a parameter."""
+        kind = next((kind for kind, spec in self.parameter_specs() if spec.name == parameter), None)
+        return "" if kind is None else f"{kind}.lower: "
+
+    def initial_model(self, seed: int = 0) -> Primitives:
+        """Return a model as a run starts with."""
+        density, colour = self.build_fields()
+        return initial_model(density, colour, self.dataset, self.settings.model, seed)
+
+    def perturbed_model(self, dtype: torch.dtype = torch.float64) -> Primitives:
+        """Return a model whose parameters differ enough that nothing is zero or equal by chance."""
+        model = self.initial_model()
+        generator = torch.Generator().manual_seed(11)
+        for name, value in model.params.items():
+            typical = float(value.abs().mean()) if value.numel() else 1.0
+            strength = {"quats": 0.3, "log_scales": 0.2}.get(name, 0.05 * max(1.0, typical))
+            model.params[name] = (value + strength * torch.randn(value.shape, generator=generator)).to(dtype)
+        for field in (model.density, model.colour):
+            field.set_progress(1.0)
+        return model
+
+    def trainer(self, iterations: int) -> Trainer:
+        """Return a trainer of a fresh model whose population changes every second step."""
+        model, train = self.initial_model(), self.settings.train
+        population = PopulationSettings(strategy="relocate", every=2, start=0.0, stop=1.0, fraction=0.2)
+        rates = {name: rate for name, rate in train.rates.items() if name in model.params}
+        units = {name: unit for name, unit in train.rate_units.items() if name in model.params}
+        short = TrainSettings(
+            iterations=iterations, rates=rates, rate_units=units, ssim_weight=train.ssim_weight, population=population
+        )
+        loss = self.task.loss(loss_settings(self.task, short, self.options))
+        return Trainer(model, self.dataset, loss, short, self.settings.renderer, 0)
+
+
+# ---------------------------------------------------------------- synthetic data
+
+_WIDTH, _HEIGHT = 10, 9  # smaller than the window of SSIM, which is then skipped
+_DISTANCE = 2.5
+_NEAR_ZERO = 3.0
+
+
+def drawn_range(spec: ConditionSpec) -> tuple[float, float]:
+    """Return the part of a condition's range that checks draw from: at most 3 from zero if the range allows it."""
+    low, high = max(spec.range[0], -_NEAR_ZERO), min(spec.range[1], _NEAR_ZERO)
+    return (low, high) if low < high else spec.range
+
+
+def random_condition(spec: ConditionSpec, generator: torch.Generator, shape: tuple[int, ...] | None = None) -> Tensor:
+    """Draw a float32 value of the condition's shape, uniform in :func:`drawn_range`."""
+    low, high = drawn_range(spec)
+    return low + (high - low) * torch.rand(spec.shape if shape is None else shape, generator=generator)
+
+
+class _Views(ViewSet):
+    def __init__(self, views: list[View], channels: int) -> None:
+        settings = RenderSettings(backend=REFERENCE)
+        frames = [render_lowered(_ellipsoids(channels), view.camera, settings) for view in views]
+        self.views, self.images = views, [Pixels(frame.rgb, frame.alpha) for frame in frames]
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def view(self, index: int) -> View:
+        return self.views[index]
+
+    def pixels(self, index: int) -> Pixels:
+        return self.images[index]
+
+
+def synthetic_dataset(conditions: tuple[ConditionSpec, ...], channels: int = 3) -> Dataset:
+    """Make six training and two test views, 10 x 9 pixels, sRGB, of ellipsoids of constant density on grey.
+
+    The conditions have random values, which the images do not depend on.
+    """
+    generator = torch.Generator().manual_seed(7)
+    cameras = [_ring_camera(1.1 * i, 0.6 * math.sin(2.0 * i)) for i in range(8)]
+    views = [
+        View(f"{'train' if i < 6 else 'test'}{i % 6}", c, {s.name: random_condition(s, generator) for s in conditions})
+        for i, c in enumerate(cameras)
+    ]
+
+    def start(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
+        means = 1.4 * (torch.rand(count, 3, generator=generator) - 0.5)
+        colours = 0.2 + 0.6 * torch.rand(count, channels, generator=generator)
+        scalars = [spec for spec in conditions if spec.shape == ()]
+        return PointCloud(means, colours, {spec.name: random_condition(spec, generator, (count,)) for spec in scalars})
+
+    return Dataset(
+        name="conformance example",
+        train=_Views(views[:6], channels),
+        test=_Views(views[6:], channels),
+        start=start,
+        extent=camera_extent(cameras[:6]),
+        background=torch.full((channels,), 0.3),
+        channels=channels,
+        data_source="generated",
+        bounds=torch.tensor([[-0.8] * 3, [0.8] * 3]),
+    )
+
+
+def _ring_camera(angle: float, height: float) -> Camera:
+    eye = _DISTANCE * torch.tensor([math.cos(angle), math.sin(angle), height], dtype=torch.float64)
+    focal = 0.5 * _WIDTH / math.tan(0.35)
+    pose = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    return Camera(pose, focal, focal, _WIDTH / 2, _HEIGHT / 2, _WIDTH, _HEIGHT)
+
+
+def _ellipsoids(channels: int) -> Lowered:
+    geometry = Geometry(
+        torch.tensor([[-0.35, 0.0, 0.0], [0.4, 0.1, 0.05], [0.0, -0.2, 0.4]]),
+        torch.tensor([[0.4, 0.25, 0.3], [0.3, 0.35, 0.25], [0.2, 0.3, 0.2]]).log(),
+        torch.tensor([[1.0, 0.1, 0.2, 0.0], [0.9, 0.0, -0.3, 0.2], [1.0, 0.0, 0.0, 0.0]]),
+    )
+    constant = Cosine(torch.zeros(3, 0, 3), torch.zeros(3, 0), torch.zeros(3, 0), torch.tensor([[2.5], [2.0], [1.5]]))
+    colours = torch.tensor([[0.9, 0.15, 0.1], [0.1, 0.3, 0.85], [0.2, 0.7, 0.3]])
+    return Lowered(geometry, constant, Constant(colours[:, torch.arange(channels) % 3]))

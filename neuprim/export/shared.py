@@ -1,0 +1,166 @@
+"""What several formats need of a model: its colours as harmonics, its box, and cameras to compare images from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera, look_at, orbit
+from neuprim.core.data import View
+from neuprim.core.errors import ConfigError, NeuprimError
+from neuprim.core.extensions import ExportJob, TrainedModel
+from neuprim.core.model.colours import sh
+from neuprim.core.model.fields import Conditions
+
+_DEGREE = 3
+_DIRECTIONS = 64
+_VIEWS, _SIZE = 8, 160
+
+
+class Harmonics:
+    """Colours max(0, SH(direction) + 1/2) of the primitives that are active under some conditions.
+
+    Attributes:
+        dc: (M, C), rest: (M, 15, C) float64 coefficients in the order and signs of 3D Gaussian splatting.
+        residual: RMS error of the fit over directions and primitives; 0.0 if the model's colours are harmonics.
+    """
+
+    def __init__(self, dc: Tensor, rest: Tensor | None, residual: float) -> None:
+        bands = sh.coefficient_count(_DEGREE) - 1
+        full = torch.zeros(len(dc), bands, dc.shape[1], dtype=torch.float64)
+        if rest is not None:
+            full[:, : rest.shape[1]] = rest
+        self.dc, self.rest, self.residual = dc.double(), full, residual
+
+    def evaluate(self, rows: Tensor, directions: Tensor) -> Tensor:
+        """Return (P, C) colours of primitives ``rows`` (P,) along unit ``directions`` (P, 3), camera to primitive."""
+        basis = sh.basis(directions.double(), _DEGREE)
+        mixed = basis[:, :1] * self.dc[rows] + (basis[:, 1:, None] * self.rest[rows]).sum(1)
+        return (mixed + 0.5).clamp_min(0.0)
+
+    def rotate(self, rotation: Tensor | None) -> Harmonics:
+        """Return the same colours on axes rotated by ``rotation`` (3, 3). This is exact, band by band."""
+        if rotation is None:
+            return self
+        directions = fibonacci_sphere(_DIRECTIONS)
+        after, before = (sh.basis(d, _DEGREE)[:, 1:] for d in (directions @ rotation.T, directions))
+        return Harmonics(
+            self.dc, torch.einsum("bk,nkc->nbc", torch.linalg.pinv(after) @ before, self.rest), self.residual
+        )
+
+    def select_channels(self, channels: tuple[int, ...]) -> Harmonics:
+        """Return the same with these channels only, in this order."""
+        index = list(channels)
+        return Harmonics(self.dc[:, index], self.rest[:, :, index], self.residual)
+
+
+def find_rgb_channels(run: TrainedModel, hint: str = "") -> tuple[int, int, int]:
+    """Find which of the model's channels are red, green and blue; a grey one is all three.
+
+    Raises:
+        ConfigError: there are none; ``hint`` says what else the format would take.
+    """
+    channels = run.channels
+    if channels.rgb is None:
+        raise ConfigError(
+            f"{run.directory}: {channels.count} channels, {channels.listed}; this format has red, green and "
+            f"blue{hint}; "
+            "--format ply and npz hold all channels"
+        )
+    return channels.rgb
+
+
+def fit_harmonics(run: TrainedModel, conditions: Conditions) -> Harmonics:
+    """Return a model's colours under some conditions as harmonics.
+
+    They are exact if the colour field is made of harmonics. Else degree 3 is fitted by least squares to the colours at
+    the primitives' centres, seen from 64 directions far away.
+
+    Raises:
+        ConfigError: the colours have no value per primitive.
+    """
+    model = run.model
+    with torch.no_grad():
+        params = model.active(conditions).params
+        exact = model.colour.harmonics({spec.name: params[spec.name] for spec in model.colour.parameters()}, conditions)
+        if exact is not None:
+            return Harmonics(exact[0], exact[1], 0.0)
+        directions = fibonacci_sphere(_DIRECTIONS)
+        seen = torch.stack([_from_afar(run, conditions, d) for d in directions], 1)  # (M, V, C)
+        basis = sh.basis(directions, _DEGREE)
+        fitted = torch.einsum("bv,nvc->nbc", torch.linalg.pinv(basis), seen - 0.5)
+        residual = float((torch.einsum("vb,nbc->nvc", basis, fitted) + 0.5 - seen).square().mean().sqrt())
+        return Harmonics(fitted[:, 0], fitted[:, 1:], residual)
+
+
+def _from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> Tensor:
+    """Return (M, C) float64 colours at the primitives' centres, all seen along one direction."""
+    means = run.model.params["means"].double()
+    middle = means.mean(0)
+    reach = float((means - middle).norm(dim=-1).max()) + 1.0
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    camera = Camera(look_at(middle - 1e4 * reach * direction, middle, up), 1e4, 1e4, 32, 32, 64, 64)
+    lowered = run.model.lower(camera, conditions, run.settings)
+    if not lowered.colour.per_primitive:
+        raise ConfigError(
+            f"{run.directory}: colours of the form {type(lowered.colour).__name__} have no value per primitive"
+        )
+    return lowered.center_colors(camera.position).double()
+
+
+def fibonacci_sphere(count: int) -> Tensor:
+    """Return (count, 3) float64 unit vectors spread evenly (a Fibonacci lattice)."""
+    i = torch.arange(count, dtype=torch.float64)
+    z = 1 - (2 * i + 1) / count
+    turn = i * math.pi * (3 - math.sqrt(5))
+    r = (1 - z * z).sqrt()
+    return torch.stack([r * turn.cos(), r * turn.sin(), z], -1)
+
+
+def choose_comparison_views(job: ExportJob, which: str, conditions: Conditions) -> tuple[list[View], str]:
+    """Choose at most eight views under the given conditions, and say what they are.
+
+    Args:
+        which: "test" cameras of the scene, an "orbit" of the model, or "auto": test cameras for models without
+            conditions, whose scenes load quickly.
+    """
+    if which == "test" or (which == "auto" and not job.run.task.conditions):
+        try:
+            views = job.run.dataset().test
+            picks = sorted({round(i * (len(views) - 1) / (_VIEWS - 1)) for i in range(_VIEWS)})
+            return [replace(views.view(i), conditions=conditions) for i in picks], f"{len(picks)} test views"
+        except NeuprimError:
+            if which == "test":
+                raise
+    with torch.no_grad():
+        geometry, _ = job.run.model.lower_density(conditions)
+    means = geometry.means.double()
+    low, high = (torch.quantile(means[:100_000], q, dim=0) for q in (0.02, 0.98))
+    middle, reach = (low + high) / 2, float((high - low).norm()) / 2 + float(geometry.scales.median())
+    focal = 0.5 * _SIZE / math.tan(math.radians(20))
+    template = Camera(torch.eye(4, dtype=torch.float64), focal, focal, _SIZE / 2, _SIZE / 2, _SIZE, _SIZE)
+    cameras = orbit(template, middle, torch.tensor([0.0, 0.0, 1.0]), 3.0 * reach, math.radians(25), _VIEWS)
+    return [View(f"orbit_{i}", c, conditions) for i, c in enumerate(cameras)], f"{_VIEWS} orbit views"
+
+
+def ellipsoid_box(job: ExportJob, frames: Sequence[Conditions]) -> tuple[Tensor, Tensor]:
+    """Return lower and upper corner (3,) float64 of a box around the ellipsoids of all frames, scene units.
+
+    Raises:
+        ConfigError: no primitive is active in any of them.
+    """
+    lows, highs = [], []
+    with torch.no_grad():
+        for conditions in frames:
+            geometry, _ = job.run.model.lower_density(conditions)
+            if geometry.count:
+                reach = (geometry.rotations.double() * geometry.scales.double()[:, None, :]).norm(dim=-1)
+                lows.append((geometry.means.double() - reach).min(0).values)
+                highs.append((geometry.means.double() + reach).max(0).values)
+    if not lows:
+        raise ConfigError(f"{job.run.directory}: no primitive is there under these conditions; nothing to export")
+    return torch.stack(lows).min(0).values, torch.stack(highs).max(0).values

@@ -1,0 +1,195 @@
+"""`neuprim export --format vdb`: voxels where the primitives are, in the units and on the voxels of the source."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neuprim.core.compute import device
+from neuprim.core.errors import ConfigError
+from neuprim.core.io.vdb import Grid, read_grid
+from neuprim.core.volumes.density_errors import NUMBERS
+from neuprim.core.volumes.grid import density_grid
+from neuprim.export import vdb as exporter
+from neuprim.runs.export import export_run
+from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.open import open_run
+from tests.core.io.vdb.openvdb_oracle import compare, other_python
+from tests.plugins import marked
+from tests.pretend_card import CARD, pretended
+
+
+def centre_of(grid: Grid, near: tuple[float, float, float], radius: float) -> np.ndarray:
+    """World position of the middle of what lies within ``radius`` of a place."""
+    assert grid.bounds is not None
+    dense, low = grid.to_dense(), np.array(grid.bounds[0])
+    where = np.argwhere(dense > 0)
+    world = (where + low) @ grid.transform[:3, :3].T + grid.transform[:3, 3]
+    close = np.linalg.norm(world - near, axis=1) < radius
+    assert close.any()
+    result: np.ndarray = world[close].mean(0)
+    return result
+
+
+@pytest.fixture(scope="module")
+def static(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return marked.static_run(tmp_path_factory.mktemp("runs") / "static")
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    return marked.dynamic_run(folder / "moving", marked.write_sequence(folder / "files"))
+
+
+def test_each_ball_is_where_it_belongs(static: Path, tmp_path: Path) -> None:
+    report = export_run(static, "vdb", tmp_path / "d.vdb", ["grid=160"])
+    grid = read_grid(report.files[0], "density")
+    assert not report.lossless and report.errors == {}
+    for place, radius in zip(marked.PLACES.tolist(), marked.RADII.tolist(), strict=True):
+        assert np.linalg.norm(centre_of(grid, tuple(place), radius + 0.03) - place) < 0.01
+    assert float(grid.background) == 0 and grid.metadata["neuprim_units"] == "world"
+    assert grid.active_voxels < 0.1 * np.prod([h - l for l, h in zip(*grid.bounds, strict=True)])
+
+
+def test_values_are_sigma_at_the_centres(static: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exporter, "_SLAB_BYTES", 4 * 8 * 64 * 16)  # many slabs
+    grid = read_grid(
+        export_run(static, "vdb", tmp_path / "d.vdb", ["voxel_size=0.04", "threshold=1"]).files[0], "density"
+    )
+    low, high = grid.bounds or ((0,) * 3, (0,) * 3)
+    matrix = np.array(grid.transform)
+    assert np.array_equal(matrix, np.diag([0.04, 0.04, 0.04, 1]))
+    matrix[:3, 3] += matrix[:3, :3] @ np.array(low)
+    shape = tuple(h - l for l, h in zip(low, high, strict=True))
+    expected = density_grid(open_run(static).model, {}, torch.from_numpy(matrix), shape).numpy()  # type: ignore[arg-type]
+    expected[expected < 1] = 0
+    assert expected.max() > 10 and np.allclose(grid.to_dense(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_sequence_lies_on_the_voxels_of_its_files_and_in_their_units(moving: Path, tmp_path: Path) -> None:
+    report = export_run(moving, "vdb", tmp_path / "frames")
+    assert [p.name for p in report.files] == ["density_0003.vdb", "density_0004.vdb", "density_0005.vdb"]
+    run = open_run(moving)
+    source = run.volume()
+    assert source is not None
+    world_from_scene = np.linalg.inv(source.placement.scene_from_world)
+    for i, path in enumerate(report.files):
+        grid = read_grid(path, "density")
+        assert np.allclose(grid.transform[:3, 3], marked.WORLD_SHIFT) and grid.voxel_size == (marked.WORLD_VOXEL,) * 3
+        assert grid.metadata["neuprim_units"] == "source" and grid.metadata["neuprim_time"] == pytest.approx(i / 2)
+        geometry, _ = run.model.lower_density({"time": torch.tensor(i / 2)})
+        first = world_from_scene[:3, :3] @ geometry.means[0].numpy() + world_from_scene[:3, 3]
+        index = np.rint((first - marked.WORLD_SHIFT) / marked.WORLD_VOXEL).astype(int)
+        place = torch.from_numpy(source.placement.scene_from_world @ grid.transform)
+        place[:3, 3] += place[:3, :3] @ torch.from_numpy(index).double()
+        sigma = float(density_grid(run.model, {"time": torch.tensor(i / 2)}, place, (1, 1, 1)))
+        value = float(grid.to_dense((tuple(index), tuple(index + 1)))[0, 0, 0])  # type: ignore[arg-type]
+        assert value > 0 and value * source.placement.sigma_per_unit == pytest.approx(sigma, rel=1e-4)
+
+
+def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Path) -> None:
+    from neuprim.tasks.dynamic.volume.ground_truth import compare_extinction
+
+    report = export_run(moving, "vdb", tmp_path / "frames")
+    run = open_run(moving)
+    expected = compare_extinction(run.model, run.volume().capture, [0.0, 0.5, 1.0])["sigma_frames"]  # type: ignore[union-attr]
+    assert len(expected) == 3
+    for entry in expected:
+        name = f"frame_{entry['frame']:04d}"
+        assert {key: report.errors[f"{name}.{key}"] for key in NUMBERS} == {key: entry[key] for key in NUMBERS}
+        # on the very voxels of the file: missing in it is what is faint, above the source's peak or outside its bounds
+        assert report.errors[f"{name}.file_relative_l2"] <= entry["relative_l2"] + 1e-3
+        assert report.errors[f"{name}.file_max_error"] <= entry["max_error"] + 1e-3
+
+
+def test_extinction_is_computed_where_the_run_draws(
+    moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The model's and the files', exported and looked into; the numbers are the processor's."""
+    own = tmp_path / "run"
+    shutil.copytree(moving, own)
+    config = (own / "config.yaml").read_text()
+    assert "backend: reference" in config
+    (own / "config.yaml").write_text(config.replace("backend: reference", "backend: auto"))
+    export_run(moving, "vdb", tmp_path / "own", ["time=0.5", "grid=24"])
+    asked: list[torch.device] = []
+    with pretended(monkeypatch):
+        monkeypatch.setattr(device, "has_warp", lambda where: bool(asked.append(where)))
+        export_run(own, "vdb", tmp_path / "there", ["time=0.5", "grid=24"])
+        assert len(asked) >= 2 and set(asked) == {CARD}
+        asked.clear()
+        inspect_run(Request(own, ("volume",), {"time": "0.5"}, 16, against="scene", out=tmp_path / "seen.vdb"))
+        assert len(asked) >= 4 and set(asked) == {CARD}
+    (here,), (there,) = (list((tmp_path / name).iterdir()) for name in ("own", "there"))
+    assert np.array_equal(read_grid(here, "density").to_dense(), read_grid(there, "density").to_dense())
+
+
+def test_units_times_and_voxels_can_be_chosen(moving: Path, tmp_path: Path) -> None:
+    values = {}
+    for units in ("source", "world", "scene"):
+        report = export_run(moving, "vdb", tmp_path / units, ["time=0:1:5", f"units={units}", "grid=24", "name=smoke"])
+        assert [p.name for p in report.files] == [f"density_{i:04d}.vdb" for i in range(5)]
+        assert {k.split(".")[0] for k in report.errors} == {
+            "frame_0003",
+            "frame_0004",
+            "frame_0005",
+        }  # times 0, 1/2 and 1
+        grid = read_grid(report.files[2], "smoke")
+        assert grid.range is not None and grid.bounds is not None
+        values[units] = grid.range[1]
+    per_unit = open_run(moving).volume().placement.sigma_per_unit  # type: ignore[union-attr]
+    scale = open_run(moving).volume().placement.scene_from_world[0, 0]  # type: ignore[union-attr]
+    assert values["scene"] == pytest.approx(values["source"] * per_unit, rel=1e-5)
+    assert values["world"] == pytest.approx(values["scene"] * scale, rel=1e-5)
+    one = export_run(moving, "vdb", tmp_path / "one.vdb", ["time=0.5"])
+    assert one.files == (tmp_path / "one.vdb",)
+
+
+def test_without_the_files_the_header_still_places_it(tmp_path: Path) -> None:
+    files = marked.write_sequence(tmp_path / "files")
+    known = open_run(marked.dynamic_run(tmp_path / "a", files)).volume()
+    assert known is not None
+    run = marked.dynamic_run(tmp_path / "b", files, world=known.placement.to_json())
+    with_files = export_run(run, "vdb", tmp_path / "with", ["voxel_size=0.25"])
+    files.rename(tmp_path / "elsewhere")
+    without = export_run(run, "vdb", tmp_path / "without", ["voxel_size=0.25"])
+    assert without.errors == {} and any("cannot be read" in note for note in without.notes)
+    for a, b in zip(with_files.files, without.files, strict=True):
+        one, two = read_grid(a, "density"), read_grid(b, "density")
+        assert np.array_equal(one.transform, two.transform) and np.array_equal(one.to_dense(), two.to_dense())
+    bare = marked.dynamic_run(tmp_path / "c", files)
+    with pytest.raises(ConfigError, match="--time: required"):
+        export_run(bare, "vdb", tmp_path / "bare")
+    assert export_run(bare, "vdb", tmp_path / "bare", ["time=0.5"]).errors == {}
+
+
+def test_a_time_when_nothing_lives_is_an_empty_frame(tmp_path: Path) -> None:
+    run = marked.dynamic_run(tmp_path / "run", marked.write_sequence(tmp_path / "files"))
+    from safetensors.torch import load_file
+
+    from neuprim.core import checkpoint
+
+    tensors = load_file(run / "model.safetensors")
+    header = checkpoint.read_header(run / "model.safetensors", "model")
+    tensors["log_window"] -= 3.0
+    checkpoint.write(
+        run / "model.safetensors", "model", tensors, {k: v for k, v in header.items() if k not in ("format", "kind")}
+    )
+    report = export_run(run, "vdb", tmp_path / "frames")
+    assert (
+        read_grid(report.files[0], "density").active_voxels == 0
+        and read_grid(report.files[1], "density").active_voxels > 0
+    )
+
+
+@pytest.mark.slow
+def test_openvdb_itself_reads_it(moving: Path, tmp_path: Path) -> None:
+    python = other_python()
+    for path in export_run(moving, "vdb", tmp_path / "frames").files:
+        (grid,) = compare(python, path, tmp_path)  # values, active voxels, transform and metadata
+        assert grid.active_voxels > 50 and grid.name == "density"

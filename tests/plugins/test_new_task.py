@@ -1,0 +1,169 @@
+"""Whole third-party packages, installed with pip into a folder of their own and used from the command line; nothing is
+downloaded."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import neuprim
+from neuprim.cli import main
+from neuprim.conformance import CHECKS
+from neuprim.core.errors import ConfigError
+from neuprim.plugins.new_task import write_task_package
+from tests.systems import posix
+
+ROOT = Path(neuprim.__file__).parents[1]
+EXAMPLE = ROOT / "examples" / "neuprim-gaussian"
+
+
+def shell(words: list[str], cwd: Path, site: Path) -> str:
+    """Standard output and error of a command that must succeed, with the packages in ``site`` and this neuprim
+    importable."""
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)]), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        words, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout[-4000:]
+    return done.stdout
+
+
+def pip_install(source: Path, site: Path) -> None:
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "--disable-pip-version-check",
+        "--no-index",
+        "--no-build-isolation",
+        "--no-deps",
+    ]
+    shell([*pip, "--target", str(site), str(source)], source.parent, site)
+
+
+def neuprim_command(words: list[str], cwd: Path, site: Path) -> str:
+    return shell([sys.executable, "-m", "neuprim", *words], cwd, site)
+
+
+def passed(output: str) -> int:
+    return int(output.split(" passed")[0].split()[-1])
+
+
+@pytest.mark.timeout(900)
+def test_the_example_installs_and_trains(tmp_path: Path) -> None:
+    copy, site = tmp_path / "example", tmp_path / "site"
+    shutil.copytree(EXAMPLE, copy, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__"))
+    pip_install(copy, site)
+    shutil.rmtree(copy / "neuprim_gaussian")  # what runs now is what was installed
+    listed = neuprim_command(["tasks"], tmp_path, site)
+    assert "gaussian  (neuprim-gaussian 0.1.0)  A static scene of true Gaussian densities" in listed
+    assert "BROKEN" not in listed
+    small = [
+        "scene.size=16",
+        "scene.train_views=4",
+        "scene.test_views=1",
+        "scene.supersampling=1",
+        "model.primitives=40",
+    ]
+    neuprim_command(["run", "task=gaussian", *small, "train.iterations=5", "output_dir=r"], tmp_path, site)
+    header = (tmp_path / "r" / "model.safetensors").read_bytes()[:4000]
+    assert b"BellDensity" in header
+    assert json.loads((tmp_path / "r" / "metrics.json").read_text())["psnr"] > 5
+    assert "psnr" in neuprim_command(["eval", "r"], tmp_path, site)
+    assert re.search(r"log_kappa +[0-9]+ +160 ", neuprim_command(["compress", "r", "--steps", "5"], tmp_path, site))
+    assert re.search(
+        r"log_kappa +7 +160 ",
+        neuprim_command(["compress", "r", "--level", "3", "--steps", "5", "--force"], tmp_path, site),
+    )
+    (tmp_path / "r" / "model.safetensors").unlink()
+    assert "psnr" in neuprim_command(["eval", "r"], tmp_path, site)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_example_passes_its_own_tests(tmp_path: Path) -> None:
+    copy, site = tmp_path / "example", tmp_path / "site"
+    shutil.copytree(EXAMPLE, copy, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__"))
+    pip_install(copy, site)
+    shutil.rmtree(copy / "neuprim_gaussian")
+    assert passed(shell([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"], copy, site)) > 50
+
+
+@pytest.mark.timeout(900)
+def test_a_new_task_installs_trains_and_passes_its_tests(tmp_path: Path) -> None:
+    site, folder = tmp_path / "site", tmp_path / "mine"
+    printed = neuprim_command(["new-task", "wave", "--out", str(folder)], tmp_path, site)
+    assert "neuprim run task=wave" in printed
+    assert f"pytest {folder}" in printed
+    lines = [p.read_text().count("\n") for p in folder.rglob("*") if p.is_file()]
+    assert len(lines) >= 10 and sum(lines) < 200
+    pip_install(folder, site)
+    shutil.rmtree(folder / "neuprim_wave")
+    assert "wave  (neuprim-wave 0.1.0)" in neuprim_command(["tasks"], tmp_path, site)
+    small = [
+        "scene.size=16",
+        "scene.train_views=4",
+        "scene.test_views=1",
+        "model.primitives=30",
+        "renderer.backend=reference",
+    ]
+    neuprim_command(["run", "task=wave", *small, "train.iterations=5", "output_dir=r"], tmp_path, site)
+    assert (tmp_path / "r" / "report.html").is_file()
+    assert (
+        passed(shell([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], folder, site)) == len(CHECKS) + 1
+    )
+
+
+@pytest.mark.parametrize("name", ["", "Wave", "3d", "a-b", "a b", "../x", "class", "wäve", "a" * 41])
+def test_bad_names_write_nothing(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="lower-case letters, digits and _"):
+        write_task_package(name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_taken_name_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["new-task", "static"]) == 2
+    assert f"new-task static: neuprim {neuprim.__version__} already has a task of this name" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["folder", "file", pytest.param("link", marks=posix)])
+def test_nothing_that_exists_is_touched(kind: str, tmp_path: Path) -> None:
+    target = tmp_path / "there"
+    if kind == "folder":
+        target.mkdir()
+        (target / "precious").write_text("x")
+    elif kind == "file":
+        target.write_text("x")
+    else:
+        target.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match="there: exists; expected a folder to make"):
+        write_task_package("wave", target)
+    assert [p.name for p in tmp_path.iterdir()] == ["there"]
+    assert kind != "folder" or (target / "precious").read_text() == "x"
+
+
+def test_the_default_folder_is_named_after_the_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_task_package("two_words")
+    assert (
+        tmp_path / "neuprim-two-words" / "neuprim_two_words" / "conf" / "preset" / "two_words" / "quick.yaml"
+    ).is_file()
+    assert not [
+        p
+        for p in (tmp_path / "neuprim-two-words").rglob("*")
+        if "NAME" in p.name or "PACKAGE" in p.name or p.suffix == ".in"
+    ]

@@ -17,9 +17,7 @@ from neuprim.cli import (
     doctor_command,
     eval_command,
     export_command,
-    import_command,
     inspect_command,
-    new_task_command,
     prune_command,
     render_command,
     run_command,
@@ -37,25 +35,25 @@ from neuprim.version import __version__
 
 __all__ = ["COMMANDS", "main"]
 
-_MODULES = (
-    run_command,
-    truth_command,
-    eval_command,
-    render_command,
-    tradeoff_command,
-    export_command,
-    compress_command,
-    prune_command,
-    import_command,
-    inspect_command,
-    view_command,
-    vdb_command,
-    tasks_command,
-    new_task_command,
-    bench_command,
-    doctor_command,
+_LISTED = (
+    run_command.COMMAND,
+    truth_command.COMMAND,
+    eval_command.COMMAND,
+    render_command.COMMAND,
+    tradeoff_command.COMMAND,
+    export_command.COMMAND,
+    compress_command.COMMAND,
+    prune_command.COMMAND,
+    export_command.IMPORT_COMMAND,
+    inspect_command.COMMAND,
+    view_command.COMMAND,
+    vdb_command.COMMAND,
+    tasks_command.COMMAND,
+    tasks_command.NEW_TASK_COMMAND,
+    bench_command.COMMAND,
+    doctor_command.COMMAND,
 )
-COMMANDS = {module.COMMAND.name: module.COMMAND for module in _MODULES}
+COMMANDS = {command.name: command for command in _LISTED}
 """Every command by its name, in the order of ``neuprim --help``."""
 
 
@@ -84,7 +82,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(words: list[str]) -> int:
-    parser = _build_parser()
+    parser = Parser(prog="neuprim", description="Radiance fields made of splattable neural primitives.")
+    parser.add_argument("--version", action="version", version=f"neuprim {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    for command in _LISTED:
+        commands.add_parser(command.name, help=command.summary, add_help=False)
     if not words:
         parser.print_help()
         return 0
@@ -92,17 +94,7 @@ def _dispatch(words: list[str]) -> int:
         parser.parse_args(words)
     if words[0] not in COMMANDS:
         raise ConfigError(f"{words[0]}: no such command{nearest(words[0], COMMANDS)}")
-    command = COMMANDS[words[0]]
-    arguments = command.parse(words[1:])
+    chosen = COMMANDS[words[0]]
+    arguments = chosen.parse(words[1:])
     with trusting(getattr(arguments, "trust", False)):
-        return command.call(arguments)
-
-
-def _build_parser() -> Parser:
-    """Return the parser of a command line without a command: help and version."""
-    parser = Parser(prog="neuprim", description="Radiance fields made of splattable neural primitives.")
-    parser.add_argument("--version", action="version", version=f"neuprim {__version__}")
-    commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for command in COMMANDS.values():
-        commands.add_parser(command.name, help=command.summary, add_help=False)
-    return parser
+        return chosen.call(arguments)

@@ -15,11 +15,11 @@ from neuprim.core.errors import ConfigError
 if TYPE_CHECKING:
     from neuprim.runs.paper import Planned, Table
 
-__all__ = ["COMMAND", "parse_table_numbers"]
-
 _RULES = """\
 PSNR of floats; SSIM and LPIPS by the rule of 3DGS's tools (ssim_3dgs, lpips_3dgs; metrics.lpips=FILE has your weights
 of VGG)"""
+
+_MEASURES = ("PSNR", "SSIM", "LPIPS")
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,9 +51,12 @@ def _bench(args: argparse.Namespace) -> int:
     wanted = parse_table_numbers(args.tables)
     chosen = [table for table in tables() if wanted & set(table.numbers)]
     if args.data is None:
-        print(*_listing(chosen), sep="\n")
+        print(*_list_tables(chosen), sep="\n")
         return 0
-    scenes = dict(_named(word) for word in args.scenes.split(",")) if args.scenes else {}
+    scenes: dict[str, str] = {}
+    for text in args.scenes.split(",") if args.scenes else []:
+        name, _, folder = text.partition("=")
+        scenes[name.strip().lower()] = (folder or name).strip()
     rows = args.rows.split(",") if args.rows else []
     planned = plan(args.data, chosen, scenes, rows, args.budget, args.seeds, args.out, args.overrides)
     print(*_estimate(planned), sep="\n", flush=True)
@@ -63,51 +66,36 @@ def _bench(args: argparse.Namespace) -> int:
     for number, one in enumerate(planned, 1):
         print(f"[{number}/{len(planned)}] {one.config.output_dir}", flush=True)
         results.append((one, read_metrics(run_one(one.config, CommandLine(one.config.overrides)))))
-        print(*_result(*results[-1]), sep="\n", flush=True)
-    print(*_means(results), _RULES, sep="\n")
+        print(*_describe_result(*results[-1]), sep="\n", flush=True)
+    print(*_average(results), _RULES, sep="\n")
     return 0
 
 
-def parse_table_numbers(words: str) -> set[int]:
+def parse_table_numbers(text: str) -> set[int]:
     """Return the numbers of the tables that ``3-5,7`` names.
 
     Raises:
         ConfigError: it names something else than tables 3 to 7.
     """
     found: set[int] = set()
-    for word in words.split(","):
-        match = re.fullmatch(r"([3-7])(?:-([3-7]))?", word.strip())
-        if match is None:
-            raise ConfigError(f"--tables {words}: expected numbers from 3 to 7, such as 3-5 or 6,7")
-        found |= set(range(int(match[1]), int(match[2] or match[1]) + 1))
-    if not found:
-        raise ConfigError(f"--tables {words}: no table; expected numbers from 3 to 7, such as 3-5 or 6,7")
+    for part in text.split(","):
+        match = re.fullmatch(r"([3-7])(?:-([3-7]))?", part.strip())
+        numbers = range(int(match[1]), int(match[2] or match[1]) + 1) if match else ()
+        if not numbers:
+            raise ConfigError(f"--tables {text}: expected numbers from 3 to 7, such as 3-5 or 6,7")
+        found |= set(numbers)
     return found
 
 
-def _named(word: str) -> tuple[str, str]:
-    """(scene, its folder) of NAME or NAME=FOLDER."""
-    name, _, folder = word.partition("=")
-    return name.strip().lower(), (folder or name).strip()
-
-
-def _number(value: float | None, kind: str) -> str:
-    return (
-        "–" if value is None else f"{value:,.0f}" if kind == "primitives" else f"{value:.{2 if kind == 'PSNR' else 4}f}"
-    )
-
-
-def _listing(chosen: Sequence[Table]) -> Iterator[str]:
+def _list_tables(chosen: Sequence[Table]) -> Iterator[str]:
     for table in chosen:
-        yield (
-            f"table{'s' if len(table.numbers) > 1 else ''} {', '.join(map(str, table.numbers))}: "
-            f"{table.title} (task=static scene={table.loader})"
-        )
+        numbers = ", ".join(map(str, table.numbers))
+        plural = "s" * (len(table.numbers) > 1)
+        yield f"table{plural} {numbers}: {table.title} (task=static scene={table.loader})"
         for row in table.rows:
             yield f"  {row.name}: preset={row.preset}{f'; beside {row.beside[0]}' if row.beside[0] else ''}"
             for scene, found in row.figures.items():
-                numbers = (("PSNR", found.psnr), ("SSIM", found.ssim), ("LPIPS", found.lpips))
-                line = "  ".join(f"{kind} {_number(value, kind):>7}" for kind, value in numbers)
+                line = "  ".join(f"{kind} {_format(getattr(found, kind.lower()), kind):>7}" for kind in _MEASURES)
                 yield f"    {scene:10} {line}{f'  {found.primitives:,} primitives' if found.primitives else ''}"
     yield "neuprim bench paper --data DIR runs those whose data are folders of DIR; --estimate says first for how long"
 
@@ -117,83 +105,77 @@ def _estimate(planned: Sequence[Planned]) -> Iterator[str]:
     scene of each row."""
     from neuprim.runs.paper import pace
 
-    total, paces, grows = 0.0, dict[tuple[str, str], float](), False
+    total, paces, longer = 0.0, dict[tuple[str, str], float](), ""
     for one in planned:
         train, key = one.config.train, (one.table.title, one.row.name)
-        if train.max_seconds is None:
-            if key not in paces:
-                paces[key] = pace(one)
-                yield (
-                    f"{one.row.name}, {one.scene}: {1e3 * paces[key]:.0f} ms a step at the start, "
-                    f"{train.iterations:,} steps"
-                )
-            assert train.iterations is not None, "a run without seconds has steps"
-            total += paces[key] * train.iterations
-            grows = grows or train.population.strategy == "gradient"
-        else:
+        if train.max_seconds is not None:
             total += train.max_seconds
-    longer = "; longer where the population grows" if grows else ""
-    yield f"{len(planned)} runs, about {_duration(total)} of training on this machine{longer}, and measuring"
+            continue
+        assert train.iterations is not None, "a run without seconds has steps"
+        if key not in paces:
+            paces[key] = pace(one)
+            start = f"{1e3 * paces[key]:.0f} ms a step at the start"
+            yield f"{one.row.name}, {one.scene}: {start}, {train.iterations:,} steps"
+        total += paces[key] * train.iterations
+        if train.population.strategy == "gradient":
+            longer = "; longer where the population grows"
+    yield f"{len(planned)} runs, about {_format_seconds(total)} of training on this machine{longer}, and measuring"
 
 
-def _duration(seconds: float) -> str:
+def _describe_result(one: Planned, metrics: Mapping[str, Any]) -> Iterator[str]:
+    from neuprim.runs.paper import compared
+
+    steps, seconds = metrics["iterations"], _format_seconds(metrics["train_seconds"])
+    yield (
+        f"{one.scene}, {one.row.name}: preset={one.row.preset}, seed {one.config.seed}, "
+        f"{metrics['checkpoint']} checkpoint after {steps:,} steps in {seconds}"
+    )
+    protocol = ("scene=", "scene.path=", "preset=", "seed=", "output_dir=", "task=")
+    own = " ".join(text for text in one.config.overrides if not text.startswith(protocol))
+    width, height = metrics["image_size"]
+    yield f"  images of {width}x{height}, down-sampling {metrics['downsampling']}{f', {own}' if own else ''}"
+    for kind, ours, theirs, other in compared(one, metrics):
+        beside = f"   {one.row.beside[0]} {_format(other, kind)}" if one.row.beside[0] and kind in _MEASURES else ""
+        yield f"  {kind:10} {_format(ours, kind):>9}   paper {_format(theirs, kind)}{beside}"
+
+
+def _average(results: Sequence[tuple[Planned, Mapping[str, Any]]]) -> Iterator[str]:
+    """Per row, over scenes and seeds that have both numbers; the paper's are of its best checkpoint on the test views,
+    ours of the last."""
+    from neuprim.runs.paper import compared
+
+    rows: dict[tuple[str, str], list[tuple[Planned, Mapping[str, Any]]]] = {}
+    for one, metrics in results:
+        rows.setdefault((one.table.title, one.row.name), []).append((one, metrics))
+    for (title, name), own in rows.items():
+        scenes, seeds = len({one.scene for one, _ in own}), len({one.config.seed for one, _ in own})
+        count = f"{scenes} scenes, {seeds} seed{'s' * (seeds > 1)}"
+        yield f"{title}, {name}: means over {count}; ours of the last checkpoint, the paper's of the best"
+        pairs = [pair for one, metrics in own for pair in compared(one, metrics)]
+        for kind in _MEASURES:
+            both = [(a, b) for what, a, b, _ in pairs if what == kind and a is not None and b is not None]
+            if both:
+                ours, theirs = (statistics.mean(column) for column in zip(*both, strict=True))
+                yield f"  {kind:10} {_format(ours, kind):>9}   paper {_format(theirs, kind)}"
+
+
+def _format(value: float | None, kind: str) -> str:
+    if value is None:
+        return "–"
+    return f"{value:,.0f}" if kind == "primitives" else f"{value:.{2 if kind == 'PSNR' else 4}f}"
+
+
+def _format_seconds(seconds: float) -> str:
     for unit, length in (("h", 3600), ("min", 60)):
         if seconds >= length:
             return f"{seconds / length:.1f} {unit}"
     return f"{seconds:.0f} s"
 
 
-def _result(one: Planned, metrics: Mapping[str, Any]) -> Iterator[str]:
-    from neuprim.runs.paper import compared
-
-    steps, seconds = metrics["iterations"], _duration(metrics["train_seconds"])
-    width, height = metrics["image_size"]
-    yield (
-        f"{one.scene}, {one.row.name}: preset={one.row.preset}, seed {one.config.seed}, "
-        f"{metrics['checkpoint']} checkpoint after {steps:,} steps in {seconds}"
-    )
-    yield f"  images of {width}x{height}, down-sampling {metrics['downsampling']}{_others(one)}"
-    for kind, ours, theirs, other in compared(one, metrics):
-        beside = f"   {one.row.beside[0]} {_number(other, kind)}" if one.row.beside[0] and kind != "primitives" else ""
-        yield f"  {kind:10} {_number(ours, kind):>9}   paper {_number(theirs, kind)}{beside}"
-
-
-def _others(one: Planned) -> str:
-    """Settings that the user has over the protocol's."""
-    own = ("scene=", "scene.path=", "preset=", "seed=", "output_dir=", "task=")
-    words = [word for word in one.config.overrides if not word.startswith(own)]
-    return f", {' '.join(words)}" if words else ""
-
-
-def _means(results: Sequence[tuple[Planned, Mapping[str, Any]]]) -> Iterator[str]:
-    """Per row, over scenes and seeds that have both numbers; the paper's are of its best checkpoint on the test views,
-    ours of the last."""
-    from neuprim.runs.paper import compared
-
-    rows = dict.fromkeys((one.table.title, one.row.name) for one, _ in results)
-    for title, name in rows:
-        own = [(one, metrics) for one, metrics in results if (one.table.title, one.row.name) == (title, name)]
-        seeds = len({one.config.seed for one, _ in own})
-        yield (
-            f"{title}, {name}: means over {len({one.scene for one, _ in own})} scenes, {seeds} "
-            f"seed{'s' * (seeds > 1)}; ours of the last checkpoint, the paper's of the best"
-        )
-        pairs = [pair for one, metrics in own for pair in compared(one, metrics) if pair[0] != "primitives"]
-        for kind in ("PSNR", "SSIM", "LPIPS"):
-            both = [
-                (ours, theirs)
-                for what, ours, theirs, _ in pairs
-                if what == kind and ours is not None and theirs is not None
-            ]
-            if both:
-                ours, theirs = (statistics.mean(column) for column in zip(*both, strict=True))
-                yield f"  {kind:10} {_number(ours, kind):>9}   paper {_number(theirs, kind)}"
-
-
 COMMAND = Command(
     "bench",
     "the paper's tables, and runs of their protocol on data that you have",
-    _add_arguments,
     _bench,
+    _add_arguments,
     take_rest=take_overrides,
 )

@@ -1,4 +1,4 @@
-"""What every command of ``neuprim`` shares: its description, its parser, and values of flags read from text.
+"""What every command of ``neuprim`` shares: its description, its parser, values of flags, and plain text output.
 
 A command is one module, ``NAME_command.py``, with a :class:`Command` named ``COMMAND``; :data:`neuprim.cli.COMMANDS`
 lists them. Modules that load torch are imported inside the function that runs the command, so that help stays fast.
@@ -18,26 +18,24 @@ from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.io.trust import FLAG
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from neuprim.config.overrides import CommandLine
     from neuprim.core.task import TaskSpec
 
-__all__ = [
-    "Command",
-    "Parser",
-    "add_trust_flag",
-    "check_run_directory",
-    "load_run_task",
-    "parse_count",
-    "parse_decibels",
-    "parse_index",
-    "parse_numbers",
-    "parse_rate",
-    "parse_seconds",
-    "parse_size",
-    "parse_whole",
-    "refuse_argument",
-    "take_conditions",
-    "take_overrides",
-]
+TakeRest = Callable[[argparse.Namespace, list[str], argparse.ArgumentParser], list[str]]
+
+RENDER_OVERRIDES_HELP = """\
+KEY=VALUE overrides how the run is drawn:
+  renderer.KEY=VALUE         any setting of the renderer
+  resolution=0.5             render at half the width and height, and upsample
+  density.NAME=N colour.NAME=N
+                             a smaller field, e.g. colour.degree=1 (bands of spherical harmonics) density.neurons=4
+  store.GROUP=float16|uint8  store means, shape, density, colour or all as 16-bit floats or 8-bit codes
+`neuprim tradeoff RUN_DIR` measures their cost and gain."""
+
+RENDER_OVERRIDE_HEADS = ("renderer", "resolution", "density", "colour", "store")
+"""A copy of neuprim.runs.render_config.HEADS, as importing that module loads torch."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -57,8 +55,8 @@ class Command:
     Attributes:
         name: what users type after ``neuprim``.
         summary: one line for ``neuprim --help``.
-        add_arguments: adds the command's own arguments to its parser.
         call: runs the command with the parsed arguments and returns the exit status.
+        add_arguments: adds the command's own arguments to its parser.
         epilog: text below the arguments in ``neuprim NAME --help``, or a function that makes it from the typed words.
         take_rest: gets the arguments, the words that argparse did not know and the parser; stores those that the
             command accepts and returns the others, which are refused.
@@ -67,21 +65,11 @@ class Command:
 
     name: str
     summary: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
     call: Callable[[argparse.Namespace], int]
+    add_arguments: Callable[[argparse.ArgumentParser], None] = lambda parser: None
     epilog: str | Callable[[Sequence[str]], str] = ""
-    take_rest: Callable[[argparse.Namespace, list[str], argparse.ArgumentParser], list[str]] | None = None
+    take_rest: TakeRest = lambda arguments, rest, parser: rest
     opens_run: bool = False
-
-    def build_parser(self, words: Sequence[str] = ()) -> Parser:
-        """Return the parser of the words after the command's name."""
-        epilog = self.epilog if isinstance(self.epilog, str) else self.epilog(words)
-        parser = Parser(prog=f"neuprim {self.name}", description=self.summary, epilog=epilog)
-        if self.opens_run:
-            parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-            add_trust_flag(parser)
-        self.add_arguments(parser)
-        return parser
 
     def parse(self, words: Sequence[str]) -> argparse.Namespace:
         """Return the arguments of the command, from the words after its name.
@@ -93,11 +81,20 @@ class Command:
         arguments, rest = parser.parse_known_args(words)
         if self.opens_run:
             check_run_directory(arguments.run_dir)
-        if self.take_rest is not None:
-            rest = self.take_rest(arguments, rest, parser)
+        rest = self.take_rest(arguments, rest, parser)
         if rest:
             raise refuse_argument(rest[0], parser)
         return arguments
+
+    def build_parser(self, words: Sequence[str] = ()) -> Parser:
+        """Return the parser of the words after the command's name."""
+        epilog = self.epilog if isinstance(self.epilog, str) else self.epilog(words)
+        parser = Parser(prog=f"neuprim {self.name}", description=self.summary, epilog=epilog)
+        if self.opens_run:
+            parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+            add_trust_flag(parser)
+        self.add_arguments(parser)
+        return parser
 
 
 def add_trust_flag(parser: argparse.ArgumentParser) -> None:
@@ -114,18 +111,32 @@ def check_run_directory(path: Path) -> None:
         raise ConfigError(f"{path}: no such run directory{hint}")
 
 
+# ---------------------------------------------------------------- words that argparse does not know
+
+
 def load_run_task(run_dir: Path) -> TaskSpec:
     """Return the task of a run."""
-    from neuprim.config import RunConfig, task_of
+    from neuprim.config import Job, RunConfig
 
-    file = run_dir / "config.yaml"
-    return task_of(RunConfig.from_yaml(file), file)
+    return Job.of(RunConfig.from_yaml(run_dir / "config.yaml")).task
 
 
 def take_overrides(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
     """Add the words that are no flags to ``arguments.overrides``: argparse gives up on them after the first flag."""
     arguments.overrides += [word for word in rest if not word.startswith("-")]
     return [word for word in rest if word.startswith("-")]
+
+
+def take_render_overrides(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
+    """Set ``arguments.words`` to the render overrides."""
+    arguments.words, rest = split_render_overrides(rest)
+    return rest
+
+
+def split_render_overrides(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split words into render overrides, as ``renderer.samples=2``, and others; ``--`` may stand between."""
+    found = [word for word in words if "=" in word and re.split(r"[.=]", word)[0] in RENDER_OVERRIDE_HEADS]
+    return found, [word for word in words if word not in found and word != "--"]
 
 
 def take_conditions(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
@@ -152,6 +163,35 @@ def refuse_argument(word: str, parser: argparse.ArgumentParser, task: TaskSpec |
     return ConfigError(f"{word}: no such argument of `{parser.prog}`{place}{nearest(word, flags)}")
 
 
+# ---------------------------------------------------------------- output
+
+
+def plain_console(stderr: bool = False, **options: Any) -> Console:
+    """Return a console that prints text as it is: no markup, emoji or guessed colours, lines as long as their text.
+
+    rich reads ``[name]`` as markup and ``:name:`` as an emoji. Names, paths and commands come from outside: ``pip
+    install 'neuprim[video]'`` would lose its extra.
+    """
+    from rich.console import Console
+
+    return Console(stderr=stderr, markup=False, emoji=False, highlight=False, soft_wrap=True, **options)
+
+
+def print_columns(rows: Sequence[Sequence[str]]) -> None:
+    """Print a table on standard output: the first column to the left, numbers to the right."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    for first, *others in rows:
+        cells = [f"{cell:>{width}}" for cell, width in zip(others, widths[1:], strict=True)]
+        print("  ".join([f"{first:{widths[0]}}", *cells]).rstrip())
+
+
+def describe_interruption(directory: Path, typed: CommandLine) -> str:
+    """Return what an interrupted run has, and the command that continues it."""
+    begun = any((directory / file).exists() for file in ("checkpoint.safetensors", "chunks.json"))
+    state = "has the run up to here" if begun else "has no checkpoint yet"
+    return f"; {directory} {state}; to go on:\n  {typed.resume_command(directory)}"
+
+
 # ---------------------------------------------------------------- values of flags
 
 
@@ -165,25 +205,22 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def parse_count(text: str) -> int:
     """Read a positive whole number."""
-    return _read_digits(text, r"[1-9]\d{0,6}", "a positive count")
+    return int(parse_number(text, 1, 9_999_999, "a positive count", whole=True))
 
 
 def parse_whole(text: str) -> int:
     """Read a whole number, from 0."""
-    return _read_digits(text, r"\d{1,7}", "a whole number, from 0")
+    return int(parse_number(text, 0, 999_999_999, "a whole number, from 0", whole=True))
 
 
-def parse_index(text: str) -> int:
-    """Read the number of a primitive, from 0."""
-    return _read_digits(text, r"\d{1,9}", "the number of a primitive, from 0")
+def parse_rate(text: str) -> float:
+    """Read frames per second."""
+    return parse_number(text, 0.1, 240.0, "0.1 to 240 frames per second")
 
 
 def parse_decibels(text: str) -> float:
     """Read 0.1 or 0.1dB."""
-    match = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?(?:dB)?", text, re.IGNORECASE)
-    if match is None or not 0 < float(match[1]) <= 100:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected decibels above 0, for example 0.1dB")
-    return float(match[1])
+    return parse_number(re.sub(r" ?dB$", "", text, flags=re.IGNORECASE), 1e-9, 100.0, "decibels above 0, as 0.1dB")
 
 
 def parse_seconds(text: str) -> float:
@@ -196,28 +233,15 @@ def parse_seconds(text: str) -> float:
 
 def parse_numbers(text: str) -> list[float]:
     """Read finite numbers separated by commas."""
-    values = [_read_number(part) for part in text.split(",")]
-    if not all(math.isfinite(value) for value in values):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected numbers separated by commas")
-    return values
+    return [parse_number(part, -math.inf, math.inf, "numbers separated by commas") for part in text.split(",")]
 
 
-def parse_rate(text: str) -> float:
-    """Read frames per second."""
-    value = _read_number(text)
-    if not 0.1 <= value <= 240.0:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected 0.1 to 240 frames per second")
-    return value
-
-
-def _read_digits(text: str, pattern: str, expected: str) -> int:
-    if not re.fullmatch(pattern, text):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected {expected}")
-    return int(text)
-
-
-def _read_number(text: str) -> float:
+def parse_number(text: str, low: float, high: float, expected: str, whole: bool = False) -> float:
+    """Read a finite number from ``low`` to ``high``; a whole one has digits alone."""
     try:
-        return float(text)
+        value = float(text)
     except ValueError:
-        return math.nan
+        value = math.nan
+    if not (math.isfinite(value) and low <= value <= high) or (whole and re.fullmatch("[0-9]+", text) is None):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected {expected}")
+    return value

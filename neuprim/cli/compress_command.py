@@ -6,12 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuprim.cli.command import Command, parse_count, parse_decibels, parse_seconds, parse_whole
+from neuprim.cli.command import Command, parse_count, parse_decibels, parse_seconds, parse_whole, print_columns
 
 if TYPE_CHECKING:
     from neuprim.search.compress import Compression
-
-__all__ = ["COMMAND", "print_compression"]
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,51 +29,39 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _compress(args: argparse.Namespace) -> int:
-    from neuprim.cli.console import plain_console
     from neuprim.cli.progress import LineProgress
     from neuprim.search.compress import CompressRequest, compress_run
 
-    progress = LineProgress(plain_console(stderr=True))
     request = CompressRequest(
         args.run_dir, args.level, args.bits, args.out, args.force, args.seconds, args.steps, args.tolerance
     )
-    made = compress_run(request, progress)
-    print_compression(made)
+    _print_compression(compress_run(request, LineProgress()))
     return 0
 
 
-def print_compression(made: Compression) -> None:
-    """File, bytes of every parameter, and what was lost, on standard output."""
+def _print_compression(made: Compression) -> None:
+    """Print file, bytes of every parameter, and what was lost."""
     print(made.file)
-    cells = [("", "bits", "bytes before", "after", "times")]
-    cells += [(p.name, p.bits, f"{p.before:,}", f"{p.after:,}", _times(p.before, p.after)) for p in made.parameters]
-    cells += [("all, and the header", "", f"{made.before:,}", f"{made.after:,}", _times(made.before, made.after))]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-    for name, *numbers in cells:
-        print(
-            "  ".join(
-                [f"{name:{widths[0]}}", *(f"{n:>{w}}" for n, w in zip(numbers, widths[1:], strict=True))]
-            ).rstrip()
-        )
-    for name, (before, after) in made.measured.items():
+    sizes = [(p.name, p.bits, p.before, p.after) for p in made.parameters]
+    sizes.append(("all, and the header", "", made.before, made.after))
+    rows = [("", "bits", "bytes before", "after", "times")]
+    for name, bits, before, after in sizes:
+        rows.append((name, bits, f"{before:,}", f"{after:,}", f"{before / after:.2f}" if before and after else "-"))
+    print_columns(rows)
+    for name, (loss_before, loss_after) in made.measured.items():
         unit, digits = (" dB", 3) if name == "psnr" else ("", 4)
-        print(
-            f"{name:5} {before:.{digits}f} -> {after:.{digits}f}{unit} ({after - before:+.{digits}f}), mean of the held-out views"
-        )
+        change = f"{loss_before:.{digits}f} -> {loss_after:.{digits}f}{unit} ({loss_after - loss_before:+.{digits}f})"
+        print(f"{name:5} {change}, mean of the held-out views")
     for note in made.notes:
         print(f"note: {note}")
     trained = f", with {made.steps:,} steps of training" if made.steps else ""
     print(f"compressed in {made.seconds:.2f} s{trained}")
 
 
-def _times(before: int, after: int) -> str:
-    return f"{before / after:.2f}" if before and after else "-"
-
-
 COMMAND = Command(
     "compress",
     "write a run's model in few bits, as one file that every command reads",
-    _add_arguments,
     _compress,
+    _add_arguments,
     opens_run=True,
 )

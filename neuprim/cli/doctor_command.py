@@ -5,29 +5,22 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from packaging.requirements import Requirement
 
-from neuprim.cli.command import Command
+from neuprim.cli.command import Command, plain_console
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["COMMAND", "print_report"]
-
-NOT_FOR_USERS = ("test", "docs", "dev")
+_DEVELOPERS = ("test", "docs", "dev")
 """Extras that only people who work on neuprim itself need."""
 
 Rows = list[tuple[str, str]]
-
-
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    pass
 
 
 def print_report(console: Console | None = None) -> int:
@@ -35,17 +28,24 @@ def print_report(console: Console | None = None) -> int:
     from rich.table import Table
     from rich.text import Text
 
-    from neuprim.cli.console import plain_console
+    from neuprim.core.compute.kernels import cache_directory as kernel_cache
+    from neuprim.core.io.files import cache_directory
+    from neuprim.core.render import backends
 
     console = console or plain_console()
-    backends, working = _backends()
-    for title, rows in (
-        ("machine", _machine()),
-        ("packages", _packages()),
-        ("CUDA devices", _cuda()),
-        ("renderer backends", backends),
-        ("caches", _caches()),
-    ):
+    reasons = {name: _probe(name) for name in backends.backend_names()}
+    working = None in reasons.values()
+    tables: dict[str, Rows] = {
+        "machine": _describe_machine(),
+        "packages": _list_packages(),
+        "CUDA devices": _list_devices(),
+        "renderer backends": [(n, "works" if r is None else f"does not work: {r}") for n, r in reasons.items()],
+        "caches": [
+            ("kernels", f"{kernel_cache()} (set by NUMBA_CACHE_DIR)"),
+            ("generated scenes", f"{cache_directory() / 'scenes'} (set by NEUPRIM_CACHE_DIR)"),
+        ],
+    }
+    for title, rows in tables.items():
         table = Table(title=title, title_justify="left", show_header=False)
         table.add_column(no_wrap=True)
         table.add_column(overflow="fold")
@@ -57,39 +57,27 @@ def print_report(console: Console | None = None) -> int:
     return 0 if working else 1
 
 
-def _machine() -> Rows:
+def _describe_machine() -> Rows:
+    from llvmlite import binding
+
     from neuprim.core.compute.threads import cpu_name
 
+    total = os.cpu_count() or 1
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else total
+    features = binding.get_host_cpu_features()
+    simd = [name for name in ("sse4.2", "neon", "avx", "avx2", "fma", "avx512f") if features.get(name)]
     return [
         ("neuprim", __version__),
         ("python", f"{platform.python_version()} ({platform.python_implementation()})"),
         ("platform", platform.platform()),
         ("cpu", cpu_name()),
-        ("cores", _cores()),
-        ("simd", _simd()),
-        ("memory", _memory()),
+        ("cores", str(total) if usable == total else f"{usable} of {total} usable by this process"),
+        ("simd", ", ".join(simd) or "none known"),
+        ("memory", _describe_memory()),
     ]
 
 
-def _cores() -> str:
-    total = os.cpu_count() or 1
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else total
-    return str(total) if usable == total else f"{usable} of {total} usable by this process"
-
-
-def _simd() -> str:
-    from llvmlite import binding
-
-    features = binding.get_host_cpu_features()
-    found = [
-        name
-        for name in ("sse4.2", "neon", "avx", "avx2", "fma", "avx512f", "avx512vl", "avx512dq")
-        if features.get(name)
-    ]
-    return ", ".join(found) or "none known"
-
-
-def _memory() -> str:
+def _describe_memory() -> str:
     try:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (ValueError, OSError, AttributeError):
@@ -102,27 +90,22 @@ def _memory() -> str:
     return f"{limit / 2**30:.1f} GiB (limit of this container; machine: {text})" if limit < total else text
 
 
-def _packages() -> Rows:
+def _list_packages() -> Rows:
     """Each package that neuprim's own metadata names, for itself or for an extra, with what is installed."""
+    extras = ["", *(metadata.metadata("neuprim").get_all("Provides-Extra") or [])]
     needed: dict[str, list[tuple[Requirement, str]]] = {}  # several extras may name one package
     for text in metadata.requires("neuprim") or []:
         requirement = Requirement(text)
-        extra = _extra_of(requirement)
-        if extra in NOT_FOR_USERS or not (
-            requirement.marker is None or requirement.marker.evaluate({"extra": extra or ""})
-        ):
-            continue
-        wanted = f"'neuprim[{extra}]'" if extra else f"'{requirement.name}{requirement.specifier}'"
-        needed.setdefault(requirement.name, []).append((requirement, wanted))
-    rows: Rows = [(name, _state(name, choices)) for name, choices in needed.items()]
-    if "triton" not in needed:
-        rows.append(("triton", _version_or("triton", "not installed: comes with torch's CUDA builds")))
-    return rows
+        marker = requirement.marker
+        extra = next((name for name in extras if marker is None or marker.evaluate({"extra": name})), None)
+        if extra is not None and extra not in _DEVELOPERS:
+            wanted = f"'neuprim[{extra}]'" if extra else f"'{requirement.name}{requirement.specifier}'"
+            needed.setdefault(requirement.name, []).append((requirement, wanted))
+    return [(name, _describe_package(name, requirements)) for name, requirements in needed.items()]
 
 
-def _state(name: str, needed: list[tuple[Requirement, str]]) -> str:
-    """The version of an installed package, and what to install where it is missing or does not suit all that need
-    it."""
+def _describe_package(name: str, needed: list[tuple[Requirement, str]]) -> str:
+    """Return the version of a package, and what to install where it is missing or too old."""
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -133,56 +116,23 @@ def _state(name: str, needed: list[tuple[Requirement, str]]) -> str:
     return version
 
 
-def _extra_of(requirement: Requirement) -> str | None:
-    """The extra a requirement belongs to, or None for a plain dependency."""
-    if requirement.marker is None:
-        return None
-    names: Iterable[str] = metadata.metadata("neuprim").get_all("Provides-Extra") or []
-    text = str(requirement.marker)
-    return next((name for name in names if f'extra == "{name}"' in text), None)
-
-
-def _version_or(name: str, otherwise: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return otherwise
-
-
-def _cuda() -> Rows:
+def _list_devices() -> Rows:
     import torch
 
     from neuprim.core.render.backends import gpu_unavailable
 
     missing = gpu_unavailable()
-    used = ("used by runs", "yes" if missing is None else f"no: {missing}")
+    rows = [("used by runs", "yes" if missing is None else f"no: {missing}")]
     if torch.version.cuda is None:
-        return [("none", f"torch {torch.__version__} is a CPU build"), used]
+        return [("none", f"torch {torch.__version__} is a CPU build"), *rows]
     if not torch.cuda.is_available():
-        return [
-            ("none", f"torch {torch.__version__} has CUDA {torch.version.cuda}, but no device or driver is usable"),
-            used,
-        ]
-    rows: Rows = [used]
+        text = f"torch {torch.__version__} has CUDA {torch.version.cuda}, but no device or driver is usable"
+        return [("none", text), *rows]
     for i in range(torch.cuda.device_count()):
         p = torch.cuda.get_device_properties(i)
-        rows.append(
-            (f"cuda:{i}", f"{p.name}, {p.total_memory / 2**30:.1f} GiB, compute capability {p.major}.{p.minor}")
-        )
+        text = f"{p.name}, {p.total_memory / 2**30:.1f} GiB, compute capability {p.major}.{p.minor}"
+        rows.append((f"cuda:{i}", text))
     return rows
-
-
-def _backends() -> tuple[Rows, bool]:
-    """A row per backend, and whether any of them works."""
-    from neuprim.core.render import backends
-
-    rows: Rows = []
-    working = False
-    for name in backends.backend_names():
-        reason = _probe(name)
-        working = working or reason is None
-        rows.append((name, "works" if reason is None else f"does not work: {reason}"))
-    return rows, working
 
 
 def _probe(name: str) -> str | None:
@@ -195,19 +145,8 @@ def _probe(name: str) -> str | None:
         return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
-def _caches() -> Rows:
-    from neuprim.core.compute.kernels import cache_directory as kernels
-    from neuprim.core.io.files import cache_directory as everything
-
-    return [
-        ("kernels", f"{kernels()} (set by NUMBA_CACHE_DIR)"),
-        ("generated scenes", f"{everything() / 'scenes'} (set by NEUPRIM_CACHE_DIR)"),
-    ]
+def _doctor(arguments: argparse.Namespace) -> int:
+    return print_report()
 
 
-COMMAND = Command(
-    "doctor",
-    "show versions, devices and which renderer backends work here",
-    _add_arguments,
-    lambda arguments: print_report(),
-)
+COMMAND = Command("doctor", "show versions, devices and which renderer backends work here", _doctor)

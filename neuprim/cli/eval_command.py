@@ -7,10 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from neuprim.cli.command import Command
-from neuprim.cli.render_overrides import RENDER_OVERRIDES_HELP, split_render_overrides
-
-__all__ = ["COMMAND", "print_metrics"]
+from neuprim.cli.command import RENDER_OVERRIDES_HELP, Command, take_render_overrides
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,36 +15,26 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lpips", type=Path, metavar="FILE", help=text)
 
 
-def _take_rest(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    arguments.words, rest = split_render_overrides(rest)
-    return rest
-
-
 def _evaluate(arguments: argparse.Namespace) -> int:
+    from neuprim.core.metrics.image import format_metrics
     from neuprim.runs.measure import evaluate_run
 
-    print_metrics(evaluate_run(arguments.run_dir, arguments.lpips, arguments.words))
-    return 0
-
-
-def print_metrics(metrics: Mapping[str, Any]) -> None:
-    """Print metrics on standard output, one number a line."""
-    rows = list(_rows(metrics))
+    metrics = evaluate_run(arguments.run_dir, arguments.lpips, arguments.words)
+    rows = _list_numbers(metrics)
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
         print(f"{name:{width}}  {value}")
     if "worse_than_black_image" in metrics:
-        from neuprim.core.metrics.image import format_metrics  # torch, loaded when needed
-
         print(format_metrics(metrics))
+    return 0
 
 
-def _rows(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:
+def _list_numbers(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = []
     for key, value in metrics.items():
         name = f"{where}{key}"
         if isinstance(value, Mapping):
-            rows += _rows(value, name + ".")
+            rows += _list_numbers(value, f"{name}.")
         elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
             rows.append((name, f"{len(value)} entries, in the run's metrics.json"))
         else:
@@ -58,9 +45,9 @@ def _rows(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:
 COMMAND = Command(
     "eval",
     "measure a run on its test views",
-    _add_arguments,
     _evaluate,
-    epilog=RENDER_OVERRIDES_HELP,
-    take_rest=_take_rest,
+    _add_arguments,
+    RENDER_OVERRIDES_HELP,
+    take_render_overrides,
     opens_run=True,
 )

@@ -1,4 +1,4 @@
-"""``neuprim export``: write a run's model in another format."""
+"""``neuprim export``: write a run's model in another format; ``neuprim import``: make a run of one."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim.cli.command import Command, load_run_task, refuse_argument
+from neuprim.cli.command import Command, load_run_task, print_columns, refuse_argument
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import ExportReport
-
-__all__ = ["COMMAND", "print_report"]
 
 _USAGE = "neuprim export RUN_DIR --format NAME [KEY=VALUE ...] [--CONDITION TEXT ...] [--out PATH] [--force] [--json]"
 _WIDTH = 100
@@ -45,20 +43,17 @@ def _take_rest(arguments: argparse.Namespace, rest: list[str], parser: argparse.
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from neuprim.cli.console import plain_console
     from neuprim.cli.progress import LineProgress
     from neuprim.runs.export import export_run
 
-    progress = LineProgress(plain_console(stderr=True))
-    report = export_run(
-        arguments.run_dir, arguments.format, arguments.out, arguments.options, arguments.force, progress
-    )
+    out, options = arguments.out, arguments.options
+    report = export_run(arguments.run_dir, arguments.format, out, options, arguments.force, LineProgress())
     print_report(report, arguments.json)
     return 0
 
 
 def _help(words: Sequence[str]) -> str:
-    """The text below the arguments, for the words after ``neuprim export``; "" if they do not ask for help.
+    """Return the text below the arguments, for the words after ``neuprim export``; "" if they do not ask for help.
 
     Without a format only package metadata is read; with one, that exporter is imported.
 
@@ -67,18 +62,15 @@ def _help(words: Sequence[str]) -> str:
     """
     if not {"-h", "--help"} & set(words):
         return ""
-    return "\n".join(_of_all() if (name := _format(words)) is None else _of_one(name))
-
-
-def _format(words: Sequence[str]) -> str | None:
+    name = None
     for word, following in zip(words, [*words[1:], ""], strict=True):
         key, equals, value = word.partition("=")
-        if key == "--format" and (value if equals else following and not following.startswith("-")):
-            return value if equals else following
-    return None
+        if name is None and key == "--format":
+            name = value if equals else following * (not following.startswith("-")) or None
+    return "\n".join(_describe_formats() if name is None else _describe_format(name))
 
 
-def _of_all() -> Iterator[str]:
+def _describe_formats() -> Iterator[str]:
     from neuprim.plugins.registry import EXPORTERS
 
     yield "formats:"
@@ -88,12 +80,12 @@ def _of_all() -> Iterator[str]:
     yield "KEY=VALUE is an option of the format: `neuprim export --format NAME --help` lists them with their defaults."
 
 
-def _of_one(name: str) -> Iterator[str]:
+def _describe_format(name: str) -> Iterator[str]:
     from neuprim.plugins.registry import EXPORTERS
 
     info, exporter = EXPORTERS.load_with_info(name)
     yield f"--format {name}  ({info.origin}): {exporter.summary}"
-    rows = [(f"{option}={_shown(default)}", help_) for option, (default, help_) in exporter.options.items()]
+    rows = [(f"{option}={_show_default(default)}", help_) for option, (default, help_) in exporter.options.items()]
     yield f"options of --format {name}, with their defaults:" if rows else f"--format {name} has no options"
     indent = 4 + max((len(first) for first, _ in rows), default=0)
     for first, second in rows:
@@ -102,9 +94,8 @@ def _of_one(name: str) -> Iterator[str]:
         yield "conditions of the run's task: --NAME TEXT or NAME=TEXT, as --time 0.5 or light=1,2,3"
 
 
-def _shown(value: Any) -> str:
-    """As a user writes it; nothing for an option that is not set."""
-    return {None: "", True: "true", False: "false"}[value] if value is None or isinstance(value, bool) else str(value)
+def _show_default(value: Any) -> str:
+    return "" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def print_report(report: ExportReport, as_json: bool) -> None:
@@ -121,35 +112,41 @@ def print_report(report: ExportReport, as_json: bool) -> None:
         return
     print(*report.files, sep="\n")
     print("lossless" if report.lossless else "lossy")
-    print(*_table(report.errors), sep="\n", end="\n" if report.errors else "")
+    _print_errors(report.errors)
     for note in report.notes:
         print(f"note: {note}")
 
 
-def _table(errors: Mapping[str, float]) -> list[str]:
-    """A line per number; numbers of several things, as ``frame_0007.relative_l2``, in a line per thing."""
+def _print_errors(errors: Mapping[str, float]) -> None:
+    """Print a line per number; numbers of several things, as ``frame_0007.relative_l2``, in a line per thing."""
     rows: dict[str, dict[str, str]] = {}
     for name, value in errors.items():
         thing, _, key = name.rpartition(".")
         rows.setdefault(thing, {})[key] = f"{value:.4f}"
-    columns = list(dict.fromkeys(key for row in rows.values() for key in row))
     if "" in rows or len(rows) < 2:
         width = max((len(name) for name in errors), default=0)
-        return [f"{name:{width}}  {value:.4f}" for name, value in errors.items()]
-    first, widths = max(map(len, rows)), [max(len(key), 9) for key in columns]
-    lines = [("", columns), *((thing, [row.get(key, "") for key in columns]) for thing, row in rows.items())]
-    return [
-        "  ".join([f"{thing:{first}}", *(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True))])
-        for thing, cells in lines
-    ]
+        for name, value in errors.items():
+            print(f"{name:{width}}  {value:.4f}")
+    else:
+        columns = list(dict.fromkeys(key for row in rows.values() for key in row))
+        print_columns([("", *columns), *((t, *(row.get(key, "") for key in columns)) for t, row in rows.items())])
+
+
+def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, metavar="FILE")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="new directory")
+
+
+def _import(arguments: argparse.Namespace) -> int:
+    from neuprim.runs.export import import_run
+
+    print(import_run(arguments.file, arguments.out))
+    return 0
 
 
 COMMAND = Command(
-    "export",
-    "write a run's model in another format",
-    _add_arguments,
-    _export,
-    epilog=_help,
-    take_rest=_take_rest,
-    opens_run=True,
+    "export", "write a run's model in another format", _export, _add_arguments, _help, _take_rest, opens_run=True
+)
+IMPORT_COMMAND = Command(
+    "import", "make a run directory of an exported .ply or .npz, or of a .neuprim", _import, _add_import_arguments
 )

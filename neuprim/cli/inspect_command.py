@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from neuprim.cli.command import Command, parse_count, parse_index, parse_numbers, parse_size, take_conditions
-
-__all__ = ["COMMAND"]
+from neuprim.cli.command import Command, parse_count, parse_numbers, parse_size, parse_whole, take_conditions
 
 _CONDITIONS = """\
 Each condition of the run's task is a flag, given after RUN_DIR: --time 0.5, or several frames: --time 0:1:20,
@@ -20,7 +18,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     ellipsoids = "the ellipsoids in their own colours; as --show primitives"
     parser.add_argument("--primitives", action="store_true", help=ellipsoids)
     one = "look into this one; as --show primitive"
-    parser.add_argument("--primitive", type=parse_index, metavar="INDEX", help=one)
+    parser.add_argument("--primitive", type=parse_whole, metavar="INDEX", help=one)
     parser.add_argument("--against", metavar="FILE.vdb|DIR|scene", help="ground truth to compare with")
     grid = "points along the box's longest side (default: 128)"
     parser.add_argument("--grid", type=parse_count, default=128, metavar="N", help=grid)
@@ -55,17 +53,16 @@ def _inspect(arguments: argparse.Namespace) -> int:
         up=arguments.up,
         overwrite=arguments.force,
     )
-    for path in inspect_run(request, print_notes):
-        print(path)
+    print(*inspect_run(request, print_notes), sep="\n")
     return 0
 
 
 COMMAND = Command(
     "inspect",
     "look inside a run's density",
-    _add_arguments,
     _inspect,
-    epilog=_CONDITIONS,
-    take_rest=take_conditions,
+    _add_arguments,
+    _CONDITIONS,
+    take_conditions,
     opens_run=True,
 )

@@ -6,39 +6,29 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuprim.cli.command import Command, parse_decibels, parse_seconds, parse_whole
+from neuprim.cli.command import Command, parse_decibels, parse_seconds, parse_whole, print_columns
 
 if TYPE_CHECKING:
     from neuprim.search.pruning import Pruning
 
-__all__ = ["COMMAND"]
-
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--tolerance",
-        type=parse_decibels,
-        default=0.1,
-        metavar="DB",
-        help="how much worse it may get (default: 0.1dB)",
-    )
-    parser.add_argument(
-        "--seconds", type=parse_seconds, default=60.0, metavar="S", help="of fine-tuning; 0 for none (default: 60)"
-    )
-    parser.add_argument(
-        "--steps", type=parse_whole, metavar="N", help="of fine-tuning instead, for the same model on every machine"
-    )
+    tolerance = "how much worse it may get (default: 0.1dB)"
+    parser.add_argument("--tolerance", type=parse_decibels, default=0.1, metavar="DB", help=tolerance)
+    seconds = "of fine-tuning; 0 for none (default: 60)"
+    parser.add_argument("--seconds", type=parse_seconds, default=60.0, metavar="S", help=seconds)
+    steps = "of fine-tuning instead, for the same model on every machine"
+    parser.add_argument("--steps", type=parse_whole, metavar="N", help=steps)
     parser.add_argument("--out", type=Path, metavar="DIR", help="the new run's directory (default: RUN_DIR-pruned)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
 
 
 def _prune(args: argparse.Namespace) -> int:
-    from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
     from neuprim.search.pruning import PruneRequest, prune_run
 
     request = PruneRequest(args.run_dir, args.tolerance, args.seconds, args.steps, args.out, args.force)
-    with DrawProgress(plain_console(stderr=True)) as progress:
+    with DrawProgress() as progress:
         made = prune_run(request, progress.show)
     _report(made, args.tolerance)
     return 0
@@ -66,11 +56,8 @@ def _report(made: Pruning, tolerance: float) -> None:
         print(f"nothing can go within {tolerance:g} dB; nothing was written")
         return
     print(made.run_dir)
-    cells = [("", "before", "after")]
-    cells += [(name, form.format(made.before[key]), form.format(made.after[key])) for key, name, form in _ROWS]
-    widths = [max(len(row[i]) for row in cells) for i in range(3)]
-    for name, before, after in cells:
-        print(f"{name:{widths[0]}}  {before:>{widths[1]}}  {after:>{widths[2]}}".rstrip())
+    rows = [(name, form.format(made.before[key]), form.format(made.after[key])) for key, name, form in _ROWS]
+    print_columns([("", "before", "after"), *rows])
     for word in made.words:
         print(f"all primitives: {word}")
     for line in describe_kept_shares(made.kept):
@@ -81,7 +68,7 @@ def _report(made: Pruning, tolerance: float) -> None:
 COMMAND = Command(
     "prune",
     "remove what a run's scene does not require, and write the rest as a run",
-    _add_arguments,
     _prune,
+    _add_arguments,
     opens_run=True,
 )

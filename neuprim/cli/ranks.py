@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import shlex
 import signal
 import sys
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -19,8 +17,6 @@ if TYPE_CHECKING:
     from neuprim.config import RunConfig
     from neuprim.core.train.distributed.process_group import ProcessGroup
     from neuprim.core.train.distributed.torchrun import TorchrunRank
-
-__all__ = ["run_as_rank"]
 
 
 def run_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
@@ -73,8 +69,8 @@ def _compose(words: list[str], more: bool, group: ProcessGroup) -> RunConfig:
     from neuprim.config import compose
     from neuprim.config.command_settings import take_launcher, take_target, take_viewer
 
-    elsewhere = any(len(split(words)[1]) < len(words) for split in (take_target, take_launcher, take_viewer))
-    if group.is_first and (more or elsewhere):
+    more = more or any(len(take(words)[1]) < len(words) for take in (take_target, take_launcher, take_viewer))
+    if group.is_first and more:
         raise ConfigError(
             f"{group.size} processes of torchrun fit one scene together; expected neither -m, --config, --cfg, "
             "a target, a launcher, nor a viewer"
@@ -82,7 +78,8 @@ def _compose(words: list[str], more: bool, group: ProcessGroup) -> RunConfig:
     config = compose(words) if group.is_first else None
     directory = group.gather(None if config is None else str(config.output_dir))[0]
     if config is None:
-        config = replace(compose(words, check_output=False), output_dir=Path(directory))
+        config = compose(words, check_output=False)
+        config.output_dir = Path(directory)
     _select_gpu(config, group.place)
     return config
 
@@ -108,34 +105,29 @@ def _select_gpu(config: RunConfig, place: TorchrunRank) -> None:
     torch.cuda.set_device(place.local_rank)
 
 
-def _fit(config: RunConfig, words: Sequence[str], group: ProcessGroup) -> None:
+def _fit(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> None:
     """Train, and show it on rank 0."""
-    from neuprim.cli.console import plain_console
+    from neuprim.cli.command import describe_interruption
     from neuprim.cli.progress import RunProgress
     from neuprim.config.overrides import CommandLine
     from neuprim.runs.events import ignore_event
     from neuprim.runs.run import run
 
-    place = group.place
-    launcher = f"torchrun --nproc-per-node {place.local_size}" if place.size == place.local_size else "torchrun …"
-    command = f"{launcher} -m {shlex.join(['neuprim', 'run', *CommandLine(words).resume_arguments(config.output_dir)])}"
+    ranks = f"--nproc-per-node {group.place.local_size}" if group.size == group.place.local_size else "…"
+    typed = CommandLine(overrides)
     try:
         if not group.is_first:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # rank 0 warns
                 run(config, ignore_event, group=group)
             return
-        title = f"{config.task}/{config.scene_name}, {group.size} ranks"
-        with RunProgress(plain_console(stderr=True), title) as events:
+        with RunProgress(f"{config.task}/{config.scene_name}, {group.size} ranks") as events:
             print(run(config, events, group=group))
     except RankError as error:
+        command = f"torchrun {ranks} -m {typed.resume_command(config.output_dir)}"
         raise RankError(f"{error}; to go on: {command}", error.reported) from error
     except KeyboardInterrupt:
-        if not group.is_first:
-            # torchrun takes any other status for a failure, and ends rank 0, which still has to write
-            return
-        saved = (config.output_dir / "checkpoint.safetensors").exists()
-        state = "has the run up to here" if saved else "has no checkpoint yet"
-        raise KeyboardInterrupt(
-            f"; {config.output_dir} {state}; to go on, with any number of processes:\n  {command}"
-        ) from None
+        # torchrun takes any other status than 0 for a failure, and ends rank 0, which still has to write
+        if group.is_first:
+            text = describe_interruption(config.output_dir, typed)
+            raise KeyboardInterrupt(text.replace("  neuprim run", f"  torchrun {ranks} -m neuprim run")) from None

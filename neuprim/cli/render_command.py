@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim.cli.command import Command, parse_count, parse_rate, parse_size, take_conditions
-from neuprim.cli.render_overrides import RENDER_OVERRIDES_HELP, split_render_overrides
+from neuprim.cli.command import (
+    RENDER_OVERRIDES_HELP,
+    Command,
+    parse_count,
+    parse_number,
+    parse_rate,
+    parse_size,
+    take_conditions,
+    take_render_overrides,
+)
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from neuprim.core.environment import EnvironmentFile
-
-__all__ = ["COMMAND"]
 
 _CONDITIONS = """\
 Each condition of the run's task (time, light, ...) is a flag, given after RUN_DIR: --time 0.5; a number may also be a
@@ -51,10 +56,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
     parser.add_argument("--frames", type=parse_count, default=60, metavar="N", help="frames of an orbit (default: 60)")
     parser.add_argument("--force", action="store_true", help="replace pictures of the run's report")
-    _add_environment(parser)
-
-
-def _add_environment(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("light from all around, for tasks with a light")
     image = "radiance by latitude and longitude, twice as wide as high"
     group.add_argument("--environment", type=Path, metavar="FILE.exr", help=image)
@@ -69,8 +70,7 @@ def _add_environment(parser: argparse.ArgumentParser) -> None:
 
 
 def _take_rest(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    arguments.words, rest = split_render_overrides(rest)
-    return take_conditions(arguments, rest, parser)
+    return take_conditions(arguments, take_render_overrides(arguments, rest, parser), parser)
 
 
 def _render(arguments: argparse.Namespace) -> int:
@@ -78,46 +78,36 @@ def _render(arguments: argparse.Namespace) -> int:
     if camera not in ("orbit", "test") and not any(Path(n).exists() for n in (camera, camera.partition("#")[0])):
         raise ConfigError(f"--camera {camera}: no such file; expected orbit, test, or a file or folder of cameras")
     environment = _read_environment(arguments)
-    from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
     from neuprim.runs.render_images import RenderRequest, render_run
 
-    given = {
-        "space": arguments.space,
-        "layers": arguments.layers,
-        "datatype": arguments.datatype,
-        "overwrite": arguments.force or None,
-    }
+    given = {"space": arguments.space, "layers": arguments.layers, "datatype": arguments.datatype}
     more: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    with DrawProgress(plain_console(stderr=True)) as progress:
-        paths = render_run(
-            arguments.run_dir,
-            RenderRequest(
-                camera,
-                size=arguments.size,
-                format=arguments.format,
-                out=arguments.out,
-                frames=arguments.frames,
-                conditions=arguments.conditions,
-                fps=arguments.fps,
-                environment=environment,
-                overrides=arguments.words,
-                **more,
-            ),
-            notify=progress.note,
-            progress=progress.show,
-        )
-    for path in paths:
-        print(path)
+    request = RenderRequest(
+        camera,
+        size=arguments.size,
+        format=arguments.format,
+        out=arguments.out,
+        frames=arguments.frames,
+        conditions=arguments.conditions,
+        fps=arguments.fps,
+        environment=environment,
+        overrides=arguments.words,
+        overwrite=arguments.force,
+        **more,
+    )
+    with DrawProgress() as progress:
+        paths = render_run(arguments.run_dir, request, notify=progress.note, progress=progress.show)
+    print(*paths, sep="\n")
     return 0
 
 
 def _read_environment(arguments: argparse.Namespace) -> EnvironmentFile | None:
-    settings = {name: getattr(arguments, f"environment_{name}") for name in ("samples", "rotation", "scale", "unseen")}
-    settings = {name: value for name, value in settings.items() if value is not None}
+    given = {name: getattr(arguments, f"environment_{name}") for name in ("samples", "rotation", "scale", "unseen")}
+    settings = {name: value for name, value in given.items() if value is not None}
     if arguments.environment is None:
-        if settings:
-            raise ConfigError(f"--environment-{next(iter(settings))} is given without --environment FILE.exr")
+        for name in settings:
+            raise ConfigError(f"--environment-{name} is given without --environment FILE.exr")
         return None
     from neuprim.core.environment import EnvironmentFile
 
@@ -126,36 +116,23 @@ def _read_environment(arguments: argparse.Namespace) -> EnvironmentFile | None:
 
 
 def _parse_lights(text: str) -> int:
-    value = _parse_number(text, 1.0, 4096.0, "a whole number from 1 to 4096")
-    if value != int(value):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number from 1 to 4096")
-    return int(value)
+    return int(parse_number(text, 1, 4096, "a whole number from 1 to 4096", whole=True))
 
 
 def _parse_degrees(text: str) -> float:
-    return _parse_number(text, -1e6, 1e6, "an angle in degrees")
+    return parse_number(text, -1e6, 1e6, "an angle in degrees")
 
 
 def _parse_factor(text: str) -> float:
-    return _parse_number(text, 0.0, 1e6, "a factor from 0 to 1e6")
-
-
-def _parse_number(text: str, low: float, high: float, expected: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected {expected}")
-    return value
+    return parse_number(text, 0.0, 1e6, "a factor from 0 to 1e6")
 
 
 COMMAND = Command(
     "render",
     "draw images of a run",
-    _add_arguments,
     _render,
-    epilog=_CONDITIONS + RENDER_OVERRIDES_HELP,
-    take_rest=_take_rest,
+    _add_arguments,
+    _CONDITIONS + RENDER_OVERRIDES_HELP,
+    _take_rest,
     opens_run=True,
 )

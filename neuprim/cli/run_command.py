@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuprim.cli.command import Command, add_trust_flag, take_overrides
+from neuprim.cli.command import Command, add_trust_flag, describe_interruption, take_overrides
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
-    from neuprim.config.command_settings import LauncherSettings, ViewerSettings
+    from neuprim.config.command_settings import LauncherSettings, Target, ViewerSettings
     from neuprim.config.overrides import CommandLine
-
-__all__ = ["COMMAND", "run_one"]
+    from neuprim.search.target_record import TargetRecord
 
 _COMMON_KEYS = """\
 commonest keys:
@@ -71,7 +69,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from neuprim.config import compose, compose_all, read_stored_config
+    from neuprim.config import compose_all, read_stored_config
     from neuprim.config.command_settings import LauncherSettings, take_launcher, take_target, take_viewer
     from neuprim.config.overrides import CommandLine, drop_place
     from neuprim.core.train.distributed.torchrun import read_torchrun_rank
@@ -82,46 +80,44 @@ def _run(args: argparse.Namespace) -> int:
         from neuprim.cli.ranks import run_as_rank
 
         return run_as_rank(place, args.overrides, args.multirun or args.cfg or args.config is not None)
-    check, typed = not args.cfg, CommandLine(args.overrides, args.config)
-    viewer, words = take_viewer(args.overrides)
-    launcher, words = take_launcher(words)
-    wanted, words = take_target(words)
-    elsewhere = launcher != LauncherSettings()
-    beside = {"-m": args.multirun, "target": wanted is not None, "launcher": elsewhere}
-    if viewer is not None and any(beside.values()):
-        raise ConfigError(
-            f"viewer=true: shows one run; expected no {next(word for word, on in beside.items() if on)} beside it"
-        )
+    typed = CommandLine(args.overrides, args.config)
+    viewer, overrides = take_viewer(args.overrides)
+    launcher, overrides = take_launcher(overrides)
+    wanted, overrides = take_target(overrides)
+    launched = launcher != LauncherSettings()
+    for name, given in (("-m", args.multirun), ("target", wanted is not None), ("launcher", launched)):
+        if viewer is not None and given:
+            raise ConfigError(f"viewer=true: shows one run; expected no {name} beside it")
     if wanted is not None and args.multirun:
         raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
-    if args.multirun and not drop_place(words):
+    if args.multirun and not drop_place(overrides):
         from neuprim.runs.sweep import read_sweep_overrides
 
-        words = read_sweep_overrides(words)
-        typed = CommandLine([*words, *args.overrides], args.config)  # what goes on with it says all of it
+        overrides = read_sweep_overrides(overrides)
+        typed = CommandLine([*overrides, *args.overrides], args.config)  # what goes on with it says all of it
     stored = None if args.config is None else read_stored_config(args.config)
-    configs = compose_all(words, check, stored) if args.multirun else [compose(words, check, stored)]
+    configs = (compose_all if args.multirun else _compose_one)(overrides, not args.cfg, stored)
     if args.cfg:
         if wanted is not None:
             print(f"# {wanted[0]} budget={wanted[1]:g}s; the search starts from")
         print("---\n".join(config.to_yaml() for config in configs), end="")
         return 0
     if wanted is not None:
-        from neuprim.cli.target import fit_target
-
-        return fit_target(configs[0], *wanted, launcher, typed)
-    if len(configs) > 1:
-        from neuprim.cli.sweep import launch_sweep
-
-        return launch_sweep(configs, words, launcher, typed)
+        return _fit_target(configs[0], *wanted, launcher, typed)
     if viewer is not None:
         refuse_chunks(configs[0], "viewer=true shows one training")
-    if elsewhere and not is_chunked(configs[0]):  # the chunks of a scene in chunks are what runs elsewhere
-        from neuprim.cli.sweep import launch_run
+    if len(configs) > 1 or (launched and not is_chunked(configs[0])):  # the chunks of a scene are launched themselves
+        from neuprim.cli.sweep import launch_runs
 
-        return launch_run(configs[0], launcher, typed)
+        return launch_runs(configs, overrides, launcher, typed)
     print(run_one(configs[0], typed, viewer, launcher))
     return 0
+
+
+def _compose_one(overrides: Sequence[str], check_output: bool, stored: RunConfig | None) -> list[RunConfig]:
+    from neuprim.config import compose
+
+    return [compose(overrides, check_output, stored)]
 
 
 def run_one(
@@ -137,24 +133,58 @@ def run_one(
     Args:
         launcher: where the chunks of a scene that is fitted in chunks work; None: here.
     """
-    from neuprim.cli.console import plain_console
     from neuprim.cli.progress import RunProgress
     from neuprim.cli.view_command import run_viewed
     from neuprim.config.command_settings import LauncherSettings
     from neuprim.runs.run import run
 
     try:
-        with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}") as events:
-            return (
-                run(config, events, launcher=launcher or LauncherSettings())
-                if viewer is None
-                else run_viewed(config, events, viewer)
-            )
+        with RunProgress(f"{config.task}/{config.scene_name}") as events:
+            if viewer is not None:
+                return run_viewed(config, events, viewer)
+            return run(config, events, launcher=launcher or LauncherSettings())
     except KeyboardInterrupt:
-        begun = any((config.output_dir / file).exists() for file in ("checkpoint.safetensors", "chunks.json"))
-        there = "has the run up to here" if begun else "has no checkpoint yet"
-        command = shlex.join(["neuprim", "run", *typed.resume_arguments(config.output_dir)])
-        raise KeyboardInterrupt(f"; {config.output_dir} {there}; to go on:\n  {command}") from None
+        raise KeyboardInterrupt(describe_interruption(config.output_dir, typed)) from None
 
 
-COMMAND = Command("run", "fit a scene", _add_arguments, _run, epilog=_help, take_rest=take_overrides)
+def _fit_target(
+    config: RunConfig, target: Target, budget: float, launcher: LauncherSettings, typed: CommandLine
+) -> int:
+    """Search for a model that reaches a target; print what was achieved and the run's directory."""
+    from neuprim.cli.progress import RunProgress
+    from neuprim.search.target import run_target
+
+    try:
+        with RunProgress(f"{config.task}/{config.scene_name}", search=True) as events:
+            record = run_target(config, target, budget, events, launcher=launcher)
+    except KeyboardInterrupt:
+        command = typed.resume_command(config.output_dir)
+        raise KeyboardInterrupt(f"; {config.output_dir} has the trials up to here; to go on:\n  {command}") from None
+    for line in _describe_target(record):
+        events.console.print(line)
+    print(record.achieved["run_dir"])
+    return 0
+
+
+def _describe_target(record: TargetRecord) -> list[str]:
+    """What was predicted and achieved, and why the search ended."""
+    from neuprim.search.size_predictor import format_forecast
+    from neuprim.search.target_record import TARGET_FILE
+
+    found = record.achieved
+    lines = [
+        f"predicted {format_forecast(name, value, doubt)}; held out {found['held_out'][name]:.4g}; "
+        f"test views {found['test'][name]:.4g}, {found['test_before_storing'][name]:.4g} before storing"
+        for name, (value, doubt) in found["predicted"].items()
+    ]
+    files = f"{found['file']} {found['packed_bytes']:,} bytes, model.safetensors {found['model_bytes']:,} bytes"
+    lines.append(f"{found['primitives']:,} primitives: {files}")
+    used = f"{found['seconds']:.0f} s of {record.asked['budget']:g} s used"
+    lines.append(f"{used}; {found['fps']:.1f} frames per second")
+    lines += [f"ended: {why}" for why in record.why]
+    if record.warning:
+        lines.append(f"neuprim: warning: {record.warning}")
+    return [*lines, f"everything that was tried: {TARGET_FILE}"]
+
+
+COMMAND = Command("run", "fit a scene", _run, _add_arguments, _help, take_overrides)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 import time
 from collections import Counter
@@ -17,7 +16,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from neuprim.cli.console import plain_console
+from neuprim.cli.command import describe_interruption, plain_console
 from neuprim.config import RunConfig
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.overrides import CommandLine
@@ -26,38 +25,34 @@ from neuprim.runs.launch.jobs import ENDED, JobStatus, Result
 from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch
 from neuprim.runs.sweep import run_job, run_sweep
 
-__all__ = ["LaunchProgress", "launch_run", "launch_sweep"]
-
 _LINE_INTERVAL = 0.25
 """Share of a training between two lines, where there is no terminal."""
 
 _STATE_ORDER = ("training", "finishing", "preparing", "starting", "failed", "interrupted", "done", "waiting")
 """Jobs that go first where not all rows fit the screen."""
 
+_STYLES = {"failed": "red", "done": "green", "waiting": "dim"}
 
-def launch_sweep(configs: Sequence[RunConfig], words: list[str], settings: LauncherSettings, typed: CommandLine) -> int:
-    """Launch all runs of a sweep; returns the exit status.
+
+def launch_runs(
+    configs: Sequence[RunConfig], overrides: list[str], settings: LauncherSettings, typed: CommandLine
+) -> int:
+    """Launch the runs of a sweep, or a single run in another process; return the exit status.
 
     Args:
-        words: what the sweep was asked for.
+        overrides: what the sweep was asked for.
         typed: all that was typed, for the command that continues.
     """
-    folder = configs[0].output_dir.parent
-    progress = _RunProgress(configs)
-    with progress:
-        _, results = run_sweep(configs, words, settings, progress)
+    with _RunProgress(configs) as progress:
+        if len(configs) > 1:
+            _, results = run_sweep(configs, overrides, settings, progress)
+        else:
+            render_ground_truth_of_runs(configs, settings, progress)
+            results = launch([run_job(configs[0])], settings, configs[0].output_dir / LAUNCH_FOLDER, progress)
     status = _report(configs, results, progress.live, typed)
-    print(folder / "sweep.html")
+    if len(configs) > 1:
+        print(configs[0].output_dir.parent / "sweep.html")
     return status
-
-
-def launch_run(config: RunConfig, settings: LauncherSettings, typed: CommandLine) -> int:
-    """Launch one run in another process; returns the exit status."""
-    progress = _RunProgress([config])
-    with progress:
-        render_ground_truth_of_runs([config], settings, progress)
-        results = launch([run_job(config)], settings, config.output_dir / LAUNCH_FOLDER, progress)
-    return _report([config], results, progress.live, typed)
 
 
 class LaunchProgress:
@@ -68,11 +63,7 @@ class LaunchProgress:
         self._statuses = [JobStatus()] * len(names)
         self._seconds: dict[int, float] = {}
         self._printed: dict[int, tuple[object, ...]] = {}
-        self._display = (
-            Live(self, console=console, refresh_per_second=4, transient=False, redirect_stdout=True)
-            if self.live
-            else None
-        )
+        self._display = Live(self, console=console, redirect_stdout=True) if self.live else None
 
     def __enter__(self) -> Self:
         if self._display is not None:
@@ -110,7 +101,7 @@ class LaunchProgress:
         if status.state == "done" and not status.step:
             return  # it was done before
         text = " ".join(filter(None, (_state(status), _steps(status), _psnr(status, " dB held out"), status.text)))
-        self.console.print(f"{self.names[number]}: {text}", highlight=False, soft_wrap=True, markup=False, emoji=False)
+        self.console.print(f"{self.names[number]}: {text}")
 
     # ------------------------------------------------------------ table
 
@@ -133,7 +124,7 @@ class LaunchProgress:
                 self._elapsed(number),
                 status.text,
             )
-            table.add_row(*(Text(cell, style=_style(status)) for cell in cells))
+            table.add_row(*(Text(cell, style=_STYLES.get(status.state, "")) for cell in cells))
         yield table
         counts = Counter(status.state for status in self._statuses)
         more = f"; {len(order) - room} not shown" if len(order) > room else ""
@@ -142,8 +133,8 @@ class LaunchProgress:
     def _elapsed(self, number: int) -> str:
         if number not in self._seconds:
             return ""
-        ended = self._statuses[number].state in ENDED
-        return f"{self._seconds[number] if ended else time.monotonic() - self._seconds[number]:.0f}"
+        seconds = self._seconds[number]
+        return f"{seconds if self._statuses[number].state in ENDED else time.monotonic() - seconds:.0f}"
 
 
 def _state(status: JobStatus) -> str:
@@ -156,10 +147,6 @@ def _steps(status: JobStatus) -> str:
 
 def _psnr(status: JobStatus, unit: str = "") -> str:
     return "" if status.psnr is None else f"{status.psnr:.2f}{unit}"
-
-
-def _style(status: JobStatus) -> str:
-    return {"failed": "red", "done": "green", "waiting": "dim"}.get(status.state, "")
 
 
 class _RunProgress(LaunchProgress):
@@ -186,38 +173,26 @@ def _print_error(directory: Path, line: str) -> None:
 
 
 def _report(configs: Sequence[RunConfig], results: Sequence[Result | None], live: bool, typed: CommandLine) -> int:
-    """Print failures, and raise KeyboardInterrupt with the command that continues; returns the exit status: 2 for bad
+    """Print failures, and raise KeyboardInterrupt with the command that continues; return the exit status: 2 for bad
     input, 1 for a bug."""
-    status = 0
+    status, left = 0, []
     for config, result in zip(configs, results, strict=True):
         if result is None or result.state == "interrupted":
-            continue
-        if result.state == "done":
+            left.append(config.output_dir)
+        elif result.state == "done":
             if live:
                 print(config.output_dir)
-            continue
-        if result.trace:
-            print(result.trace, end="", file=sys.stderr)
-        if live:
-            _print_error(config.output_dir, result.line)
-        status = 1 if result.trace or status == 1 else 2
-    left = [
-        config
-        for config, result in zip(configs, results, strict=True)
-        if result is None or result.state == "interrupted"
-    ]
+        else:
+            if result.trace:
+                print(result.trace, end="", file=sys.stderr)
+            if live:
+                _print_error(config.output_dir, result.line)
+            status = 1 if result.trace or status == 1 else 2
+    if left and len(configs) == 1:
+        raise KeyboardInterrupt(describe_interruption(left[0], typed))
     if left:
-        raise KeyboardInterrupt(_describe_rest(configs, left, typed))
+        over = f"{left[0].parent} has {len(configs) - len(left)} of {len(configs)} runs"
+        begun = sum((directory / "checkpoint.safetensors").exists() for directory in left)
+        command = typed.resume_command(left[0])
+        raise KeyboardInterrupt(f"; {over}, and {begun} of the others up to here; to go on:\n  {command}")
     return status
-
-
-def _describe_rest(configs: Sequence[RunConfig], left: Sequence[RunConfig], typed: CommandLine) -> str:
-    begun = [config.output_dir for config in left if (config.output_dir / "checkpoint.safetensors").exists()]
-    if len(configs) == 1:
-        where = f"{left[0].output_dir} {'has the run up to here' if begun else 'has no checkpoint yet'}"
-    else:
-        over = len(configs) - len(left)
-        where = (
-            f"{left[0].output_dir.parent} has {over} of {len(configs)} runs, and {len(begun)} of the others up to here"
-        )
-    return f"; {where}; to go on:\n  {shlex.join(['neuprim', 'run', *typed.resume_arguments(left[0].output_dir)])}"

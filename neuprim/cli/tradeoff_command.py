@@ -7,16 +7,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuprim.cli.command import Command, add_trust_flag, check_run_directory, parse_count
-from neuprim.cli.render_overrides import RENDER_OVERRIDES_HELP, split_render_overrides
+from neuprim.cli.command import (
+    RENDER_OVERRIDES_HELP,
+    Command,
+    add_trust_flag,
+    check_run_directory,
+    parse_count,
+    plain_console,
+    take_render_overrides,
+)
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from neuprim.search.points import Point, Record
-
-__all__ = ["COMMAND", "is_override"]
 
 _USAGE = """\
 neuprim tradeoff RUN_DIR | KEY=VALUE ... [KEY=VALUE ...] [--views N] [--repeats N] [--knobs NAME ...] [--budget TIME]
@@ -40,30 +45,23 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.usage = _USAGE
     add_trust_flag(parser)
     parser.add_argument("run_dir", metavar="RUN_DIR|KEY=VALUE", help="a finished run, or overrides of `neuprim run`")
-    parser.add_argument(
-        "--views", type=parse_count, default=5, metavar="N", help="test views, evenly spread (default: 5)"
-    )
+    views = "test views, evenly spread (default: 5)"
+    parser.add_argument("--views", type=parse_count, default=5, metavar="N", help=views)
     parser.add_argument("--repeats", type=parse_count, default=15, metavar="N", help="rounds of timing (default: 15)")
-    parser.add_argument(
-        "--knobs", nargs="+", default=[], metavar="NAME", help="some of them, e.g. alpha_min sort (default: all)"
-    )
-    parser.add_argument(
-        "--budget",
-        metavar="TIME",
-        help="about how long, e.g. 90s or 10m; what does not fit is left out (default: 5m, 20m of trainings)",
-    )
+    knobs = "some of them, e.g. alpha_min sort (default: all)"
+    parser.add_argument("--knobs", nargs="+", default=[], metavar="NAME", help=knobs)
+    budget = "about how long, e.g. 90s or 10m; what does not fit is left out (default: 5m, 20m of trainings)"
+    parser.add_argument("--budget", metavar="TIME", help=budget)
     parser.add_argument("--seeds", type=parse_count, metavar="N", help="trainings of every model (default: 1)")
-    parser.add_argument(
-        "--lpips", type=Path, metavar="FILE", help="measure LPIPS with these weights of your own, a file or a folder"
-    )
+    lpips = "measure LPIPS with these weights of your own, a file or a folder"
+    parser.add_argument("--lpips", type=Path, metavar="FILE", help=lpips)
 
 
 def _take_rest(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
     if is_override(arguments.run_dir):
         arguments.words = [word for word in rest if not word.startswith("-")]
         return [word for word in rest if word.startswith("-") and word != "--"]
-    arguments.words, rest = split_render_overrides(rest)
-    return rest
+    return take_render_overrides(arguments, rest, parser)
 
 
 def _tradeoff(args: argparse.Namespace) -> int:
@@ -73,15 +71,9 @@ def _tradeoff(args: argparse.Namespace) -> int:
 
 
 def _compare_rendering(args: argparse.Namespace) -> int:
-    from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
     from neuprim.search.points import TRADEOFF_FOLDER
-    from neuprim.search.render_tradeoff import (
-        TradeoffRequest,
-        format_render_command,
-        measure_tradeoff,
-        parse_budget,
-    )
+    from neuprim.search.render_tradeoff import TradeoffRequest, format_render_command, measure_tradeoff, parse_budget
 
     run_dir, views, repeats = Path(args.run_dir), args.views, args.repeats
     check_run_directory(run_dir)
@@ -91,7 +83,7 @@ def _compare_rendering(args: argparse.Namespace) -> int:
     request = TradeoffRequest(run_dir, views, repeats, args.knobs, budget, args.words, args.lpips)
     folder = run_dir / TRADEOFF_FOLDER
     try:
-        with DrawProgress(plain_console(stderr=True)) as progress:
+        with DrawProgress() as progress:
             record = measure_tradeoff(request, progress.note, progress.show)
     except KeyboardInterrupt:
         if not (folder / "tradeoff.json").exists():
@@ -104,7 +96,6 @@ def _compare_rendering(args: argparse.Namespace) -> int:
 
 
 def _compare_models(args: argparse.Namespace) -> int:
-    from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
     from neuprim.config.command_settings import take_launcher
     from neuprim.config.overrides import parse
@@ -120,7 +111,7 @@ def _compare_models(args: argparse.Namespace) -> int:
     seeds = args.seeds or 1
     request = AblationRequest(words, budget, args.views, args.repeats, args.knobs, seeds, args.lpips, launcher)
     try:
-        with DrawProgress(plain_console(stderr=True)) as progress:
+        with DrawProgress() as progress:
             folder, record = run_ablation(request, progress.note, progress.show)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("; what is trained is kept, and the same command goes on") from None
@@ -129,19 +120,17 @@ def _compare_models(args: argparse.Namespace) -> int:
 
 
 def _print_fronts(folder: Path, record: Record, commands: Sequence[str]) -> None:
-    from neuprim.cli.console import plain_console
-
     console = plain_console()
     if "length" in record.facts:
-        console.print(record.facts["length"], markup=False)
+        console.print(record.facts["length"])
     for title, numbers in (("front of speed", record.speed), ("front of size", record.size)):
         console.print(_build_table(title, record, numbers))
         for place, number in enumerate(numbers, 1):
-            console.print(f"{commands[number]}  # {place}", markup=False)
+            console.print(f"{commands[number]}  # {place}")
         console.print()
     if record.points[0].run_dir:
         for one in record.left_out:
-            console.print(f"left out: {' '.join(one.words) or one.knob}: {one.reason}", markup=False)
+            console.print(f"left out: {' '.join(one.words) or one.knob}: {one.reason}")
     for name in _FILES:
         console.print(folder / name)
 
@@ -178,8 +167,8 @@ def _format_cells(point: Point) -> tuple[str, ...]:
 COMMAND = Command(
     "tradeoff",
     "measure what speed and size cost in accuracy: how a run is drawn, or what is trained",
-    _add_arguments,
     _tradeoff,
-    epilog=_FORMS + RENDER_OVERRIDES_HELP,
-    take_rest=_take_rest,
+    _add_arguments,
+    _FORMS + RENDER_OVERRIDES_HELP,
+    _take_rest,
 )

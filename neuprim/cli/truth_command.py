@@ -8,8 +8,6 @@ import shlex
 from neuprim.cli.command import Command, take_overrides
 from neuprim.core.errors import ConfigError
 
-__all__ = ["COMMAND"]
-
 _HELP = """\
 Frames that are there are not made again; a run with the same scene reads them. With a launcher they are made side by
 side:
@@ -19,26 +17,22 @@ Prints where they are."""
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "overrides", nargs="*", metavar="KEY=VALUE", help="settings of the scene and of the launcher, as of neuprim run"
-    )
-    parser.add_argument(
-        "-m", "--multirun", action="store_true", help="of every combination of values separated by commas"
-    )
+    settings = "settings of the scene and of the launcher, as of neuprim run"
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help=settings)
+    every = "of every combination of values separated by commas"
+    parser.add_argument("-m", "--multirun", action="store_true", help=every)
 
 
 def _truth(args: argparse.Namespace) -> int:
-    from neuprim.cli.console import plain_console
     from neuprim.cli.progress import RunProgress
     from neuprim.config import compose, compose_all
     from neuprim.config.command_settings import take_launcher
     from neuprim.runs.ground_truth import render_ground_truth
 
     launcher, rest = take_launcher(args.overrides)
-    configs = compose_all(rest) if args.multirun else [compose(rest)]
     try:
-        for config in configs:
-            with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}") as events:
+        for config in compose_all(rest) if args.multirun else [compose(rest)]:
+            with RunProgress(f"{config.task}/{config.scene_name}") as events:
                 made = render_ground_truth(config, launcher, events)
             if made is None:
                 raise ConfigError(
@@ -53,10 +47,5 @@ def _truth(args: argparse.Namespace) -> int:
 
 
 COMMAND = Command(
-    "truth",
-    "render the ground truth of a scene before runs need it",
-    _add_arguments,
-    _truth,
-    epilog=_HELP,
-    take_rest=take_overrides,
+    "truth", "render the ground truth of a scene before runs need it", _truth, _add_arguments, _HELP, take_overrides
 )

@@ -5,19 +5,17 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim.cli.command import Command
+from neuprim.cli.command import Command, plain_console
 from neuprim.core.errors import DataError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from neuprim.core.io.vdb import Grid, GridHeader
-
-__all__ = ["COMMAND"]
 
 COLUMNS = ("grid", "type", "compression", "voxel size", "bounds", "active", "range", "dense")
 
@@ -39,15 +37,11 @@ def _print_info(arguments: argparse.Namespace) -> int:
         record = {"files": [_describe_file(file) for file in files], "notes": notes}
         print(json.dumps(record, indent=1, allow_nan=False))
         return 0
-    from rich.text import Text
-
-    from neuprim.cli.console import plain_console
-
     console = plain_console()
     for file in files:
         _print_file(console, _describe_file(file))
     for note in notes:
-        console.print(Text(note))
+        console.print(note)
     return 0
 
 
@@ -65,9 +59,8 @@ def _find_files(path: Path) -> tuple[list[Path], list[str]]:
             raise
         return files, [f"not one sequence: {error}"]
     missing = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in frames.gaps)
-    note = (
-        f"{len(frames)} frames, {frames.frames[0].number} to {frames.frames[-1].number}; missing: {missing or 'none'}"
-    )
+    numbers = f"{frames.frames[0].number} to {frames.frames[-1].number}"
+    note = f"{len(frames)} frames, {numbers}; missing: {missing or 'none'}"
     return [frame.path for frame in frames.frames], [note]
 
 
@@ -81,12 +74,12 @@ def _describe_file(path: Path) -> dict[str, Any]:
         "path": str(path),
         "version": header.version,
         "library": list(header.library),
-        "metadata": _plain(header.metadata),
-        "grids": [_describe(entry, None if entry.undecodable() else next(grids)) for entry in header.grids],
+        "metadata": _to_json(header.metadata),
+        "grids": [_describe_grid(entry, None if entry.undecodable() else next(grids)) for entry in header.grids],
     }
 
 
-def _describe(header: GridHeader, grid: Grid | None) -> dict[str, Any]:
+def _describe_grid(header: GridHeader, grid: Grid | None) -> dict[str, Any]:
     """One grid; grids that cannot be decoded have a ``reason`` and no numbers from voxels."""
     entry: dict[str, Any] = {
         "name": header.name,
@@ -96,39 +89,36 @@ def _describe(header: GridHeader, grid: Grid | None) -> dict[str, Any]:
         "compression": header.compression,
         "map": header.map,
         "transform": None if header.transform is None else header.transform.tolist(),
-        "voxel_size": None if header.voxel_size is None else list(header.voxel_size),
-        "metadata": _plain(header.metadata),
+        "voxel_size": header.voxel_size,
+        "metadata": _to_json(header.metadata),
         "reason": header.refusal(),
     }
     if grid is None:
         return entry
     box = grid.world_bounds()
     return entry | {
-        "background": [_number(v) for v in grid.background.ravel().tolist()],
-        "bounds": None if grid.bounds is None else [list(corner) for corner in grid.bounds],
+        "background": _to_json(grid.background.ravel().tolist()),
+        "bounds": grid.bounds,
         "world_bounds": None if box is None else box.tolist(),
         "leaves": len(grid.values),
         "tiles": len(grid.tiles),
         "active_voxels": grid.active_voxels,
-        "range": None if grid.range is None else list(grid.range),
+        "range": grid.range,
         "non_finite": grid.non_finite,
         "sparse_bytes": grid.sparse_bytes,
         "dense_bytes": grid.dense_bytes,
     }
 
 
-def _plain(metadata: Any) -> dict[str, Any]:
-    return {name: _value(value) for name, value in metadata.items()}
-
-
-def _value(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
+    """Plain values: JSON knows no bytes, tuples or NaN."""
+    if isinstance(value, Mapping):
+        return {name: _to_json(item) for name, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_to_json(item) for item in value]
     if isinstance(value, bytes):
         return f"{len(value)} bytes"
-    return [_number(v) for v in value] if isinstance(value, tuple) else _number(value)
-
-
-def _number(value: Any) -> Any:
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value  # JSON knows no NaN
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _print_file(console: Console, file: dict[str, Any]) -> None:
@@ -136,19 +126,22 @@ def _print_file(console: Console, file: dict[str, Any]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    count = len(file["grids"])
-    title = f"{file['path']}  (version {file['version']}, {count} {'grid' if count == 1 else 'grids'})"
+    grids = file["grids"]
+    title = f"{file['path']}  (version {file['version']}, {len(grids)} {'grid' if len(grids) == 1 else 'grids'})"
     table = Table(title=Text(_clean(title)), title_justify="left", box=SIMPLE_HEAD)
     for name in COLUMNS:
         table.add_column(name, overflow="fold", no_wrap=name in ("bounds", "active", "range", "dense"))
-    for grid in file["grids"]:
-        table.add_row(*(Text(_clean(cell)) for cell in _cells(grid)))
+    for grid in grids:
+        table.add_row(*(Text(_clean(cell)) for cell in _format_cells(grid)))
     console.print(table)
-    for line in _remarks(file["grids"]):
-        console.print(Text(_clean(f"  {line}")))
+    for grid in grids:
+        if grid["reason"]:
+            console.print(_clean(f"  {grid['name']}: {grid['reason']}"))
+        if grid.get("non_finite"):
+            console.print(_clean(f"  {grid['name']}: {grid['non_finite']} active values are NaN or infinite"))
 
 
-def _cells(grid: dict[str, Any]) -> Iterator[str]:
+def _format_cells(grid: dict[str, Any]) -> Iterator[str]:
     size = grid["voxel_size"]
     kind = grid["type"].removeprefix("Tree_").removesuffix("_5_4_3") + " as half" * grid["half"]
     yield from (grid["name"], f"{kind}\n{grid['class']}", grid["compression"].replace(" + ", "\n"))
@@ -160,18 +153,10 @@ def _cells(grid: dict[str, Any]) -> Iterator[str]:
     yield "empty" if box is None else "\n".join(f"{a}:{b}" for a, b in zip(*box, strict=True))
     yield f"{grid['active_voxels']:,}"
     yield "–" if span is None else f"{span[0]:.4g}\n{span[1]:.4g}"
-    yield _bytes(grid["dense_bytes"])
+    yield _format_bytes(grid["dense_bytes"])
 
 
-def _remarks(grids: list[dict[str, Any]]) -> Iterator[str]:
-    for grid in grids:
-        if grid["reason"]:
-            yield f"{grid['name']}: {grid['reason']}"
-        if grid.get("non_finite"):
-            yield f"{grid['name']}: {grid['non_finite']} active values are NaN or infinite"
-
-
-def _bytes(count: int) -> str:
+def _format_bytes(count: int) -> str:
     size = float(count)
     for unit in ("B", "KiB", "MiB", "GiB"):
         if size < 1024:
@@ -181,14 +166,14 @@ def _bytes(count: int) -> str:
 
 
 def _clean(text: str) -> str:
-    """Names in files may hold control characters; a terminal must not act on them."""
+    """Replace control characters in names of files; a terminal must not act on them."""
     return "".join(c if c.isprintable() or c == "\n" else "�" for c in text)
 
 
 COMMAND = Command(
     "vdb",
     "look into OpenVDB files",
-    _add_arguments,
     _print_info,
-    epilog="`info` lists grids: type, transform, bounds, active voxels, values, memory.",
+    _add_arguments,
+    "`info` lists grids: type, transform, bounds, active voxels, values, memory.",
 )

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from neuprim.config import RunConfig
     from neuprim.config.command_settings import ViewerSettings
 
-__all__ = ["COMMAND", "run_viewed"]
-
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     port = "of the page's address; 0 for any (default: 8080)"
@@ -27,26 +25,22 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _view(args: argparse.Namespace) -> int:
     """Show the run until Ctrl-C."""
-    from neuprim.cli.console import plain_console
     from neuprim.cli.progress import LineProgress
-    from neuprim.config.command_settings import ViewerSettings
+    from neuprim.config.command_settings import LOOPBACK, ViewerSettings
     from neuprim.viewer.view import view_run
 
-    settings = ViewerSettings(port=args.port) if args.host is None else ViewerSettings(args.host, args.port)
+    settings = ViewerSettings(args.host or LOOPBACK, args.port)
     _warn_of_open_host(settings)
-    console = plain_console(stderr=True)
+    progress = LineProgress()
 
-    def opened(address: str) -> None:
+    def print_address(address: str) -> None:
         print(f"{address}\nopen it in a browser; Ctrl-C ends the viewer", flush=True)
 
+    def print_note(text: str) -> None:
+        progress.console.print(f"neuprim: {text}")
+
     try:
-        view_run(
-            args.run_dir,
-            settings,
-            opened,
-            lambda text: console.print(f"neuprim: {text}", markup=False),
-            LineProgress(console),
-        )
+        view_run(args.run_dir, settings, print_address, print_note, progress)
     except KeyboardInterrupt:
         print("neuprim: the viewer is closed", file=sys.stderr)
     return 0
@@ -67,15 +61,14 @@ def _warn_of_open_host(settings: ViewerSettings) -> None:
     from neuprim.config.command_settings import LOOPBACK
     from neuprim.viewer.server import is_loopback
 
-    if is_loopback(settings.host):
-        return
-    port = settings.port or 8080
-    print(
-        f"neuprim: warning: other machines can reach the viewer at {settings.host}, without encryption: whoever can "
-        "read the network can read its token. Safer: leave the host out, and type on the other machine "
-        f"`ssh -L {port}:{LOOPBACK}:{port} THIS_MACHINE`",
-        file=sys.stderr,
-    )
+    if not is_loopback(settings.host):
+        port = settings.port or 8080
+        print(
+            f"neuprim: warning: other machines can reach the viewer at {settings.host}, without encryption: whoever "
+            "can read the network can read its token. Safer: leave the host out, and type on the other machine "
+            f"`ssh -L {port}:{LOOPBACK}:{port} THIS_MACHINE`",
+            file=sys.stderr,
+        )
 
 
 def _parse_port(text: str) -> int:
@@ -87,7 +80,7 @@ def _parse_port(text: str) -> int:
 COMMAND = Command(
     "view",
     "look at a run in the browser: turn it, play it, move its light, edit a camera path",
-    _add_arguments,
     _view,
+    _add_arguments,
     opens_run=True,
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,15 +42,16 @@ class CommandLine:
     overrides: Sequence[str]
     file: Path | None = None
 
-    def resume_arguments(self, directory: Path) -> list[str]:
-        """Return the arguments that continue what these began: a run in ``directory``, or the sweep it is a part of."""
+    def resume_command(self, directory: Path) -> str:
+        """Return the command that continues what these began: a run in ``directory``, or the sweep it is a part of."""
         sweep = bool(swept_keys(self.overrides))
         overrides = drop_place(self.overrides)
         if not overrides and self.file is None and not (directory / "config.yaml").is_file():
             overrides = ["task=static"]  # the default, which a bare resume=true does not begin
         flags = [*(["-m"] if sweep else []), *([] if self.file is None else ["--config", str(self.file)])]
         place = str(directory.parent if sweep else directory)
-        return [*flags, *overrides, quote_override("output_dir", place), "resume=true"]
+        last = [quote_override("output_dir", place), "resume=true"]
+        return shlex.join(["neuprim", "run", *flags, *overrides, *last])
 
 
 def parse(overrides: Sequence[str]) -> list[Assignment]:

@@ -140,11 +140,10 @@ class RunConfig:
         scene_name = scene.pop("name", None)
         if not isinstance(scene_name, str):
             raise ConfigError("scene.name: missing; expected a name")
-        made_by = None if stored.made_by is None else Provenance.from_dict(stored.made_by)
         loss = None if stored.train.loss is None else split_plugin_name(stored.train.loss)[1]
         names = {"task.name": stored.task.name, "scene.name": scene_name, "train.loss": loss}
         for (key, name), kind in zip(names.items(), ("task", "scene", "loss"), strict=True):
-            maker = None if made_by is None else getattr(made_by, kind)
+            maker = None if stored.made_by is None else getattr(stored.made_by, kind)
             if maker is not None and maker.name != name:
                 raise ConfigError(f"made_by.{kind}.name: found {maker.name!r}; expected {name!r}, as {key} says")
         return cls(
@@ -163,7 +162,7 @@ class RunConfig:
             unused=unused,
             overrides=stored.overrides,
             non_default=stored.non_default,
-            made_by=made_by,
+            made_by=stored.made_by,
         )
 
 
@@ -184,7 +183,7 @@ class _StoredConfig(RunSettings):
     preset: str
     overrides: list[str] = field(default_factory=list)
     non_default: dict[str, tuple[Any, Any]] = field(default_factory=dict)
-    made_by: Any = None
+    made_by: Provenance | None = None
 
 
 class _PlainDumper(yaml.SafeDumper):

@@ -1,16 +1,21 @@
+import json
 import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 
 import neuprim
 from neuprim.cli import main
+from neuprim.cli.export_command import print_report
 from neuprim.config import RunConfig
 from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import NonFiniteError
+from neuprim.core.extensions import ExportReport
 from neuprim.runs.events import Events
 from neuprim.runs.render_images import RenderRequest
 from tests.plugins.fakes import install, site, toy
@@ -122,6 +127,14 @@ def test_a_failing_combination_does_not_lose_the_others(
         (["render", ".", "--camera", "orbit", "--time", "0"], "config.yaml: missing"),
         (["vdb", "info", "x" * 300], "File name too long"),
         (["tasks", "more"], "more: no such argument of `neuprim tasks`"),
+        (["run", "task=toy", "target.psnr=30"], "target.psnr=30: expected a budget beside it"),
+        (["run", "-m", "task=toy", "target.psnr=30", "budget=5m", "seed=1,2"], "expected no -m beside it"),
+        (["run", "--config", "nowhere.yaml"], "no such file; expected RUN_DIR/config.yaml of an earlier run"),
+        (["run", "-m", "viewer=true", "seed=1,2"], "viewer=true: shows one run; expected no -m beside it"),
+        (["run", "viewer=true", "target.psnr=20", "budget=1m"], "expected no target beside it"),
+        (["run", "viewer.prot=1"], "viewer.prot: no such setting; did you mean 'viewer.port'"),
+        (["view", "."], "config.yaml: missing"),
+        (["view", ".", "--port", "80000"], "--port 80000: expected a port, 1 to 65535, or 0 for any"),
     ],
 )
 def test_one_line_and_status_2(
@@ -144,6 +157,15 @@ def test_interrupt_is_130_and_a_bug_keeps_its_traceback(calls: list[Any], monkey
     monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", bug)
     with pytest.raises(ZeroDivisionError):
         main(["run", "task=toy"])
+
+
+def test_a_full_gpu_is_one_line(calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    def fill(*args: Any, **options: Any) -> Path:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+
+    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", fill)
+    assert main(["run", "task=toy"]) == 2
+    assert "memory is full; expected a smaller image or grid" in error_line(capsys)
 
 
 def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
@@ -192,7 +214,58 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
         )
 
 
-# ---------------------------------------------------------------- eval, render
+def test_a_target_prints_what_came_of_it(
+    calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["run", "task=toy", "target.ssim=0.9", "target.megabytes=2", "budget=5m", "output_dir=out"]
+    assert main([*words, "--cfg"]) == 0
+    first = "# target.ssim=0.9 target.megabytes=2 budget=300s; the search starts from\ntask:\n"
+    assert capsys.readouterr().out.startswith(first)
+    achieved: dict[str, Any] = {"predicted": {"psnr": (30.0, 0.5)}, "run_dir": "out", "file": "model.neuprim"}
+    achieved |= {key: {"psnr": 29.5} for key in ("held_out", "test", "test_before_storing")}
+    achieved |= dict.fromkeys(("primitives", "packed_bytes", "model_bytes", "seconds", "fps"), 1234)
+    record = SimpleNamespace(achieved=achieved, asked={"budget": 300.0}, why=["enough"], warning="psnr is missed")
+    monkeypatch.setattr("neuprim.search.target.run_target", lambda *args, **options: record)
+    assert main(words) == 0
+    out, err = capsys.readouterr()
+    assert out == "out\n"
+    for text in ("predicted psnr ", "model.neuprim 1,234 bytes", "s of 300 s used", "ended: enough", "psnr is missed"):
+        assert text in err
+
+    def interrupt(*args: Any, **options: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("neuprim.search.target.run_target", interrupt)
+    assert main(words) == 130
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "neuprim: interrupted; out has the trials up to here; to go on:"
+    assert second == f"  neuprim {' '.join(words)} resume=true"
+
+
+# ---------------------------------------------------------------- eval, render, export
+
+
+@pytest.mark.parametrize(
+    ("errors", "rows"),
+    [
+        ({}, []),
+        ({"iou": 0.5, "front.iou": 0.75}, [["iou", "0.5000"], ["front.iou", "0.7500"]]),
+        ({"frame_1.l2": 0.25}, [["frame_1.l2", "0.2500"]]),
+        (
+            {"frame_1.l2": 0.25, "frame_1.psnr": 23.5, "frame_2.l2": 0.125},
+            [["l2", "psnr"], ["frame_1", "0.2500", "23.5000"], ["frame_2", "0.1250"]],
+        ),
+    ],
+)
+def test_export_reports_numbers_in_lines_or_columns(
+    errors: dict[str, float], rows: list[list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    print_report(ExportReport((Path("a.vdb"),), False, errors, ("a note",)), False)
+    lines = capsys.readouterr().out.splitlines()
+    assert (lines[:2], lines[-1]) == (["a.vdb", "lossy"], "note: a note")
+    assert [line.split() for line in lines[2:-1]] == rows
+    print_report(ExportReport((Path("a.vdb"),), False, {"psnr": float("inf")}), True)
+    assert json.loads(capsys.readouterr().out)["errors"] == {"psnr": None}
 
 
 def test_eval_prints_metrics(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 import neuprim
-from neuprim.cli.console import plain_console
+from neuprim.cli.command import plain_console
 from neuprim.cli.progress import DrawProgress, RunProgress
 from neuprim.core.train.trainer import StepReport
 from neuprim.runs.events import Finishing, Note, Preparing, Step
@@ -20,23 +20,15 @@ ODD = "pip install 'neuprim[video]' [bold]loud[/bold] [/] :smile: C:dir:x"
 """Markup that would vanish, a closing tag that would raise, an emoji's name."""
 
 
-def wide(terminal: bool) -> Console:
-    return Console(file=io.StringIO(), width=400, force_terminal=terminal, color_system=None, legacy_windows=False)
-
-
-def written(console: Console) -> str:
-    return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
-
-
-def while_running(console: Console) -> None:
-    with RunProgress(console, ODD) as progress:
+def train(console: Console) -> None:
+    with RunProgress(ODD, console) as progress:
         progress(Preparing(ODD, 0.5))
         progress(Step(StepReport(1, 0.1, 0.5, {}, 20.0, 10, "view", None), 0.5))
         progress(Finishing(ODD))
         progress(Note(ODD))
 
 
-def while_drawing(console: Console) -> None:
+def draw(console: Console) -> None:
     with DrawProgress(console) as progress:
         progress.note(ODD)
         progress.show(ODD, 0.5)
@@ -44,29 +36,28 @@ def while_drawing(console: Console) -> None:
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-@pytest.mark.parametrize("show", [while_running, while_drawing])
+@pytest.mark.parametrize("show", [train, draw])
 def test_progress_shows_text_as_it_is(show: Callable[[Console], None], terminal: bool) -> None:
-    console = wide(terminal)
-    show(console)
-    lines = [line for line in written(console).replace("\r", "\n").splitlines() if "neuprim" in line]
+    text = io.StringIO()
+    show(plain_console(file=text, width=400, force_terminal=terminal, color_system=None, legacy_windows=False))
+    lines = [line for line in text.getvalue().replace("\r", "\n").splitlines() if "neuprim" in line]
     assert lines and any(ODD in line for line in lines)
     assert all("[video]" in line and ":smile:" in line for line in lines if "pip install" in line), lines
 
 
 def test_a_plain_console_prints_text_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    long = ODD * 20
-    plain_console().print(long)
-    plain_console(stderr=True).print(long)
+    plain_console().print(ODD * 20)
+    plain_console(stderr=True).print(ODD * 20)
     out, err = capsys.readouterr()
-    assert out == err == long + "\n", "nothing eaten, nothing wrapped"
+    assert out == err == ODD * 20 + "\n", "nothing eaten, nothing wrapped"
 
 
 def test_every_console_is_a_plain_one() -> None:
     root = Path(neuprim.__file__).parent
     made = [
-        f"{file.relative_to(root)}:{node.lineno}"
+        str(file.relative_to(root))
         for file in sorted(root.rglob("*.py"))
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] == "Console"
     ]
-    assert [place.partition(":")[0] for place in made] == ["cli/console.py"], made
+    assert made == ["cli/command.py"]

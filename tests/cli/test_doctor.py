@@ -30,7 +30,6 @@ def test_report(monkeypatch: pytest.MonkeyPatch) -> None:
         "hydra-core",
         metadata.version("torch"),
         "pycolmap",
-        "triton",
         "CUDA",
         "numba",
         "works",
@@ -56,7 +55,7 @@ def test_what_is_missing_or_too_old_says_how_to_install(monkeypatch: pytest.Monk
         "skipped; sys_platform == 'none'",
     ]
     monkeypatch.setattr(metadata, "requires", lambda name: needs)
-    rows = dict(doctor._packages())
+    rows = dict(doctor._list_packages())
     assert "needs >=999: pip install 'numpy>=999'" in rows["numpy"]
     assert rows["not-there"] == "not installed: pip install 'not-there>=1'"
     assert rows["also-not"] == "not installed: pip install 'neuprim[colmap]'"
@@ -80,12 +79,15 @@ def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypa
 def test_it_says_whether_runs_use_a_card_and_why_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_probe", lambda name: None)
     monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
-    assert dict(doctor._cuda())["used by runs"] == "no: torch finds no CUDA device" and "used by runs" in report()[1]
+    assert (
+        dict(doctor._list_devices())["used by runs"] == "no: torch finds no CUDA device"
+        and "used by runs" in report()[1]
+    )
     monkeypatch.setattr(device, "cuda_unavailable", lambda: None)
     row = Backend(
         "card", lambda: pytest.fail("loaded"), missing=lambda: "pip install 'neuprim[cuda]'", devices=("cuda",)
     )
     monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE[-1:]))
-    assert dict(doctor._cuda())["used by runs"] == "no: pip install 'neuprim[cuda]'"
+    assert dict(doctor._list_devices())["used by runs"] == "no: pip install 'neuprim[cuda]'"
     monkeypatch.setattr(backends, "TABLE", (replace(row, missing=lambda: None), *backends.TABLE[-1:]))
-    assert dict(doctor._cuda())["used by runs"] == "yes"
+    assert dict(doctor._list_devices())["used by runs"] == "yes"

@@ -67,7 +67,7 @@ def changed(site: Path, tmp_path: Path, *words: str, **changes: str) -> tuple[Pa
     """A run of a task with other lines in its TaskSpec, and what the console said."""
     install_spectral(site, **changes)
     console = Console(file=io.StringIO(), width=200)
-    with RunProgress(console, "spectral") as events:
+    with RunProgress("spectral", console) as events:
         out = fit(tmp_path / "run", *words, events=events)
     return out, console.file.getvalue()  # type: ignore[attr-defined]
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuprim.cli import main
-from neuprim.cli.render_overrides import _HEADS, split_render_overrides
+from neuprim.cli.command import RENDER_OVERRIDE_HEADS, split_render_overrides
 from neuprim.core.checkpoint import save_model
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
@@ -69,7 +69,7 @@ def test_overrides_round_trip(model: Primitives, config: RenderConfig) -> None:
 
 
 def test_the_command_line_knows_the_keys() -> None:
-    assert set(_HEADS) == set(HEADS)
+    assert set(RENDER_OVERRIDE_HEADS) == set(HEADS)
 
 
 @pytest.mark.parametrize(

@@ -36,48 +36,31 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EnvironmentFile:
-    """What a user asks for.
+    """What a user asks for."""
 
-    Attributes:
-        path: see :func:`read_environment`.
-        samples: number of lights that stand for it.
-        rotation: degrees about the scene's upward direction.
-        scale: multiplies the radiance.
-        guesses: whether light from directions that the model never saw counts.
-    """
-
-    path: Path
-    samples: int = 64
-    rotation: float = 0.0
-    scale: float = 1.0
-    guesses: bool = True
+    path: Path  # see read_environment
+    samples: int = 64  # number of lights that stand for it
+    rotation: float = 0.0  # degrees about the scene's upward direction
+    scale: float = 1.0  # multiplies the radiance
+    guesses: bool = True  # whether light from directions that the model never saw counts
 
 
 @dataclass(frozen=True)
 class Beams:
-    """Distant light from M directions.
+    """Distant light from M directions."""
 
-    Attributes:
-        directions: (M, 3) float64 unit vectors towards where the light comes from, scene axes.
-        irradiance: (M, 3) float64 linear RGB on a surface that faces it: radiance times solid angle.
-    """
-
-    directions: Tensor
-    irradiance: Tensor
+    directions: Tensor  # (M, 3) float64 unit vectors towards where the light comes from, scene axes
+    irradiance: Tensor  # (M, 3) float64 linear RGB on a surface that faces it: radiance times solid angle
 
 
 @dataclass(frozen=True)
 class Illumination:
-    """What a task makes of an environment: frames to draw one by one and to add up.
+    """What a task makes of an environment: frames to draw one by one and to add up."""
 
-    Attributes:
-        conditions: of each frame, one or more; they replace the view's own of the same names.
-        notes: one line each, for the user.
-        guessed: of each frame, whether its light comes from where the model never saw any; empty if none does.
-    """
-
+    # of each frame, one or more; they replace the view's own of the same names
     conditions: tuple[dict[str, Tensor], ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # one line each, for the user
+    # of each frame, whether its light comes from where the model never saw any; empty if none does
     guessed: tuple[bool, ...] = ()
 
     def frames(self, guesses: bool) -> tuple[dict[str, Tensor], ...]:

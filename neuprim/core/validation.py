@@ -49,21 +49,16 @@ _KINDS = {
 
 @dataclass(frozen=True)
 class Range:
-    """Bounds of a number: ``Annotated[float, Range(above=0, at_most=1)]``.
+    """Bounds of a number: ``Annotated[float, Range(above=0, at_most=1)]``."""
 
-    Attributes:
-        at_least, at_most: the lowest and highest value.
-        above, below: instead of these, bounds that are themselves refused.
-        also: values beyond the bounds that have a meaning of their own, e.g. 0 for "none".
-        says: what is expected, where it is more than the bounds ("degrees from 1 to 120").
-    """
-
+    # the lowest and highest value
     at_least: float | None = None
     at_most: float | None = None
+    # instead of these, bounds that are themselves refused
     above: float | None = None
     below: float | None = None
-    also: tuple[float, ...] = ()
-    says: str = ""
+    also: tuple[float, ...] = ()  # values beyond the bounds that have a meaning of their own, e.g. 0 for "none"
+    says: str = ""  # what is expected, where it is more than the bounds ("degrees from 1 to 120")
 
     def accepts(self, value: Any) -> bool:
         return value in self.also or not (

@@ -15,17 +15,13 @@ OTHERS = "others"
 
 @dataclass(frozen=True)
 class BitTable:
-    """Bits per number, by parameter.
+    """Bits per number, by parameter."""
 
-    Attributes:
-        named: parameter -> bits. Several values are for the degrees 1, 2, ... of spherical harmonics (in the order of
-            3D Gaussian splatting); the last holds for all higher degrees.
-        others: bits of every other parameter.
-        exact: parameters that get exactly these bits. Other parameters get more where their data need it.
-    """
-
+    # parameter -> bits. Several values are for the degrees 1, 2, ... of spherical harmonics (in the order of 3D
+    # Gaussian splatting); the last holds for all higher degrees
     named: Mapping[str, tuple[int, ...]]
-    others: int
+    others: int  # bits of every other parameter
+    # parameters that get exactly these bits. Other parameters get more where their data need it
     exact: frozenset[str] = frozenset()
 
     def of(self, name: str, shape: tuple[int, ...]) -> list[int]:

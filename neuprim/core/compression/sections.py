@@ -46,20 +46,13 @@ class CorruptSection(Exception):
 
 @dataclass(frozen=True)
 class Section:
-    """A parameter, or the one text, of a file.
-
-    Attributes:
-        coding: one of :data:`CODINGS`.
-        shape: shape of one primitive's row.
-        head: quantizer: a record per column, then mask numbers of sparse columns; or the bits of rotations.
-        planes: byte planes of the codes, or the text.
-    """
+    """A parameter, or the one text, of a file."""
 
     name: str
-    coding: int
-    shape: tuple[int, ...]
-    head: bytes = b""
-    planes: tuple[bytes, ...] = ()
+    coding: int  # one of CODINGS
+    shape: tuple[int, ...]  # shape of one primitive's row
+    head: bytes = b""  # quantizer: a record per column, then mask numbers of sparse columns; or the bits of rotations
+    planes: tuple[bytes, ...] = ()  # byte planes of the codes, or the text
 
     @property
     def columns(self) -> int:

@@ -16,13 +16,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-import warp as wp
+import warp as wp  # kernels import it from here, where it is started
 from torch import Tensor
 
 from neuprim.core.compute.code_cache import code_cache
 from neuprim.core.io import files
-
-__all__ = ["BLOCK", "FAST", "OPTIONS", "array", "launch", "wp"]
 
 BLOCK = 256
 """Threads of a block where a kernel asks for nothing else."""
@@ -34,6 +32,16 @@ FAST = {**OPTIONS, "fast_math": True}
 """Of the pixel kernels in float32: approximate division, root and exponential, which a card computes to one or two
 units in the last place. Errors on an H100 were the same with and without (``benchmarks/gpu.py --parts parity``), and a
 third of the time of small forms goes. The processor ignores it."""
+
+
+# ---- types of kernels' arrays, by what they hold
+_SCALARS = wp.bool, wp.uint8, wp.uint16, wp.int32, wp.int64, wp.float32, wp.float64
+_VECTORS = wp.vec2, wp.vec3, wp.vec4, wp.vec4i, wp.vec4d
+Bools, Bytes, Shorts, Ints, Longs, Floats, Doubles = (wp.array(dtype=kind) for kind in _SCALARS)
+Bools2d, Bytes2d, Shorts2d, Ints2d, Longs2d, Floats2d, Doubles2d = (wp.array2d(dtype=kind) for kind in _SCALARS)
+Vec2s, Vec3s, Vec4s, Vec4is, Vec4ds = (wp.array(dtype=kind) for kind in _VECTORS)
+Vec2s2d, Vec3s2d, Vec4s2d, Vec4is2d, Vec4ds2d = (wp.array2d(dtype=kind) for kind in _VECTORS)
+Floats3d = wp.array3d(dtype=wp.float32)
 
 
 def _start() -> None:

@@ -23,22 +23,16 @@ from neuprim.core.metrics.image import matched
 
 
 class _Layer(NamedTuple):
-    """A convolution with its rectifier.
+    """A convolution with its rectifier."""
 
-    Attributes:
-        number: where it stands in torchvision's ``features``.
-        pool: side of the maximum, in steps of 2, that is taken before it; 0 for none.
-        tap: whether the distance looks at what comes out.
-    """
-
-    number: int
+    number: int  # where it stands in torchvision's features
     inputs: int
     outputs: int
     side: int
     stride: int
     padding: int
-    pool: int
-    tap: bool
+    pool: int  # side of the maximum, in steps of 2, that is taken before it; 0 for none
+    tap: bool  # whether the distance looks at what comes out
 
 
 def _vgg16() -> tuple[_Layer, ...]:
@@ -72,18 +66,13 @@ _SUFFIXES = (".pth", ".pt", ".safetensors")
 
 @dataclass(frozen=True)
 class Lpips:
-    """The distance, version 0.1, with one set of weights.
+    """The distance, version 0.1, with one set of weights."""
 
-    Attributes:
-        network: "alex" or "vgg".
-        weights, biases: of the convolutions, in order.
-        linear: (C,) per tap: how much each of its channels counts.
-    """
-
-    network: str
+    network: str  # "alex" or "vgg"
+    # of the convolutions, in order
     weights: tuple[Tensor, ...]
     biases: tuple[Tensor, ...]
-    linear: tuple[Tensor, ...]
+    linear: tuple[Tensor, ...]  # (C,) per tap: how much each of its channels counts
 
     @property
     def least(self) -> int:

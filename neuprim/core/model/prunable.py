@@ -21,17 +21,11 @@ Index = tuple[int | slice, ...]
 
 @dataclass(frozen=True)
 class PrunableUnit:
-    """Numbers of a field that are removed together.
+    """Numbers of a field that are removed together."""
 
-    Attributes:
-        name: unique within the field, e.g. "neuron 2".
-        places: parameter -> index of the numbers.
-        group: units that are reported together, e.g. "band 2"; empty: the name.
-    """
-
-    name: str
-    places: Mapping[str, Index]
-    group: str = ""
+    name: str  # unique within the field, e.g. "neuron 2"
+    places: Mapping[str, Index]  # parameter -> index of the numbers
+    group: str = ""  # units that are reported together, e.g. "band 2"; empty: the name
 
     def of(self, params: Params) -> dict[str, Tensor]:
         """Return views of the numbers, (N, ...) each."""

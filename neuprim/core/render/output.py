@@ -94,20 +94,14 @@ class RenderStats:
 
 @dataclass(frozen=True)
 class RenderOutput:
-    """One frame.
+    """One frame."""
 
-    Attributes:
-        rgb: (H, W, C) in the model's colour space, composited over the background.
-        alpha: (H, W) accumulated opacity 1 - T.
-        depth: (H, W) weighted mean camera-z (ray distance for a ``RayCamera``) of the chord middles, 0 where nothing is
-            hit; None unless the settings ask for it.
-        stats: see :class:`RenderStats`.
-    """
-
-    rgb: Tensor
-    alpha: Tensor
+    rgb: Tensor  # (H, W, C) in the model's colour space, composited over the background
+    alpha: Tensor  # (H, W) accumulated opacity 1 - T
+    # (H, W) weighted mean camera-z (ray distance for a RayCamera) of the chord middles, 0 where nothing is hit; None
+    # unless the settings ask for it
     depth: Tensor | None
-    stats: RenderStats
+    stats: RenderStats  # see RenderStats
 
     def request_contributions(self, error: Tensor) -> Contributions:
         """Have the backward pass sum what each primitive contributed to the frame and to an error; call it before

@@ -44,23 +44,17 @@ Array = np.ndarray[Any, Any]
 
 
 class ImageGradient(NamedTuple):
-    """What the backward kernels read of a frame, and the rows that they fill.
+    """What the backward kernels read of a frame, and the rows that they fill."""
 
-    Attributes:
-        transmittance, last: of the forward pass.
-        rgb, g_transmittance, z: dL/d of the image's; ``g_transmittance`` has the background's share, ``z`` is read if
-            ``with_depth``.
-        error: (H, W) error of each pixel for the contributions.
-        pair_rows: (pairs, gradient_width) filled.
-    """
-
+    # of the forward pass
     transmittance: Array
     last: Array
+    # dL/d of the image's; g_transmittance has the background's share, z is read if with_depth
     rgb: Array
     g_transmittance: Array
     z: Array
-    error: Array
-    pair_rows: Array
+    error: Array  # (H, W) error of each pixel for the contributions
+    pair_rows: Array  # (pairs, gradient_width) filled
     with_depth: bool
 
 

@@ -19,19 +19,12 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class TileLists:
-    """Pairs sorted by tile, then by depth.
+    """Pairs sorted by tile, then by depth."""
 
-    Attributes:
-        starts: (tiles + 1,) first pair of each tile.
-        ids: (pairs,) primitive of each pair.
-        first: (N + 1,) first entry of each primitive in ``slots``.
-        slots: (pairs,) where each primitive's pairs lie in ``ids``.
-    """
-
-    starts: NDArray[np.int64]
-    ids: NDArray[np.int32]
-    first: NDArray[np.int64]
-    slots: NDArray[np.int32]
+    starts: NDArray[np.int64]  # (tiles + 1,) first pair of each tile
+    ids: NDArray[np.int32]  # (pairs,) primitive of each pair
+    first: NDArray[np.int64]  # (N + 1,) first entry of each primitive in slots
+    slots: NDArray[np.int32]  # (pairs,) where each primitive's pairs lie in ids
 
     @property
     def pairs(self) -> int:

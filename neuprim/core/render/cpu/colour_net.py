@@ -32,18 +32,13 @@ Array = np.ndarray[Any, Any]
 
 
 class Net(NamedTuple):
-    """The networks of one frame, as the pixel kernels take them.
+    """The networks of one frame, as the pixel kernels take them."""
 
-    Attributes:
-        rows: (N, net_row_width) float32: per unit its first layer (WX, WY, WZ, PHASE: whitened axes, turns), then C
-            output weights.
-        wide: the same in float64 of the primitives that are drawn so, by slot.
-        hidden: units per primitive, padded to a whole number of pairs by units without output.
-    """
-
+    # (N, net_row_width) float32: per unit its first layer (WX, WY, WZ, PHASE: whitened axes, turns), then C output
+    # weights
     rows: Array
-    wide: Array
-    hidden: int
+    wide: Array  # the same in float64 of the primitives that are drawn so, by slot
+    hidden: int  # units per primitive, padded to a whole number of pairs by units without output
 
 
 # ---- Per primitive

@@ -38,35 +38,25 @@ Array = np.ndarray[Any, Any]
 
 
 class Image(NamedTuple):
-    """Arrays that the forward kernels fill, and the (C,) background behind them.
+    """Arrays that the forward kernels fill, and the (C,) background behind them."""
 
-    Attributes:
-        rgb, transmittance: (H, W, C) and (H, W).
-        zsum: (H, W) sum of w z, filled if ``with_depth``.
-        last: (H, W) rank + 1 of each pixel's last contributor; sorted by entry, the number of its hits.
-    """
-
+    # (H, W, C) and (H, W)
     rgb: Array
     transmittance: Array
-    zsum: Array
-    last: Array
+    zsum: Array  # (H, W) sum of w z, filled if with_depth
+    last: Array  # (H, W) rank + 1 of each pixel's last contributor; sorted by entry, the number of its hits
     background: Array
     with_depth: bool
 
 
 @dataclass
 class SavedForBackward:
-    """What the forward pass of one frame saves.
+    """What the forward pass of one frame saves."""
 
-    Attributes:
-        live: (pairs,) bit y is set where row y of the tile was live when the pair was drawn; no pairs if nothing is
-            saved.
-        first_lane: (pairs,) first lane of each pair in the depths of its chunk.
-        depths: per chunk of tiles (lanes,) optical depth of each evaluated lane.
-    """
-
+    # (pairs,) bit y is set where row y of the tile was live when the pair was drawn; no pairs if nothing is saved
     live: Array
-    first_lane: Array
+    first_lane: Array  # (pairs,) first lane of each pair in the depths of its chunk
+    # per chunk of tiles (lanes,) optical depth of each evaluated lane
     depths: list[Array] = field(default_factory=list)
 
     @classmethod

@@ -68,26 +68,17 @@ class View(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """What :func:`prepare` fills for each primitive.
+    """What :func:`prepare` fills for each primitive."""
 
-    Attributes:
-        rows: (N, row_width) float32 rows of the pixel kernels.
-        spans, boxes: (N, SPAN_WIDTH) silhouettes and (N, 4) pixel boxes.
-        kinds: (N, K/2) range of rates (SLOW, MEDIUM, FAST) of row neurons 2m and 2m + 1.
-        order: (N, K) the model's index of each row neuron; they are stored by rising rate.
-        depth: (N,) camera-z of the centres.
-        status: (N,) VISIBLE, CULLED or NON_FINITE.
-        in_float64: (N,) whether float32 is not enough for the primitive's pixels.
-    """
-
-    rows: Array
+    rows: Array  # (N, row_width) float32 rows of the pixel kernels
+    # (N, SPAN_WIDTH) silhouettes and (N, 4) pixel boxes
     spans: Array
     boxes: Array
-    kinds: Array
-    order: Array
-    depth: Array
-    status: Array
-    in_float64: Array
+    kinds: Array  # (N, K/2) range of rates (SLOW, MEDIUM, FAST) of row neurons 2m and 2m + 1
+    order: Array  # (N, K) the model's index of each row neuron; they are stored by rising rate
+    depth: Array  # (N,) camera-z of the centres
+    status: Array  # (N,) VISIBLE, CULLED or NON_FINITE
+    in_float64: Array  # (N,) whether float32 is not enough for the primitive's pixels
 
     @classmethod
     def allocate(cls, count: int, neurons: int) -> Projected:

@@ -30,34 +30,25 @@ Array = np.ndarray[Any, Any]
 
 
 class FrameArrays(NamedTuple):
-    """One frame as the pixel kernels read it.
+    """One frame as the pixel kernels read it."""
 
-    Attributes:
-        rows: (N, row_width) float32, one row per primitive (:mod:`neuprim.core.render.layout`).
-        wide: (M, row_width) float64 rows of the primitives that are drawn in float64.
-        slots: (N,) row of each primitive in ``wide``, or -1.
-        spans, boxes: (N, SPAN_WIDTH) silhouettes and (N, 4) pixel boxes.
-        kinds: (N, K/2) range of rates of each pair of neurons.
-        starts, ids: first pair of each tile, primitive of each pair.
-        norms: (H, W) length of each pixel's ray direction whose camera-z is 1.
-        alpha_min, alpha_max, transmittance_min, depth_floor: of the settings, float32.
-        neurons: K, padded to a whole number of pairs.
-    """
-
-    rows: Array
-    wide: Array
-    slots: Array
+    rows: Array  # (N, row_width) float32, one row per primitive (layout)
+    wide: Array  # (M, row_width) float64 rows of the primitives that are drawn in float64
+    slots: Array  # (N,) row of each primitive in wide, or -1
+    # (N, SPAN_WIDTH) silhouettes and (N, 4) pixel boxes
     spans: Array
     boxes: Array
-    kinds: Array
+    kinds: Array  # (N, K/2) range of rates of each pair of neurons
+    # first pair of each tile, primitive of each pair
     starts: Array
     ids: Array
-    norms: Array
+    norms: Array  # (H, W) length of each pixel's ray direction whose camera-z is 1
+    # of the settings, float32
     alpha_min: Any
     alpha_max: Any
     transmittance_min: Any
     depth_floor: Any
-    neurons: int
+    neurons: int  # K, padded to a whole number of pairs
 
 
 class PairWindow(NamedTuple):

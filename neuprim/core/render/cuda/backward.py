@@ -16,7 +16,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from neuprim.core.compute.warp import FAST, wp
+from neuprim.core.compute.warp import FAST, Floats, Floats2d, Ints, Shorts2d, Vec2s, Vec4s2d, wp
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.block_ops import (
@@ -53,22 +53,10 @@ def pixels_kernel(form: Form, depth: bool) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def backward_pixels(
-        rows: wp.array2d(dtype=wp.vec4),
-        starts: wp.array(dtype=wp.int32),
-        ids: wp.array(dtype=wp.int32),
-        spans: wp.array2d(dtype=wp.uint16),
-        offsets: wp.array(dtype=wp.int32),
-        limits: wp.vec4,
-        size: wp.vec2i,
-        transmittance: wp.array(dtype=wp.float32),
-        reached: wp.array(dtype=wp.int32),
-        g_rgb: wp.array2d(dtype=wp.float32),
-        g_transmittance: wp.array(dtype=wp.float32),
-        g_z: wp.array(dtype=wp.float32),
-        depths: wp.array(dtype=wp.float32),
-        hues: wp.array2d(dtype=wp.float32),
-        hits: wp.array(dtype=wp.vec2),
-    ):
+        rows: Vec4s2d, starts: Ints, ids: Ints, spans: Shorts2d, offsets: Ints, limits: wp.vec4, size: wp.vec2i,
+        transmittance: Floats, reached: Ints, g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats, depths: Floats,
+        hues: Floats2d, hits: Vec2s,
+    ):  # fmt: skip
         """``g_transmittance`` already holds the background's share. With b what lies behind a hit, sum of w (dL/dw) and
         the rest of the light: dL/dI = (1 - alpha) T dL/dw - b, and 0 where the opacity was clamped."""
         tile, lane = wp.tid()
@@ -134,21 +122,9 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False, launch_bounds=bounds)
     def backward_pairs(
-        rows: wp.array2d(dtype=wp.vec4),
-        ids: wp.array(dtype=wp.int32),
-        tiles: wp.array(dtype=wp.int32),
-        spans: wp.array2d(dtype=wp.uint16),
-        offsets: wp.array(dtype=wp.int32),
-        lens: wp.vec4,
-        depth_floor: float,
-        size: wp.vec2i,
-        reached: wp.array(dtype=wp.int32),
-        hits: wp.array(dtype=wp.vec2),
-        g_rgb: wp.array(dtype=wp.float32),
-        g_z: wp.array(dtype=wp.float32),
-        error: wp.array(dtype=wp.float32),
-        out: wp.array(dtype=wp.float32),
-    ):
+        rows: Vec4s2d, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints, lens: wp.vec4, depth_floor: float,
+        size: wp.vec2i, reached: Ints, hits: Vec2s, g_rgb: Floats, g_z: Floats, error: Floats, out: Floats,
+    ):  # fmt: skip
         n, lane = wp.tid()
         tile = tiles[n]
         across = (size[0] + L.TILE - 1) // L.TILE
@@ -273,11 +249,9 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
 
 @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
 def sum_pairs(
-    first: wp.array(dtype=wp.int32),
-    slots: wp.array(dtype=wp.int32),
-    pair_rows: wp.array2d(dtype=wp.float32),
-    grads: wp.array2d(dtype=wp.float32),
-):
+    first: Ints, slots: Ints, pair_rows: Floats2d,
+    grads: Floats2d,
+):  # fmt: skip
     """Thread (i, c): column c of primitive i's pair rows, in the order of its pairs."""
     i, c = wp.tid()
     total = float(0.0)

@@ -14,7 +14,20 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.compute.warp import OPTIONS, array, launch, wp
+from neuprim.core.compute.warp import (
+    OPTIONS,
+    Floats2d,
+    Ints,
+    Ints2d,
+    Longs,
+    Longs2d,
+    Shorts2d,
+    Vec4is,
+    Vec4s2d,
+    array,
+    launch,
+    wp,
+)
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK
@@ -28,38 +41,23 @@ _MOST = 2**31  # indices of pairs are int32
 
 @dataclass(frozen=True)
 class Counted:
-    """What the host learns of a frame.
+    """What the host learns of a frame."""
 
-    Attributes:
-        pairs: (tile, primitive) pairs.
-        in_float64: primitives that are drawn in float64.
-        bad: the first primitive that is not finite, or -1.
-        ends: (2, N) int64 on the device, running sums of tiles and of in_float64 primitives.
-    """
-
-    pairs: int
-    in_float64: int
-    bad: int
-    ends: Tensor
+    pairs: int  # (tile, primitive) pairs
+    in_float64: int  # primitives that are drawn in float64
+    bad: int  # the first primitive that is not finite, or -1
+    ends: Tensor  # (2, N) int64 on the device, running sums of tiles and of in_float64 primitives
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """Pairs sorted by image, where there are several, then by tile, by depth and by index.
+    """Pairs sorted by image, where there are several, then by tile, by depth and by index."""
 
-    Attributes:
-        starts: (tiles + 1,) int32, first pair of each tile, of all images.
-        ids: (pairs,) int32, primitive of each pair.
-        tile_of: (pairs,) int32, its tile of its image.
-        first: (N + 1,) int32, first entry of each primitive in ``slots_of``.
-        slots_of: (pairs,) int32, where each primitive's pairs lie in ``ids``.
-    """
-
-    starts: Tensor
-    ids: Tensor
-    tile_of: Tensor
-    first: Tensor
-    slots_of: Tensor
+    starts: Tensor  # (tiles + 1,) int32, first pair of each tile, of all images
+    ids: Tensor  # (pairs,) int32, primitive of each pair
+    tile_of: Tensor  # (pairs,) int32, its tile of its image
+    first: Tensor  # (N + 1,) int32, first entry of each primitive in slots_of
+    slots_of: Tensor  # (pairs,) int32, where each primitive's pairs lie in ids
 
     @property
     def pairs(self) -> int:
@@ -141,9 +139,8 @@ def tile_range(e: Ellipse, ty: int):
 def _kernels() -> tuple[Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def emit(
-        rows: wp.array2d(dtype=wp.vec4), spans: wp.array2d(dtype=wp.vec4), boxes: wp.array(dtype=wp.vec4i), order: wp.array(dtype=wp.int64),
-        counts: wp.array2d(dtype=wp.int32), ends: wp.array2d(dtype=wp.int64), across: int, images: wp.array(dtype=wp.int32), tiles: int,
-        first: wp.array(dtype=wp.int32), keys: wp.array(dtype=wp.int64), slots: wp.array(dtype=wp.int32), which: wp.array(dtype=wp.int32),
+        rows: Vec4s2d, spans: Vec4s2d, boxes: Vec4is, order: Longs, counts: Ints2d, ends: Longs2d, across: int,
+        images: Ints, tiles: int, first: Ints, keys: Longs, slots: Ints, which: Ints,
     ):  # fmt: skip
         """A key tile << 32 | rank for every tile that the primitive of depth rank ``tid`` reaches; dim (N,).
 
@@ -171,8 +168,8 @@ def _kernels() -> tuple[Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def list_pairs(
-        keys: wp.array(dtype=wp.int64), came_from: wp.array(dtype=wp.int64), order: wp.array(dtype=wp.int64), pairs: int, tiles: int, each: int,
-        starts: wp.array(dtype=wp.int32), ids: wp.array(dtype=wp.int32), tile_of: wp.array(dtype=wp.int32), slots_of: wp.array(dtype=wp.int32),
+        keys: Longs, came_from: Longs, order: Longs, pairs: int, tiles: int, each: int,
+        starts: Ints, ids: Ints, tile_of: Ints, slots_of: Ints,
     ):  # fmt: skip
         """From sorted keys to lists; dim (pairs,). ``tiles``: of all images; ``each``: of one."""
         k = wp.tid()
@@ -238,15 +235,9 @@ def bin_primitives(
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def row_spans(
-    rows: wp.array2d(dtype=wp.vec4),
-    silhouettes: wp.array2d(dtype=wp.float32),
-    boxes: wp.array(dtype=wp.vec4i),
-    ids: wp.array(dtype=wp.int32),
-    tiles: wp.array(dtype=wp.int32),
-    size: wp.vec2i,
-    spans: wp.array2d(dtype=wp.uint16),
-    counts: wp.array(dtype=wp.int32),
-):
+    rows: Vec4s2d, silhouettes: Floats2d, boxes: Vec4is, ids: Ints, tiles: Ints, size: wp.vec2i, spans: Shorts2d,
+    counts: Ints,
+):  # fmt: skip
     """Thread n: which pixels of a tile the silhouette of pair n covers, a span start << 8 | last << 4 | first in each of
     its 16 rows, and how many pixels they have together.
 

@@ -14,7 +14,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from neuprim.core.compute.warp import wp
+from neuprim.core.compute.warp import Floats, Ints, Shorts2d, Vec2s, Vec4s2d, wp
 from neuprim.core.render.cuda.layout import TILE, WARP
 
 _ANY = """
@@ -92,37 +92,37 @@ def row_sums(width: int) -> Callable[..., Any]:
     row = row_type(width)
 
     @wp.func_native(_halving(width))
-    def sums(x: row, lane: int, out: wp.array(dtype=wp.float32), pair: int): ...
+    def sums(x: row, lane: int, out: Floats, pair: int): ...
 
     return sums
 
 
 @wp.func_native("return numbers.data[at];")
-def number_at(numbers: wp.array(dtype=wp.float32), at: int) -> float: ...
+def number_at(numbers: Floats, at: int) -> float: ...
 
 
 @wp.func_native("return numbers.data[at];")
-def int_at(numbers: wp.array(dtype=wp.int32), at: int) -> int: ...
+def int_at(numbers: Ints, at: int) -> int: ...
 
 
 @wp.func_native("return numbers.data[size_t(row) * size_t(width) + column];")
-def number_of_row(numbers: wp.array(dtype=wp.float32), row: int, width: int, column: int) -> float:
+def number_of_row(numbers: Floats, row: int, width: int, column: int) -> float:
     """Of rows of ``width`` numbers."""
 
 
 @wp.func_native(f"return spans.data[size_t(pair) * {TILE} + y];")
-def span_of(spans: wp.array2d(dtype=wp.uint16), pair: int, y: int) -> int:
+def span_of(spans: Shorts2d, pair: int, y: int) -> int:
     """Of a pair's row of pixels (:mod:`~neuprim.core.render.cuda.spans`)."""
 
 
 @wp.func_native("return rows.data[size_t(row) * size_t(width) + column];")
-def column_of(rows: wp.array2d(dtype=wp.vec4), row: int, width: int, column: int) -> wp.vec4:
+def column_of(rows: Vec4s2d, row: int, width: int, column: int) -> wp.vec4:
     """Of primitives' rows of ``width`` columns."""
 
 
 @wp.func_native("return hits.data[slot];")
-def hit_at(hits: wp.array(dtype=wp.vec2), slot: int) -> wp.vec2: ...
+def hit_at(hits: Vec2s, slot: int) -> wp.vec2: ...
 
 
 @wp.func_native("hits.data[slot] = hit;")
-def set_hit(hits: wp.array(dtype=wp.vec2), slot: int, hit: wp.vec2): ...
+def set_hit(hits: Vec2s, slot: int, hit: wp.vec2): ...

@@ -18,7 +18,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.warp import FAST, OPTIONS, array, launch, wp
+from neuprim.core.compute.warp import (
+    FAST,
+    OPTIONS,
+    Bools2d,
+    Doubles2d,
+    Floats,
+    Floats2d,
+    Floats3d,
+    Ints,
+    Shorts2d,
+    Vec2s,
+    Vec3s,
+    Vec3s2d,
+    Vec4ds2d,
+    Vec4s,
+    Vec4s2d,
+    array,
+    launch,
+    wp,
+)
 from neuprim.core.render import layout as W
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.block_ops import row_sums, row_type
@@ -79,7 +98,7 @@ def _kernels(double: bool) -> tuple[Any, Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def fill_rows(
         log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3), bias: wp.array2d(dtype=real),
-        Wout: wp.array3d(dtype=real), channels: int, rows: wp.array2d(dtype=wp.vec4), fast: wp.array2d(dtype=wp.bool),
+        Wout: wp.array3d(dtype=real), channels: int, rows: Vec4s2d, fast: Bools2d,
     ):  # fmt: skip
         """Thread (i, j): unit j of primitive i."""
         i, j = wp.tid()
@@ -96,8 +115,8 @@ def _kernels(double: bool) -> tuple[Any, Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def prepare_wide(
-        which: wp.array(dtype=wp.int32), log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3),
-        bias: wp.array2d(dtype=real), wide: wp.array2d(dtype=wp.vec4d),
+        which: Ints, log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3),
+        bias: wp.array2d(dtype=real), wide: Vec4ds2d,
     ):  # fmt: skip
         """Thread (m, j): unit j of primitive ``which[m]``."""
         m, j = wp.tid()
@@ -106,10 +125,9 @@ def _kernels(double: bool) -> tuple[Any, Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def backward(
-        log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3), hidden: int, channels: int,
-        weights: wp.array2d(dtype=wp.float32), grads: wp.array2d(dtype=wp.float32), first: int,
-        g_log_scales: wp.array(dtype=wp.vec3), g_quats: wp.array(dtype=wp.vec4), g_Wx: wp.array2d(dtype=wp.vec3),
-        g_bias: wp.array2d(dtype=wp.float32), g_Wout: wp.array3d(dtype=wp.float32),
+        log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3), hidden: int,
+        channels: int, weights: Floats2d, grads: Floats2d, first: int, g_log_scales: Vec3s, g_quats: Vec4s,
+        g_Wx: Vec3s2d, g_bias: Floats2d, g_Wout: Floats3d,
     ):  # fmt: skip
         """Thread i. ``weights``: rows whose column G_WEIGHT says whether the primitive was seen. Adds to
         ``g_log_scales`` and ``g_quats``."""
@@ -235,10 +253,8 @@ def net_pairs_kernel(form: Form) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def net_pairs(
-        rows: wp.array2d(dtype=wp.vec4), net: wp.array2d(dtype=wp.vec4), ids: wp.array(dtype=wp.int32), tiles: wp.array(dtype=wp.int32),
-        spans: wp.array2d(dtype=wp.uint16), offsets: wp.array(dtype=wp.int32), depth_floor: float, size: wp.vec2i,
-        reached: wp.array(dtype=wp.int32), hits: wp.array(dtype=wp.vec2), hues: wp.array2d(dtype=wp.float32), g_rgb: wp.array2d(dtype=wp.float32),
-        out: wp.array(dtype=wp.float32),
+        rows: Vec4s2d, net: Vec4s2d, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints, depth_floor: float,
+        size: wp.vec2i, reached: Ints, hits: Vec2s, hues: Floats2d, g_rgb: Floats2d, out: Floats,
     ):  # fmt: skip
         n, lane = wp.tid()
         tile = tiles[n]
@@ -308,10 +324,8 @@ def float64_hues_kernel(channels: int) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_hues(
-        pairs: wp.array(dtype=wp.int32), wide: wp.array2d(dtype=wp.float64), net: wp.array2d(dtype=wp.vec4d), mixes: wp.array2d(dtype=wp.vec4),
-        rows: wp.array2d(dtype=wp.vec4), first: int, hidden: int, slots: wp.array(dtype=wp.int32), ids: wp.array(dtype=wp.int32),
-        tiles: wp.array(dtype=wp.int32), spans: wp.array2d(dtype=wp.uint16), offsets: wp.array(dtype=wp.int32), size: wp.vec2i,
-        hues: wp.array2d(dtype=wp.float32),
+        pairs: Ints, wide: Doubles2d, net: Vec4ds2d, mixes: Vec4s2d, rows: Vec4s2d, first: int, hidden: int,
+        slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints, size: wp.vec2i, hues: Floats2d,
     ):  # fmt: skip
         """``mixes``: the networks' float32 rows, for their output weights; ``rows``: the primitives', with the bases
         from column ``first``."""
@@ -346,11 +360,9 @@ def float64_net_kernel(form: Form) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_net(
-        pairs: wp.array(dtype=wp.int32), wide: wp.array2d(dtype=wp.float64), net: wp.array2d(dtype=wp.vec4d), mixes: wp.array2d(dtype=wp.vec4),
-        hidden: int, slots: wp.array(dtype=wp.int32), ids: wp.array(dtype=wp.int32), tiles: wp.array(dtype=wp.int32),
-        spans: wp.array2d(dtype=wp.uint16), offsets: wp.array(dtype=wp.int32), depth_floor: float, size: wp.vec2i,
-        reached: wp.array(dtype=wp.int32), hits: wp.array(dtype=wp.vec2), hues: wp.array2d(dtype=wp.float32), g_rgb: wp.array2d(dtype=wp.float32),
-        out: wp.array(dtype=wp.float32),
+        pairs: Ints, wide: Doubles2d, net: Vec4ds2d, mixes: Vec4s2d, hidden: int, slots: Ints, ids: Ints,
+        tiles: Ints, spans: Shorts2d, offsets: Ints, depth_floor: float, size: wp.vec2i, reached: Ints, hits: Vec2s,
+        hues: Floats2d, g_rgb: Floats2d, out: Floats,
     ):  # fmt: skip
         member, lane = wp.tid()
         n = pairs[member]

@@ -10,13 +10,13 @@ complete, so hidden primitives cost. What follows, over pairs, is the same.
 import functools
 from typing import Any
 
-from neuprim.core.compute.warp import FAST, wp
+from neuprim.core.compute.warp import FAST, Floats, Floats2d, Ints, Longs, Vec2s, Vec4s2d, wp
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.layout import Form
 
 
 @wp.func
-def _begin(keys: wp.array(dtype=wp.int64), count: int, pixel: int):
+def _begin(keys: Longs, count: int, pixel: int):
     """The first of the sorted keys that belongs to this pixel or a later one."""
     low, high = int(0), int(count)
     while low < high:
@@ -38,10 +38,9 @@ def composite_kernel(form: Form, depth: bool) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def composite(
-        rows: wp.array2d(dtype=wp.vec4), ids: wp.array(dtype=wp.int32), keys: wp.array(dtype=wp.int64), order: wp.array(dtype=wp.int64), count: int,
-        owners: wp.array(dtype=wp.int32), limits: wp.vec4, background: wp.array(dtype=wp.float32), hues: wp.array2d(dtype=wp.float32),
-        depths: wp.array(dtype=wp.float32), hits: wp.array(dtype=wp.vec2), rgb: wp.array2d(dtype=wp.float32),
-        transmittance: wp.array(dtype=wp.float32), zsum: wp.array(dtype=wp.float32), begins: wp.array(dtype=wp.int32),
+        rows: Vec4s2d, ids: Ints, keys: Longs, order: Longs, count: int, owners: Ints, limits: wp.vec4,
+        background: Floats, hues: Floats2d, depths: Floats, hits: Vec2s, rgb: Floats2d, transmittance: Floats,
+        zsum: Floats, begins: Ints,
     ):  # fmt: skip
         """``begins[pixel]`` receives where its hits begin in ``order``."""
         n = wp.tid()
@@ -85,10 +84,8 @@ def uncomposite_kernel(form: Form, depth: bool) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def uncomposite(
-        rows: wp.array2d(dtype=wp.vec4), ids: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int64), begins: wp.array(dtype=wp.int32),
-        owners: wp.array(dtype=wp.int32), limits: wp.vec4, transmittance: wp.array(dtype=wp.float32), g_rgb: wp.array2d(dtype=wp.float32),
-        g_transmittance: wp.array(dtype=wp.float32), g_z: wp.array(dtype=wp.float32), depths: wp.array(dtype=wp.float32),
-        hues: wp.array2d(dtype=wp.float32), hits: wp.array(dtype=wp.vec2),
+        rows: Vec4s2d, ids: Ints, order: Longs, begins: Ints, owners: Ints, limits: wp.vec4, transmittance: Floats,
+        g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats, depths: Floats, hues: Floats2d, hits: Vec2s,
     ):  # fmt: skip
         n = wp.tid()
         behind = transmittance[n] * g_transmittance[n]

@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from neuprim.core.compute.warp import OPTIONS, wp
+from neuprim.core.compute.warp import OPTIONS, Doubles2d, Floats, Floats2d, Ints, Shorts2d, Vec2s, wp
 from neuprim.core.render import layout as W
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.block_ops import row_sums, row_type
@@ -50,12 +50,12 @@ class Chord64:
 
 
 @wp.func
-def _vector(wide: wp.array2d(dtype=wp.float64), r: int, c: int):
+def _vector(wide: Doubles2d, r: int, c: int):
     return wp.vec3d(wide[r, c], wide[r, c + 1], wide[r, c + 2])
 
 
 @wp.func
-def chord64(wide: wp.array2d(dtype=wp.float64), r: int, X: int, Y: int):
+def chord64(wide: Doubles2d, r: int, X: int, Y: int):
     """Of pixel (X, Y) and row ``r``."""
     c = Chord64()
     zero = wp.float64(0.0)
@@ -167,7 +167,7 @@ def moments(z: wp.float64):
 
 
 @wp.func
-def neuron64(wide: wp.array2d(dtype=wp.float64), r: int, o: int):
+def neuron64(wide: Doubles2d, r: int, o: int):
     """(WX, WY, WZ) of the unit at column ``o``."""
     return _vector(wide, r, o)
 
@@ -253,21 +253,9 @@ def float64_opacity_kernel(depth: bool) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_opacity(
-        pairs: wp.array(dtype=wp.int32),
-        wide: wp.array2d(dtype=wp.float64),
-        slots: wp.array(dtype=wp.int32),
-        ids: wp.array(dtype=wp.int32),
-        tiles: wp.array(dtype=wp.int32),
-        spans: wp.array2d(dtype=wp.uint16),
-        offsets: wp.array(dtype=wp.int32),
-        lens: wp.vec4,
-        limits: wp.vec4,
-        size: wp.vec2i,
-        neurons: int,
-        edge: int,
-        hits: wp.array(dtype=wp.vec2),
-        depths: wp.array(dtype=wp.float32),
-    ):
+        pairs: Ints, wide: Doubles2d, slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints,
+        lens: wp.vec4, limits: wp.vec4, size: wp.vec2i, neurons: int, edge: int, hits: Vec2s, depths: Floats,
+    ):  # fmt: skip
         """A warp a pair of those listed in ``pairs``; ``slots[i]``: the row of primitive i in ``wide``."""
         member, lane = wp.tid()
         n = pairs[member]
@@ -316,24 +304,10 @@ def float64_pairs_kernel(form: Form, depth: bool) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_pairs(
-        pairs: wp.array(dtype=wp.int32),
-        wide: wp.array2d(dtype=wp.float64),
-        slots: wp.array(dtype=wp.int32),
-        ids: wp.array(dtype=wp.int32),
-        tiles: wp.array(dtype=wp.int32),
-        spans: wp.array2d(dtype=wp.uint16),
-        offsets: wp.array(dtype=wp.int32),
-        lens: wp.vec4,
-        depth_floor: float,
-        size: wp.vec2i,
-        neurons: int,
-        reached: wp.array(dtype=wp.int32),
-        hits: wp.array(dtype=wp.vec2),
-        g_rgb: wp.array2d(dtype=wp.float32),
-        g_z: wp.array(dtype=wp.float32),
-        error: wp.array(dtype=wp.float32),
-        out: wp.array(dtype=wp.float32),
-    ):
+        pairs: Ints, wide: Doubles2d, slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints,
+        lens: wp.vec4, depth_floor: float, size: wp.vec2i, neurons: int, reached: Ints, hits: Vec2s, g_rgb: Floats2d,
+        g_z: Floats, error: Floats, out: Floats,
+    ):  # fmt: skip
         member, lane = wp.tid()
         n = pairs[member]
         r = slots[ids[n]]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from neuprim.core.compute.warp import FAST, wp
+from neuprim.core.compute.warp import FAST, Floats, Floats2d, Ints, Longs, Shorts2d, Vec2s, Vec4s2d, wp
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.block_ops import any_thread, hit_at, int_at, set_hit, span_of
@@ -57,26 +57,10 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def forward(
-        rows: wp.array2d(dtype=wp.vec4),
-        net: wp.array2d(dtype=wp.vec4),
-        starts: wp.array(dtype=wp.int32),
-        ids: wp.array(dtype=wp.int32),
-        spans: wp.array2d(dtype=wp.uint16),
-        offsets: wp.array(dtype=wp.int32),
-        lens: wp.vec4,
-        limits: wp.vec4,
-        background: wp.array(dtype=wp.float32),
-        size: wp.vec2i,
-        rgb: wp.array2d(dtype=wp.float32),
-        transmittance: wp.array(dtype=wp.float32),
-        zsum: wp.array(dtype=wp.float32),
-        hits: wp.array(dtype=wp.vec2),
-        depths: wp.array(dtype=wp.float32),
-        hues: wp.array2d(dtype=wp.float32),
-        reached: wp.array(dtype=wp.int32),
-        keys: wp.array(dtype=wp.int64),
-        owners: wp.array(dtype=wp.int32),
-    ):
+        rows: Vec4s2d, net: Vec4s2d, starts: Ints, ids: Ints, spans: Shorts2d, offsets: Ints, lens: wp.vec4,
+        limits: wp.vec4, background: Floats, size: wp.vec2i, rgb: Floats2d, transmittance: Floats, zsum: Floats,
+        hits: Vec2s, depths: Floats, hues: Floats2d, reached: Ints, keys: Longs, owners: Ints,
+    ):  # fmt: skip
         """limits = (alpha_min, alpha_max, transmittance_min, -); ``net``, ``hues``: of colour networks;
         ``reached[tile]``: the pairs before it were composited."""
         tile, lane = wp.tid()

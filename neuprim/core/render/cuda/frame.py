@@ -30,19 +30,12 @@ class NotFinite(ValueError):
 
 @dataclass(frozen=True)
 class Projection:
-    """A view as the kernels take it.
+    """A view as the kernels take it."""
 
-    Attributes:
-        matrix: (16,) float64 on the device, world to camera.
-        camera: focal lengths and centre in pixels, size.
-        near: of the near plane, in scene units.
-        turns: omega0 / 2 pi.
-    """
-
-    matrix: Tensor
-    camera: Camera
-    near: float
-    turns: float
+    matrix: Tensor  # (16,) float64 on the device, world to camera
+    camera: Camera  # focal lengths and centre in pixels, size
+    near: float  # of the near plane, in scene units
+    turns: float  # omega0 / 2 pi
 
     @property
     def intrinsics(self) -> Any:
@@ -51,34 +44,19 @@ class Projection:
 
 @dataclass(frozen=True)
 class Frame:
-    """Device arrays of one view; :mod:`neuprim.core.render.cuda.layout` names the columns.
+    """Device arrays of one view; :mod:`neuprim.core.render.cuda.layout` names the columns."""
 
-    Attributes:
-        projection: the view.
-        parameters: tensors of :data:`~neuprim.core.render.rasterize.PARAMETERS`, contiguous, all float32 or all float64.
-        rows: (N, columns(K, C), 4) float32.
-        wide: (M, wide_width(K)) float64, rows of the primitives in float64, columns of
-            :mod:`neuprim.core.render.layout`.
-        slots: (N,) int32, row in ``wide``, or -1.
-        which: (M,) int32, primitive of each row of ``wide``, rising.
-        spans: (N, 8) float32, silhouettes.
-        boxes: (N, 4) int32, pixel boxes x0, y0, x1, y1.
-        depth: (N,) float64, camera z of the centres.
-        status: (N,) uint8, VISIBLE or CULLED.
-        lists: which primitives reach which tile.
-    """
-
-    projection: Projection
-    parameters: tuple[Tensor, ...]
-    rows: Tensor
-    wide: Tensor
-    slots: Tensor
-    which: Tensor
-    spans: Tensor
-    boxes: Tensor
-    depth: Tensor
-    status: Tensor
-    lists: TileLists
+    projection: Projection  # the view
+    parameters: tuple[Tensor, ...]  # tensors of PARAMETERS, contiguous, all float32 or all float64
+    rows: Tensor  # (N, columns(K, C), 4) float32
+    wide: Tensor  # (M, wide_width(K)) float64, rows of the primitives in float64, columns of layout
+    slots: Tensor  # (N,) int32, row in wide, or -1
+    which: Tensor  # (M,) int32, primitive of each row of wide, rising
+    spans: Tensor  # (N, 8) float32, silhouettes
+    boxes: Tensor  # (N, 4) int32, pixel boxes x0, y0, x1, y1
+    depth: Tensor  # (N,) float64, camera z of the centres
+    status: Tensor  # (N,) uint8, VISIBLE or CULLED
+    lists: TileLists  # which primitives reach which tile
 
     @property
     def device(self) -> torch.device:

@@ -11,7 +11,7 @@ tiles, see
 import functools
 from typing import Any
 
-from neuprim.core.compute.warp import wp
+from neuprim.core.compute.warp import Bools, Bytes, Doubles, Doubles2d, Floats2d, Ints, Ints2d, Vec4is, Vec4s2d, wp
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render import layout as W
 from neuprim.core.render.cuda import layout as L
@@ -69,11 +69,11 @@ _STORE = """
 
 
 @wp.func_native(_STORE)
-def store(rows: wp.array2d(dtype=wp.vec4), i: int, j: int, x: float, y: float, z: float, w: float): ...
+def store(rows: Vec4s2d, i: int, j: int, x: float, y: float, z: float, w: float): ...
 
 
 @wp.func
-def _put(rows: wp.array2d(dtype=wp.vec4), i: int, j: int, v: wp.vec3d, scalar: wp.float64):
+def _put(rows: Vec4s2d, i: int, j: int, v: wp.vec3d, scalar: wp.float64):
     """16 bytes at once: Warp's own store of a vector is four."""
     store(rows, i, j, f(v[0]), f(v[1]), f(v[2]), f(scalar))
 
@@ -227,11 +227,9 @@ def prepare_kernel(double: bool) -> Any:
     def prepare(
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4),
         W1: wp.array2d(dtype=vec3), b1: wp.array2d(dtype=real), w2: wp.array2d(dtype=real), b2: wp.array(dtype=real),
-        palette: wp.array2d(dtype=wp.float32), forced: wp.array(dtype=wp.bool),
-        matrix: wp.array(dtype=wp.float64), intrinsics: wp.vec4d, width: int, height: int, near: wp.float64, turns: wp.float64, edge: int,
-        least: wp.float64, neurons: int, channels: int,
-        rows: wp.array2d(dtype=wp.vec4), spans: wp.array2d(dtype=wp.vec4), boxes: wp.array(dtype=wp.vec4i), depth: wp.array(dtype=wp.float64),
-        status: wp.array(dtype=wp.uint8), counts: wp.array2d(dtype=wp.int32), bad: wp.array(dtype=wp.int32),
+        palette: Floats2d, forced: Bools, matrix: Doubles, intrinsics: wp.vec4d, width: int, height: int,
+        near: wp.float64, turns: wp.float64, edge: int, least: wp.float64, neurons: int, channels: int,
+        rows: Vec4s2d, spans: Vec4s2d, boxes: Vec4is, depth: Doubles, status: Bytes, counts: Ints2d, bad: Ints,
     ):  # fmt: skip
         i = wp.tid()
         most = d(b2[i])
@@ -368,7 +366,7 @@ def prepare_kernel(double: bool) -> Any:
 
 
 @wp.func
-def _put_wide(wide: wp.array2d(dtype=wp.float64), n: int, column: int, v: wp.vec3d):
+def _put_wide(wide: Doubles2d, n: int, column: int, v: wp.vec3d):
     for a in range(3):
         wide[n, column + a] = v[a]
 
@@ -380,10 +378,9 @@ def wide_kernel(double: bool) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def prepare_wide(
-        which: wp.array(dtype=wp.int32), means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4),
+        which: Ints, means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4),
         W1: wp.array2d(dtype=vec3), b1: wp.array2d(dtype=real), w2: wp.array2d(dtype=real), b2: wp.array(dtype=real),
-        matrix: wp.array(dtype=wp.float64), intrinsics: wp.vec4d, near: wp.float64, turns: wp.float64, neurons: int,
-        wide: wp.array2d(dtype=wp.float64),
+        matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64, turns: wp.float64, neurons: int, wide: Doubles2d,
     ):  # fmt: skip
         n = wp.tid()
         i = which[n]

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.warp import array, launch, wp
+from neuprim.core.compute.warp import Doubles, Doubles2d, Floats, Floats2d, Vec3s, Vec3s2d, Vec4s, array, launch, wp
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.frame import Frame, as_arrays
 from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, project_primitive, view_of, whiten
@@ -20,7 +20,7 @@ _G_OFFSET, _G_LOG_M, _G_WEIGHT, _G_NEURONS, _PER_NEURON = L.G_OFFSET, L.G_LOG_M,
 
 
 @wp.func
-def _three(grads: wp.array2d(dtype=wp.float32), i: int, column: int):
+def _three(grads: Floats2d, i: int, column: int):
     return wp.vec3d(d(grads[i, column]), d(grads[i, column + 1]), d(grads[i, column + 2]))
 
 
@@ -51,11 +51,9 @@ def _kernel(double: bool) -> Any:
     def backward(
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4),
         W1: wp.array2d(dtype=vec3), b1: wp.array2d(dtype=real), w2: wp.array2d(dtype=real), b2: wp.array(dtype=real),
-        matrix: wp.array(dtype=wp.float64), intrinsics: wp.vec4d, near: wp.float64, turns: wp.float64, neurons: int,
-        grads: wp.array2d(dtype=wp.float32),
-        g_means: wp.array(dtype=wp.vec3), g_log_scales: wp.array(dtype=wp.vec3), g_quats: wp.array(dtype=wp.vec4),
-        g_W1: wp.array2d(dtype=wp.vec3), g_b1: wp.array2d(dtype=wp.float32), g_w2: wp.array2d(dtype=wp.float32), g_b2: wp.array(dtype=wp.float32),
-        g_view: wp.array2d(dtype=wp.float64),
+        matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64, turns: wp.float64, neurons: int, grads: Floats2d,
+        g_means: Vec3s, g_log_scales: Vec3s, g_quats: Vec4s, g_W1: Vec3s2d, g_b1: Floats2d, g_w2: Floats2d,
+        g_b2: Floats, g_view: Doubles2d,
     ):  # fmt: skip
         i = wp.tid()
         if grads[i, _G_WEIGHT] > f(0.0):

@@ -5,7 +5,7 @@ The twin of ``_frame`` and of the geometry in ``_wide_row`` of :mod:`neuprim.cor
 the numbers are.
 """
 
-from neuprim.core.compute.warp import OPTIONS, wp
+from neuprim.core.compute.warp import OPTIONS, Doubles, wp
 from neuprim.core.render.limits import ANCHOR_RADII
 
 EXACT = {**OPTIONS, "fuse_fp": False}
@@ -70,7 +70,7 @@ def rounded(x: wp.float64):
 
 
 @wp.func
-def view_of(matrix: wp.array(dtype=wp.float64), intrinsics: wp.vec4d, near: wp.float64):
+def view_of(matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64):
     """``matrix``: the 16 numbers of a world-to-camera matrix, on the device."""
     v = View()
     v.R = wp.mat33d(matrix[0], matrix[1], matrix[2], matrix[4], matrix[5], matrix[6], matrix[8], matrix[9], matrix[10])

@@ -17,29 +17,18 @@ from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays from the camera centre, float64.
+    """Rays from the camera centre, float64."""
 
-    Attributes:
-        directions: (..., 3) unit vectors in camera axes; a zero vector meets nothing.
-        near: (...) ray distance before which chords are cut, scene units.
-        depth: (...) depth per unit of ray distance.
-    """
-
-    directions: Tensor
-    near: Tensor
-    depth: Tensor
+    directions: Tensor  # (..., 3) unit vectors in camera axes; a zero vector meets nothing
+    near: Tensor  # (...) ray distance before which chords are cut, scene units
+    depth: Tensor  # (...) depth per unit of ray distance
 
 
 class FrameRays(ABC):
-    """The rays (H, W) of one frame, and its primitives front to back.
+    """The rays (H, W) of one frame, and its primitives front to back."""
 
-    Attributes:
-        rays: one per pixel.
-        order: (N,) primitive rows, front to back.
-    """
-
-    rays: Rays
-    order: Tensor
+    rays: Rays  # one per pixel
+    order: Tensor  # (N,) primitive rows, front to back
 
     @abstractmethod
     def touched(self, y: int, x: int, h: int, w: int) -> Tensor:

@@ -14,385 +14,297 @@ DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free 
                --neurons, all with the bytes of --primitives of quick's and the same iterations
 
 Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds
-+- half the spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json, part by part; of main
-and equations only what is missing is run, --jobs at a time, one thread each. --docs puts the recorded tables between
-the markers of docs/dynamic.md; without DIR nothing is run.
++- half the spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json after every run, and
+only what is missing is run. --docs puts the recorded tables between the markers of docs/dynamic.md; without DIR nothing
+is run.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import json
-import math
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from shared.tables import ROOT, between_markers, spread
+from shared.arguments import make_parser
+from shared.records import RESULTS, read_record
+from shared.tables import DOCS, Run, Table, between_markers, format_range, group_runs, make_table, spread_of
 from shared.trials import Trial, run_all
+from torch import Tensor
 
 from neuprim.config import compose
-from neuprim.core.compute.threads import core_count, cpu_name
-from neuprim.core.data import Dataset
+from neuprim.core.compute.threads import cpu_name
+from neuprim.core.metrics import psnr
 from neuprim.core.model.geometry import GEOMETRY_SPECS
-from neuprim.core.train.trainer import Trainer
-from neuprim.runs.fit import prepare_training, train_to_end
+from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import render_image
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.dynamic.evaluation import recording_of
-from neuprim.tasks.dynamic.volume.dataset import Recording
 
-RESULTS = Path(__file__).parent / "results" / "dynamic_quality.json"
-SIZE = 96
-COLOUR = ("model.colour.powers=4", "model.colour.waves=4")
+RECORD = RESULTS / "dynamic_quality.json"
+PARTS = ("main", "control", "between", "equations")
 FORMS = {
     "quick: window, motion": ("model.density.time=window+motion",),
     "equations 10 to 13, degree 3": ("preset=equations",),
     "equations 10 to 13, degree 0": ("preset=equations", "model.sh_degree=0"),
-    "union: phase, window, motion, colour in time": ("model.density.time=phase+window+motion", *COLOUR),
+    "union: phase, window, motion, colour in time": (
+        "model.density.time=phase+window+motion",
+        "model.colour.powers=4",
+        "model.colour.waves=4",
+    ),
 }
 HARD = (
-    "model.neurons=8",
-    "model.density.edge=0",
-    "model.density.gain=false",
-    "train.supervision=images",
-    "train.rates.log_scales=0.02",
+    *("model.neurons=8", "model.density.edge=0", "model.density.gain=false"),
+    *("train.supervision=images", "train.rates.log_scales=0.02"),
 )
 """The paper's primitive from images alone."""
-EVERY = "train.population.every=400"  # as the preset has it, however short
 PRESETS = {"quick": (), "equations": ("preset=equations",), "hard": HARD}
+THIRDS = ("early", "middle", "late")
 KEYS = (
-    "psnr",
-    "psnr_mask",
-    "psnr_pooled_mask",
-    "psnr_black_image",
-    "psnr_black_image_mask",
-    "psnr_srgb",
-    "ssim",
-    "ssim_srgb",
-    "sigma_correlation_early",
-    "sigma_correlation_middle",
-    "sigma_correlation_late",
-    "sigma_relative_l2_early",
-    "sigma_relative_l2_middle",
-    "sigma_relative_l2_late",
-    "invisible_fraction",
-    "primitives",
-    "parameters_per_primitive",
-    "model_bytes",
-    "vdb_bytes",
-    "iterations",
-    "train_seconds",
-    "seed",
+    *("psnr", "psnr_mask", "psnr_pooled_mask", "psnr_black_image", "psnr_black_image_mask"),
+    *("psnr_srgb", "ssim", "ssim_srgb"),
+    *(f"sigma_correlation_{third}" for third in THIRDS),
+    *(f"sigma_relative_l2_{third}" for third in THIRDS),
+    *("invisible_fraction", "primitives", "parameters_per_primitive", "model_bytes", "vdb_bytes", "train_seconds"),
 )
 
 
-def fit(words: list[str], change: Callable[[Trainer], None] = lambda trainer: None) -> tuple[Trainer, dict[str, Any]]:
-    """What `neuprim run` does, less its files: the trainer after its budget, and the metrics."""
-    torch.set_num_threads(1)
-    fitted = prepare_training(compose(["task=dynamic", *words], check_output=False))
-    change(fitted.trainer)
-    return fitted.trainer, train_to_end(fitted).metrics()
+# ---------------------------------------------------------------- what is trained
 
 
-def numbers(*words: str) -> int:
-    """Numbers per primitive of a form whose colours are red, green and blue."""
+def numbers_per_primitive(*words: str) -> int:
+    """Of a form whose colours are red, green and blue."""
     model = compose(["task=dynamic", *words], check_output=False).model
-    fields = (
-        TimeDensity(model.neurons, **model.density),
-        TimeHarmonics(model.sh_degree, 3, model.sh_every, **model.colour),
-    )
-    return sum(spec.size for spec in (*GEOMETRY_SPECS, *fields[0].parameters(), *fields[1].parameters()))
+    density = TimeDensity(model.neurons, **model.density)
+    colour = TimeHarmonics(model.sh_degree, 3, model.sh_every, **model.colour)
+    return sum(spec.size for spec in (*GEOMETRY_SPECS, *density.parameters(), *colour.parameters()))
 
 
-def as_many_bytes(primitives: int, *words: str) -> int:
-    """How many primitives of a form have the bytes of ``primitives`` of the preset quick."""
-    return max(round(primitives * numbers() / numbers(*words)), 1)
+def equal_bytes(primitives: int, *words: str) -> str:
+    """The setting of as many primitives of a form as have the bytes of ``primitives`` of the preset quick."""
+    count = max(round(primitives * numbers_per_primitive() / numbers_per_primitive(*words)), 1)
+    return f"model.primitives={count}"
 
 
-def kept(metrics: dict[str, Any]) -> dict[str, Any]:
-    """Of a run's metrics, what is recorded of the parts ``main`` and ``equations``."""
-    return {k: metrics[k] for k in KEYS} | {"per_frame": [round(f["psnr_mask"], 3) for f in metrics["per_frame"]]}
-
-
-def main_trials(args: argparse.Namespace, data: list[str]) -> list[Trial]:
+def main_trials(args: argparse.Namespace, data: Sequence[str], seed: int) -> list[Trial]:
     found = []
-    for seed, row, preset in itertools.product(range(args.seeds), args.rows, args.presets):
+    for row, preset in itertools.product(args.rows, args.presets):
         primitives, steps = (int(n) for n in row.split("x"))
-        words = [*data, *PRESETS[preset], f"model.primitives={as_many_bytes(primitives, *PRESETS[preset])}", EVERY]
+        # the population as the preset has it, however short
+        own = (*PRESETS[preset], equal_bytes(primitives, *PRESETS[preset]), "train.population.every=400")
         facts = (("part", "main"), ("preset", preset), ("as_many_as", primitives))
-        found.append(Trial(f"main-{preset}-{primitives}-{steps}-{seed}", tuple(words), steps, seed, 0, facts))
+        found.append(Trial(f"main-{preset}-{primitives}-{steps}-{seed}", (*data, *own), steps, seed, 0, facts))
     return found
 
 
-def equation_trials(args: argparse.Namespace, data: list[str]) -> list[Trial]:
+def equation_trials(args: argparse.Namespace, data: Sequence[str], seed: int) -> list[Trial]:
     found = []
-    for seed, form, edge, neurons in itertools.product(range(args.seeds), args.forms, args.edges, args.neurons):
-        words = [
-            *FORMS[form],
-            f"model.density.edge={edge}",
-            f"model.neurons={neurons}",
-            f"model.density.gain={'true' if edge else 'false'}",
-        ]
-        words.append(f"model.primitives={as_many_bytes(args.primitives, *words)}")
+    for form, edge, neurons in itertools.product(args.forms, args.edges, args.neurons):
+        gain = f"model.density.gain={'true' if edge else 'false'}"
+        own = (*FORMS[form], f"model.density.edge={edge}", f"model.neurons={neurons}", gain)
         facts = (("part", "equations"), ("form", form), ("edge", edge), ("neurons", neurons), ("gain", edge > 0))
         name = f"equations-{form}-{edge}-{neurons}-{args.primitives}-{args.iterations}-{seed}"
-        found.append(Trial(name, (*data, *words), args.iterations, seed, 0, facts))
+        words = (*data, *own, equal_bytes(args.primitives, *own))
+        found.append(Trial(name, words, args.iterations, seed, 0, facts))
     return found
 
 
-def shuffled_times(trainer: Trainer) -> None:
+def short_trial(args: argparse.Namespace, name: str, words: Sequence[str], seed: int, **more: Any) -> Trial:
+    """A run of the parts control and between."""
+    words = (*words, *HARD, "model.primitives=2000")
+    return Trial(f"{name}-{args.iterations}-{seed}", words, args.iterations, seed, interventions=None, **more)
+
+
+def control_trials(args: argparse.Namespace, data: Sequence[str], seed: int) -> list[Trial]:
+    changes: dict[str, Callable[[Fitted], None] | None] = {"true times": None, "shuffled times": shuffle_times}
+    return [
+        short_trial(args, f"control-{name}", data, seed, facts=(("part", "control"), ("name", name)), change=change)
+        for name, change in changes.items()
+    ]
+
+
+def between_trials(args: argparse.Namespace, data: Sequence[str], seed: int) -> list[Trial]:
+    return [
+        short_trial(
+            args,
+            f"between-{every}",
+            (*data, f"scene.train_every={every}"),
+            seed,
+            facts=(("part", "between"), ("every", every)),
+        )
+        for every in (1, 2)
+    ]
+
+
+def shuffle_times(fitted: Fitted) -> None:
     """Every training camera keeps its images, under the times of other frames."""
-    views: Any = trainer.dataset.train
+    views: Any = fitted.dataset.train
     order = torch.randperm(len(views.times), generator=torch.Generator().manual_seed(5)).tolist()
     views.times = [views.times[i] for i in order]
 
 
-def recorded_in(trainer: Trainer) -> tuple[Dataset, Recording]:
-    """The data set, and the sequence that it was rendered from."""
-    recording = recording_of(trainer.dataset)
-    assert recording is not None
-    return trainer.dataset, recording
-
-
-def between_frames(trainer: Trainer) -> dict[str, float]:
-    """PSNR inside the mask of test frames that were learned from and of those between them, and the largest step
-    between frames.
+def measure_between_frames(fitted: Fitted, metrics: dict[str, Any]) -> dict[str, float]:
+    """PSNR inside the mask of test frames that were learned from and of those between them, of the real frame before
+    the latter, which interpolation must beat, and the largest step between frames.
 
     The steps: the image at every quarter of a frame's interval. ``largest_step`` is the largest mean absolute
     difference of two such neighbours over that of the two whole frames around them; smooth motion gives about 1/4, a
     jump 1 or more.
     """
-    data, recording = recorded_in(trainer)
+    data, model, settings = fitted.dataset, fitted.model, fitted.trainer.renderer
+    recording = recording_of(data)
+    assert recording is not None
     frames, every = len(recording.test.times), recording.every
-    errors: dict[bool, list[float]] = {True: [], False: []}
+    errors: dict[str, list[float]] = {"learned": [], "between": [], "repeat": []}
     worst = 0.0
+
+    def truth(index: int) -> Tensor:
+        return data.test.pixels(index).over(data.background)
+
     for index in range(len(data.test)):
-        view, t = data.test.view(index), index % frames
-        rendered, truth = (
-            render_image(trainer.model, view, trainer.renderer, data.background),
-            data.test.pixels(index).over(data.background),
-        )
-        error = (rendered - truth)[recording.matter_mask(index)].double().square().mean().item()
-        errors[t % every == 0].append(-10 * math.log10(error))
-        if t + 1 < frames and index < frames:
-            after = data.test.view(index + 1)
-            steps = [
-                view.conditions["time"] + q / 4 * (after.conditions["time"] - view.conditions["time"]) for q in range(5)
-            ]
-            images = [
-                render_image(trainer.model, type(view)("", view.camera, {"time": s}), trainer.renderer, data.background)
-                for s in steps
-            ]
-            whole = (images[4] - images[0]).abs().mean().item()
-            worst = max(worst, *((b - a).abs().mean().item() / max(whole, 1e-9) for a, b in itertools.pairwise(images)))
-    found = {"learned": statistics.mean(errors[True]), "largest_step": worst}
-    return found | ({"between": statistics.mean(errors[False])} if errors[False] else {})
+        view, since = data.test.view(index), (index % frames) % every
+        mask = recording.matter_mask(index)
+        rendered = render_image(model, view, settings, data.background)
+        errors["between" if since else "learned"].append(psnr(rendered, truth(index), mask))
+        if since:
+            errors["repeat"].append(psnr(truth(index - since), truth(index), mask))
+        if index + 1 < frames:
+            first, last = view.conditions["time"], data.test.view(index + 1).conditions["time"]
+            moments = [type(view)("", view.camera, {"time": first + q / 4 * (last - first)}) for q in range(5)]
+            images = [render_image(model, moment, settings, data.background) for moment in moments]
+            whole = max((images[4] - images[0]).abs().mean().item(), 1e-9)
+            worst = max(worst, *((b - a).abs().mean().item() / whole for a, b in itertools.pairwise(images)))
+    return {"largest_step": worst} | {name: statistics.mean(values) for name, values in errors.items() if values}
 
 
-def repeat_neighbour(trainer: Trainer) -> float:
-    """PSNR inside the mask of showing, for each frame that was not learned, the real frame before it: what
-    interpolation must beat."""
-    data, recording = recorded_in(trainer)
-    frames, every, values = len(recording.test.times), recording.every, []
-    for index in range(len(data.test)):
-        if (index % frames) % every:
-            pair = [data.test.pixels(i).over(data.background) for i in (index - (index % frames) % every, index)]
-            error = (pair[0] - pair[1])[recording.matter_mask(index)].double().square().mean().item()
-            values.append(-10 * math.log10(error))
-    return statistics.mean(values)
+# ---------------------------------------------------------------- tables
+
+
+def main_table(runs: Sequence[Run]) -> str:
+    """One column per budget and preset, one row per number, beside what a black image scores."""
+    groups = group_runs(runs, "as_many_as", "iterations", "preset")
+    columns = [groups[key] for key in sorted(groups, key=lambda key: (key[:2], key[2] != "quick", key[2]))]
+    heads = (
+        f"`{own[0]['preset']}`, {own[0]['primitives']:,} primitives, {own[0]['iterations']:,} steps" for own in columns
+    )
+    table = Table("", *heads, "black image")
+
+    def thirds(key: str) -> Callable[[list[Run]], str]:
+        return lambda own: " / ".join(spread_of(own, f"sigma_{key}_{third}", 3) for third in THIRDS)
+
+    rows: dict[str, Callable[[list[Run]], str]] = {
+        "PSNR, whole image": lambda own: f"{spread_of(own, 'psnr')} dB",
+        "PSNR inside the union mask": lambda own: f"{spread_of(own, 'psnr_mask')} dB",
+        "PSNR of the pooled error inside the mask": lambda own: f"{spread_of(own, 'psnr_pooled_mask')} dB",
+        "PSNR after the sRGB curve": lambda own: f"{spread_of(own, 'psnr_srgb')} dB",
+        "SSIM, linear / sRGB": lambda own: f"{spread_of(own, 'ssim', 4)} / {spread_of(own, 'ssim_srgb', 4)}",
+        "correlation of σ with the files, early / middle / late frames": thirds("correlation"),
+        "relative L2 error of σ, early / middle / late frames": thirds("relative_l2"),
+        "model, with the errors above": lambda own: f"{own[0]['model_bytes'] / 1e6:.2f} MB",
+        "the .vdb files, which have none": lambda own: f"{own[0]['vdb_bytes'] / 1e6:.2f} MB",
+        "primitives that never show": lambda own: f"{mean_percentage(own):.1f} %",
+        "seeds": lambda own: f"{len(own)}",
+    }
+    black = {
+        "PSNR, whole image": f"{runs[0]['psnr_black_image']:.1f} dB",
+        "PSNR inside the union mask": f"{runs[0]['psnr_black_image_mask']:.1f} dB",
+    }
+    for name, cell in rows.items():
+        table.row(name, *(cell(own) for own in columns), black.get(name, ""))
+    return str(table)
+
+
+def mean_percentage(runs: Sequence[Run]) -> float:
+    """Primitives that never show, in percent."""
+    return 100 * statistics.mean(run["invisible_fraction"] for run in runs)
+
+
+def equations_table(runs: Sequence[Run]) -> str:
+    """The forms of quick, of the paper's equations and their union by edge and neurons, all at equal bytes."""
+    columns = {
+        "form": lambda own: own[0]["form"],
+        "edge": lambda own: f"{own[0]['edge']}{', gain' if own[0]['gain'] else ''}",
+        "K": lambda own: own[0]["neurons"],
+        "numbers": lambda own: own[0]["parameters_per_primitive"],
+        "primitives": lambda own: f"{own[0]['primitives']:,}",
+        "PSNR": lambda own: f"{spread_of(own, 'psnr')} dB",
+        "inside the mask": lambda own: f"{spread_of(own, 'psnr_mask')} dB",
+        "pooled, inside": lambda own: f"{spread_of(own, 'psnr_pooled_mask')} dB",
+        "invisible": lambda own: f"{mean_percentage(own):.0f} %",
+        "ms a step": lambda own: f"{1e3 * statistics.mean(r['cpu_seconds'] / r['iterations'] for r in own):.0f}",
+    }
+    table = make_table(columns, group_runs(runs, "form", "edge", "neurons").values())
+    steps = format_range(run["iterations"] for run in runs)
+    seeds = len({run["seed"] for run in runs})
+    return f"{table}\n\n{runs[0]['model_bytes'] / 1e6:.2f} MB each, {steps} iterations, {seeds} seed(s)."
+
+
+def control_table(control: Sequence[Run], between: Sequence[Run]) -> str:
+    """Shuffled times, and frames between those that were learned."""
+    groups = group_runs(control, "name")
+    first = make_table(
+        {
+            "control": lambda own: own[0]["name"],
+            "PSNR": lambda own: f"{spread_of(own, 'psnr')} dB",
+            "inside the mask": lambda own: f"{spread_of(own, 'psnr_mask')} dB",
+        },
+        [groups[name,] for name in ("true times", "shuffled times") if (name,) in groups],
+    )
+    second = make_table(
+        {
+            "learned from": lambda own: "every frame" if own[0]["every"] == 1 else f"every {own[0]['every']}nd frame",
+            "learned frames, inside the mask": lambda own: f"{spread_of(own, 'learned')} dB",
+            "frames between": lambda own: f"{spread_of(own, 'between')} dB" if "between" in own[0] else "–",
+            "real frame before instead": lambda own: f"{spread_of(own, 'repeat')} dB" if "repeat" in own[0] else "–",
+            "largest step": lambda own: spread_of(own, "largest_step"),
+        },
+        group_runs(between, "every").values(),
+    )
+    return f"{first}\n\n{second}"
+
+
+def make_tables(record: dict[str, Any]) -> dict[str, str]:
+    """The text of each pair of markers."""
+    parts = {key: runs for (key,), runs in group_runs(record["trials"], "part").items()}
+    control = control_table(parts.get("control", []), parts.get("between", []))
+    tables = {"dynamic-quality": main_table(parts["main"])} if "main" in parts else {}
+    tables |= {"dynamic-equations": equations_table(parts["equations"])} if "equations" in parts else {}
+    notes = {name: f"\n\nMeans over seeds ± half the spread; {cpu}." for name, cpu in record["machines"].items()}
+    return {name: text + notes["main"] for name, text in tables.items()} | {
+        "dynamic-control": control + notes["control"]
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = make_parser(__doc__, "--seeds", "--jobs", "--docs")
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--frames", default="1:40")
-    parser.add_argument("--parts", nargs="*", default=["main", "control", "between"])
+    parser.add_argument("--parts", nargs="*", default=["main", "control", "between"], choices=PARTS)
     parser.add_argument("--rows", nargs="*", default=["13500x4000"], help="PRIMITIVESxSTEPS, of main")
     parser.add_argument("--presets", nargs="*", default=list(PRESETS), choices=list(PRESETS), help="of main")
     parser.add_argument("--edges", nargs="*", type=int, default=[0, 2], help="of equations")
     parser.add_argument("--neurons", nargs="*", type=int, default=[0, 8], help="of equations")
     parser.add_argument("--forms", nargs="*", default=list(FORMS), help="of equations")
     parser.add_argument("--primitives", type=int, default=5400, help="of equations")
-    parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=2500, help="of every run but those of main")
-    parser.add_argument("--jobs", type=int, default=2, help="runs at a time of main and equations, one thread each")
-    parser.add_argument("--docs", action="store_true")
     args = parser.parse_args()
-    recorded: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     if args.folder:
-        if {"control", "between"} & set(args.parts):
-            recorded |= {"cpu": cpu_name(), "cores": core_count()}
-        data = [
-            "scene=vdb",
-            f"scene.vdb='{args.folder.resolve()}'",
-            f"scene.frames='{args.frames}'",
-            "scene.look=embergen_fire",
-            f"scene.size={SIZE}",
-            "train.eval_every=0",
-        ]
-        short = [*HARD, "model.primitives=2000", "train.max_seconds=null", f"train.iterations={args.iterations}"]
-
-        def keep(part: str, entry: dict[str, Any]) -> None:
-            recorded.setdefault(part, []).append(entry)
-            RESULTS.write_text(
-                json.dumps(recorded, indent=1) + "\n"
-            )  # after every run: a long benchmark may be cut short
-            print(
-                part, json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in entry.items()}), flush=True
-            )
-
-        for part in {"control", "between"} & set(args.parts):
-            recorded[part] = []
-        trials = main_trials(args, ["task=dynamic", *data]) if "main" in args.parts else []
-        trials += equation_trials(args, ["task=dynamic", *data]) if "equations" in args.parts else []
-        run_all(trials, RESULTS, kept, args.jobs, lambda row: f"{row['psnr_mask']:.2f} dB", {"main_cpu": cpu_name()})
-        recorded |= json.loads(RESULTS.read_text())
-        for seed in range(args.seeds):
-            own = [*data, f"seed={seed}"]
-            if "control" in args.parts:
-                for name, change in (("true times", lambda trainer: None), ("shuffled times", shuffled_times)):
-                    _, m = fit([*own, *short], change)
-                    keep("control", {"name": name, **{k: m[k] for k in KEYS}})
-            if "between" in args.parts:
-                for every in (1, 2):
-                    trainer, m = fit([*own, *short, f"scene.train_every={every}"])
-                    base = {"repeat": repeat_neighbour(trainer)} if every > 1 else {}
-                    keep("between", {"every": every, "seed": seed, **between_frames(trainer), **base})
-    notes = {where: f"\n\nMeans over seeds ± half the spread; {cpu}." for where, cpu in _machines(recorded).items()}
-    tables = {
-        "dynamic-quality": main_table,
-        "dynamic-control": control_table,
-        "dynamic-equations": equations_table,
-    }
-    for name, make in tables.items():
-        text = make(recorded)
-        text += notes["side by side" if make in (main_table, equations_table) else "one by one"] if text else ""
+        data = ["task=dynamic", "scene=vdb", "scene.look=embergen_fire", "scene.size=96"]
+        data += [f"scene.vdb='{args.folder.resolve()}'", f"scene.frames='{args.frames}'"]
+        make = {"main": main_trials, "control": control_trials, "between": between_trials, "equations": equation_trials}
+        for part in args.parts:
+            trials = [trial for seed in range(args.seeds) for trial in make[part](args, data, seed)]
+            known = read_record(RECORD).get("machines", {})
+            machine = {"control" if part in ("control", "between") else "main": f"one thread of {cpu_name()} a run"}
+            wanted = measure_between_frames if part == "between" else KEYS
+            run_all(trials, RECORD, wanted, args.jobs, machines=known | machine)
+    for name, text in make_tables(read_record(RECORD)).items():
         if args.docs:
-            between_markers(ROOT / "docs" / "dynamic.md", name, text)
-        print(f"\n{text}")
-
-
-def _machines(recorded: dict[str, Any]) -> dict[str, str]:
-    """What the two kinds of parts were measured on."""
-    return {
-        "side by side": f"one thread of {recorded.get('main_cpu', 'nothing yet')} a run",
-        "one by one": f"{recorded.get('cores', 0)} cores of {recorded.get('cpu', 'nothing yet')}",
-    }
-
-
-def _spread(runs: list[dict[str, Any]], key: str, digits: int = 2) -> str:
-    return spread([r[key] for r in runs], digits) if runs else "–"
-
-
-def _part(recorded: dict[str, Any], part: str) -> list[dict[str, Any]]:
-    return [r for r in recorded.get("trials", []) if r["part"] == part]
-
-
-def _budget(run: dict[str, Any]) -> tuple[int, int]:
-    """Primitives of the preset quick with as many bytes, and steps."""
-    return run["as_many_as"], run["iterations"]
-
-
-def _columns(runs: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    """The runs of each budget and preset, quick first."""
-    keys = sorted({(_budget(r), r["preset"] != "quick", r["preset"]) for r in runs})
-    return [[r for r in runs if (_budget(r), r["preset"]) == (budget, preset)] for budget, _, preset in keys]
-
-
-def main_table(recorded: dict[str, Any]) -> str:
-    """One column per budget and preset, one row per number, beside what a black image scores."""
-    runs = _part(recorded, "main")
-    if not runs:
-        return "not measured"
-    columns = _columns(runs)
-    black, inside = runs[0]["psnr_black_image"], runs[0]["psnr_black_image_mask"]
-
-    def line(name: str, cell: Callable[[list[dict[str, Any]]], str], baseline: str = "") -> str:
-        return f"| {name} | " + " | ".join(cell(own) for own in columns) + f" | {baseline} |"
-
-    def thirds(key: str) -> Callable[[list[dict[str, Any]]], str]:
-        return lambda own: " / ".join(_spread(own, f"sigma_{key}_{third}", 3) for third in ("early", "middle", "late"))
-
-    return "\n".join(
-        [
-            line(
-                "",
-                lambda own: (
-                    f"`{own[0]['preset']}`, {own[0]['primitives']:,} primitives, {own[0]['iterations']:,} steps"
-                ),
-                "black image",
-            ),
-            "| --- |" + " --- |" * (len(columns) + 1),
-            line("PSNR, whole image", lambda own: f"{_spread(own, 'psnr')} dB", f"{black:.1f} dB"),
-            line("PSNR inside the union mask", lambda own: f"{_spread(own, 'psnr_mask')} dB", f"{inside:.1f} dB"),
-            line("PSNR of the pooled error inside the mask", lambda own: f"{_spread(own, 'psnr_pooled_mask')} dB"),
-            line("PSNR after the sRGB curve", lambda own: f"{_spread(own, 'psnr_srgb')} dB"),
-            line("SSIM, linear / sRGB", lambda own: f"{_spread(own, 'ssim', 4)} / {_spread(own, 'ssim_srgb', 4)}"),
-            line("correlation of σ with the files, early / middle / late frames", thirds("correlation")),
-            line("relative L2 error of σ, early / middle / late frames", thirds("relative_l2")),
-            line("model, with the errors above", lambda own: f"{own[0]['model_bytes'] / 1e6:.2f} MB"),
-            line("the .vdb files, which have none", lambda own: f"{own[0]['vdb_bytes'] / 1e6:.2f} MB"),
-            line(
-                "primitives that never show",
-                lambda own: f"{100 * statistics.mean(r['invisible_fraction'] for r in own):.1f} %",
-            ),
-            line("seeds", lambda own: f"{len(own)}"),
-        ]
-    )
-
-
-def equations_table(recorded: dict[str, Any]) -> str:
-    """The forms of quick, of the paper's equations and their union by edge and neurons, all at equal bytes; nothing
-    where none was measured."""
-    runs = _part(recorded, "equations")
-    if not runs:
-        return ""
-    lines = [
-        "| form | edge | K | numbers | primitives | PSNR | inside the mask | pooled, inside | invisible | ms a step |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for key in dict.fromkeys((r["form"], r["edge"], r["neurons"]) for r in runs):
-        own = [r for r in runs if (r["form"], r["edge"], r["neurons"]) == key]
-        step = 1e3 * statistics.mean(r["cpu_seconds"] / r["iterations"] for r in own)
-        lines.append(
-            f"| {key[0]} | {key[1]}{', gain' if own[0]['gain'] else ''} | {key[2]} | "
-            f"{own[0]['parameters_per_primitive']} "
-            f"| {own[0]['primitives']:,} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB | "
-            f"{_spread(own, 'psnr_pooled_mask')} dB "
-            f"| {100 * statistics.mean(r['invisible_fraction'] for r in own):.0f} % | {step:.0f} |"
-        )
-    steps = [r["iterations"] for r in runs]
-    many = f"{steps[0]:,}" if len(set(steps)) == 1 else f"{min(steps):,} to {max(steps):,}"
-    seeds = len({r["seed"] for r in runs})
-    return "\n".join([*lines, "", f"{runs[0]['model_bytes'] / 1e6:.2f} MB each, {many} iterations, {seeds} seed(s)."])
-
-
-def control_table(recorded: dict[str, Any]) -> str:
-    """Shuffled times, and frames between those that were learned."""
-    lines = ["| control | PSNR | inside the mask |", "| --- | --- | --- |"]
-    runs = recorded.get("control", [])
-    for name in dict.fromkeys(r["name"] for r in runs):
-        own = [r for r in runs if r["name"] == name]
-        lines.append(f"| {name} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB |")
-    lines += [
-        "",
-        "| learned from | learned frames, inside the mask | frames between | real frame before instead | largest "
-        "step |",
-    ]
-    lines.append("| --- | --- | --- | --- | --- |")
-    for every in dict.fromkeys(r["every"] for r in recorded.get("between", [])):
-        own = [r for r in recorded["between"] if r["every"] == every]
-        what = "every frame" if every == 1 else f"every {every}nd frame"
-        between, repeat = (_spread(own, k) + " dB" if every > 1 else "–" for k in ("between", "repeat"))
-        lines.append(
-            f"| {what} | {_spread(own, 'learned')} dB | {between} | {repeat} | {_spread(own, 'largest_step')} |"
-        )
-    return "\n".join(lines)
+            between_markers(DOCS / "dynamic.md", name, text)
 
 
 if __name__ == "__main__":

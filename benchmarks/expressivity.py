@@ -9,12 +9,11 @@ cool-down. A size is the bytes of so many of the paper's primitives; every form 
 hold. Parts:
 
     forms     every form at every size, for as many steps as fit into the seconds that the paper's form takes for its
-    own: the forms take turns
-              on this machine first, over a whole run, and each has its pace in seconds that its thread computes
+              own: the forms take turns on this machine first, over a whole run, and each has its pace in seconds that
+              its thread computes
     slope     the same with half the steps, first seed: what the last doubling of the budget still brought
     gaussian  a true Gaussian has no fast kernel and runs on the reference backend: small images of the static scenes
-    and few steps, equal count
-              and equal bytes, beside the other forms in the same conditions
+              and few steps, equal count and equal bytes, beside the other forms in the same conditions
 
 Numbers are means over seeds +- half the spread, of the last checkpoint, on the test views. Results go to
 benchmarks/results/expressivity.json after every run, and only what is missing is run. --docs puts the tables between
@@ -24,47 +23,28 @@ the markers in docs/expressivity.md; --print runs nothing.
 from __future__ import annotations
 
 import argparse
-import json
-import multiprocessing
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-import torch
+from shared.arguments import make_parser, require_folders
 from shared.forms import AS_RECORDED, PAPER, SCENES, Form
-from shared.tables import between_markers, spread
-from shared.trials import Trial, begin, paces_of, run_all
+from shared.records import RESULTS, read_record
+from shared.tables import DOCS, Run, between_markers, format_range, group_runs, make_table, spread_of
+from shared.trials import Trial, measure_paces, run_all
 
-from neuprim.core.compute.threads import cpu_name
-
-HERE = Path(__file__).parent
-RESULTS = HERE / "results" / "expressivity.json"
-DOCS = HERE.parent / "docs" / "expressivity.md"
+RECORD = RESULTS / "expressivity.json"
+SIGMA = tuple(f"sigma_relative_l2_{third}" for third in ("early", "middle", "late"))
 KEYS = (
-    "psnr",
-    "psnr_worst",
-    "ssim",
-    "psnr_mask",
-    "psnr_linear_clamped",
-    "psnr_pooled_cast_shadow",
-    "psnr_pooled_highlight",
-    "sigma_relative_l2_early",
-    "sigma_relative_l2_middle",
-    "sigma_relative_l2_late",
-    "parameters",
-    "parameters_per_primitive",
-    "primitives",
-    "backend",
+    *("psnr", "psnr_worst", "ssim", "psnr_mask", "psnr_linear_clamped"),
+    *("psnr_pooled_cast_shadow", "psnr_pooled_highlight", *SIGMA),
+    *("parameters", "parameters_per_primitive", "primitives", "backend"),
 )
-
 FORMS = {
     "static": ("8:0", "0:2", "2:2", "4:2"),
     "dynamic": ("8:0@images", "0:2@images", "0:2", "2:2"),
     "relight": ("8:0", "0:2", "2:2"),
 }
-REFERENCE = {"static": str(PAPER), "dynamic": f"{PAPER}@images", "relight": str(PAPER)}
-"""Whose seconds all others get."""
+"""The first is the paper's, whose seconds all others get."""
 STEPS = {
     "solids": {100: 2000, 400: 2000, 2000: 3000},
     "chair": {100: 2000, 400: 2000, 2000: 3000},
@@ -72,212 +52,154 @@ STEPS = {
     "smoke_fire": {1000: 5000},
     "lit_solids": {2000: 2000},
 }
-"""Of the reference; the others train as long in seconds."""
-SMALL = {"iterations": 400, "primitives": 100, "size": 64, "downsample": 4}
-"""What the part ``gaussian`` is reduced to."""
-
-
-def reduced(scene: str) -> tuple[str, ...]:
-    """The small images of the part ``gaussian``."""
-    return (f"scene.size={SMALL['size']}",) if scene == "solids" else (f"scene.downsample={SMALL['downsample']}",)
+"""Of the paper's form; the others train as long in seconds."""
+SMALL = 100
+"""Primitives of the part ``gaussian``."""
+SMALL_STEPS = 400
+SMALL_IMAGES = {"solids": "scene.size=64", "chair": "scene.downsample=4"}
 
 
 def words_of(form: str, scene: str, args: argparse.Namespace, count: int) -> tuple[str, ...]:
-    own = SCENES[scene]
-    return (*own.all_words(vars(args), scene), *AS_RECORDED, *Form.named(form).words, f"model.primitives={count}")
+    own = SCENES[scene].all_words(vars(args), scene)
+    return (*own, *AS_RECORDED, *Form.named(form).words, f"model.primitives={count}")
 
 
-def measure_paces(scene: str, size: int, forms: Sequence[str], args: argparse.Namespace) -> dict[str, float]:
-    """Seconds a step of each over a whole run as long as the reference's."""
-    torch.set_num_threads(1)
-    steps, trainers = STEPS[scene][size], {}
-    for form in forms:
-        count = Form.named(form).equal_bytes(size, SCENES[scene].task)
-        trainers[form] = begin(Trial(form, words_of(form, scene, args, count), steps)).trainer
-    return paces_of(trainers, steps)
+def equal_seconds(scene: str, size: int, args: argparse.Namespace) -> dict[str, Trial]:
+    """Every form at a size, for as long as the paper's takes for its steps."""
+    task, whole = SCENES[scene].task, STEPS[scene][size]
+
+    def trial(form: str, steps: int) -> Trial:
+        return Trial("", words_of(form, scene, args, Form.named(form).equal_bytes(size, task)), steps)
+
+    forms = args.forms or FORMS[task]
+    named = {f"{scene} {size} {form}": trial(form, whole) for form in forms}
+    paces = measure_paces(RECORD, trial(FORMS[task][0], whole), named, whole)
+    return {form: trial(form, round(whole / paces[f"{scene} {size} {form}"])) for form in forms}
 
 
-def measured_paces(args: argparse.Namespace) -> dict[str, float]:
-    """Time of a step over that of the paper's form, by "scene size form"; what is recorded stays."""
-    whole: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    found: dict[str, float] = whole.setdefault("paces", {})
-    wanted = []
-    for scene in args.scenes:
-        for size in sizes(scene, args):
-            missing = [f for f in forms_of(scene, args) if f"{scene} {size} {f}" not in found]
-            if missing:  # ratios travel, seconds do not: the reference takes part every time
-                wanted.append((scene, size, list(dict.fromkeys([REFERENCE[SCENES[scene].task], *missing]))))
-    with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(measure_paces, scene, size, forms, args) for scene, size, forms in wanted]
-        for (scene, size, forms), future in zip(wanted, futures, strict=True):
-            took = future.result()
-            ratios = {form: took[form] / took[forms[0]] for form in forms}
-            found |= {f"{scene} {size} {form}": ratio for form, ratio in ratios.items()}
-            RESULTS.write_text(json.dumps(whole, indent=1) + "\n")
-            print(f"paces of {scene}, {size}:", {form: round(ratio, 3) for form, ratio in ratios.items()}, flush=True)
-    return found
-
-
-def forms_of(scene: str, args: argparse.Namespace) -> list[str]:
-    return args.forms or list(FORMS[SCENES[scene].task])
-
-
-def sizes(scene: str, args: argparse.Namespace) -> list[int]:
-    return [size for size in STEPS[scene] if not args.sizes or size in args.sizes]
-
-
-def plan(args: argparse.Namespace, paces: dict[str, float]) -> list[Trial]:
+def plan(args: argparse.Namespace) -> Iterator[Trial]:
     """Every run; the first seed of everything first, so that an early end leaves whole rows."""
-    trials = []
 
-    def add(
-        part: str, scene: str, size: int, form: str, count: int, steps: int, seed: int, further: tuple[str, ...] = ()
-    ) -> None:
+    def named(part: str, scene: str, size: int, form: str, words: tuple[str, ...], steps: int, seed: int) -> Trial:
         facts = (("part", part), ("scene", scene), ("form", form), ("size", size))
-        name = f"{part}-{scene}-{size}-{form}-{count}-{steps}-{seed}"
-        trials.append(Trial(name, (*words_of(form, scene, args, count), *further), steps, seed, 0, facts))
+        count = next(word for word in words if word.startswith("model.primitives=")).partition("=")[2]
+        return Trial(f"{part}-{scene}-{size}-{form}-{count}-{steps}-{seed}", words, steps, seed, 0, facts)
 
+    timed = {"forms", "slope"} & set(args.parts)
+    sizes = [
+        (scene, size) for scene in args.scenes for size in STEPS[scene] if timed and size in (args.sizes or [size])
+    ]
+    forms = {key: equal_seconds(*key, args) for key in sizes}
     for seed in range(args.seeds):
-        for scene in args.scenes:
-            task = SCENES[scene].task
-            for size in sizes(scene, args) if paces else []:
-                for form in forms_of(scene, args):
-                    count, steps = (
-                        Form.named(form).equal_bytes(size, task),
-                        round(STEPS[scene][size] / paces[f"{scene} {size} {form}"]),
-                    )
-                    if "forms" in args.parts:
-                        add("forms", scene, size, form, count, steps, seed)
-                    if "slope" in args.parts and seed == 0:
-                        add("slope", scene, size, form, count, steps // 2, seed)
-            if "gaussian" in args.parts and task == "static":
-                for form in [*forms_of(scene, args), "gaussian"]:
-                    size = SMALL["primitives"]
-                    for count in dict.fromkeys((size, Form.named(form).equal_bytes(size, task))):
-                        add("gaussian", scene, size, form, count, SMALL["iterations"], seed, reduced(scene))
-    return trials
+        for (scene, size), trials in forms.items():
+            for form, trial in trials.items():
+                if "forms" in args.parts:
+                    yield named("forms", scene, size, form, trial.words, trial.iterations, seed)
+                if "slope" in args.parts and seed == 0:
+                    yield named("slope", scene, size, form, trial.words, trial.iterations // 2, seed)
+        if "gaussian" in args.parts:
+            for scene in (name for name in args.scenes if name in SMALL_IMAGES):
+                for form in (*(args.forms or FORMS["static"]), "gaussian"):
+                    for count in dict.fromkeys((SMALL, Form.named(form).equal_bytes(SMALL, "static"))):
+                        words = (*words_of(form, scene, args, count), SMALL_IMAGES[scene])
+                        yield named("gaussian", scene, SMALL, form, words, SMALL_STEPS, seed)
 
 
-# ---------------------------------------------------------------- the tables
+# ---------------------------------------------------------------- tables
 
 
-def forms_table(found: dict[str, Any]) -> str:
+def mean_score(runs: Sequence[Run]) -> float:
+    return sum(float(run[SCENES[run["scene"]].judged]) for run in runs) / len(runs)
+
+
+def forms_table(record: dict[str, Any]) -> str:
     """One row per form, scene and size; the best in bold, and all whose mean lies within its half spread."""
-    trials = found["trials"]
-    lines = [
-        "| scene | bytes of | primitive | primitives | numbers each | steps | PSNR | worst view | SSIM | last "
-        "doubling | error of σ |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    groups: dict[tuple[str, int, str], list[dict[str, Any]]] = {}
-    for run in trials:
-        if run["part"] == "forms":
-            groups.setdefault((run["scene"], run["size"], run["form"]), []).append(run)
+    groups = group_runs([run for run in record["trials"] if run["part"] == "forms"], "scene", "size", "form")
+    halved = {(r["scene"], r["size"], r["form"]): r for r in record["trials"] if r["part"] == "slope"}
     order = list(SCENES)
-    for (scene, size, form), runs in sorted(
-        groups.items(), key=lambda g: (order.index(g[0][0]), g[0][1], -_mean(g[1]))
-    ):
-        judged = SCENES[scene].judged
-        top = max((own for key, own in groups.items() if key[:2] == (scene, size)), key=_mean)
-        values = [r[judged] for r in top]
-        text = f"{spread([r[judged] for r in runs], 2)} dB"
-        half = [
-            r[judged]
-            for r in trials
-            if r["part"] == "slope" and (r["scene"], r["size"], r["form"]) == (scene, size, form)
-        ]
-        first = next(r[judged] for r in runs if r["seed"] == 0)
-        lines.append(
-            f"| {scene} | {size} | {Form.named(form).label} | {runs[0]['primitives']} | "
-            f"{runs[0]['parameters_per_primitive']} | {runs[0]['iterations']} "
-            f"| {f'**{text}**' if _mean(runs) >= _mean(top) - (max(values) - min(values)) / 2 else text} | "
-            f"{spread([r['psnr_worst'] for r in runs], 1)} dB "
-            f"| {spread([r['ssim'] for r in runs], 4)} | {f'{first - half[0]:+.2f} dB' if half else ''} | "
-            f"{_sigma(runs)} |"
-        )
-    seeds = sorted({len(runs) for runs in groups.values()})
-    lines.append(
-        f"\nPreset `quick` with all primitives from the start and without a cool-down, "
-        f"{' to '.join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1])))} seed(s), mean ± half the spread; "
-        f"*bytes of* so many of the paper's primitives; steps: as many as fit into "
-        "the seconds of the paper's form, at paces measured in turns over whole runs; *error of σ*: relative L2 "
-        "over the files' voxels, early / middle / late; *last doubling*: what the second half of the budget "
-        "brought, first seed. PSNR is of "
-        f"the whole image (solids, chair at 200×200 on white), inside the mask (fire, smoke_fire), clamped linear "
-        f"(lit_solids). {found['cpu']}, one thread."
+
+    def score(runs: Sequence[Run]) -> str:
+        key, judged = (runs[0]["scene"], runs[0]["size"]), SCENES[runs[0]["scene"]].judged
+        best = max((own for found, own in groups.items() if found[:2] == key), key=mean_score)
+        values = [run[judged] for run in best]
+        text = f"{spread_of(runs, judged)} dB"
+        return f"**{text}**" if mean_score(runs) >= mean_score(best) - (max(values) - min(values)) / 2 else text
+
+    def last_doubling(runs: Sequence[Run]) -> str:
+        half = halved.get((runs[0]["scene"], runs[0]["size"], runs[0]["form"]))
+        judged = SCENES[runs[0]["scene"]].judged
+        first = next(run[judged] for run in runs if run["seed"] == 0)
+        return f"{first - half[judged]:+.2f} dB" if half else ""
+
+    columns = {
+        "scene": lambda runs: runs[0]["scene"],
+        "bytes of": lambda runs: runs[0]["size"],
+        "primitive": lambda runs: Form.named(runs[0]["form"]).label,
+        "primitives": lambda runs: runs[0]["primitives"],
+        "numbers each": lambda runs: runs[0]["parameters_per_primitive"],
+        "steps": lambda runs: runs[0]["iterations"],
+        "PSNR": score,
+        "worst view": lambda runs: f"{spread_of(runs, 'psnr_worst', 1)} dB",
+        "SSIM": lambda runs: spread_of(runs, "ssim", 4),
+        "last doubling": last_doubling,
+        "error of σ": lambda runs: " / ".join(spread_of(runs, key) for key in SIGMA if key in runs[0]),
+    }
+    ordered = sorted(groups.items(), key=lambda item: (order.index(item[0][0]), item[0][1], -mean_score(item[1])))
+    table = make_table(columns, [runs for _, runs in ordered])
+    seeds = format_range(len(runs) for runs in groups.values())
+    return (
+        f"{table}\n\nPreset `quick` with all primitives from the start and without a cool-down, {seeds} seed(s), mean ± "
+        "half the spread; *bytes of* so many of the paper's primitives; steps: as many as fit into the seconds of the "
+        "paper's form, at paces measured in turns over whole runs; *error of σ*: relative L2 over the files' voxels, "
+        "early / middle / late; *last doubling*: what the second half of the budget brought, first seed. PSNR is of "
+        "the whole image (solids, chair at 200×200 on white), inside the mask (fire, smoke_fire), clamped linear "
+        f"(lit_solids). {record['cpu']}, one thread."
     )
-    return "\n".join(lines)
 
 
-def gaussian_table(trials: list[dict[str, Any]]) -> str:
+def gaussian_table(trials: Sequence[Run]) -> str:
     """Equal count and equal bytes in the conditions that a Gaussian can be trained in."""
-    lines = [
-        "| scene | primitive | primitives | parameters | PSNR | worst view | backend |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
-    for run in trials:
-        if run["part"] == "gaussian":
-            groups.setdefault((run["scene"], run["form"], run["primitives"]), []).append(run)
-    size = SMALL["primitives"]
-    for (scene, form, count), runs in sorted(
-        groups.items(), key=lambda g: (g[0][0] != "solids", g[0][0], g[0][2] != size, -_mean(g[1]))
-    ):
-        same = "" if count == size and form != str(PAPER) else " (equal bytes)" if count != size else " (both)"
-        lines.append(
-            f"| {scene} | {Form.named(form).label} | {count}{same} | {runs[0]['parameters']} | "
-            f"{spread([r['psnr'] for r in runs], 2)} dB "
-            f"| {spread([r['psnr_worst'] for r in runs], 1)} dB | {runs[0]['backend']} |"
-        )
-    lines.append(
-        f"\nReduced: solids at {SMALL['size']}×{SMALL['size']}, the folder's images averaged down "
-        f"{SMALL['downsample']} times, {SMALL['iterations']} steps of every form "
-        "(not equal seconds: the backends differ)."
+    groups = group_runs([run for run in trials if run["part"] == "gaussian"], "scene", "form", "primitives")
+
+    def count(runs: Sequence[Run]) -> str:
+        own, paper = runs[0]["primitives"], runs[0]["form"] == str(PAPER)
+        return f"{own}{' (equal bytes)' if own != SMALL else ' (both)' if paper else ''}"
+
+    columns = {
+        "scene": lambda runs: runs[0]["scene"],
+        "primitive": lambda runs: Form.named(runs[0]["form"]).label,
+        "primitives": count,
+        "parameters": lambda runs: runs[0]["parameters"],
+        "PSNR": lambda runs: f"{spread_of(runs, 'psnr')} dB",
+        "worst view": lambda runs: f"{spread_of(runs, 'psnr_worst', 1)} dB",
+        "backend": lambda runs: runs[0]["backend"],
+    }
+    ordered = sorted(
+        groups.items(), key=lambda item: (item[0][0] != "solids", item[0][0], item[0][2] != SMALL, -mean_score(item[1]))
     )
-    return "\n".join(lines)
-
-
-def _mean(runs: list[dict[str, Any]]) -> float:
-    return sum(float(r[SCENES[r["scene"]].judged]) for r in runs) / len(runs)
-
-
-def _sigma(runs: list[dict[str, Any]]) -> str:
-    keys = [f"sigma_relative_l2_{third}" for third in ("early", "middle", "late")]
-    return " / ".join(spread([r[k] for r in runs], 2) for k in keys) if all(k in runs[0] for k in keys) else ""
+    table = make_table(columns, [runs for _, runs in ordered])
+    return (
+        f"{table}\n\nReduced: solids at 64×64, the folder's images averaged down 4 times, {SMALL_STEPS} steps of every "
+        "form (not equal seconds: the backends differ)."
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
-    parser.add_argument("--chair", type=Path, help="a NeRF-synthetic folder")
-    parser.add_argument("--fire", type=Path, help="a folder of EmberGen's .vdb files")
-    parser.add_argument(
-        "--parts", nargs="*", default=["forms", "slope", "gaussian"], choices=("forms", "slope", "gaussian")
-    )
+    parser = make_parser(__doc__, "--chair", "--fire", "--seeds", "--jobs", "--docs", "--print", scenes=STEPS)
+    parts = ["forms", "slope", "gaussian"]
+    parser.add_argument("--parts", nargs="*", default=parts, choices=parts)
     parser.add_argument("--forms", nargs="*", default=[], metavar="K:EDGE", help="instead of the task's")
     parser.add_argument("--sizes", nargs="*", type=int, default=[], help="some of the scenes' sizes")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
-    parser.add_argument("--print", action="store_true", help="train nothing")
-    parser.add_argument("--docs", action="store_true", help="write the tables into docs")
     args = parser.parse_args()
-    if not args.print:
-        paces = measured_paces(args) if {"forms", "slope"} & set(args.parts) else {}
-        run_all(
-            plan(args, paces),
-            RESULTS,
-            KEYS,
-            args.jobs,
-            lambda row: f"{row[SCENES[row['scene']].judged]:.2f} dB",
-            {"cpu": cpu_name(), **({"paces": paces} if paces else {})},
-        )
-    found = json.loads(RESULTS.read_text())
-    trials = found["trials"]
-    tables = {"expressivity": forms_table(found), "expressivity-gaussian": gaussian_table(trials)}
-    for name, text in tables.items():
-        print(f"\n{text}")
+    if not args.only_print:
+        require_folders(parser, args, args.scenes)
+        run_all(list(plan(args)), RECORD, KEYS, args.jobs)
+    record = read_record(RECORD)
+    for name, make in (("expressivity", forms_table), ("expressivity-gaussian", lambda r: gaussian_table(r["trials"]))):
+        text = make(record)
+        print()
         if args.docs:
-            between_markers(DOCS, name, text)
+            between_markers(DOCS / "expressivity.md", name, text)
 
 
 if __name__ == "__main__":

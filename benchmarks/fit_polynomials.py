@@ -79,21 +79,20 @@ def fit(function, degree: int, reach: float, centred: bool) -> tuple[F64, float]
 
 
 def main() -> None:
-    for name, function, degree, reach, centred in (
-        ("cos", cos_turns, 6, 0.5, False),
-        ("sinc", sinc_turns, 5, 0.5, False),
-        ("dsinc", dsinc_turns, 5, 0.5, False),
-        ("sinc medium", sinc_turns, 10, 1.5, True),
-        ("dsinc medium", dsinc_turns, 9, 1.5, True),
-        ("B1", profile_turns(1), 5, 0.5, False),
-        ("dB1", dprofile_turns(1), 5, 0.5, False),
-        ("B1 medium", profile_turns(1), 9, 1.5, True),
-        ("dB1 medium", dprofile_turns(1), 9, 1.5, True),
-        ("B2", profile_turns(2), 5, 0.5, False),
-        ("dB2", dprofile_turns(2), 5, 0.5, False),
-        ("B2 medium", profile_turns(2), 9, 1.5, True),
-        ("dB2 medium", dprofile_turns(2), 9, 1.5, True),
+    for name, function, degree, centred in (
+        ("cos", cos_turns, 6, False),
+        ("sinc", sinc_turns, 5, False),
+        ("dsinc", dsinc_turns, 5, False),
+        ("sinc medium", sinc_turns, 10, True),
+        ("dsinc medium", dsinc_turns, 9, True),
+        *(
+            (f"{mark}B{p}{size}", make(p), degree, centred)
+            for p in (1, 2)
+            for size, degree, centred in (("", 5, False), (" medium", 9, True))
+            for mark, make in (("", profile_turns), ("d", dprofile_turns))
+        ),
     ):
+        reach = 1.5 if centred else 0.5
         c, error = fit(function, degree, reach, centred)
         r = np.linspace(0, reach, 200_001).astype(np.float32)
         z = r * r

@@ -12,17 +12,17 @@ draws docs/pictures/fronts.png; --print runs nothing.
 
 from __future__ import annotations
 
-import argparse
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shared.tables import ROOT, Table, between_markers
+from shared.arguments import make_parser, require_folders
+from shared.records import RESULTS, read_record, update_record
+from shared.tables import DOCS, ROOT, between_markers, make_table
 
 from neuprim.core.compute.threads import cpu_name
-from neuprim.core.io.files import write_json
+from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
 from neuprim.search.ablation import run_ablation
 from neuprim.search.ablation_folder import AblationRequest
 from neuprim.search.render_tradeoff import parse_budget
@@ -30,8 +30,8 @@ from neuprim.search.render_tradeoff import parse_budget
 VIEWS = 25
 """Held-out views, evenly spread: as many as the chair has."""
 
-RESULTS = Path(__file__).parent / "results" / "fronts.json"
-PICTURE = ROOT / "docs" / "pictures" / "fronts.png"
+RECORD = RESULTS / "fronts.json"
+PICTURE = DOCS / "pictures" / "fronts.png"
 
 
 @dataclass(frozen=True)
@@ -70,28 +70,7 @@ SCENES = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
-    parser.add_argument("--chair", type=Path, help="a NeRF-synthetic folder")
-    parser.add_argument("--fire", type=Path, help="a folder of OpenVDB files")
-    parser.add_argument("--out", type=Path, default=ROOT / "outputs" / "fronts")
-    parser.add_argument("--docs", action="store_true")
-    parser.add_argument("--print", action="store_true", dest="only_print")
-    args = parser.parse_args()
-    if not args.only_print:
-        for name in args.scenes:
-            data = getattr(args, name, None)
-            if SCENES[name].data and data is None:
-                parser.error(f"--{name}: wants the folder of its data; or leave it out of --scenes")
-            measured = measure(name, data, args.out)
-            found = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
-            write_json(RESULTS, {**found, name: measured})
-    found = json.loads(RESULTS.read_text(encoding="utf-8"))
-    texts = [report(name, found[name]) for name in SCENES if name in found]
-    if args.docs:
-        between_markers(ROOT / "docs" / "tradeoffs.md", "fronts", "\n\n".join(texts))
-        draw(found)
+KEYS = ("name", "primitives", "steps", "bytes", "time_ratio", "time_ratio_spread", "ms_per_frame", "ms_per_step")
 
 
 def measure(name: str, data: Path | None, out: Path) -> dict[str, Any]:
@@ -100,23 +79,19 @@ def measure(name: str, data: Path | None, out: Path) -> dict[str, Any]:
     words = [*scene.words, *where, "renderer.threads=1", f"output_dir={(out / name).resolve()}"]
     _, record = run_ablation(AblationRequest(words, parse_budget(scene.budget), VIEWS, knobs=scene.knobs), print)
     whole = record.to_dict()
-    shown = [
-        {key: point[key] for key in KEYS} | {"psnr": point["quality"]["psnr"], "ssim": point["quality"]["ssim"]}
+    models = [
+        {key: point[key] for key in KEYS} | {key: point["quality"][key] for key in ("psnr", "ssim")}
         for point in whole["points"]
     ]
     return {
         "words": scene.words,
         "length": whole["length"],
-        "models": shown,
-        "speed": whole["front"]["speed"],
-        "size": whole["front"]["size"],
+        "models": models,
+        **{front: whole["front"][front] for front in ("speed", "size")},
         "left_out": [one["knob"] + " " + " ".join(one["words"]) for one in whole["left_out"]],
         "views": VIEWS,
         "cpu": cpu_name(),
     }
-
-
-KEYS = ("name", "primitives", "steps", "bytes", "time_ratio", "time_ratio_spread", "ms_per_frame", "ms_per_step")
 
 
 def reach(result: Mapping[str, Any], front: str, cost: str) -> float:
@@ -127,85 +102,58 @@ def reach(result: Mapping[str, Any], front: str, cost: str) -> float:
 
 def report(name: str, result: Mapping[str, Any]) -> str:
     """Prints the table of a scene; returns it with what is said about it."""
-    speed, size = reach(result, "speed", "time_ratio"), reach(result, "size", "bytes")
     title = (
-        f"**{SCENES[name].title}** (`{' '.join(result['words'])}`): {speed:.1f} times in the time of a frame, "
-        f"{size:.0f} times in bytes. {result['length']}"
+        f"**{SCENES[name].title}** (`{' '.join(result['words'])}`): {reach(result, 'speed', 'time_ratio'):.1f} times in "
+        f"the time of a frame, {reach(result, 'size', 'bytes'):.0f} times in bytes. {result['length']}"
     )
     print(f"\n{title}\n")
-    table = Table("model", "front of", "PSNR, dB", "SSIM", "time", "ms", "bytes", "steps", "ms/step")
-    models: Sequence[Mapping[str, Any]] = result["models"]
-    for i in sorted(range(len(models)), key=lambda i: -float(models[i]["psnr"])):
-        model = models[i]
-        fronts = [text for front, text in (("speed", "time"), ("size", "bytes")) if i in result[front]]
-        table.row(
-            model["name"] + ("" if model["name"] != "centre" else f", {model['primitives']:,} primitives"),
-            ", ".join(fronts),
-            f"{model['psnr']:.2f}",
-            f"{model['ssim']:.4f}",
-            f"{model['time_ratio']:.3f} ± {model['time_ratio_spread']:.3f}",
-            f"{model['ms_per_frame']:.2f}",
-            f"{model['bytes']:,}",
-            f"{model['steps']:,}",
-            f"{model['ms_per_step']:.1f}",
-        )
+    models = result["models"]
+    fronts = {"speed": "time", "size": "bytes"}
+    columns = {
+        "model": lambda i: (
+            models[i]["name"] + (f", {models[i]['primitives']:,} primitives" if models[i]["name"] == "centre" else "")
+        ),
+        "front of": lambda i: ", ".join(text for front, text in fronts.items() if i in result[front]),
+        "PSNR, dB": lambda i: f"{models[i]['psnr']:.2f}",
+        "SSIM": lambda i: f"{models[i]['ssim']:.4f}",
+        "time": lambda i: f"{models[i]['time_ratio']:.3f} ± {models[i]['time_ratio_spread']:.3f}",
+        "ms": lambda i: f"{models[i]['ms_per_frame']:.2f}",
+        "bytes": lambda i: f"{models[i]['bytes']:,}",
+        "steps": lambda i: f"{models[i]['steps']:,}",
+        "ms/step": lambda i: f"{models[i]['ms_per_step']:.1f}",
+    }
+    table = make_table(columns, sorted(range(len(models)), key=lambda i: -float(models[i]["psnr"])))
     return f"{title}\n\n{table}\n\n{result['cpu']}, one thread, one training each, {result['views']} held-out views."
 
 
-def draw(found: Mapping[str, Any]) -> None:
-    """The fronts of each task: time above, bytes below."""
-    import matplotlib
+def make_chart(name: str, result: Mapping[str, Any], front: str) -> Chart:
+    """The front of a scene; its points are marked with their primitives."""
+    cost, unit, label = {
+        "speed": ("ms_per_frame", 1.0, "ms a frame, one thread"),
+        "size": ("bytes", 1e-6, "MB"),
+    }[front]
+    dots = []
+    for i, model in enumerate(result["models"]):
+        mark = f"{model['primitives']:,}" + (", no shadows" if "visibility=none" in model["name"] else "")
+        dots.append(Dot(unit * model[cost], model["psnr"], mark=mark if i in result[front] else None))
+    return front_chart(SCENES[name].title, label, "PSNR, dB", dots)
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+def main() -> None:
+    parser = make_parser(__doc__, "--chair", "--fire", "--docs", "--print", scenes=SCENES)
+    parser.add_argument("--out", type=Path, default=ROOT / "outputs" / "fronts")
+    args = parser.parse_args()
+    if not args.only_print:
+        require_folders(parser, args, args.scenes)
+        for name in args.scenes:
+            update_record(RECORD, **{name: measure(name, getattr(args, name, None), args.out)})
+    found = read_record(RECORD)
     names = [name for name in SCENES if name in found]
-    figure, axes = pyplot.subplots(
-        2, len(names), figsize=(4.2 * len(names), 5.6), constrained_layout=True, squeeze=False
-    )
-    for column, name in enumerate(names):
-        models = found[name]["models"]
-        kinds = (("speed", "ms_per_frame", 1.0, "ms a frame, one thread"), ("size", "bytes", 1e-6, "MB"))
-        for axis, (front, cost, unit, label) in zip(axes[:, column], kinds, strict=True):
-            line = sorted(found[name][front], key=lambda i: models[i][cost])
-            others = [i for i in range(len(models)) if i not in line]
-            axis.plot(
-                [unit * models[i][cost] for i in line],
-                [models[i]["psnr"] for i in line],
-                marker="o",
-                markersize=4.5,
-                label="front",
-            )
-            axis.plot(
-                [unit * models[i][cost] for i in others],
-                [models[i]["psnr"] for i in others],
-                ".",
-                color="0.65",
-                label="behind it",
-            )
-            for i in line:
-                axis.annotate(
-                    f"{models[i]['primitives']:,}" + (", no shadows" if "visibility=none" in models[i]["name"] else ""),
-                    (unit * models[i][cost], models[i]["psnr"]),
-                    textcoords="offset points",
-                    xytext=(4, -9),
-                    fontsize=7,
-                )
-            axis.set_xscale("log")
-            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            axis.xaxis.set_minor_formatter(NullFormatter())
-            axis.set_xlabel(label)
-            axis.grid(alpha=0.25)
-            axis.margins(x=0.13, y=0.1)  # room for the labels
-            if others:
-                axis.legend(fontsize=7, loc="lower right")
-        axes[0, column].set_title(SCENES[name].title, fontsize=9)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("PSNR, dB")
-    figure.savefig(PICTURE, dpi=110)
-    pyplot.close(figure)
+    text = "\n\n".join(report(name, found[name]) for name in names)
+    if args.docs:
+        between_markers(DOCS / "tradeoffs.md", "fronts", text)
+        charts = [make_chart(name, found[name], front) for front in ("speed", "size") for name in names]
+        write_png_charts(PICTURE, charts, rows=2)
 
 
 if __name__ == "__main__":

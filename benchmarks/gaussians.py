@@ -8,13 +8,13 @@ scene's background. --docs puts the table between the markers of docs/export.md.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from shared.tables import ROOT, Table, between_markers
+from shared.arguments import make_parser
+from shared.tables import DOCS, Table, between_markers
 
 from neuprim.config import compose
 from neuprim.core.model.edge import EDGES
@@ -22,60 +22,44 @@ from neuprim.export.gaussian_ply import SIZES
 from neuprim.runs.export import export_run
 from neuprim.runs.run import run
 
-PAGE = ROOT / "docs" / "export.md"
 
-
-def trained(folder: Path, neurons: int, edge: int, iterations: int) -> Path:
-    words = [
-        "task=static",
-        "scene=solids",
-        "scene.size=128",
-        "model.primitives=500",
-        f"model.neurons={neurons}",
-        f"model.density.edge={edge}",
-        f"model.density.gain={'true' if edge else 'false'}",
-        f"train.iterations={iterations}",
-        "train.max_seconds=null",
-        "train.eval_every=0",
-        f"train.population.every={max(iterations // 15, 1)}",
-        "train.rates.b2=0.03",
-        "train.rates.w2=0.03",
-        "train.rates.log_scales=0.04",
-        f"output_dir='{folder}'",
-    ]
+def train(folder: Path, neurons: int, edge: int, iterations: int) -> Path:
+    words = ["task=static", "scene=solids", "scene.size=128", "model.primitives=500", f"model.neurons={neurons}"]
+    words += [f"model.density.edge={edge}", f"model.density.gain={'true' if edge else 'false'}"]
+    words += [f"train.iterations={iterations}", "train.max_seconds=null", "train.eval_every=0"]
+    words += [f"train.population.every={max(iterations // 15, 1)}", f"output_dir='{folder}'"]
+    words += ["train.rates.b2=0.03", "train.rates.w2=0.03", "train.rates.log_scales=0.04"]
     return run(compose(words))
 
 
-def export_table(runs: Sequence[tuple[str, Path]]) -> str:
+def export_table(runs: Sequence[tuple[str, Path]]) -> Table:
     table = Table("model", *(f"size={size}" for size in SIZES))
     for name, folder in runs:
-        scores = []
         with tempfile.TemporaryDirectory() as target:
-            for size in SIZES:
-                report = export_run(folder, "gaussian-ply", Path(target) / f"{size}.ply", [f"size={size}"])
-                scores.append(report.errors["psnr"])
-        table.row(name, *(f"{score:.1f} dB" for score in scores))
-    return str(table)
+            reports = [
+                export_run(folder, "gaussian-ply", Path(target) / f"{size}.ply", [f"size={size}"]) for size in SIZES
+            ]
+        table.row(name, *(f"{report.errors['psnr']:.1f} dB" for report in reports))
+    return table
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, "--docs")
     parser.add_argument("runs", type=Path, nargs="*")
     parser.add_argument("--edges", nargs="*", type=int, choices=EDGES, default=EDGES)
     parser.add_argument("--neurons", nargs="*", type=int, default=[8, 0])
     parser.add_argument("--iterations", type=int, default=600)
-    parser.add_argument("--docs", action="store_true")
     args = parser.parse_args()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         runs = [(str(path), path) for path in args.runs] or [
-            (f"`solids`, K = {K}, edge {edge}", trained(Path(folder) / f"{K}_{edge}", K, edge, args.iterations))
+            (f"`solids`, K = {K}, edge {edge}", train(Path(folder) / f"{K}_{edge}", K, edge, args.iterations))
             for K in args.neurons
             for edge in args.edges
         ]
         table = export_table(runs)
     if args.docs:
-        between_markers(PAGE, "gaussians-export", table)
+        between_markers(DOCS / "export.md", "gaussians-export", str(table))
 
 
 if __name__ == "__main__":

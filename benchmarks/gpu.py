@@ -1,46 +1,54 @@
-"""The CUDA backend on a card: parity with the float64 reference, times, frames per second, peak memory.
+"""The CUDA backend on a GPU: parity with the float64 reference, times, frames per second, peak memory.
 
     python benchmarks/gpu.py [--parts parity times kernels train] [--scenes 5000 20000 100000 300000 1000000]
-    [--sizes 800x800 1920x1080]
-        [--chair DIR] [--fire DIR] [--trained chair fire lit_solids] [--record]
+        [--sizes 800x800 1920x1080] [--chair DIR] [--fire DIR] [--trained chair fire lit_solids] [--record]
+    python benchmarks/gpu.py --print [--docs]
 
     parity    images and all gradients of small scenes (thin, deep, around the camera) for several forms against the
-    reference, and reruns bit
-              for bit; needs no card with --device cpu, on Warp's CPU blocks
+              reference, and reruns bit for bit; needs no GPU with --device cpu, on Warp's CPU blocks
     times     random scenes whose primitives shrink as they multiply, 8 neurons and the default form: ms for a forward
-    pass without gradients, a
-              forward and backward pass, and a whole training step (L1 loss, Adam on every parameter), medians by CUDA
-              events; frames per second, peak memory, primitive-pixel hits
+              pass without gradients, a forward and backward pass, and a whole training step (L1 loss, Adam on every
+              parameter), medians by CUDA events; frames per second, peak memory, primitive-pixel hits
     kernels   where a training step's time goes, kernel by kernel, of the scene with the most primitives up to 100,000
-    train     preset quick of each task with its usual steps on the card: ms a step of the second half, PSNR on the test
-    views
+    train     preset quick of each task with its usual steps on the GPU: ms a step of the second half, PSNR on the test
+              views
 
---record writes benchmarks/results/gpu/DEVICE.json. Times are absolute, of the device named there.
+--record writes benchmarks/results/gpu/DEVICE.json and the tables of docs/gpu.md, in which every recorded device has its
+own; --print makes them from what is recorded. Times are absolute, of the device named there.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import re
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from shared.parity import parity
+from shared.arguments import make_parser, require_folders
+from shared.forms import SCENES
+from shared.parity import NAMES, measure_parity
+from shared.records import RESULTS, Record, read_record, update_record
 from shared.scenes import lower, random_scene, view
-from shared.tables import Table
+from shared.tables import DOCS, Columns, Run, between_markers, make_table
+from shared.trials import Trial, begin
 
 from neuprim.core.cameras import Camera
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.runs.fit import train_to_end
 
-RESULTS = Path(__file__).parent / "results" / "gpu"
+FOLDER, PAGE = RESULTS / "gpu", DOCS / "gpu.md"
 FORMS = {"K=8 p=0": (8, 0), "K=2 p=2": (2, 2), "K=0 p=2": (0, 2)}
+PARTS = ("parity", "times", "kernels", "train")
+STEPS = {"chair": 2500, "fire": 4000, "smoke_fire": 4000, "lit_solids": 2600}
+"""Those of the recorded rows of the other benchmarks."""
+
+
+# ---------------------------------------------------------------- times
 
 
 def median_ms(run: Callable[[], Any], repeats: int = 20, warm: int = 3) -> float:
@@ -58,76 +66,55 @@ def median_ms(run: Callable[[], Any], repeats: int = 20, warm: int = 3) -> float
     return statistics.median(times)
 
 
-def scene_on(count: int, neurons: int, edge: int) -> tuple[Lowered, list[torch.Tensor]]:
-    """The random scene of the other benchmarks, its first neurons, on the card."""
+def scene_on_gpu(count: int, neurons: int, edge: int) -> tuple[Lowered, list[torch.Tensor]]:
+    """The random scene of the other benchmarks, its first neurons, and the tensors that it is made of."""
     low = lower(random_scene(count))
     g, d, c = low.geometry, low.density, low.colour
     assert isinstance(d, Cosine) and isinstance(c, Constant)
     tensors = [g.means, g.log_scales, g.quats, d.W1[:, :neurons], d.b1[:, :neurons], d.w2[:, :neurons], d.b2, c.rgb]
-    means, log_scales, quats, W1, b1, w2, b2, rgb = leaves = [
-        t.detach().cuda().contiguous().requires_grad_() for t in tensors
-    ]
+    leaves = [tensor.detach().cuda().contiguous().requires_grad_() for tensor in tensors]
+    means, log_scales, quats, W1, b1, w2, b2, rgb = leaves
     return Lowered(Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, 1.0, edge), Constant(rgb)), leaves
 
 
-def camera(width: int, height: int) -> Camera:
+def make_camera(width: int, height: int) -> Camera:
     square = view(height)
     return Camera(square.viewmat, square.fx, square.fy, width / 2, height / 2, width, height)
 
 
-def step_of(
-    lowered: Lowered, leaves: list[torch.Tensor], cam: Camera, settings: RenderSettings
-) -> tuple[Callable[[], Any], Callable[[], Any], Callable[[], Any]]:
+def make_passes(lowered: Lowered, leaves: list[torch.Tensor], camera: Camera) -> dict[str, Callable[[], None]]:
     """A forward pass, a forward and backward pass, and a training step."""
-    background = torch.zeros(3, device="cuda")
-    target = torch.rand(cam.height, cam.width, 3, device="cuda")
-    adam = torch.optim.Adam([x for x in leaves if x.numel()], lr=0.0, fused=True)
+    settings, background = RenderSettings(backend="cuda"), torch.zeros(3, device="cuda")
+    target = torch.rand(camera.height, camera.width, 3, device="cuda")
+    used = [leaf for leaf in leaves if leaf.numel()]
+    adam = torch.optim.Adam(used, lr=0.0, fused=True)
 
     def forward() -> None:
         with torch.no_grad():
-            render_lowered(lowered, cam, settings, background)
+            render_lowered(lowered, camera, settings, background)
 
     def both() -> None:
-        out = render_lowered(lowered, cam, settings, background).rgb
-        torch.autograd.grad(out, [x for x in leaves if x.numel()], target)
+        torch.autograd.grad(render_lowered(lowered, camera, settings, background).rgb, used, target)
 
     def step() -> None:
         adam.zero_grad(set_to_none=True)
-        loss = (render_lowered(lowered, cam, settings, background).rgb - target).abs().mean()
+        loss = (render_lowered(lowered, camera, settings, background).rgb - target).abs().mean()
         loss.backward()
         adam.step()
 
-    return forward, both, step
+    return {"forward_ms": forward, "both_ms": both, "step_ms": step}
 
 
-def times(counts: list[int], sizes: list[tuple[int, int]]) -> list[dict[str, Any]]:
-    table, rows = (
-        Table(
-            "form",
-            "primitives",
-            "size",
-            "pairs",
-            "hits",
-            "forward ms",
-            "forward + backward",
-            "step",
-            "frames/s",
-            "peak MB",
-        ),
-        [],
-    )
-    settings = RenderSettings(backend="cuda")
-    for name, (K, p) in FORMS.items():
+def measure_times(counts: Sequence[int], sizes: Sequence[tuple[int, int]]) -> Iterator[Record]:
+    for name, form in FORMS.items():
         for count in counts:
-            lowered, leaves = scene_on(count, K, p)
+            lowered, leaves = scene_on_gpu(count, *form)
             for width, height in sizes:
-                cam = camera(width, height)
+                camera = make_camera(width, height)
                 torch.cuda.reset_peak_memory_stats()
-                runs = step_of(lowered, leaves, cam, settings)
-                stats = render_lowered(lowered, cam, settings).stats
-                ms = [median_ms(run) for run in runs]
-                peak = torch.cuda.max_memory_allocated() / 1e6
-                row = {
+                passes = make_passes(lowered, leaves, camera)
+                stats = render_lowered(lowered, camera, RenderSettings(backend="cuda")).stats
+                yield {
                     "form": name,
                     "primitives": count,
                     "width": width,
@@ -135,43 +122,26 @@ def times(counts: list[int], sizes: list[tuple[int, int]]) -> list[dict[str, Any
                     "pairs": stats.pairs,
                     "slots": stats.extra["hits"],
                     "delicate": stats.extra["float64"],
-                    "forward_ms": ms[0],
-                    "both_ms": ms[1],
-                    "step_ms": ms[2],
-                    "peak_mb": peak,
+                    **{key: median_ms(run) for key, run in passes.items()},
+                    "peak_mb": torch.cuda.max_memory_allocated() / 1e6,
                 }
-                rows.append(row)
-                shown = [f"{x:.2f}" for x in ms]
-                table.row(
-                    name,
-                    count,
-                    f"{width}x{height}",
-                    stats.pairs,
-                    stats.extra["hits"],
-                    *shown,
-                    f"{1000 / ms[0]:.0f}",
-                    f"{peak:.0f}",
-                )
             del lowered, leaves
-    return rows
 
 
-def kernels(count: int, width: int, height: int) -> dict[str, dict[str, float]]:
+def measure_kernels(count: int, width: int, height: int) -> dict[str, dict[str, float]]:
     """Milliseconds of each kernel in a training step, by form."""
     found = {}
-    for name, (K, p) in FORMS.items():
-        lowered, leaves = scene_on(count, K, p)
-        _, _, step = step_of(lowered, leaves, camera(width, height), RenderSettings(backend="cuda"))
+    activities = [torch.profiler.ProfilerActivity.CUDA, torch.profiler.ProfilerActivity.CPU]
+    for name, form in FORMS.items():
+        step = make_passes(*scene_on_gpu(count, *form), make_camera(width, height))["step_ms"]
         for _ in range(3):
             step()
-        with torch.profiler.profile(
-            activities=[torch.profiler.ProfilerActivity.CUDA, torch.profiler.ProfilerActivity.CPU]
-        ) as seen:
+        with torch.profiler.profile(activities=activities) as profile:
             for _ in range(5):
                 step()
             torch.cuda.synchronize()
         spent: dict[str, float] = {}
-        for event in seen.events():
+        for event in profile.events():
             if event.device_type == torch.autograd.DeviceType.CUDA:
                 label = re.sub(r"_[0-9a-f]{6,}.*", "", event.name)[:60]
                 spent[label] = spent.get(label, 0.0) + event.device_time / 5e3
@@ -182,75 +152,117 @@ def kernels(count: int, width: int, height: int) -> dict[str, dict[str, float]]:
     return found
 
 
-STEPS = {"chair": 2500, "fire": 4000, "smoke_fire": 4000, "lit_solids": 2600}
-"""Those of the recorded rows of the other benchmarks."""
-
-
-def train(names: list[str], folders: dict[str, Any]) -> list[dict[str, Any]]:
-    from shared.forms import SCENES
-    from shared.trials import Trial, begin
-
-    from neuprim.runs.fit import train_to_end
-
-    table, rows = Table("scene", "primitives", "steps", "ms a step", "PSNR", "of it"), []
+def measure_training(names: Sequence[str], folders: Mapping[str, Any]) -> Iterator[Record]:
     for name in names:
-        scene = SCENES[name]
-        words = (*scene.all_words(folders, name), "renderer.device=cuda")
-        fitted = begin(Trial(name, words, STEPS[name]))
-        while fitted.trainer.step < STEPS[name] // 2:  # kernels are compiled and views read in this half
+        scene, steps = SCENES[name], STEPS[name]
+        fitted = begin(Trial(name, (*scene.all_words(folders, name), "renderer.device=cuda"), steps))
+        while fitted.trainer.step < steps // 2:  # kernels are compiled and views read in this half
             fitted.trainer.train_step()
         before = fitted.trainer.elapsed
         fitted = train_to_end(fitted)
-        ms = 1e3 * (fitted.trainer.elapsed - before) / (STEPS[name] - STEPS[name] // 2)
-        metrics = fitted.metrics()
-        rows.append(
-            {
-                "scene": name,
-                "primitives": fitted.model.count,
-                "steps": STEPS[name],
-                "step_ms": ms,
-                "psnr": metrics[scene.judged],
-                "of": scene.judged,
-            }
+        ms = 1e3 * (fitted.trainer.elapsed - before) / (steps - steps // 2)
+        yield {
+            "scene": name,
+            "primitives": fitted.model.count,
+            "steps": steps,
+            "step_ms": ms,
+            "psnr": fitted.metrics()[scene.judged],
+            "of": scene.judged,
+        }
+
+
+# ---------------------------------------------------------------- tables
+
+
+def gradient_cell(name: str) -> Callable[[Run], str]:
+    """Of no neurons there is no gradient."""
+    return lambda row: f"{row['gradients'][name]:.0e}" if row["neurons"] or name not in ("W1", "b1", "w2") else "–"
+
+
+COLUMNS: dict[str, Columns] = {
+    "parity": {
+        "K, p": lambda row: f"{row['neurons']}, {row['edge']}",
+        "scene": lambda row: row["scene"],
+        "image": lambda row: f"{row['image']:.0e}",
+        **{name: gradient_cell(name) for name in NAMES},
+        "same bits again": lambda row: "yes" if row["same"] else "**no**",
+    },
+    "times": {
+        "form": lambda row: row["form"],
+        "primitives": lambda row: f"{row['primitives']:,}",
+        "size": lambda row: f"{row['width']}×{row['height']}",
+        "pairs": lambda row: f"{row['pairs']:,}",
+        "slots": lambda row: f"{row['slots']:,}",
+        "forward, ms": lambda row: f"{row['forward_ms']:.2f}",
+        "and backward": lambda row: f"{row['both_ms']:.2f}",
+        "training step": lambda row: f"{row['step_ms']:.2f}",
+        "frames/s": lambda row: f"{1000 / row['forward_ms']:.0f}",
+        "peak MB": lambda row: f"{row['peak_mb']:,.0f}",
+    },
+    "train": {
+        "scene": lambda row: row["scene"].replace("_", " "),
+        "primitives": lambda row: f"{row['primitives']:,}",
+        "steps": lambda row: f"{row['steps']:,}",
+        "ms a step": lambda row: f"{row['step_ms']:.2f}",
+        "PSNR, dB": lambda row: f"{row['psnr']:.2f} ({row['of']})",
+    },
+}
+
+
+def read_records() -> list[Record]:
+    """A record per device, GPUs first."""
+    found = [read_record(path) for path in sorted(FOLDER.glob("*.json"))]
+    return sorted(found, key=lambda record: "times" not in record)
+
+
+def make_tables(records: Sequence[Record]) -> dict[str, str]:
+    """The text of each pair of markers: a table per device that has the part, under its name."""
+
+    def tables(part: str, columns: Columns) -> str:
+        return "\n\n".join(
+            f"{record['device']}, torch {record['torch']}:\n\n{make_table(columns, record[part])}"
+            for record in records
+            if part in record
         )
-        table.row(name, fitted.model.count, STEPS[name], f"{ms:.2f}", f"{metrics[scene.judged]:.2f}", scene.judged)
-    return rows
+
+    texts = {part: tables(part, columns) for part, columns in COLUMNS.items()}
+    if first := tables("times_before", COLUMNS["times"]):
+        texts["times"] += f"\n\nThe first version that ran there, up to a million primitives:\n\n{first}"
+    markers = {"gpu-parity": "parity", "gpu-times": "times", "gpu-training": "train"}
+    return {marker: texts[part] for marker, part in markers.items() if texts[part]}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument(
-        "--parts",
-        nargs="*",
-        default=["parity", "times", "kernels", "train"],
-        choices=("parity", "times", "kernels", "train"),
-    )
+    parser = make_parser(__doc__, "--chair", "--fire", "--record", "--docs", "--print")
+    parser.add_argument("--parts", nargs="*", default=PARTS, choices=PARTS)
     parser.add_argument("--scenes", nargs="*", type=int, default=[5_000, 20_000, 100_000, 300_000, 1_000_000])
     parser.add_argument("--sizes", nargs="*", default=["800x800", "1920x1080"])
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"), help="of the part parity")
-    parser.add_argument("--chair", type=Path, help="a NeRF-synthetic folder")
-    parser.add_argument("--fire", type=Path, help="a folder of EmberGen's .vdb files")
     parser.add_argument("--trained", nargs="*", default=["chair", "fire", "lit_solids"], choices=list(STEPS))
-    parser.add_argument("--record", action="store_true")
     args = parser.parse_args()
-    sizes = [tuple(int(x) for x in size.split("x")) for size in args.sizes]
-    result: dict[str, Any] = {
-        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "Warp's CPU blocks",
-        "torch": torch.__version__,
-    }
-    if "parity" in args.parts:
-        result["parity"] = parity(args.device)
-    if "times" in args.parts:
-        result["times"] = times(args.scenes, sizes)
-    if "kernels" in args.parts:
-        result["kernels"] = kernels(max((c for c in args.scenes if c <= 100_000), default=args.scenes[0]), *sizes[0])
-    if "train" in args.parts:
-        result["train"] = train(args.trained, vars(args))
-    path = RESULTS / (re.sub(r"[^a-z0-9]+", "_", result["device"].lower()).strip("_") + ".json")
-    kept = json.loads(path.read_text()) if path.exists() else {}
-    if args.record:
-        RESULTS.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(kept | result, indent=1) + "\n")
+    if not args.only_print:
+        sizes = [(int(width), int(height)) for width, height in (size.split("x") for size in args.sizes)]
+        device = torch.cuda.get_device_name() if torch.cuda.is_available() else "Warp's CPU blocks"
+        result: Record = {"device": device, "torch": torch.__version__}
+        measures: dict[str, Callable[[], Any]] = {
+            "parity": lambda: list(measure_parity(args.device)),
+            "times": lambda: list(measure_times(args.scenes, sizes)),
+            "kernels": lambda: measure_kernels(max((c for c in args.scenes if c <= 100_000), default=5000), *sizes[0]),
+            "train": lambda: list(measure_training(args.trained, vars(args))),
+        }
+        if "train" in args.parts:
+            require_folders(parser, args, args.trained)
+        for part in args.parts:
+            result[part] = measures[part]()
+            if part in COLUMNS:
+                make_table(COLUMNS[part], result[part])
+        if args.record:
+            name = re.sub(r"[^a-z0-9]+", "_", device.lower()).strip("_")
+            update_record(Path(FOLDER / f"{name}.json"), **result)
+    if args.only_print or args.record:
+        for marker, text in make_tables(read_records()).items():
+            if args.docs or args.record:
+                between_markers(PAGE, marker, text)
 
 
 if __name__ == "__main__":

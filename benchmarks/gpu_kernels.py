@@ -17,19 +17,21 @@ grown --from-record   writes the table from the file and compiles nothing
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict
 from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import warp
-from shared.cubins import compiled, resources
-from shared.tables import ROOT, Table, between_markers
+from shared.arguments import make_parser
+from shared.cubins import compile_kernel, read_resources
+from shared.records import RESULTS, read_record
+from shared.tables import DOCS, Table, between_markers, make_table
 
 from neuprim.core.compute.warp import BLOCK
 from neuprim.core.model.colours import sh_warp
@@ -41,8 +43,8 @@ from neuprim.core.train import adam_warp, ssim_warp
 from neuprim.core.volumes import grid_warp
 from neuprim.tasks.dynamic.volume import raymarch_warp
 
-RESULTS = Path(__file__).parent / "results" / "gpu_kernels.json"
-PAGE = ROOT / "docs" / "gpu.md"
+RECORD = RESULTS / "gpu_kernels.json"
+PAGE = DOCS / "gpu.md"
 ARCHS = (80, 89, 90)
 EVERY, BESIDE = "every frame", "beside frames"
 NET = ", H=8"
@@ -89,27 +91,15 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
     yield "float64 pairs, backward", passes.float64_pairs_kernel(form, False), L.WARP
 
 
-def measure(archs: list[int], forms: list[str], names: list[str] | None = None) -> list[Row]:
-    table, rows = Table("form", "kernel", "arch", "threads", "capped", "registers", "stack", "shared", "code"), []
+def measure(archs: list[int], forms: list[str], names: list[str] | None = None) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as place:
-        for form in forms:
+        for form, arch in product(forms, archs):
             for kernel, compiles, block in kernels(form):
-                if names is not None and kernel not in names:
-                    continue
-                for arch in archs:
-                    found = resources(compiled(compiles, arch, block, Path(place) / str(len(rows))))
+                if names is None or kernel in names:
+                    found = read_resources(compile_kernel(compiles, arch, block, Path(place, form, kernel, str(arch))))
                     capped = compiles.options.get("launch_bounds") is not None
-                    row = {
-                        "form": form,
-                        "kernel": kernel,
-                        "arch": arch,
-                        "threads": block,
-                        "capped": capped,
-                        **asdict(found),
-                    }
-                    rows.append(row)
-                    table.row(*row.values())
-    return rows
+                    row = {"form": form, "kernel": kernel, "arch": arch, "threads": block, "capped": capped}
+                    yield row | asdict(found)
 
 
 def spilled(rows: list[Row]) -> list[str]:
@@ -144,33 +134,32 @@ def grown(rows: list[Row], recorded: list[Row]) -> list[str]:
 def document(record: dict[str, Any]) -> str:
     """The table of docs/gpu.md: registers of the hot kernels, with the stack where there is any."""
     found = {(r["form"], r["kernel"], r["arch"]): r for r in record["kernels"]}
+
+    def cell(form: str, kernel: str) -> str:
+        rows = [found[form, kernel, arch] for arch in ARCHS if (form, kernel, arch) in found]
+        texts = [
+            str(r["registers"]) + (f" + {r['stack']} B" if r["stack"] else "") + (" capped" if r["capped"] else "")
+            for r in rows
+        ]
+        return texts[0] if len(set(texts)) == 1 else " / ".join(texts)
+
     columns = ("forward", "pixels", "pairs", "network pairs")
-    lines = [f"| form | {' | '.join(columns)} |", "| --- |" + " --- |" * len(columns)]
+    table = Table("form", *columns)
     for form in FORMS:
-        cells = []
-        for kernel in columns:
-            rows = [found[form, kernel, arch] for arch in ARCHS if (form, kernel, arch) in found]
-            texts = [
-                str(r["registers"]) + (f" + {r['stack']} B" if r["stack"] else "") + (" capped" if r["capped"] else "")
-                for r in rows
-            ]
-            cells.append(texts[0] if len(set(texts)) == 1 else " / ".join(texts))
-        lines.append(f"| {form} | {' | '.join(cells)} |")
+        table.row(form, *(cell(form, kernel) for kernel in columns))
     shared = max(r["shared"] for r in record["kernels"])
     most = max((r for r in record["kernels"] if r["form"] == EVERY), key=lambda r: r["registers"])
-    said = (
-        f"Registers a thread on sm_{' / '.join(str(a) for a in ARCHS)}, one number where they agree, with bytes "
-        f"of stack where registers "
-        f'spill, "capped" where a kernel asks for fewer than it could use; C = 3 channels, H = 8 units of a '
-        f"colour network. Of the kernels that every frame needs {most['kernel']} takes the most, "
+    return (
+        f"Registers a thread on sm_{' / '.join(str(a) for a in ARCHS)}, one number where they agree, with bytes of "
+        f'stack where registers spill, "capped" where a kernel asks for fewer than it could use; C = 3 channels, H = 8 '
+        f"units of a colour network. Of the kernels that every frame needs {most['kernel']} takes the most, "
         f"{most['registers']}; no block has more than {shared:,} bytes of shared memory. Compiled with Warp "
-        f"{record['warp']}."
+        f"{record['warp']}.\n\n{table}"
     )
-    return f"{said}\n\n" + "\n".join(lines)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = make_parser(__doc__)
     parser.add_argument("--archs", nargs="*", type=int, choices=ARCHS, default=list(ARCHS))
     parser.add_argument("--forms", nargs="*", choices=(*FORMS, EVERY, BESIDE), default=[*FORMS, EVERY, BESIDE])
     parser.add_argument("--kernels", nargs="*", help="of the forms, those of these names alone")
@@ -182,16 +171,19 @@ def main() -> int:
     if args.record and (args.kernels is not None or len(args.forms) < len(FORMS) + 2 or len(args.archs) < len(ARCHS)):
         parser.error("--record: expected every form, kernel and architecture")
     if args.from_record:
-        between_markers(PAGE, "gpu-kernels", document(json.loads(RESULTS.read_text())))
+        between_markers(PAGE, "gpu-kernels", document(read_record(RECORD)))
         return 0
-    rows = measure(args.archs, args.forms, args.kernels)
+    rows: list[Row] = []
+    keys = ("form", "kernel", "arch", "threads", "capped", "registers", "stack", "shared", "code")
+    columns = {key: itemgetter(key) for key in keys}
+    make_table(columns, (rows.append(row) or row for row in measure(args.archs, args.forms, args.kernels)))
     faults = spilled(rows)
     if args.check:
-        faults += grown(rows, json.loads(RESULTS.read_text())["kernels"])
+        faults += grown(rows, read_record(RECORD)["kernels"])
     if args.record:
         record = {"warp": warp.__version__, "kernels": rows}
         lines = ",\n".join("  " + json.dumps(row) for row in rows)
-        RESULTS.write_text(f'{{\n "warp": "{warp.__version__}",\n "kernels": [\n{lines}\n ]\n}}\n')
+        RECORD.write_text(f'{{\n "warp": "{warp.__version__}",\n "kernels": [\n{lines}\n ]\n}}\n')
         between_markers(PAGE, "gpu-kernels", document(record))
     for fault in faults:
         print(fault, file=sys.stderr)

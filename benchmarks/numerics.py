@@ -19,13 +19,13 @@ backend draws in float64, and the largest error of three small images against th
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from shared.tables import ROOT, Table, between_markers
+from shared.arguments import make_parser
+from shared.tables import DOCS, Table, between_markers
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -40,32 +40,27 @@ VIEWS, COMPARED, SMALL = 12, 3, 50
 
 
 @torch.no_grad()
-def trained(folder: Path, planes: Sequence[float]) -> None:
-    """Print what float64 is needed for in a finished run's model, one line per near plane."""
+def measure_run(folder: Path, near: float) -> str:
+    """What float64 is needed for in a finished run's model with this near plane, in one line."""
     config, task, model, _ = load_run(folder)
     dataset = load_dataset(config, task)
-    picks = sorted({i * len(dataset.test) // VIEWS for i in range(VIEWS)})
-    for near in planes:
-        fast, slow = (
-            RenderSettings(backend=b, near=near, alpha_min=0.0, transmittance_min=0.0) for b in ("cpu", "reference")
-        )
-        counts, worst = [], 0.0
-        for i in picks:
-            view = dataset.test.view(i)
-            counts.append(
-                int(render(model, view.camera, view.conditions, fast, dataset.background).stats.extra["float64"])
-            )
-            if len(counts) <= COMPARED:
-                images = [
-                    render(model, view.camera.resized(SMALL, SMALL), view.conditions, s, dataset.background).rgb
-                    for s in (fast, slow)
-                ]
-                worst = max(worst, (images[0] - images[1]).abs().max().item())
-        mean = sum(counts) / len(counts)
-        print(
-            f"near {near:g}: {mean:.1f} of {model.count} primitives in float64 ({min(counts)} to {max(counts)} a "
-            f"view), largest error {worst:.1e}"
-        )
+    settings = [
+        RenderSettings(backend=backend, near=near, alpha_min=0.0, transmittance_min=0.0)
+        for backend in ("cpu", "reference")
+    ]
+    counts, worst = [], 0.0
+    for i in sorted({i * len(dataset.test) // VIEWS for i in range(VIEWS)}):
+        view = dataset.test.view(i)
+        frame = render(model, view.camera, view.conditions, settings[0], dataset.background)
+        counts.append(int(frame.stats.extra["float64"]))
+        if len(counts) <= COMPARED:
+            small = view.camera.resized(SMALL, SMALL)
+            fast, slow = (render(model, small, view.conditions, s, dataset.background).rgb for s in settings)
+            worst = max(worst, (fast - slow).abs().max().item())
+    return (
+        f"near {near:g}: {sum(counts) / len(counts):.1f} of {model.count} primitives in float64 ({min(counts)} to "
+        f"{max(counts)} a view), largest error {worst:.1e}"
+    )
 
 
 def cells(row: Sequence[Result]) -> list[str]:
@@ -94,18 +89,18 @@ def cells(row: Sequence[Result]) -> list[str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, "--record")
     parser.add_argument("--coarse", action="store_true", help="3 cases per region instead of 40")
     parser.add_argument("--cases", type=int, help="cases per region")
     parser.add_argument("--regions", nargs="*", default=[], help="only regions whose name contains one of these")
     parser.add_argument("--edges", nargs="*", type=int, choices=EDGES, default=EDGES)
     parser.add_argument("--run", type=Path, help="a finished run's directory, instead of the regions")
     parser.add_argument("--near", nargs="*", type=float, default=[0.01], help="of --run: near planes, scene units")
-    parser.add_argument("--record", action="store_true", help="write the table to docs/numerical_limits.md")
     args = parser.parse_args()
     torch.set_num_threads(1)
     if args.run:
-        trained(args.run, args.near)
+        for near in args.near:
+            print(measure_run(args.run, near))
         return 0
     rows = []
     table = Table("region", "backend", "error/S", "thin", "gradient", "drawn in float64", "bounds", "")
@@ -116,7 +111,7 @@ def main() -> int:
         print(f"no region contains {args.regions}", file=sys.stderr)
         return 2
     if args.record:
-        between_markers(ROOT / "docs" / "numerical_limits.md", "limits", str(table))
+        between_markers(DOCS / "numerical_limits.md", "limits", str(table))
     broken = [result for row in rows for result in row if result.broken]
     for result in broken:
         print(f"broken: {result.label}: {', '.join(result.broken)}", file=sys.stderr)

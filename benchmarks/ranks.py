@@ -14,7 +14,6 @@ prints what was recorded.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import subprocess
@@ -22,217 +21,183 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from shared.tables import ROOT, Table, between_markers, spread
+from shared.arguments import make_parser
+from shared.records import RESULTS, Record, read_record, update_record
+from shared.tables import DOCS, between_markers, make_table, spread
 
-RESULTS, PAGE = Path(__file__).parent / "results" / "ranks.json", ROOT / "docs" / "scaling.md"
+from neuprim.config import compose
+from neuprim.core.compute.threads import core_count, cpu_name
+from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.distributed.torchrun import read_torchrun_rank
+from neuprim.core.train.trainer import Trainer
+from neuprim.runs.fit import fit, prepare_training, use_one_torch_thread
+from neuprim.runs.training import compile_for_run
+
+RECORD = RESULTS / "ranks.json"
 SCENES = {
     "solids": ("task=static", "scene=solids"),
     "smoke_fire": ("task=dynamic", "scene=smoke_fire", "scene.size=64"),
     "lit_solids": ("task=relight", "scene=lit_solids", "scene.size=128"),
     "large": ("task=static", "scene=solids", "scene.size=400", "model.primitives=20000"),
 }
-TITLES = {"large": "`solids`, more primitives"}
-WAYS = {
-    "together": "2 ranks × 1 thread",
-    "two threads": "1 process × 2 threads",
-    "one thread": "1 process × 1 thread",
-    "single view": "1 process × 2 threads, a view a step",
-}
-
-
+WAYS = {"together": (1, 1), "two threads": (2, 2), "one thread": (2, 1), "single view": (1, 2)}
+"""Views a step of a process, and its threads; ``together`` two ranks work."""
 BUDGET, VIEWS = ("task=static", "scene=solids", "scene.size=128", "model.primitives=1500"), 2400
 
 
-def trainers(scene: str, group: Any) -> dict[str, Any]:
+def make_trainers(scene: str, group: ProcessGroup) -> dict[str, Trainer]:
     """The same training in every way; on ranks but the first only what they take part in."""
-    from neuprim.config import compose
-    from neuprim.runs.fit import prepare_training
-    from neuprim.runs.training import compile_for_run
-
     words = [*SCENES[scene], "train.population.strategy=fixed", "train.population.grow_from=1", "seed=0"]
-    made: dict[str, Any] = {}
-    dataset = None
+    config, made, dataset = compose(words, check_output=False), {}, None
     for way in WAYS if group.is_first else ("together",):
-        config = compose(words, check_output=False)
-        views = 2 if way in ("two threads", "one thread") else 1
-        config = replace(config, train=replace(config.train, views_per_step=views))
-        config = replace(
-            config,
-            renderer=replace(config.renderer, device="cpu", threads=1 if way in ("together", "one thread") else 2),
-        )
-        fitted = prepare_training(config, dataset=dataset, group=group if way == "together" else None)
+        views, threads = WAYS[way]
+        own = replace(config, train=replace(config.train, views_per_step=views))
+        own = replace(own, renderer=replace(config.renderer, device="cpu", threads=threads))
+        fitted = prepare_training(own, dataset=dataset, group=group if way == "together" else None)
         dataset = fitted.dataset
-        trainer = fitted.trainer
-        compile_for_run(trainer)
-        trainer.step = (trainer.settings.iterations or 0) // 2
-        made[way] = trainer
+        compile_for_run(fitted.trainer)
+        fitted.trainer.step = (fitted.trainer.settings.iterations or 0) // 2
+        made[way] = fitted.trainer
     return made
 
 
-def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, Any]:
+def measure(scene: str, args: argparse.Namespace, group: ProcessGroup) -> Record:
     """Seconds per view of every way and round, by the first rank's clock."""
-    from neuprim.runs.fit import use_one_torch_thread
-
     with group.in_turn():
-        made = trainers(scene, group)
+        trainers = make_trainers(scene, group)
 
-    def turn(way: str, steps: int) -> tuple[float, float]:
-        """Seconds of a step, by the clock and of processors that this process used."""
+    def run_steps(way: str, steps: int) -> tuple[float, float]:
+        """Seconds of a step, by the clock and of cores that this process used."""
         begun, used = time.perf_counter(), time.process_time()
         for _ in range(steps):
-            made[way].train_step()
+            trainers[way].train_step()
         return (time.perf_counter() - begun) / steps, (time.process_time() - used) / steps
 
     with use_one_torch_thread():
-        for way in made:
-            turn(way, 10)
-        steps = group.gather(max(round(seconds / turn("together", 10)[0]), 4))[0]
+        for way in trainers:
+            run_steps(way, 10)
+        steps = group.gather(max(round(args.seconds / run_steps("together", 10)[0]), 4))[0]
         times: dict[str, list[float]] = {way: [] for way in WAYS}
         used: dict[str, list[float]] = {way: [] for way in WAYS}
-        for _ in range(rounds):
-            for way in WAYS:
-                if way in made:
-                    if way == "together":
-                        group.gather(None)  # the others have waited for the first rank's turns
-                    took, worked = turn(way, steps)
-                    times[way].append(took / (1 if way == "single view" else 2))
-                    used[way].append(
-                        worked / (1 if way in ("single view", "together") else 2)
-                    )  # a rank works for one view a step
-    trainer = made["together"]
+        for _ in range(args.rounds):
+            for way in trainers:
+                if way == "together":
+                    group.gather(None)  # the others have waited for the first rank's turns
+                took, worked = run_steps(way, steps)
+                views = WAYS[way][0]
+                times[way].append(took / (2 if way == "together" else views))
+                used[way].append(worked / views)  # a rank works for one view a step
+    trainer = trainers["together"]
     view = trainer.dataset.train.view(0).camera
     numbers = sum(value.numel() for value in trainer.model.params.values())
     return {
-        "scene": scene, "size": [view.width, view.height], "primitives": trainer.model.count, "numbers": numbers,
-        "steps": steps, "seconds": times, "processor": used,
-    }  # fmt: skip
+        "scene": scene,
+        "size": [view.width, view.height],
+        "primitives": trainer.model.count,
+        "numbers": numbers,
+        "steps": steps,
+        "seconds": times,
+        "processor": used,
+    }
 
 
-def worker(scenes: list[str], rounds: int, seconds: float, out: Path) -> None:
+def work_as_rank(args: argparse.Namespace) -> None:
     """What each process of the torchrun does."""
-    from neuprim.core.train.distributed.process_group import ProcessGroup
-    from neuprim.core.train.distributed.torchrun import read_torchrun_rank
-
     place = read_torchrun_rank()
     assert place is not None and place.size == 2
     group = ProcessGroup(place, os.environ)
-    for scene in scenes:
-        found = measure(scene, rounds, seconds, group)
+    for scene in args.scenes:
+        found = measure(scene, args, group)
         if group.is_first:
-            record = json.loads(out.read_text()) if out.exists() else {}
-            record[scene] = found
-            out.write_text(json.dumps(record, indent=1) + "\n")
+            update_record(args.worker, **{scene: found})
     group.close()
 
 
-def table(record: dict[str, Any]) -> str:
-    rows = Table(
-        "scene", "image", "primitives", "views/s of 2 ranks × 1 thread", "over 1 process × 2 threads, 2 views a step", "over the same, 1 view a step",
-        "over 1 process × 1 thread, 2 views", "processor time of a view, over 1 process × 2 threads", "bytes a step sends",
-    )  # fmt: skip
-    for scene, found in record["scenes"].items():
-        times = found["seconds"]
-
-        def ratio(way: str, times: dict[str, list[float]] = times) -> str:
-            middle = statistics.median(other / own for own, other in zip(times["together"], times[way], strict=True))
-            return f"{middle:.2f}; {min(times[way]) / min(times['together']):.2f}"
-
-        work = statistics.median(
-            a / b for a, b in zip(found["processor"]["together"], found["processor"]["two threads"], strict=True)
-        )
-        width, height = found["size"]
-        formula = 4 * (found["numbers"] + 2 * found["primitives"])
-        rows.row(
-            TITLES.get(scene, f"`{scene}`"), f"{width}×{height}", f"{found['primitives']:,}", f"{1 / statistics.median(times['together']):.1f}",
-            ratio("two threads"), ratio("single view"), ratio("one thread"), f"{work:.2f}", f"{formula:,} B",
-        )  # fmt: skip
-    note = f"Each ratio: median of {record['rounds']} rounds; of the fastest turns. {record['cpu']}, {record['cores']} cores that other work shared."
-    return f"{rows}\n\n{note}"
+def measure_pace(args: argparse.Namespace) -> None:
+    """Start the two ranks and record what they find."""
+    out = RECORD.with_suffix(".part")
+    out.unlink(missing_ok=True)
+    options = ["--rounds", str(args.rounds), "--seconds", str(args.seconds), "--scenes", *args.scenes]
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
+    subprocess.run([*launcher, __file__, "--worker", str(out), *options], check=True)
+    scenes = {**read_record(RECORD).get("scenes", {}), **read_record(out)}
+    update_record(RECORD, cpu=cpu_name(), cores=core_count(), rounds=args.rounds, scenes=scenes)
+    out.unlink()
 
 
-def larger_steps(seeds: int) -> dict[str, Any]:
+def measure_larger_steps(seeds: int) -> Record:
     """PSNR on the test views after as many views in fewer, larger steps, by one process: several ranks train the
     same."""
-    from neuprim.config import compose
-    from neuprim.runs.fit import fit
-
-    found: dict[str, Any] = {"words": list(BUDGET), "views": VIEWS, "psnr": {}}
+    found: dict[str, list[float]] = {}
     for views in (1, 2, 4, 8):
-        words = [
-            *BUDGET,
-            f"train.iterations={VIEWS // views}",
-            f"train.views_per_step={views}",
-            f"train.population.every={200 // views}",
-        ]
+        words = [*BUDGET, f"train.iterations={VIEWS // views}", f"train.views_per_step={views}"]
+        words.append(f"train.population.every={200 // views}")
         runs = [fit(compose([*words, f"seed={seed}"], check_output=False)).metrics()["psnr"] for seed in range(seeds)]
-        found["psnr"][str(views)] = runs
-        print(f"{views} views a step: {spread(runs, 2)} dB", flush=True)
-    return found
+        found[str(views)] = runs
+    return {"words": list(BUDGET), "views": VIEWS, "psnr": found}
 
 
-def table_of_steps(found: dict[str, Any]) -> str:
-    rows = Table("views a step, of all ranks together", "steps", "PSNR")
-    for views, values in found["psnr"].items():
-        rows.row(views, f"{found['views'] // int(views):,}", f"{spread(values, 2)} dB")
+def pace_table(record: Record) -> str:
+    def ratio(scene: Record, way: str) -> str:
+        own, other = scene["seconds"]["together"], scene["seconds"][way]
+        middle = statistics.median(b / a for a, b in zip(own, other, strict=True))
+        return f"{middle:.2f}; {min(other) / min(own):.2f}"
+
+    def work(scene: Record) -> str:
+        own, other = scene["processor"]["together"], scene["processor"]["two threads"]
+        return f"{statistics.median(a / b for a, b in zip(own, other, strict=True)):.2f}"
+
+    columns = {
+        "scene": lambda one: "`solids`, more primitives" if one["scene"] == "large" else f"`{one['scene']}`",
+        "image": lambda one: "×".join(map(str, one["size"])),
+        "primitives": lambda one: f"{one['primitives']:,}",
+        "views/s of 2 ranks × 1 thread": lambda one: f"{1 / statistics.median(one['seconds']['together']):.1f}",
+        "over 1 process × 2 threads, 2 views a step": lambda one: ratio(one, "two threads"),
+        "over the same, 1 view a step": lambda one: ratio(one, "single view"),
+        "over 1 process × 1 thread, 2 views": lambda one: ratio(one, "one thread"),
+        "processor time of a view, over 1 process × 2 threads": work,
+        "bytes a step sends": lambda one: f"{4 * (one['numbers'] + 2 * one['primitives']):,} B",
+    }
+    table = make_table(columns, record["scenes"].values())
+    return (
+        f"{table}\n\nEach ratio: median of {record['rounds']} rounds; of the fastest turns. {record['cpu']}, "
+        f"{record['cores']} cores that other work shared."
+    )
+
+
+def steps_table(found: Record) -> str:
+    columns = {
+        "views a step, of all ranks together": lambda row: row[0],
+        "steps": lambda row: f"{found['views'] // int(row[0]):,}",
+        "PSNR": lambda row: f"{spread(row[1], 2)} dB",
+    }
+    table = make_table(columns, found["psnr"].items())
     seeds = len(next(iter(found["psnr"].values())))
     return (
-        f"{rows}\n\n`neuprim run {' '.join(found['words'])}`, {found['views']:,} views in all, rates as for one view a step, means of {seeds} seeds "
-        "± half the spread."
+        f"{table}\n\n`neuprim run {' '.join(found['words'])}`, {found['views']:,} views in all, rates as for one view a "
+        f"step, means of {seeds} seeds ± half the spread."
     )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
-    parser.add_argument("--rounds", type=int, default=15)
+    parser = make_parser(__doc__, "--rounds", "--seeds", "--docs", "--print", scenes=SCENES)
+    parser.set_defaults(rounds=15, seeds=2)
     parser.add_argument("--seconds", type=float, default=0.5, help="of a turn")
-    parser.add_argument("--seeds", type=int, default=2, help="of the training with larger steps")
     parser.add_argument("--parts", nargs="+", default=["pace", "steps"], choices=["pace", "steps"])
-    parser.add_argument("--docs", action="store_true")
-    parser.add_argument("--print", action="store_true")
     parser.add_argument("--worker", type=Path, metavar="OUT", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.worker is not None:
-        worker(args.scenes, args.rounds, args.seconds, args.worker)
+        work_as_rank(args)
         return
-    from neuprim.core.compute.threads import core_count, cpu_name
-
-    record = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"scenes": {}}
-    if "pace" in args.parts and not args.print:
-        out = RESULTS.with_suffix(".part")
-        out.unlink(missing_ok=True)
-        more = [
-            "--scenes",
-            *args.scenes,
-            "--rounds",
-            str(args.rounds),
-            "--seconds",
-            str(args.seconds),
-            "--worker",
-            str(out),
-        ]
-        subprocess.run(
-            [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", __file__, *more], check=True
-        )
-        record |= {
-            "cpu": cpu_name(),
-            "cores": core_count(),
-            "rounds": args.rounds,
-            "scenes": {**record["scenes"], **json.loads(out.read_text())},
-        }
-        out.unlink()
-    if "steps" in args.parts and not args.print:
-        record["larger steps"] = larger_steps(args.seeds)
-    if not args.print:
-        RESULTS.write_text(json.dumps(record, indent=1) + "\n")
-    tables = {"ranks": table(record)} if record["scenes"] else {}
-    if "larger steps" in record:
-        tables["larger-steps"] = table_of_steps(record["larger steps"])
-    for name, text in tables.items():
+    if "pace" in args.parts and not args.only_print:
+        measure_pace(args)
+    if "steps" in args.parts and not args.only_print:
+        update_record(RECORD, **{"larger steps": measure_larger_steps(args.seeds)})
+    record = read_record(RECORD)
+    for name, text in (("ranks", pace_table(record)), ("larger-steps", steps_table(record["larger steps"]))):
         if args.docs:
-            between_markers(PAGE, name, text)
+            between_markers(DOCS / "scaling.md", name, text)
 
 
 if __name__ == "__main__":

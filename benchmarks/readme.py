@@ -8,22 +8,14 @@ dynamic_quality.py, relight_quality.py and expressivity.py.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any
 
-from shared.tables import README, ROOT, Table, between_markers, spread
-
-Run = Mapping[str, Any]
-
-
-def read_runs(name: str, part: str) -> list[Run]:
-    """The recorded runs of a benchmark."""
-    runs: list[Run] = json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text())[part]
-    return runs
+from shared.records import RESULTS, read_trials
+from shared.tables import README, Run, Table, between_markers, spread
 
 
-def psnr_cell(runs: list[Run], key: str, **facts: Any) -> str:
+def psnr_cell(runs: Sequence[Run], key: str, **facts: Any) -> str:
     """Mean of ``key`` over the runs with these facts, with half the spread over seeds."""
     values = [run[key] for run in runs if all(run.get(name) == value for name, value in facts.items())]
     return f"{spread(values, 2)} dB"
@@ -32,20 +24,20 @@ def psnr_cell(runs: list[Run], key: str, **facts: Any) -> str:
 def results_table() -> str:
     """The table in Markdown."""
     table = Table("scene", "model", "training", "default", "the paper's form")
-    runs = read_runs("static_quality", "trials")
+    runs = read_trials(RESULTS / "static_quality.json")
     for size, steps, default, paper in (("0.8 MB", "2,500 steps", 2800, 2000), ("2.0 MB", "4,000 steps", 7000, 5000)):
         cells = [psnr_cell(runs, "psnr", primitives=count) for count in (default, paper)]
         table.row("NeRF-synthetic chair, 200×200", size, steps, *cells)
-    runs = read_runs("expressivity", "trials")
+    runs = read_trials(RESULTS / "expressivity.json")
     cells = [psnr_cell(runs, "psnr", part="forms", scene="solids", size=2000, form=form) for form in ("2:2", "8:0")]
     table.row("`solids` (generated), 200×200", "0.8 MB", "equal time", *cells)
-    runs = read_runs("dynamic_quality", "trials")
+    runs = read_trials(RESULTS / "dynamic_quality.json")
     cells = [psnr_cell(runs, "psnr_mask", part="main", preset=preset) for preset in ("quick", "equations")]
     table.row("EmberGen fire, 40 frames, 96×96, inside the mask", "1.2 MB", "4,000 steps", *cells)
-    runs = read_runs("relight_quality", "forms")
+    runs = read_trials(RESULTS / "relight_quality.json")
     for key, pixels in (("psnr_linear_clamped", "all pixels"), ("psnr_pooled_cast_shadow", "cast shadows")):
         names = ("equation 14, visibility per primitive", "equation 14")
-        cells = [psnr_cell(runs, key, name=name) for name in names]
+        cells = [psnr_cell(runs, key, form=name) for name in names]
         table.row(f"`lit_solids` (generated), 128×128, {pixels}", "1.3 MB", "equal time", *cells)
     return str(table)
 

@@ -2,35 +2,32 @@
 more lights.
 
     python benchmarks/relight_environment.py RUN_DIR [--lights 16 64 256] [--views N] [--record] [--picture FILE.png]
-    [--keep DIR]
 
 - same lights: the model's image against the ray-cast sum over the very point lights that stand for the environment, so
-  that only the
-  model is wrong;
+  that only the model is wrong;
 - seen lights: both without the lights more than 15 degrees off every training light;
 - distant: against 1024 lights at 1e4 units, so that the lights' number and finite distance count too;
 - lights alone: the ray caster under the few lights against the distant ones, what a perfect model would score there.
 
 PSNR of linear light clamped to 0..1, means over views of the test split. --record writes the table to
-docs/relighting.md, --keep the environments as OpenEXR files.
+docs/relighting.md.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 from pathlib import Path
 
 import numpy as np
 import torch
-from shared.tables import ROOT, Table, between_markers
+from shared.arguments import make_parser
+from shared.tables import DOCS, Table, between_markers
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.channels import Channels
 from neuprim.core.data import View
 from neuprim.core.environment import Environment
-from neuprim.core.io.exr import write_exr
 from neuprim.core.io.images import write_png
 from neuprim.core.metrics import psnr
 from neuprim.runs.measure import render_light_sum
@@ -39,9 +36,9 @@ from neuprim.scenes.lit import INTENSITY, build_lit_solids, draw_lit_solids
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight.lighting import illuminate
 
-PAGE = ROOT / "docs" / "relighting.md"
 MANY, DISTANT = 1024, 1e4
 PIXELS = 176  # of one image in the picture
+Lights = list[dict[str, Tensor]]
 
 
 def directions(height: int) -> Tensor:
@@ -73,7 +70,7 @@ def environments(height: int = 128) -> dict[str, Tensor]:
     return {"sky and sun": sky, "two softboxes": 0.02 + warm + cold, "white": torch.ones_like(sky)}
 
 
-def truth(scene: Scene, camera: Camera, lights: list[dict[str, Tensor]], supersampling: int = 2) -> Tensor:
+def truth(scene: Scene, camera: Camera, lights: Lights, supersampling: int = 2) -> Tensor:
     """(H, W, 3) sum of ray-cast images, float64."""
     pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(
         torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
@@ -86,15 +83,11 @@ def truth(scene: Scene, camera: Camera, lights: list[dict[str, Tensor]], supersa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, "--record")
     parser.add_argument("run_dir", type=Path)
     parser.add_argument("--lights", type=int, nargs="*", default=[16, 64, 256])
     parser.add_argument("--views", type=int, default=3)
-    parser.add_argument("--record", action="store_true", help="write the table to docs/relighting.md")
-    parser.add_argument(
-        "--picture", type=Path, help="environment; truth and model under those of 64 lights that are near trained ones"
-    )
-    parser.add_argument("--keep", type=Path, help="write the environments here")
+    parser.add_argument("--picture", type=Path, help="environment; truth and model under 64 lights near trained ones")
     args = parser.parse_args()
     torch.set_num_threads(1)
     config, task, model, header = load_run(args.run_dir)
@@ -102,50 +95,40 @@ def main() -> None:
     far = {**facts, "lights": {**facts["lights"], "distance": DISTANT}}
     step = max(len(dataset.test) // args.views, 1)
     views = [dataset.test.view(i) for i in range(0, len(dataset.test), step)][: args.views]
+
+    def draw(view: View, lights: Lights) -> Tensor:
+        return render_light_sum(model, view, lights, config.renderer, torch.zeros(3))
+
+    def picture(radiance: Tensor) -> Tensor:
+        """The environment, the truth and the model below each other."""
+        camera = views[-1].camera.resized(PIXELS, PIXELS)
+        lights = list(illuminate(Environment(radiance), 64, facts).frames(False))
+        planes, size = radiance.clamp(0, 1).movedim(-1, 0)[None], (PIXELS // 2, PIXELS)
+        small = torch.nn.functional.interpolate(planes, size=size, mode="bilinear", antialias=True)[0].movedim(0, -1)
+        images = [small, truth(scene, camera, lights, 3).float(), draw(View("picture", camera), lights)]
+        return torch.cat([Channels(color_space="linear").display(image).clamp(0, 1) for image in images])
+
     table = Table("environment", "lights", "same lights", "seen lights", "distant", "lights alone")
-    columns = []
     for name, radiance in environments().items():
-        if args.keep:
-            args.keep.mkdir(parents=True, exist_ok=True)
-            write_exr(args.keep / f"{name.replace(' ', '_')}.exr", radiance, half=False)
         environment = Environment(radiance)
         distant = [truth(scene, v.camera, list(illuminate(environment, MANY, far).conditions), 1) for v in views]
         for count in args.lights:
             around = illuminate(environment, count, facts)
-            lights = list(around.conditions)
+            lights, seen = list(around.conditions), list(around.frames(False))
             scores = []
             for view, reference in zip(views, distant, strict=True):
-                drawn = render_light_sum(model, view, lights, config.renderer, torch.zeros(3)).double()
-                cast = truth(scene, view.camera, lights, 2)
-                seen = list(around.frames(False))
-                fair = (
-                    render_light_sum(model, view, seen, config.renderer, torch.zeros(3)).double(),
-                    truth(scene, view.camera, seen, 2),
-                )
+                drawn, cast = draw(view, lights).double(), truth(scene, view.camera, lights)
+                fair = (draw(view, seen).double(), truth(scene, view.camera, seen))
                 pairs = ((drawn, cast), fair, (drawn, reference), (cast, reference))
                 scores.append([psnr(a.clamp(0, 1), b.clamp(0, 1)) for a, b in pairs])
-            means = [f"{x:.2f} dB" for x in np.mean(scores, axis=0)]
-            table.row(name, len(lights), *means)
-            for note in around.notes:
-                print(f"  {note}")
-        if args.picture:
-            camera = views[-1].camera.resized(PIXELS, PIXELS)
-            around = illuminate(environment, 64, facts)
-            lights = list(around.frames(False))
-            drawn = render_light_sum(model, View("picture", camera), lights, config.renderer, torch.zeros(3))
-            planes = radiance.clamp(0, 1).movedim(-1, 0)[None]
-            small = torch.nn.functional.interpolate(
-                planes, size=(PIXELS // 2, PIXELS), mode="bilinear", antialias=True
-            )[0].movedim(0, -1)
-            images = [small, truth(scene, camera, lights, 3).float(), drawn]
-            columns.append(torch.cat([Channels(color_space="linear").display(x).clamp(0, 1) for x in images]))
+            table.row(name, len(lights), *(f"{score:.2f} dB" for score in np.mean(scores, axis=0)))
     if args.picture:
-        write_png(args.picture, torch.cat(columns, 1))
+        write_png(args.picture, torch.cat([picture(radiance) for radiance in environments().values()], 1))
     if args.record:
-        rate = (
-            f"{len(views)} test views of {views[0].camera.width}x{views[0].camera.height}, {model.count} primitives, "
-        )
-        between_markers(PAGE, "relight-environment", f"{table}\n\n{rate}{header['train_seconds']:.0f} s of training.")
+        camera, seconds = views[0].camera, header["train_seconds"]
+        run = f"{model.count} primitives, {seconds:.0f} s of training."
+        text = f"{table}\n\n{len(views)} test views of {camera.width}x{camera.height}, {run}"
+        between_markers(DOCS / "relighting.md", "relight-environment", text)
 
 
 if __name__ == "__main__":

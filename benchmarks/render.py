@@ -1,25 +1,33 @@
 """Speed of the CPU backend: time per evaluated lane, lanes per true hit, arithmetic rate and memory.
 
     python benchmarks/render.py [--scenes 5000x400 20000x400 20000x800] [--threads 1 2] [--rounds 9] [--record]
+    python benchmarks/render.py --against CHECKOUT [--scenes 20000x400] [--threads 1] [--rounds 9] [--turns 5]
 
 Draws random scenes, with preparation and binning. A step is forward, backward and Adam on all parameters; three
 colours, no depth. Flops are counted by one rule: 420 per evaluated lane forward, 1,100 backward (K = 8). --record
 writes the result to benchmarks/results/render.json and docs/performance.md.
+
+--against compares with another commit (`git worktree add CHECKOUT COMMIT`): processes of both checkouts run their own
+copy of this script in turns, and the ratio of the fastest times is printed.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-from collections.abc import Callable
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numba import njit
+from shared.arguments import make_parser
+from shared.records import RESULTS, update_record
 from shared.scenes import lower, random_scene, view
-from shared.tables import PERFORMANCE, Table, between_markers
+from shared.tables import PERFORMANCE, ROOT, Table, between_markers, make_table
 from shared.timing import fastest
 
 from neuprim.core.cameras import Camera
@@ -31,8 +39,12 @@ from neuprim.core.render import RenderSettings, layout, render_lowered
 from neuprim.core.render.cpu.layout import gradient_width, row_width
 from neuprim.core.train.optimizer import RowAdam
 
-RESULTS = Path(__file__).parent / "results" / "render.json"
 FLOPS = {"forward": 420, "backward": 1100}
+MEMORY = (
+    f"Per primitive {4 * row_width(8) + 4 * layout.SPAN_WIDTH} bytes of rows and spans and per pair 8 bytes of lists; a "
+    f"backward pass takes {4 * gradient_width(8, 3)} bytes more for each (K = 8, three colours), and what the forward "
+    f"pass keeps for it: 6 bytes a pair and 4 a lane."
+)
 Passes = tuple[Callable[[], None], Callable[[], None], Callable[[], None]]
 
 
@@ -52,7 +64,7 @@ def _count_hits(E0, EX, EY, XA, tc, anchor, boxes):  # type: ignore[no-untyped-d
     return hits
 
 
-def true_hits(lowered: Lowered, camera: Camera) -> int:
+def count_true_hits(lowered: Lowered, camera: Camera) -> int:
     """Rays that really meet a primitive within its silhouette, of all (pixel, primitive) pairs; counted in the frame
     that a forward pass keeps."""
     node = render_lowered(lowered, camera, RenderSettings(backend="cpu"), torch.zeros(3)).rgb.grad_fn
@@ -66,21 +78,14 @@ def true_hits(lowered: Lowered, camera: Camera) -> int:
 
 
 def make_passes(lowered: Lowered, camera: Camera, threads: int) -> tuple[Passes, dict[str, int]]:
+    """The forward pass, the backward pass and a whole step; lanes of the first two, and pairs."""
     settings, background = RenderSettings(backend="cpu", threads=threads), torch.zeros(3)
     g_rgb = torch.ones(camera.height, camera.width, 3)
-    kept = render_lowered(lowered, camera, settings, background)
+    saved = render_lowered(lowered, camera, settings, background)
     g, d, c = lowered.geometry, lowered.density, lowered.colour
     assert isinstance(d, Cosine) and isinstance(c, Constant)
-    params = {
-        "means": g.means,
-        "log_scales": g.log_scales,
-        "quats": g.quats,
-        "W1": d.W1,
-        "b1": d.b1,
-        "w2": d.w2,
-        "b2": d.b2,
-        "rgb": c.rgb,
-    }
+    params = {"means": g.means, "log_scales": g.log_scales, "quats": g.quats, "rgb": c.rgb}
+    params |= {"W1": d.W1, "b1": d.b1, "w2": d.w2, "b2": d.b2}
     specs = [ParameterSpec(n, tuple(v.shape[1:]), 0.0, lambda context: torch.empty(0)) for n, v in params.items()]
     adam = RowAdam(specs, params)
 
@@ -89,7 +94,7 @@ def make_passes(lowered: Lowered, camera: Camera, threads: int) -> tuple[Passes,
             render_lowered(lowered, camera, settings, background)
 
     def backward() -> None:
-        torch.autograd.grad(kept.rgb, list(params.values()), g_rgb, retain_graph=True)
+        torch.autograd.grad(saved.rgb, list(params.values()), g_rgb, retain_graph=True)
 
     def step() -> None:
         for value in params.values():
@@ -98,62 +103,89 @@ def make_passes(lowered: Lowered, camera: Camera, threads: int) -> tuple[Passes,
         adam.step(params, dict.fromkeys(params, 0.0))  # the scene stays as it is
 
     backward()
-    lanes = {k: int(kept.stats.extra[f"{k}_lanes"]) for k in ("forward", "backward")}
-    return (forward, backward, step), {**lanes, "pairs": kept.stats.pairs}
+    lanes = {k: int(saved.stats.extra[f"{k}_lanes"]) for k in ("forward", "backward")}
+    return (forward, backward, step), {**lanes, "pairs": saved.stats.pairs}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--scenes", nargs="*", default=["5000x400", "20000x400", "20000x800"], help="PRIMITIVESxSIZE")
-    parser.add_argument("--threads", nargs="*", type=int, default=[1, 2])
-    parser.add_argument(
-        "--rate", type=float, default=4.0, help="largest phase rate per axis, radians per m (trained models: about 10)"
-    )
-    parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--record", action="store_true")
-    args = parser.parse_args()
-    torch.set_num_threads(1)
-    rows = []
-    memory = (
-        f"Per primitive {4 * row_width(8) + 4 * layout.SPAN_WIDTH} bytes of rows and spans and per pair 8 bytes of "
-        f"lists; a backward pass takes "
-        f"{4 * gradient_width(8, 3)} bytes more for each (K = 8, three colours), and what the forward pass keeps "
-        f"for it: 6 bytes a pair and 4 a lane."
-    )
-    print(memory)
-    table = Table("scene", "largest rate", "threads", "pass", "ms", "ns/lane", "lanes/hit", "GFLOP/s")
+def measure(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A row per scene, number of threads and pass."""
     for text in args.scenes:
         count, size = (int(x) for x in text.split("x"))
-        p, camera = random_scene(count, rate=args.rate), view(size)
-        lowered = lower(p)
-        hits = true_hits(lowered, camera)
+        camera, lowered = view(size), lower(random_scene(count, rate=args.rate))
+        hits = count_true_hits(lowered, camera)
         for threads in args.threads:
             passes, counts = make_passes(lowered, camera, threads)
-            for i, name in enumerate((*FLOPS, "step")):
-                times = fastest([passes[i]], args.rounds)
-                row: dict[str, Any] = {
+            for run, name in zip(passes, (*FLOPS, "step"), strict=True):
+                (seconds,) = fastest([run], args.rounds)
+                parts = [name] if name in FLOPS else list(FLOPS)
+                lanes = sum(counts[part] for part in parts)
+                flops = sum(counts[part] * FLOPS[part] for part in parts)
+                yield {
                     "scene": text,
                     "rate": args.rate,
                     "threads": threads,
                     "pass": name,
-                    "ms": times[0] * 1e3,
+                    "ms": seconds * 1e3,
+                    "ns_per_lane": seconds / lanes * 1e9 * threads,
+                    "lanes_per_hit": counts["forward"] / hits,
+                    "gflops": flops / seconds / 1e9,
                 }
-                lanes = counts["forward"] + counts["backward"] if name == "step" else counts[name]
-                flops = sum(counts[k] * FLOPS[k] for k in FLOPS) if name == "step" else lanes * FLOPS[name]
-                row |= {"ns_per_lane": times[0] / lanes * 1e9 * threads, "lanes_per_hit": counts["forward"] / hits}
-                row["gflops"] = flops / times[0] / 1e9
-                cells = (
-                    f"{row['ms']:.1f}",
-                    f"{row['ns_per_lane']:.1f}",
-                    f"{row['lanes_per_hit']:.2f}",
-                    f"{row['gflops']:.0f}",
-                )
-                table.row(text, f"{args.rate:g}", threads, name, *cells)
-                rows.append(row)
+
+
+COLUMNS: dict[str, Callable[[dict[str, Any]], object]] = {
+    "scene": lambda row: row["scene"],
+    "largest rate": lambda row: f"{row['rate']:g}",
+    "threads": lambda row: row["threads"],
+    "pass": lambda row: row["pass"],
+    "ms": lambda row: f"{row['ms']:.1f}",
+    "ns/lane": lambda row: f"{row['ns_per_lane']:.1f}",
+    "lanes/hit": lambda row: f"{row['lanes_per_hit']:.2f}",
+    "GFLOP/s": lambda row: f"{row['gflops']:.0f}",
+}
+
+
+def times_of(checkout: Path, args: argparse.Namespace) -> dict[tuple[str, ...], float]:
+    """Milliseconds by scene, threads and pass, as a checkout's own script prints them."""
+    options = ["--rate", args.rate, "--rounds", args.rounds, "--scenes", *args.scenes, "--threads", *args.threads]
+    command = [sys.executable, "benchmarks/render.py", *map(str, options)]
+    environment = {**os.environ, "PYTHONPATH": str(checkout)}
+    done = subprocess.run(command, env=environment, cwd=checkout, stdout=subprocess.PIPE, text=True, check=True)
+    lines = [line.strip("| \n").split(" | ") for line in done.stdout.splitlines() if line.startswith("|")]
+    rows = [dict(zip(lines[0], cells, strict=False)) for cells in lines[2:]]
+    return {(row["scene"], row["threads"], row["pass"]): float(row["ms"]) for row in rows}
+
+
+def compare(args: argparse.Namespace) -> None:
+    """Print how long frames and steps of this checkout take, over those of another one."""
+    best: dict[Path, dict[tuple[str, ...], float]] = {args.against.resolve(): {}, ROOT: {}}
+    for turn in range(args.turns):
+        for checkout in list(best)[:: 1 if turn % 2 else -1]:
+            for key, ms in times_of(checkout, args).items():
+                best[checkout][key] = min(ms, best[checkout].get(key, ms))
+    other, own = best.values()
+    table = Table("scene", "threads", "pass", f"ms, {args.against.name}", "ms, here", "here / there")
+    for key in own:
+        table.row(*key, f"{other[key]:.1f}", f"{own[key]:.1f}", f"{own[key] / other[key]:.3f}")
+
+
+def main() -> None:
+    parser = make_parser(__doc__, "--rounds", "--record")
+    parser.add_argument("--scenes", nargs="*", default=["5000x400", "20000x400", "20000x800"], help="PRIMITIVESxSIZE")
+    parser.add_argument("--threads", nargs="*", type=int, default=[1, 2])
+    parser.add_argument("--rate", type=float, default=4.0, help="largest phase rate per axis, radians per m")
+    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout")
+    parser.add_argument("--turns", type=int, default=5, help="of --against")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    if args.against:
+        compare(args)
+        return
+    print(MEMORY)
+    rows: list[dict[str, Any]] = []
+    table = make_table(COLUMNS, (rows.append(row) or row for row in measure(args)))
     if args.record:
-        RESULTS.parent.mkdir(exist_ok=True)
-        RESULTS.write_text(json.dumps({"cpu": cpu_name(), "rows": rows}, indent=1) + "\n")
-        between_markers(PERFORMANCE, "render", f"{table}\n\n{cpu_name()}. {memory}")
+        update_record(RESULTS / "render.json", cpu=cpu_name(), rows=rows)
+        between_markers(PERFORMANCE, "render", f"{table}\n\n{cpu_name()}. {MEMORY}")
 
 
 if __name__ == "__main__":

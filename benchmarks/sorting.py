@@ -6,25 +6,25 @@ the joint volume.
 
 Draws a random scene of overlapping primitives (benchmarks/render.py) and, with --run, the model of a finished run from
 one of its test views. Errors are those of an image ``size`` pixels wide against the marched sum of densities
-(benchmarks/shared/unsorted_volume.py): "order" keeps every primitive's opacity, so that only the order differs; "field" is the sum
-of the densities as they are, clamped at zero, so that it also counts the renderer's clamps and cuts. Times are ratios
-to sort=center at the full size, the fastest of
-``rounds``, taken in turns in one process; the backward column is the backward pass alone. --record writes the table to
-benchmarks/results/sorting.json and docs/performance.md.
+(benchmarks/shared/unsorted_volume.py): "order" keeps every primitive's opacity, so that only the order differs; "field"
+is the sum of the densities as they are, clamped at zero, so that it also counts the renderer's clamps and cuts. Times
+are ratios to sort=center at the full size, the fastest of ``rounds``, taken in turns in one process; the backward
+column is the backward pass alone. --record writes the table to benchmarks/results/sorting.json and docs/performance.md.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from shared.arguments import make_parser
+from shared.records import RESULTS, update_record
 from shared.scenes import lower, random_scene, view
-from shared.tables import PERFORMANCE, Table, between_markers
+from shared.tables import PERFORMANCE, between_markers, make_table
 from shared.timing import fastest
 from shared.unsorted_volume import measure_sorting_errors
 from torch import Tensor
@@ -32,21 +32,20 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.runs.open import load_dataset, load_run
 
-RESULTS = Path(__file__).parent / "results" / "sorting.json"
 VARIANTS: dict[str, dict[str, Any]] = {
     "sort=center": {},
     "sort=entry": {"sort": "entry"},
     "sort=center samples=2": {"samples": 2},
     "sort=entry samples=2": {"sort": "entry", "samples": 2},
 }
+Scene = tuple[Lowered, Camera, Tensor]
 
 
-def from_run(folder: Path, index: int) -> tuple[str, tuple[Lowered, Camera, Tensor]]:
+def open_scene(folder: Path, index: int) -> tuple[str, Scene]:
     """The model of a finished run, as leaves that take gradients, one of its test cameras, and its background;
     named."""
-    from neuprim.runs.open import load_dataset, load_run
-
     config, task, model, _ = load_run(folder)
     dataset = load_dataset(config, task)
     shot = dataset.test.view(index)
@@ -56,74 +55,64 @@ def from_run(folder: Path, index: int) -> tuple[str, tuple[Lowered, Camera, Tens
     return name, (model.lower(shot.camera, shot.conditions), shot.camera, dataset.background)
 
 
-def ratios(
-    lowered: Lowered, camera: Camera, background: Tensor, settings: RenderSettings, rounds: int
-) -> dict[str, list[float]]:
+def measure_times(scene: Scene, settings: RenderSettings, rounds: int) -> dict[str, list[float]]:
     """Seconds of the forward pass and of the backward pass of every variant, in the order of VARIANTS."""
+    lowered, camera, background = scene
+    leaves = [x for x in (lowered.geometry.means, lowered.geometry.log_scales, lowered.density.W1) if x.requires_grad]  # type: ignore[union-attr]
     forward: list[Callable[[], Any]] = []
     backward: list[Callable[[], Any]] = []
-    leaves = [x for x in (lowered.geometry.means, lowered.geometry.log_scales, lowered.density.W1) if x.requires_grad]  # type: ignore[union-attr]
-    for knobs in VARIANTS.values():
-        chosen = replace(settings, **knobs)
-        kept = render_lowered(lowered, camera, chosen, background)
-
-        def draw(chosen: RenderSettings = chosen) -> None:
-            with torch.no_grad():
-                render_lowered(lowered, camera, chosen, background)
-
-        def differentiate(rgb: Tensor = kept.rgb) -> None:
-            torch.autograd.grad(rgb, leaves, torch.ones_like(rgb), retain_graph=True)
-
-        forward.append(draw)
-        backward.append(differentiate)
+    for words in VARIANTS.values():
+        draw = partial(render_lowered, lowered, camera, replace(settings, **words), background)
+        rgb = draw().rgb
+        forward.append(torch.no_grad()(draw))
+        backward.append(partial(torch.autograd.grad, rgb, leaves, torch.ones_like(rgb), retain_graph=True))
     return {"forward": fastest(forward, rounds), "backward": fastest(backward, rounds)}
 
 
+def error_cell(key: str) -> Callable[[dict[str, Any]], str]:
+    return lambda row: f"{row[key]['psnr']:.2f} dB, {row[key]['mean_abs']:.5f}" if key in row else ""
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = make_parser(__doc__, "--rounds", "--threads", "--record")
+    parser.set_defaults(rounds=7)
     parser.add_argument("--scene", default="2000x400", help="PRIMITIVESxSIZE of the random scene")
     parser.add_argument("--run", type=Path, help="a finished run's directory")
     parser.add_argument("--view", type=int, default=0, help="which of the run's test views")
     parser.add_argument("--size", type=int, default=128, help="width of the images whose errors are measured")
-    parser.add_argument(
-        "--steps",
-        type=int,
-        default=64,
-        help="even divisions per ray of the joint volume, beside the ends of all chords",
-    )
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--threads", type=int, default=0)
-    parser.add_argument("--record", action="store_true")
+    parser.add_argument("--steps", type=int, default=64, help="even divisions per ray, beside the ends of all chords")
     args = parser.parse_args()
     count, size = (int(x) for x in args.scene.split("x"))
     settings = RenderSettings(threads=args.threads)
-    scenes = {f"random {args.scene}": (lower(random_scene(count)), view(size), torch.zeros(3))}
+    scenes: dict[str, Scene] = {f"random {args.scene}": (lower(random_scene(count)), view(size), torch.zeros(3))}
     if args.run:
-        name, scene = from_run(args.run, args.view)
-        scenes[name] = scene
-    rows = []
-    table = Table("scene", "drawn with", "order: PSNR, mean abs", "field: PSNR, mean abs", "forward", "backward")
-    for name, (lowered, camera, background) in scenes.items():
+        scenes |= dict([open_scene(args.run, args.view)])
+    rows: list[dict[str, Any]] = []
+    for name, scene in scenes.items():
+        lowered, camera, background = scene
         small = camera.resized(args.size, max(1, round(camera.height * args.size / camera.width)))
-        order, field = (
-            measure_sorting_errors(lowered, small, settings, background, args.steps, keep)
-            for keep in ("opacity", "density")
-        )
-        times = ratios(lowered, camera, background, settings, args.rounds)
-        for i, (variant, knobs) in enumerate(VARIANTS.items()):
+        errors = {
+            key: measure_sorting_errors(lowered, small, settings, background, args.steps, what)
+            for key, what in (("order", "opacity"), ("field", "density"))
+        }
+        times = measure_times(scene, settings, args.rounds)
+        for i, (variant, words) in enumerate(VARIANTS.items()):
             row: dict[str, Any] = {"scene": name, "variant": variant, **{k: v[i] / v[0] for k, v in times.items()}}
-            cells = ["", ""]
-            if "samples" not in knobs:
-                found = [e[settings.sort if "sort" not in knobs else knobs["sort"]] for e in (order, field)]
-                cells = [f"{e.psnr:.2f} dB, {e.mean_abs:.5f}" for e in found]
-                row |= {
-                    k: {"psnr": e.psnr, "mean_abs": e.mean_abs} for k, e in zip(("order", "field"), found, strict=True)
-                }
-            table.row(name, variant, *cells, f"{row['forward']:.2f}", f"{row['backward']:.2f}")
+            for key, found in errors.items() if "samples" not in words else ():
+                error = found[words.get("sort", settings.sort)]
+                row[key] = {"psnr": error.psnr, "mean_abs": error.mean_abs}
             rows.append(row)
+    columns = {
+        "scene": lambda row: row["scene"],
+        "drawn with": lambda row: row["variant"],
+        "order: PSNR, mean abs": error_cell("order"),
+        "field: PSNR, mean abs": error_cell("field"),
+        "forward": lambda row: f"{row['forward']:.2f}",
+        "backward": lambda row: f"{row['backward']:.2f}",
+    }
+    table = make_table(columns, rows)
     if args.record:
-        RESULTS.parent.mkdir(exist_ok=True)
-        RESULTS.write_text(json.dumps({"size": args.size, "steps": args.steps, "rows": rows}, indent=1) + "\n")
+        update_record(RESULTS / "sorting.json", size=args.size, steps=args.steps, rows=rows)
         between_markers(PERFORMANCE, "sorting", str(table))
 
 

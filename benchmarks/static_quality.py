@@ -12,109 +12,68 @@ the markers in docs/static.md; without DIR nothing is run.
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
+from shared.arguments import make_parser
 from shared.forms import Form
-from shared.tables import ROOT, between_markers, spread
+from shared.records import RESULTS, read_record
+from shared.tables import DOCS, between_markers, group_runs, make_table, spread_of
 from shared.trials import Trial, run_all
 
-from neuprim.core.compute.threads import cpu_name
-
-HERE = Path(__file__).parent
-RESULTS = HERE / "results" / "static_quality.json"
+RECORD = RESULTS / "static_quality.json"
 ROWS = ("2800x2500", "7000x4000", "2000x2500x8:0", "5000x4000x8:0")
 DEFAULT = "2:2"
-"""What the preset has."""
+"""The preset's form."""
 KEYS = ("psnr", "psnr_worst", "ssim", "train_seconds", "model_bytes", "parameters_per_primitive", "primitives")
-Group = tuple[int, int, str]
-"""Primitives, steps, form."""
 
 
-def group_of(text: str) -> Group:
-    parts = text.split("x")
-    return int(parts[0]), int(parts[1]), parts[2] if len(parts) > 2 else DEFAULT
+def make_trial(scene: Path, row: str, seed: int) -> Trial:
+    """The run of a row, PRIMITIVESxSTEPS[xK:EDGE]."""
+    primitives, steps, form = (*row.split("x"), DEFAULT)[:3]
+    words = ["task=static", "scene=blender", f"scene.path='{scene}'", "train.background=white"]
+    words += [f"model.primitives={primitives}", *Form.named(form).words]
+    words.append("train.population.every=200")  # as the preset has it, however short
+    return Trial(f"{primitives}-{steps}-{form}-{seed}", tuple(words), int(steps), seed, 0, (("form", form),))
 
 
-def trial(scene: Path, group: Group, seed: int) -> Trial:
-    primitives, steps, form = group
-    words = [
-        "task=static",
-        "scene=blender",
-        f"scene.path='{scene}'",
-        "train.background=white",
-        f"model.primitives={primitives}",
-    ]
-    words += [*Form.named(form).words, "train.population.every=200"]  # as the preset has it, however short
-    return Trial(f"{primitives}-{steps}-{form}-{seed}", tuple(words), steps, seed, 0, (("form", form),))
+def table(record: dict[str, Any]) -> str:
+    """A row per budget and form, the default form first."""
+    groups = group_runs(record["trials"], "primitives", "iterations", "form")
+    ordered = sorted(groups.values(), key=lambda runs: runs[0]["primitives"] * runs[0]["iterations"])
+    columns = {
+        "primitives": lambda runs: f"{runs[0]['primitives']:,}",
+        "form": lambda runs: form_label(runs[0]["form"]),
+        "steps": lambda runs: f"{runs[0]['iterations']:,}",
+        "PSNR": lambda runs: f"{spread_of(runs, 'psnr')} dB",
+        "worst view": lambda runs: f"{spread_of(runs, 'psnr_worst', 1)} dB",
+        "SSIM": lambda runs: spread_of(runs, "ssim", 4),
+        "model": lambda runs: f"{runs[0]['model_bytes'] / 1e6:.2f} MB",
+    }
+    made = make_table(columns, sorted(ordered, key=lambda runs: runs[0]["form"] != DEFAULT))
+    seeds = max(len(runs) for runs in ordered)
+    source = f"{record['scene']}, {record['views']} test views"
+    return f"{made}\n\n{source}, {seeds} seed(s), one thread of {record['cpu']}."
 
 
-def described(scene: Path) -> dict[str, Any]:
-    """Name, image width and test views of the scene."""
-    frames = json.loads((scene / "transforms_test.json").read_text())["frames"]
-    with Image.open(scene / f"{frames[0]['file_path']}.png") as image:
-        return {
-            "scene": scene.name,
-            "name": "NeRF-synthetic " + scene.name.partition("_")[0],
-            "size": image.width,
-            "views": len(frames),
-        }
-
-
-def groups(results: dict[str, Any]) -> dict[Group, list[dict[str, Any]]]:
-    """Runs by what they have in common, the default first, then by budget."""
-    found: dict[Group, list[dict[str, Any]]] = {}
-    for run in results["trials"]:
-        found.setdefault((run["primitives"], run["iterations"], run["form"]), []).append(run)
-    return dict(sorted(found.items(), key=lambda g: (g[0][2] != DEFAULT, g[0][0] * g[0][1])))
-
-
-def table(results: dict[str, Any]) -> str:
-    lines = [
-        "| primitives | form | steps | PSNR | worst view | SSIM | model |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for (primitives, steps, form), runs in groups(results).items():
-        lines.append(
-            f"| {primitives:,} | {shown(form)} | {steps:,} | {spread([r['psnr'] for r in runs], 2)} dB "
-            f"| {spread([r['psnr_worst'] for r in runs], 1)} dB | {spread([r['ssim'] for r in runs], 4)} "
-            f"| {runs[0]['model_bytes'] / 1e6:.2f} MB |"
-        )
-    seeds = max(len(runs) for runs in groups(results).values())
-    note = f"\n{results['scene']}, {results['views']} test views, {seeds} seed(s), one thread of {results['cpu']}."
-    return "\n".join(lines) + "\n" + note
-
-
-def shown(form: str) -> str:
+def form_label(form: str) -> str:
     return Form.named(form).label + (", the default" if form == DEFAULT else "")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, "--seeds", "--jobs", "--docs")
     parser.add_argument("scene", type=Path, nargs="?")
-    parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--rows", nargs="*", default=list(ROWS), help="PRIMITIVESxSTEPS[xK:EDGE]")
-    parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
-    parser.add_argument("--docs", action="store_true", help="write the recorded table into docs/static.md")
     args = parser.parse_args()
     if args.scene:
         scene = args.scene.resolve()
-        trials = [trial(scene, group_of(row), seed) for seed in range(args.seeds) for row in args.rows]
-        run_all(
-            trials,
-            RESULTS,
-            KEYS,
-            args.jobs,
-            lambda row: f"{row['psnr']:.2f} dB",
-            {"cpu": cpu_name(), **described(scene)},
-        )
-    results = json.loads(RESULTS.read_text())
-    print(table(results))
+        views = len(json.loads((scene / "transforms_test.json").read_text())["frames"])
+        trials = [make_trial(scene, row, seed) for seed in range(args.seeds) for row in args.rows]
+        run_all(trials, RECORD, KEYS, args.jobs, scene=scene.name, views=views)
+    text = table(read_record(RECORD))
     if args.docs:
-        between_markers(ROOT / "docs" / "static.md", "static-quality", table(results))
+        between_markers(DOCS / "static.md", "static-quality", text)
 
 
 if __name__ == "__main__":

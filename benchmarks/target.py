@@ -21,34 +21,33 @@ benchmarks/results/target.json; --docs puts the tables between the markers of do
 
 from __future__ import annotations
 
-import argparse
-import dataclasses
-import json
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from shared.tables import ROOT, Table, between_markers
+from shared.arguments import make_parser, require_folders
+from shared.records import RESULTS, read_record, update_record
+from shared.tables import DOCS, Run, Table, between_markers, make_table
 
 from neuprim.config import compose, task_of
 from neuprim.config.command_settings import Target
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.compute.threads import cpu_name
-from neuprim.core.io.files import write_json
 from neuprim.runs.events import Event, Note
 from neuprim.runs.open import load_dataset
 from neuprim.search.target import choose_hold_out, run_target
 from neuprim.search.trial_runner import VIEWS
 from neuprim.search.trials import Trial, run_trial
 
-RESULTS = Path(__file__).parent / "results" / "target.json"
+RECORD = RESULTS / "target.json"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Scene:
     """What is searched.
 
@@ -81,61 +80,40 @@ SCENES = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="*", default=["solids"], choices=list(SCENES))
-    parser.add_argument("--chair", type=Path, help="a NeRF-synthetic folder")
-    parser.add_argument("--fire", type=Path, help="a folder of OpenVDB files")
-    parser.add_argument("--seeds", type=int, default=3)
+    parser = make_parser(__doc__, "--chair", "--fire", "--seeds", "--docs", "--print", scenes=SCENES)
+    parser.set_defaults(scenes=["solids"])
     parser.add_argument("--work", type=Path, help="where trainings are kept (default: a temporary folder)")
     parser.add_argument("--grid", action="store_true", help="no target runs")
-    parser.add_argument("--docs", action="store_true")
-    parser.add_argument("--print", action="store_true", dest="only_print")
     args = parser.parse_args()
-    data = {"chair": args.chair, "fire": args.fire}
-    for name in args.scenes:
-        if name in data and data[name] is None and not args.only_print:
-            parser.error(f"--{name}: wants the folder of its data; or leave it out of --scenes")
-    found: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
     if not args.only_print:
+        require_folders(parser, args, args.scenes)
         with tempfile.TemporaryDirectory() as temporary:
             for name in args.scenes:
-                work = args.work or Path(temporary)
-                where = (
-                    []
-                    if data.get(name) is None
-                    else [f"scene.{'vdb' if name == 'fire' else 'path'}='{data[name].resolve()}'"]
-                )
-                grid = gridded(name, where, work)
+                work, folder = args.work or Path(temporary), getattr(args, name, None)
+                data = [] if folder is None else [f"scene.{'vdb' if name == 'fire' else 'path'}='{folder.resolve()}'"]
+                grid = train_grid(name, data, work)
                 if not args.grid:
-                    found[name] = {
-                        **grid,
-                        "runs": [r for seed in range(args.seeds) for r in searched(name, where, work, seed)],
-                    }
-                    write_json(RESULTS, {**found, "cpu": cpu_name()})
+                    runs = [run for seed in range(args.seeds) for run in search(name, data, work, seed)]
+                    update_record(RECORD, **{name: {**grid, "runs": runs}, "cpu": cpu_name()})
     if args.grid:
         return
+    found = read_record(RECORD)
     texts = [report(name, found[name]) for name in SCENES if name in found]
     if args.docs:
-        between_markers(ROOT / "docs" / "tradeoffs.md", "target", "\n\n".join(texts))
+        between_markers(DOCS / "tradeoffs.md", "target", "\n\n".join(texts))
 
 
-def words(name: str, where: Sequence[str], out: Path) -> list[str]:
-    return [
-        *SCENES[name].words,
-        *where,
-        "renderer.threads=1",
-        "train.eval_every=0",
-        "resume=true",
-        f"output_dir='{out}'",
-    ]
+def words_of(name: str, data: Sequence[str], out: Path) -> list[str]:
+    further = ("renderer.threads=1", "train.eval_every=0", "resume=true")
+    return [*SCENES[name].words, *data, *further, f"output_dir='{out}'"]
 
 
-def searched(name: str, where: Sequence[str], work: Path, seed: int) -> list[dict[str, Any]]:
+def search(name: str, data: Sequence[str], work: Path, seed: int) -> list[dict[str, Any]]:
     """Target runs of a seed."""
     scene, runs = SCENES[name], []
     for psnr in scene.targets:
         out = work / f"{name}-{psnr:g}-{seed}"
-        config = compose([*words(name, where, out), f"model.primitives={scene.start}", f"seed={seed}"])
+        config = compose([*words_of(name, data, out), f"model.primitives={scene.start}", f"seed={seed}"])
         record = run_target(config, Target(psnr=psnr), scene.budget, tell)
         full = [a for a in record.attempts if a.purpose == "full"]
         chosen = next(a for a in full if a.folder == record.chosen)
@@ -163,13 +141,13 @@ def searched(name: str, where: Sequence[str], work: Path, seed: int) -> list[dic
     return runs
 
 
-def gridded(name: str, where: Sequence[str], work: Path) -> dict[str, Any]:
+def train_grid(name: str, data: Sequence[str], work: Path) -> dict[str, Any]:
     """Every size at full length."""
     scene, grid, dataset = SCENES[name], [], None
     for less in scene.less:
         for size in scene.sizes:
             out = work / f"{name}-grid-{size}{'-' if less else ''}{less.rpartition('.')[2]}"
-            config = compose([*words(name, where, out), f"model.primitives={size}", *([less] if less else [])])
+            config = compose([*words_of(name, data, out), f"model.primitives={size}", *([less] if less else [])])
             task = task_of(config)
             dataset = dataset or load_dataset(config, task)
             every = choose_hold_out(dataset)
@@ -177,20 +155,9 @@ def gridded(name: str, where: Sequence[str], work: Path) -> dict[str, Any]:
             model, _ = load_model(out / "model.safetensors", task)
             packed, text = out / "packed.neuprim", (out / "config.yaml").read_text(encoding="utf-8")
             save_compressed(packed, model, task.name, {}, bit_table(DEFAULT_LEVEL, (), model.specs), text)
-            grid.append(
-                {
-                    "less": less,
-                    "primitives": size,
-                    "psnr": outcome.psnr,
-                    "bytes": packed.stat().st_size,
-                    "seconds": outcome.seconds,
-                }
-            )
-            print(
-                f"{name}: {size} primitives {less}: {outcome.psnr:.2f} dB, {grid[-1]['bytes']} bytes, "
-                f"{outcome.seconds:.0f} s",
-                flush=True,
-            )
+            row = {"less": less, "primitives": size, "psnr": outcome.psnr, "bytes": packed.stat().st_size}
+            grid.append(row | {"seconds": outcome.seconds})
+            print(f"{name}: {size} primitives {less}: {outcome.psnr:.2f} dB, {row['bytes']} bytes", flush=True)
     return {"words": scene.words, "hold_out": every, "grid": grid}
 
 
@@ -210,42 +177,37 @@ def report(name: str, result: Mapping[str, Any]) -> str:
     """Prints both tables of a scene; returns them."""
     title = f"**{name}** (`{' '.join(result['words'])}`), one of {result['hold_out']} training views held out"
     print(f"\n{title}")
-    less = list(dict.fromkeys(g["less"] for g in result["grid"]))
+    cells = {(g["primitives"], g["less"]): f"{g['psnr']:.2f} dB, {g['bytes']:,} bytes" for g in result["grid"]}
+    less = list(dict.fromkeys(word for _, word in cells))
     sizes = Table("grid", *(f"`{word}`" if word else "as the preset has it" for word in less))
-    for size in sorted({g["primitives"] for g in result["grid"]}):
-        own = {g["less"]: g for g in result["grid"] if g["primitives"] == size}
-        sizes.row(f"{size:,} primitives", *(f"{own[w]['psnr']:.2f} dB, {own[w]['bytes']:,} bytes" for w in less))
+    for size in sorted({size for size, _ in cells}):
+        sizes.row(f"{size:,} primitives", *(cells[size, word] for word in less))
     print()
-    table = Table(
-        "target",
-        "seed",
-        "found",
-        "time",
-        "trained",
-        "first full run",
-        "held out",
-        "stored",
-        "test views",
-        "bytes",
-        "ratio",
-    )
-    for run in result["runs"]:
+    return f"{title}\n\n{sizes}\n\n{runs_table(result)}"
+
+
+def runs_table(result: Mapping[str, Any]) -> Table:
+    def turned(run: Run) -> str:
+        return "".join(f", {key.rpartition('.')[2]} {value}" for key, value in run["words"].items())
+
+    def first(run: Run) -> str:
         (value, doubt), had = run["first"]
-        turned = "".join(f", {key.rpartition('.')[2]} {v}" for key, v in run["words"].items())
-        table.row(
-            f"{run['target']:.1f} dB",
-            run["seed"],
-            f"{run['primitives']:,} primitives{turned}",
-            f"{run['seconds']:.0f} of {run['budget']:.0f} s",
-            f"{run['trials']} trials, {run['full_runs']} full",
-            f"{value:.2f} ± {doubt:.2f}, had {had:.2f}",
-            f"{run['held_out']:.2f}",
-            f"{run['held_out_stored']:.2f}",
-            f"{run['test_stored']:.2f}",
-            f"{run['bytes']:,}",
-            f"{run['bytes_usual'] / smallest(result['grid'], run['target']):.2f}",
-        )
-    return f"{title}\n\n{sizes}\n\n{table}"
+        return f"{value:.2f} ± {doubt:.2f}, had {had:.2f}"
+
+    columns = {
+        "target": lambda run: f"{run['target']:.1f} dB",
+        "seed": lambda run: run["seed"],
+        "found": lambda run: f"{run['primitives']:,} primitives{turned(run)}",
+        "time": lambda run: f"{run['seconds']:.0f} of {run['budget']:.0f} s",
+        "trained": lambda run: f"{run['trials']} trials, {run['full_runs']} full",
+        "first full run": first,
+        "held out": lambda run: f"{run['held_out']:.2f}",
+        "stored": lambda run: f"{run['held_out_stored']:.2f}",
+        "test views": lambda run: f"{run['test_stored']:.2f}",
+        "bytes": lambda run: f"{run['bytes']:,}",
+        "ratio": lambda run: f"{run['bytes_usual'] / smallest(result['grid'], run['target']):.2f}",
+    }
+    return make_table(columns, result["runs"])
 
 
 def tell(event: Event) -> None:

@@ -21,19 +21,19 @@ puts both tables into docs/export.md.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import statistics
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from shared.tables import ROOT, Table, between_markers
+from shared.arguments import make_parser
+from shared.records import RESULTS, read_record, update_record
+from shared.tables import DOCS, ROOT, Run, Table, between_markers, make_table
 from torch import Tensor
 
 from neuprim.config import compose
@@ -41,7 +41,6 @@ from neuprim.core.cameras import Camera, orbit
 from neuprim.core.compute.threads import cpu_name
 from neuprim.core.conditions import read_conditions
 from neuprim.core.extensions import TrainedModel
-from neuprim.core.io.files import write_json
 from neuprim.core.render import render
 from neuprim.runs.export import export_run
 from neuprim.runs.fit import prepare_training
@@ -53,13 +52,9 @@ sys.path.insert(0, str(ROOT))
 
 from tests.browsers import Tab, browser, open_tab
 
-RESULTS = Path(__file__).parent / "results" / "webpage.json"
-PAGE = ROOT / "docs" / "export.md"
+RECORD = RESULTS / "webpage.json"
 LEVELS = (0, 1, 3)
 WIDE, HIGH = 1280, 720
-RATES = (110e9, 220e9)
-"""Instructions a second of integrated graphics: half and all of 24 units of 8 lanes at 1.15 GHz."""
-
 COUNTS = (5_000, 20_000)
 FRAMES = 60
 STARTS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
@@ -76,7 +71,7 @@ STARTS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
 # ---------------------------------------------------------------- exactness, size and work
 
 
-def measured(chromium: Any, run_dir: Path, count: int, folder: Path) -> dict[str, Any]:
+def measure_pages(chromium: Any, run_dir: Path, count: int, folder: Path) -> dict[str, Any]:
     """Everything about the pages of one run."""
     run = open_run(run_dir)
     found: dict[str, Any] = {"task": run.task.name, "primitives": run.model.count, "levels": {}}
@@ -85,13 +80,13 @@ def measured(chromium: Any, run_dir: Path, count: int, folder: Path) -> dict[str
         report = export_run(run_dir, "html", path, (f"level={level}",), overwrite=True)
         found["levels"][str(level)] = {"bytes": path.stat().st_size, **report.errors}
     with open_tab(chromium, pages[0]) as tab:
-        found["views"] = list(differences(tab, run, count))
-        found["chords"] = chords(tab, run)
+        found["views"] = list(compare_views(tab, run, count))
+        found["chords"] = count_chords(tab, run)
         assert not tab.faults, tab.faults
     return found
 
 
-def differences(tab: Tab, run: TrainedModel, count: int) -> Iterator[dict[str, Any]]:
+def compare_views(tab: Tab, run: TrainedModel, count: int) -> Iterator[dict[str, Any]]:
     """The largest difference in each of some held-out views."""
     views, background = run.dataset().test, torch.tensor(run.header["background"])
     for index in sorted({k * len(views) // count for k in range(count)}):
@@ -107,21 +102,14 @@ def differences(tab: Tab, run: TrainedModel, count: int) -> Iterator[dict[str, A
         yield row
 
 
-def chords(tab: Tab, run: TrainedModel) -> int:
+def count_chords(tab: Tab, run: TrainedModel) -> int:
     """Pixels of all silhouettes of the first held-out view: ellipses of half axes hx and hy on sheared axes, none more
     than the screen."""
     view = run.dataset().test.view(0)
     scale = HIGH / view.camera.height
-    camera = replace(
-        view.camera,
-        fx=scale * view.camera.fx,
-        fy=scale * view.camera.fy,
-        cx=WIDE / 2,
-        cy=HIGH / 2,
-        width=WIDE,
-        height=HIGH,
-    )
-    halves = tab.page.evaluate(_HALVES, [camera_numbers(camera), plain(view.conditions)])
+    fx, fy = scale * view.camera.fx, scale * view.camera.fy
+    camera = replace(view.camera, fx=fx, fy=fy, cx=WIDE / 2, cy=HIGH / 2, width=WIDE, height=HIGH)
+    halves = tab.page.evaluate(_HALVES, [camera_numbers(camera), as_lists(view.conditions)])
     return round(sum(min(math.pi * hx * hy, WIDE * HIGH) if hx >= 0 else WIDE * HIGH for hx, hy in halves))
 
 
@@ -133,51 +121,43 @@ _HALVES = """async ([camera, values]) => {
 }"""
 
 
-def plain(conditions: Mapping[str, Tensor]) -> dict[str, Any]:
+def as_lists(conditions: Mapping[str, Tensor]) -> dict[str, Any]:
     return {name: value.double().tolist() for name, value in conditions.items()}
 
 
 # ---------------------------------------------------------------- preparation
 
 
-def prepared(chromium: Any, scene: str, count: int, folder: Path) -> dict[str, Any]:
+def measure_preparation(chromium: Any, scene: str, count: int, folder: Path) -> dict[str, Any]:
     """Milliseconds of the worker. The model has not learned yet: how much work it is does not depend on what it would
     have."""
     words, sweep = STARTS[scene]
-    fitted = prepare_training(
-        compose([*words, f"model.primitives={count}", "train.population.grow_from=1"], check_output=False)
-    )
+    words = (*words, f"model.primitives={count}", "train.population.grow_from=1")
+    fitted = prepare_training(compose(words, check_output=False))
     fitted.unlock()
     model, view, specs = fitted.model, fitted.dataset.test.view(0), fitted.task.conditions
-    page = web_page(
-        scene,
-        model,
-        (0, 1, 2),
-        fitted.config.renderer,
-        conditions=[Condition(s, view.conditions[s.name]) for s in specs],
-    )
+    conditions = [Condition(spec, view.conditions[spec.name]) for spec in specs]
     path = folder / f"{scene}_{count}.html"
+    page = web_page(scene, model, (0, 1, 2), fitted.config.renderer, conditions=conditions)
     path.write_text(page.text, encoding="utf-8")
     middle = model.params["means"].detach().mean(0)
     away = float((view.camera.position - middle).norm())
-    around = orbit(view.camera, middle, fitted.dataset.up, away, 0.3, FRAMES)
-    still = [dict(view.conditions) for _ in around]
+    cameras = orbit(view.camera, middle, fitted.dataset.up, away, 0.3, FRAMES)
+    still = [dict(view.conditions) for _ in cameras]
     moved = read_conditions(specs, sweep)
-    moving = (
-        [values | {name: found[k] for name, found in moved.items()} for k, values in enumerate(still)] if moved else []
-    )
+    moving = [values | {name: found[k] for name, found in moved.items()} for k, values in enumerate(still)]
     result: dict[str, Any] = {"scene": scene, "primitives": model.count}
     with open_tab(chromium, path) as tab:
-        for key, values in (("camera", still), ("conditions", moving)):
-            if values:
-                result |= {key: timed(tab, around, values)}
+        result["camera"] = time_frames(tab, cameras, still)
+        if moved:
+            result["conditions"] = time_frames(tab, cameras, moving)
         assert not tab.faults, tab.faults
     return result
 
 
-def timed(tab: Tab, cameras: Sequence[Camera], conditions: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
+def time_frames(tab: Tab, cameras: Sequence[Camera], conditions: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
     """Median and fastest frame, and how many primitives a frame has; frames before are for the browser's compiler."""
-    frames = [[camera_numbers(camera), plain(values)] for camera, values in zip(cameras, conditions, strict=True)]
+    frames = [[camera_numbers(camera), as_lists(values)] for camera, values in zip(cameras, conditions, strict=True)]
     rounds = [tab.page.evaluate(_TIMES, frames) for _ in range(2)]
     times = [one["milliseconds"] for one in rounds[-1]]
     return {
@@ -201,66 +181,60 @@ _TIMES = """async frames => {
 # ---------------------------------------------------------------- tables
 
 
-def page_table(runs: Mapping[str, dict[str, Any]]) -> Table:
-    table = Table(
-        "run",
-        "primitives",
-        "brightest value",
-        "without `transmittance_min`",
-        "as configured",
-        "page, level 0",
-        "level 1",
-        "level 3",
-        "chords at 1280×720",
-    )
-    for name, run in runs.items():
-        worst = [f"{max(view[key] for view in run['views']):.1e}" for key in ("whole", "configured")]
-        brightest = max(view["brightest"] for view in run["views"])
-        sizes = [
-            f"{one['bytes'] / 1e6:.2f} MB" + (f", {one['psnr']:.1f} dB" if "psnr" in one else "")
-            for one in run["levels"].values()
-        ]
-        table.row(
-            f"`{name}`, {len(run['views'])} views",
-            f"{run['primitives']:,}",
-            f"{brightest:.2f}",
-            *worst,
-            *sizes,
-            f"{run['chords'] / 1e6:.1f} M",
-        )
-    return table
+def page_table(runs: Mapping[str, Run]) -> Table:
+    def worst(key: str) -> Callable[[tuple[str, Run]], str]:
+        return lambda row: f"{max(view[key] for view in row[1]['views']):.1e}"
+
+    def size(level: int) -> Callable[[tuple[str, Run]], str]:
+        def cell(row: tuple[str, Run]) -> str:
+            found = row[1]["levels"][str(level)]
+            return f"{found['bytes'] / 1e6:.2f} MB" + (f", {found['psnr']:.1f} dB" if "psnr" in found else "")
+
+        return cell
+
+    columns = {
+        "run": lambda row: f"`{row[0]}`, {len(row[1]['views'])} views",
+        "primitives": lambda row: f"{row[1]['primitives']:,}",
+        "brightest value": lambda row: f"{max(view['brightest'] for view in row[1]['views']):.2f}",
+        "without `transmittance_min`": worst("whole"),
+        "as configured": worst("configured"),
+        **{f"{'page, ' if level == 0 else ''}level {level}": size(level) for level in LEVELS},
+        "chords at 1280×720": lambda row: f"{row[1]['chords'] / 1e6:.1f} M",
+    }
+    return make_table(columns, runs.items())
 
 
-def prepare_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    table = Table("scene", "primitives", "drawn", "only the camera moves", "time or light moves")
-    for row in rows:
-        cells = [f"{row[key]['median']:.1f} ms" if key in row else "" for key in ("camera", "conditions")]
-        table.row(f"`{row['scene']}`", f"{row['primitives']:,}", f"{row['camera']['drawn']:,.0f}", *cells)
-    return table
+def prepare_table(rows: Sequence[Run]) -> Table:
+    columns = {
+        "scene": lambda row: f"`{row['scene']}`",
+        "primitives": lambda row: f"{row['primitives']:,}",
+        "drawn": lambda row: f"{row['camera']['drawn']:,.0f}",
+        "only the camera moves": lambda row: f"{row['camera']['median']:.1f} ms",
+        "time or light moves": lambda row: f"{row['conditions']['median']:.1f} ms" if "conditions" in row else "",
+    }
+    return make_table(columns, rows)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, "--docs", "--print")
     parser.add_argument("runs", type=lambda text: text.split("=", 1), nargs="*", metavar="ROW=RUN_DIR")
     parser.add_argument("--views", type=int, default=8)
     parser.add_argument("--prepare", action="store_true")
-    parser.add_argument("--print", action="store_true")
-    parser.add_argument("--docs", action="store_true")
     args = parser.parse_args()
-    known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"runs": {}, "prepare": []}
-    if not args.print:
+    record = {"runs": {}, "prepare": []} | read_record(RECORD)
+    if not args.only_print:
         with browser() as chromium, tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
             for row, run in args.runs:
-                known["runs"][row] = measured(chromium, Path(run), args.views, Path(name))
+                record["runs"][row] = measure_pages(chromium, Path(run), args.views, folder)
             if args.prepare:
-                known["prepare"] = [
-                    prepared(chromium, scene, count, Path(name)) for scene in STARTS for count in COUNTS
-                ]
-        write_json(RESULTS, known | {"cpu": cpu_name()})
-    tables = {"webpage": page_table(known["runs"]), "webpage-prepare": prepare_table(known["prepare"])}
+                starts = [(scene, count) for scene in STARTS for count in COUNTS]
+                record["prepare"] = [measure_preparation(chromium, *start, folder) for start in starts]
+        update_record(RECORD, **record | {"cpu": cpu_name()})
+    tables = {"webpage": page_table(record["runs"]), "webpage-prepare": prepare_table(record["prepare"])}
     if args.docs:
         for marker, table in tables.items():
-            between_markers(PAGE, marker, str(table))
+            between_markers(DOCS / "export.md", marker, str(table))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import neuprim
@@ -14,28 +16,29 @@ FILES = sorted(ROOT.rglob("*.py"))
 LONGEST = 460
 
 
+TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
+
+
 def imported(path: Path) -> set[str]:
     """Absolute names of all modules a file imports, anywhere in it, type-checking blocks and functions included."""
     package = (ROOT.name, *path.relative_to(ROOT).parent.parts)
     names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(TREES[path]):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                base = ".".join([*package[: len(package) - node.level + 1], *([node.module] if node.module else [])])
+            above = package[: len(package) - node.level + 1] if node.level else ()
+            base = ".".join([*above, *([node.module] if node.module else [])])
             names |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
-        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in (
-            "import_module",
-            "__import__",
-        ):
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
             names |= {a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)}
     return names
 
 
-def within(name: str, package: str) -> bool:
-    return name == package or name.startswith(package + ".")
+def places(paths: list[Path], wrong: Callable[[ast.AST], bool]) -> list[str]:
+    """Where a file has what is wrong."""
+    found = [(path, node) for path in paths for node in ast.walk(TREES[path]) if wrong(node)]
+    return [f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 0)}" for path, node in found]
 
 
 ROOMS: dict[str, set[str]] = {
@@ -135,19 +138,19 @@ def circles(graph: dict[str, set[str]]) -> list[list[str]]:
     """Sets of nodes that reach each other."""
     reach: dict[str, set[str]] = {}
     for node in graph:
-        seen, todo = set(), [node]
+        reach[node], todo = set(), [node]
         while todo:
-            for other in graph.get(todo.pop(), ()):
-                if other not in seen:
-                    seen.add(other)
-                    todo.append(other)
-        reach[node] = seen
-    found = {
-        tuple(sorted(n for n in graph if n in reach[node] and node in reach[n]))
-        for node in graph
-        if node in reach[node]
-    }
+            new = graph.get(todo.pop(), set()) - reach[node]
+            reach[node] |= new
+            todo += new
+    circular = [node for node in graph if node in reach[node]]
+    found = {tuple(sorted(n for n in circular if n in reach[node] and node in reach[n])) for node in circular}
     return [list(circle) for circle in sorted(found)]
+
+
+def rooms_in(folder: Path) -> set[str]:
+    packages = {path.parent.name for path in folder.glob("*/__init__.py")}
+    return packages | {path.stem for path in folder.glob("*.py")} - {"__init__", "__main__"}
 
 
 def test_every_room_imports_only_what_the_list_allows() -> None:
@@ -156,18 +159,8 @@ def test_every_room_imports_only_what_the_list_allows() -> None:
 
 
 def test_the_lists_name_what_is_there_and_run_down() -> None:
-    there = {
-        p.stem if p.suffix == ".py" else p.name
-        for p in ROOT.iterdir()
-        if p.suffix == ".py" or (p / "__init__.py").exists()
-    }
-    assert set(ROOMS) == there - {"__init__", "__main__"} and len(ROOMS) <= MOST_ROOMS
-    core = {
-        p.stem if p.suffix == ".py" else p.name
-        for p in (ROOT / "core").iterdir()
-        if p.suffix == ".py" or (p / "__init__.py").exists()
-    }
-    assert set(CORE) == core - {"__init__"}
+    assert set(ROOMS) == rooms_in(ROOT) and len(ROOMS) <= MOST_ROOMS
+    assert set(CORE) == rooms_in(ROOT / "core")
     assert circles(ROOMS) == [] and circles(CORE) == []
 
 
@@ -178,38 +171,24 @@ def test_no_module_imports_itself_by_a_detour() -> None:
 
 
 def test_tasks_do_not_know_each_other() -> None:
-    names = sorted(p.name for p in (ROOT / "tasks").iterdir() if (p / "__init__.py").exists())
+    names = rooms_in(ROOT / "tasks")
     assert between(2, {name: set() for name in names}, (ROOT.name, "tasks")) == []
 
 
-def test_nothing_imports_a_built_in_task_by_name() -> None:
-    """Built-in tasks are found through the entry-point group, like anybody's."""
-    wrong = [
-        f"{f.relative_to(ROOT)} imports {n}"
-        for f in FILES
-        if not f.is_relative_to(ROOT / "tasks")
-        for n in imported(f)
-        if n.startswith("neuprim.tasks.")
-    ]
-    assert wrong == []
+def test_built_in_tasks_are_found_through_their_entry_points_like_anybody_s() -> None:
+    outside = [f for f in FILES if not f.is_relative_to(ROOT / "tasks")]
+    assert [f for f in outside if any(name.startswith("neuprim.tasks.") for name in imported(f))] == []
 
 
 def test_nobody_imports_the_command_line() -> None:
     outside = [f for f in FILES if f.name != "__main__.py" and not f.is_relative_to(ROOT / "cli")]
-    wrong = [str(f.relative_to(ROOT)) for f in outside if any(within(n, "neuprim.cli") for n in imported(f))]
-    assert wrong == []
+    assert [f for f in outside if any(f"{name}.".startswith("neuprim.cli.") for name in imported(f))] == []
 
 
 def test_runs_do_not_print() -> None:
     """What happens is told as events; ``print`` as a default says it past them."""
-    wrong = [
-        f"{f.relative_to(ROOT)}:{node.lineno}"
-        for f in FILES
-        if f.is_relative_to(ROOT / "runs")
-        for node in ast.walk(ast.parse(f.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Name) and node.id == "print"
-    ]
-    assert wrong == []
+    runs = [f for f in FILES if f.is_relative_to(ROOT / "runs")]
+    assert places(runs, lambda node: isinstance(node, ast.Name) and node.id == "print") == []
 
 
 def test_files_stay_small() -> None:
@@ -226,66 +205,36 @@ def test_files_stay_small() -> None:
 def test_tests_do_not_import_tests() -> None:
     """What several of them need is in a module without ``test_`` in its name: else a change of one test is a change of
     others."""
-    folder = Path(__file__).parent
-    wrong = [
-        f"{f.relative_to(folder)}:{node.lineno}"
-        for f in sorted(
-            [
-                *folder.rglob("*.py"),
-                *(folder.parent / "examples").rglob("*.py"),
-                *(folder.parent / "benchmarks").rglob("*.py"),
-            ]
-        )
-        for node in ast.walk(ast.parse(f.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Import | ast.ImportFrom)
-        for name in [getattr(node, "module", None) or "", *(alias.name for alias in node.names)]
-        if any(part.startswith("test_") for part in name.split("."))
-    ]
-    assert wrong == []
+    files = [f for folder in ("tests", "examples", "benchmarks") for f in (ROOT.parent / folder).rglob("*.py")]
+    importing = re.compile(r"^\s*(from|import) [\w. ]*\btest_", re.MULTILINE)
+    assert [f for f in files if importing.search(f.read_text(encoding="utf-8"))] == []
 
 
 def test_every_property_of_a_parameter_decides_something() -> None:
     """What a plugin must say about its parameters is read by the core, or there is no need to say it."""
-    read = {
-        node.attr
-        for f in FILES
-        if f.is_relative_to(ROOT / "core") and f.name != "schema.py"
-        for tree in [ast.parse(f.read_text(encoding="utf-8"))]
-        for called in [{id(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)}]
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load) and id(node) not in called
-    }
-    callables = {"init"}
-    assert {field.name for field in dataclasses.fields(ParameterSpec)} - read - callables == set()
+    read: set[str] = set()
+    for path in FILES:
+        if path.is_relative_to(ROOT / "core") and path.name != "schema.py":
+            called = {id(node.func) for node in ast.walk(TREES[path]) if isinstance(node, ast.Call)}
+            attributes = [node for node in ast.walk(TREES[path]) if isinstance(node, ast.Attribute)]
+            read |= {n.attr for n in attributes if isinstance(n.ctx, ast.Load) and id(n) not in called}
+    assert {field.name for field in dataclasses.fields(ParameterSpec)} - read - {"init"} == set()
 
 
 def test_every_module_says_what_it_is_for() -> None:
-    silent = [
-        str(f.relative_to(ROOT))
-        for f in FILES
-        if f.read_text(encoding="utf-8").strip() and not ast.get_docstring(ast.parse(f.read_text(encoding="utf-8")))
-    ]
-    assert silent == []
+    assert [f for f, tree in TREES.items() if tree.body and not ast.get_docstring(tree)] == []
 
 
 def test_nothing_unpickles_or_evaluates() -> None:
     """No file of a user's is ever executed; torch's own unpickler may read one where it is told to take nothing but
     tensors."""
-    wrong = []
-    for f in FILES:
-        for node in ast.walk(ast.parse(f.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("eval", "exec"):
-                wrong.append(f"{f.relative_to(ROOT)}:{node.lineno}")
-            tensors_alone = isinstance(node, ast.Call) and "weights_only=True" in [
-                ast.unparse(k) for k in node.keywords
-            ]
-            if isinstance(node, ast.Call) and ast.unparse(node.func) == "torch.load" and not tensors_alone:
-                wrong.append(f"{f.relative_to(ROOT)}:{node.lineno}")
-            if isinstance(node, ast.Call) and ast.unparse(node.func) in (
-                "pickle.load",
-                "pickle.loads",
-                "yaml.load",
-                "yaml.unsafe_load",
-            ):
-                wrong.append(f"{f.relative_to(ROOT)}:{node.lineno}")
-    assert wrong == []
+
+    def executes(node: ast.AST) -> bool:
+        if not isinstance(node, ast.Call):
+            return False
+        name = ast.unparse(node.func)
+        if name == "torch.load":
+            return "weights_only=True" not in [ast.unparse(keyword) for keyword in node.keywords]
+        return name in ("eval", "exec", "pickle.load", "pickle.loads", "yaml.load", "yaml.unsafe_load")
+
+    assert places(FILES, executes) == []

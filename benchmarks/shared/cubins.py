@@ -14,8 +14,6 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["Resources", "compiled", "resources"]
-
 _SIZED, _REGISTERS, _FRAME = 4, 0x2F, 0x11  # form of an attribute with a size; EIATTR_REGCOUNT, EIATTR_FRAME_SIZE
 
 
@@ -54,7 +52,7 @@ def _attributes(info: bytes) -> list[tuple[int, bytes]]:
     return found
 
 
-def resources(cubin: Path) -> Resources:
+def read_resources(cubin: Path) -> Resources:
     """Of the kernel in a cubin; of registers and stack the most that it or a function it calls takes.
 
     Raises:
@@ -76,7 +74,7 @@ def resources(cubin: Path) -> Resources:
     return Resources(max(numbers[_REGISTERS]), sum(numbers[_FRAME]), shared, sum(code))
 
 
-def compiled(kernel: Any, arch: int, block: int, folder: Path) -> Path:
+def compile_kernel(kernel: Any, arch: int, block: int, folder: Path) -> Path:
     """The cubin of a kernel that is alone in its module, for blocks of so many threads; in ``folder``, which is
     empty."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,7 @@ compared."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -11,8 +11,6 @@ from pathlib import Path
 from neuprim.config import compose, task_of
 from neuprim.core.used_settings import build_settings
 from neuprim.runs.open import load_dataset
-
-__all__ = ["AS_RECORDED", "PAPER", "SCENES", "Form", "Scene", "parameters"]
 
 
 @dataclass(frozen=True)
@@ -37,9 +35,8 @@ class Form:
         return cls(int(neurons), int(edge), source=source)
 
     def __str__(self) -> str:
-        return (
-            "gaussian" if self.gaussian else f"{self.neurons}:{self.edge}" + (f"@{self.source}" if self.source else "")
-        )
+        name = "gaussian" if self.gaussian else f"{self.neurons}:{self.edge}"
+        return f"{name}@{self.source}" if self.source else name
 
     @property
     def label(self) -> str:
@@ -51,22 +48,17 @@ class Form:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Of the model."""
+        """Settings of the model."""
         if self.gaussian:
             # of the rates 0.02, 0.1 and 0.2 the best: 23.63, 25.18, 25.37 dB on solids with 150 primitives
             return ("model.density.form=gaussian", "train.rates.log_amplitude=0.2")
-        gain = "true" if self.edge else "false"
+        gain = f"model.density.gain={'true' if self.edge else 'false'}"
         source = (f"train.supervision={self.source}",) if self.source else ()
-        return (
-            f"model.neurons={self.neurons}",
-            f"model.density.edge={self.edge}",
-            f"model.density.gain={gain}",
-            *source,
-        )
+        return (f"model.neurons={self.neurons}", f"model.density.edge={self.edge}", gain, *source)
 
-    def equal_bytes(self, primitives: int, task: str, words: Sequence[str] = ()) -> int:
+    def equal_bytes(self, primitives: int, task: str) -> int:
         """As many of these as have the parameters of ``primitives`` of the paper's form, all else equal."""
-        return round(primitives * parameters(PAPER, task, tuple(words)) / parameters(self, task, tuple(words)))
+        return round(primitives * count_parameters(PAPER, task) / count_parameters(self, task))
 
 
 PAPER = Form(8, 0)
@@ -79,14 +71,12 @@ class Scene:
     Attributes:
         words: of task, scene and what is done alike to all.
         folder: the setting that names the data, None for embedded scenes.
-        tuning: words for tuning, which keep the test views unseen: other cameras, or views held out of the training
-        ones. judged: the metric that decides.
+        judged: the metric that decides.
     """
 
     task: str
     words: tuple[str, ...]
     folder: str | None = None
-    tuning: tuple[str, ...] = ()
     judged: str = "psnr"
 
     def all_words(self, folders: Mapping[str, Path], name: str) -> tuple[str, ...]:
@@ -102,25 +92,24 @@ _FIRE = ("scene=vdb", "scene.frames='1:40'", "scene.look=embergen_fire", "scene.
 SCENES = {
     "solids": Scene("static", ("scene=solids", "scene.size=200", "train.background=white")),
     "chair": Scene("static", ("scene=blender", "train.background=white"), "scene.path"),
-    "fire": Scene("dynamic", _FIRE, "scene.vdb", ("scene.cameras=38",), "psnr_mask"),
-    "smoke_fire": Scene("dynamic", ("scene=smoke_fire", "scene.size=64"), None, ("scene.cameras=38",), "psnr_mask"),
-    "lit_solids": Scene(
-        "relight", ("scene=lit_solids", "scene.size=128"), None, ("scene.hold_out=8",), "psnr_linear_clamped"
-    ),
+    "fire": Scene("dynamic", _FIRE, "scene.vdb", "psnr_mask"),
+    "smoke_fire": Scene("dynamic", ("scene=smoke_fire", "scene.size=64"), judged="psnr_mask"),
+    "lit_solids": Scene("relight", ("scene=lit_solids", "scene.size=128"), judged="psnr_linear_clamped"),
+}
+_SMALL = {
+    "static": ("scene=solids", "scene.size=16"),
+    "dynamic": ("scene=smoke_fire", "scene.size=8", "scene.resolution=16", "scene.timesteps=2"),
+    "relight": ("scene=lit_solids", "scene.size=16"),
 }
 
 
 @cache
-def parameters(form: Form, task: str, words: tuple[str, ...] = ()) -> int:
-    """Of one primitive, colour included, of the task's preset with further ``words`` of model and train."""
-    scene = {"static": "solids", "dynamic": "smoke_fire", "relight": "lit_solids"}[task]
-    small = ("scene.size=8", "scene.resolution=16", "scene.timesteps=2") if task == "dynamic" else ("scene.size=16",)
-    own = [word for word in words if not word.startswith("scene.")]
-    config = compose([f"task={task}", f"scene={scene}", *small, *form.words, *own], check_output=False)
+def count_parameters(form: Form, task: str) -> int:
+    """Of one primitive of the task's preset, colour included."""
+    config = compose([f"task={task}", *_SMALL[task], *form.words], check_output=False)
     spec = task_of(config)
-    data = replace(
-        load_dataset(config, spec), points=None
-    )  # forms alone, without what only some of them learn from voxels
+    # without points: some forms learn more from voxels
+    data = replace(load_dataset(config, spec), points=None)
     density, colour = spec.build(build_settings(spec, config.model, config.options), data)
     geometry = 3 + 3 + 4
     return geometry + sum(parameter.size for parameter in (*density.parameters(), *colour.parameters()))

@@ -1,8 +1,9 @@
-"""How far a backend's images and gradients are from the float64 reference, on small random scenes."""
+"""How far the CUDA backend's images and gradients are from the float64 reference, on small random scenes."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -14,9 +15,6 @@ from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
-from shared.tables import Table
-
-__all__ = ["KINDS", "parity", "small_scene"]
 
 KINDS = {"thin": (500, 1), "deep": (300, 2), "inside": (200, 3)}
 """Few hits a pixel; many and opaque; around and behind the camera, with fast neurons. Primitives and seed."""
@@ -37,17 +35,16 @@ def small_scene(kind: str, neurons: int) -> list[Tensor]:
     quats = uniform(count, 4) * 2 - 1
     W1 = (uniform(count, neurons, 3) - 0.5) * (1.2 if kind == "inside" else 2 / 3)
     b1, w2 = (uniform(count, neurons) - 0.5) * 2 / 3, (uniform(count, neurons) - 0.5) * 1.2
-    return [
-        t.float().double() for t in (means, scales, quats, W1, b1, w2, uniform(count) * 2.5 + 0.6, uniform(count, 3))
-    ]
+    b2, colours = uniform(count) * 2.5 + 0.6, uniform(count, 3)
+    return [tensor.float().double() for tensor in (means, scales, quats, W1, b1, w2, b2, colours)]
 
 
-def drawn(
-    values: list[Tensor], edge: int, settings: RenderSettings, device: str, dtype: torch.dtype
+def render_with_gradients(
+    values: list[Tensor], edge: int, settings: RenderSettings, dtype: torch.dtype
 ) -> tuple[Tensor, list[Tensor]]:
     """Image with its alpha and depth, (H, W, 5), and the gradients of NAMES under random weights on all five; float64,
-    on the processor."""
-    leaves = [t.to(device, dtype).requires_grad_() for t in values]
+    on the CPU."""
+    leaves = [tensor.to(settings.device or "cpu", dtype).requires_grad_() for tensor in values]
     view = torch.eye(4, dtype=torch.float64)
     view[0, 3], view[1, 3] = 0.1, -0.05
     view.requires_grad_()
@@ -55,49 +52,37 @@ def drawn(
     means, log_scales, quats, W1, b1, w2, b2, colours = leaves
     lowered = Lowered(Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, 30.0, edge), Constant(colours))
     out = render_lowered(lowered, Camera(view, 70.0, 72.0, 31.0, 33.0, SIZE, SIZE), settings, background)
-    image = torch.cat(
-        [
-            out.rgb,
-            out.alpha[..., None],
-            torch.zeros_like(out.alpha[..., None]) if out.depth is None else out.depth[..., None],
-        ],
-        -1,
-    )
+    depth = torch.zeros_like(out.alpha) if out.depth is None else out.depth
+    image = torch.cat([out.rgb, out.alpha[..., None], depth[..., None]], -1)
     weights = torch.randn(SIZE, SIZE, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     weights[..., 4] *= 0.1
-    grads = torch.autograd.grad((image * weights.to(image)).sum(), [*leaves, view, background], allow_unused=True)
-    back = [torch.zeros(x.shape) if g is None else g for x, g in zip([*leaves, view, background], grads, strict=True)]
-    return image.detach().double().cpu(), [g.double().cpu() for g in back]
+    inputs = [*leaves, view, background]
+    grads = torch.autograd.grad((image * weights.to(image)).sum(), inputs, allow_unused=True)
+    filled = [torch.zeros(x.shape) if g is None else g for x, g in zip(inputs, grads, strict=True)]
+    return image.detach().double().cpu(), [g.double().cpu() for g in filled]
 
 
-def parity(device: str) -> list[dict[str, Any]]:
-    """Print and return errors of the CUDA backend: of images, absolute; of each gradient over its largest number; and
-    whether a rerun is the same."""
-    table, rows = Table("K, p", "scene", "image", *NAMES, "same bits"), []
+def measure_parity(device: str) -> Iterator[dict[str, Any]]:
+    """Errors of the CUDA backend: of images, absolute; of each gradient over its largest number; and whether a rerun is
+    the same."""
     for neurons, edge in ((8, 0), (8, 2), (2, 1), (2, 2), (0, 2), (16, 0)):
         for kind in KINDS:
             values, settings = small_scene(kind, neurons), RenderSettings(depth=kind == "deep")
-            truth, expected = drawn(values, edge, replace(settings, backend="reference"), "cpu", torch.float64)
+            reference = replace(settings, backend="reference", device="cpu")
+            truth, expected = render_with_gradients(values, edge, reference, torch.float64)
             own = replace(settings, backend="cuda", device=device)
-            image, found = drawn(values, edge, own, device, torch.float32)
-            again, refound = drawn(values, edge, own, device, torch.float32)
-            same = bool((image == again).all()) and all(
-                bool((a == b).all()) for a, b in zip(found, refound, strict=True)
-            )
-            worst = [
-                float((a - b).abs().max() / b.abs().max().clamp_min(1e-9)) if b.numel() else 0.0
-                for a, b in zip(found, expected, strict=True)
-            ]
-            error = float((image - truth).abs().max())
-            rows.append(
-                {
-                    "neurons": neurons,
-                    "edge": edge,
-                    "scene": kind,
-                    "image": error,
-                    "gradients": dict(zip(NAMES, worst, strict=True)),
-                    "same": same,
-                }
-            )
-            table.row(f"{neurons}, {edge}", kind, f"{error:.1e}", *(f"{w:.0e}" for w in worst), same)
-    return rows
+            image, found = render_with_gradients(values, edge, own, torch.float32)
+            again, refound = render_with_gradients(values, edge, own, torch.float32)
+            errors = {
+                name: float((a - b).abs().max() / b.abs().max().clamp_min(1e-9)) if b.numel() else 0.0
+                for name, a, b in zip(NAMES, found, expected, strict=True)
+            }
+            same = all(torch.equal(a, b) for a, b in zip([image, *found], [again, *refound], strict=True))
+            yield {
+                "neurons": neurons,
+                "edge": edge,
+                "scene": kind,
+                "image": float((image - truth).abs().max()),
+                "gradients": errors,
+                "same": same,
+            }

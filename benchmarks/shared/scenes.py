@@ -11,15 +11,10 @@ from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 
-__all__ = ["lower", "random_scene", "view"]
-
 
 def random_scene(count: int, seed: int = 0, overlap: float = 30.0, rate: float = 4.0) -> dict[str, torch.Tensor]:
     """Anisotropic primitives filling a unit cube that cover its face ``overlap`` times; phases turn up to ``rate``
-    radians per axis and m.
-
-    The same numbers in the same order as the study's generator, so that both sides draw one scene.
-    """
+    radians per axis and m."""
     g = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> torch.Tensor:
@@ -32,16 +27,8 @@ def random_scene(count: int, seed: int = 0, overlap: float = 30.0, rate: float =
     scales = math.sqrt(overlap / (count * math.pi)) * 0.92 * torch.exp(0.45 * normal(count, 3))
     W1, b1 = (2 * uniform(count, 8, 3) - 1) * rate, (2 * uniform(count, 8) - 1) * math.pi
     w2, b2 = normal(count, 8) * 0.12, 0.12 + 0.1 * uniform(count)
-    return {
-        "mean": means,
-        "scale": scales,
-        "quat": normal(count, 4),
-        "W1": W1,
-        "b1": b1,
-        "w2": w2,
-        "b2": b2,
-        "col": uniform(count, 3),
-    }
+    quats, colours = normal(count, 4), uniform(count, 3)
+    return {"mean": means, "scale": scales, "quat": quats, "W1": W1, "b1": b1, "w2": w2, "b2": b2, "col": colours}
 
 
 def lower(p: dict[str, torch.Tensor]) -> Lowered:

@@ -1,13 +1,19 @@
-"""Tables in README and docs: printed as they grow, and put between their markers so that no number is typed by hand."""
+"""Tables of README and docs, put between their markers so that no number is typed by hand."""
 
 from __future__ import annotations
 
 import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 README = ROOT / "README.md"
-PERFORMANCE = ROOT / "docs" / "performance.md"
+PERFORMANCE = DOCS / "performance.md"
+
+Run = Mapping[str, Any]
+Columns = Mapping[str, Callable[[Any], object]]
 
 
 def between_markers(page: Path, name: str, text: str) -> None:
@@ -34,7 +40,34 @@ class Table:
         return "\n".join(self.lines)
 
 
-def spread(values: list[float], digits: int) -> str:
+def make_table(columns: Columns, rows: Iterable[Any]) -> Table:
+    """A table with a row per entry; ``columns`` maps each heading to what fills its cells."""
+    table = Table(*columns)
+    for row in rows:
+        table.row(*(cell(row) for cell in columns.values()))
+    return table
+
+
+def group_runs(runs: Iterable[Run], *keys: str) -> dict[tuple[Any, ...], list[Run]]:
+    """Runs by the values of ``keys``, in the order in which they first occur."""
+    groups: dict[tuple[Any, ...], list[Run]] = {}
+    for run in runs:
+        groups.setdefault(tuple(run[key] for key in keys), []).append(run)
+    return groups
+
+
+def spread(values: Sequence[float], digits: int) -> str:
     """Mean ± half the spread."""
     half = (max(values) - min(values)) / 2
     return f"{statistics.mean(values):.{digits}f}" + (f" ± {half:.{digits}f}" if len(values) > 1 else "")
+
+
+def spread_of(runs: Sequence[Run], key: str, digits: int = 2) -> str:
+    """Mean ± half the spread of a number of some runs; a dash without runs."""
+    return spread([run[key] for run in runs], digits) if runs else "–"
+
+
+def format_range(numbers: Iterable[int], joint: str = " to ") -> str:
+    """The smallest and the largest number, once if they are equal."""
+    found = sorted(numbers)
+    return joint.join(f"{n:,}" for n in dict.fromkeys((found[0], found[-1])))

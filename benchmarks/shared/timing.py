@@ -6,8 +6,6 @@ import math
 import time
 from collections.abc import Callable
 
-__all__ = ["fastest"]
-
 
 def fastest(pairs: list[Callable[[], None]], rounds: int) -> list[float]:
     """Fastest of ``rounds`` runs of each, taken in turns so that all meet the same noise; one run each beforehand."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,16 +12,17 @@ import torch
 
 from neuprim.config import compose
 from neuprim.config.command_settings import LauncherSettings
-from neuprim.core.checkpoint import save_model
+from neuprim.core.compute.threads import cpu_name
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.events import Events
 from neuprim.runs.fit import Fitted, compile_kernels, prepare_training, train_to_end
 from neuprim.runs.launch.jobs import Job, Result
 from neuprim.runs.launch.launcher import launch
-
-__all__ = ["Trial", "begin", "paces_of", "recorded", "run_all"]
+from shared.records import read_trials, update_record
 
 _TURN, _DRAWS = 16, 500
+
+Measure = Callable[[Fitted, dict[str, Any]], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,9 @@ class Trial:
         iterations: the budget, in steps.
         hold_out: n > 1: judge by every n-th training view instead of the test views.
         facts: what the record says of it besides its numbers.
-        keep: folder for configuration and model, or None.
         interventions: into the population, spread evenly, so that short runs have as many as one of the preset's own
-        length;
-            None leaves the steps between two of them to the preset.
+            length; None leaves the steps between two of them to the preset.
+        change: a function of a module that changes the training before it starts.
     """
 
     name: str
@@ -47,94 +46,68 @@ class Trial:
     seed: int = 0
     hold_out: int = 0
     facts: tuple[tuple[str, Any], ...] = ()
-    keep: Path | None = None
     interventions: int | None = 20
+    change: Callable[[Fitted], None] | None = None
 
 
 def begin(trial: Trial) -> Fitted:
     """Data and a fresh model."""
-    words = [
-        *trial.words,
-        f"seed={trial.seed}",
-        f"train.iterations={trial.iterations}",
-        "train.max_seconds=null",
-        "train.eval_every=0",
-        "renderer.threads=1",
-    ]
+    words = [*trial.words, f"seed={trial.seed}", f"train.iterations={trial.iterations}"]
+    words += ["train.max_seconds=null", "train.eval_every=0", "renderer.threads=1"]
     if trial.interventions and not any(word.startswith("train.population.every=") for word in words):
         words.append(f"train.population.every={max(trial.iterations // trial.interventions, 1)}")
-    if trial.keep is not None:
-        words.append(f"output_dir='{trial.keep.resolve()}'")
-    return prepare_training(compose(words, check_output=False), hold_out=trial.hold_out)
+    fitted = prepare_training(compose(words, check_output=False), hold_out=trial.hold_out)
+    if trial.change is not None:
+        trial.change(fitted)
+    return fitted
 
 
-Wanted = Sequence[str] | Callable[[dict[str, Any]], dict[str, Any]]
-"""Of the metrics: names, of those that are there, or a function of a module that takes out what is to be kept."""
-
-
-def train(trial: Trial, wanted: Wanted) -> dict[str, Any]:
+def train(trial: Trial, wanted: Sequence[str] | Measure) -> dict[str, Any]:
     """One run and its numbers; ``cpu_seconds`` are those that this thread computed while the model learned."""
     torch.set_num_threads(1)
     fitted = begin(trial)
     compile_kernels(fitted.trainer)
     start = time.thread_time()
     train_to_end(fitted)
-    seconds = time.thread_time() - start
+    numbers = {"trial": trial.name, "seed": trial.seed, "iterations": trial.iterations}
+    numbers["cpu_seconds"] = time.thread_time() - start
     metrics = fitted.metrics()
-    if trial.keep is not None:
-        trial.keep.mkdir(parents=True, exist_ok=True)
-        (trial.keep / "config.yaml").write_text(fitted.config.to_yaml())
-        save_model(
-            trial.keep / "model.safetensors",
-            fitted.model,
-            fitted.config.task,
-            {"color_space": fitted.dataset.color_space},
-        )
-    return {
-        "trial": trial.name,
-        "seed": trial.seed,
-        "iterations": trial.iterations,
-        "cpu_seconds": seconds,
-        **dict(trial.facts),
-        **(wanted(metrics) if callable(wanted) else {k: metrics[k] for k in wanted if k in metrics}),
-    }
+    chosen = wanted(fitted, metrics) if callable(wanted) else {k: metrics[k] for k in wanted if k in metrics}
+    return {**numbers, **dict(trial.facts), **chosen}
 
 
-def recorded(path: Path) -> list[dict[str, Any]]:
-    """The trials of a file, none if there is no file."""
-    found: list[dict[str, Any]] = json.loads(path.read_text()).get("trials", []) if path.exists() else []
-    return found
+def train_job(data: tuple[Trial, Sequence[str] | Measure], attempt: int, events: Events) -> dict[str, Any]:
+    """The function of a job; after its worker died a trial begins anew."""
+    return train(*data)
 
 
 def run_all(
-    trials: Sequence[Trial],
-    path: Path,
-    wanted: Wanted,
-    jobs: int,
-    shown: Callable[[dict[str, Any]], str],
-    beside: Mapping[str, Any] = {},
+    trials: Sequence[Trial], path: Path, wanted: Sequence[str] | Measure, jobs: int = 1, **entries: Any
 ) -> None:
-    """Train what ``path`` does not have yet, ``jobs`` at a time, and write it after every one, with what stands
-    ``beside`` the trials."""
-    known = {row["trial"] for row in recorded(path)}
+    """Train what the record at ``path`` does not have yet, ``jobs`` at a time, and write it after every one.
+
+    Args:
+        wanted: names of metrics, of which those that a task has are recorded, or a function of a module that makes the
+            numbers of the record.
+        entries: further entries of the record.
+    """
+    known = {row["trial"] for row in read_trials(path)}
     waiting = [trial for trial in trials if trial.name not in known]
-    path.parent.mkdir(parents=True, exist_ok=True)
 
     def keep(number: int, result: Result) -> None:
-        if result.state != "done":
-            return
-        row, whole = result.value, json.loads(path.read_text()) if path.exists() else {}
-        whole |= {**beside, "trials": sorted([*whole.get("trials", []), row], key=lambda r: r["trial"])}
-        path.write_text(json.dumps(whole, indent=1) + "\n")
-        print(f"{time.strftime('%H:%M')} {row['trial']}: {shown(row)}", flush=True)
+        if result.state == "done":
+            row = result.value
+            rows = sorted([*read_trials(path), row], key=lambda r: r["trial"])
+            update_record(path, **{"cpu": cpu_name(), **entries, "trials": rows})
+            print(f"{time.strftime('%H:%M')} {row['trial']}: {row.get('psnr', float('nan')):.2f} dB", flush=True)
 
-    work = [Job(trial.name, f"{__name__}:train_one", (trial, wanted)) for trial in waiting]
+    work = [Job(trial.name, f"{__name__}:train_job", (trial, wanted)) for trial in waiting]
     settings = LauncherSettings("processes", workers=jobs, threads=1)
-    results = launch(work, settings, path.parent / f".{path.stem}-launch", ended=keep)
+    results = launch(work, settings, path.parent / f".{path.stem}-launch", on_result=keep)
     failed = [
         f"{trial.name}: {result.trace or result.line}"
         for trial, result in zip(waiting, results, strict=True)
-        if result and result.state == "failed"
+        if result is not None and result.state == "failed"
     ]
     if failed:
         raise SystemExit("\n".join(failed))
@@ -142,12 +115,21 @@ def run_all(
         raise KeyboardInterrupt
 
 
-def train_one(data: tuple[Trial, Wanted], attempt: int, events: Events) -> dict[str, Any]:
-    """The function of a job; after its worker died a trial begins anew."""
-    return train(*data)
+def measure_paces(path: Path, reference: Trial, others: Mapping[str, Trial], steps: int) -> dict[str, float]:
+    """Time of a step over that of ``reference``, by name; measured where the record at ``path`` does not have it."""
+    known = dict(update_record(path).get("paces", {}))
+    missing = {name: trial for name, trial in others.items() if name not in known}
+    if missing:  # ratios travel, seconds do not: the reference takes part every time
+        torch.set_num_threads(1)
+        trainers = {name: begin(trial).trainer for name, trial in {"": reference, **missing}.items()}
+        took = time_steps(trainers, steps)
+        known |= {name: took[name] / took[""] for name in missing}
+        update_record(path, paces=known)
+        print("paces:", {name: round(known[name], 3) for name in missing}, flush=True)
+    return known
 
 
-def paces_of(trainers: Mapping[str, Trainer], steps: int = 480) -> dict[str, float]:
+def time_steps(trainers: Mapping[str, Trainer], steps: int) -> dict[str, float]:
     """Seconds a step of each, taking turns so that all meet the same noise; a mean over ``steps``, as a run pays for
     every one of them.
 
@@ -161,9 +143,8 @@ def paces_of(trainers: Mapping[str, Trainer], steps: int = 480) -> dict[str, flo
             generator = torch.Generator().manual_seed(0)
             for _ in range(_DRAWS):
                 trainer.dataset.points.draw(8, generator)
-    clock = (
-        time.thread_time if all(trainer.renderer.threads == 1 for trainer in trainers.values()) else time.perf_counter
-    )
+    alone = all(trainer.renderer.threads == 1 for trainer in trainers.values())
+    clock = time.thread_time if alone else time.perf_counter
     took, turns = dict.fromkeys(trainers, 0.0), max(steps // _TURN, 1)
     for _ in range(turns):
         for name, trainer in trainers.items():

@@ -22,9 +22,7 @@ from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import render_lowered
-from neuprim.core.render.draw import draw_samples
 from neuprim.core.render.near_plane import resolve_near
-from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.reference.rays import pixel_directions, screen_boxes
 from neuprim.core.settings import RenderSettings, SortOrder
 
@@ -41,50 +39,31 @@ class SortingError:
     mean_abs: float
 
 
+@torch.no_grad()
 def measure_sorting_errors(
-    lowered: Lowered,
-    camera: Camera,
-    settings: RenderSettings | None = None,
-    background: Tensor | None = None,
-    steps: int = 64,
-    keep: Keep = "opacity",
+    lowered: Lowered, camera: Camera, settings: RenderSettings, background: Tensor, steps: int, keep: Keep
 ) -> dict[SortOrder, SortingError]:
-    """Return the errors of both orders against :func:`render_unsorted_volume`, each drawn with ``settings`` but for its ``sort``."""
-    settings = settings or RenderSettings()
+    """Return the errors of both orders against :func:`render_unsorted_volume`, all drawn with ``settings``."""
     errors: dict[SortOrder, SortingError] = {}
-    with torch.no_grad():
-        truth = render_unsorted_volume(lowered, camera, settings, background, steps, keep).rgb
-        for order in _ORDERS:
-            image = render_lowered(lowered, camera, replace(settings, sort=order), background).rgb.double()
-            difference = (image - truth).abs()
-            errors[order] = SortingError(psnr(image, truth), difference.mean().item())
+    truth = render_unsorted_volume(lowered, camera, settings, background, steps, keep)
+    for order in _ORDERS:
+        image = render_lowered(lowered, camera, replace(settings, sort=order), background).rgb.double()
+        errors[order] = SortingError(psnr(image, truth), (image - truth).abs().mean().item())
     return errors
 
 
 @torch.no_grad()
 def render_unsorted_volume(
-    lowered: Lowered,
-    camera: Camera,
-    settings: RenderSettings | None = None,
-    background: Tensor | None = None,
-    steps: int = 64,
-    keep: Keep = "opacity",
-) -> RenderOutput:
-    """Render the emission-absorption image of the summed densities, float64, without gradients.
+    lowered: Lowered, camera: Camera, settings: RenderSettings, background: Tensor, steps: int, keep: Keep
+) -> Tensor:
+    """Render the emission-absorption image of the summed densities, (H, W, C) float64.
 
     Each ray is cut into cells at the ends of all its chords and at ``steps`` even divisions. Within a cell the set of
     primitives is fixed, the optical depth of each is its closed line integral, and only their mixture is taken as
     constant: errors go as steps^-2.
     """
-    lowered.check(camera.viewmat, background)
-    settings = resolve_near(settings or RenderSettings(near="auto"), lowered.geometry.means, [camera])
-
-    def draw(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
-        return _Volume(lowered, camera, settings, steps, keep).draw(background)
-
-    if settings.samples > 1:
-        return draw_samples(draw, lowered, camera, background, settings)
-    return draw(lowered, camera, background, settings)
+    settings = resolve_near(settings, lowered.geometry.means, [camera])
+    return _Volume(lowered, camera, settings, steps, keep).draw(background)
 
 
 class _Volume:
@@ -93,31 +72,27 @@ class _Volume:
     def __init__(self, lowered: Lowered, camera: Camera, settings: RenderSettings, steps: int, keep: Keep) -> None:
         self.lowered, self.camera, self.settings, self.steps, self.keep = lowered, camera, settings, steps, keep
         g = lowered.geometry
-        self.channels, self.stats = lowered.colour.channels, RenderStats("unsorted", g.count)
+        self.channels = lowered.colour.channels
         scaled = quaternion_to_matrix(g.quats.double()) / g.log_scales.double().exp()[:, None, :]
         self.whiten = scaled.transpose(1, 2)  # scene -> unit sphere
 
-    def draw(self, background: Tensor | None) -> RenderOutput:
-        camera, channels, settings = self.camera, self.channels, self.settings
+    def draw(self, background: Tensor) -> Tensor:
+        camera, channels = self.camera, self.channels
         directions = pixel_directions(camera)
-        boxes = screen_boxes(self.lowered.geometry, camera, settings.near_plane)
-        image = torch.zeros(camera.height, camera.width, channels + 2, dtype=torch.float64)
+        boxes = screen_boxes(self.lowered.geometry, camera, self.settings.near_plane)
+        image = torch.zeros(camera.height, camera.width, channels + 1, dtype=torch.float64)
         for y in range(0, camera.height, _BLOCK):
             for x in range(0, camera.width, _BLOCK):
                 window = directions[y : y + _BLOCK, x : x + _BLOCK]
                 h, w = window.shape[:2]
                 near_block = (boxes[:, 0] < x + w) & (boxes[:, 2] > x) & (boxes[:, 1] < y + h) & (boxes[:, 3] > y)
                 rays = self._march(near_block.nonzero()[:, 0], window.reshape(-1, 3))
-                image[y : y + h, x : x + w] = rays.reshape(h, w, channels + 2)
-        rgb, T = image[..., :channels], image[..., channels]
-        if background is not None:
-            rgb = rgb + T[..., None] * background.double()
-        depth = mean_depth(image[..., channels + 1], 1 - T) if settings.depth else None
-        return RenderOutput(rgb, 1 - T, depth, self.stats)
+                image[y : y + h, x : x + w] = rays.reshape(h, w, channels + 1)
+        return image[..., :channels] + image[..., channels:] * background.double()
 
     def _march(self, rows: Tensor, d: Tensor) -> Tensor:
-        """(P, channels + 2): premultiplied colour, transmittance and sum of w z of P unit rays ``d`` (camera axes)
-        against ``rows``."""
+        """(P, channels + 1): premultiplied colour and transmittance of P unit rays ``d`` (camera axes) against
+        ``rows``."""
         g, camera, settings, channels = self.lowered.geometry, self.camera, self.settings, self.channels
         whiten = self.whiten[rows]
         origin = camera.position.detach().double()
@@ -136,10 +111,9 @@ class _Volume:
         chords = Pairs.of(g, prim, origin, world[ray], t0, t1)
         alpha = -torch.expm1(-self.lowered.optical_depth(chords).clamp_min(0))
         alpha = torch.where(alpha >= settings.alpha_min, alpha.clamp_max(settings.alpha_max), torch.zeros_like(alpha))
-        self.stats.pairs += len(prim)
         P = d.shape[0]
         if len(prim) == 0:
-            return torch.cat([d.new_zeros(P, channels), d.new_ones(P, 1), d.new_zeros(P, 1)], 1)
+            return torch.cat([d.new_zeros(P, channels), d.new_ones(P, 1)], 1)
 
         # cells of every ray
         most = int(torch.bincount(ray, minlength=P).max())
@@ -156,19 +130,14 @@ class _Volume:
 
         # optical depth of every chord in every cell of it
         middle = (low + high) / 2
-        chord, cell = ((middle[ray] > t0[:, None]) & (middle[ray] < t1[:, None]) & (high > low)[ray]).nonzero(
-            as_tuple=True
-        )
+        inside = (middle[ray] > t0[:, None]) & (middle[ray] < t1[:, None]) & (high > low)[ray]
+        chord, cell = inside.nonzero(as_tuple=True)
         pieces = Pairs.of(g, prim[chord], origin, world[ray[chord]], low[ray[chord], cell], high[ray[chord], cell])
         tau = self.lowered.optical_depth(pieces).clamp_min(0)
         if self.keep == "opacity":
             total = torch.zeros_like(alpha).index_add(0, chord, tau)
-            scale = torch.where(
-                total > 0,
-                -torch.log1p(-alpha) / torch.where(total > 0, total, torch.ones_like(total)),
-                torch.zeros_like(total),
-            )
-            tau = tau * scale[chord]
+            wanted = torch.where(total > 0, -torch.log1p(-alpha), torch.zeros_like(total))
+            tau = tau * (wanted / torch.where(total > 0, total, torch.ones_like(total)))[chord]
 
         # emission and absorption: a cell's colour is the mean of its primitives', weighted by optical depth
         c = self.lowered.chord_colours(chords)
@@ -181,5 +150,4 @@ class _Volume:
         behind = depth.cumsum(1)
         weight = -torch.expm1(-depth) * (depth - behind).exp()
         rgb = (weight[..., None] * mixed).sum(1)
-        z = (weight * middle).sum(1) * d[:, 2]
-        return torch.cat([rgb, (-behind[:, -1:]).exp(), z[:, None]], 1)
+        return torch.cat([rgb, (-behind[:, -1:]).exp()], 1)

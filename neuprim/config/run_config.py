@@ -214,7 +214,8 @@ def _read_mapping(file: Path) -> Mapping[str, Any]:
 
 def _lacks(data: Mapping[str, Any], name: str) -> bool:
     group, _, key = name.partition(".")
-    return key not in (data.get(group) or {})
+    found = data.get(group)
+    return not isinstance(found, Mapping) or key not in found
 
 
 def flatten(node: Mapping[str, Any], where: str = "") -> dict[str, Any]:

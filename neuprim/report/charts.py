@@ -73,6 +73,7 @@ class Points:
         size: diameter in points; None marks the points of a line only while they are few.
         spread: half-lengths of horizontal error bars.
         labels: texts below the points.
+        name: text in the chart's legend.
     """
 
     x: Sequence[float] | NDArray[np.float64]
@@ -84,6 +85,7 @@ class Points:
     opacity: float = 1.0
     spread: Sequence[float] = ()
     labels: Sequence[str] = ()
+    name: str = ""
 
     def finite(self) -> Points:
         """Return those with finite coordinates."""
@@ -235,15 +237,16 @@ def draw_svg(chart: Chart) -> str | None:
         return _to_element(figure, chart.title)
 
 
-def write_png_charts(path: Path, charts: Sequence[Chart]) -> None:
-    """Write charts side by side into a PNG file."""
+def write_png_charts(path: Path, charts: Sequence[Chart], rows: int = 1) -> None:
+    """Write charts side by side into a PNG file, ``rows`` times as many as a row holds."""
     from matplotlib.figure import Figure
 
     charts = [chart for chart in charts if chart.known()]
-    width, height = LARGE
+    columns, (width, height) = -(-len(charts) // rows), LARGE
     with _style():
-        figure = Figure(figsize=(len(charts) * width / 72, 1.12 * height / 72), layout="constrained", facecolor="white")
-        for axes, chart in zip(figure.subplots(1, len(charts), squeeze=False)[0], charts, strict=True):
+        size = (columns * width / 72, rows * 1.12 * height / 72)
+        figure = Figure(figsize=size, layout="constrained", facecolor="white")
+        for axes, chart in zip(figure.subplots(rows, columns, squeeze=False).flat, charts, strict=False):
             _draw(axes, chart, PNG_COLOURS)
             axes.set_title(chart.title, fontsize=11, loc="left", color=PNG_COLOURS[INK])
             axes.set_ylabel(chart.y_label, color=PNG_COLOURS[INK])
@@ -280,6 +283,8 @@ def _draw(axes: Axes, chart: Chart, palette: Mapping[str, str]) -> None:
         axes.set_ylim((bottom + top - chart.least) / 2, (bottom + top + chart.least) / 2)
     axes.tick_params(colors=palette[GRID], labelcolor=palette[INK])
     axes.grid(True, axis="both" if chart.least else "y", color=palette[GRID])
+    if any(points.name for points in known):
+        axes.legend(frameon=False, labelcolor=palette[INK])
     for spine in axes.spines.values():
         spine.set_color(palette[GRID])
 
@@ -294,7 +299,7 @@ def _draw_points(axes: Axes, points: Points, colour: str) -> None:
         x, y = np.array([x[group].mean() for group in groups]), middle
         axes.fill_between(x, low, high, color=colour, alpha=0.22, linewidth=0, zorder=2)
     if points.joined:
-        axes.plot(x, y, color=colour, linewidth=1.5, zorder=3)
+        axes.plot(x, y, color=colour, linewidth=1.5, label=points.name or None, zorder=3)
     if size:
         errors = points.spread if any(points.spread) else None
         axes.errorbar(

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from neuprim.core.data import Dataset
 from neuprim.core.errors import DataError
 from neuprim.core.task import SceneContext
 from tests.fuzz import mutations as m
 from tests.fuzz.mutations import Mutation
-
-__all__ = ["FORMATS", "Format"]
 
 Files = Mapping[str, Mutation]
 
@@ -45,16 +43,24 @@ class Format:
 # ---------------------------------------------------------------- scenes
 
 
-def _shown(dataset: Dataset) -> None:
-    for views in (dataset.train, dataset.test):
-        for i in range(len(views)):
-            views.view(i), views.pixels(i)
+def _reader(module: str, function: str, *arguments: Any) -> Callable[[Path], None]:
+    """Read ``a.*`` by a function of a module that is imported when it is needed."""
+    return lambda folder: [
+        getattr(import_module(module), function)(path, *arguments) for path in sorted(folder.glob("a.*"))
+    ]
 
 
-def _loaded(load: Callable[..., Dataset], **settings: Any) -> Callable[[Path], None]:
-    return lambda folder: _shown(
-        load({"path": str(folder), **settings}, SceneContext(seed=0, cache_dir=folder / "cache"))
-    )
+def _loader(module: str, function: str = "load") -> Callable[[Path], None]:
+    """Load the folder as a scene, and look at every view."""
+
+    def read(folder: Path) -> None:
+        load = getattr(import_module(module), function)
+        dataset = load({"path": str(folder)}, SceneContext(seed=0, cache_dir=folder / "cache"))
+        for views in (dataset.train, dataset.test):
+            for i in range(len(views)):
+                views.view(i), views.pixels(i)
+
+    return read
 
 
 def _posed(
@@ -80,20 +86,9 @@ def _blender(folder: Path) -> None:
 
 
 def _nerfstudio(folder: Path) -> None:
-    lens = {
-        "w": 16,
-        "h": 12,
-        "fl_x": 15.0,
-        "fl_y": 16.0,
-        "cx": 8.0,
-        "cy": 6.0,
-        "camera_model": "OPENCV",
-        "k1": 0.01,
-        "k2": 0.0,
-        "p1": 0.0,
-        "p2": 0.0,
-    }
-    _posed(folder, "", 9, head=lens | {"ply_file_path": "points.ply"}, mask_path="mask.png")
+    lens = {"w": 16, "h": 12, "fl_x": 15.0, "fl_y": 16.0, "cx": 8.0, "cy": 6.0, "camera_model": "OPENCV", "k1": 0.01}
+    lens |= {"k2": 0.0, "p1": 0.0, "p2": 0.0, "ply_file_path": "points.ply"}
+    _posed(folder, "", 9, head=lens, mask_path="mask.png")
     Image.fromarray(np.full((12, 16), 255, np.uint8)).save(folder / "mask.png")
     _points(folder)
 
@@ -114,10 +109,8 @@ def _colmap(text: bool) -> Callable[[Path], None]:
 
         from tests.tasks.conftest import Scenes
 
-        model, lens = (
-            pycolmap.Reconstruction(),
-            pycolmap.Camera(model="OPENCV", width=16, height=12, params=[15, 16, 8, 6, 0.1, 0, 0, 0], camera_id=1),
-        )
+        model, params = pycolmap.Reconstruction(), [15, 16, 8, 6, 0.1, 0, 0, 0]
+        lens = pycolmap.Camera(model="OPENCV", width=16, height=12, params=params, camera_id=1)
         model.add_camera_with_trivial_rig(lens)
         for i, pose in enumerate(Scenes.ring(9)):
             view = np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
@@ -166,8 +159,11 @@ def _read_points(folder: Path) -> None:
             read_points(folder / name, 3, "srgb")
 
 
-_EXPORTED = {"text.ply": "ply", "a.stl": "stl", "text.stl": "stl_ascii"}
-_OPTIONS = {"text.ply": {"encoding": "ascii"}}
+_EXPORTED: dict[str, tuple[str, dict[str, Any]]] = {
+    "text.ply": ("ply", {"encoding": "ascii"}),
+    "a.stl": ("stl", {}),
+    "text.stl": ("stl_ascii", {}),
+}
 
 
 def _mesh(name: str) -> tuple[Callable[[Path], Any], Callable[[Path], None]]:
@@ -181,9 +177,8 @@ def _mesh(name: str) -> tuple[Callable[[Path], Any], Callable[[Path], None]]:
         if name == "a.ply":
             models.write_ply(path, vertices, faces, np.full((24, 3), 99, np.uint8))
         elif path.suffix in (".ply", ".stl"):
-            data = trimesh.Trimesh(vertices, faces, process=False).export(
-                file_type=_EXPORTED[name], **_OPTIONS.get(name, {})
-            )
+            kind, options = _EXPORTED[name]
+            data = trimesh.Trimesh(vertices, faces, process=False).export(file_type=kind, **options)
             path.write_bytes(data.encode() if isinstance(data, str) else data)
         else:
             {".glb": models.write_glb, ".gltf": models.write_gltf, ".obj": models.write_obj}[path.suffix](path)
@@ -191,9 +186,8 @@ def _mesh(name: str) -> tuple[Callable[[Path], Any], Callable[[Path], None]]:
     def read(folder: Path) -> None:
         from neuprim.tasks.static.mesh.generate import MeshSettings, generate
 
-        generate(
-            MeshSettings(path=folder / name, size=8, train_views=1, test_views=1, supersampling=1), folder / "cache"
-        )
+        settings = MeshSettings(path=folder / name, size=8, train_views=1, test_views=1, supersampling=1)
+        generate(settings, folder / "cache")
 
     return make, read
 
@@ -223,18 +217,6 @@ def _read_images(folder: Path) -> None:
     for path in sorted(folder.glob("a.*")):
         image_info(path)
         read_image(path)
-
-
-def _read_mask(folder: Path) -> None:
-    from neuprim.core.io.images import read_mask
-
-    read_mask(folder / "a.png")
-
-
-def _read_environment(folder: Path) -> None:
-    from neuprim.core.environment import read_environment
-
-    read_environment(folder / "a.exr")
 
 
 def _vdb(folder: Path) -> None:
@@ -420,12 +402,8 @@ def _read_records(folder: Path) -> None:
     if (chunks := read_chunks(folder)) is not None:
         chunks.write(folder / "again")
     if (target := read_target(folder / "target")) is not None:
-        (
-            target.write(folder / "again"),
-            target.words,
-            target.finished("size"),
-            [one.count for one in target.attempts if one.outcome],
-        )
+        target.write(folder / "again")
+        repr((target.words, target.finished("size"), [one.count for one in target.attempts if one.outcome]))
     read_front(folder / "run")
     if (points := read_record(folder / "run/tradeoff/tradeoff.json")) is not None:
         write_points(folder / "out.csv", points, 40)
@@ -479,38 +457,30 @@ def _read_checkpoint(folder: Path) -> None:
     _resume(_fitted(folder), ignore_event)
 
 
-_DATASETS = "neuprim.tasks.static.datasets"
-
-
-def _lazy(module: str, function: str = "load", **settings: Any) -> Callable[[Path], None]:
-    import importlib
-
-    return lambda folder: _loaded(getattr(importlib.import_module(module), function), **settings)(folder)
+_DATASETS, _IMAGES = "neuprim.tasks.static.datasets", "neuprim.core.io.images"
 
 
 _RECORDS: Files = {
-    **dict.fromkeys(
-        ("run/metrics.json", "run/renders/worst.json", "sweep.json", "chunks.json", "target/target.json"), m.json_of
-    ),
-    **dict.fromkeys(("run/tradeoff/tradeoff.json", "trial.json", "status.json"), m.json_of),
     "run/metrics.jsonl": m.jsonl_of,
+    **dict.fromkeys(("run/metrics.json", "run/renders/worst.json", "run/tradeoff/tradeoff.json"), m.json_of),
+    **dict.fromkeys(("sweep.json", "chunks.json", "target/target.json", "trial.json", "status.json"), m.json_of),
 }
 _SPLITS: Files = {"transforms_train.json": m.json_of, "transforms_test.json": m.json_of}
 
 FORMATS: dict[str, Format] = {
-    "blender": Format(_blender, _lazy(_DATASETS, "load_blender"), _SPLITS),
+    "blender": Format(_blender, _loader(_DATASETS, "load_blender"), _SPLITS),
     "nerfstudio": Format(
         _nerfstudio,
-        _lazy(_DATASETS, "load_nerfstudio"),
+        _loader(_DATASETS, "load_nerfstudio"),
         {"transforms.json": m.json_of, "points.ply": m.text_of, "mask.png": m.png},
     ),
-    "multiview": Format(_multiview, _lazy("neuprim.tasks.dynamic.multiview"), _SPLITS, slow=True),
-    "olat": Format(_olat, _lazy("neuprim.tasks.relight.olat"), _SPLITS),
+    "multiview": Format(_multiview, _loader("neuprim.tasks.dynamic.multiview"), _SPLITS, slow=True),
+    "olat": Format(_olat, _loader("neuprim.tasks.relight.olat"), _SPLITS),
     "colmap": Format(
-        _colmap(False), _lazy(_DATASETS, "load_colmap"), {f"sparse/0/{part}.bin": m.lies(0, 400) for part in _PARTS}
+        _colmap(False), _loader(_DATASETS, "load_colmap"), {f"sparse/0/{part}.bin": m.lies(0, 400) for part in _PARTS}
     ),
     "colmap-text": Format(
-        _colmap(True), _lazy(_DATASETS, "load_colmap"), {f"sparse/0/{part}.txt": m.text_of for part in _PARTS}
+        _colmap(True), _loader(_DATASETS, "load_colmap"), {f"sparse/0/{part}.txt": m.text_of for part in _PARTS}
     ),
     "points": Format(_points, _read_points, {"points.ply": m.text_of, "text.ply": m.text_of}),
     "gaussians": Format(_gaussians, _read_points, {"points.ply": m.text_of}),
@@ -524,9 +494,9 @@ FORMATS: dict[str, Format] = {
     "png": Format(_images("png"), _read_images, {"a.png": m.png}),
     "jpeg": Format(_images("jpg"), _read_images, {"a.jpg": m.lies(0, 400)}),
     "webp": Format(_images("webp"), _read_images, {"a.webp": m.lies(0, 100)}),
-    "mask": Format(_images("png"), _read_mask, {"a.png": m.png}),
+    "mask": Format(_images("png"), _reader(_IMAGES, "read_mask"), {"a.png": m.png}),
     "exr": Format(_exr, _read_images, {"a.exr": m.lies(0, 420)}),
-    "environment": Format(_exr, _read_environment, {"a.exr": m.lies(0, 420)}),
+    "environment": Format(_exr, _reader("neuprim.core.environment", "read_environment"), {"a.exr": m.lies(0, 420)}),
     "vdb": Format(_vdb, _read_vdb, {f"{name}.vdb": m.lies(0, 1500) for name in ("none", "zip", "blosc")}),
     "voxels": Format(_voxels, _read_voxels, {"a.npz": m.npz}),
     "cameras": Format(_cameras, _read_cameras("c.json"), {"c.json": m.json_of}),

@@ -16,119 +16,23 @@ from typing import Any
 import numpy as np
 import yaml
 
-__all__ = [
-    "bytes_of",
-    "compressed",
-    "container",
-    "glb",
-    "json_of",
-    "jsonl_of",
-    "lies",
-    "npz",
-    "png",
-    "safetensors",
-    "text_of",
-    "yaml_of",
-]
-
 Mutation = Callable[[bytes, Random], bytes]
 
 _NUMBERS = (
-    0,
-    1,
-    -1,
-    2,
-    255,
-    256,
-    65535,
-    2**31 - 1,
-    2**31,
-    -(2**31),
-    2**32 - 1,
-    2**40,
-    2**53 + 1,
-    2**63 - 1,
-    2**64 - 1,
-    10**30,
+    *(0, 1, -1, 2, 255, 256, 65535, 2**31 - 1, 2**31, -(2**31), 2**32 - 1),
+    *(2**40, 2**53 + 1, 2**63 - 1, 2**64 - 1, 10**30),
 )
+_ELSEWHERE = ("/etc/passwd", "http://127.0.0.1:9/x", "${oc.env:HOME}")
 _WORDS = (
-    *(
-        "nan",
-        "inf",
-        "-inf",
-        "1e400",
-        "-1",
-        "0",
-        "4294967295",
-        "99999999999999999999999",
-        "1e38",
-        "-1e300",
-        "0x10",
-        "",
-        " ",
-        "\t",
-    ),
-    *(
-        "a" * 3000,
-        "../../../../etc/passwd",
-        "/etc/passwd",
-        "http://127.0.0.1:9/x",
-        "${oc.env:HOME}",
-        "\x00",
-        "\u202e",
-        "ÿ",
-        "%s%n",
-        "--",
-    ),
+    *("nan", "inf", "-inf", "1e400", "-1", "0", "4294967295", "99999999999999999999999", "1e38", "-1e300", "0x10"),
+    *("", " ", "\t", "a" * 3000, "../../../../etc/passwd", *_ELSEWHERE, "\x00", "\u202e", "ÿ", "%s%n", "--"),
 )
 _VALUES: tuple[Any, ...] = (
-    *(
-        None,
-        True,
-        False,
-        [],
-        {},
-        [[]],
-        [{}],
-        "",
-        "text",
-        0,
-        1,
-        -1,
-        1.5,
-        float("nan"),
-        float("inf"),
-        -float("inf"),
-        1e300,
-        -1e300,
-        1e-300,
-    ),
-    *(
-        2**31,
-        -(2**31),
-        2**63,
-        10**30,
-        10**400,
-        -(10**400),
-        "nan",
-        "1e400",
-        "1",
-        [0] * 1000,
-        [[1, 2], [3]],
-        ["a", None],
-        {"a": {"b": []}},
-    ),
-    *(
-        "../../outside",
-        "/etc/passwd",
-        "http://127.0.0.1:9/x",
-        "${oc.env:HOME}",
-        "${.}",
-        "a" * 5000,
-        "\x00",
-        "é\ud800",
-        [[[[[[[[1]]]]]]]],
-    ),
+    *(None, True, False, [], {}, [[]], [{}], "", "text", 0, 1, -1, 1.5),
+    *(float("nan"), float("inf"), -float("inf"), 1e300, -1e300, 1e-300),
+    *(2**31, -(2**31), 2**63, 10**30, 10**400, -(10**400), "nan", "1e400", "1"),
+    *([0] * 1000, [[1, 2], [3]], ["a", None], {"a": {"b": []}}, "../../outside", *_ELSEWHERE),
+    *("${.}", "a" * 5000, "\x00", "é\ud800", [[[[[[[[1]]]]]]]]),
 )
 
 
@@ -149,9 +53,8 @@ def bytes_of(raw: bytes, rng: Random) -> bytes:
         elif how == 2:
             data[at : at + size] = b"\xff" * size
         elif how == 3:
-            data[at : at + size] = (rng.choice((*_NUMBERS[:-1], len(raw), len(raw) + 1)) % 2 ** (8 * size)).to_bytes(
-                size, rng.choice(("little", "big"))
-            )  # type: ignore[arg-type]
+            number = rng.choice((*_NUMBERS[:-1], len(raw), len(raw) + 1))
+            data[at : at + size] = (number % 2 ** (8 * size)).to_bytes(size, rng.choice(("little", "big")))
         elif how == 4:
             data[at:at] = data[at : at + rng.choice((1, 16, 200))]
         elif how == 5:
@@ -184,9 +87,8 @@ def text_of(raw: bytes, rng: Random) -> bytes:
     """Replace, repeat, drop or exchange words and lines of a text; what follows a header that ends in ``end_header`` is
     left."""
     head, mark, body = raw.partition(b"end_header\n")
-    lines = [[""]] + [
-        re.split(r"(\s+|[=,()\"]+)", line) for line in head.decode("utf-8", "surrogateescape").split("\n")
-    ]
+    text = head.decode("utf-8", "surrogateescape")
+    lines = [[""], *(re.split(r"(\s+|[=,()\"]+)", line) for line in text.split("\n"))]
     for _ in range(rng.randint(1, 3)):
         line = rng.choice(lines[1:] or lines)
         at, how = rng.randrange(max(len(line), 1)), rng.randrange(6)
@@ -220,9 +122,8 @@ def _document(value: Any, rng: Random) -> Any:
         elif how == 2:
             holder[key] = rng.choice(([holder[key]], {"a": holder[key]}, str(holder[key])[:200]))
         elif how == 3 and isinstance(holder, dict):
-            holder[rng.choice(("", "x" * 300, "file_path", "__class__", str(key).upper()))] = rng.choice(
-                (holder.pop(key), deepcopy(rng.choice(_VALUES)))
-            )
+            name = rng.choice(("", "x" * 300, "file_path", "__class__", str(key).upper()))
+            holder[name] = rng.choice((holder.pop(key), deepcopy(rng.choice(_VALUES))))
         elif how == 4:
             other, name = rng.choice(nodes)
             if name in (range(len(other)) if isinstance(other, list) else other) and other is not root:
@@ -244,12 +145,8 @@ def _dumped(value: Any, rng: Random) -> bytes:
     JSON at all."""
     text = json.dumps(value)
     if rng.random() < 0.15:
-        text = re.sub(
-            r"\d+\.?\d*",
-            lambda m: rng.choice((m[0], m[0], "1e400", "-1e400", "9" * 5000)),
-            text,
-            count=rng.randint(1, 6),
-        )
+        beyond = ("1e400", "-1e400", "9" * 5000)
+        text = re.sub(r"\d+\.?\d*", lambda m: rng.choice((m[0], m[0], *beyond)), text, count=rng.randint(1, 6))
     if rng.random() < 0.05:
         text = re.sub(r'("\w+"): ', r"\1: 7, \1: ", text, count=1)
     if rng.random() < 0.03:
@@ -275,18 +172,8 @@ def yaml_of(raw: bytes, rng: Random) -> bytes:
         bomb = b"a: &a [1,1,1,1,1,1,1,1,1]\n" + b"".join(
             b"%c: &%c [%s]\n" % (c, c, b",".join([b"*%c" % (c - 1)] * 9)) for c in range(98, 107)
         )
-        value = rng.choice(
-            (
-                b"&x [*x]",
-                b"!!python/object/apply:os.system ['false']",
-                b"2001-01-01",
-                b"!!binary aGk=",
-                b"{[1]: 2}",
-                b"? [a]\n",
-                b"1:30",
-                b"0o777",
-            )
-        )
+        tags = (b"&x [*x]", b"!!python/object/apply:os.system ['false']", b"2001-01-01", b"!!binary aGk=")
+        value = rng.choice((*tags, b"{[1]: 2}", b"? [a]\n", b"1:30", b"0o777"))
         if rng.random() < 0.3:
             return raw + bomb + key + b": *j\n"
         return re.sub(rb"^%s:.*(\n[ -].*)*" % key, lambda m: key + b": " + value, raw, count=1, flags=re.MULTILINE)
@@ -296,15 +183,6 @@ def yaml_of(raw: bytes, rng: Random) -> bytes:
 
 
 # ---------------------------------------------------------------- containers
-
-
-def container(read: Callable[[bytes], Any], write: Callable[[bytes, Any], bytes]) -> Mutation:
-    """Mutations of a JSON document inside a file whose sizes and check sums stay right."""
-
-    def mutate(raw: bytes, rng: Random) -> bytes:
-        return write(raw, _dumped(_document(read(raw), rng), rng))
-
-    return mutate
 
 
 def safetensors(raw: bytes, rng: Random) -> bytes:
@@ -357,17 +235,15 @@ def png(raw: bytes, rng: Random) -> bytes:
         if how == 0 and len(chunks) > 1:
             del chunks[index]
         elif how == 1:
-            chunks.insert(
-                rng.randrange(len(chunks)), (rng.choice((kind, b"PLTE", b"tRNS", b"iCCP", b"zTXt", b"eXIf")), content)
-            )
+            other = rng.choice((kind, b"PLTE", b"tRNS", b"iCCP", b"zTXt", b"eXIf"))
+            chunks.insert(rng.randrange(len(chunks)), (other, content))
         elif how == 2:
             chunks[index] = (kind, zlib.compress(bytes(rng.choice((1, 10**6, 10**8))), 9))
         else:
             chunks[index] = (kind, lies(0, max(len(content), 1))(content, rng))
-    parts = (
-        len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big") for kind, body in chunks
+    return raw[:8] + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks
     )
-    return raw[:8] + b"".join(parts)
 
 
 def npz(raw: bytes, rng: Random) -> bytes:
@@ -379,10 +255,8 @@ def npz(raw: bytes, rng: Random) -> bytes:
     if how == 0:
         del members[name]
     elif how == 1:
-        np.lib.format.write_array(
-            made,
-            rng.choice((np.zeros(0), np.array(["a"]), np.zeros((2, 2, 2)), np.full(5, np.nan), np.zeros(3, ">f8"))),
-        )
+        arrays = (np.zeros(0), np.array(["a"]), np.zeros((2, 2, 2)), np.full(5, np.nan), np.zeros(3, ">f8"))
+        np.lib.format.write_array(made, rng.choice(arrays))
         members[name] = made.getvalue()
     elif how == 2:
         members[name] = text_of(members[name][:128], rng)[:128].ljust(128) + members[name][128:]

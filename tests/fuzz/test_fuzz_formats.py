@@ -1,6 +1,5 @@
 """Every format that is read, spoiled in bytes and in structure: what comes is valid, or one line; within 4 GB and
-seconds; nothing is written or contacted. ``python -m tests.fuzz.worker`` does the same from a console, and repeats a
-failure by its number.
+seconds; nothing is written or contacted. ``python -m tests.fuzz.worker`` repeats a failure by its number.
 """
 
 from __future__ import annotations
@@ -24,6 +23,9 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of addre
 FEW, MANY = 40, 300
 """Files of each kind and format: by default, and in the slow tests."""
 
+PACKAGES = {"colmap": "pycolmap", "colmap-text": "pycolmap", "cameras-usd": "pxr", "cameras-usdc": "pxr"}
+"""Optional ones that formats need."""
+
 
 class Reader:
     """A worker, started again when it dies."""
@@ -31,22 +33,17 @@ class Reader:
     def __init__(self, folder: Path) -> None:
         self.folder, self.process = folder, None
 
-    def faults(self, name: str, kind: str, count: int, seed: int) -> list[Any]:
+    def find_faults(self, name: str, kind: str, count: int, seed: int) -> list[Any]:
         """What is wrong with the reading of so many spoiled files; all numbers of one that ends the worker are
         named."""
         if self.process is None or self.process.poll() is not None:
             root = Path(__file__).parents[2]
             paths = os.pathsep.join([str(root), *filter(None, sys.path)])
-            env = os.environ | {
-                "PYTHONPATH": paths,
-                "TMPDIR": str(self.folder),
-                "OMP_NUM_THREADS": "1",
-                "OPENBLAS_NUM_THREADS": "1",
-            }
+            env = os.environ | {"PYTHONPATH": paths, "TMPDIR": str(self.folder)}
+            env |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
             command = [sys.executable, "-m", "tests.fuzz.worker"]
-            self.process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=env, text=True
-            )
+            self.process = subprocess.Popen(command, env=env, text=True, **pipes)
         assert self.process.stdin is not None and self.process.stdout is not None
         self.process.stdin.write(json.dumps([name, kind, 0, count, seed]) + "\n")
         self.process.stdin.flush()
@@ -68,24 +65,12 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reader]:
         made.process.wait()
 
 
-def needs(name: str) -> None:
-    """Skips a format whose optional package is missing."""
-    packages = {"colmap": "pycolmap", "colmap-text": "pycolmap", "cameras-usd": "pxr"}
-    if name in packages:
-        pytest.importorskip(packages[name], reason=f"needs {packages[name]}")
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", FORMATS)
-def test_spoiled_files_are_read_or_refused(name: str, kind: str, reader: Reader) -> None:
-    needs(name)
-    assert reader.faults(name, kind, FEW // 4 if FORMATS[name].slow else FEW, 0) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", FORMATS)
-def test_many_spoiled_files_are_read_or_refused(name: str, kind: str, reader: Reader) -> None:
-    needs(name)
-    for seed in range(1, 11):  # in parts, so that a hanging one is noticed soon
-        assert reader.faults(name, kind, MANY // 10, seed) == []
+@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 11), marks=pytest.mark.slow)], ids=["few", "many"])
+def test_spoiled_files_are_read_or_refused(seeds: range, name: str, kind: str, reader: Reader) -> None:
+    if name in PACKAGES:
+        pytest.importorskip(PACKAGES[name], reason=f"needs {PACKAGES[name]}")
+    count = MANY // 10 if len(seeds) > 1 else FEW // 4 if FORMATS[name].slow else FEW
+    for seed in seeds:  # in parts, so that a hanging one is noticed soon
+        assert reader.find_faults(name, kind, count, seed) == []

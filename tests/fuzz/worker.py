@@ -1,8 +1,7 @@
 """Reads spoiled files in a process that may take 4 GB, write into one folder and reach nobody.
 
-    python -m tests.fuzz.worker FORMAT|all bytes|structure COUNT [SEED]   # every failure as a line
-    python -m tests.fuzz.worker FORMAT bytes|structure =NUMBER [SEED]     # one of them again, with its traceback; the
-    file is left in the folder
+    python -m tests.fuzz.worker FORMAT bytes|structure NUMBER SEED   # one of them again, with its traceback; the file
+                                                                     # is left in the folder
 
 Without words it serves the tests: a JSON list of FORMAT, KIND, FIRST, LAST and SEED a line, answered by a JSON list of
 failures.
@@ -47,30 +46,23 @@ class Sandbox:
     def __init__(self, folder: Path) -> None:
         self.folder, self.offences = folder, list[str]()
         self.watching = False
-        sys.addaudithook(self._seen)
+        sys.addaudithook(self._audit)
 
-    def _seen(self, event: str, args: tuple[Any, ...]) -> None:
+    def _audit(self, event: str, args: tuple[Any, ...]) -> None:
         if not self.watching:
             return
         if event in ("socket.connect", "socket.getaddrinfo", "socket.gethostbyname"):
             self.offences.append(f"{event} {args[1:]}")
         elif event == "open" and isinstance(args[0], str) and (args[2] or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
-            self._written(args[0])
-        elif event in (
-            "os.remove",
-            "os.rmdir",
-            "os.mkdir",
-            "os.rename",
-            "os.symlink",
-            "os.link",
-            "os.truncate",
-            "os.chmod",
-        ):
-            self._written(args[1] if event in ("os.rename", "os.symlink", "os.link") else args[0])
+            self._check_place(args[0])
+        elif event in ("os.rename", "os.symlink", "os.link"):
+            self._check_place(args[1])
+        elif event in ("os.remove", "os.rmdir", "os.mkdir", "os.truncate", "os.chmod"):
+            self._check_place(args[0])
         elif event in ("os.system", "os.exec", "pty.spawn"):
             self.offences.append(event)
 
-    def _written(self, path: Any) -> None:
+    def _check_place(self, path: Any) -> None:
         place = Path(os.path.abspath(os.fsdecode(path))) if isinstance(path, str | bytes | os.PathLike) else Path("/")
         if not place.is_relative_to(self.folder) and not str(place).startswith(("/dev/", "/proc/")):
             self.offences.append(f"writes {place}")
@@ -118,8 +110,8 @@ class Example:
         assert self.pristine, f"{name}: none of {list(self.format.files)} was made"
         self.format.read(self.folder)  # a valid file is read
 
-    def spoiled(self, kind: str, number: int, seed: int) -> str:
-        """Writes the file of that number; its name."""
+    def spoil(self, kind: str, number: int, seed: int) -> str:
+        """Write the file of that number and return its name."""
         rng = Random(f"{self.name} {kind} {number} {seed}")
         file = list(self.pristine)[number % len(self.pristine)]
         mutate = self.format.files[file]
@@ -136,9 +128,9 @@ class Example:
         (self.folder / file).write_bytes(self.pristine[file])
         shutil.rmtree(self.folder / "cache", ignore_errors=True)
 
-    def fault(self, kind: str, number: int, seed: int) -> str | None:
+    def find_fault(self, kind: str, number: int, seed: int) -> str | None:
         """What is wrong with how the file of that number is read; None: it is valid, or refused in one line."""
-        file = self.spoiled(kind, number, seed)
+        file = self.spoil(kind, number, seed)
         try:
             return self._read()
         finally:
@@ -154,9 +146,8 @@ class Example:
                 self.format.read(self.folder)
         except NeuprimError as error:
             text = one_line(error) or ""
-            if (
-                str(self.folder) not in text and "/etc/passwd" not in text
-            ):  # a picture that a spoiled file names is named by its own path
+            # a picture that a spoiled file names is named by its own path
+            if str(self.folder) not in text and "/etc/passwd" not in text:
                 return f"names no file: {text[:200]!r}"
             text = text.replace(str(self.folder), "")
             if len(text) > LONGEST:
@@ -164,10 +155,9 @@ class Example:
         except _TooLong:
             return f"took more than {SECONDS} s"
         except BaseException as error:
-            places = [
-                f"{Path(place.filename).name}:{place.lineno}" for place in traceback.extract_tb(error.__traceback__)
-            ]
-            return f"{type(error).__name__}: {' '.join(str(error).split())[:150]} at {' '.join(places[-4:])}"
+            frames = traceback.extract_tb(error.__traceback__)[-4:]
+            places = " ".join(f"{Path(frame.filename).name}:{frame.lineno}" for frame in frames)
+            return f"{type(error).__name__}: {' '.join(str(error).split())[:150]} at {places}"
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
         return self.sandbox.offences[0] if self.sandbox.offences else None
@@ -184,37 +174,22 @@ def serve(sandbox: Sandbox) -> None:
             examples[name] = Example(name, sandbox)
         faults = []
         for number in range(first, last):
-            (sandbox.folder / "now").write_text(f"{name} {kind} ={number} {seed}")
-            if (fault := examples[name].fault(kind, number, seed)) is not None:
+            (sandbox.folder / "now").write_text(f"{name} {kind} {number} {seed}")
+            if (fault := examples[name].find_fault(kind, number, seed)) is not None:
                 faults.append([number, fault])
         print(json.dumps(faults), file=out, flush=True)
 
 
-def main(words: list[str]) -> int:
-    from tests.fuzz.formats import FORMATS
-
+def main(words: list[str]) -> None:
     sandbox = prepare()
     if not words:
         serve(sandbox)
-        return 0
-    name, kind, count, *rest = words
-    seed = int(rest[0]) if rest else 0
-    if count.startswith("="):
-        example = Example(name, sandbox)
-        print("spoiled", example.folder / example.spoiled(kind, int(count[1:]), seed), flush=True)
-        example.format.read(example.folder)
-        return 0
-    total = 0
-    for one in FORMATS if name == "all" else name.split(","):
-        example = Example(one, sandbox)
-        for number in range(int(count)):
-            print(f"{one} {kind} ={number} {seed}", file=sys.stderr, end="\r")
-            if (fault := example.fault(kind, number, seed)) is not None:
-                total += 1
-                print(f"{one} {kind} ={number} {seed}: {fault}", flush=True)
-    shutil.rmtree(sandbox.folder, ignore_errors=True)
-    return min(total, 1)
+        return
+    name, kind, number, seed = words
+    example = Example(name, sandbox)
+    print("spoiled", example.folder / example.spoil(kind, int(number), int(seed)), flush=True)
+    example.format.read(example.folder)
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(sys.argv[1:])

@@ -1,12 +1,11 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Adam over all parameters of a model in two launches on a GPU: one checks that gradients are finite, one steps.
+"""Adam over all parameters of a model in two launches on a card: one that looks for numbers that are not finite, one
+that moves.
 
 In torch code a step is a hundred launches, which take longer than a small frame. Warp is imported with this module.
 """
 
 import functools
-import itertools
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +13,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute.warp import OPTIONS, array, launch, wp
+
+__all__ = ["TOGETHER", "adam_rows"]
 
 TOGETHER = 16
 """Parameters of a launch."""
@@ -88,14 +89,15 @@ def _kernels() -> tuple[Any, Any]:
 
 def adam_rows(
     values: Sequence[Tensor], grads: Sequence[Tensor], firsts: Sequence[Tensor], seconds: Sequence[Tensor], rates: Sequence[float],
-    age: Tensor, betas: tuple[float, float],
+    age: Tensor, betas: tuple[float, float], logs: tuple[float, float],
 ) -> bool:  # fmt: skip
-    """Take one step in place; returns whether all gradients were finite, and if not nothing has changed. The host waits
-    for the device once.
+    """One step in place; whether all gradients were finite, and if not nothing has changed. The host waits for the
+    device once.
 
     Args:
-        values, grads, firsts, seconds: (N, ...) float32, none empty; all but ``grads`` contiguous.
+        values, grads, firsts, seconds: (N, ...) float32, contiguous, none empty.
         age: (N,) int64, this step included.
+        logs: natural logarithms of ``betas``.
     """
     device = age.device
     bad = torch.zeros(1, dtype=torch.int32, device=device)
@@ -104,18 +106,26 @@ def adam_rows(
     groups = []
     for at in range(0, len(values), TOGETHER):
         some = slice(at, at + TOGETHER)
-        ends = list(itertools.accumulate(value.numel() for value in values[some]))
-        total, spare = ends[-1], TOGETHER - len(ends)
+        ends, total = [], 0
+        for value in values[some]:
+            total += value.numel()
+            ends.append(total)
+        spare = TOGETHER - len(ends)
         pointers = [
             _POINTERS(*[x.data_ptr() for x in group[some]], *[0] * spare) for group in (values, grads, firsts, seconds)
         ]
-        widths = _LONGS(*[value[0].numel() for value in values[some]], *[1] * spare)
-        own_rates = _FLOATS(*rates[some], *[0.0] * spare)
-        groups.append((total, pointers, _LONGS(*ends, *[total + 1] * spare), widths, own_rates))
+        widths = _LONGS(*[value.numel() // value.shape[0] for value in values[some]], *[1] * spare)
+        groups.append(
+            (total, pointers, _LONGS(*ends, *[total + 1] * spare), widths, _FLOATS(*rates[some], *[0.0] * spare))
+        )
     flag = array(bad, wp.int32)
     for total, pointers, ends_, _, _ in groups:
         launch(check, total, (pointers[1], ends_, flag), device)
-    constants = (*betas, *(1 - beta for beta in betas), *map(math.log, betas), array(age, wp.int64), flag)
-    for total, pointers, ends_, widths, own_rates in groups:
-        launch(move, total, (*pointers, ends_, widths, own_rates, *constants), device)
+    for total, pointers, ends_, widths, own in groups:
+        launch(
+            move,
+            total,
+            (*pointers, ends_, widths, own, *betas, *(1 - beta for beta in betas), *logs, array(age, wp.int64), flag),
+            device,
+        )
     return int(bad) == 0

@@ -31,7 +31,7 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 @pytest.fixture
 def record(script: ModuleType) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(script.RESULTS.read_text(encoding="utf-8"))
+    found: dict[str, Any] = json.loads(script.RECORD.read_text(encoding="utf-8"))
     return found
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import subprocess
 import sys
@@ -74,19 +73,6 @@ def test_edges_and_gains_are_those_of_a_model(backend: str) -> None:
         assert not torch.allclose(soft.rgb, hard, atol=1e-2)
         (grad,) = torch.autograd.grad(soft.rgb.sum(), log_gain)
         assert float(grad.abs().max()) > 1e-3
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_colours_of_each_camera(backend: str) -> None:
-    a = arguments()
-    per_camera = torch.stack([a["colors"], 1 - a["colors"], 0.5 * a["colors"]]).requires_grad_()
-    out = neuprim.rasterize(**{**a, "colors": per_camera}, **by(backend))
-    for c in range(3):
-        alone = neuprim.rasterize(**{**a, "colors": per_camera[c].detach()}, **by(backend))
-        assert torch.equal(out.rgb[c], alone.rgb[c])
-    out.rgb[1].sum().backward()
-    assert per_camera.grad is not None and per_camera.grad[1].abs().max() > 0
-    assert per_camera.grad[0].abs().max() == per_camera.grad[2].abs().max() == 0
 
 
 def grads(backend: str, names: list[str], dtype: torch.dtype) -> dict[str, Tensor]:
@@ -198,47 +184,26 @@ def put(name: str, value: Any) -> Any:
 NAN = float("nan")
 BAD: dict[str, tuple[Any, type[NeuprimError], str]] = {
     "means flat": (put("means", lambda v: v.flatten()), DataError, r"means has shape \(90,\); expected \(N, 3\)"),
-    "log_scales": (put("log_scales", lambda v: v[:, :1]), DataError, r"log_scales has shape \(30, 1\); expected \(30, 3\)"),
-    "quats": (put("quats", lambda v: v[:, :3]), DataError, r"quats has shape \(30, 3\); expected \(30, 4\)"),
     "W1": (put("W1", lambda v: v.transpose(1, 2)), DataError, r"W1 has shape \(30, 3, 8\); expected \(N, K, 3\) with N=30"),
-    "W1 wide": (put("W1", lambda v: v.repeat(1, 40, 1)), DataError, r"W1 has shape \(30, 320, 3\); .*K at most 256"),
-    "W1 sparse": (put("W1", lambda v: v.to_sparse()), DataError, r"W1 has layout torch\.sparse_coo; expected a dense tensor"),
-    "omega0 type": (put("omega0", "30"), DataError, r"omega0 has type str; expected a finite number"),
-    "b1": (put("b1", lambda v: v[:, :4]), DataError, r"b1 has shape \(30, 4\); expected \(30, 8\).*K=8"),
     "w2": (put("w2", lambda v: v[:7]), DataError, r"w2 has shape \(7, 8\); expected \(30, 8\)"),
     "b2": (put("b2", lambda v: v.expand(30, 2)), DataError, r"b2 has shape \(30, 2\); expected \(30, 1\) or \(30,\)"),
     "colors rows": (put("colors", lambda v: v[:29]), DataError, r"colors has shape \(29, 3\); expected \(N, channels\)"),
-    "colors empty": (put("colors", lambda v: v[:, :0]), DataError, r"colors has shape \(30, 0\).*channels >= 1"),
     "colors views": (put("colors", lambda v: v.expand(2, 30, 3)), DataError, r"colors has shape \(2, 30, 3\); expected \(3, 30, channels\)"),
-    "type": (put("means", lambda v: v.numpy()), DataError, r"means has type ndarray; expected a torch tensor"),
-    "half": (put("quats", lambda v: v.half()), DataError, r"quats has dtype torch\.float16; expected torch\.float32 or torch\.float64"),
     "mixed": (put("w2", lambda v: v.double()), DataError, r"w2 has dtype torch\.float64; expected torch\.float32, as means has"),
     "device": (put("colors", lambda v: v.to("meta")), DataError, r"colors has device meta; expected cpu"),
     "nan": (changed("b1", (13, 2), NAN), NonFiniteError, r"b1 of primitive 13 is not finite"),
-    "inf": (changed("means", (4, 0), -float("inf")), NonFiniteError, r"means of primitive 4 is not finite"),
     "zero quat": (changed("quats", (9,), 0.0), NonFiniteError, r"quats of primitive 9 is zero"),
-    "viewmats shape": (put("viewmats", lambda v: v[0]), DataError, r"viewmats has shape \(4, 4\); expected \(C, 4, 4\)"),
     "viewmats nan": (changed("viewmats", (1, 0, 3), NAN), DataError, r"viewmats\[1\].*non-finite"),
     "viewmats scaled": (put("viewmats", lambda v: v * 2), DataError, r"viewmats\[0\].*expected a rotation"),
-    "viewmats transposed": (put("viewmats", lambda v: v.transpose(1, 2)), DataError, r"viewmats\[0\] has last row .*expected \[0, 0, 0, 1\]"),
-    "viewmats dtype": (put("viewmats", lambda v: v.long()), DataError, r"viewmats has dtype torch\.int64"),
-    "Ks count": (put("Ks", lambda v: v[:2]), DataError, r"Ks has shape \(2, 3, 3\); expected \(3, 3, 3\)"),
-    "Ks 4x4": (put("Ks", lambda v: torch.eye(4).expand(3, 4, 4)), DataError, r"Ks has shape \(3, 4, 4\)"),
-    "Ks nan": (changed("Ks", (2, 0, 0), NAN), DataError, r"Ks\[2\] has entries .*expected finite"),
     "Ks skew": (changed("Ks", (1, 0, 1), 0.5), DataError, r"Ks\[1\] has skew K\[0,1\]=0\.5.*not supported"),
     "Ks last row": (changed("Ks", (0, 2, 2), 2.0), DataError, r"Ks\[0\] has last row \[0\.0, 0\.0, 2\.0\]; expected \[0, 0, 1\]"),
     "Ks focal": (changed("Ks", (0, 1, 1), -5.0), DataError, r"Ks\[0\] has focal lengths .*fy=-5\.0; expected positive"),
     "width": (put("width", 0), DataError, r"width has value 0; expected a positive int"),
-    "height": (put("height", 30.0), DataError, r"height has value 30\.0; expected a positive int"),
-    "omega0": (put("omega0", float("inf")), DataError, r"omega0 has value inf; expected a finite number"),
     "edge": (put("edge", 3), DataError, r"edge has value 3; expected 0, 1 or 2"),
     "log_gain": (put("log_gain", torch.zeros(29)), DataError, r"log_gain has shape \(29,\); expected \(30, 1\) or \(30,\)"),
-    "log_gain nan": (put("log_gain", torch.full((30,), NAN)), NonFiniteError, r"log_gain of primitive 0 is not finite"),
     "backgrounds": (put("backgrounds", torch.ones(2, 3)), DataError, r"backgrounds has shape \(2, 3\); expected \(3,\) or \(3, 3\)"),
     "backgrounds nan": (put("backgrounds", torch.full((3,), NAN)), NonFiniteError, r"backgrounds is not finite"),
     "setting": (put("alpha_mim", 0.1), ConfigError, r"unknown setting 'alpha_mim'; did you mean 'alpha_min'"),
-    "setting value": (put("near", -1.0), ConfigError, r"near=-1\.0: expected a positive distance"),
-    "setting type": (put("near", "close"), ConfigError, r"near=close: expected a finite number above 0, or auto$"),
 }  # fmt: skip
 
 
@@ -260,14 +225,3 @@ def test_importing_the_package_stays_light_and_the_name_stays_a_function() -> No
     assert done.returncode == 1 and "AttributeError: module 'neuprim' has no attribute 'nothing'" in done.stderr
     assert inspect.isfunction(neuprim.rasterize)
     assert list(inspect.signature(neuprim.rasterize).parameters)[:2] == ["means", "log_scales"]
-
-
-def test_the_example_learns(capsys: pytest.CaptureFixture[str]) -> None:
-    path = Path(__file__).parents[1] / "examples" / "train_your_own.py"
-    spec = importlib.util.spec_from_file_location("train_your_own", path)
-    assert spec is not None and spec.loader is not None
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
-    losses = example.train(60)
-    assert losses[-1] < 0.5 * losses[0], losses[:: len(losses) - 1]
-    assert capsys.readouterr().out.startswith("step    0  loss")

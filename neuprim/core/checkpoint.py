@@ -8,7 +8,7 @@ both.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from neuprim.core import compression
 from neuprim.core.errors import CheckpointError, cut, nearest
 from neuprim.core.io.files import atomic_path
 from neuprim.core.io.plain import finite, load_json
-from neuprim.core.io.safetensors_stream import TensorType, write_safetensors_stream
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.sparse_storage import load_sparse, store_sparse
@@ -92,24 +91,6 @@ def _checked(path: Path, header: Any, kind: str) -> dict[str, Any]:
     if not isinstance(background, list) or any(finite(value) is None for value in background):
         raise CheckpointError(f"{path}: background is {cut(repr(background))}; expected finite numbers")
     return header
-
-
-def write_in_pieces(
-    path: Path,
-    kind: str,
-    kinds: Mapping[str, TensorType],
-    header: Mapping[str, Any],
-    pieces: Callable[[str], Iterable[Tensor]],
-) -> None:
-    """Write as :func:`write` tensors that do not fit into memory (:mod:`neuprim.core.io.safetensors_stream`)."""
-    text = json.dumps({"format": FORMAT, "kind": kind, **header}, allow_nan=False)
-    try:
-        with atomic_path(path) as temporary:
-            write_safetensors_stream(temporary, kinds, {_KEY: text}, pieces)
-    except OSError as error:
-        raise CheckpointError(
-            f"{path}: could not write the {kind}: {error}; the previous one, if any, is untouched"
-        ) from error
 
 
 def shapes(path: Path, kind: str) -> dict[str, tuple[int, ...]]:

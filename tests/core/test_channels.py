@@ -48,10 +48,6 @@ def test_without_a_display_it_is_said_what_is_shown(names: tuple[str, ...], show
     assert not found[..., len(indices) :].any()
 
 
-def test_many_names_are_listed_by_their_ends() -> None:
-    assert Channels(default_channel_names(31)).listed == "c0, c1, c2, … c30 (31 channels)"
-
-
 def test_the_tasks_own_display_is_what_is_shown() -> None:
     channels = Channels(BANDS, "linear", lambda x: x.flip(-1)[..., :3], "bands")
     values = image(5)
@@ -122,30 +118,3 @@ def test_exr_gives_back_every_channel_by_its_name(tmp_path: Path, names: tuple[s
     assert torch.equal(images.read_image(path, channels=names[-1:]), expected[..., -1:])
     with OpenEXR.File(str(path), separate_channels=True) as file:
         assert set(file.channels()) == set(names)
-
-
-def test_exr_refusals_name_the_channels(tmp_path: Path) -> None:
-    path = tmp_path / "a.exr"
-
-    def refuses(call: Any, *words: str) -> None:
-        with pytest.raises(DataError) as caught:
-            call()
-        assert all(w in str(caught.value) for w in (str(path), *words)), caught.value
-
-    refuses(lambda: write_exr(path, image(5)), "(4, 6, 5); expected (H, W, 3) or (H, W, 4)")
-    refuses(
-        lambda: write_exr(path, image(4), names=BANDS),
-        "(4, 6, 4); expected (H, W, 5), for the channels 450nm, 550 nm",
-    )
-    refuses(lambda: write_exr(path, image(2), names=("a", "a")), "names[1] is 'a' once more")
-    assert not path.exists()
-    write_exr(path, image(5), names=BANDS)
-    refuses(
-        lambda: images.read_image(path),
-        "channels are 450nm, 550 nm, NIR, layer.R, Ünïcode; expected R, G, B and optionally A",
-    )
-    refuses(lambda: images.read_image(path, channels=("NIR", "red")), "channels are 450nm", "expected NIR, red")
-    refuses(lambda: images.read_image(path, channels=()), "expected some to be asked for")
-    images.write_png(path, torch.zeros(2, 2, 3))
-    refuses(lambda: images.read_image(path, channels=("NIR",)), "not an OpenEXR file")
-    refuses(lambda: exr_channels(path), "not an OpenEXR file")

@@ -136,23 +136,6 @@ def test_a_full_disk_leaves_the_old_file(saved: Path, monkeypatch: pytest.Monkey
     assert [p.name for p in saved.parent.iterdir()] == [saved.name]
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
-def test_an_interruption_leaves_the_old_file(
-    saved: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
-) -> None:
-    before = saved.read_bytes()
-
-    def stop(tensors: dict[str, Tensor], name: str, metadata: dict[str, str]) -> None:
-        Path(name).write_bytes(b"partial")
-        raise error
-
-    monkeypatch.setattr(checkpoint, "save_file", stop)
-    with pytest.raises(error):
-        checkpoint.save_model(saved, model(2), "static", {})
-    assert saved.read_bytes() == before
-    assert [p.name for p in saved.parent.iterdir()] == [saved.name]
-
-
 def test_a_header_that_claims_terabytes(saved: Path) -> None:
     whole = saved.read_bytes()
     for length in (2**40, 2**63, 2**64 - 1):

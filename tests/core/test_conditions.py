@@ -81,13 +81,6 @@ def test_one_number_a_list_a_range_and_any_mixture() -> None:
     assert shifts("0:0.5:2,1,.5:1e0:2") == [0.0, 0.5, 1.0, 0.5, 1.0]
 
 
-def test_a_task_that_reads_ranges_itself_is_asked_first() -> None:
-    def cubes(text: str) -> list[Tensor]:
-        return [torch.tensor(0.125), torch.tensor(1.0)] if ":" in text else number(text)
-
-    assert shifts("0.5:1:9,0", replace(SHIFT, parse=cubes)) == [0.125, 1.0, 0.0]
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

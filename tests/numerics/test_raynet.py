@@ -47,27 +47,6 @@ def test_negative_colours_are_black_and_pass_no_gradient(backend: str, sort: str
     assert all(v.grad is not None and v.grad.abs().max() == 0 for v in leaves.values())
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_network_that_starts_at_zero_can_learn(backend: str) -> None:
-    """A colour of exactly 0 is not clamped."""
-    t = scenes.tensors(20, 2, seed=2, hidden=3)
-    t["Wout"] *= 0
-    t["base"] *= 0
-    leaves = {k: v.requires_grad_() for k, v in t.items()}
-    out = render_lowered(scenes.lowered(leaves), scenes.camera(33, 25), RenderSettings(**by(backend)))
-    out.rgb.sum().backward()
-    seen = leaves["base"].grad
-    assert (
-        seen is not None
-        and (seen > 0.1).any()
-        and leaves["Wout"].grad is not None
-        and leaves["Wout"].grad.abs().max() > 0.1
-    )
-
-
-# ---------------------------------------------------------------- the reference
-
-
 # ---------------------------------------------------------------- choice and refusals
 
 
@@ -82,17 +61,6 @@ def test_denormals_and_huge_phases_are_drawn(name: str, backend: str) -> None:
         assert torch.isfinite(out.rgb).all() and out.alpha.max() > 0.2
         out.rgb.sum().backward()
         assert all(v.grad is not None and torch.isfinite(v.grad).all() for v in leaves.values())
-
-
-def test_only_colours_may_learn() -> None:
-    """Geometry and density without gradients: the network's are the same."""
-    t, camera = scenes.tensors(30, 3, seed=5, hidden=4), scenes.camera(30, 22)
-    both = []
-    for names in (tuple(t), NET):
-        leaves = {k: v.clone().requires_grad_(k in names) for k, v in t.items()}
-        render_lowered(scenes.lowered(leaves), camera, RenderSettings()).rgb.square().sum().backward()
-        both.append([leaves[k].grad for k in NET])
-    assert all(torch.equal(a, b) for a, b in zip(*both, strict=True) if a is not None and b is not None)
 
 
 @pytest.mark.parametrize("backend", FAST)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.render import RenderOutput, RenderSettings, find_backend, render_lowered
+from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from tests import scenes
 from tests.backends import BACKENDS, by
 
@@ -64,18 +64,6 @@ def test_means_of_a_finer_image(backend: str, sort: str, n: int) -> None:
     assert out.stats.backend == backend and out.stats.pairs == fine.stats.pairs
 
 
-def test_statistics_compare_with_one_ray_per_pixel() -> None:
-    sums = []
-    for n in (1, 3):
-        out = frame(leaves(), replace(SETTINGS, samples=n))
-        tally = out.request_contributions(torch.full((15, 20), 0.5))
-        out.rgb.sum().backward()
-        assert torch.allclose(tally.error_weight, 0.5 * tally.weight, rtol=1e-5)
-        sums.append(tally.weight)
-    assert sums[0].sum() == pytest.approx(sums[1].sum().item(), rel=0.03)
-    assert (sums[0] - sums[1]).abs().max() < 0.1 * sums[0].max()
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_only_what_is_watched_is_summed(backend: str) -> None:
     """A tally is zeros until the backward pass; a second one takes the place of the first."""
@@ -88,17 +76,3 @@ def test_only_what_is_watched_is_summed(backend: str) -> None:
     out.rgb.sum().backward()
     assert first.weight.abs().max() == 0 and second.weight.max() > 1
     assert torch.allclose(second.error_weight, 0.25 * second.weight) and not second.error_weight.requires_grad
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_one_sample_is_the_backend_itself(backend: str) -> None:
-    draw = find_backend(backend).load()
-    t = scenes.tensors(40, 4, seed=6)
-    settings = replace(SETTINGS, **by(backend), samples=1)
-    out, direct = frame(t, settings), draw(scenes.lowered(t), CAMERA, SKY, settings)
-    assert (
-        torch.equal(out.rgb, direct.rgb)
-        and torch.equal(out.alpha, direct.alpha)
-        and torch.equal(out.depth, direct.depth)
-    )
-    assert out.stats.samples == direct.stats.samples == 1 and out.stats.pairs == direct.stats.pairs

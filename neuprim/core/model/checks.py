@@ -39,8 +39,17 @@ _DENSITIES: tuple[type[Shaped], ...] = (Cosine, CustomDensity)
 _COLOURS: tuple[type[Shaped], ...] = (Constant, RayNet, CustomColour)
 
 
-def _kept(value: Tensor) -> bool:
-    return value.is_cpu or value.device.type in device.DEVICE_TYPES
+def _is_dense(value: Any) -> bool:
+    kept = isinstance(value, Tensor) and (value.is_cpu or value.device.type in device.DEVICE_TYPES)
+    return kept and value.layout is torch.strided
+
+
+def _described(value: Any) -> str:
+    """What a value is, for messages."""
+    if not isinstance(value, Tensor):
+        return f"type {type(value).__name__}"
+    layout = "" if value.layout is torch.strided else f" {value.layout}"
+    return f"{value.dtype}{layout} {tuple(value.shape)} on {value.device}"
 
 
 # ---------------------------------------------------------------- entrances
@@ -73,23 +82,21 @@ def check_geometry(geometry: Any, who: str, count: int | None = None) -> Sizes:
 
 def check_density(density: Any, sizes: Sizes, field: str | None) -> None:
     """Raise :class:`FormError` unless a lowered density fits; ``sizes`` are those of :func:`check_geometry`."""
-    _check_form("density", density, _DENSITIES, sizes, field)
+    _check_form(source("density", field), density, _DENSITIES, sizes)
 
 
 def check_colour(colour: Any, sizes: Sizes, field: str | None) -> None:
     """The same of a lowered colour."""
-    _check_form("colour", colour, _COLOURS, sizes, field)
+    _check_form(source("colour", field), colour, _COLOURS, sizes)
 
 
-def _check_form(kind: str, form: Any, kinds: tuple[type[Shaped], ...], sizes: Sizes, field: str | None) -> None:
+def _check_form(who: str, form: Any, kinds: tuple[type[Shaped], ...], sizes: Sizes) -> None:
     if not isinstance(form, kinds):
         names = ", ".join(k.__name__ for k in kinds[:-1])
-        raise FormError(
-            f"{source(kind, field)} lowered to {type(form).__name__}; expected {names} or {kinds[-1].__name__}"
-        )
+        raise FormError(f"{who} lowered to {type(form).__name__}; expected {names} or {kinds[-1].__name__}")
     fault = form.fault(sizes)
     if fault is not None:
-        raise FormError(f"{source(kind, field)} lowered to {type(form).__name__}: {fault}")
+        raise FormError(f"{who} lowered to {type(form).__name__}: {fault}")
 
 
 def check_channels(found: int, colour: ColourField) -> None:
@@ -115,23 +122,17 @@ def check_rows(rows: Any, model: int | None, who: str, length: int | None = None
     """Raise :class:`FormError` unless ``rows`` are ascending int64 rows (M,) of a ``model`` of so many primitives,
     ``length`` of them."""
     found = None
-    if not isinstance(rows, Tensor):
-        found = f"type {type(rows).__name__}"
-    elif not _kept(rows) or rows.layout is not torch.strided or rows.dtype != torch.int64 or rows.dim() != 1:
-        found = f"{rows.dtype} {tuple(rows.shape)} on {rows.device}"
+    if not _is_dense(rows) or rows.dtype != torch.int64 or rows.dim() != 1:
+        found = _described(rows)
     elif length is not None and len(rows) != length:
         found = f"{len(rows)} rows for {length} primitives"
-    elif len(rows) and not rows.is_cpu:
-        if model is not None and not bool(
-            (rows[0] >= 0) & (rows[-1] < model) & (rows[1:] > rows[:-1]).all()
-        ):  # one wait for a card
-            found = f"rows that leave the model or do not ascend, {rows[:8].tolist()}{' ...' if len(rows) > 8 else ''}"
     elif len(rows):
-        numbers = rows.numpy()  # whose overhead is a fraction of torch's
-        if numbers[0] < 0 or (model is not None and numbers[-1] >= model):
-            found = f"rows {numbers[0]} to {numbers[-1]}"
-        elif not (numbers[1:] > numbers[:-1]).all():
-            found = f"rows that do not ascend, {rows[:8].tolist()}{' ...' if len(rows) > 8 else ''}"
+        numbers = rows.numpy() if rows.is_cpu else rows  # numpy's overhead is a fraction of torch's
+        fits = (numbers[0] >= 0) & (numbers[1:] > numbers[:-1]).all()
+        if model is not None:
+            fits = fits & (numbers[-1] < model)
+        if not bool(fits):  # one wait for a GPU
+            found = f"rows {rows[:8].tolist()}{' ...' if len(rows) > 8 else ''}"
     if found is not None:
         limit = "" if model is None else f" from 0 to {model - 1}"
         raise FormError(f"{who} {found}; expected ascending int64 rows (M,){limit}")
@@ -143,21 +144,13 @@ def check_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
     Raises:
         FormError: it is something else; ``who`` names field and method.
     """
-    if isinstance(value, Tensor) and _kept(value) and value.layout is torch.strided and value.is_floating_point():
-        if value.shape == shape:
-            return value
-        raise FormError(
-            f"{who} returned shape {tuple(value.shape)}; "
-            f"expected {shape}, a row for each of the {shape[0]} that it was given"
-        )
-    found = (
-        f"{value.dtype} {value.layout} on {value.device}"
-        if isinstance(value, Tensor)
-        else f"type {type(value).__name__}"
-    )
-    raise FormError(
-        f"{who} returned {found}; expected a dense tensor of real numbers on the {' or '.join(device.DEVICE_TYPES)}"
-    )
+    if not _is_dense(value) or not value.is_floating_point():
+        kinds = " or ".join(device.DEVICE_TYPES)
+        raise FormError(f"{who} returned {_described(value)}; expected a dense tensor of real numbers on the {kinds}")
+    if value.shape != shape:
+        each = f"a row for each of the {shape[0]} that it was given"
+        raise FormError(f"{who} returned shape {tuple(value.shape)}; expected {shape}, {each}")
+    return value  # type: ignore[no-any-return]
 
 
 def check_shading(found: Any, count: int, who: str) -> Shading:
@@ -222,18 +215,9 @@ def check_halves(
         raise FormError(f"{who} returned type {type(found).__name__}; expected (mask, tensors, Geometry) or None")
     mask, halves, where = found
     parents = place.count // 2
-    if (
-        not isinstance(mask, Tensor)
-        or mask.device != place.means.device
-        or mask.dtype != torch.bool
-        or mask.shape != (parents,)
-    ):
-        of = (
-            f"{mask.dtype} {tuple(mask.shape)} on {mask.device}"
-            if isinstance(mask, Tensor)
-            else f"type {type(mask).__name__}"
-        )
-        raise FormError(f"{who} returned a mask of {of}; expected torch.bool ({parents},)")
+    fits = isinstance(mask, Tensor) and mask.device == place.means.device and mask.dtype == torch.bool
+    if not fits or mask.shape != (parents,):
+        raise FormError(f"{who} returned a mask of {_described(mask)}; expected torch.bool ({parents},)")
     if not isinstance(where, Geometry):
         raise FormError(f"{who} returned a geometry of type {type(where).__name__}; expected Geometry")
     names = ("means", "log_scales", "quats")

@@ -1,11 +1,12 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Adam over all parameters of a model in two launches on a card: one that looks for numbers that are not finite, one
-that moves.
+"""Adam over all parameters of a model in two launches on a GPU: one checks that gradients are finite, one steps.
 
 In torch code a step is a hundred launches, which take longer than a small frame. Warp is imported with this module.
 """
 
 import functools
+import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,8 +14,6 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute.warp import OPTIONS, array, launch, wp
-
-__all__ = ["TOGETHER", "adam_rows"]
 
 TOGETHER = 16
 """Parameters of a launch."""
@@ -89,15 +88,14 @@ def _kernels() -> tuple[Any, Any]:
 
 def adam_rows(
     values: Sequence[Tensor], grads: Sequence[Tensor], firsts: Sequence[Tensor], seconds: Sequence[Tensor], rates: Sequence[float],
-    age: Tensor, betas: tuple[float, float], logs: tuple[float, float],
+    age: Tensor, betas: tuple[float, float],
 ) -> bool:  # fmt: skip
-    """One step in place; whether all gradients were finite, and if not nothing has changed. The host waits for the
-    device once.
+    """Take one step in place; returns whether all gradients were finite, and if not nothing has changed. The host waits
+    for the device once.
 
     Args:
-        values, grads, firsts, seconds: (N, ...) float32, contiguous, none empty.
+        values, grads, firsts, seconds: (N, ...) float32, none empty; all but ``grads`` contiguous.
         age: (N,) int64, this step included.
-        logs: natural logarithms of ``betas``.
     """
     device = age.device
     bad = torch.zeros(1, dtype=torch.int32, device=device)
@@ -106,26 +104,18 @@ def adam_rows(
     groups = []
     for at in range(0, len(values), TOGETHER):
         some = slice(at, at + TOGETHER)
-        ends, total = [], 0
-        for value in values[some]:
-            total += value.numel()
-            ends.append(total)
-        spare = TOGETHER - len(ends)
+        ends = list(itertools.accumulate(value.numel() for value in values[some]))
+        total, spare = ends[-1], TOGETHER - len(ends)
         pointers = [
             _POINTERS(*[x.data_ptr() for x in group[some]], *[0] * spare) for group in (values, grads, firsts, seconds)
         ]
-        widths = _LONGS(*[value.numel() // value.shape[0] for value in values[some]], *[1] * spare)
-        groups.append(
-            (total, pointers, _LONGS(*ends, *[total + 1] * spare), widths, _FLOATS(*rates[some], *[0.0] * spare))
-        )
+        widths = _LONGS(*[value[0].numel() for value in values[some]], *[1] * spare)
+        own_rates = _FLOATS(*rates[some], *[0.0] * spare)
+        groups.append((total, pointers, _LONGS(*ends, *[total + 1] * spare), widths, own_rates))
     flag = array(bad, wp.int32)
     for total, pointers, ends_, _, _ in groups:
         launch(check, total, (pointers[1], ends_, flag), device)
-    for total, pointers, ends_, widths, own in groups:
-        launch(
-            move,
-            total,
-            (*pointers, ends_, widths, own, *betas, *(1 - beta for beta in betas), *logs, array(age, wp.int64), flag),
-            device,
-        )
+    constants = (*betas, *(1 - beta for beta in betas), *map(math.log, betas), array(age, wp.int64), flag)
+    for total, pointers, ends_, widths, own_rates in groups:
+        launch(move, total, (*pointers, ends_, widths, own_rates, *constants), device)
     return int(bad) == 0

@@ -8,8 +8,6 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-__all__ = ["Exposures"]
-
 _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 
 
@@ -62,21 +60,7 @@ class Exposures:
         """Tensors from which :meth:`load_state` goes on."""
         return {"log_gain": self.log_gain, "m": self.m, "v": self.v, "seen": self.seen}
 
-    def check_state(self, state: dict[str, Tensor]) -> None:
-        """Raise ValueError where a state is of other views, or not finite."""
-        for name, own in self.state().items():
-            given = state.get(name)
-            if (
-                given is None
-                or given.shape != own.shape
-                or given.dtype != own.dtype
-                or not bool(torch.isfinite(given.double()).all())
-            ):
-                found = "missing" if given is None else f"{given.dtype} {tuple(given.shape)}"
-                raise ValueError(f"exposure.{name} is {found}; expected finite {own.dtype} {tuple(own.shape)}")
-
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Continue from a checked state."""
-        device = self.log_gain.device
-        self.log_gain, self.m, self.v = (state[k].to(device, copy=True) for k in ("log_gain", "m", "v"))
-        self.seen = state["seen"].clone()
+        self.log_gain, self.m, self.v = state["log_gain"], state["m"], state["v"]
+        self.seen = state["seen"].cpu()

@@ -19,8 +19,6 @@ from neuprim.core.model.schema import InitContext
 from neuprim.core.render.near_plane import scene_extent
 from neuprim.core.train.settings import ModelSettings
 
-__all__ = ["initial_model"]
-
 _USUAL_OPACITY = 0.5
 """Of Gaussians that say how large they are, but not how opaque."""
 

@@ -15,8 +15,6 @@ from neuprim.core.render.output import Contributions
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.volumes.points import Shares, values_at
 
-__all__ = ["PointResult", "point_loss"]
-
 _COMPONENT = 0.1
 """Weight of an extinction's components: it teaches the primitives' shares, whose rate does not depend on it, and hardly
 moves primitives."""

@@ -16,8 +16,6 @@ from neuprim.core.render.output import Contributions
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.core.train.splitting import SPLIT_GAUSSIAN, SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT, split_primitives
 
-__all__ = ["STRATEGIES", "Change", "Fixed", "Gradient", "Population", "Relocate", "check_strategy", "make_population"]
-
 _GROWTH = 0.25
 """Share of the primitives that is born at once: a split costs quality that training has to win back. It is more where
 the count would otherwise not be reached."""

@@ -8,8 +8,6 @@ from torch import Tensor
 
 from neuprim.core.data import ViewSet
 
-__all__ = ["MaxScreenSize", "scale_anisotropy"]
-
 
 class MaxScreenSize:
     """Limit every primitive's largest semi-axis to a share of its distance to the nearest training camera.

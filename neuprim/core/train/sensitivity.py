@@ -24,8 +24,6 @@ from neuprim.core.model.prunable import removal_effect
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.volumes.points import values_at
 
-__all__ = ["Sensitivity", "inner_sensitivity", "sensitivity"]
-
 
 @dataclass(frozen=True)
 class Sensitivity:

@@ -10,8 +10,6 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.schema import RateUnit
 from neuprim.core.validation import Accepts, Range, nonempty_text, validate_fields
 
-__all__ = ["ModelSettings", "PopulationSettings", "TrainSettings"]
-
 Share = Annotated[float, Range(0, 1, says="a fraction of the budget, 0 to 1")]
 NotNegative = Annotated[float, Range(at_least=0)]
 
@@ -26,15 +24,14 @@ class ModelSettings:
 
     Attributes:
         primitives: primitives at the start (and throughout, unless population control grows them).
-        density: which density the task builds; the task says what there is to choose, see its presets.
-        colour: the same for the colour.
+        density, colour: which density and colour the task builds; the task says what there is to choose, see its
+            presets.
         neurons: hidden width K of the cosine density, 0..16; 0 is a constant density. A Gaussian has none.
         sh_degree: spherical-harmonics degree of the colour, 0..3.
         sh_every: fraction of the budget after which one more SH band is unlocked; 0 unlocks all at once.
         init: free settings of the fields' initialisers, see the preset files.
-        reduced: what density and colour do with less of than the settings above say, as ``density.neurons=0`` and
-        ``colour.degree=1``, one
-            after the other; what ``neuprim prune`` found that a scene does not require.
+        reduced: reductions of density and colour, one after the other, as ``density.neurons=0`` and
+            ``colour.degree=1``; what ``neuprim prune`` found that a scene does not require.
     """
 
     primitives: Annotated[int, Range(at_least=1)] = 2000
@@ -57,19 +54,16 @@ class PopulationSettings:
     """How primitives are born, moved and removed. ``start`` and ``stop`` are fractions of the training budget.
 
     Attributes:
-        strategy: "fixed", "relocate" (the least used move to where the error is; the count is constant once it is
-        reached) or "gradient" (clone,
-            split and prune by the density network's gradient norm, as the authors do).
+        strategy: "fixed", "relocate" (the least used primitives move to where the error is; the count is constant once
+            it is reached) or "gradient" (clone, split and prune by the density network's gradient norm, as the authors
+            do).
         every: steps between two interventions.
         fraction: relocate: the largest share of primitives moved at once.
-        idle: relocate: only primitives whose weight in the images since the last intervention is below this share of
-        the mean
-            primitive's move; null moves the least used ones, however much they do.
+        idle: relocate: only primitives move whose weight in the images since the last intervention is below this share
+            of the mean primitive's; null moves the least used ones, however much they contribute.
         grow_to: relocate: how many primitives there are to be; where the start has fewer, those with the largest error
-        split. null is
-            as many as ``model.primitives``, of which data may not offer enough points.
-        grow_from: relocate: how many of ``model.primitives`` there are at the start, as a share; the others are born
-        where the error turns
+            split. null is as many as ``model.primitives``, of which data may not offer enough points.
+        grow_from: relocate: the share of ``model.primitives`` at the start; the others are born where the error turns
             out to be largest. 1 starts with all that the data offer points for.
         grow_threshold, prune_threshold: gradient: on the mean norm of the density gradient.
         clone_scale, prune_scale: gradient: in units of the scene's extent.
@@ -107,32 +101,30 @@ class TrainSettings:
 
     Attributes:
         iterations: steps, each of ``views_per_step`` views; null leaves the budget to ``max_seconds``. A command line
-        that types ``max_seconds``
-            alone means that: all the seconds are used, however fast the machine.
-        views_per_step: views that a step looks at; gradients are their mean. A card has room for several small images.
-        max_seconds: stop after this many seconds of training, if given (such a run is not
-        bit-reproducible). rates: learning rate by parameter name, over the specs' own.
-        rate_units: unit of a parameter's rate by its name, over the spec's own: "absolute" (a position's is in scene
-        units a step), or
-            "extent" (the rate times the scene's extent, so that it does not depend on how large the scene is).
+            that types ``max_seconds`` alone means that: all the seconds are used, however fast the machine.
+        views_per_step: views of a step; gradients are their mean. A GPU has room for several small images.
         coarse: factor by which training views are reduced at first; 1 for none. It is halved, rounded down, until
             ``coarse_until``, a fraction of the budget, from which on views are as they are.
-        angular_size: no primitive's largest semi-axis is more than this share of its distance to the nearest training
-        camera; null for no limit. exposure_rate: learning rate of a gain per training view and channel, for photographs
-        that are not exposed alike, per step in
-            which a view is seen; 0 for none. Held-out views are drawn with the training views' mean gain.
-        final_rate: the rates decay exponentially to this fraction of themselves at the end of the budget; 1 is
-        constant. cooldown: the last share of the budget, over which the rates also fall linearly to next to nothing, so
-        that numbers settle; 0 for none. adam_beta2: decay of Adam's second moment per step, in [0, 1).
+        angular_size: limit of a primitive's largest semi-axis over its distance to the nearest training camera; null
+            for none.
+        exposure_rate: learning rate of a gain per training view and channel, for photographs that are not exposed
+            alike, per step in which a view is used; 0 for none. Held-out views are rendered with the mean gain.
+        max_seconds: stop after this many seconds of training, if given; such a run is not bit-reproducible.
+        rates: learning rate by parameter name, over the specs' own.
+        rate_units: unit of a parameter's rate by its name, over the spec's own: "absolute" (a position's is in scene
+            units a step), or "extent" (the rate times the scene's extent, so that it does not depend on the scale).
+        final_rate: the rates decay exponentially to this fraction of themselves; 1 is constant.
+        cooldown: the last share of the budget, over which the rates also fall linearly to next to nothing; 0 for none.
+        adam_beta2: decay of Adam's second moment per step, in [0, 1).
         warmup_steps: steps over which the rates rise linearly from zero.
-        supervision: what is learned from: "images", "voxels" (points of the files that the images were made of, where
-        the data set has
+        supervision: "images", "voxels" (points of the files that the images were made of, where the data set has
             them), "both", or "auto": both where the data set has voxels, else images.
-        voxels_per_step: points of one frame that a step looks at.
-        voxels_every: both: steps from one look at points to the next; each sees an image.
+        voxels_per_step: points of one frame in a step.
+        voxels_every: both: steps from one use of points to the next; each step has an image.
         voxel_weight: both: weight of the points' loss beside the images'.
         voxel_colour: weight of the source radiance at the points beside their extinction; 0 leaves colours to the
-        images. loss: name of a loss that a package provides (``neuprim tasks`` lists them), or null for the task's own.
+            images.
+        loss: name of a loss that a package provides (``neuprim tasks`` lists them), or null for the task's own.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
         anisotropy_weight, anisotropy_from: weight of mean(std over axes of s / min s), and the step it starts at.
         background: "white", "black", "random" or "auto" (the data set's own choice).

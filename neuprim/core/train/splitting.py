@@ -9,8 +9,6 @@ from neuprim.core.model.checks import check_halves, check_tensors, method
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["SPLIT_GAUSSIAN", "SPLIT_LONG", "SPLIT_OTHERS", "SPLIT_SHIFT", "split_primitives"]
-
 SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS = 0.5, 0.6, 0.9
 """A child's centre and semi-axes over its parent's: shift along the longest axis, that axis, the other two.
 

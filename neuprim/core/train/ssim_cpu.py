@@ -16,13 +16,15 @@ from torch import Tensor
 
 from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.train.ssim_window import SSIM_TAPS, SSIM_WINDOW
 
-__all__ = ["photometric_fused"]
+SSIM_TAPS = 11
+_offsets = np.arange(SSIM_TAPS) - 5.0
+_gaussian = np.exp(-(_offsets**2) / (2 * 1.5**2))
+SSIM_WINDOW: list[float] = (_gaussian / _gaussian.sum()).tolist()
+"""The window of SSIM: 11 taps of a Gaussian of 1.5 pixels, as kornia has it."""
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end, which lets LLVM vectorise
-_TAPS = SSIM_TAPS
 _WINDOW = np.array(SSIM_WINDOW, np.float32)
 _ROWS = 16  # rows per band; fixed, so that sums do not depend on the number of threads
 _BLOCK = 512  # outputs of a row at a time, so that scratch arrays lie at constant offsets in the nearest cache
@@ -36,7 +38,7 @@ def _vertical_moments(V, x, y, at, pitch, count):  # type: ignore[no-untyped-def
     """Blurs over 11 rows of flat images from position ``at``: x, y, xx, yy, xy, sums kept in registers."""
     for j in range(count):
         s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
-        for k in range(_TAPS):
+        for k in range(SSIM_TAPS):
             i = index(at + k * pitch + j)
             w, a, b = _WINDOW[k], x[i], y[i]
             wa, wb = w * a, w * b
@@ -52,7 +54,7 @@ def _vertical_moments(V, x, y, at, pitch, count):  # type: ignore[no-untyped-def
 def _vertical(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
     for j in range(count):
         s = f(0)
-        for k in range(_TAPS):
+        for k in range(SSIM_TAPS):
             s += _WINDOW[k] * g[index(at + k * pitch + j)]
         V[j] = s
 
@@ -61,7 +63,7 @@ def _vertical(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
 def _horizontal(out, V, step, count):  # type: ignore[no-untyped-def]
     for j in range(count):
         s = f(0)
-        for k in range(_TAPS):
+        for k in range(SSIM_TAPS):
             s += _WINDOW[k] * V[index(j + k * step)]
         out[j] = s
 
@@ -93,9 +95,9 @@ def _similarity(start, stop, x, y, height, channels, maps):  # type: ignore[no-u
     x, y: flat (height x width x channels). maps: (3, windows + 20, m + 20 channels), a zero border around the windows.
     """
     n = x.shape[0] // height
-    reach = (_TAPS - 1) * channels
+    reach = (SSIM_TAPS - 1) * channels
     m = n - reach
-    scale = f(1) / f((height - _TAPS + 1) * m)
+    scale = f(1) / f((height - SSIM_TAPS + 1) * m)
     V = np.zeros(5 * _WIDE, np.float32)
     s = np.zeros(5 * _BLOCK, np.float32)
     total = 0.0
@@ -107,7 +109,7 @@ def _similarity(start, stop, x, y, height, channels, maps):  # type: ignore[no-u
                 _horizontal(s[q * _BLOCK :], V[q * _WIDE :], channels, size)
             total += _derivatives(s, size, scale)
             for q, block in enumerate((_EX, _EXX, _EXY)):
-                row = maps[q, r + _TAPS - 1]
+                row = maps[q, r + SSIM_TAPS - 1]
                 row[reach + j0 : reach + j0 + size] = s[block : block + size]
     return total
 
@@ -130,7 +132,7 @@ def _spread(start, stop, x, y, height, channels, maps, weight, grad):  # type: i
     """Image rows start:stop of d loss / d x, the adjoint of the blur; returns the sum of |x - y|."""
     n = x.shape[0] // height
     pitch = maps.shape[2]
-    reach = (_TAPS - 1) * channels
+    reach = (SSIM_TAPS - 1) * channels
     V = np.zeros(_WIDE, np.float32)
     s = np.zeros(3 * _BLOCK, np.float32)
     l1_share = (f(1) - weight) / f(x.shape[0])
@@ -158,30 +160,18 @@ def _bordered(rows: int, columns: int) -> Any:
     return maps
 
 
-class _Photometric(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, rendered: Tensor, truth: Tensor, weight: float, parts: dict[str, float]) -> Tensor:
-        H, W, C = rendered.shape
-        x = np.ascontiguousarray(rendered.detach().numpy()).reshape(-1)
-        y = np.ascontiguousarray(truth.detach().numpy()).reshape(-1)
-        windows, m = H - _TAPS + 1, (W - _TAPS + 1) * C
-        maps = _bordered(windows + 20, m + 20 * C)
-        similarity = sum(parallel_for(_similarity, windows, _ROWS, 0, x, y, H, C, maps)) / (windows * m)
-        grad = np.empty(x.size, np.float32)
-        l1 = sum(parallel_for(_spread, H, _ROWS, 0, x, y, H, C, maps, np.float32(weight), grad)) / x.size
-        parts["l1"], parts["ssim"] = float(l1), float(similarity)
-        ctx.save_for_backward(torch.from_numpy(grad).reshape(H, W, C))
-        return torch.tensor((1 - weight) * l1 + weight * (1 - similarity), dtype=torch.float32)
+def similarity(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+    """Means of the absolute difference and of SSIM, (2,) float64, and (H, W, C) the gradient of (1 - weight) L1 +
+    weight (1 - SSIM).
 
-    @staticmethod
-    def backward(ctx: Any, g: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
-        (grad,) = ctx.saved_tensors
-        return grad * g, None, None, None
-
-
-def photometric_fused(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, float]]:
-    """Same value and gradient as :func:`~neuprim.core.train.losses.photometric_reference`, float32 CPU images of at
-    least 11 x 11."""
-    parts: dict[str, float] = {}
-    loss: Tensor = _Photometric.apply(rendered, truth, ssim_weight, parts)
-    return loss, parts
+    Args:
+        rendered, truth: (H, W, C) float32 of at least 11 x 11 pixels and at most 51 channels.
+    """
+    H, W, C = rendered.shape
+    x, y = (np.ascontiguousarray(image.numpy()).reshape(-1) for image in (rendered, truth))
+    windows, m = H - SSIM_TAPS + 1, (W - SSIM_TAPS + 1) * C
+    maps = _bordered(windows + 20, m + 20 * C)
+    ssim = sum(parallel_for(_similarity, windows, _ROWS, 0, x, y, H, C, maps)) / (windows * m)
+    grad = np.empty(x.size, np.float32)
+    l1 = sum(parallel_for(_spread, H, _ROWS, 0, x, y, H, C, maps, np.float32(weight), grad)) / x.size
+    return torch.tensor([l1, ssim], dtype=torch.float64), torch.from_numpy(grad).reshape(H, W, C)

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""L1 + SSIM with its analytic gradient in four launches on a card: the twin of :mod:`neuprim.core.train.ssim_cpu`, see
+"""L1 + SSIM with its analytic gradient in four launches on a GPU: the twin of :mod:`neuprim.core.train.ssim_cpu`, see
 there for the derivation.
 
 Blurs are separable: a thread a number, eleven taps along a row, then along a column, and back again for the gradient.
@@ -13,11 +13,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute.warp import OPTIONS, array, launch, wp
-from neuprim.core.train.ssim_window import SSIM_TAPS, SSIM_WINDOW
+from neuprim.core.train.ssim_cpu import SSIM_TAPS, SSIM_WINDOW
 
-__all__ = ["similarity"]
-
-_TAPS = SSIM_TAPS
 _Window = wp.types.vector(length=SSIM_TAPS, dtype=wp.float32)
 _vec5 = wp.types.vector(length=5, dtype=wp.float32)
 _C1, _C2 = wp.constant(0.01**2), wp.constant(0.03**2)
@@ -32,7 +29,7 @@ def _kernels() -> tuple[Any, Any, Any, Any]:
         """(x, y, xx, yy, xy) blurred along rows of pixels; (H, W - 10, C)."""
         y, x, c = wp.tid()
         total = _vec5()
-        for k in range(_TAPS):
+        for k in range(SSIM_TAPS):
             p = a[y, x + k, c]
             q = b[y, x + k, c]
             w = window[k]
@@ -50,7 +47,7 @@ def _kernels() -> tuple[Any, Any, Any, Any]:
         """SSIM of every window, (H - 10, W - 10, C), and its derivatives by the means of x, of x^2 and of x y."""
         y, x, c = wp.tid()
         total = _vec5()
-        for k in range(_TAPS):
+        for k in range(SSIM_TAPS):
             total += window[k] * rows[y + k, x, c]
         a = total[0]
         b = total[1]
@@ -67,7 +64,7 @@ def _kernels() -> tuple[Any, Any, Any, Any]:
         """The adjoint of blurring along columns; (H, W - 10, C)."""
         y, x, c = wp.tid()
         total = wp.vec3()
-        for k in range(_TAPS):
+        for k in range(SSIM_TAPS):
             at = y - k
             if at >= 0 and at < maps.shape[0]:
                 total += window[k] * maps[at, x, c]
@@ -81,7 +78,7 @@ def _kernels() -> tuple[Any, Any, Any, Any]:
         """``by_l1``, ``by_ssim``: weights over numbers of pixels and of windows."""
         y, x, c = wp.tid()
         total = wp.vec3()
-        for k in range(_TAPS):
+        for k in range(SSIM_TAPS):
             at = x - k
             if at >= 0 and at < columns.shape[1]:
                 total += window[k] * columns[y, at, c]
@@ -106,22 +103,15 @@ def similarity(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, 
     Args:
         rendered, truth: (H, W, C) float32 of at least 11 x 11 pixels, on one device.
     """
-    a, b = rendered.detach().contiguous(), truth.detach().contiguous()
+    a, b = rendered.contiguous(), truth.contiguous()
     (H, W, C), device = a.shape, a.device
-    h, w = H - _TAPS + 1, W - _TAPS + 1
+    h, w = H - SSIM_TAPS + 1, W - SSIM_TAPS + 1
 
-    def empty(*shape: int) -> Tensor:
-        return torch.empty(shape, dtype=torch.float32, device=device)
-
-    window = _window()
+    shapes = ((H, w, C, 5), (h, w, C), (h, w, C, 3), (H, w, C, 3), (H, W, C), (H, W, C))
     rows, S, maps, columns, difference, grad = (
-        empty(H, w, C, 5),
-        empty(h, w, C),
-        empty(h, w, C, 3),
-        empty(H, w, C, 3),
-        empty(H, W, C),
-        empty(H, W, C),
+        torch.empty(shape, dtype=torch.float32, device=device) for shape in shapes
     )
+    window = _window()
     first, second = array(a, wp.float32), array(b, wp.float32)
     along_rows, compare, back_along_columns, gradient = _kernels()
     launch(along_rows, (H, w, C), (first, second, window, array(rows, _vec5)), device)

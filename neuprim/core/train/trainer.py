@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -33,10 +34,8 @@ from neuprim.core.train.point_loss import PointResult, point_loss
 from neuprim.core.train.population import Change, make_population
 from neuprim.core.train.regularization import MaxScreenSize, scale_anisotropy
 from neuprim.core.train.settings import TrainSettings
-from neuprim.core.train.trainer_state import hash_names, parse_state
+from neuprim.core.train.trainer_state import check_state, hash_names, select_prefix
 from neuprim.core.train.training_views import Prefetcher, reduce_view, resolution_factor
-
-__all__ = ["MIN_COOLDOWN", "StepReport", "Trainer", "ViewResult", "ViewTask"]
 
 MIN_COOLDOWN = 0.02
 """Smallest factor of the learning rates in a cool-down."""
@@ -62,35 +61,32 @@ class StepReport:
     change: str | None
 
 
-@dataclass(frozen=True)
-class ViewTask:
-    """A view to render: its index, its background, and the index of the view after it, if known."""
+class ViewTask(NamedTuple):
+    """A view to render by its index, its background, and the index of the view after it, if known."""
 
-    index: int
+    view: int
     background: Tensor
     upcoming: int | None
 
 
-@dataclass(frozen=True)
-class ViewResult:
+class ViewResult(NamedTuple):
     """Numbers of one view of a step.
 
     Attributes:
-        loss: of the view; of the last view of a step its share, plus the losses of points and regularisers.
-        point_parts: named parts of the loss at points.
+        loss: its share of the step's loss; that of the last view includes points and regularisers.
         gain: gradient of the logarithm of the view's exposure, one number per channel; None without exposures.
     """
 
-    index: int
+    view: int
     name: str
     loss: float
     psnr: float
     parts: dict[str, float]
-    point_parts: dict[str, float] = field(default_factory=dict)
-    gain: list[float] | None = None
+    point_parts: dict[str, float]
+    gain: list[float] | None
 
 
-class RenderedView(NamedTuple):
+class _RenderedView(NamedTuple):
     """A view, rendered and compared; the backward pass fills ``contributions``."""
 
     loss: Tensor
@@ -128,7 +124,8 @@ class Trainer:
         renderer: RenderSettings,
         seed: int,
     ) -> None:
-        if len(dataset.train) == 0:
+        train = dataset.train
+        if len(train) == 0:
             raise DataError(f"{dataset.name}: the training split is empty")
         names = [spec.name for spec in model.specs]
         for group, given in (("rates", settings.rates), ("rate_units", settings.rate_units)):
@@ -141,43 +138,34 @@ class Trainer:
             raise ConfigError(
                 f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images"
             )
-        self.model, self.dataset, self.loss = model, dataset, loss
-        cameras = [dataset.train.view(i).camera for i in range(len(dataset.train))]
-        self.settings, self.renderer = (
-            settings,
-            replace(resolve_near(renderer, model.params["means"], cameras), depth=False),
-        )
+        cameras = [train.view(i).camera for i in range(len(train))]
+        self.model, self.dataset, self.loss, self.settings = model, dataset, loss, settings
+        self.renderer = replace(resolve_near(renderer, model.params["means"], cameras), depth=False)
         self.extent = scene_extent(dataset.extent, model.params["means"], cameras)
-        first = dataset.train.view(0)
-        self.device = device_of(model, self.renderer, first.camera, first.conditions)
+        self.device = device_of(model, self.renderer, cameras[0], train.view(0).conditions)
         model.params = model.to(self.device).params
-        self.prefetcher = (
-            Prefetcher(self._load_pixels, device.free_cuda_memory(self.device) // 4)
-            if self.device.type == device.CUDA
-            else None
-        )
+        self.prefetcher: Prefetcher | None = None
+        if self.device.type == device.CUDA:
+            self.prefetcher = Prefetcher(self._load_pixels, device.free_cuda_memory(self.device) // 4)
         self.population = make_population(settings.population)
-        self.max_screen_size = (
-            None if settings.angular_size is None else MaxScreenSize(dataset.train, settings.angular_size)
-        )
-        self.exposures = None
+        self.max_screen_size: MaxScreenSize | None = None
+        if settings.angular_size is not None:
+            self.max_screen_size = MaxScreenSize(train, settings.angular_size)
+        self.exposures: Exposures | None = None
         if settings.exposure_rate > 0:
-            if dataset.train.pixels(0).alpha is not None:
+            if train.pixels(0).alpha is not None:
                 raise ConfigError(
                     f"train.exposure_rate={settings.exposure_rate:g}: images of {dataset.name} have alpha; expected "
                     "opaque photographs, as a gain would change the background that is put behind them"
                 )
-            self.exposures = Exposures(len(dataset.train), dataset.channels, settings.exposure_rate, self.device)
+            self.exposures = Exposures(len(train), dataset.channels, settings.exposure_rate, self.device)
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order = torch.empty(0, dtype=torch.int64)
-        self.step = 0
-        self.elapsed = 0.0
+        self.step, self.elapsed = 0, 0.0
         self.fake_quantize: Callable[[dict[str, Tensor]], dict[str, Tensor]] | None = None
         self.zero_masks: dict[str, Tensor] = {}
         self.stop_requested: Callable[[], bool] = lambda: False
         self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
-        self._view_results: list[ViewResult] = []
-        self._contributions: list[Contributions] = []
         self._require_grad()
 
     # ------------------------------------------------------------ the budget
@@ -227,79 +215,80 @@ class Trainer:
             NonFiniteError: a loss, gradient or parameter is NaN or infinite; this step updated nothing.
             DeviceMemoryError: the GPU has no room for a step; what was saved is intact.
         """
+        with self._limit_resources():
+            start, model, progress = time.perf_counter(), self.model, self.progress
+            model.density.set_progress(progress)
+            model.colour.set_progress(progress)
+            for value in model.params.values():
+                value.grad = None
+
+            # Draw the views and the points of this step.
+            tasks = self._draw_views()
+            samples = self._draw_points() if self._points_due() else None
+
+            # Add up losses and gradients, view by view. Points and regularisers join the last view.
+            points: PointResult | None = None
+            results, each = list[ViewResult](), list[Contributions]()
+            for number, task in enumerate(tasks, start=1):
+                view = self._render_view(task, progress)
+                loss = view.loss / (self.settings.views_per_step * self.ranks)
+                if number == len(tasks) and self.rank == self.ranks - 1:
+                    points = None if samples is None else self._compare_points(samples)
+                    loss = self._total_loss(loss, points)
+                cost = self._backward(loss, view, points)
+                gain = None if self.exposures is None else self.exposures.gradient(task.view)
+                point_parts = {} if points is None else points.parts
+                results.append(ViewResult(task.view, view.name, cost, view.psnr, view.parts, point_parts, gain))
+                each.append(self._exchange_gradients(view.contributions))
+                del view, loss  # free what autograd saved before the next view is rendered
+            if tasks:
+                results, contributions = self._combine_views(results, each, start)
+                cost, parts, psnr, name = _summarize_views(results)
+            else:
+                assert samples is not None, "a step without views has points"
+                points = self._compare_points(samples)
+                cost = self._backward(self._total_loss(None, points), None, points)
+                contributions, parts, psnr, name = points.contributions(), points.parts, points.psnr, points.name
+
+            # Update the parameters and the exposures.
+            self.population.observe(model, contributions)
+            self.optimizer.step(model.params, self.rates())
+            if self.dataset.largest is not None:
+                model.limit(self.dataset.largest)
+            for parameter, mask in self.zero_masks.items():
+                model.params[parameter].detach()[mask] = 0
+            if self.exposures is not None:
+                self.exposures.step({result.view: result.gain for result in results})
+            if self.max_screen_size is not None:
+                self.max_screen_size.apply(self.step, model.params["means"], model.params["log_scales"])
+            self.step += 1
+
+            # Let the population react.
+            change = None
+            if self.population.due(self.step, progress):
+                change = self.population.intervene(model, self.extent)
+                if change is not None:
+                    self._apply_change(change)
+            self.elapsed = self._stop_clock(start)
+            text = None if change is None else change.text
+            return StepReport(self.step, self.elapsed, cost, parts, psnr, model.count, name, text)
+
+    @contextmanager
+    def _limit_resources(self) -> Iterator[None]:
         try:
             with limit_threads(self.renderer.threads):
-                return self._train_step()
+                yield
         except torch.OutOfMemoryError as error:
             camera = self.dataset.train.view(0).camera
-            size = f"{camera.width} x {camera.height} pixels"
             raise DeviceMemoryError(
-                f"{self.device}: out of memory at step {self.step} with {self.model.count} primitives, images of {size} "
-                f"and train.views_per_step={self.settings.views_per_step}; lower one of them. The last checkpoint is intact"
+                f"{self.device}: out of memory at step {self.step} with {self.model.count} primitives, images of "
+                f"{camera.width} x {camera.height} pixels and train.views_per_step={self.settings.views_per_step}; "
+                "lower one of them. The last checkpoint is intact"
             ) from error
-
-    def _train_step(self) -> StepReport:
-        start = time.perf_counter()
-        model, progress = self.model, self.progress
-        model.density.set_progress(progress)
-        model.colour.set_progress(progress)
-        for value in model.params.values():
-            value.grad = None
-        self._view_results, self._contributions = [], []
-
-        # Loss and gradients, view by view. Points and regularisers join the last view of the step.
-        tasks = self._sample_views()
-        samples = self._draw_points() if self._points_due() else None
-        points: PointResult | None = None
-        views = self.settings.views_per_step * self.ranks
-        for number, task in enumerate(tasks, start=1):
-            view = self._render_view(task, progress)
-            loss = view.loss / views if views > 1 else view.loss
-            last = number == len(tasks) and self.rank == self.ranks - 1
-            if last:
-                points = None if samples is None else self._point_loss(samples)
-                loss = self._total_loss(loss, points)
-            cost = self._backward(loss, loss if last else view.loss, view, points)
-            gain = None if self.exposures is None else self.exposures.gradient(task.index)
-            point_parts = {} if points is None else points.parts
-            result = ViewResult(task.index, view.name, cost, view.psnr, view.parts, point_parts, gain)
-            self._collect_view(result, view.contributions)
-            del view, loss  # free what autograd saved before the next view is rendered
-        if tasks:
-            results, contributions = self._sum_views(start)
-            cost, parts, psnr, name = summarize_views(results)
-        else:
-            assert samples is not None, "a step without views has points"
-            points = self._point_loss(samples)
-            loss = self._total_loss(None, points)
-            cost = self._backward(loss, loss, None, points)
-            results, contributions = [], points.contributions()
-            parts, psnr, name = points.parts, points.psnr, points.name
-
-        # Update parameters and exposures, then the population.
-        self.population.observe(model, contributions)
-        self.optimizer.step(model.params, self.rates())
-        if self.dataset.largest is not None:
-            model.limit(self.dataset.largest)
-        for parameter, mask in self.zero_masks.items():
-            model.params[parameter].detach()[mask] = 0
-        if self.exposures is not None:
-            self.exposures.step({result.index: result.gain for result in results})
-        if self.max_screen_size is not None:
-            self.max_screen_size.apply(self.step, model.params["means"], model.params["log_scales"])
-        self.step += 1
-        change = None
-        if self.population.due(self.step, progress):
-            change = self.population.intervene(model, self.extent)
-            if change is not None:
-                self._apply_change(change)
-        self.elapsed = self._stop_clock(start)
-        text = None if change is None else change.text
-        return StepReport(self.step, self.elapsed, cost, parts, psnr, model.count, name, text)
 
     # ------------------------------------------------------------ what several processes do differently
 
-    def _sample_views(self) -> list[ViewTask]:
+    def _draw_views(self) -> list[ViewTask]:
         """Draw the views of a step with their backgrounds; none for ``train.supervision=voxels``."""
         if self.settings.supervision == "voxels":
             return []
@@ -307,16 +296,17 @@ class Trainer:
         upcoming = [*(index for index, _ in drawn[1:]), int(self.order[0]) if len(self.order) else None]
         return [ViewTask(index, background, then) for (index, background), then in zip(drawn, upcoming, strict=True)]
 
-    def _collect_view(self, result: ViewResult, contributions: Contributions) -> None:
-        """Note a view after its backward pass; its gradients are added to those of the views before."""
-        self._view_results.append(result)
-        self._contributions.append(contributions)
+    def _exchange_gradients(self, contributions: Contributions) -> Contributions:
+        """Called after the backward pass of each view, whose gradients one process adds to those of the views before;
+        returns what :meth:`_combine_views` gets."""
+        return contributions
 
-    def _sum_views(self, start: float) -> tuple[list[ViewResult], Contributions]:
+    def _combine_views(
+        self, results: list[ViewResult], each: list[Contributions], start: float
+    ) -> tuple[list[ViewResult], Contributions]:
         """Results of all views of the step, in their order, and the sum of their contributions. ``start``: when the
         step began, seconds of ``time.perf_counter``."""
-        each = self._contributions
-        return self._view_results, each[0] if len(each) == 1 else sum_contributions(each, self.model.count)
+        return results, each[0] if len(each) == 1 else sum_contributions(each, self.model.count)
 
     def _stop_clock(self, start: float) -> float:
         """Seconds of training up to the end of this step."""
@@ -324,38 +314,50 @@ class Trainer:
 
     # ------------------------------------------------------------ parts of a step
 
-    def _total_loss(self, loss: Tensor | None, points: PointResult | None) -> Tensor:
-        """Add the losses of points and regularisers to that of the views, if there are views."""
-        if points is not None:
-            loss = points.loss if loss is None else loss + self.settings.voxel_weight * points.loss
-        assert loss is not None
-        if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
-            loss = loss + self.settings.anisotropy_weight * scale_anisotropy(self.model.params["log_scales"])
-        return loss
+    def _next_view(self) -> int:
+        """Index of the next view: random order without replacement."""
+        if len(self.order) == 0:
+            self.order = torch.randperm(len(self.dataset.train), generator=self.generator)
+        index, self.order = int(self.order[0]), self.order[1:]
+        return index
 
-    def _backward(self, loss: Tensor, reported: Tensor, view: RenderedView | None, points: PointResult | None) -> float:
-        """Add the gradients of ``loss`` to the parameters'; returns the value of ``reported``.
+    def _draw_background(self) -> Tensor:
+        choice, channels = self.settings.background, self.dataset.channels
+        if choice == "random" or (choice == "auto" and self.dataset.random_background):
+            return torch.rand(channels, generator=self.generator)
+        if choice == "auto":
+            return self.dataset.background.float()
+        return torch.full((channels,), 1.0 if choice == "white" else 0.0)
 
-        Raises:
-            NonFiniteError: the value is NaN or infinite; names the view or points.
-        """
-        cost = reported.item()
-        if not math.isfinite(cost):
-            self.model.check_finite()
-            where = (
-                f"view {view.name}" if view is not None else f"points of {points.name}" if points is not None else ""
-            )
-            spoiled = view is not None and not bool(torch.isfinite(view.truth).all())
-            more = ", whose pixels are NaN or infinite somewhere" if spoiled else ""
-            raise NonFiniteError(f"loss is {cost} at step {self.step} on {where}{more}")
-        loss.backward()
-        return cost
+    def _points_due(self) -> bool:
+        """Whether this step uses points. With ``both``, the last step before each multiple of ``voxels_every`` does,
+        which is the one that logs show."""
+        source = self.settings.supervision
+        return source == "voxels" or (source == "both" and (self.step + 1) % self.settings.voxels_every == 0)
 
-    def _render_view(self, task: ViewTask, progress: float) -> RenderedView:
+    def _draw_points(self) -> PointSamples:
+        points = self.dataset.points
+        assert points is not None, "the constructor refuses data without points"
+        return points.draw(self.settings.voxels_per_step, self.generator)
+
+    def _load_pixels(self, index: int) -> Pixels:
+        """Pixels of a training view, on the training's device."""
+        pixels = self.dataset.train.pixels(index)
+        check_pixels("train", self.dataset.train.view(index), pixels, self.dataset.channels)
+        return pixels.to(self.device)
+
+    def _quantized_model(self) -> Primitives:
+        """The model that images and points are rendered of."""
+        model = self.model
+        if self.fake_quantize is None:
+            return model
+        return Primitives(model.density, model.colour, self.fake_quantize(model.params))
+
+    def _render_view(self, task: ViewTask, progress: float) -> _RenderedView:
         """Render a view and compare it with its image."""
-        index = task.index
+        index, settings = task.view, self.settings
         pixels = self._load_pixels(index) if self.prefetcher is None else self.prefetcher.take(index, task.upcoming)
-        factor = resolution_factor(progress, self.settings.coarse, self.settings.coarse_until)
+        factor = resolution_factor(progress, settings.coarse, settings.coarse_until)
         view, pixels = reduce_view(self.dataset.train.view(index), pixels, factor)
         background = task.background.to(self.device, non_blocking=True)
         truth = pixels.over(background)
@@ -373,59 +375,46 @@ class Trainer:
             counted = flat.numel() if pixels.mask is None else int(pixels.mask.sum()) * channels
             mse = torch.dot(flat, flat).item() / counted
         psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
-        return RenderedView(loss, parts, psnr, view.name, truth, contributions)
+        return _RenderedView(loss, parts, psnr, view.name, truth, contributions)
 
-    def _quantized_model(self) -> Primitives:
-        """The model that images and points are rendered of."""
-        model = self.model
-        if self.fake_quantize is None:
-            return model
-        return Primitives(model.density, model.colour, self.fake_quantize(model.params))
-
-    def _load_pixels(self, index: int) -> Pixels:
-        """Pixels of a training view, on the training's device."""
-        pixels = self.dataset.train.pixels(index)
-        check_pixels("train", self.dataset.train.view(index), pixels, self.dataset.channels)
-        return pixels.to(self.device)
-
-    def _points_due(self) -> bool:
-        """Whether this step uses points. With ``both``, the last step before each multiple of ``voxels_every`` does,
-        which is the one that logs show."""
-        source = self.settings.supervision
-        return source == "voxels" or (source == "both" and (self.step + 1) % self.settings.voxels_every == 0)
-
-    def _draw_points(self) -> PointSamples:
-        points = self.dataset.points
-        assert points is not None, "the constructor refuses data without points"
-        return points.draw(self.settings.voxels_per_step, self.generator)
-
-    def _point_loss(self, samples: PointSamples) -> PointResult:
+    def _compare_points(self, samples: PointSamples) -> PointResult:
         return point_loss(self._quantized_model(), self.dataset, samples, self.settings, self.renderer.threads)
 
-    def _next_view(self) -> int:
-        """Index of the next view: random order without replacement."""
-        if len(self.order) == 0:
-            self.order = torch.randperm(len(self.dataset.train), generator=self.generator)
-        index, self.order = int(self.order[0]), self.order[1:]
-        return index
+    def _total_loss(self, loss: Tensor | None, points: PointResult | None) -> Tensor:
+        """Add the losses of points and regularisers to that of the views, if there are views."""
+        if points is not None:
+            loss = points.loss if loss is None else loss + self.settings.voxel_weight * points.loss
+        assert loss is not None
+        if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
+            loss = loss + self.settings.anisotropy_weight * scale_anisotropy(self.model.params["log_scales"])
+        return loss
 
-    def _draw_background(self) -> Tensor:
-        choice, channels = self.settings.background, self.dataset.channels
-        if choice == "random" or (choice == "auto" and self.dataset.random_background):
-            return torch.rand(channels, generator=self.generator)
-        if choice == "auto":
-            return self.dataset.background.float()
-        return torch.full((channels,), 1.0 if choice == "white" else 0.0)
+    def _backward(self, loss: Tensor, view: _RenderedView | None, points: PointResult | None) -> float:
+        """Add the gradients of ``loss`` to the parameters'; returns its value.
+
+        Raises:
+            NonFiniteError: the value is NaN or infinite; names the view or points.
+        """
+        cost = loss.item()
+        if not math.isfinite(cost):
+            self.model.check_finite()
+            where = f"points of {points.name}" if view is None and points is not None else ""
+            if view is not None:
+                bad_pixels = not bool(torch.isfinite(view.truth).all())
+                where = f"view {view.name}{', whose pixels are NaN or infinite somewhere' if bad_pixels else ''}"
+            raise NonFiniteError(f"loss is {cost} at step {self.step} on {where}")
+        loss.backward()
+        return cost
 
     def _apply_change(self, change: Change) -> None:
-        self.model.params = {spec.name: change.params[spec.name].contiguous() for spec in self.model.specs}
+        self.model.params = {spec.name: change.params[spec.name] for spec in self.model.specs}
         self.optimizer.select(change.origin, change.fresh)
         self.zero_masks = {name: mask[change.origin] for name, mask in self.zero_masks.items()}
         self._require_grad()
 
     def _require_grad(self) -> None:
         for name, value in self.model.params.items():
-            self.model.params[name] = value.detach().requires_grad_()
+            self.model.params[name] = value.detach().contiguous().requires_grad_()
 
     # ------------------------------------------------------------ exact state
 
@@ -448,27 +437,23 @@ class Trainer:
         Raises:
             CheckpointError: the state belongs to other settings or data; names what differs. The trainer is unchanged.
         """
-        found = parse_state(
-            tensors, header, where, self.model, self.settings.adam_beta2, self.dataset.train, self.exposures
-        )
-        self.model.params = found.model.to(self.device).params
-        self.optimizer = RowAdam(self.model.specs, self.model.params, self.settings.adam_beta2)
-        self.optimizer.load_state(found.optimizer.state())
+        check_state(tensors, header, where, *self.state())
+        moved = {name: value.to(self.device, copy=True) for name, value in tensors.items()}
+        self.model.params = {spec.name: moved[f"params.{spec.name}"] for spec in self.model.specs}
+        self.optimizer.load_state(select_prefix(moved, "adam."))
+        self.population.load_state(select_prefix(moved, "population."))
         if self.exposures is not None:
-            self.exposures.load_state(found.exposures)
-        self.order, self.generator = tensors["order"].clone(), found.generator
-        self.population.load_state({name: value.to(self.device) for name, value in found.population.items()})
-        self.zero_masks = {name: mask.to(self.device) for name, mask in found.zero_masks.items()}
-        self.step, self.elapsed = found.step, found.elapsed
+            self.exposures.load_state(select_prefix(moved, "exposure."))
+        self.zero_masks = select_prefix(moved, "zeros.")
+        self.order = tensors["order"].clone()
+        self.generator.set_state(tensors["generator"])
+        self.step, self.elapsed = header["step"], float(header["elapsed"])
         self._require_grad()
 
 
-def summarize_views(views: Sequence[ViewResult]) -> tuple[float, dict[str, float], float, str]:
-    """Loss, its parts, PSNR and name of a step, from its views in their order."""
-    last, others, count = views[-1], views[:-1], len(views)
-    parts = {**last.parts, **last.point_parts}
-    if not others:
-        return last.loss, parts, last.psnr, last.name
-    cost = last.loss + sum(view.loss for view in others) / count
-    parts |= {part: sum(view.parts[part] for view in views) / count for part in last.parts}
-    return cost, parts, sum(view.psnr for view in views) / count, f"{last.name} and {count - 1} more"
+def _summarize_views(views: list[ViewResult]) -> tuple[float, dict[str, float], float, str]:
+    """Loss, mean parts, mean PSNR and name of a step, from its views in their order."""
+    last, count = views[-1], len(views)
+    parts = {part: sum(view.parts[part] for view in views) / count for part in last.parts}
+    name = last.name if count == 1 else f"{last.name} and {count - 1} more"
+    return sum(view.loss for view in views), parts | last.point_parts, sum(view.psnr for view in views) / count, name

@@ -10,8 +10,6 @@ from dataclasses import replace
 from neuprim.core.data import Pixels, View
 from neuprim.core.data.image_views import average_pixels, reduce_mask
 
-__all__ = ["Prefetcher", "reduce_view", "resolution_factor"]
-
 _MIN_SIDE = 16
 """Pixels along a side that no reduction goes below."""
 

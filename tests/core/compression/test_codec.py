@@ -108,29 +108,6 @@ def test_neither_the_order_of_rows_nor_their_place_matters(tmp_path: Path) -> No
         assert torch.allclose(a, b, atol=1e-5)
 
 
-def test_more_bits_are_a_better_image(tmp_path: Path) -> None:
-    task, model = example("static", 100)
-    errors, sizes = [], []
-    with torch.no_grad():
-        true = render(model, scenes.camera(), {}, RenderSettings()).rgb
-        for level in LEVELS:
-            checkpoint.save_compressed(tmp_path / "m", model, task.name, {}, LEVELS[level])
-            sizes.append((tmp_path / "m").stat().st_size)
-            errors.append(
-                float(
-                    (
-                        render(
-                            checkpoint.load_model(tmp_path / "m", task)[0], scenes.camera(), {}, RenderSettings()
-                        ).rgb
-                        - true
-                    )
-                    .abs()
-                    .mean()
-                )
-            )
-    assert sizes == sorted(sizes, reverse=True) and errors == sorted(errors) and errors[0] < 0.1 * errors[-1]
-
-
 # ---------------------------------------------------------------- bits
 
 
@@ -153,15 +130,6 @@ def test_positions_get_the_bits_that_the_primitives_sizes_ask_for() -> None:
     steps = float((made.high - made.low)[0] / made.last[0])
     assert np.exp(-3.0) / 100 < steps <= np.exp(-3.0) / 50
     assert fit_quantizers(model, bit_table(5, ["means=9"], model.specs))["means"].bits.tolist() == [9] * 3
-
-
-def test_words_over_a_level() -> None:
-    specs = example("dynamic")[1].specs
-    table = bit_table(3, ["sh_rest=6,5", "means=20", "others=9"], specs)
-    assert table.named["sh_rest"] == (6, 5) and table.named["means"] == (20,) and table.of("W_t", (3,)) == [9] * 3
-    assert all(table.of(name, (4,)) == LEVELS[3].of(name, (4,)) for name in ("quats", "W1", "log_scales"))
-    assert {"W_t", "velocity", "sh_rest", "means"} <= table.exact and not {"quats", "W1"} & table.exact
-    assert bit_table(2, [], specs) == LEVELS[2]
 
 
 @pytest.mark.parametrize(

@@ -91,14 +91,6 @@ def test_even_steps_reach_every_number_and_pass_through_one_place(
     assert float(near) <= 1e-3 * taken + 5e-7 * size + 1e-40  # ends are float32
 
 
-@pytest.mark.parametrize("value", [torch.finfo(torch.float32).max, 1e-45, -0.0])
-def test_extreme_numbers(value: float) -> None:
-    x = torch.tensor([[value], [-value], [0.0]])
-    made = fit_columns(x, [9])
-    back = made.values(made.codes(x))
-    assert bool(torch.isfinite(back).all()) and float((back[:2] - x[:2]).abs().max()) == 0
-
-
 def test_gradients_go_straight_through() -> None:
     x = torch.randn(6, 2, requires_grad=True)
     made = fit_columns(x, [3, 3])
@@ -139,12 +131,6 @@ def test_ties_between_components_are_coded_as_they_were() -> None:
         made = Rotations(bits)
         once = made.values(made.codes(q))
         assert torch.equal(made.values(made.codes(once)), once)
-
-
-def test_no_turn_and_quarter_turns_stay_exact() -> None:
-    q = torch.cat([torch.eye(4), -torch.eye(4), 1e-20 * torch.eye(4), 1e-45 * torch.eye(4)])
-    for bits in (3, 8):
-        assert torch.equal(Rotations(bits).values(Rotations(bits).codes(q)), torch.eye(4).repeat(4, 1))
 
 
 def test_rounded_orientations_keep_norm_sign_and_gradient() -> None:

@@ -44,13 +44,6 @@ def plain_ssim(a: np.ndarray, b: np.ndarray, window: int, peak: float = 1.0) -> 
     return float(np.mean(values))
 
 
-def test_psnr_averages_squares_over_pixels_and_channels() -> None:
-    truth = torch.zeros(2, 2, 2)
-    rendered = truth.clone()
-    rendered[0, 1, 1] = 0.5  # MSE = 0.25 / 8
-    assert psnr(rendered, truth) == pytest.approx(10 * math.log10(8 / 0.25))
-
-
 def test_psnr_mask_selects_pixels() -> None:
     truth = torch.zeros(2, 3, 3)
     rendered = truth.clone()
@@ -132,19 +125,6 @@ def test_non_finite_values_are_an_error_not_a_number() -> None:
             metric(rendered, truth)
         with pytest.raises(NonFiniteError, match="truth"):
             metric(truth, rendered)
-
-
-def test_bad_masks_and_peaks() -> None:
-    image = torch.zeros(4, 4, 3)
-    with pytest.raises(DataError, match="no pixel"):
-        psnr(image, image, torch.zeros(4, 4, dtype=torch.bool))
-    with pytest.raises(DataError, match="expected bool"):
-        psnr(image, image, torch.ones(4, 4))
-    with pytest.raises(DataError, match=r"\(4, 4\)"):
-        psnr(image, image, torch.ones(4, 3, dtype=torch.bool))
-    for metric in (psnr, ssim):
-        with pytest.raises(DataError, match="peak"):
-            metric(image, image, peak=0.0)
 
 
 def test_infinite_values_survive_strict_json() -> None:

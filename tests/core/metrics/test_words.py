@@ -28,9 +28,3 @@ def test_the_worst_view_and_those_worse_than_black_are_named() -> None:
     assert format_metrics(metrics([40.0], [])) == "PSNR of 1 views: mean 40.00 dB, worst 40.00 dB (v0)"
     many = format_metrics(metrics([1.0] * 9, [f"v{i}" for i in range(9)]))
     assert many.endswith("(v0, v1, v2, v3, v4, v5 and 3 more, see worse_than_black_image in metrics.json)")
-
-
-def test_empty_frames_without_error() -> None:
-    assert format_metrics(metrics([math.inf, math.inf], [])).startswith(
-        "PSNR of 2 views, 2 exact: mean inf dB, worst inf dB"
-    )

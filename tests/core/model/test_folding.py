@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from neuprim.core.model.cosine_sums import canonicalize_cosines
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from tests import scenes
@@ -55,14 +54,6 @@ def test_numbers_lie_where_they_are_said_to() -> None:
         assert float(first.min()) >= 0 and float(model.params[weights].min()) < 0
         assert float(made[phase].min()) >= 0 and float(made[phase].max()) <= math.pi / rate * (1 + 1e-5)
         assert float(model.params[phase].abs().max()) > math.pi / rate
-
-
-def test_a_phase_at_the_end_of_half_a_turn_stays() -> None:
-    """float32 rounds pi/30 up: taken for more than half a turn, it would be folded to just below, then again."""
-    end = torch.tensor([[math.pi / 30, 0.0]])
-    params = {"W": torch.ones(1, 2, 3), "b": end, "w": torch.ones(1, 2)}
-    made = canonicalize_cosines(params, ("W",), "b", "w", 30.0)
-    assert all(torch.equal(made[key], value) for key, value in params.items())
 
 
 def test_one_number_says_how_strong_a_density_without_neurons_is() -> None:

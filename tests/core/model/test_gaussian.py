@@ -15,13 +15,11 @@ from torch import Tensor
 import neuprim.runs.run as running
 from neuprim.config import compose
 from neuprim.core import checkpoint
-from neuprim.core.errors import BackendUnavailable
 from neuprim.core.model.densities.gaussian import GaussianDensity, bell_integral
 from neuprim.core.model.fields import CustomDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.core.render import RenderSettings, render
 from neuprim.core.train.splitting import split_primitives
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
@@ -180,15 +178,6 @@ def test_split_keeps_the_mass_of_the_pair(factors: tuple[float, float]) -> None:
     assert torch.allclose(pair, before, rtol=1e-12, atol=0)
     in_place = m.density.on_split(m.of(m.density), m.geometry, m.geometry)
     assert torch.allclose(2 * in_place["log_amplitude"].exp(), m.params["log_amplitude"].exp(), rtol=1e-14, atol=0)
-
-
-def test_renders_through_the_reference_backend() -> None:
-    m = model(dtype=torch.float32)
-    output = render(m, scenes.camera(), {}, RenderSettings(backend="auto"))
-    assert output.stats.backend == "reference" and output.rgb.dtype == torch.float32
-    assert 0.2 < output.alpha.max() <= 1
-    with pytest.raises(BackendUnavailable, match="CustomDensity density"):
-        render(m, scenes.camera(), {}, RenderSettings(backend="cpu"))
 
 
 # ---------------------------------------------------------------- runs

@@ -167,17 +167,6 @@ def test_fewer_terms_in_time_are_closer_than_terms_cut_off(name: str) -> None:
     assert fitted < 0.5 * plain
 
 
-def test_no_terms_in_time_leave_the_mean_over_the_sequence() -> None:
-    model = made(*PAIRS[1])
-    colour = model.colour
-    assert isinstance(colour, TimeHarmonics)
-    field, params = colour.reduce(model.of(colour), model.geometry, "powers", 0)
-    field, params = field.reduce(params, model.geometry, "waves", 0)
-    times = torch.linspace(0, 1, 401)
-    mean = torch.stack([colour.harmonics(model.of(colour), {"time": t})[0] for t in times]).mean(0)
-    assert torch.allclose(field.harmonics(params, CONDITIONS)[0], mean, atol=5e-3)
-
-
 def in_time(time: str, neurons: int = 4) -> Primitives:
     """A density that varies in time, quietly enough for its mean to mean something."""
     return made(TimeDensity(neurons, time), TimeHarmonics(0, powers=0, waves=0), noise=0.05)
@@ -197,15 +186,6 @@ def test_a_still_phase_is_the_mean_of_the_moving_one() -> None:
     assert torch.allclose(still, mean, rtol=1e-3, atol=1e-3 * float(mean.abs().max()))
 
 
-def test_a_still_offset_is_the_mean_of_the_changing_one() -> None:
-    model = in_time("offset", 0)
-    density = model.density
-    field, params = density.reduce(model.of(density), model.geometry, "offset", 0)
-    times = (torch.arange(400) + 0.5) / 400
-    mean = torch.stack([density.lower(model.of(density), model.geometry, {"time": t}).b2 for t in times]).mean(0)
-    assert torch.allclose(field.lower(params, model.geometry, CONDITIONS).b2, mean, atol=1e-5)
-
-
 def test_without_windows_primitives_are_as_dense_as_they_are_in_the_mean() -> None:
     model = in_time("window", 2)
     density = model.density
@@ -214,17 +194,6 @@ def test_without_windows_primitives_are_as_dense_as_they_are_in_the_mean() -> No
     for name in ("w2", "b2"):
         lowered = [getattr(density.lower(model.of(density), model.geometry, {"time": t}), name) for t in times]
         assert torch.allclose(params[name], torch.stack(lowered).mean(0), atol=1e-4)
-
-
-def test_without_windows_motion_goes_on_as_it_was() -> None:
-    model = in_time("window+motion", 0)
-    density = model.density
-    field, params = density.reduce(model.of(density), model.geometry, "window", 0)
-    moved = Geometry(params.pop("means"), model.geometry.log_scales, model.geometry.quats)
-    for time in (0.0, 0.3, 1.0):
-        before = density.move(model.of(density), model.geometry, {"time": torch.tensor(time)}).means
-        after = field.move(params, moved, {"time": torch.tensor(time)}).means
-        assert torch.allclose(after, before, atol=1e-5)
 
 
 @pytest.mark.parametrize("time", ["motion", "window+motion"])

@@ -73,18 +73,6 @@ def test_without_a_gpu_everything_is_computed_on_the_cpu(monkeypatch: pytest.Mon
     assert backends.with_available_device(RenderSettings(device="cuda", near=0.5)) == RenderSettings(near=0.5)
 
 
-def test_what_is_no_frame_is_computed_where_frames_are(card: Card) -> None:
-    for settings, wanted in (
-        (RenderSettings(), CARD),
-        (RenderSettings(device="cpu"), HOST),
-        (RenderSettings(backend="cpu"), HOST),
-        (RenderSettings(backend="card"), CARD),
-        (setting(CARD.type), CARD),
-        (RenderSettings(backend="cuda", device="cpu"), HOST),
-    ):
-        assert computing_device(settings) == wanted, settings
-
-
 def test_a_backend_and_a_device_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
     line = r"^renderer\.device=cuda: renderer\.backend=reference does not draw there; expected cpu or auto$"
     with pytest.raises(ConfigError, match=line):

@@ -26,8 +26,6 @@ from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer, ViewResult, ViewTask
 from neuprim.core.train.trainer_state import hash_names
 
-__all__ = ["DistributedTrainer"]
-
 
 class _Message(NamedTuple):
     """What a rank tells the others in a step.
@@ -119,7 +117,7 @@ class DistributedTrainer(Trainer):
         """Whether any rank was asked to stop before the step just done; the same on all ranks."""
         return self._stopping
 
-    def _sample_views(self) -> list[ViewTask]:
+    def _draw_views(self) -> list[ViewTask]:
         drawn = [(self._next_view(), self._draw_background()) for _ in range(self.settings.views_per_step * self.ranks)]
         own = drawn[self.rank :: self.ranks]
         after = int(self.order[self.rank]) if len(self.order) > self.rank else None
@@ -130,17 +128,19 @@ class DistributedTrainer(Trainer):
         self._present = [False] * len(self.model.params)
         return [ViewTask(index, background, then) for (index, background), then in zip(own, upcoming, strict=True)]
 
-    def _collect_view(self, result: ViewResult, contributions: Contributions) -> None:
+    def _exchange_gradients(self, contributions: Contributions) -> Contributions:
         assert self._sums is not None
-        self._view_results.append(result)
         present = self._sums.add(self.model.params, contributions)
         self._present = [before or now for before, now in zip(self._present, present, strict=True)]
+        return contributions
 
-    def _sum_views(self, start: float) -> tuple[list[ViewResult], Contributions]:
+    def _combine_views(
+        self, results: list[ViewResult], each: list[Contributions], start: float
+    ) -> tuple[list[ViewResult], Contributions]:
         assert self._sums is not None
         self._agreed_at = time.perf_counter()
         elapsed = self.elapsed + self._after + self._agreed_at - start
-        own = _Message(self._checksum, elapsed, self.stop_requested(), self._present, self._view_results)
+        own = _Message(self._checksum, elapsed, self.stop_requested(), self._present, results)
         messages: list[_Message] = self.group.gather(own)
         for rank, message in enumerate(messages):
             if message.checksum != messages[0].checksum:
@@ -151,11 +151,11 @@ class DistributedTrainer(Trainer):
         self._agreed = messages[0].elapsed
         self._stopping = any(message.stop for message in messages)
         present = [any(each) for each in zip(*(message.present for message in messages), strict=True)]
-        results = [view for views in zip(*(message.views for message in messages), strict=True) for view in views]
-        return results, self._sums.finish(self.model.params, present)
+        every = [view for views in zip(*(message.views for message in messages), strict=True) for view in views]
+        return every, self._sums.finish(self.model.params, present)
 
     def _stop_clock(self, start: float) -> float:
-        """Rank 0's clock as of :meth:`_sum_views`; what the step spends afterwards counts in the next one."""
+        """Rank 0's clock as of :meth:`_combine_views`; what the step spends afterwards counts in the next one."""
         self._after = time.perf_counter() - self._agreed_at
         return self._agreed
 

@@ -18,7 +18,6 @@ from neuprim.core.render.output import Contributions
 if TYPE_CHECKING:
     from neuprim.core.train.distributed.process_group import ProcessGroup
 
-__all__ = ["GradientSum"]
 
 _ALIGNMENT = 16
 """Numbers; tensors start at multiples of 64 bytes, which vector units read at once."""

@@ -16,8 +16,6 @@ from torch.distributed.rendezvous import rendezvous
 from neuprim.core.errors import ConfigError, RankError
 from neuprim.core.train.distributed.torchrun import TorchrunRank
 
-__all__ = ["ProcessGroup"]
-
 MEETING = timedelta(minutes=5)
 """How long ranks wait for the last one to start."""
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 from neuprim.core.errors import ConfigError
 
-__all__ = ["TorchrunRank", "read_torchrun_rank"]
-
 _NUMBERS = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
 _VARIABLES = (*_NUMBERS, "MASTER_ADDR", "MASTER_PORT")
 

@@ -3,8 +3,6 @@ card where there is one."""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -13,9 +11,7 @@ pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip ins
 
 from neuprim.core.render import layout as P
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.frame import Frame, NotFinite
-from neuprim.core.render.cuda.prepare_backward import prepare_backward
-from neuprim.core.render.rasterize import PARAMETERS
+from neuprim.core.render.cuda.frame import Frame
 from tests.core.render.cuda.twin import CASES, DEVICES, Array, both, frame_of, numpy, ulps
 
 PLACES = {
@@ -105,49 +101,3 @@ def test_forced_primitives_are_drawn_in_float64(device: str) -> None:
     assert (frame.rows[wanted][:, [L.XU, L.XV], 3] == 0).all(), "float64 does not slide"
     assert torch.equal(frame.rows[~forced], free.rows[~forced])
     assert torch.equal(frame.lists.ids, free.lists.ids)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [(n, math.nan) for n in (*PARAMETERS, "colors")]
-    + [("log_scales", 95.0), ("w2", -math.inf), ("b2", -math.inf), ("quats", 0.0)],
-)
-def test_the_first_primitive_that_is_not_finite_is_named(name: str, value: float, device: str) -> None:
-    case = CASES["K=8"]
-    t = case.tensors()
-    t[name][[77, 310]] = value
-    with pytest.raises(NotFinite) as error:
-        frame_of(case, t, device)
-    assert error.value.row == 77
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("name", CASES)
-def test_gradients_are_numbas(name: str, device: str) -> None:
-    numba, frame = both(name, device)
-    seen = numba.visible
-    g = torch.Generator().manual_seed(5)
-    grads = torch.randn(len(seen), L.gradient_width(frame.neurons, CASES[name].channels), generator=g)
-    grads[:, L.G_WEIGHT] = (torch.rand(len(seen), generator=g) - 0.3).clamp(min=0)
-    grads[torch.from_numpy(~seen)] = 0.0
-    expected, view = numba.backward(grads.numpy())
-    found, found_view = prepare_backward(frame, grads.to(device), True)
-    for parameter, own, theirs in zip(PARAMETERS, found, expected, strict=True):
-        assert own.dtype == torch.float32 and own.shape == theirs.shape
-        a, b = numpy(own).reshape(len(seen), -1).astype(np.float64), theirs.reshape(len(seen), -1).astype(np.float64)
-        if (
-            parameter == "log_scales"
-        ):  # numba takes its frequencies from the float32 row, and the longest axis is a sum that cancels
-            W = numba.neurons(numba.projected.rows, np.arange(len(seen)))[:, :, :3]
-            gw = grads.numpy()[:, L.G_NEURONS : L.G_NEURONS + L.PER_NEURON * frame.neurons].reshape(
-                len(seen), frame.neurons, L.PER_NEURON
-            )
-            scale = np.abs(b).max(1) + np.abs(W * gw[:, :, :3]).sum((1, 2))
-        else:
-            scale = np.abs(b).max(1, initial=0)
-        assert (np.abs(a - b).max(1, initial=0) <= 1e-6 * scale).all(), parameter
-        assert b.size == 0 or np.abs(b).max() > 0
-    assert found_view is not None and found_view.dtype == torch.float64
-    assert (np.abs(numpy(found_view) - view.sum(0)) <= 1e-12 * np.abs(view).sum(0)).all()
-    assert prepare_backward(frame, grads.to(device))[1] is None

@@ -10,10 +10,7 @@ import torch
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
 from neuprim.config import compose
-from neuprim.core import notices
-from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.runs.fit import prepare_training
-from tests import scenes
 from tests.core import tiny
 from tests.short_runs import words
 
@@ -41,14 +38,3 @@ def test_first_gradients_are_the_cpu_backends(task: str, tmp_path: Path) -> None
         least = 1e-8 if name == "quats" else 0.0  # all of it is rounding, as fresh primitives are balls
         assert torch.allclose(found, value, rtol=1e-4, atol=1e-4 * float(value.abs().max()) + least), name
     assert float(one.trainer.optimizer.m["means"].abs().max()) > 0
-
-
-def test_it_warns_once_that_it_is_slow_on_the_cpu(
-    monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
-) -> None:
-    monkeypatch.setattr(notices, "_said", set())
-    low, camera = scenes.lowered(scenes.tensors(3)), scenes.camera(8, 8)
-    for backend in ("cpu", "reference", "auto", "cuda", "cuda"):
-        render_lowered(low, camera, RenderSettings(backend=backend, device="cpu"))
-    (said,) = [w for w in recwarn if issubclass(w.category, notices.NeuprimWarning)]
-    assert str(said.message).startswith("renderer.backend=cuda is slow on the cpu")

@@ -15,10 +15,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu.backend import _view
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
-from neuprim.core.render.cpu.layout import gradient_width
 from neuprim.core.render.cpu.prepare import Parameters, Projected, View, prepare, prepare_wide
-from neuprim.core.render.cpu.prepare_backward import prepare_backward
-from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.frame import Frame, prepare_frame
 from neuprim.core.render.limits import NON_FINITE, VISIBLE, min_visible_depth
 from neuprim.core.render.output import RenderStats
@@ -119,19 +116,6 @@ class Numba:
         out = np.empty_like(given)
         np.put_along_axis(out, np.repeat(order[which].astype(np.int64)[:, :, None], P.PER_NEURON, 2), given, 1)
         return out
-
-    def backward(self, grads: Array) -> tuple[Parameters, Array]:
-        """Gradients of the parameters, and (N, 3, 4) of the view, from the cuda backend's gradient rows."""
-        count, K = self.projected.order.shape
-        own = np.zeros((count, gradient_width(K + K % 2, self.case.channels)), np.float32)
-        own[:, : P.G_NEURONS] = grads[:, : L.G_NEURONS]
-        given = grads[:, L.G_NEURONS : L.G_NEURONS + L.PER_NEURON * K].reshape(count, K, L.PER_NEURON)
-        order = np.repeat(self.projected.order.astype(np.int64)[:, :, None], L.PER_NEURON, 2)
-        own[:, P.G_NEURONS : P.G_NEURONS + P.PER_NEURON * K] = np.take_along_axis(given, order, 1).reshape(count, -1)
-        out, view = Parameters(*(np.zeros(x.shape, np.float32) for x in self.parameters)), np.zeros((count, 3, 4))
-        touched = own[:, P.G_WEIGHT] > 0
-        prepare_backward(0, count, self.parameters, self.view, self.projected, own, touched, out, view)
-        return out, view
 
 
 def numba_frame(case: Case, t: dict[str, Tensor]) -> Numba:

@@ -35,7 +35,8 @@ RUNS: dict[str, tuple[str, int, tuple[str, ...], tuple[str, ...]]] = {
         ("psnr_linear_clamped", "psnr_pooled_cast_shadow", "psnr_pooled_highlight"),
     ),
 }
-"""Scene, steps, further words and the measures. `chair_*` have the bytes of 2,000 or 5,000 of the paper's primitives."""
+"""Scene, steps, further words and the measures. `chair_*` have the bytes of 2,000 or 5,000 of the paper's
+primitives."""
 
 
 def describe_commit(folder: Path) -> str:

@@ -148,7 +148,8 @@ def forms_table(record: dict[str, Any]) -> str:
     table = make_table(columns, [runs for _, runs in ordered])
     seeds = format_range(len(runs) for runs in groups.values())
     return (
-        f"{table}\n\nPreset `quick` with all primitives from the start and without a cool-down, {seeds} seed(s), mean ± "
+        f"{table}\n\nPreset `quick` with all primitives from the start and without a cool-down, {seeds} seed(s), mean "
+        f"± "
         "half the spread; *bytes of* so many of the paper's primitives; steps: as many as fit into the seconds of the "
         "paper's form, at paces measured in turns over whole runs; *error of σ*: relative L2 over the files' voxels, "
         "early / middle / late; *last doubling*: what the second half of the budget brought, first seed. PSNR is of "

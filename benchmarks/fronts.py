@@ -103,7 +103,8 @@ def reach(result: Mapping[str, Any], front: str, cost: str) -> float:
 def report(name: str, result: Mapping[str, Any]) -> str:
     """Prints the table of a scene; returns it with what is said about it."""
     title = (
-        f"**{SCENES[name].title}** (`{' '.join(result['words'])}`): {reach(result, 'speed', 'time_ratio'):.1f} times in "
+        f"**{SCENES[name].title}** (`{' '.join(result['words'])}`): {reach(result, 'speed', 'time_ratio'):.1f} times "
+        f"in "
         f"the time of a frame, {reach(result, 'size', 'bytes'):.0f} times in bytes. {result['length']}"
     )
     print(f"\n{title}\n")

@@ -13,8 +13,9 @@ with the float64 reference's.
 - thin: on shorter chords, misses included, error/S_c (S_c/S)^(2p - 1), S_c the central chord's S.
 - gradient: error of a parameter's gradient over the gradient's norm, over four random functionals of the image.
 
---record writes the table to docs/numerical_limits.md. --run looks at a trained model instead: from a dozen of its held-out views, with the near plane at each of --near, how many primitives the cpu
-backend draws in float64, and the largest error of three small images against the reference backend.
+--record writes the table to docs/numerical_limits.md. --run looks at a trained model instead: from a dozen of its
+held-out views, with the near plane at each of --near, how many primitives the cpu backend draws in float64, and the
+largest error of three small images against the reference backend.
 """
 
 from __future__ import annotations

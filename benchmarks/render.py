@@ -41,7 +41,8 @@ from neuprim.core.train.optimizer import RowAdam
 
 FLOPS = {"forward": 420, "backward": 1100}
 MEMORY = (
-    f"Per primitive {4 * row_width(8) + 4 * layout.SPAN_WIDTH} bytes of rows and spans and per pair 8 bytes of lists; a "
+    f"Per primitive {4 * row_width(8) + 4 * layout.SPAN_WIDTH} bytes of rows and spans and per pair 8 bytes of lists; "
+    f"a "
     f"backward pass takes {4 * gradient_width(8, 3)} bytes more for each (K = 8, three colours), and what the forward "
     f"pass keeps for it: 6 bytes a pair and 4 a lane."
 )

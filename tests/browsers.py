@@ -23,7 +23,8 @@ from neuprim.webpage.page import camera_numbers
 __all__ = ["Tab", "browser", "executable", "open_tab"]
 
 _FLAGS = (
-    "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run", "--disable-background-networking",
+    "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run",
+    "--disable-background-networking",
     "--disable-component-update", "--disable-sync",
 )  # fmt: skip
 _PATIENCE = 120.0

@@ -33,7 +33,8 @@ def compiled_by(program: str) -> dict[str, list[str]]:
         "for name, module in sorted(sys.modules.items()):\n"
         "    for value in vars(module).values() if name.startswith('neuprim.') else ():\n"
         "        if isinstance(value, Dispatcher) and isinstance(value._cache, FunctionCache) and value.signatures:\n"
-        "            found[f'{value.py_func.__module__}.{value.py_func.__name__}'] = sorted(map(str, value.signatures))\n"
+        "            found[f'{value.py_func.__module__}.{value.py_func.__name__}'] = sorted(map(str, "
+        "value.signatures))\n"
         "print(json.dumps(found))\n"
     )
     done = subprocess.run(

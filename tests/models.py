@@ -114,7 +114,10 @@ def write_gltf(path: Path, **changes: Any) -> Path:
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = None) -> Path:
     """Binary, with the colours of vertices."""
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\nproperty float x\nproperty float "
+        f"y\nproperty float z\n"
+    )
     if colours is not None:
         header += "property uchar red\nproperty uchar green\nproperty uchar blue\n"
     header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"

@@ -83,7 +83,8 @@ class Card(TorchDispatchMode):
                     name in _INDEXED and isinstance(args[0], _OnCard) and other.dtype in (torch.int64, torch.bool)
                 ):
                     raise RuntimeError(
-                        f"{name}: expected all tensors to be on the same device, found {[str(x.device) for x in tensors]}"
+                        f"{name}: expected all tensors to be on the same device, found "
+                        f"{[str(x.device) for x in tensors]}"
                     )
         if cards and (
             name in _WAITS or (name == "aten::_to_copy" and asked is not None and torch.device(asked).type == "cpu")

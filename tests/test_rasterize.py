@@ -161,7 +161,8 @@ def test_population_statistics_come_back_per_camera() -> None:
         assert torch.allclose(tally.error_weight, tally.weight * (0.5 if c == 1 else 1.0))
     with pytest.raises(
         DataError,
-        match=rf"^rasterize: request_contributions: error has shape \(2, 3\); expected \(3, {HEIGHT}, {WIDTH}\), that of alpha$",
+        match=rf"^rasterize: request_contributions: error has shape \(2, 3\); expected \(3, {HEIGHT}, {WIDTH}\), that "
+        rf"of alpha$",
     ):
         out.request_contributions(torch.ones(2, 3))
 
@@ -184,24 +185,31 @@ def put(name: str, value: Any) -> Any:
 NAN = float("nan")
 BAD: dict[str, tuple[Any, type[NeuprimError], str]] = {
     "means flat": (put("means", lambda v: v.flatten()), DataError, r"means has shape \(90,\); expected \(N, 3\)"),
-    "W1": (put("W1", lambda v: v.transpose(1, 2)), DataError, r"W1 has shape \(30, 3, 8\); expected \(N, K, 3\) with N=30"),
+    "W1": (put("W1", lambda v: v.transpose(1, 2)), DataError,
+        r"W1 has shape \(30, 3, 8\); expected \(N, K, 3\) with N=30"),
     "w2": (put("w2", lambda v: v[:7]), DataError, r"w2 has shape \(7, 8\); expected \(30, 8\)"),
     "b2": (put("b2", lambda v: v.expand(30, 2)), DataError, r"b2 has shape \(30, 2\); expected \(30, 1\) or \(30,\)"),
-    "colors rows": (put("colors", lambda v: v[:29]), DataError, r"colors has shape \(29, 3\); expected \(N, channels\)"),
-    "colors views": (put("colors", lambda v: v.expand(2, 30, 3)), DataError, r"colors has shape \(2, 30, 3\); expected \(3, 30, channels\)"),
-    "mixed": (put("w2", lambda v: v.double()), DataError, r"w2 has dtype torch\.float64; expected torch\.float32, as means has"),
+    "colors rows": (put("colors", lambda v: v[:29]), DataError,
+        r"colors has shape \(29, 3\); expected \(N, channels\)"),
+    "colors views": (put("colors", lambda v: v.expand(2, 30, 3)), DataError,
+        r"colors has shape \(2, 30, 3\); expected \(3, 30, channels\)"),
+    "mixed": (put("w2", lambda v: v.double()), DataError,
+        r"w2 has dtype torch\.float64; expected torch\.float32, as means has"),
     "device": (put("colors", lambda v: v.to("meta")), DataError, r"colors has device meta; expected cpu"),
     "nan": (changed("b1", (13, 2), NAN), NonFiniteError, r"b1 of primitive 13 is not finite"),
     "zero quat": (changed("quats", (9,), 0.0), NonFiniteError, r"quats of primitive 9 is zero"),
     "viewmats nan": (changed("viewmats", (1, 0, 3), NAN), DataError, r"viewmats\[1\].*non-finite"),
     "viewmats scaled": (put("viewmats", lambda v: v * 2), DataError, r"viewmats\[0\].*expected a rotation"),
     "Ks skew": (changed("Ks", (1, 0, 1), 0.5), DataError, r"Ks\[1\] has skew K\[0,1\]=0\.5.*not supported"),
-    "Ks last row": (changed("Ks", (0, 2, 2), 2.0), DataError, r"Ks\[0\] has last row \[0\.0, 0\.0, 2\.0\]; expected \[0, 0, 1\]"),
+    "Ks last row": (changed("Ks", (0, 2, 2), 2.0), DataError,
+        r"Ks\[0\] has last row \[0\.0, 0\.0, 2\.0\]; expected \[0, 0, 1\]"),
     "Ks focal": (changed("Ks", (0, 1, 1), -5.0), DataError, r"Ks\[0\] has focal lengths .*fy=-5\.0; expected positive"),
     "width": (put("width", 0), DataError, r"width has value 0; expected a positive int"),
     "edge": (put("edge", 3), DataError, r"edge has value 3; expected 0, 1 or 2"),
-    "log_gain": (put("log_gain", torch.zeros(29)), DataError, r"log_gain has shape \(29,\); expected \(30, 1\) or \(30,\)"),
-    "backgrounds": (put("backgrounds", torch.ones(2, 3)), DataError, r"backgrounds has shape \(2, 3\); expected \(3,\) or \(3, 3\)"),
+    "log_gain": (put("log_gain", torch.zeros(29)), DataError,
+        r"log_gain has shape \(29,\); expected \(30, 1\) or \(30,\)"),
+    "backgrounds": (put("backgrounds", torch.ones(2, 3)), DataError,
+        r"backgrounds has shape \(2, 3\); expected \(3,\) or \(3, 3\)"),
     "backgrounds nan": (put("backgrounds", torch.full((3,), NAN)), NonFiniteError, r"backgrounds is not finite"),
     "setting": (put("alpha_mim", 0.1), ConfigError, r"unknown setting 'alpha_mim'; did you mean 'alpha_min'"),
 }  # fmt: skip
@@ -220,7 +228,10 @@ def test_bad_input_is_named(name: str) -> None:
 
 
 def test_importing_the_package_stays_light_and_the_name_stays_a_function() -> None:
-    code = "import sys, neuprim; assert 'torch' not in sys.modules; assert 'rasterize' in dir(neuprim); neuprim.rasterize; neuprim.nothing"
+    code = (
+        "import sys, neuprim; assert 'torch' not in sys.modules; assert 'rasterize' in dir(neuprim); "
+        "neuprim.rasterize; neuprim.nothing"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[1])
     assert done.returncode == 1 and "AttributeError: module 'neuprim' has no attribute 'nothing'" in done.stderr
     assert inspect.isfunction(neuprim.rasterize)

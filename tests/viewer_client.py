@@ -41,7 +41,8 @@ class Visitor:
     def stand(self, position: tuple[float, float, float] = (0.0, -4.0, 1.0), size: tuple[int, int] = (64, 48)) -> None:
         """A camera that looks at the origin, as a page reports it."""
         self.say(
-            "ViewerCameraMessage", wxyz=(0.7071, -0.7071, 0.0, 0.0), position=position, fov=0.8, near=0.01, far=100.0, image_height=size[1],
+            "ViewerCameraMessage", wxyz=(0.7071, -0.7071, 0.0, 0.0), position=position, fov=0.8, near=0.01, far=100.0,
+            image_height=size[1],
             image_width=size[0], look_at=(0.0, 0.0, 0.0), up_direction=(0.0, 0.0, 1.0),
         )  # fmt: skip
 

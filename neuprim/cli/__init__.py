@@ -1,7 +1,8 @@
 """The ``neuprim`` command: parse, call, print.
 
 Exit status: 0 done, 1 no backend works (``doctor``), 2 the input's fault (one line on standard error), 130 interrupted.
-A bug in neuprim keeps its traceback. ``NEUPRIM_TRACEBACK=1`` shows the traceback of every error, for authors of plugins.
+A bug in neuprim keeps its traceback. ``NEUPRIM_TRACEBACK=1`` shows the traceback of every error, for authors of
+plugins.
 """
 
 from __future__ import annotations

@@ -107,7 +107,8 @@ def package_root(spec: TaskSpec) -> Traversable:
 
 
 def read_group(spec: TaskSpec, group: str, name: str, package: str | None = None) -> dict[str, Any]:
-    """Return the settings of a scene or preset, with those of its ``defaults`` under its own; ``${...}`` stays as it is.
+    """Return the settings of a scene or preset, with those of its ``defaults`` under its own; ``${...}`` stays as it
+    is.
 
     Args:
         package: that holds the file; None for the task's own.

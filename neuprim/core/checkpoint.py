@@ -138,7 +138,8 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
     """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source.
 
     Args:
-        without_zeros: whether zeros of the fields are left out (:mod:`neuprim.core.model.sparse_storage`), as in models that
+        without_zeros: whether zeros of the fields are left out (:mod:`neuprim.core.model.sparse_storage`), as in models
+            that
         were pruned.
     """
     specs = (*model.density.parameters(), *model.colour.parameters()) if without_zeros else ()

@@ -21,8 +21,8 @@ class LayerSpec:
     Attributes:
         name: what the user types after ``--layers``, and the prefix of its channels in the file: letters, digits, _.
         summary: one line with the meaning and unit of a value; it is written into the file, too.
-        draw: :class:`~neuprim.core.render.layer_frame.LayerFrame` -> (H, W, C) finite values, or (H, W) for one channel;
-            None if the frame's model has no such layer.
+        draw: :class:`~neuprim.core.render.layer_frame.LayerFrame` -> (H, W, C) finite values, or (H, W) for one
+            channel; None if the frame's model has no such layer.
         channels: their names. Empty for layers of light, which have the channels of the task's images over black,
             premultiplied by alpha, and are sums over the lights of an environment. They need linear colours.
     """

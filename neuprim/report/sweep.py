@@ -196,7 +196,8 @@ class _Page:
             if better(name) is not None
         )
         choice = (
-            f'<p class="choose" hidden><label for="metric">Best by</label><select id="metric">{options}</select><b id="best"></b></p>'
+            f'<p class="choose" hidden><label for="metric">Best by</label><select id="metric">{options}</select><b '
+            f'id="best"></b></p>'
             if options
             else ""
         )
@@ -220,7 +221,9 @@ class _Page:
                 else ""
             )
             cells.append(
-                f'<td{kind} data-value="{"" if value is None else _sortable(value)}">{" ".join(filter(None, _shown(metric, value)))}</td>'
+                f"<td{kind} "
+                f'data-value="{"" if value is None else _sortable(value)}">'
+                f"{' '.join(filter(None, _shown(metric, value)))}</td>"
             )
         cells.append(f'<td data-value="{run.seconds:.3f}">{format_decimal(run.seconds, 1)}</td>')
         return f'<tr data-run="{escape(run.name)}">{"".join(cells)}</tr>'

@@ -251,7 +251,8 @@ class _Page:
             kind = ' class="front"' if i in marked else ""
             rows.append(f"<tr{kind}><th scope=row>{escape(self.name(i))}</th>{cells}</tr>")
         note = (
-            f'<p class="note">Time and ± are multiples of the time of {self.texts.reference} in the same round; orange: '
+            f'<p class="note">Time and ± are multiples of the time of {self.texts.reference} in the same round; '
+            f"orange: "
             "on a front.</p>"
         )
         title = f"All {format_count(len(self.points))} {'models' if self.trained else 'points'}"

@@ -233,7 +233,8 @@ def _start_record(plan: ChunkPlan, folder: Path, resume: bool) -> ChunkRecord:
     was, now = ([row.facts for row in record.rows] for record in (before, fresh))
     if was != now:
         raise ConfigError(
-            f"{folder / CHUNKS_FILE}: begun with {_describe(was)}; the words now ask for {_describe(now)}; expected the same words, or another output_dir"
+            f"{folder / CHUNKS_FILE}: begun with {_describe(was)}; the words now ask for {_describe(now)}; expected "
+            f"the same words, or another output_dir"
         )
     return before
 
@@ -350,7 +351,8 @@ def _fit_chunks(
     if failed:
         done, first = len(plan.configs) - len(failed), "; ".join(f"{directory}: {line}" for directory, line in failed)
         raise ChunksMissing(
-            f"{first}; {done} of {len(plan.configs)} chunks are done, and resume=true with output_dir={folder} makes the others"
+            f"{first}; {done} of {len(plan.configs)} chunks are done, and resume=true with output_dir={folder} makes "
+            f"the others"
         )
     record.write(folder)
     return record

@@ -85,7 +85,8 @@ def next_evaluation_progress(trainer: Trainer) -> float:
 
 
 def evaluate_curve_point(trainer: Trainer) -> float:
-    """Mean PSNR of a few held-out views as :func:`~neuprim.runs.measure.measure_views` has it, but at most 200 dB, so that a
+    """Mean PSNR of a few held-out views as :func:`~neuprim.runs.measure.measure_views` has it, but at most 200 dB, so
+    that a
     line of JSON can hold it; does not touch the training state."""
     views = trainer.dataset.test
     picks = sorted({i * len(views) // _VIEWS for i in range(_VIEWS)})

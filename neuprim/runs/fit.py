@@ -199,7 +199,8 @@ def train_steps(trainer: Trainer, events: Events = ignore_event) -> Iterator[tup
     if trainer.settings.population.strategy == "relocate" and trainer.model.count < asked:
         events(
             Note(
-                f"{trainer.model.count:,} primitives of model.primitives={asked:,}: too few interventions, or places with an error, to split for the others; "
+                f"{trainer.model.count:,} primitives of model.primitives={asked:,}: too few interventions, or places "
+                f"with an error, to split for the others; "
                 "see train.population.every"
             )
         )

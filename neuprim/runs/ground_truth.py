@@ -140,7 +140,8 @@ def render_frames_job(data: Mapping[str, Any], attempt: int, events: Events) -> 
     truth = _truth(config, data["known"])
     if truth.key != data["key"]:
         raise DataError(
-            f"{truth.place}: a worker sees another scene; expected the launcher's files there, of the same names, sizes and times, and its neuprim"
+            f"{truth.place}: a worker sees another scene; expected the launcher's files there, of the same names, "
+            f"sizes and times, and its neuprim"
         )
     for done, frame in enumerate(data["frames"]):
         if Path(data["stop"]).exists():  # another one cannot be made

@@ -105,7 +105,8 @@ class Layers:
             light = [spec.name for spec in found if spec.light and spec.name != "beauty"] + [LIGHTS] * self.apart
             if light:
                 raise ConfigError(
-                    f"--layers {light[0]}: the model's colours are sRGB values, which do not add up; expected a model in linear light"
+                    f"--layers {light[0]}: the model's colours are sRGB values, which do not add up; expected a model "
+                    f"in linear light"
                 )
         return tuple(spec for spec in found if not spec.light or spec.name == "beauty")
 

@@ -156,7 +156,8 @@ def measure_views(
             seen(i, view, rendered, truth)
     if all(view.empty for view in result):
         warn_once(
-            f"{dataset.name}: the model is in none of {len(result)} test views, which show the background alone; expected starting points where "
+            f"{dataset.name}: the model is in none of {len(result)} test views, which show the background alone; "
+            f"expected starting points where "
             f"the cameras look: {GIVE_POINTS}"
         )
     return result

@@ -58,7 +58,8 @@ def load_dataset(
     """The data set of a run's configuration.
 
     Args:
-        run_dir: the finished run that the configuration was read from: messages name its file. None: a run that is only about to be made.
+        run_dir: the finished run that the configuration was read from: messages name its file. None: a run that is only
+            about to be made.
 
     Raises:
         NeuprimError: what the loader refuses, or that it crashed.

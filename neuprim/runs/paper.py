@@ -175,7 +175,8 @@ def plan(
                     )
     if not found:
         raise ConfigError(
-            f"--data {data}: no folder named like a scene; expected one of {', '.join(s for t in chosen for s in t.scenes)}"
+            f"--data {data}: no folder named like a scene; expected one of "
+            f"{', '.join(s for t in chosen for s in t.scenes)}"
         )
     return found
 

@@ -307,7 +307,10 @@ def _describe_position(model: Primitives, view: View, world: World) -> str:
     low, high = world.world_box(torch.stack([(means - reach).min(0).values, (means + reach).max(0).values]).numpy())
     seen = world.world_camera(view.camera)
     at, towards = seen.position.tolist(), seen.viewmat[2, :3].tolist()
-    return f"the model is within {_point(low)} to {_point(high)}, and {view.name} at {_point(at)} looks towards {_point(towards)}"
+    return (
+        f"the model is within {_point(low)} to {_point(high)}, and {view.name} at {_point(at)} looks towards "
+        f"{_point(towards)}"
+    )
 
 
 def _point(numbers: Sequence[float]) -> str:

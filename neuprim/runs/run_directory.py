@@ -28,9 +28,9 @@ def lock_directory(directory: Path, what: str = "run") -> Iterator[None]:
     """Lock a directory, so that one process at a time works in it. It is made if it is missing, and removed again if it
     is left empty.
 
-    The lock is an advisory lock of the system (``flock``; on Windows ``msvcrt``), which ends with its process. On shared
-    folders it works between machines where their file system has such locks: NFS from version 4 on, CephFS, GPFS, Lustre
-    mounted with ``flock``.
+    The lock is an advisory lock of the system (``flock``; on Windows ``msvcrt``), which ends with its process. On
+    shared folders it works between machines where their file system has such locks: NFS from version 4 on, CephFS,
+    GPFS, Lustre mounted with ``flock``.
 
     Args:
         what: is in the directory, for the message.
@@ -59,7 +59,8 @@ def lock_directory(directory: Path, what: str = "run") -> Iterator[None]:
         yield
     finally:
         with suppress(OSError):
-            file.unlink()  # while it is locked: a process that opened it meanwhile sees that it is gone and makes a new one
+            # while it is locked: a process that opened it meanwhile sees that it is gone and makes a new one
+            file.unlink()
         lock.release()
         with suppress(OSError):  # not empty
             if new:

@@ -166,12 +166,14 @@ def read_sweep_overrides(words: Sequence[str]) -> list[str]:
     if before is None:
         said = " ".join(words) or "nothing"
         raise ConfigError(
-            f"{said}: no values to sweep; expected KEY=A,B,C, or output_dir=DIR resume=true of a sweep ({SWEEP_FILE} in it)"
+            f"{said}: no values to sweep; expected KEY=A,B,C, or output_dir=DIR resume=true of a sweep ({SWEEP_FILE} "
+            f"in it)"
         )
     for word in before.words:
         if "${" in word:  # a file must not read the environment; see neuprim.config.compose
             raise ConfigError(
-                f"{Path(str(where)) / SWEEP_FILE}: {cut(word)} refers to something outside of the file; type the sweep's words again, with resume=true"
+                f"{Path(str(where)) / SWEEP_FILE}: {cut(word)} refers to something outside of the file; type the "
+                f"sweep's words again, with resume=true"
             )
     return [*before.words, *words]
 
@@ -239,7 +241,8 @@ def run_sweep(
     Args:
         configs: as :func:`~neuprim.config.compose_all` gives them, all in one directory.
         words: what the sweep was asked for.
-        on_status: called with (place in ``configs``, status) whenever there is something new; once of each run that is kept.
+        on_status: called with (place in ``configs``, status) whenever there is something new; once of each run that is
+            kept.
 
     Returns:
         the record, and a result for each configuration; None of those that Ctrl-C came before.

@@ -130,7 +130,8 @@ def _resume(fitted: Fitted, events: Events) -> None:
     ):
         origins = [w.world_points(torch.zeros(3, dtype=torch.float64)).tolist() for w in (was, now)]
         raise CheckpointError(
-            f"{saved}: the scene's origin is {origins[0]} of the data's files, and now {origins[1]}; expected the same data"
+            f"{saved}: the scene's origin is {origins[0]} of the data's files, and now {origins[1]}; expected the "
+            f"same data"
         )
     events(Note(f"resumed at step {fitted.trainer.step}"))
 
@@ -156,7 +157,8 @@ def _train(fitted: Fitted, events: Events, between: BetweenSteps) -> bool:
             if report.change:
                 line["change"] = report.change
             if line or report.step % config.train.log_every == 0 or trainer.finished:
-                line = {"step": report.step, "seconds": round(report.seconds, 4), "loss": report.loss, **report.parts, "psnr": report.psnr, "primitives": report.primitives, **line}  # fmt: skip
+                line = {"step": report.step, "seconds": round(report.seconds, 4), "loss": report.loss, **report.parts,
+                    "psnr": report.psnr, "primitives": report.primitives, **line}  # fmt: skip
                 with _warn_of_full_disk(fitted, curve.path):
                     curve.add(json.dumps(line) + "\n")
             if time.monotonic() - last_saved > config.train.checkpoint_every_seconds:

@@ -81,7 +81,8 @@ def average_rays(values: NDArray[np.float32], size: int, samples: int) -> NDArra
 
 
 def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: Callable[[float], None]) -> None:
-    """Do the work for every job in threads; ``progress`` receives the fraction done. Errors cancel what has not begun."""
+    """Do the work for every job in threads; ``progress`` receives the fraction done. Errors cancel what has not
+    begun."""
     pool = ThreadPoolExecutor(min(_MAX_THREADS, os.cpu_count() or 1))
     try:
         for done, _ in enumerate(pool.map(work, jobs), start=1):

@@ -341,7 +341,10 @@ def test_help_and_version(toy: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 def test_help_is_light() -> None:
     heavy = "{'torch', 'numpy', 'hydra', 'omegaconf', 'rich', 'numba'}"
-    code = f"import sys, neuprim.cli as c; c.main(['run', '--help']); bad = {heavy} & set(sys.modules); sys.exit(str(bad) if bad else 0)"
+    code = (
+        f"import sys, neuprim.cli as c; c.main(['run', '--help']); bad = {heavy} & set(sys.modules); "
+        f"sys.exit(str(bad) if bad else 0)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

@@ -71,7 +71,8 @@ def test_one_run_alone_is_shared(tmp_path: Path) -> None:
     assert isinstance(first, ConfigError)
     assert (
         str(first)
-        == "2 processes of torchrun fit one scene together; expected neither -m, --config, --cfg, a target, a launcher, nor a viewer"
+        == "2 processes of torchrun fit one scene together; expected neither -m, --config, --cfg, a target, a "
+        "launcher, nor a viewer"
     )
 
 

@@ -95,7 +95,8 @@ def test_two_ranks_of_which_one_is_killed_then_one_process_then_two_ranks_are_on
     assert launched.returncode != 0 and time.monotonic() - killed < 20
     (line,) = errors(said)
     found = re.match(
-        r"neuprim: error: step (\d+): another rank ended without a message, .*; to go on: torchrun --nproc-per-node 2 -m neuprim run .*resume=true$",
+        r"neuprim: error: step (\d+): another rank ended without a message, .*; to go on: torchrun --nproc-per-node 2 "
+        r"-m neuprim run .*resume=true$",
         line,
     )
     assert found is not None, line

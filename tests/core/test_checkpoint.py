@@ -94,9 +94,11 @@ def test_another_task(saved: Path) -> None:
 @pytest.mark.parametrize(
     "entry",
     [
-        None, [], "CosineDensity", {"class": "CosineDensity"}, {"class": 3, "settings": {}}, {"class": "CosineDensity", "settings": []},
+        None, [], "CosineDensity", {"class": "CosineDensity"}, {"class": 3, "settings": {}},
+        {"class": "CosineDensity", "settings": []},
         *({"class": "CosineDensity", "settings": s} for s in (
-            {"neurons": 10**9}, {"neurons": -1}, {"neurons": 2**70}, {"neurons": 1e9}, {"neurons": 2.5}, {"neurons": None}, {"neurons": "3"},
+            {"neurons": 10**9}, {"neurons": -1}, {"neurons": 2**70}, {"neurons": 1e9}, {"neurons": 2.5},
+            {"neurons": None}, {"neurons": "3"},
             {"neurons": [3]}, {"neurons": {}}, {"width": 3}, {"neurons": 4}, {"self": 3},
         )),
     ],

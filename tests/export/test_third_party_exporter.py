@@ -219,7 +219,10 @@ def test_help_shows_the_options_of_any_format(site: Path, run_dir: Path, capsys:
 
 
 def test_options_have_their_defaults_and_limits(site: Path, run_dir: Path, tmp_path: Path) -> None:
-    body = "path.write_text(repr((job.count('digits', 0, 9), job.number('scale'), job.flag('pretty'), job.choice('up', 'y', 'z'), job.frames())))"
+    body = (
+        "path.write_text(repr((job.count('digits', 0, 9), job.number('scale'), job.flag('pretty'), "
+        "job.choice('up', 'y', 'z'), job.frames())))"
+    )
     options = "{'digits': (6, ''), 'scale': (None, ''), 'pretty': (False, ''), 'up': ('z', '')}"
     source = EXPORTER.replace('path.write_text(json.dumps(job.run.model.params["means"].tolist()))', body)
     add(site, "exporter", source.replace("write=write", f"write=write, conditions=True, options={options}"))

@@ -44,7 +44,8 @@ GREEN = np.array([0.0, 1.0, 0.0])
 
 def cube(low, high):
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
+    faces += [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
     return low + corners * (high - low), np.array(faces)
 
 def layers(frame):
@@ -59,7 +60,12 @@ EVERYTHING = """[
     Volume(frame.sigma, frame.origin, frame.step, frame.scale, depth=frame.gain),
     Slices(frame.sigma, frame.origin, (frame.step,) * 3, Scale(0, frame.top, "viridis")),
     Isosurfaces(frame.sigma, frame.origin, frame.step, frame.scale, levels=(0.5 * frame.top, frame.top)),
-    Ellipsoids((low + high)[None] / 2, np.eye(3)[None] * 0.1, values=np.ones(1), scale=Scale(0, 2, title="size", unit="m")),
+    Ellipsoids(
+        (low + high)[None] / 2,
+        np.eye(3)[None] * 0.1,
+        values=np.ones(1),
+        scale=Scale(0, 2, title="size", unit="m"),
+    ),
     Points(frame.box, colours=np.eye(3)[:2], size=12.0, opacity=0.5),
     Lines(frame.box, np.array([[0, 1]]), colours=np.array([1.0, 1.0, 0.0])),
     Text("hello <there>", "upper_right"),
@@ -235,7 +241,8 @@ def test_layers_of_nothing_are_drawn(site: Path, run_dir: Path, tmp_path: Path) 
     none = "np.zeros((0, 3))"
     stranger(
         site,
-        f"[Mesh({none}, np.zeros((0, 3), int)), Points({none}), Lines({none}, np.zeros((0, 2), int)), Ellipsoids({none}, np.zeros((0, 3, 3))),"
+        f"[Mesh({none}, np.zeros((0, 3), int)), Points({none}), Lines({none}, np.zeros((0, 2), int)), "
+        f"Ellipsoids({none}, np.zeros((0, 3, 3))),"
         " Slices(frame.sigma, frame.origin, frame.step, frame.scale, through=high + 9)]",
     )
     for name in ("x.png", "x.html"):

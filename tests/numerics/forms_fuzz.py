@@ -251,7 +251,8 @@ def main(count: int, seed: int, backends: list[str]) -> None:
             same(r, lowered, backend)
             drawn += 1
     print(
-        f"{refused} wrong forms refused, {skipped} skipped that were right by chance, {drawn} odd but right ones drawn alike"
+        f"{refused} wrong forms refused, {skipped} skipped that were right by chance, {drawn} odd but right ones "
+        f"drawn alike"
     )
 
 

@@ -19,7 +19,8 @@ def load(settings, context):
     assert settings == {"wobble": 2.0}
     return two_primitives()
 
-PLUGIN = SceneExtension(api=1, task="static", scene=SceneSpec("extra", "two ellipsoids", load), config_package="fake_extra.conf")
+PLUGIN = SceneExtension(api=1, task="static", scene=SceneSpec("extra", "two ellipsoids", load),
+                        config_package="fake_extra.conf")
 """
 LOSS = """
 from neuprim.core.extensions import LossExtension
@@ -33,12 +34,14 @@ def make(settings):
     return loss
 
 PLUGIN = LossExtension(
-    api=1, name="extra", summary="mean squared error", make=make, options={"weight": (3.0, "of it")}, uses=("train.ssim_weight",)
+    api=1, name="extra", summary="mean squared error", make=make,
+    options={"weight": (3.0, "of it")}, uses=("train.ssim_weight",)
 )
 """
 EXPORTER = """
 from neuprim.core.extensions import Exporter, ExportReport
-PLUGIN = Exporter(api=1, name="extra", summary="nothing at all", write=lambda job: ExportReport((), False), options={"size": (1, "of it")})
+PLUGIN = Exporter(api=1, name="extra", summary="nothing at all", write=lambda job: ExportReport((), False),
+                  options={"size": (1, "of it")})
 """
 INSPECTOR = """
 from neuprim.core.extensions import Inspector

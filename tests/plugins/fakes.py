@@ -27,7 +27,8 @@ TASK = TaskSpec(
     loss=lambda s: None,
     options={"gain": (1.0, "of the amplifier")},
     uses=("model.neurons",),
-    conditions=(ConditionSpec("time", (), "1", (0.0, 1.0), lambda t: []), ConditionSpec("light_pos", (3,), "m", (0.0, 1.0), lambda t: [])),
+    conditions=(ConditionSpec("time", (), "1", (0.0, 1.0), lambda t: []),
+                ConditionSpec("light_pos", (3,), "m", (0.0, 1.0), lambda t: [])),
 )
 """
 

@@ -188,7 +188,8 @@ def test_another_version_is_one_warning(made: Path, site: Path, capsys: pytest.C
     assert main(["eval", "r"]) == 0
     err += capsys.readouterr().err
     assert [line for line in err.splitlines() if "warning" in line] == [
-        "neuprim: warning: r/config.yaml: this run was made by neuprim-glow 0.1 (task glow); installed is neuprim-glow 0.2"
+        "neuprim: warning: r/config.yaml: this run was made by neuprim-glow 0.1 (task glow); installed is "
+        "neuprim-glow 0.2"
     ]
     with pytest.warns(
         NeuprimWarning,

@@ -53,7 +53,8 @@ def load(settings, context):
     return replace(data, extra={extra})
 
 
-PLUGIN = SceneExtension(api=1, task="relight", scene=SceneSpec("mine", "two ellipsoids", load), config_package="lit_scene.conf")
+PLUGIN = SceneExtension(api=1, task="relight", scene=SceneSpec("mine", "two ellipsoids", load),
+                        config_package="lit_scene.conf")
 """
 WORDS = [
     "task=relight", "scene=mine", "renderer.backend=reference", "model.primitives=8", "model.colour.visibility=none",
@@ -131,5 +132,8 @@ def test_what_else_it_knows_of_its_pixels_counts(site: Path) -> None:
 
 def test_another_class_is_refused_before_training(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(site, "3") == 2
-    expected = "scene 'mine' of lit-scene 0.3: two: extra is a int; expected a neuprim.tasks.relight.lighting.Lighting, or None"
+    expected = (
+        "scene 'mine' of lit-scene 0.3: two: extra is a int; expected a "
+        "neuprim.tasks.relight.lighting.Lighting, or None"
+    )
     assert expected in capsys.readouterr().err and not Path("r").exists()

@@ -76,7 +76,10 @@ def test_options_are_complete_typed_and_shown(toy: Path, capsys: pytest.CaptureF
 def test_an_option_may_say_its_bounds_and_choices(toy: Path) -> None:
     source = (toy / "__init__.py").read_text()
     imports = "from typing import Annotated\nfrom neuprim.core.validation import Range\n"
-    more = '"gain": (1.0, "of the amplifier", Annotated[float, Range(above=0, at_most=5)]), "form": ("soft", "of the knee", ("soft", "hard"))'
+    more = (
+        '"gain": (1.0, "of the amplifier", Annotated[float, Range(above=0, at_most=5)]), "form": ("soft", "of the '
+        'knee", ("soft", "hard"))'
+    )
     (toy / "__init__.py").write_text(imports + source.replace('"gain": (1.0, "of the amplifier")', more))
     assert toys("task.options.gain=5", "task.options.form=hard").options == {"gain": 5.0, "form": "hard"}
     with pytest.raises(ConfigError, match=r"^task\.options\.gain=6: expected a number above 0 and at most 5$"):
@@ -114,7 +117,8 @@ def test_a_losss_options_belong_to_task_options_while_it_is_chosen(
 def test_options_that_a_loss_refuses_cost_no_loading_of_data(site: Path, tmp_path: Path) -> None:
     picky = LOSS.replace(
         "    assert",
-        "    from neuprim.core.errors import ConfigError\n    if weight < 0: raise ConfigError('weight: expected more')\n    assert",
+        "    from neuprim.core.errors import ConfigError\n    if weight < 0: raise ConfigError('weight: expected "
+        "more')\n    assert",
     )
     add(site, "loss", picky, package="fake_loss")
     words = [

@@ -117,7 +117,8 @@ def test_metrics_and_report_name_the_channels(trained: Path) -> None:
     assert "<dt>channels</dt><dd>450nm, 550nm, 650nm, 750nm, 850nm</dd>" in page
     assert "mean absolute difference over all channels" in page
     again = evaluate_run(trained)
-    assert {k: again[k] for k in ("psnr", "ssim", "psnr_display", "channels", "shown")} == {k: found[k] for k in ("psnr", "ssim", "psnr_display", "channels", "shown")}  # fmt: skip
+    assert {k: again[k] for k in ("psnr", "ssim", "psnr_display", "channels",
+        "shown")} == {k: found[k] for k in ("psnr", "ssim", "psnr_display", "channels", "shown")}  # fmt: skip
 
 
 def test_exr_and_npy_hold_every_channel(trained: Path, tmp_path: Path) -> None:
@@ -288,7 +289,8 @@ def test_red_green_and_blue_among_others_are_exported_by_name(site: Path, tmp_pa
         (
             (),
             {"build": "lambda m, d: (TwoScales(), ShiftedSpectrum(3))"},
-            "task 'spectral' of neuprim-spectral 0.1: build: channels of the colour: found 3; expected 5, as data set 'ball' has",
+            "task 'spectral' of neuprim-spectral 0.1: build: channels of the colour: found 3; expected 5, as data set "
+            "'ball' has",
         ),
     ],
 )

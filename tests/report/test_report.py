@@ -108,9 +108,11 @@ def make_run(folder: Path, size: tuple[int, int] = (48, 64), lines: int = 400, n
         "psnr_worst": min(e["psnr"] for e in entries), "per_view": entries,
         "primitives": 10_000, "parameters": 670_000, "parameters_per_primitive": 67, "model_bytes": 2_684_112,
         "iterations": 4000, "train_seconds": 664.2, "render_fps": 41.37, "backend": "cpu", "device": "16-core CPU",
-        "checkpoint": "last", "downsampling": "200x200 from 800x800 by area", "background": [1.0, 1.0, 1.0], "seed": 0, "color_space": "srgb",
+        "checkpoint": "last", "downsampling": "200x200 from 800x800 by area", "background": [1.0, 1.0, 1.0], "seed": 0,
+        "color_space": "srgb",
         "versions": {"neuprim": "0.1.0", "torch": "2.13.0+cpu", "python": "3.11.2", "numpy": "2.3.0"},
-        "non_default": {"train.iterations": [30000, 4000], "scene.downsample": [1, 4], "model.growth": [None, {"until": 3000}], "train.ssim": [True, False]},
+        "non_default": {"train.iterations": [30000, 4000], "scene.downsample": [1, 4],
+            "model.growth": [None, {"until": 3000}], "train.ssim": [True, False]},
     }  # fmt: skip
     (folder / "metrics.json").write_text(json.dumps(metrics), encoding="utf-8")
     (folder / "metrics.jsonl").write_text(
@@ -190,10 +192,14 @@ def test_a_finished_run_shows_what_it_measured(finished: Path) -> None:
     text = Structure(page).text
     assert "<title>static / chequered-ball – neuprim</title>" in page
     for expected in (
-        "generated data", "Metrics of the last checkpoint, not the best.", f"PSNR, mean {metrics['psnr']:.2f} dB 4 test views",
-        f"PSNR, worst view {metrics['psnr_worst']:.2f} dB r_75", f"SSIM {metrics['ssim']:.4f}", "Primitives 10,000", "670,000 67 per primitive",
-        "2.68 MB", "11 min 04 s 4,000 iterations", "41.4 fps cpu", "16-core CPU", "2.13.0+cpu", "200x200 from 800x800 by area",
-        "train.iterations 30000 4000", 'model.growth null {"until": 3000}', "train.ssim true false", "neurons: 8", "≥ 0.2", "night-view",
+        "generated data", "Metrics of the last checkpoint, not the best.",
+        f"PSNR, mean {metrics['psnr']:.2f} dB 4 test views",
+        f"PSNR, worst view {metrics['psnr_worst']:.2f} dB r_75", f"SSIM {metrics['ssim']:.4f}", "Primitives 10,000",
+        "670,000 67 per primitive",
+        "2.68 MB", "11 min 04 s 4,000 iterations", "41.4 fps cpu", "16-core CPU", "2.13.0+cpu",
+        "200x200 from 800x800 by area",
+        "train.iterations 30000 4000", 'model.growth null {"until": 3000}', "train.ssim true false", "neurons: 8",
+        "≥ 0.2", "night-view",
         "mean absolute difference",
     ):  # fmt: skip
         assert expected in text, expected

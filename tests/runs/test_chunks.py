@@ -41,8 +41,10 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def words(files: Path, out: Path, *more: str) -> list[str]:
     return [
-        "task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire", "scene.size=24", "scene.cameras=6", "scene.samples=1",
-        "scene.chunks=2", "model.primitives=80", f"train.iterations={STEPS}", "train.population.every=10", "train.eval_every=0.5",
+        "task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire", "scene.size=24",
+        "scene.cameras=6", "scene.samples=1",
+        "scene.chunks=2", "model.primitives=80", f"train.iterations={STEPS}", "train.population.every=10",
+        "train.eval_every=0.5",
         "train.log_every=10", f"output_dir='{out}'", *more,
     ]  # fmt: skip
 
@@ -218,7 +220,8 @@ def test_few_frames_in_auto_are_one_run(files: Path, tmp_path: Path) -> None:
     [
         (
             ["scene.chunks=4"],
-            "scene.chunks=4: there are 6 frames to learn from; expected at most 3, as a chunk has at least two of its own",
+            "scene.chunks=4: there are 6 frames to learn from; expected at most 3, as a chunk has at least two of its "
+            "own",
         ),
         (["model.primitives=9"], "model.primitives=9: expected at least 16 for 2 chunks"),
         (

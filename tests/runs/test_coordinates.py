@@ -127,7 +127,8 @@ def test_meshes_are_in_the_world(tmp_path: Path, world: World, suffix: str) -> N
     pytest.importorskip("pyvista")
     export_run(run_in(tmp_path / "run", world), "mesh", tmp_path / f"m.{suffix}", ["grid=32", "smooth=0", "keep=0"])
     scene = trimesh.load(tmp_path / f"m.{suffix}", force="scene", process=False)
-    points = np.concatenate([trimesh.transform_points(scene.geometry[g].vertices, m) for m, g in (scene.graph[n] for n in scene.graph.nodes_geometry)])  # fmt: skip
+    points = np.concatenate([trimesh.transform_points(scene.geometry[g].vertices, m) for m,
+        g in (scene.graph[n] for n in scene.graph.nodes_geometry)])  # fmt: skip
     if suffix == "glb" and world is UTM:  # back from y up, as readers do
         points = points[:, [0, 2, 1]] * [1, -1, 1]
     box = np.stack([points.min(0), points.max(0)])

@@ -27,7 +27,8 @@ def write(job):
         path.touch()
     return ExportReport(paths, False)
 
-PLUGIN = Exporter(api=1, name="ply", summary="names of files", write=write, options={"count": (1, "n"), "text": ("", "t"), "size": (1.0, "x")})
+PLUGIN = Exporter(api=1, name="ply", summary="names of files", write=write,
+                  options={"count": (1, "n"), "text": ("", "t"), "size": (1.0, "x")})
 """
 
 

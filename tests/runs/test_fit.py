@@ -37,7 +37,8 @@ def test_a_count_that_is_not_reached_is_said(scene: Path, tmp_path: Path) -> Non
     first, last, notes = trained(scene, tmp_path, "train.population.grow_from=0.2", "train.population.every=30")
     assert (first, last) == (8, 32), "two interventions, and a primitive splits once in each"
     assert notes == [
-        "32 primitives of model.primitives=40: too few interventions, or places with an error, to split for the others; see train.population.every"
+        "32 primitives of model.primitives=40: too few interventions, or places with an error, to split for the "
+        "others; see train.population.every"
     ]
 
 

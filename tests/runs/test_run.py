@@ -93,7 +93,8 @@ def test_contents(whole: Path) -> None:
 def test_metrics(whole: Path, scene: Path) -> None:
     metrics = read_metrics(whole)
     asked = (
-        "task scene split psnr ssim per_view primitives parameters parameters_per_primitive model_bytes iterations train_seconds render_fps "
+        "task scene split psnr ssim per_view primitives parameters parameters_per_primitive model_bytes iterations "
+        "train_seconds render_fps "
         "backend device checkpoint downsampling background data_source seed versions"
     )
     assert set(asked.split()) <= metrics.keys()

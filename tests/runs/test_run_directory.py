@@ -16,7 +16,10 @@ from neuprim.runs.run_directory import LOCK_FILE, lock_directory
 from tests.runs.launching import wait_for
 from tests.systems import posix
 
-HOLD = "import sys, time; from pathlib import Path; from neuprim.runs.run_directory import lock_directory\nwith lock_directory(Path(sys.argv[1])): time.sleep(600)"
+HOLD = (
+    "import sys, time; from pathlib import Path; from neuprim.runs.run_directory import lock_directory\nwith "
+    "lock_directory(Path(sys.argv[1])): time.sleep(600)"
+)
 
 
 def test_a_second_one_is_refused_by_name_and_the_first_is_left_alone(tmp_path: Path) -> None:
@@ -72,7 +75,10 @@ def test_a_killed_process_lets_go(tmp_path: Path) -> None:
 
 @posix
 def test_what_killed_writers_left_is_gone_and_what_others_write_stays(tmp_path: Path) -> None:
-    script = "import sys, time; from pathlib import Path; from neuprim.core.io.files import atomic_path\nwith atomic_path(Path(sys.argv[1])): time.sleep(600)"
+    script = (
+        "import sys, time; from pathlib import Path; from neuprim.core.io.files import atomic_path\nwith "
+        "atomic_path(Path(sys.argv[1])): time.sleep(600)"
+    )
     run = tmp_path / "run"
     (run / "renders").mkdir(parents=True)
     writers = [

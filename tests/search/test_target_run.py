@@ -55,7 +55,8 @@ class Clock:
 
 # A step costs the same from the first on (grow_from), so that a resumed training is timed by its remaining steps.
 WORDS = (
-    "task=static scene=solids scene.size=32 scene.train_views=16 scene.test_views=3 model.primitives=40 model.neurons=2 "
+    "task=static scene=solids scene.size=32 scene.train_views=16 scene.test_views=3 model.primitives=40 "
+    "model.neurons=2 "
     "train.iterations=320 train.population.every=20 train.population.grow_from=1 renderer.threads=1"
 ).split()
 

@@ -41,7 +41,8 @@ from tests.viewer_client import fetch, visit
 
 NAN, INF = math.nan, math.inf
 CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": (1, 0, 0, 0), "position": (0, -4.0, 1), "fov": 0.8, "near": 0.01, "far": 1000, "image_height": 48,
+    "type": "ViewerCameraMessage", "wxyz": (1, 0, 0, 0), "position": (0, -4.0, 1), "fov": 0.8, "near": 0.01,
+    "far": 1000, "image_height": 48,
     "image_width": 64, "look_at": (0, 0, 0), "up_direction": (0, 0, 1),
 }  # fmt: skip
 CLICK = {
@@ -244,10 +245,14 @@ def test_what_a_page_sends_passes() -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"fov": NAN}, {"fov": 1e9}, {"fov": 0}, {"fov": -1}, {"image_width": 10**7}, {"image_height": -1}, {"image_width": NAN},
-        {"image_height": 0.5}, {"position": (NAN, 0, 0)}, {"position": (0, -INF, 0)}, {"position": (0, 0)}, {"position": [0] * 10_000},
-        {"position": (1e300, 0, 0)}, {"wxyz": (0, 0, 0, 0)}, {"wxyz": (1, 1, 1, 1)}, {"look_at": None}, {"near": "x"}, {"far": True},
-        {"removed": True}, {"type": "ShareUrlRequest"}, {"type": "FileTransferStartUpload"}, {"type": ["a"]}, {"type": None},
+        {"fov": NAN}, {"fov": 1e9}, {"fov": 0}, {"fov": -1}, {"image_width": 10**7}, {"image_height": -1},
+        {"image_width": NAN},
+        {"image_height": 0.5}, {"position": (NAN, 0, 0)}, {"position": (0, -INF, 0)}, {"position": (0, 0)},
+        {"position": [0] * 10_000},
+        {"position": (1e300, 0, 0)}, {"wxyz": (0, 0, 0, 0)}, {"wxyz": (1, 1, 1, 1)}, {"look_at": None}, {"near": "x"},
+        {"far": True},
+        {"removed": True}, {"type": "ShareUrlRequest"}, {"type": "FileTransferStartUpload"}, {"type": ["a"]},
+        {"type": None},
     ],
 )  # fmt: skip
 def test_other_cameras_do_not(change: dict[str, Any]) -> None:
@@ -258,8 +263,10 @@ def test_other_cameras_do_not(change: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     "message",
     [
-        b"", b"\x00", b"\xc1", b"\x91" * 60_000, b"\xdf\xff\xff\xff\xff", b"\xdd\xff\xff\xff\xff", "text", [1], None, {}, {"type": "X"},
-        {**CLICK, "event_type": "rect-select"}, {**CLICK, "ray_direction": None}, {**CLICK, "screen_pos": [(0, 0)] * 99},
+        b"", b"\x00", b"\xc1", b"\x91" * 60_000, b"\xdf\xff\xff\xff\xff", b"\xdd\xff\xff\xff\xff", "text", [1], None,
+        {}, {"type": "X"},
+        {**CLICK, "event_type": "rect-select"}, {**CLICK, "ray_direction": None},
+        {**CLICK, "screen_pos": [(0, 0)] * 99},
         {"type": "GuiUpdateMessage", "uuid": "a"}, {"type": "GuiUpdateMessage", "uuid": 1, "updates": {"value": 1}},
         {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"update_cb": []}},
         {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 1, "removed": True}},
@@ -275,8 +282,10 @@ def test_other_messages_do_not(message: Any) -> None:
 CONTROLS: list[tuple[Callable[[Any], Any], list[Any], list[Any]]] = [
     (lambda g: g.add_dropdown("film", ["webp", "mp4"]), ["mp4"], ["gif", "../../../x", "", 0, None, ["mp4"], {"a": 1}]),
     (lambda g: g.add_button_group("write", ["cameras", "film"]), ["film"], ["delete", True, NAN]),
-    (lambda g: g.add_slider("pixels", 128, 2048, 32, 960), [128, 2048, 160], [20_000, 0, -128, 200.5, NAN, INF, "200", True, [1] * 9, 1e30]),
-    (lambda g: g.add_slider("time", 0.0, 1.0, 0.001, 0.5), [0, 1, 0.25, 1.0000001], [1.1, -0.1, NAN, -INF, None, "0.5", 2**63]),
+    (lambda g: g.add_slider("pixels", 128, 2048, 32, 960), [128, 2048, 160],
+        [20_000, 0, -128, 200.5, NAN, INF, "200", True, [1] * 9, 1e30]),
+    (lambda g: g.add_slider("time", 0.0, 1.0, 0.001, 0.5), [0, 1, 0.25, 1.0000001],
+        [1.1, -0.1, NAN, -INF, None, "0.5", 2**63]),
     (lambda g: g.add_number("seconds", 4.0, min=0.1, max=600.0, step=0.1), [1, 0.1], [0, -1, 1e9, NAN, "1"]),
     (lambda g: g.add_number("samples", 1, step=1), [3], [1.5, NAN, INF, "2", -INF, 10**18, False]),
     (lambda g: g.add_checkbox("play", False), [True, False], [1, 0, "yes", None, []]),

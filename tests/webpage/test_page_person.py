@@ -222,7 +222,8 @@ def test_a_card_that_is_taken_away_and_comes_back(still_page: Path, chromium: An
 NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null;"
 NO_FLOATS = "WebGL2RenderingContext.prototype.getExtension = () => null;"
 NO_BLENDING = """const get = WebGL2RenderingContext.prototype.getExtension;
-WebGL2RenderingContext.prototype.getExtension = function (name) { return name === "EXT_float_blend" ? null : get.call(this, name); };"""
+WebGL2RenderingContext.prototype.getExtension = function (name) {
+  return name === "EXT_float_blend" ? null : get.call(this, name); };"""
 
 
 @pytest.mark.parametrize(

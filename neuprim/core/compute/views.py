@@ -1,4 +1,5 @@
-"""Things that numba has no word for: an array that is borrowed, sixteen floats at once, and those of sixteen that count."""
+"""Things that numba has no word for: an array that is borrowed, sixteen floats at once, and those of sixteen that
+count."""
 
 from __future__ import annotations
 

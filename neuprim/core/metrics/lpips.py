@@ -162,7 +162,8 @@ def _made(found: Mapping[str, Any], where: Path) -> Lpips:
         if indices == {layer.number for layer in layers}:
             return _fitting(network, layers, parts, where)
     raise DataError(
-        f"{where}: convolutions {sorted(indices) or 'none'}; expected those of AlexNet or VGG16, as features.N or net.sliceM.N"
+        f"{where}: convolutions {sorted(indices) or 'none'}; expected those of AlexNet or VGG16, as features.N or "
+        f"net.sliceM.N"
     )
 
 

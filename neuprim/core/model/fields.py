@@ -195,7 +195,8 @@ class DensityField(Field):
 
     @abstractmethod
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
-        """Return sigma (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3) inside them."""
+        """Return sigma (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3) inside
+        them."""
 
     @abstractmethod
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:

@@ -1,4 +1,5 @@
-"""A backend's draw function, and what can be put around it: several rays per pixel, deferred shading, another device."""
+"""A backend's draw function, and what can be put around it: several rays per pixel, deferred shading, another
+device."""
 
 from __future__ import annotations
 

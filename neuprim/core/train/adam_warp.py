@@ -62,8 +62,10 @@ def _kernels() -> tuple[Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def move(
-        values: _POINTERS, grads: _POINTERS, firsts: _POINTERS, seconds: _POINTERS, ends: _LONGS, widths: _LONGS, rates: _FLOATS,
-        beta1: float, beta2: float, rest1: float, rest2: float, log1: float, log2: float, age: wp.array(dtype=wp.int64), bad: wp.array(dtype=wp.int32),
+        values: _POINTERS, grads: _POINTERS, firsts: _POINTERS, seconds: _POINTERS, ends: _LONGS, widths: _LONGS,
+        rates: _FLOATS,
+        beta1: float, beta2: float, rest1: float, rest2: float, log1: float, log2: float, age: wp.array(dtype=wp.int64),
+        bad: wp.array(dtype=wp.int32),
     ):  # fmt: skip
         """``widths``: numbers per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of
         the betas; ``age``: steps of each row, this one included."""
@@ -87,7 +89,8 @@ def _kernels() -> tuple[Any, Any]:
 
 
 def adam_rows(
-    values: Sequence[Tensor], grads: Sequence[Tensor], firsts: Sequence[Tensor], seconds: Sequence[Tensor], rates: Sequence[float],
+    values: Sequence[Tensor], grads: Sequence[Tensor], firsts: Sequence[Tensor], seconds: Sequence[Tensor],
+    rates: Sequence[float],
     age: Tensor, betas: tuple[float, float],
 ) -> bool:  # fmt: skip
     """Take one step in place; returns whether all gradients were finite, and if not nothing has changed. The host waits

@@ -57,7 +57,8 @@ def initial_model(
         raise DataError(f"{dataset.name}: no starting points found; expected points or images with visible content")
     if not bool((count_seeing_views(dataset.train, cloud.means) > 0).any()):
         raise DataError(
-            f"{dataset.name}: none of {len(cloud.means)} starting points is in the image of a training camera; {GIVE_POINTS}"
+            f"{dataset.name}: none of {len(cloud.means)} starting points is in the image of a training camera; "
+            f"{GIVE_POINTS}"
         )
     extent = scene_extent(
         dataset.extent, cloud.means, [dataset.train.view(i).camera for i in range(len(dataset.train))]

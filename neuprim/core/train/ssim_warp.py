@@ -72,7 +72,8 @@ def _kernels() -> tuple[Any, Any, Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def gradient(
-        a: wp.array3d(dtype=float), b: wp.array3d(dtype=float), columns: wp.array3d(dtype=wp.vec3), window: _Window, by_l1: float, by_ssim: float,
+        a: wp.array3d(dtype=float), b: wp.array3d(dtype=float), columns: wp.array3d(dtype=wp.vec3), window: _Window,
+        by_l1: float, by_ssim: float,
         difference: wp.array3d(dtype=float), grad: wp.array3d(dtype=float),
     ):  # fmt: skip
         """``by_l1``, ``by_ssim``: weights over numbers of pixels and of windows."""
@@ -120,7 +121,8 @@ def similarity(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, 
     by_l1, by_ssim = (1 - weight) / a.numel(), weight / S.numel()
     launch(
         gradient, (H, W, C),
-        (first, second, array(columns, wp.vec3), window, by_l1, by_ssim, array(difference, wp.float32), array(grad, wp.float32)), device,
+        (first, second, array(columns, wp.vec3), window, by_l1, by_ssim, array(difference, wp.float32),
+            array(grad, wp.float32)), device,
     )  # fmt: skip
     return torch.stack([difference.mean(dtype=torch.float64), S.mean(dtype=torch.float64)]), grad
 

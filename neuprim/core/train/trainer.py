@@ -2,7 +2,8 @@
 
 A step draws a view, renders it, compares it with the image, runs the backward pass, updates the parameters and lets the
 population react. ``train.supervision`` adds points of known extinction, or replaces the view by them. Everything that
-affects the next step is in :meth:`Trainer.state`: a run that is stopped and resumed equals one that was not, bit for bit.
+affects the next step is in :meth:`Trainer.state`: a run that is stopped and resumed equals one that was not, bit for
+bit.
 """
 
 from __future__ import annotations
@@ -107,7 +108,8 @@ class Trainer:
         device: where the training's tensors are.
         extent: the unit of position rates and size limits, see :func:`~neuprim.core.render.near_plane.scene_extent`.
         step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
-        fake_quantize: parameters -> parameters as a file would store them, with gradients; None renders them as they are.
+        fake_quantize: parameters -> parameters as a file would store them, with gradients; None renders them as they
+            are.
         zero_masks: parameter -> (N, ...) bool of the numbers that stay zero.
         rank, ranks: number of this process among those that train the model, and how many there are.
         stop_requested: polled after every step; see :attr:`stopping`.

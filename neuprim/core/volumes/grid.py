@@ -149,7 +149,8 @@ def _add_any_density(
 
 @exact_kernel
 def _fill(
-    start: int, stop: int, means: Any, scales: Any, R: Any, W1: Any, b1: Any, w2: Any, b2: Any, P: Any, Q: Any, omega0: float, edge: int,
+    start: int, stop: int, means: Any, scales: Any, R: Any, W1: Any, b1: Any, w2: Any, b2: Any, P: Any, Q: Any,
+    omega0: float, edge: int,
     grid: Any,
 ) -> None:  # fmt: skip
     """Planes start:stop. P (3, 4) maps indices to the scene, Q (3, 4) back."""

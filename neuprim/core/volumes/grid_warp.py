@@ -34,9 +34,11 @@ def _kernel() -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def add_primitives(
-        starts: wp.array(dtype=wp.int32), ids: wp.array(dtype=wp.int32), tiles: wp.vec2i, first: int, P: wp.array(dtype=wp.vec4d),
+        starts: wp.array(dtype=wp.int32), ids: wp.array(dtype=wp.int32), tiles: wp.vec2i, first: int,
+        P: wp.array(dtype=wp.vec4d),
         means: wp.array(dtype=wp.vec3d), whiten: wp.array(dtype=wp.mat33d), rate: wp.array2d(dtype=wp.vec3d),
-        phase: wp.array2d(dtype=wp.float64), amplitude: wp.array2d(dtype=wp.float64), offset: wp.array(dtype=wp.float64), edge: int,
+        phase: wp.array2d(dtype=wp.float64), amplitude: wp.array2d(dtype=wp.float64),
+        offset: wp.array(dtype=wp.float64), edge: int,
         grid: wp.array3d(dtype=wp.float32),
     ):  # fmt: skip
         """``tiles``: how many there are across and deep; ``first``: index of the grid's first plane; P: rows of (3, 4),
@@ -112,7 +114,8 @@ def _parts(counts: Tensor) -> Iterator[tuple[int, int]]:
 
 
 def fill_grid(
-    ellipsoids: tuple[Tensor, Tensor, Tensor], neurons: tuple[Tensor, Tensor, Tensor, Tensor], omega0: float, edge: int, P: Tensor, Q: Tensor,
+    ellipsoids: tuple[Tensor, Tensor, Tensor], neurons: tuple[Tensor, Tensor, Tensor, Tensor], omega0: float, edge: int,
+    P: Tensor, Q: Tensor,
     shape: tuple[int, int, int], where: torch.device,
 ) -> np.ndarray:  # fmt: skip
     """(X, Y, Z) float32 extinction, computed on ``where``.
@@ -149,7 +152,8 @@ def fill_grid(
             starts, ids = _list_primitives(low, wide, counts, own, *some)
             lists = array(starts, wp.int32), array(ids, wp.int32)
             launch(
-                _kernel(), (len(starts) - 1, _THREADS), (*lists, wp.vec2i(own[1], own[2]), first, rows, *prims, edge, array(part, f)), where,
+                _kernel(), (len(starts) - 1, _THREADS),
+                (*lists, wp.vec2i(own[1], own[2]), first, rows, *prims, edge, array(part, f)), where,
                 _THREADS,
             )  # fmt: skip
         grid[first:last] = part.cpu().numpy()

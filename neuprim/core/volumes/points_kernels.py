@@ -84,7 +84,8 @@ def pull_parameters(start, stop, log_scales, quats, omega0, m, prims, pulled, gr
 
 @exact_kernel
 def sort_points(points, low, step, counts, starts, order, placed):  # type: ignore[no-untyped-def]
-    """A counting sort by cell: fill ``starts`` (X Y Z + 1,), zeros before, ``order`` (M,), and the sorted ``placed``."""
+    """A counting sort by cell: fill ``starts`` (X Y Z + 1,), zeros before, ``order`` (M,), and the sorted
+    ``placed``."""
     cells = np.empty(points.shape[0], np.int64)
     for p in range(points.shape[0]):
         cell = 0

@@ -197,7 +197,8 @@ class Lens:
         return self.distortion.project(points, self.camera)
 
     def rays(self, pose: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(M, 3) unit directions in the scene of (M, 2) photographed pixels; ``pose`` is camera to world, OpenGL axes."""
+        """(M, 3) unit directions in the scene of (M, 2) photographed pixels; ``pose`` is camera to world, OpenGL
+        axes."""
         x, y = self._undistort(pixels).T
         local = np.stack([x, -y, -np.ones_like(x)], axis=1)
         local /= np.sqrt(np.einsum("nc,nc->n", local, local))[:, None]

@@ -89,7 +89,10 @@ def test_the_footprint_is_the_closest_of_those_that_hide_as_much(edge: int, volu
 def test_plain_clouds(tmp_path: Path, form: str) -> None:
     path = tmp_path / "p.ply"
     if form == "ascii":
-        head = "property float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
+        head = (
+            "property float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty uchar "
+            "green\nproperty uchar blue\n"
+        )
         path.write_text(
             f"ply\nformat ascii 1.0\nelement vertex 2\n{head}end_header\n0 0 0 51 102 255\n1 2 3 51 102 255\n"
         )

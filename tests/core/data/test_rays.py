@@ -96,7 +96,8 @@ def test_a_tripod_has_no_unit(noise: float) -> None:
 
 
 def test_an_array_of_parallel_cameras() -> None:
-    side = [camera(0.25 * torch.tensor([float(i), 0.0, float(j)]) - torch.tensor([0.5, 3.5, 0.5]), torch.tensor([0.0, 1, 0])) for i in range(5) for j in range(5)]  # fmt: skip
+    side = [camera(0.25 * torch.tensor([float(i), 0.0, float(j)]) - torch.tensor([0.5, 3.5, 0.5]),
+        torch.tensor([0.0, 1, 0])) for i in range(5) for j in range(5)]  # fmt: skip
     views = Taken(side, room(4.0))
     assert not optical_axes_meet(side)
     off = initial_points(views, None, 300, rng()).means.abs().amax(1) / 4.0 - 1

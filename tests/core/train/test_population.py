@@ -173,7 +173,8 @@ def test_relocation_grows_to_what_was_asked_for_where_the_error_is() -> None:
 
 @pytest.mark.parametrize(
     ("steps", "every", "target", "most"),
-    [(1000, 100, 2 * COUNT, 3), (1000, 100, 5 * COUNT, 3), (5, 200, 2 * COUNT, 2), (40, 200, 2 * COUNT, 2), (500, 200, 2 * COUNT, 2)],
+    [(1000, 100, 2 * COUNT, 3), (1000, 100, 5 * COUNT, 3), (5, 200, 2 * COUNT, 2), (40, 200, 2 * COUNT, 2),
+        (500, 200, 2 * COUNT, 2)],
 )  # fmt: skip
 def test_relocation_reaches_its_count_in_time(steps: int, every: int, target: int, most: int) -> None:
     """However few interventions there are, and in budgets that are over before the first one."""

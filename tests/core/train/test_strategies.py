@@ -46,9 +46,11 @@ def third(monkeypatch: pytest.MonkeyPatch) -> type[Decimate]:
 def words(folder: Path, strategy: str) -> list[str]:
     scene = tiny.write_blender(folder / "two")
     return [
-        "task=static", "scene=blender", f"scene.path={scene}", "model.primitives=9", "model.neurons=1", "model.sh_degree=0",
+        "task=static", "scene=blender", f"scene.path={scene}", "model.primitives=9", "model.neurons=1",
+        "model.sh_degree=0",
         "train.iterations=8", "train.max_seconds=null", "train.population.every=2", "train.population.start=0",
-        "train.population.stop=1", f"train.population.strategy={strategy}", "renderer.backend=reference", f"output_dir={folder / 'run'}",
+        "train.population.stop=1", f"train.population.strategy={strategy}", "renderer.backend=reference",
+        f"output_dir={folder / 'run'}",
     ]  # fmt: skip
 
 

@@ -298,7 +298,8 @@ def test_a_full_card_is_one_line_that_says_what_to_lower(plain: Dataset) -> None
     )
     with pytest.raises(
         DeviceMemoryError,
-        match=r"out of memory at step 1 with 12 primitives, images of \d+ x \d+ pixels and train.views_per_step=2; lower",
+        match=r"out of memory at step 1 with 12 primitives, images of \d+ x \d+ pixels and train.views_per_step=2; "
+        r"lower",
     ):
         trainer.train_step()
 

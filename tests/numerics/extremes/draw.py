@@ -16,7 +16,8 @@ from tests.numerics.extremes.measure import OPEN, Case
 from tests.numerics.extremes.oracle import GAIN_LIMIT, Integrals, long_integrals
 
 __all__ = [
-    "SIZE", "aimed", "amplified", "crowd", "cut", "grazing", "log_uniform", "networked", "normalised", "primitive", "signed", "silhouette", "single",
+    "SIZE", "aimed", "amplified", "crowd", "cut", "grazing", "log_uniform", "networked", "normalised", "primitive",
+    "signed", "silhouette", "single",
 ]  # fmt: skip
 
 SIZE = 24  # pixels on a side

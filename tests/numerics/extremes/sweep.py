@@ -45,7 +45,8 @@ class Result:
 
 
 def measure(region: Region, edge: int, cases: int, left_out: Sequence[str] = ()) -> list[Result]:
-    """Worst of the first ``cases`` cases, per backend but those ``left_out``. Gradients are compared on the fast ones; the reference's are the
+    """Worst of the first ``cases`` cases, per backend but those ``left_out``. Gradients are compared on the fast ones;
+    the reference's are the
     standard."""
     found = [
         Result(region, backend, precision, edge, Errors()) for backend, precision in BACKENDS if backend not in left_out

@@ -54,7 +54,7 @@ def pixel(camera: Camera, point: list[float]) -> tuple[int, int]:
 
 
 # Colours
-# -------------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 def test_a_textured_cube_shows_its_quarters_where_geometry_says(tmp_path: Path) -> None:
@@ -114,7 +114,8 @@ def test_names_of_textures_in_libraries(tmp_path: Path, line: str, name: str) ->
 def test_the_texture_that_a_ply_names(tmp_path: Path) -> None:
     quarters().save(tmp_path / "skin.png")
     (tmp_path / "square.ply").write_text(
-        "ply\nformat ascii 1.0\ncomment TextureFile skin.png\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "ply\nformat ascii 1.0\ncomment TextureFile skin.png\nelement vertex 4\nproperty float x\nproperty float "
+        "y\nproperty float z\n"
         "property float s\nproperty float t\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
         "-1 -1 0 0 0\n1 -1 0 1 0\n1 1 0 1 1\n-1 1 0 0 1\n3 0 1 2\n3 0 2 3\n"
     )
@@ -220,7 +221,7 @@ def test_triangles_strips_and_fans(tmp_path: Path, mode: int, indices: list[int]
 
 
 # Holes
-# ---------------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -243,7 +244,7 @@ def test_where_the_texture_is_clear_there_is_a_hole(tmp_path: Path, mode: str, a
 
 
 # Textures
-# ------------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 def test_texels_are_mixed_in_linear_light_about_their_middles() -> None:
@@ -269,10 +270,12 @@ def test_a_ray_that_covers_many_texels_sees_their_mean() -> None:
 
 
 # Shape and place
-# -----------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("suffix", "up", "expected"), [(".glb", "auto", "y"), (".obj", "auto", "y"), (".ply", "auto", "z"), (".stl", "auto", "z"), (".ply", "y", "y"), (".glb", "z", "z")])  # fmt: skip
+@pytest.mark.parametrize(("suffix", "up", "expected"),
+    [(".glb", "auto", "y"), (".obj", "auto", "y"), (".ply", "auto", "z"), (".stl", "auto", "z"), (".ply", "y", "y"),
+        (".glb", "z", "z")])  # fmt: skip
 def test_it_stands_upright_in_the_box_and_can_be_put_back(tmp_path: Path, suffix: str, up: str, expected: str) -> None:
     """A thin pole of height 60 along ``expected``, far from the origin."""
     size = [2.0, 2, 60] if expected == "z" else [2.0, 60, 2]
@@ -313,7 +316,7 @@ def test_normals_of_the_file_are_used_and_others_follow_from_the_angles(tmp_path
 
 
 # The data set
-# --------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 def test_images_are_kept_by_contents_and_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -345,4 +348,4 @@ def test_images_are_kept_by_contents_and_settings(tmp_path: Path, monkeypatch: p
 
 
 # What it shares
-# ------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------

@@ -55,11 +55,11 @@ def notes(path: Path, **settings: Any) -> list[str]:
 
 
 # The file itself
-# -----------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 # Geometry
-# ------------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -89,12 +89,15 @@ def test_sizes_from_atoms_to_galaxies(tmp_path: Path) -> None:
 
 
 # Limits
-# --------------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 def test_a_header_that_says_a_billion_takes_no_memory(tmp_path: Path) -> None:
     billion = 10**9
-    head = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face {}\nproperty list uchar int vertex_indices\nend_header\n"
+    head = (
+        "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face "
+        "{}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
     (tmp_path / "a.ply").write_text(head.format("ascii", billion, 1))
     (tmp_path / "b.ply").write_text(head.format("binary_little_endian", 3, billion))
     (tmp_path / "c.ply").write_text(
@@ -178,7 +181,7 @@ def test_textures_are_bounded_before_they_are_decoded(tmp_path: Path, monkeypatc
 
 
 # References
-# ----------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -280,7 +283,7 @@ def test_texture_coordinates_beyond_all_measure(tmp_path: Path) -> None:
 
 
 # glTF
-# ----------------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -187,13 +187,14 @@ def test_textures_of_libraries_are_moved_and_in_folders_with_blanks(
     (tmp_path / "other.mtl").write_text("newmtl other\n")
     for libraries in ("my lib.mtl", "other.mtl my lib.mtl"):
         (tmp_path / "a.obj").write_text(
-            f"mtllib {libraries}\nusemtl my mat\nv -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf -4/-4 -3/-3 -2/-2 -1/-1\n"
+            f"mtllib {libraries}\nusemtl my mat\nv -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 "
+            f"1\nf -4/-4 -3/-3 -2/-2 -1/-1\n"
         )
         assert shown(tmp_path / "a.obj") == list(colour)
 
 
 # Base colours
-# --------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("metallic", [{}, {"baseColorFactor": [0, 0, 1, 1]}, None])
@@ -268,7 +269,7 @@ def test_opacity_cuts_holes_and_translucency_is_said(
 
 
 # Extensions
-# ----------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -320,7 +321,7 @@ def test_what_a_file_offers_beside_compression_is_read(tmp_path: Path) -> None:
 
 
 # Places
-# --------------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 def placed(path: Path) -> list[np.ndarray]:
@@ -408,7 +409,7 @@ def test_a_skin_is_where_its_joints_are(tmp_path: Path) -> None:
 
 
 # STL
-# -----------------------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 def write_stl(path: Path, head: bytes, *attributes: int) -> Path:

@@ -106,8 +106,14 @@ def test_a_ply_with_concave_faces(tmp_path: Path, order: str, mixed: bool) -> No
     """Faces of one size, and of several, each with a colour that its triangles have."""
     faces = [list(range(8)), *([[0, 1, 2], [4, 5, 6, 7]] if mixed else [])]
     kind = {"<": "binary_little_endian", ">": "binary_big_endian", "": "ascii"}[order]
-    head = f"ply\nformat {kind} 1.0\nelement vertex 8\nproperty double x\nproperty double y\nproperty float z\nelement face {len(faces)}\n"
-    head += "property uchar red\nproperty uchar green\nproperty uchar blue\nproperty list uchar ushort vertex_index\nend_header\n"
+    head = (
+        f"ply\nformat {kind} 1.0\nelement vertex 8\nproperty double x\nproperty double y\nproperty float "
+        f"z\nelement face {len(faces)}\n"
+    )
+    head += (
+        "property uchar red\nproperty uchar green\nproperty uchar blue\nproperty list uchar ushort "
+        "vertex_index\nend_header\n"
+    )
     if order:
         body = b"".join(struct.pack(f"{order}ddf", x, y, 0) for x, y in U)
         body += b"".join(struct.pack(f"{order}4B{len(f)}H", 255, 0, 51 * i, len(f), *f) for i, f in enumerate(faces))

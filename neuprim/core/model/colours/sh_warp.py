@@ -65,11 +65,14 @@ def _functions(degree: int) -> tuple[Any, Any]:
             i, j, k, l = b0 * g[8], b1 * g[9], b2 * g[10], b3 * g[11]
             m, n, o = b4 * g[12], b5 * g[13], b6 * g[14]
             out += wp.vec3d(
-                six * i * x * y + j * y * z - two * k * x * y - six * l * x * z + m * (four * zz - three * xx - yy) + two * n * x * z
+                six * i * x * y + j * y * z - two * k * x * y - six * l * x * z
+                + m * (four * zz - three * xx - yy) + two * n * x * z
                 + three * o * (xx - yy),
-                three * i * (xx - yy) + j * x * z + k * (four * zz - xx - three * yy) - six * l * y * z - two * m * x * y - two * n * y * z
+                three * i * (xx - yy) + j * x * z + k * (four * zz - xx - three * yy) - six * l * y * z
+                - two * m * x * y - two * n * y * z
                 - six * o * x * y,
-                j * x * y + eight * k * y * z + l * (six * zz - three * xx - three * yy) + eight * m * x * z + n * (xx - yy),
+                j * x * y + eight * k * y * z + l * (six * zz - three * xx - three * yy)
+                + eight * m * x * z + n * (xx - yy),
             )  # fmt: skip
         return out
 
@@ -83,7 +86,8 @@ def _kernels(degree: int) -> tuple[Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def forward(
-        means: wp.array(dtype=wp.vec3), dc: wp.array2d(dtype=float), rest: wp.array3d(dtype=float), origin: wp.array(dtype=wp.float64),
+        means: wp.array(dtype=wp.vec3), dc: wp.array2d(dtype=float), rest: wp.array3d(dtype=float),
+        origin: wp.array(dtype=wp.float64),
         color: wp.array2d(dtype=float),
     ):  # fmt: skip
         i = wp.tid()
@@ -97,8 +101,10 @@ def _kernels(degree: int) -> tuple[Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def backward(
-        means: wp.array(dtype=wp.vec3), rest: wp.array3d(dtype=float), origin: wp.array(dtype=wp.float64), color: wp.array2d(dtype=float),
-        grad: wp.array2d(dtype=float), g_means: wp.array(dtype=wp.vec3), g_dc: wp.array2d(dtype=float), g_rest: wp.array3d(dtype=float),
+        means: wp.array(dtype=wp.vec3), rest: wp.array3d(dtype=float), origin: wp.array(dtype=wp.float64),
+        color: wp.array2d(dtype=float),
+        grad: wp.array2d(dtype=float), g_means: wp.array(dtype=wp.vec3), g_dc: wp.array2d(dtype=float),
+        g_rest: wp.array3d(dtype=float),
     ):  # fmt: skip
         i = wp.tid()
         offset = wp.vec3d(means[i]) - wp.vec3d(origin[0], origin[1], origin[2])
@@ -147,7 +153,8 @@ class _Colors(torch.autograd.Function):
             _kernels(ctx.degree)[1], len(means),
             (
                 array(means, wp.vec3), array(rest, wp.float32), array(centre, wp.float64), array(color, wp.float32),
-                array(grad.contiguous(), wp.float32), array(g_means, wp.vec3), array(g_dc, wp.float32), array(g_rest, wp.float32),
+                array(grad.contiguous(), wp.float32), array(g_means, wp.vec3), array(g_dc, wp.float32),
+                array(g_rest, wp.float32),
             ), means.device,
         )  # fmt: skip
         dtype, place = ctx.origin

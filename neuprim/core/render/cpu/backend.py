@@ -144,7 +144,8 @@ def _prepare(
         depth_floor=np.float32(settings.depth_floor),
         neurons=K + K % 2,  # a padded one has amplitude 0
     )
-    # Both passes share one unit of work: half a row of tiles, or more where threads are few, as every unit costs a call.
+    # Both passes share one unit of work: half a row of tiles, or more where threads are few, as every unit costs a
+    # call.
     across, workers = -(-camera.width // P.TILE), resolve_threads(threads)
     tiles = across * -(-camera.height // P.TILE)
     chunk = max(2 if workers > 1 else _TILES_ALONE, across // 2, tiles // (_UNITS_PER_THREAD * workers))
@@ -271,7 +272,8 @@ def render_slabs(
         starts = frame.lists.starts[slab * frame.tiles : (slab + 1) * frame.tiles + 1]
         parallel_for(
             composite_tiles, frame.tiles, frame.chunk, settings.threads, frame.arrays._replace(starts=starts), colors,
-            Image(rgb, T[slab], z[slab], last, black, True), saved.live, saved.first_lane, None, EDGE_TYPES[request.edge],
+            Image(rgb, T[slab], z[slab], last, black, True), saved.live, saved.first_lane, None,
+            EDGE_TYPES[request.edge],
         )  # fmt: skip
     alpha = 1 - torch.from_numpy(T)
     return alpha.to(means.dtype), mean_depth(torch.from_numpy(z), alpha).to(means.dtype)

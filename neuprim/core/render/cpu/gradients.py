@@ -82,7 +82,8 @@ def _without_neurons(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-d
         g = f(2) * S[L.GRAD + k]
         total += g * half * fade
         gmx, gmy, gmz, gex, gey, gez = through_chord(
-            g * field * fade, f(0), f(0), g * half * field * by_d, f(0), half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut,
+            g * field * fade, f(0), f(0), g * half * field * by_d, f(0), half, ex, ey, ez, px, py, pz, mid, tm, ia, h,
+            uncut,
             by_depth(D, ia, depth_floor, edge), f(0), f(0), f(0), f(0), f(0), f(0),
         )  # fmt: skip
         rays = add_ray(rays, du, dv, slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
@@ -118,8 +119,10 @@ def _with_two(products):  # type: ignore[no-untyped-def]
             gqx, gqy, gqz = u * ax1 + u1 * bx1, u * ay1 + u1 * by1, u * az1 + u1 * bz1
             gvx, gvy, gvz = v * ax1 + v1 * bx1, v * ay1 + v1 * by1, v * az1 + v1 * bz1
             gmx, gmy, gmz, gex, gey, gez = through_chord(
-                gvx * ex + gvy * ey + gvz * ez + g * field * fade, gqx * ex + gqy * ey + gqz * ez, f(0), g * half * field * by_d, f(0),
-                half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, by_depth(D, ia, depth_floor, edge), gqx, gqy, gqz, gvx, gvy, gvz,
+                gvx * ex + gvy * ey + gvz * ez + g * field * fade, gqx * ex + gqy * ey + gqz * ez, f(0),
+                g * half * field * by_d, f(0),
+                half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, by_depth(D, ia, depth_floor, edge), gqx, gqy, gqz,
+                gvx, gvy, gvz,
             )  # fmt: skip
             rays = add_ray(rays, du, dv, slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
         out[P.G_OFFSET], out[P.G_LOG_M] = total, total * offset + aa * sums[0] + ba * sums1[0]
@@ -272,7 +275,8 @@ def chord_gradient(S, n, p, out, edge, in_float64):  # type: ignore[no-untyped-d
             else:
                 gD = g * half * field * S[L.BY_D + k]
         gmx, gmy, gmz, gex, gey, gez = through_chord(
-            g_half, g_mid, g_tm, gD, gA, half, ex, ey, ez, px, py, pz, mid, tm, S[L.IA + k], S[L.HEIGHT + k], S[L.UNCUT + k],
+            g_half, g_mid, g_tm, gD, gA, half, ex, ey, ez, px, py, pz, mid, tm, S[L.IA + k], S[L.HEIGHT + k],
+            S[L.UNCUT + k],
             S[L.DH + k], gqx, gqy, gqz, gvx, gvy, gvz,
         )  # fmt: skip
         rays = add_ray(rays, S[L.DU + k], S[L.DV + k], slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)

@@ -368,7 +368,8 @@ def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no
             y0, y1 = _extent(c, m, B, axes, view.fy, view.cy, 1, s22, square)
             x0, x1 = max(0.0, np.ceil(x0 - 0.5)), min(float(view.width), np.floor(x1 - 0.5) + 1)
             y0, y1 = max(0.0, np.ceil(y0 - 0.5)), min(float(view.height), np.floor(y1 - 0.5) + 1)
-            # |r e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width by HX, HY
+            # |r e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width by HX,
+            # HY
             _cross(xa, e0, k0)
             _cross(xa, ex, ka)
             _cross(ex, e0, tmp)

@@ -70,8 +70,10 @@ class PairWindow(NamedTuple):
 def lend_frame(frame):  # type: ignore[no-untyped-def]
     """The same arrays without reference counts."""
     return FrameArrays(
-        borrow_array(frame.rows), borrow_array(frame.wide), borrow_array(frame.slots), borrow_array(frame.spans), borrow_array(frame.boxes), borrow_array(frame.kinds),
-        borrow_array(frame.starts), borrow_array(frame.ids), borrow_array(frame.norms), frame.alpha_min, frame.alpha_max,
+        borrow_array(frame.rows), borrow_array(frame.wide), borrow_array(frame.slots), borrow_array(frame.spans),
+        borrow_array(frame.boxes), borrow_array(frame.kinds),
+        borrow_array(frame.starts), borrow_array(frame.ids), borrow_array(frame.norms), frame.alpha_min,
+        frame.alpha_max,
         frame.transmittance_min, frame.depth_floor, frame.neurons,
     )  # fmt: skip
 

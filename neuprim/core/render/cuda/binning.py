@@ -218,8 +218,10 @@ def bin_primitives(
     first = torch.zeros(N + 1, dtype=torch.int32, device=device)
     slots, which, keys = integers(N), integers(counted.in_float64), torch.empty(pairs, dtype=torch.int64, device=device)
     reached = (
-        array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(order, wp.int64), array(counts, wp.int32),
-        array(counted.ends, wp.int64), across, image_of, 0 if images is None else each, array(first, wp.int32), array(keys, wp.int64), array(slots, wp.int32), array(which, wp.int32),
+        array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(order, wp.int64),
+        array(counts, wp.int32),
+        array(counted.ends, wp.int64), across, image_of, 0 if images is None else each, array(first, wp.int32),
+        array(keys, wp.int64), array(slots, wp.int32), array(which, wp.int32),
     )  # fmt: skip
     launch(emit, N, reached, device, PER_BLOCK)
     keys, came_from = torch.sort(keys)
@@ -238,7 +240,8 @@ def row_spans(
     rows: Vec4s2d, silhouettes: Floats2d, boxes: Vec4is, ids: Ints, tiles: Ints, size: wp.vec2i, spans: Shorts2d,
     counts: Ints,
 ):  # fmt: skip
-    """Thread n: which pixels of a tile the silhouette of pair n covers, a span start << 8 | last << 4 | first in each of
+    """Thread n: which pixels of a tile the silhouette of pair n covers, a span start << 8 | last << 4 | first in each
+    of
     its 16 rows, and how many pixels they have together.
 
     Each pixel inside has a slot of its own, in the order of pairs, rows and pixels, where the forward pass leaves what

@@ -97,7 +97,8 @@ def _kernels(double: bool) -> tuple[Any, Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def fill_rows(
-        log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3), bias: wp.array2d(dtype=real),
+        log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3),
+        bias: wp.array2d(dtype=real),
         Wout: wp.array3d(dtype=real), channels: int, rows: Vec4s2d, fast: Bools2d,
     ):  # fmt: skip
         """Thread (i, j): unit j of primitive i."""
@@ -201,7 +202,8 @@ def fill_wide_net(net: Net, which: Tensor, log_scales: Tensor, quats: Tensor) ->
     launch(
         _kernels(double)[1], (M, H),
         (
-            array(which, wp.int32), array(log_scales.to(net.Wx), vec3), array(quats.to(net.Wx), vec4), array(net.Wx, vec3), array(net.bias, real),
+            array(which, wp.int32), array(log_scales.to(net.Wx), vec3), array(quats.to(net.Wx), vec4),
+            array(net.Wx, vec3), array(net.bias, real),
             array(net.wide, wp.vec4d),
         ), device, PER_BLOCK,
     )  # fmt: skip
@@ -229,8 +231,10 @@ def net_backward(
     launch(
         _kernels(double)[2], net.Wx.shape[0],
         (
-            array(log_scales.to(net.Wx), vec3), array(quats.to(net.Wx), vec4), array(net.Wx, vec3), net.hidden, int(net.Wout.shape[1]),
-            array(weights, wp.float32), array(grads, wp.float32), first, array(g_log_scales, wp.vec3), array(g_quats, wp.vec4),
+            array(log_scales.to(net.Wx), vec3), array(quats.to(net.Wx), vec4), array(net.Wx, vec3), net.hidden,
+            int(net.Wout.shape[1]),
+            array(weights, wp.float32), array(grads, wp.float32), first, array(g_log_scales, wp.vec3),
+            array(g_quats, wp.vec4),
             array(g_Wx, wp.vec3), array(g_bias, wp.float32), array(g_Wout, wp.float32),
         ), net.Wx.device, PER_BLOCK,
     )  # fmt: skip

@@ -217,7 +217,8 @@ class Pull64:
 
 @wp.func
 def through64(
-    c: Chord64, tc: wp.float64, depth_floor: float, g_half: wp.float64, g_mid: wp.float64, g_tm: wp.float64, gD: wp.float64, gA: wp.float64,
+    c: Chord64, tc: wp.float64, depth_floor: float, g_half: wp.float64, g_mid: wp.float64, g_tm: wp.float64,
+    gD: wp.float64, gA: wp.float64,
     gq: wp.vec3d, gv: wp.vec3d,
 ):  # fmt: skip
     """As :func:`~neuprim.core.render.cuda.chord.through`, with dh/dD from the floor on D; g_tm, gD, gA: on other ways

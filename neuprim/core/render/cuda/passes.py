@@ -132,7 +132,8 @@ def _count_slots(frame: Frame, counts: Tensor) -> tuple[int, Tensor, Tensor]:
         total = int(ends[-1])
     if total >= _MAX_HITS:
         raise BackendUnavailable(
-            f"primitives cover {total} pixels in all; the cuda backend counts to {_MAX_HITS - 1}: render a smaller image"
+            f"primitives cover {total} pixels in all; the cuda backend counts to {_MAX_HITS - 1}: render a smaller "
+            f"image"
         )
     return total, offsets, in_float64
 

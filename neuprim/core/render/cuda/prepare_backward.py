@@ -116,7 +116,8 @@ def _kernel(double: bool) -> Any:
 
 
 def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tuple[tuple[Tensor, ...], Tensor | None]:
-    """Gradients of :data:`~neuprim.core.render.rasterize.PARAMETERS` in float32, and of the upper three rows of the view.
+    """Gradients of :data:`~neuprim.core.render.rasterize.PARAMETERS` in float32, and of the upper three rows of the
+    view.
 
     Args:
         frame: of the forward pass.
@@ -129,7 +130,8 @@ def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tu
     launch(
         _kernel(frame.double), grads.shape[0],
         (
-            *frame.inputs, array(p.matrix, wp.float64), p.intrinsics, p.near, p.turns, frame.neurons, array(grads.contiguous(), wp.float32),
+            *frame.inputs, array(p.matrix, wp.float64), p.intrinsics, p.near, p.turns, frame.neurons,
+            array(grads.contiguous(), wp.float32),
             *as_arrays(out), None if g_view is None else array(g_view, wp.float64),
         ), grads.device, PER_BLOCK,
     )  # fmt: skip

@@ -2,8 +2,8 @@
 """cos and B_p of a phase in turns: the CPU's polynomials up to half a turn, recursion beyond.
 
 B_p(z) = (2p + 1)!! j_p(z)/z^p and B_p' = -z B_(p+1)/(2p + 3), so that the backward pass needs one more member of the
-family and nothing else. Rates v are in turns over half a chord, z = 2 pi v (:mod:`neuprim.core.model.edge`). Coefficients:
-benchmarks/fit_polynomials.py. float32 errors up to half a turn: cos 4e-7, B_0 2.6e-7, B_1 to B_3 1.1e-7.
+family and nothing else. Rates v are in turns over half a chord, z = 2 pi v (:mod:`neuprim.core.model.edge`).
+Coefficients: benchmarks/fit_polynomials.py. float32 errors up to half a turn: cos 4e-7, B_0 2.6e-7, B_1 to B_3 1.1e-7.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ COSINE = (
     6.528658390045166,
 )  # fmt: skip
 BANDS = (
-    (0.9999999403953552, -6.579718112945557, 12.987034797668457, -12.193572044372559, 6.5799241065979, -1.9848600625991821),
+    (0.9999999403953552, -6.579718112945557, 12.987034797668457, -12.193572044372559, 6.5799241065979,
+        -1.9848600625991821),
     (1.0, -3.947838068008423, 5.566061973571777, -4.0664167404174805, 1.8024897575378418, -0.4700262248516083),
     (1.0, -2.8198859691619873, 3.0923008918762207, -1.84883451461792, 0.6952810883522034, -0.15978121757507324),
     (1.0, -2.1932449340820312, 1.967841386795044, -0.9956727027893066, 0.32511693239212036, -0.06681565195322037),

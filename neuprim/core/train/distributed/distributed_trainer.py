@@ -68,7 +68,8 @@ class DistributedTrainer(Trainer):
         super().__init__(model, dataset, loss, settings, renderer, seed)
         if self.settings.supervision == "voxels":
             raise ConfigError(
-                f"train.supervision=voxels: there are no views that {group.size} ranks could share; expected one process"
+                f"train.supervision=voxels: there are no views that {group.size} ranks could share; expected one "
+                f"process"
             )
         self.group, self.rank, self.ranks = group, group.rank, group.size
         self._sums: GradientSum | None = None

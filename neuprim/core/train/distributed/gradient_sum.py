@@ -1,8 +1,8 @@
 """Sum gradients and contributions over the views of all ranks, in the order of the views.
 
-Floating-point sums depend on their order, and an all-reduce adds in an order of its own. Here every rank owns a slice of
-a flat buffer, receives that slice of every view, adds the views one after the other as one process does, and sends the
-sum to the others. This moves as many bytes as a ring all-reduce.
+Floating-point sums depend on their order, and an all-reduce adds in an order of its own. Here every rank owns a slice
+of a flat buffer, receives that slice of every view, adds the views one after the other as one process does, and sends
+the sum to the others. This moves as many bytes as a ring all-reduce.
 """
 
 from __future__ import annotations

@@ -57,7 +57,8 @@ def read_torchrun_rank(environment: Mapping[str, str] = os.environ) -> TorchrunR
             raise ConfigError(f"environment: {name}={value} with {whole}={most}: expected less")
     if local_size > size or local_rank > rank:
         raise ConfigError(
-            f"environment: rank {rank} of {size} is {local_rank} of {local_size} on this machine: expected no more there than in all"
+            f"environment: rank {rank} of {size} is {local_rank} of {local_size} on this machine: expected no more "
+            f"there than in all"
         )
     found = TorchrunRank(
         rank, size, local_rank, local_size, f"{environment['MASTER_ADDR']}:{environment['MASTER_PORT']}"

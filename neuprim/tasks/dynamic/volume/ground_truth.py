@@ -146,9 +146,10 @@ class CaptureSource(VolumeTruth, VolumeSource):
 def compare_extinction(model: Primitives, capture: Capture, times: list[float], per_third: int = 3) -> dict[str, Any]:
     """Errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
 
-    ``sigma_frames`` has the numbers of every compared frame (:func:`~neuprim.core.volumes.density_errors.measure_frame_errors`); the
-    thirds are means over ``per_third`` of them, evenly spaced. Frames without extinction are left out. If flames add to
-    the extinction of a grid, the same numbers exist for that grid's part: ``density_frames``, ...
+    ``sigma_frames`` has the numbers of every compared frame
+    (:func:`~neuprim.core.volumes.density_errors.measure_frame_errors`); the thirds are means over ``per_third`` of
+    them, evenly spaced. Frames without extinction are left out. If flames add to the extinction of a grid, the same
+    numbers exist for that grid's part: ``density_frames``, ...
     """
     result: dict[str, Any] = {}
     for component in (None, *model.density.components(model.params)):

@@ -40,7 +40,8 @@ SMALL = [
 ]
 TASKS = {
     "static": ["scene=solids", "scene.size=24", "scene.train_views=8", "scene.test_views=2", "model.primitives=60"],
-    "dynamic": ["scene=smoke_fire", "scene.size=24", "scene.resolution=16", "scene.timesteps=3", "scene.cameras=5", "model.primitives=60",
+    "dynamic": ["scene=smoke_fire", "scene.size=24", "scene.resolution=16", "scene.timesteps=3", "scene.cameras=5",
+        "model.primitives=60",
                 "train.supervision=both", "train.voxels_every=2", "train.voxels_per_step=200"],
     "relight": ["scene=lit_solids", "scene.size=24", "model.primitives=40"],
 }  # fmt: skip
@@ -241,7 +242,8 @@ def test_a_rank_that_computes_differently_is_found_at_the_next_step(scene: Datas
 
 @pytest.mark.parametrize(
     ("change", "what"),
-    [({"seed": 5}, "state"), ({"final_rate": 0.5}, "settings"), ({"views": 5}, "training views"), ({"steps": 1}, "steps done")],
+    [({"seed": 5}, "state"), ({"final_rate": 0.5}, "settings"), ({"views": 5}, "training views"),
+        ({"steps": 1}, "steps done")],
 )  # fmt: skip
 def test_ranks_that_start_differently_are_refused(change: dict[str, Any], what: str, scene: Dataset) -> None:
     def work(group: ProcessGroup) -> None:

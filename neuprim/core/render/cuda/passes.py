@@ -20,9 +20,8 @@ from neuprim.core.render.cuda.colour_net import (
     net_pairs_kernel,
     net_width,
 )
-from neuprim.core.render.cuda.entry import composite_kernel, uncomposite_kernel
 from neuprim.core.render.cuda.float64 import float64_opacity_kernel, float64_pairs_kernel
-from neuprim.core.render.cuda.forward import forward_kernel
+from neuprim.core.render.cuda.forward import composite_kernel, forward_kernel, uncomposite_kernel
 from neuprim.core.render.cuda.frame import Frame
 from neuprim.core.render.cuda.layout import Form
 from neuprim.core.settings import RenderSettings

@@ -18,7 +18,6 @@ from neuprim.export import vdb as exporter
 from neuprim.runs.export import export_run
 from neuprim.runs.inspect import Request, inspect_run
 from neuprim.runs.open import open_run
-from tests.core.io.vdb.openvdb_oracle import compare, other_python
 from tests.plugins import marked
 from tests.pretend_card import CARD, pretended
 
@@ -185,11 +184,3 @@ def test_a_time_when_nothing_lives_is_an_empty_frame(tmp_path: Path) -> None:
         read_grid(report.files[0], "density").active_voxels == 0
         and read_grid(report.files[1], "density").active_voxels > 0
     )
-
-
-@pytest.mark.slow
-def test_openvdb_itself_reads_it(moving: Path, tmp_path: Path) -> None:
-    python = other_python()
-    for path in export_run(moving, "vdb", tmp_path / "frames").files:
-        (grid,) = compare(python, path, tmp_path)  # values, active voxels, transform and metadata
-        assert grid.active_voxels > 50 and grid.name == "density"

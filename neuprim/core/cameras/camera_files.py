@@ -28,128 +28,11 @@ from neuprim.core.cameras.usd import is_usd, read_usd_cameras
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 
-__all__ = ["read_camera_file", "read_cameras", "read_json_cameras"]
-
 _MAX_BYTES = 64 * 1024 * 1024
-
-
-def read_json_cameras(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
-    """Read a file with ``frames`` or ``camera_path``.
-
-    Args:
-        size: (width, height) where the file has none.
-
-    Raises:
-        DataError: names file, frame and field.
-    """
-    document = JsonReader.open(path, _MAX_BYTES)
-    if document.has("camera_path"):
-        return _camera_path(document, size)
-    if not document.has("frames"):
-        raise document.fail("frames", "a non-empty list of objects (or camera_path, as nerfstudio's viewer writes it)")
-    return _read_frames(document, size)
-
-
-def _listed_cameras(document: JsonReader, key: str) -> list[JsonReader]:
-    records = list(document.objects(key))
-    if len(records) > MAX_CAMERAS:
-        raise DataError(f"{document.where}: {key} has {len(records)} cameras; expected at most {MAX_CAMERAS}")
-    return records
-
-
-def _stated_size(record: JsonReader, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
-    found = [
-        record.count(key) if record.has(key) or size is None else fallback
-        for key, fallback in zip(keys, size or (0, 0), strict=True)
-    ]
-    for key, value in zip(keys, found, strict=True):
-        if not 0 < value <= MAX_IMAGE_SIDE:
-            raise DataError(f"{record.where}: {key} is {value}; expected 1 to {MAX_IMAGE_SIDE} pixels")
-    return found[0], found[1]
-
-
-def _times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
-    """The times of all cameras, where all have one."""
-    return tuple(r.number(key, "a time") for r in records) if all(r.has(key) for r in records) else None
-
-
-def _rate(document: JsonReader, count: int) -> float | None:
-    """``fps``, else ``count`` frames over ``seconds``; None without either."""
-    for key, rate in (("fps", lambda value: value), ("seconds", lambda value: count / value)):
-        if document.has(key):
-            found = rate(document.number(key, "a number above 0", 0.0))
-            if not FRAME_RATES[0] <= found <= FRAME_RATES[1]:
-                raise document.fail(key, f"{FRAME_RATES[0]:g} to {FRAME_RATES[1]:g} frames per second")
-            return found
-    return None
-
-
-# ---------------------------------------------------------------- frames
-
-
-def _read_frames(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
-    """Read ``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``."""
-    records, found, bent = _listed_cameras(document, "frames"), [], 0
-    notes: dict[str, None] = {}
-    refuse_unsupported_keys(document)
-    for i, record in enumerate(records):
-        refuse_unsupported_keys(record)
-        if has_fisheye_lens(record, document, ()):
-            raise DataError(
-                f"{record.where}: the camera is a fisheye (camera_model, is_fisheye); expected one of "
-                f"{', '.join(MODELS)}"
-            )
-        bent += any(read_lens_coefficients(record, document).values())
-        stated = JsonReader(
-            {key: r.values[key] for r in (document, record) for key in ("w", "h") if r.has(key)}, record.where
-        )
-        target = Target(*_stated_size(stated, ("w", "h"), size))
-        own = record.has("transform_matrix") or not document.has("transform_matrix")
-        view = None if own else opengl_to_viewmat(document.matrix("transform_matrix"))
-        camera = read_camera(record, document, target, view, lambda text: notes.update({text: None}))
-        found.append((f"camera_{i:03d}", camera.validate(record.where)))
-    if bent:
-        notes[f"the lens distortion of {bent} of {len(found)} cameras is left out"] = None
-    return CameraViews(tuple(found), _times(records, "time"), _rate(document, len(found)), tuple(notes))
-
-
-# ---------------------------------------------------------------- nerfstudio's viewer
-
-
-def _camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
-    """Read a path of nerfstudio's viewer.
-
-    ``{"render_width", "render_height", "fps", "seconds", "camera_path": [{"camera_to_world": 16 numbers, "fov"}]}``:
-    ``fov`` is vertical, in degrees, and axes are OpenGL's.
-    """
-    kind = document.values.get("camera_type", "perspective")
-    if kind != "perspective":
-        raise document.fail("camera_type", "perspective; others are not drawn")
-    records = _listed_cameras(document, "camera_path")
-    width, height = _stated_size(document, ("render_width", "render_height"), size)
-    found = []
-    for i, record in enumerate(records):
-        fov = record.number("fov", "a vertical field of view in degrees, between 0 and 180", 0.0, 180.0)
-        focal = 0.5 * height / math.tan(math.radians(fov) / 2)
-        view = opengl_to_viewmat(_flat_matrix(record, "camera_to_world"))
-        camera = Camera(view, focal, focal, 0.5 * width, 0.5 * height, width, height)
-        found.append((f"camera_{i:03d}", camera.validate(f"{record.where}.camera_to_world")))
-    note = (
-        "poses are taken as they are; nerfstudio's viewer has them in the frame that its dataparser moved "
-        "and scaled the scene to"
-    )
-    return CameraViews(tuple(found), _times(records, "render_time"), _rate(document, len(found)), (note,))
-
-
-def _flat_matrix(record: JsonReader, key: str) -> Tensor:
-    """(4, 4) of 16 numbers row by row, or of rows."""
-    value = record.values.get(key)
-    if isinstance(value, list) and len(value) == 16:
-        rows = [value[i : i + 4] for i in (0, 4, 8, 12)]
-        return JsonReader({key: rows}, record.where).matrix(key)
-    if not isinstance(value, list) or len(value) not in (3, 4):
-        raise record.fail(key, "16 numbers, row by row")
-    return record.matrix(key)
+_VIEWER_NOTE = (
+    "poses are taken as they are; nerfstudio's viewer has them in the frame that its dataparser moved "
+    "and scaled the scene to"
+)
 
 
 def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
@@ -166,7 +49,8 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
         DataError: names the file and the field that is missing or wrong.
         BackendUnavailable: the package that reads the format is missing.
     """
-    path, prim = split_usd_prim(path)
+    text, hash_, prim = str(path).partition("#")
+    path, prim = (Path(text), prim) if hash_ and not path.exists() else (path, "")
     model = find_colmap_model(path)
     if model is not None:
         named, notes = read_colmap_cameras(model)
@@ -174,20 +58,104 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
             raise DataError(f"{path}: {len(named)} cameras; expected at most {MAX_CAMERAS}")
         return CameraViews(tuple(named), notes=tuple(notes))
     if path.is_dir():
-        raise DataError(
-            f"{path}: is a folder without cameras.txt or cameras.bin; expected a COLMAP model, or a file of cameras"
-        )
+        found = "is a folder without cameras.txt or cameras.bin"
+        raise DataError(f"{path}: {found}; expected a COLMAP model, or a file of cameras")
     if is_usd(path):
         return read_usd_cameras(path, prim, size)
-    return read_json_cameras(path, size)
-
-
-def split_usd_prim(path: Path) -> tuple[Path, str]:
-    """Split ``FILE#/World/Camera``; a file of that very name comes first."""
-    text, hash_, prim = str(path).partition("#")
-    return (Path(text), prim) if hash_ and not path.exists() else (path, "")
+    document = JsonReader.open(path, _MAX_BYTES)
+    if document.has("camera_path"):
+        return _read_camera_path(document, size)
+    if not document.has("frames"):
+        raise document.fail("frames", "a non-empty list of objects (or camera_path, as nerfstudio's viewer writes it)")
+    return _read_frames(document, size)
 
 
 def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[tuple[str, Camera]]:
     """Return names and cameras of :func:`read_camera_file`."""
     return list(read_camera_file(path, size).named)
+
+
+def _listed_cameras(document: JsonReader, key: str) -> list[JsonReader]:
+    records = list(document.objects(key))
+    if len(records) > MAX_CAMERAS:
+        raise DataError(f"{document.where}: {key} has {len(records)} cameras; expected at most {MAX_CAMERAS}")
+    return records
+
+
+def _stated_size(record: JsonReader, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
+    found = []
+    for key, fallback in zip(keys, size or (0, 0), strict=True):
+        value = record.count(key) if record.has(key) or size is None else fallback
+        if not 0 < value <= MAX_IMAGE_SIDE:
+            raise DataError(f"{record.where}: {key} is {value}; expected 1 to {MAX_IMAGE_SIDE} pixels")
+        found.append(value)
+    return found[0], found[1]
+
+
+def _times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
+    """The times of all cameras, where all have one."""
+    return tuple(r.number(key, "a time") for r in records) if all(r.has(key) for r in records) else None
+
+
+def _rate(document: JsonReader, count: int) -> float | None:
+    """``fps``, else ``count`` frames over ``seconds``; None without either."""
+    for key in ("fps", "seconds"):
+        if document.has(key):
+            value = document.number(key, "a number above 0", 0.0)
+            rate = value if key == "fps" else count / value
+            if not FRAME_RATES[0] <= rate <= FRAME_RATES[1]:
+                raise document.fail(key, f"{FRAME_RATES[0]:g} to {FRAME_RATES[1]:g} frames per second")
+            return rate
+    return None
+
+
+def _read_frames(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
+    """Read ``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``."""
+    records, found, bent = _listed_cameras(document, "frames"), [], 0
+    notes: dict[str, None] = {}
+    refuse_unsupported_keys(document)
+    for i, record in enumerate(records):
+        refuse_unsupported_keys(record)
+        if has_fisheye_lens(record, document, ()):
+            what = "the camera is a fisheye (camera_model, is_fisheye)"
+            raise DataError(f"{record.where}: {what}; expected one of {', '.join(MODELS)}")
+        bent += any(read_lens_coefficients(record, document).values())
+        stated = {key: r.values[key] for r in (document, record) for key in ("w", "h") if r.has(key)}
+        target = Target(*_stated_size(JsonReader(stated, record.where), ("w", "h"), size))
+        own = record.has("transform_matrix") or not document.has("transform_matrix")
+        view = None if own else opengl_to_viewmat(document.matrix("transform_matrix"))
+        camera = read_camera(record, document, target, view, lambda text: notes.update({text: None}))
+        found.append((f"camera_{i:03d}", camera.validate(record.where)))
+    if bent:
+        notes[f"the lens distortion of {bent} of {len(found)} cameras is left out"] = None
+    return CameraViews(tuple(found), _times(records, "time"), _rate(document, len(found)), tuple(notes))
+
+
+def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
+    """Read a path of nerfstudio's viewer.
+
+    ``{"render_width", "render_height", "fps", "seconds", "camera_path": [{"camera_to_world": 16 numbers, "fov"}]}``:
+    ``fov`` is vertical, in degrees, and axes are OpenGL's.
+    """
+    if document.values.get("camera_type", "perspective") != "perspective":
+        raise document.fail("camera_type", "perspective; others are not drawn")
+    records = _listed_cameras(document, "camera_path")
+    width, height = _stated_size(document, ("render_width", "render_height"), size)
+    found = []
+    for i, record in enumerate(records):
+        fov = record.number("fov", "a vertical field of view in degrees, between 0 and 180", 0.0, 180.0)
+        focal = 0.5 * height / math.tan(math.radians(fov) / 2)
+        view = opengl_to_viewmat(_flat_matrix(record, "camera_to_world"))
+        camera = Camera(view, focal, focal, 0.5 * width, 0.5 * height, width, height)
+        found.append((f"camera_{i:03d}", camera.validate(f"{record.where}.camera_to_world")))
+    return CameraViews(tuple(found), _times(records, "render_time"), _rate(document, len(found)), (_VIEWER_NOTE,))
+
+
+def _flat_matrix(record: JsonReader, key: str) -> Tensor:
+    """(4, 4) of 16 numbers row by row, or of rows."""
+    value = record.values.get(key)
+    if isinstance(value, list) and len(value) == 16:
+        return JsonReader({key: [value[i : i + 4] for i in (0, 4, 8, 12)]}, record.where).matrix(key)
+    if not isinstance(value, list) or len(value) not in (3, 4):
+        raise record.fail(key, "16 numbers, row by row")
+    return record.matrix(key)

@@ -21,21 +21,7 @@ from torch import Tensor
 from neuprim.core.cameras.pinhole import Camera
 from neuprim.core.errors import BackendUnavailable, DataError
 
-__all__ = [
-    "PINHOLES",
-    "check_binary_model",
-    "find_colmap_model",
-    "largest_colmap_model",
-    "pinhole_parameters",
-    "read_colmap_cameras",
-    "import_pycolmap",
-    "read_colmap_model",
-    "colmap_viewmat",
-]
-
-PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
-"""COLMAP's camera models without distortion."""
-
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")  # camera models without distortion
 _DISTORTED = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")  # pinholes but for their distortion
 
 _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
@@ -46,9 +32,8 @@ def import_pycolmap() -> Any:
     try:
         import pycolmap
     except ImportError as error:
-        raise BackendUnavailable(
-            f"COLMAP scenes need the package pycolmap ({error}): pip install 'neuprim[colmap]'"
-        ) from None
+        what = f"COLMAP scenes need the package pycolmap ({error}): pip install 'neuprim[colmap]'"
+        raise BackendUnavailable(what) from None
     return pycolmap
 
 
@@ -116,9 +101,8 @@ def pinhole_parameters(lens: Any, where: str) -> tuple[float, float, float, floa
     named = {"fx": named.get("f"), "fy": named.get("f"), **named}
     fx, fy, cx, cy = (named.get(key) for key in ("fx", "fy", "cx", "cy"))
     if fx is None or fy is None or cx is None or cy is None:
-        raise DataError(
-            f"{where}: model is {lens.model_name}; expected a model with focal lengths, which a pinhole can replace"
-        )
+        expected = "a model with focal lengths, which a pinhole can replace"
+        raise DataError(f"{where}: model is {lens.model_name}; expected {expected}")
     return fx, fy, cx, cy
 
 
@@ -159,18 +143,12 @@ def _count_images(model: Path) -> int:
         return 0
 
 
-# ---------------------------------------------------------------- cameras alone
-
-
 def find_colmap_model(path: Path) -> Path | None:
     """Return the model folder that a path means: itself, one of its files, or a project; else None."""
     if path.is_dir():
         return path if _kind(path) is not None else largest_colmap_model(path)[0]
-    return (
-        path.parent
-        if path.name in {f"{part}{kind}" for part in _PARTS for kind in (".txt", ".bin")} and _kind(path.parent)
-        else None
-    )
+    is_part = path.suffix in (".txt", ".bin") and path.stem in _PARTS
+    return path.parent if is_part and _kind(path.parent) else None
 
 
 def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
@@ -186,30 +164,22 @@ def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[st
         raise DataError(f"{folder}: has no images with a pose; expected at least one")
     found, bent = [], Counter[str]()
     for image in images:
-        lens, where = (
-            reconstruction.cameras[image.camera_id],
-            f"{folder}: camera {image.camera_id} of image {image.name}",
-        )
+        lens = reconstruction.cameras[image.camera_id]
+        where = f"{folder}: camera {image.camera_id} of image {image.name}"
         if lens.model_name not in (*PINHOLES, *_DISTORTED):
-            raise DataError(
-                f"{where}: model is {lens.model_name}; expected one of {', '.join((*PINHOLES, *_DISTORTED))}"
-            )
-        names = [name.strip() for name in lens.params_info.split(",")]
-        if any(
-            value for name, value in zip(names, lens.params, strict=True) if name not in ("f", "fx", "fy", "cx", "cy")
-        ):
-            bent[lens.model_name] += 1
+            expected = ", ".join((*PINHOLES, *_DISTORTED))
+            raise DataError(f"{where}: model is {lens.model_name}; expected one of {expected}")
+        named = zip((name.strip() for name in lens.params_info.split(",")), lens.params, strict=True)
+        bent[lens.model_name] += any(value for name, value in named if name not in ("f", "fx", "fy", "cx", "cy"))
         camera = Camera(colmap_viewmat(image), *pinhole_parameters(lens, where), int(lens.width), int(lens.height))
         found.append((str(PurePosixPath(image.name).with_suffix("")), camera.validate(where)))
     notes = [
         f"the lens distortion of {count} of {len(found)} cameras ({model}) is left out"
         for model, count in sorted(bent.items())
+        if count
     ]
-    if folder.parent.name == "sparse":
-        notes += [
-            line for line in [largest_colmap_model(folder.parent.parent)[1].replace("takes", "the largest is")] if line
-        ]
-    return found, notes
+    several = largest_colmap_model(folder.parent.parent)[1] if folder.parent.name == "sparse" else ""
+    return found, notes + [several.replace("takes", "the largest is")] * bool(several)
 
 
 def _without_points(folder: Path) -> Any:
@@ -229,7 +199,7 @@ def _without_points(folder: Path) -> Any:
             raise DataError(str(error).replace(name, str(folder))) from None
 
 
-_MAX_PARAMS = 64
+_MAX_PARAMS = 64  # of a camera model
 
 
 class _Bytes:
@@ -247,9 +217,8 @@ class _Bytes:
         """Advance by ``size`` bytes and return the position before."""
         start, self.at = self.at, self.at + size
         if size < 0 or self.at > len(self.data):
-            raise DataError(
-                f"{self.path}: truncated or corrupt: a record ends at byte {self.at}, the file at {len(self.data)}"
-            )
+            found = f"a record ends at byte {self.at}, the file at {len(self.data)}"
+            raise DataError(f"{self.path}: truncated or corrupt: {found}")
         return start
 
     def number(self, kind: str) -> int:
@@ -264,24 +233,19 @@ class _Bytes:
 def check_binary_model(folder: Path, parameter_count: Callable[[int], int]) -> None:
     """Check all ``.bin`` files of a model from first to last record; ``rigs`` and ``frames`` are optional.
 
-    Args:
-        parameter_count: COLMAP camera model number -> number of parameters, or -1.
+    ``parameter_count`` maps the number of a camera model to its number of parameters, or -1.
 
     Raises:
         DataError: a file is unreadable, truncated, too long, or names an unknown camera model.
     """
-    for name, record in (
-        ("cameras.bin", lambda f: _camera(f, parameter_count)),
-        ("images.bin", _image),
-        ("points3D.bin", _point),
-        ("rigs.bin", _rig),
-        ("frames.bin", _frame),
-    ):
-        if record in (_rig, _frame) and not (folder / name).is_file():
+    records = (lambda file: _camera(file, parameter_count), _image, _point, _rig, _frame)
+    for part, skip_record in zip(_PARTS, records, strict=True):
+        path = folder / f"{part}.bin"
+        if part in ("rigs", "frames") and not path.is_file():
             continue
-        file = _Bytes(folder / name)
+        file = _Bytes(path)
         for _ in range(file.number("Q")):
-            record(file)
+            skip_record(file)
         if file.at != len(file.data):
             raise DataError(f"{file.path}: corrupt: its records end at byte {file.at}, the file at {len(file.data)}")
 

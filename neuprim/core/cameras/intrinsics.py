@@ -23,51 +23,27 @@ from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 
-__all__ = [
-    "COEFFICIENTS",
-    "FOCAL",
-    "PRINCIPAL_POINT",
-    "MODELS",
-    "READ",
-    "SIZE",
-    "Target",
-    "read_camera",
-    "refuse_unsupported_keys",
-    "has_fisheye_lens",
-    "read_lens_coefficients",
-    "is_resized_copy",
-    "describe_unknown_keys",
-]
-
+# pinholes but for radial and tangential distortion
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
-"""Camera models that are pinholes but for radial and tangential distortion."""
-
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "camera_intrinsics")
 PRINCIPAL_POINT = ("cx", "cy")
 SIZE = ("w", "h")
 
 _TOLERANCE = 0.01
-_SHORTEST = 0.5 / math.tan(math.radians(85))
-"""Of a focal length over the image's side: no photograph of a pinhole sees more, and no picture of it is sharp."""
+_SHORTEST = 0.5 / math.tan(math.radians(85))  # focal length over the image's side: no photograph of a pinhole sees more
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Target:
-    """The pixels that a camera is for.
-
-    Attributes:
-        width, height: of the image, or of the picture to draw.
-        image: the image file; "" if there is none.
-        hint: end of messages about the size.
-    """
+    """The pixels that a camera is for: of an image file, or of a picture to draw."""
 
     width: int
     height: int
-    image: str = ""
-    hint: str = ""
+    image: str = ""  # the file; empty for a picture
+    hint: str = ""  # end of messages about the size
 
     @property
     def size(self) -> tuple[int, int]:
@@ -87,13 +63,14 @@ class _Level:
     def scales(self, keys: str, target: Target) -> tuple[float, float]:
         """Target pixels per pixel of this size, horizontally and vertically."""
         if not is_resized_copy(self.size, target.size):
-            found = (
-                f"{keys} belong to w, h {self.size[0]}x{self.size[1]}, and the image is {target.width}x{target.height}"
-            )
-            raise DataError(
-                f"{self.record.where}: {found}; expected them in the frame, beside its own w, h{target.hint}"
-            )
+            found = f"{keys} belong to w, h {_format_size(self.size)}, and the image is {_format_size(target.size)}"
+            expected = f"them in the frame, beside its own w, h{target.hint}"
+            raise DataError(f"{self.record.where}: {found}; expected {expected}")
         return target.width / self.size[0], target.height / self.size[1]
+
+
+def _format_size(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
 
 
 def is_resized_copy(size: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -123,17 +100,12 @@ def read_camera(
     of_file = _Level(file, _size(file, target.size))
     of_frame = _Level(frame, _size(frame, of_file.size))
     if target.image and of_frame.size != target.size:
-        stated, (width, height) = _owner(SIZE, frame, file).where, of_frame.size
+        stated, image = _format_size(of_frame.size), _format_size(target.size)
         if not is_resized_copy(of_frame.size, target.size):
-            found = (
-                f"image is {target.width}x{target.height}; expected {width}x{height} (w, h in {stated}) or "
-                "a reduction of it"
-            )
-            raise DataError(f"{target.image}: {found}{target.hint}")
-        say(
-            f"{file.where}: w, h are {width}x{height} and the image {target.width}x{target.height}; cameras "
-            "are scaled to the images"
-        )
+            where = _owner(SIZE, frame, file).where
+            expected = f"{stated} (w, h in {where}) or a reduction of it"
+            raise DataError(f"{target.image}: image is {image}; expected {expected}{target.hint}")
+        say(f"{file.where}: w, h are {stated} and the image {image}; cameras are scaled to the images")
     focal = of_frame if of_frame.has(FOCAL) else of_file
     fx, fy = _focal(frame, focal, target, say)
     cx, cy = _middle(of_frame, of_file, focal, target)
@@ -160,19 +132,18 @@ def _focal(frame: JsonReader, level: _Level, target: Target, say: Say) -> tuple[
         raise DataError(f"{frame.where}: no focal length: expected {keys}, in the frame or in the file")
     fx, fy = (next(iter(found.values()), 0.0) for found in (x, y))
     fx, fy = fx or fy, fy or fx
-    where = level.record.where
+    where, lengths = level.record.where, f"{fx:.5g} and {fy:.5g}"
     if min(fx / target.width, fy / target.height) < _SHORTEST:
+        stated = f"focal lengths of {lengths} pixels on {_format_size(target.size)}"
         raise DataError(
-            f"{where}: {', '.join((*x, *y))} mean focal lengths of {fx:.5g} and {fy:.5g} pixels on "
-            f"{target.width}x{target.height}, a field of view "
-            "of more than 170 degrees; expected a pinhole, and lengths in pixels, not in shares of the image"
+            f"{where}: {', '.join((*x, *y))} mean {stated}, a field of view of more than 170 degrees; "
+            "expected a pinhole, and lengths in pixels, not in shares of the image"
         )
     if not {*x, *y} & {"fl_x", "fl_y", "camera_intrinsics"} and not _agree(fx, fy):
+        keys = f"{next(iter(x))} and {next(iter(y))}"
+        expected = "square pixels, or fl_x and fl_y (Blender's angle_y is the sensor's, not the image's: leave it out)"
         raise DataError(
-            f"{where}: {next(iter(x))} and {next(iter(y))} mean pixels that are not square, with focal lengths "
-            f"{fx:.5g} and {fy:.5g}; "
-            "expected square pixels, or fl_x and fl_y (Blender's angle_y is the sensor's, not the image's: "
-            "leave it out)"
+            f"{where}: {keys} mean pixels that are not square, with focal lengths {lengths}; expected {expected}"
         )
     portrait = max(target.height / target.width, 1.0)
     for found, other in ((x, y), (y, x)):
@@ -182,15 +153,12 @@ def _focal(frame: JsonReader, level: _Level, target: Target, say: Say) -> tuple[
                 continue
             text = f"{where}: {first} means a focal length of {value:.5g} pixels, and {key} {found[key]:.5g}"
             # BlenderNeRF writes the angles of Blender's sensor beside the right fl_x and fl_y: angle_x is that of the
-            # image's longer
-            # side, and angle_y has nothing to do with the image
+            # image's longer side, and angle_y has nothing to do with the image
             explained = key == "camera_angle_x" and _agree(found[key] * portrait, value)
             explained |= key == "camera_angle_y" and first == "fl_y" and _agree(fx, fy) and "camera_angle_x" in other
             if not explained:
-                raise DataError(
-                    f"{text}; expected the same within {_TOLERANCE:.0%}: take out the wrong one, or give w, h "
-                    "of the images they are for"
-                )
+                remedy = "take out the wrong one, or give w, h of the images they are for"
+                raise DataError(f"{text}; expected the same within {_TOLERANCE:.0%}: {remedy}")
             say(f"{text}; {first} is taken")
     return fx, fy
 
@@ -200,9 +168,8 @@ def _stated(level: _Level, axis: int, target: Target) -> dict[str, float]:
     record, name, side = level.record, "xy"[axis], target.size[axis]
     found = {}
     if record.has(key := f"fl_{name}"):
-        found[key] = (
-            record.number(key, "a focal length in pixels above 0", 0.0) * level.scales("fl_x, fl_y", target)[axis]
-        )
+        length = record.number(key, "a focal length in pixels above 0", 0.0)
+        found[key] = length * level.scales("fl_x, fl_y", target)[axis]
     if record.has(key := "camera_intrinsics"):
         found[key] = _intrinsics(record)[2 + axis] * level.scales(key, target)[axis]
     for key, unit, expected in (
@@ -219,9 +186,8 @@ def _intrinsics(record: JsonReader) -> list[float]:
     """[cx, cy, fx, fy] of ``camera_intrinsics``, pixels."""
     values: list[float] = record.array("camera_intrinsics", (4,), "[cx, cy, fx, fy] in pixels").tolist()
     if not (values[2] > 0 and values[3] > 0):
-        raise DataError(
-            f"{record.where}: camera_intrinsics is {values}; expected [cx, cy, fx, fy], focal lengths above 0"
-        )
+        expected = "[cx, cy, fx, fy], focal lengths above 0"
+        raise DataError(f"{record.where}: camera_intrinsics is {values}; expected {expected}")
     return values
 
 
@@ -240,28 +206,18 @@ def _middle(frame: _Level, file: _Level, focal: _Level, target: Target) -> tuple
     if not array and not level.has(PRINCIPAL_POINT):
         return 0.5 * target.width, 0.5 * target.height
     record, keys = level.record, "camera_intrinsics" if array else "cx, cy"
-    if level is frame and 0 < sum(record.has(key) for key in PRINCIPAL_POINT) < 2 and file.has(PRINCIPAL_POINT):
-        raise DataError(
-            f"{record.where}: cx or cy is missing, and the file's belong to another camera; expected both in the frame"
-        )
+    if level is frame and sum(record.has(key) for key in PRINCIPAL_POINT) == 1 and file.has(PRINCIPAL_POINT):
+        found = "cx or cy is missing, and the file's belong to another camera"
+        raise DataError(f"{record.where}: {found}; expected both in the frame")
     scale = level.scales(keys, target)
-    plain = [
-        record.number(key) if record.has(key) else 0.5 * side
-        for key, side in zip(PRINCIPAL_POINT, level.size, strict=True)
-    ]
-    cx, cy = (value * s for value, s in zip(_intrinsics(record)[:2] if array else plain, scale, strict=True))
-    if (
-        array
-        and level.has(PRINCIPAL_POINT)
-        and any(
-            abs(a - b * s) > _TOLERANCE * side
-            for a, b, s, side in zip((cx, cy), plain, scale, target.size, strict=True)
-        )
-    ):
-        raise DataError(
-            f"{record.where}: cx, cy are {plain}, and camera_intrinsics begins with {_intrinsics(record)[:2]}; "
-            "expected the same"
-        )
+    plain = [record.number_or(key, 0.5 * side) for key, side in zip(PRINCIPAL_POINT, level.size, strict=True)]
+    stated = _intrinsics(record)[:2] if array else plain
+    cx, cy = stated[0] * scale[0], stated[1] * scale[1]
+    if array and level.has(PRINCIPAL_POINT):
+        differences = (abs(cx - plain[0] * scale[0]), abs(cy - plain[1] * scale[1]))
+        if any(d > _TOLERANCE * side for d, side in zip(differences, target.size, strict=True)):
+            found = f"cx, cy are {plain}, and camera_intrinsics begins with {stated}"
+            raise DataError(f"{record.where}: {found}; expected the same")
     if target.image or not (frame.has(SIZE) or file.has(SIZE)):  # a picture of a stated size may look past its edge
         _check_middle(record.where, keys, (cx, cy), frame.has(SIZE) or file.has(SIZE), target)
     return cx, cy
@@ -272,19 +228,16 @@ def _check_middle(where: str, keys: str, point: tuple[float, float], stated: boo
     (cx, cy), image = point, f"{target.image or 'the picture'} ({target.width}x{target.height})"
     kx, ky = 2.0 * cx / target.width, 2.0 * cy / target.height
     if not stated and min(kx, ky) > 0.0 and abs(kx - 1.0) > 0.05 and abs(kx - ky) <= 2 * _TOLERANCE * kx:
-        size = f"{round(2 * cx)}x{round(2 * cy)}"
-        found = f"{keys} are {cx:g}, {cy:g}, the middle of an image of {size} and not of {image}"
-        raise DataError(
-            f"{where}: {found}; expected w, h of the images that the lengths in pixels are for, e.g. "
-            f"{size.replace('x', ', ')}"
-        )
+        width, height = round(2 * cx), round(2 * cy)
+        found = f"{keys} are {cx:g}, {cy:g}, the middle of an image of {width}x{height} and not of {image}"
+        expected = f"w, h of the images that the lengths in pixels are for, e.g. {width}, {height}"
+        raise DataError(f"{where}: {found}; expected {expected}")
     if max(cx, cy) <= 1.0 and min(target.width, target.height) > 8:
         raise DataError(f"{where}: {keys} are {cx:g}, {cy:g} on {image}; expected pixels, not shares of the image")
     if not (0.0 < cx < target.width and 0.0 < cy < target.height):
         order = "the order [cx, cy, fx, fy]" if keys == "camera_intrinsics" else "a point in the image"
-        raise DataError(
-            f"{where}: {keys} put the principal point outside of {image}, at {cx:g}, {cy:g}; expected {order}"
-        )
+        found = f"{keys} put the principal point outside of {image}, at {cx:g}, {cy:g}"
+        raise DataError(f"{where}: {found}; expected {order}")
 
 
 # ---------------------------------------------------------------- lenses
@@ -302,10 +255,10 @@ def _check_one_lens(frame: _Level, file: _Level, target: Target) -> None:
         left += [key for key in COEFFICIENTS if file.record.number_or(key, 0.0) != 0.0]
     if not left:
         return
-    own, others = (
-        [*_stated(level, 0, target).values(), *_stated(level, 1, target).values()] for level in (frame, file)
+    own, other = (
+        [*_stated(level, 0, target).values(), *_stated(level, 1, target).values()][0] for level in (frame, file)
     )
-    if not _agree(own[0], others[0]):
+    if not _agree(own, other):
         found = f"has a focal length of its own, and {', '.join(left)} of the file belong to another one"
         raise DataError(f"{frame.record.where}: {found}; expected {', '.join(left)} in the frame, too")
 
@@ -317,13 +270,9 @@ def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, flo
 
 
 def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
-    """Whether the lens is OpenCV's fisheye.
+    """Whether the lens is OpenCV's fisheye; raises DataError for a camera model that is neither that nor a pinhole.
 
-    Args:
-        others: further models that messages offer.
-
-    Raises:
-        DataError: the camera model is neither that nor one of :data:`MODELS`.
+    ``others`` are further models that messages offer.
     """
     record = _owner(("camera_model", "is_fisheye"), frame, file)
     model = record.text("camera_model") if record.has("camera_model") else "OPENCV"
@@ -334,29 +283,16 @@ def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...
     return False
 
 
-READ = frozenset(
-    {
-        *FOCAL,
-        *PRINCIPAL_POINT,
-        *SIZE,
-        *COEFFICIENTS,
-        "camera_model",
-        "has_fisheye_lens",
-        "frames",
-        "file_path",
-        "transform_matrix",
-        "mask_path",
-    }
-)
-"""Keys that every loader reads, in the file or in a frame."""
+# keys that every loader reads, in the file or in a frame
+_READ = {*FOCAL, *PRINCIPAL_POINT, *SIZE, *COEFFICIENTS}
+_READ |= {"camera_model", "is_fisheye", "frames", "file_path", "transform_matrix", "mask_path"}
 
 _HARMLESS = frozenset(
     # extents, starting values and switches of the training of other programs
     "aabb_scale aabb aabb_range render_aabb scale offset up sphere_center sphere_radius scene_scale scene_box "
-    "near far bounds "
-    "camera_near camera_far n_frames sharpen sharpness sharpness_discard_threshold importance_sampling "
-    "n_extra_learnable_dims "
-    "envmap from_na orientation_override auto_scale_poses_override fps seconds "
+    "near far bounds camera_near camera_far n_frames sharpen sharpness sharpness_discard_threshold "
+    "importance_sampling n_extra_learnable_dims envmap from_na orientation_override auto_scale_poses_override "
+    "fps seconds "
     # poses and points are already in the frame that these lead to
     "applied_transform applied_scale "
     # depths and normals, which are not learned from
@@ -364,8 +300,7 @@ _HARMLESS = frozenset(
     "normal_path normal_file_path "
     # names and numbers of images and cameras
     "colmap_im_id colmap_image_id camera_id camera_idx camera_index camera_label image_id img_id frame_id "
-    "frame_index id index name "
-    "rotation metadata aux_cam_params points timestamp camera_angle "
+    "frame_index id index name rotation metadata aux_cam_params points timestamp camera_angle "
     # of scene=mesh, which reads them itself
     "rendered_from scene_from_file".split()
 )
@@ -404,13 +339,9 @@ def refuse_unsupported_keys(record: JsonReader) -> None:
     for key, states in _REFUSED.items():
         if key in record.values and _says(record.values[key]):
             raise DataError(f"{record.where}: {key} states {states}")
+    pinholes = ("perspective", "persp", "none", *(m.lower() for m in MODELS))
     for key in _KINDS:
-        if record.has(key) and str(record.values[key]).lower() not in (
-            "perspective",
-            "persp",
-            "none",
-            *(m.lower() for m in MODELS),
-        ):
+        if record.has(key) and str(record.values[key]).lower() not in pinholes:
             raise record.fail(key, "perspective (camera_model is read for lenses)")
     frames = record.values.get("frames")
     if record.has("n_frames") and isinstance(frames, list) and record.count("n_frames") < len(frames):
@@ -419,14 +350,12 @@ def refuse_unsupported_keys(record: JsonReader) -> None:
 
 def _says(value: Any) -> bool:
     """Whether a value is more than zeros, false or nothing."""
-    if isinstance(value, (list, tuple)):
-        return any(map(_says, value))
-    return bool(value)
+    return any(map(_says, value)) if isinstance(value, list) else bool(value)
 
 
 def describe_unknown_keys(file: JsonReader, frames: Iterable[JsonReader], read: Iterable[str]) -> str:
     """Return a line that names keys that are neither read nor known to be harmless; "" for none."""
-    known = READ | _HARMLESS | _REFUSED.keys() | {*_KINDS, *read}
+    known = _READ | _HARMLESS | _REFUSED.keys() | {*_KINDS, *read}
     found = dict.fromkeys(k for k in file.values if k not in known)
     found.update(dict.fromkeys(f"frames[].{k}" for r in frames for k in r.values if k not in known))
     named = [k[:60] for k in found if not k.removeprefix("frames[].").startswith("_")]

@@ -12,34 +12,15 @@ from torch import Tensor
 
 from neuprim.core.errors import DataError
 
-__all__ = [
-    "CameraViews",
-    "MAX_IMAGE_SIDE",
-    "MAX_CAMERAS",
-    "FRAME_RATES",
-    "Camera",
-    "check_viewmat",
-    "camera_exr_attributes",
-    "look_at",
-    "opengl_to_viewmat",
-    "orbit",
-]
-
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole view.
+    """A pinhole view; lengths in pixels."""
 
-    Attributes:
-        viewmat: (4, 4) world to camera, OpenCV axes; float64 unless it carries gradients of another dtype.
-        fx, fy, cx, cy: focal lengths and principal point in pixels; the latter may lie outside of the image.
-        width, height: image size in pixels.
-    """
-
-    viewmat: Tensor
+    viewmat: Tensor  # (4, 4) world to camera, OpenCV axes; float64 unless it carries gradients of another dtype
     fx: float
     fy: float
-    cx: float
+    cx: float  # the principal point may lie outside of the image
     cy: float
     width: int
     height: int
@@ -57,9 +38,7 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """Return the same view sampled on another pixel grid."""
         sx, sy = width / self.width, height / self.height
-        return replace(
-            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
-        )
+        return Camera(self.viewmat, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
 
     def reduced(self, factor: int) -> Camera:
         """Return the view with pixels ``factor`` times as large; remainders at the right and bottom are cut off."""
@@ -78,14 +57,11 @@ class Camera:
         return (z > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([self.width, self.height])).all(1)
 
     def validate(self, where: str) -> Camera:
-        """Return self, or raise :class:`DataError` naming ``where`` for non-finite, singular, scaled or mirrored
-        cameras."""
+        """Return self, or raise DataError naming ``where`` for non-finite, singular, scaled or mirrored cameras."""
         numbers = torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=torch.float64)
         if not (torch.isfinite(numbers).all() and self.fx > 0 and self.fy > 0):
-            raise DataError(
-                f"{where}: intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}; expected finite "
-                "numbers, focal lengths > 0"
-            )
+            found = f"intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}"
+            raise DataError(f"{where}: {found}; expected finite numbers, focal lengths > 0")
         if self.width <= 0 or self.height <= 0:
             raise DataError(f"{where}: image size {self.width}x{self.height}; expected positive")
         check_viewmat(self.viewmat, where)
@@ -93,19 +69,16 @@ class Camera:
 
 
 def check_viewmat(viewmat: Tensor, where: str) -> None:
-    """Raise :class:`DataError` naming ``where`` unless ``viewmat`` is a finite (4, 4) matrix with a rotation in its
-    upper left."""
+    """Raise DataError naming ``where`` unless ``viewmat`` is finite (4, 4) with a rotation in its upper left."""
     view = viewmat.detach().double().cpu()
     if view.shape != (4, 4) or not torch.isfinite(view).all():
-        raise DataError(
-            f"{where}: camera matrix has shape {tuple(view.shape)} or non-finite entries; expected finite 4x4"
-        )
+        found = f"camera matrix has shape {tuple(view.shape)} or non-finite entries"
+        raise DataError(f"{where}: {found}; expected finite 4x4")
     R = view[:3, :3]
     error = (R @ R.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
     if error > 1e-3:
-        raise DataError(
-            f"{where}: camera rotation is singular or scaled (|R R^T - 1| = {error:.2g}); expected a rotation"
-        )
+        found = f"camera rotation is singular or scaled (|R R^T - 1| = {error:.2g})"
+        raise DataError(f"{where}: {found}; expected a rotation")
     if torch.linalg.det(R).item() < 0:
         raise DataError(f"{where}: camera rotation is mirrored (determinant -1); expected a rotation")
 
@@ -122,8 +95,7 @@ def opengl_to_viewmat(c2w: Tensor) -> Tensor:
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """(4, 4) world-to-camera OpenCV matrix of a camera at ``eye`` looking at ``target`` with ``up`` upwards in the
-    image."""
+    """(4, 4) world-to-camera OpenCV matrix of a camera at ``eye`` looking at ``target``; ``up`` is up in the image."""
     eye, target, up = eye.double(), target.double(), up.double()
     z = target - eye
     z = z / z.norm()
@@ -154,31 +126,19 @@ def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation
     return views
 
 
-MAX_CAMERAS = 100_000
-"""Cameras of one file."""
-
-MAX_IMAGE_SIDE = 32768
-"""Pixels of an image's side."""
-
-FRAME_RATES = (0.1, 240.0)
-"""Least and most frames per second of a film, as ``--fps`` takes them."""
+MAX_CAMERAS = 100_000  # of one file
+MAX_IMAGE_SIDE = 32768  # pixels
+FRAME_RATES = (0.1, 240.0)  # least and most frames per second of a film, as ``--fps`` takes them
 
 
 @dataclass(frozen=True)
 class CameraViews:
-    """Cameras of a file, in order.
+    """Cameras of a file, in order."""
 
-    Attributes:
-        named: name and camera of each.
-        times: time of each in the file's own unit; None without.
-        fps: frames per second of their film; None without.
-        notes: lines for the user on conventions, and on what cannot be drawn.
-    """
-
-    named: tuple[tuple[str, Camera], ...]
-    times: tuple[float, ...] | None = None
-    fps: float | None = None
-    notes: tuple[str, ...] = ()
+    named: tuple[tuple[str, Camera], ...]  # with their names
+    times: tuple[float, ...] | None = None  # in the file's own unit
+    fps: float | None = None  # of their film
+    notes: tuple[str, ...] = ()  # lines for the user on conventions, and on what cannot be drawn
 
 
 def camera_exr_attributes(camera: Camera, near: float) -> dict[str, Any]:

@@ -1,5 +1,4 @@
-"""Central cameras that are no pinholes: one unit direction per pixel (fisheye, equirectangular, any calibrated
-lens)."""
+"""Central cameras that are no pinholes: one unit direction per pixel (fisheye, panorama, any calibrated lens)."""
 
 from __future__ import annotations
 
@@ -11,8 +10,6 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, check_viewmat
 from neuprim.core.errors import DataError
-
-__all__ = ["AnyCamera", "RayCamera"]
 
 _UNIT = 1e-6  # how far from 1 a direction's length may be: float32 rounding passes, a forgotten normalisation does not
 
@@ -26,44 +23,33 @@ class RayCamera:
     their centres from the camera. Images therefore differ from a pinhole's where a near plane cuts chords or where the
     two orders disagree. Only the reference backend draws these cameras; gradients reach ``viewmat`` and ``directions``.
 
-    Attributes:
-        viewmat: (4, 4) world-to-camera, OpenCV axes (x right, y down, z forward).
-        directions: (H, W, 3) unit vectors in camera axes, float64 for full accuracy; a zero vector marks a pixel that
-        has no
-            ray (outside a fisheye's image circle) and shows the background.
+    A zero vector marks a pixel that has no ray (outside a fisheye's image circle) and shows the background.
 
     Raises:
-        DataError: a matrix that is no rigid transform, or directions of another shape, non-finite or not of unit
-        length.
+        DataError: a matrix that is no rigid transform, or directions of another shape or not of unit length.
     """
 
-    viewmat: Tensor
-    directions: Tensor
+    viewmat: Tensor  # (4, 4) world to camera, OpenCV axes
+    directions: Tensor  # (H, W, 3) unit vectors in camera axes, float64 for full accuracy
 
     def __post_init__(self) -> None:
         check_viewmat(self.viewmat, "RayCamera.viewmat")
         d = self.directions.detach().double()
         if d.dim() != 3 or d.shape[-1] != 3 or not d.numel():
-            raise DataError(
-                f"RayCamera.directions has shape {tuple(d.shape)}; expected (H, W, 3) with at least one pixel"
-            )
+            raise DataError(f"RayCamera.directions has shape {tuple(d.shape)}; expected (H, W, 3), one pixel or more")
         length = d.norm(dim=-1)
         wrong = ~(((length - 1).abs() <= _UNIT) | (length == 0))
         if bool(wrong.any()):
             y, x = wrong.nonzero()[0].tolist()
-            raise DataError(
-                f"RayCamera.directions: pixel (x={x}, y={y}) is {d[y, x].tolist()} of length {length[y, x]:.9g}; "
-                "expected length 1, or a zero vector for no ray"
-            )
+            found = f"pixel (x={x}, y={y}) is {d[y, x].tolist()} of length {length[y, x]:.9g}"
+            raise DataError(f"RayCamera.directions: {found}; expected length 1, or a zero vector for no ray")
 
     @property
     def width(self) -> int:
-        """Image width in pixels."""
         return int(self.directions.shape[1])
 
     @property
     def height(self) -> int:
-        """Image height in pixels."""
         return int(self.directions.shape[0])
 
     @property
@@ -73,16 +59,10 @@ class RayCamera:
 
     @classmethod
     def fisheye(cls, width: int, height: int, viewmat: Tensor, fov_degrees: float = 180.0) -> RayCamera:
-        """An equidistant fisheye: the angle to the optical axis grows in proportion to the distance from the image
-        centre.
+        """An equidistant fisheye: the angle to the axis is proportional to the distance from the image centre.
 
-        The field of view, up to 360 degrees, spans the shorter side. Pixels beyond it towards the corners go on by the
-        same law up to 180 degrees off the axis, straight backwards; beyond that they have no ray.
-
-        Args:
-            width, height: image size in pixels; pixel centres at +0.5.
-            viewmat: (4, 4) world-to-camera.
-            fov_degrees: full angle across the shorter side.
+        ``fov_degrees``, at most 360, spans the shorter side. Pixels towards the corners go on by the same law up to 180
+        degrees off the axis, straight backwards; beyond that they have no ray.
 
         Raises:
             DataError: impossible size or field of view.
@@ -103,15 +83,8 @@ class RayCamera:
     def equirectangular(cls, width: int, height: int, viewmat: Tensor) -> RayCamera:
         """A full panorama: columns are longitudes -180..180 degrees, rows latitudes from 90 (up, -y) to -90 degrees.
 
-        The image centre looks along +z, its right half to +x. Square pixels at the equator take ``width == 2 *
-        height``.
-
-        Args:
-            width, height: image size in pixels; pixel centres at +0.5.
-            viewmat: (4, 4) world-to-camera.
-
-        Raises:
-            DataError: impossible size.
+        The image centre looks along +z, its right half to +x. Pixels are square at the equator if ``width`` is twice
+        ``height``. Raises DataError for an impossible size.
         """
         _check_size("equirectangular", width, height)
         y, x = _grid(width, height)

@@ -29,8 +29,6 @@ from neuprim.core.cameras.pinhole import (
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.io.json_reader import JsonReader
 
-__all__ = ["is_usd", "read_usd_cameras"]
-
 _MAGIC = (b"#usda ", b"PXR-USDC", b"PK\x03\x04")
 _MAX_BYTES = 1 << 30
 _SECONDS = 120.0
@@ -49,9 +47,8 @@ def is_usd(path: Path) -> bool:
 def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = None) -> CameraViews:
     """The camera of a stage, at every whole time code of its range where it moves.
 
-    Axes and units are those of the stage, and nothing is turned or scaled. The image shows the whole aperture: where
-    its shape differs, it shows more on two sides ("expandAperture" of UsdRender). Lens distortion, depth of field and
-    exposure are not USD's pinhole.
+    Axes and units are those of the stage. The image shows the whole aperture: where its shape differs, it shows more
+    on two sides ("expandAperture" of UsdRender). Lens distortion, depth of field and exposure are not read.
 
     Args:
         prim: path of the camera in a stage with several.

@@ -15,8 +15,6 @@ from neuprim.core.cameras.pinhole import Camera
 from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import DataError
 
-__all__ = ["World"]
-
 _ROTATION = 1e-6
 """How far a matrix over its scale may be from a rotation."""
 
@@ -29,12 +27,9 @@ class World:
 
     Everything inside is in scene units, mostly float32. Coordinates of the user (cameras, lights, boxes, exported
     positions) are in the world, float64, and are converted by this class alone.
-
-    Attributes:
-        scene_from_world: (4, 4) float64.
     """
 
-    scene_from_world: Tensor = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
+    scene_from_world: Tensor = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))  # (4, 4) float64
 
     @staticmethod
     def at(origin: Sequence[float]) -> World:
@@ -109,36 +104,26 @@ class World:
         return np.stack([moved.min(0), moved.max(0)])
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers, exact when read back: the "world" of a model's header."""
+        """The "world" of a model's header, exact when read back."""
         return {"scene_from_world": self.scene_from_world.tolist()}
 
     @staticmethod
     def of(header: Mapping[str, Any], where: str) -> World:
-        """That of a model's header; the identity where it says none. ``where`` names the file in errors.
-
-        Raises:
-            DataError: the header's "world" is something else than :meth:`to_json` makes.
-        """
+        """Read the "world" of a model's header; the identity where there is none. Raises DataError if damaged."""
         record = header.get("world")
         if record is None:
             return World()
+        where = f"{where}: header field 'world'"
         try:
-            return World(torch.tensor(record["scene_from_world"], dtype=torch.float64)).validate(
-                f"{where}: header field 'world'"
-            )
+            return World(torch.tensor(record["scene_from_world"], dtype=torch.float64)).validate(where)
         except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
-            raise DataError(f"{where}: header field 'world' is damaged ({type(error).__name__})") from None
+            raise DataError(f"{where} is damaged ({type(error).__name__})") from None
 
     def validate(self, where: str) -> World:
-        """Return self; raise :class:`DataError` naming ``where`` unless this is a rotation, one scale and an offset."""
+        """Return self; raise DataError naming ``where`` unless this is a rotation, one scale and an offset."""
         matrix = self.scene_from_world
-        fits = (
-            isinstance(matrix, Tensor)
-            and matrix.shape == (4, 4)
-            and matrix.dtype == torch.float64
-            and bool(matrix.isfinite().all())
-        )
-        if fits and matrix[3].tolist() == [0, 0, 0, 1]:
+        fits = isinstance(matrix, Tensor) and matrix.shape == (4, 4) and matrix.dtype == torch.float64
+        if fits and bool(matrix.isfinite().all()) and matrix[3].tolist() == [0, 0, 0, 1]:
             square = matrix[:3, :3] @ matrix[:3, :3].T
             scale = float(square.diagonal().mean())
             fits = scale > 0 and bool((square / scale - torch.eye(3, dtype=torch.float64)).abs().max() < _ROTATION)

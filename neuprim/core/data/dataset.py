@@ -27,23 +27,6 @@ from neuprim.core.model.fields import Conditions
 if TYPE_CHECKING:
     from neuprim.core.volumes.source import Placement
 
-__all__ = [
-    "Clip",
-    "DataSource",
-    "Dataset",
-    "GroundTruth",
-    "Pixels",
-    "PointCloud",
-    "PointSamples",
-    "PointSupervision",
-    "SceneContext",
-    "ViewSubset",
-    "StartingPoints",
-    "View",
-    "ViewSet",
-    "hold_out_views",
-]
-
 DataSource = Literal["real", "generated", "simulated"]
 """Photographs or captures ("real"), our own ray-cast scenes ("generated"), stand-ins for data not given
 ("simulated")."""
@@ -51,31 +34,20 @@ DataSource = Literal["real", "generated", "simulated"]
 
 @dataclass(frozen=True)
 class View:
-    """One frame without its pixels.
+    """One frame without its pixels."""
 
-    Attributes:
-        name: unique within its split; used for file names and reports.
-        conditions: what the frame depends on besides its camera (time, light, ...); empty for static scenes.
-    """
-
-    name: str
+    name: str  # unique within its split; used for file names and reports
     camera: Camera
-    conditions: Conditions = field(default_factory=dict)
+    conditions: Conditions = field(default_factory=dict)  # what else it depends on: time, light, ...
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """One frame's pixels.
+    """One frame's pixels."""
 
-    Attributes:
-        rgb: (H, W, C) float32. With ``alpha`` it is premultiplied.
-        alpha: (H, W) float32 coverage 0..1, or None for an opaque photograph.
-        mask: (H, W) bool of pixels that count, or None for all.
-    """
-
-    rgb: Tensor
-    alpha: Tensor | None = None
-    mask: Tensor | None = None
+    rgb: Tensor  # (H, W, C) float32; with alpha it is premultiplied
+    alpha: Tensor | None = None  # (H, W) float32 coverage 0..1, or None for an opaque photograph
+    mask: Tensor | None = None  # (H, W) bool of pixels that count, or None for all
 
     def to(self, device: torch.device) -> Pixels:
         """Copy to another device without waiting for it."""
@@ -121,63 +93,43 @@ class ViewSubset(ViewSet):
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points where matter probably is.
+    """Points where matter probably is."""
 
-    Attributes:
-        means: (N, 3) scene units; right after reading a file, float64 world units (:meth:`within`).
-        colors: (N, C) in the data set's colour space.
-        conditions: name -> (N,) values under which the points were observed, e.g. "time" -> 0..1.
-        axes, quats: (N, 3) semi-axes and (N, 4) rotations wxyz of ellipsoids.
-        alphas: (N,) opacities 0..1 at the centres.
-        deviations: (N, 3) standard deviations, instead of ``axes``, of Gaussians.
-        steps: condition name -> distance of neighbouring frames, where it is known.
-    """
-
-    means: Tensor
-    colors: Tensor
-    conditions: Mapping[str, Tensor] = field(default_factory=dict)
-    axes: Tensor | None = None
-    quats: Tensor | None = None
-    alphas: Tensor | None = None
-    deviations: Tensor | None = None
-    steps: Mapping[str, float] = field(default_factory=dict)
+    means: Tensor  # (N, 3) scene units; right after reading a file, float64 world units (see within)
+    colors: Tensor  # (N, C) in the data set's colour space
+    conditions: Mapping[str, Tensor] = field(default_factory=dict)  # (N,) values of observation, e.g. "time" -> 0..1
+    axes: Tensor | None = None  # (N, 3) semi-axes of ellipsoids
+    quats: Tensor | None = None  # (N, 4) their rotations wxyz
+    alphas: Tensor | None = None  # (N,) opacities 0..1 at the centres
+    deviations: Tensor | None = None  # (N, 3) standard deviations of Gaussians, instead of axes
+    steps: Mapping[str, float] = field(default_factory=dict)  # condition -> distance of neighbouring frames, if known
 
     def rows(self, index: Tensor) -> PointCloud:
         """Select points by (M,) int64 or (N,) bool ``index``."""
-        axes, quats, alphas, deviations = (
-            None if value is None else value[index] for value in (self.axes, self.quats, self.alphas, self.deviations)
-        )
-        found = {n: value[index] for n, value in self.conditions.items()}
-        return PointCloud(self.means[index], self.colors[index], found, axes, quats, alphas, deviations, self.steps)
+        values = {name: getattr(self, name) for name in ("means", "colors", "axes", "quats", "alphas", "deviations")}
+        chosen = {name: value[index] for name, value in values.items() if value is not None}
+        return replace(self, **chosen, conditions={n: value[index] for n, value in self.conditions.items()})
 
     def within(self, world: World) -> PointCloud:
         """Convert world to scene coordinates; positions are subtracted in float64."""
         means = world.scene_points(self.means).float()
-        axes, deviations = (
-            x if x is None or world.scale == 1.0 else x * world.scale for x in (self.axes, self.deviations)
-        )
-        quats = self.quats
+        scale, quats = world.scale, self.quats
+        axes, deviations = (x if x is None or scale == 1.0 else x * scale for x in (self.axes, self.deviations))
         if quats is not None and world.rotation is not None:
-            turned = Rotation.from_matrix(world.rotation.numpy()) * Rotation.from_quat(
-                quats[:, [1, 2, 3, 0]].double().numpy()
-            )
+            given = Rotation.from_quat(quats[:, [1, 2, 3, 0]].double().numpy())
+            turned = Rotation.from_matrix(world.rotation.numpy()) * given
             quats = torch.from_numpy(turned.as_quat()[:, [3, 0, 1, 2]]).float()
         return replace(self, means=means, axes=axes, deviations=deviations, quats=quats)
 
 
 @dataclass(frozen=True)
 class Clip:
-    """Views that make a film in this order.
-
-    Attributes:
-        views: indices into ``source``, or into the test split.
-        source: views outside of the test split; None for the test split.
-    """
+    """Views that make a film in this order."""
 
     name: str
-    views: Sequence[int]
+    views: Sequence[int]  # indices into source
     fps: float = 12.0
-    source: ViewSet | None = None
+    source: ViewSet | None = None  # None for the test split
 
 
 StartingPoints = Callable[[ViewSet, int, torch.Generator], PointCloud]
@@ -188,56 +140,33 @@ generator's."""
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dataset:
-    """A scene to fit. Create instances; subclasses are refused.
+    """A scene to fit. Create instances; subclasses are refused."""
 
-    Attributes:
-        name: shown in reports.
-        train, test: the splits.
-        start: rule for starting points, see :data:`StartingPoints`.
-        extent: scene extent in scene units (:func:`~neuprim.core.data.scene_frame.camera_extent`), the unit of learning
-            rates and size limits.
-        background: (C,) colour that evaluation composites over.
-        channels: number of colour channels C.
-        color_space: "srgb" (as stored in PNG) or "linear".
-        random_background: whether training composites random colours (needs alpha).
-        downsampling: text for reports, e.g. "none", "images_4" or "200x200 from 800x800 by area".
-        up: (3,) upward direction, for orbits.
-        center: (3,) point that the cameras look at, for orbits.
-        bounds: (2, 3) lower and upper corner of a box around everything, scene units, if known.
-        exposure: divisor that was applied to the linear values of the files.
-        world: transform between the scene and the user's files.
-        placement: the voxel files the scene was made from, if any.
-        largest: largest extinction in the scene, 1/scene unit, if known; primitives stay below it.
-        points: points of known extinction and radiance, for ``train.supervision=voxels`` and ``both``.
-        extra: further knowledge in a class of the task, e.g. pixel classes. Tasks accept None.
-    """
-
-    name: str
+    name: str  # shown in reports
     train: ViewSet
     test: ViewSet
     start: StartingPoints
-    extent: float
-    background: Tensor
+    extent: float  # size in scene units (scene_frame.camera_extent), the unit of learning rates and size limits
+    background: Tensor  # (C,) colour that evaluation composites over
     channels: int = 3
-    color_space: Literal["srgb", "linear"] = "srgb"
+    color_space: Literal["srgb", "linear"] = "srgb"  # "srgb" as stored in PNG
     data_source: DataSource = "real"
-    random_background: bool = False
-    downsampling: str = "none"
-    up: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0]))
-    center: Tensor = field(default_factory=lambda: torch.zeros(3))
-    bounds: Tensor | None = None
-    exposure: float = 1.0
-    world: World = field(default_factory=World)
-    placement: Placement | None = None
-    largest: float | None = None
-    points: PointSupervision | None = None
-    extra: object = None
+    random_background: bool = False  # whether training composites random colours (needs alpha)
+    downsampling: str = "none"  # for reports, e.g. "images_4" or "200x200 from 800x800 by area"
+    up: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0]))  # (3,) for orbits
+    center: Tensor = field(default_factory=lambda: torch.zeros(3))  # (3,) that the cameras look at, for orbits
+    bounds: Tensor | None = None  # (2, 3) lower and upper corner of a box around everything, scene units, if known
+    exposure: float = 1.0  # divisor that was applied to the linear values of the files
+    world: World = field(default_factory=World)  # transform between the scene and the user's files
+    placement: Placement | None = None  # the voxel files the scene was made from, if any
+    largest: float | None = None  # largest extinction, 1/scene unit, if known; primitives stay below it
+    points: PointSupervision | None = None  # for ``train.supervision=voxels`` and ``both``
+    extra: object = None  # further knowledge in a class of the task, e.g. pixel classes; tasks accept None
 
     def __init_subclass__(cls) -> None:
         raise TypeError(
             f"class {cls.__name__}(Dataset): a data set is made by calling neuprim.core.data.Dataset(name=..., "
-            "train=..., test=..., ...); "
-            "what a class of its own would judge, film or tell is the task's"
+            "train=..., test=..., ...); metrics, films and headers are the task's"
         )
 
     def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
@@ -245,15 +174,10 @@ class Dataset:
         return self.start(self.train, count, generator)
 
     def uniform_points(self, count: int, generator: torch.Generator) -> PointCloud:
-        """Draw ``count`` mid-grey points, uniform in :attr:`bounds`.
-
-        Raises:
-            ConfigError: the data set has no bounds.
-        """
+        """Draw ``count`` mid-grey points, uniform in :attr:`bounds`; raise ConfigError without bounds."""
         if self.bounds is None:
-            raise ConfigError(
-                f"model.init.points=box: {self.name} does not say which box its matter fills; expected matter"
-            )
+            found = f"{self.name} does not say which box its matter fills"
+            raise ConfigError(f"model.init.points=box: {found}; expected matter")
         low, high = self.bounds.float()
         means = low + torch.rand((count, 3), generator=generator) * (high - low)
         return PointCloud(means, torch.full((count, self.channels), 0.5))
@@ -273,71 +197,53 @@ class Dataset:
         units = offsets / offsets.norm(dim=-1, keepdim=True).clamp_min(1e-30)
         forward = torch.stack([c.viewmat[2, :3] for c in cameras]).double()
         outward = bool((units * forward).sum(-1).mean() > -0.5)
-        sine = ((forward if outward else units) @ up).mean().clamp(-0.9, 0.9)
+        elevation = torch.asin(((forward if outward else units) @ up).mean().clamp(-0.9, 0.9)).item()
         if outward:
-            directions = [
-                c.position for c in orbit(cameras[0], torch.zeros(3), self.up, 1.0, torch.asin(sine).item(), frames)
-            ]
-            eyes = [self.center.double() + radius * d for d in directions]
-            views = [replace(cameras[0], viewmat=look_at(e, e + d, up)) for e, d in zip(eyes, directions, strict=True)]
+            circle = orbit(cameras[0], torch.zeros(3), self.up, 1.0, elevation, frames)
+            eyes = [(self.center.double() + radius * c.position, c.position) for c in circle]
+            views = [replace(cameras[0], viewmat=look_at(eye, eye + d, up)) for eye, d in eyes]
         else:
-            views = orbit(cameras[0], self.center, self.up, radius, torch.asin(sine).item(), frames)
-        between = self._scalar_conditions()
-        held = {name: value for name, value in self.train.view(0).conditions.items() if name not in between}
-        return [
-            View(
-                f"orbit_{i:03d}",
-                c,
-                {**held, **{n: low + i / max(frames - 1, 1) * (high - low) for n, (low, high) in between.items()}},
-            )
-            for i, c in enumerate(views)
-        ]
+            views = orbit(cameras[0], self.center, self.up, radius, elevation, frames)
+        first, values = dict(self.train.view(0).conditions), self._scalar_conditions()
+        found = []
+        for i, camera in enumerate(views):
+            share = i / max(frames - 1, 1)
+            between = {
+                name: v.min(0).values + share * (v.max(0).values - v.min(0).values) for name, v in values.items()
+            }
+            found.append(View(f"orbit_{i:03d}", camera, first | between))
+        return found
 
-    def _scalar_conditions(self) -> dict[str, tuple[Tensor, Tensor]]:
-        """Least and greatest training value of each condition that is a single number."""
+    def _scalar_conditions(self) -> dict[str, Tensor]:
+        """The training values of each condition that is a single number."""
         found: dict[str, list[Tensor]] = {}
         for i in range(len(self.train)):
             for name, value in self.train.view(i).conditions.items():
                 if value.numel() == 1:
                     found.setdefault(name, []).append(value)
-        return {
-            name: (torch.stack(values).min(0).values, torch.stack(values).max(0).values)
-            for name, values in found.items()
-        }
+        return {name: torch.stack(values) for name, values in found.items()}
 
 
 @dataclass(frozen=True)
 class PointSamples:
-    """True values at M points of one frame.
+    """True values at M points of one frame."""
 
-    Attributes:
-        name: of the frame, for logs.
-        conditions: of the frame, shared by all points.
-        points: (M, 3) float32, scene units.
-        sigma: (M,) float32 extinction, 1/scene unit.
-        source: (M, C) float32 extinction times isotropic source radiance; None trains the extinction only.
-        sigma_scale, source_scale: typical values inside matter, by which errors are divided.
-        components: source grid name -> its (M,) part of ``sigma``, and the typical value.
-    """
-
-    name: str
-    conditions: Conditions
-    points: Tensor
-    sigma: Tensor
-    source: Tensor | None
-    sigma_scale: float
+    name: str  # of the frame, for logs
+    conditions: Conditions  # of the frame, shared by all points
+    points: Tensor  # (M, 3) float32, scene units
+    sigma: Tensor  # (M,) float32 extinction, 1/scene unit
+    source: Tensor | None  # (M, C) float32 extinction times isotropic source radiance; None trains the extinction only
+    sigma_scale: float  # typical value inside matter, by which errors are divided
     source_scale: float = 1.0
-    components: Mapping[str, tuple[Tensor, float]] = field(default_factory=dict)
+    components: Mapping[str, tuple[Tensor, float]] = field(
+        default_factory=dict
+    )  # grid -> (M,) part of sigma, and scale
 
 
 class PointSupervision(ABC):
-    """Points to learn from, see :attr:`Dataset.points`.
+    """Points to learn from, see :attr:`Dataset.points`."""
 
-    Attributes:
-        components: names of the source grids in :attr:`PointSamples.components`.
-    """
-
-    components: tuple[str, ...] = ()
+    components: tuple[str, ...] = ()  # names of the source grids in PointSamples.components
 
     @abstractmethod
     def draw(self, count: int, generator: torch.Generator) -> PointSamples:
@@ -355,9 +261,8 @@ def hold_out_views(dataset: Dataset, every: int) -> Dataset:
     """
     count = len(dataset.train)
     if every < 2 or count < 2:
-        raise ConfigError(
-            f"{dataset.name}: every {every}. of {count} training views held out; expected 2 or more of 2 views or more"
-        )
+        found = f"every {every}. of {count} training views held out"
+        raise ConfigError(f"{dataset.name}: {found}; expected 2 or more of 2 views or more")
     test = [i for i in range(count) if i % every == i // every % every]
     train = [i for i in range(count) if i % every != i // every % every]
     return replace(dataset, train=ViewSubset(dataset.train, train), test=ViewSubset(dataset.train, test))
@@ -404,18 +309,10 @@ class GroundTruth(ABC):
 
 @dataclass(frozen=True)
 class SceneContext:
-    """What a loader gets besides the settings of its scene.
+    """What a loader gets besides the settings of its scene."""
 
-    Attributes:
-        seed: for generated scenes.
-        cache_dir: for generated data, keyed by everything they depend on.
-        progress: called with (text, fraction 0..1) during long work.
-        device: where ground truth may be computed; data sets are on the CPU.
-        world: of the model that the scene is loaded for again; None lets the scene choose.
-    """
-
-    seed: int
-    cache_dir: Path
-    progress: Callable[[str, float], None] = lambda text, fraction: None
-    device: torch.device = HOST
-    world: World | None = None
+    seed: int  # for generated scenes
+    cache_dir: Path  # for generated data, keyed by everything they depend on
+    progress: Callable[[str, float], None] = lambda text, fraction: None  # of long work: text, fraction 0..1
+    device: torch.device = HOST  # where ground truth may be computed; data sets are on the CPU
+    world: World | None = None  # of the model that the scene is loaded for again; None lets the scene choose

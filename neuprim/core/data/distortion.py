@@ -17,8 +17,6 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 
-__all__ = ["Distortion", "Fisheye", "Radial", "resample_image", "undistortion_grid"]
-
 
 class Distortion(ABC):
     """A lens. Instances are hashable, so that views with the same lens share a resampling grid."""
@@ -69,9 +67,8 @@ class Fisheye(Distortion):
 def undistortion_grid(camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
     """Where the pixels of the undistorted ``camera`` lie in a photograph of the same size.
 
-    Returns:
-        (H, W, 2) float32 source pixels (x, y), centres at +0.5, and (H, W) bool: inside the photograph and on the part
-        of the lens around the principal point where the map does not fold over.
+    Returned are (H, W, 2) float32 source pixels (x, y), centres at +0.5, and (H, W) bool: inside the photograph and on
+    the part of the lens around the principal point where the map does not fold over.
     """
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy

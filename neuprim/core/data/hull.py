@@ -6,7 +6,7 @@ covers the voxel, so thin parts survive until the finest grid.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,9 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.data import ViewSet
+from neuprim.core.data.ray_points import evenly_spaced
 from neuprim.core.data.scene_frame import focus_point
 from neuprim.core.errors import DataError
-
-__all__ = ["EmptyHull", "hull_surface"]
 
 _VIEWS = 100
 _MASK_SIDE = 400
@@ -62,8 +61,7 @@ def hull_surface(
         wrong_views: share of the views that may show no matter there.
         matter: alpha above which a pixel shows matter.
 
-    Raises:
-        EmptyHull: no voxel is left.
+    Raises EmptyHull if no voxel is left.
     """
     silhouettes = _silhouettes(views, matter)
     cameras = [s.camera for s in silhouettes]
@@ -72,19 +70,15 @@ def hull_surface(
     everything = torch.ones((_COARSE,) * 3, dtype=torch.bool)
     grid = _carved(_Grid(center - half, 2.0 * half / _COARSE, everything), silhouettes, 0.87, seen_views, wrong_views)
     grid = _carved(_refined(grid, _COARSE), silhouettes, 0.87, seen_views, wrong_views)
-    grid = _carved(
-        _refined(grid, resolution), silhouettes, 0.25, seen_views, wrong_views
-    )  # wider and the hull swells, narrower and it tears
+    # wider than 0.25 and the hull swells, narrower and it tears
+    grid = _carved(_refined(grid, resolution), silhouettes, 0.25, seen_views, wrong_views)
     core = -F.max_pool3d(-F.pad(grid.full[None].float(), (1,) * 6), 3, stride=1)[0] > 0.5
     return grid.centers((grid.full & ~core).nonzero()).float(), grid.voxel
 
 
 def _silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
     """Masks of evenly chosen views, ordered so that neighbours look from different sides."""
-    chosen = sorted(
-        {round(i * (len(views) - 1) / max(1, min(len(views), _VIEWS) - 1)) for i in range(min(len(views), _VIEWS))}
-    )
-    chosen.sort(key=lambda i: i * 0.6180339887 % 1.0)
+    chosen = sorted(evenly_spaced(len(views), _VIEWS), key=lambda i: i * 0.6180339887 % 1.0)
     found = []
     for index in chosen:
         camera, pixels = views.view(index).camera, views.pixels(index)
@@ -96,9 +90,7 @@ def _silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
         n = -(-max(camera.width, camera.height) // _MASK_SIDE)
         small = F.max_pool2d(matter[None].float(), n, ceil_mode=True)[0]
         table = F.pad(small.to(torch.int32).cumsum(0).cumsum(1), (1, 0, 1, 0)).to(torch.int32)
-        scaled = Camera(
-            camera.viewmat, camera.fx / n, camera.fy / n, camera.cx / n, camera.cy / n, small.shape[1], small.shape[0]
-        )
+        scaled = replace(camera.reduced(n), width=small.shape[1], height=small.shape[0])
         found.append(_Silhouette(scaled, table))
     return found
 
@@ -130,9 +122,9 @@ def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float, seen_view
     keep = _test_points(points, poses, lenses, np.cumsum(sizes) - sizes, tables, reach * grid.voxel, allowed, needed)
     cells = cells[torch.from_numpy(keep)]
     if len(cells) == 0:
+        found = "no point in front of the cameras is opaque in all views"
         raise EmptyHull(
-            f"the visual hull of {len(silhouettes)} alpha masks is empty: no point in front of the cameras is "
-            "opaque in all views; "
+            f"the visual hull of {len(silhouettes)} alpha masks is empty: {found}; "
             "expected masks of one scene and poses that agree with them"
         )
     full = torch.zeros_like(grid.full)

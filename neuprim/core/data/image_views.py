@@ -22,17 +22,10 @@ from neuprim.core.io.images import ImageInfo, read_image, read_mask, srgb_to_lin
 from neuprim.core.model.fields import Conditions
 from neuprim.core.notices import warn_once
 
-__all__ = ["ImageFrame", "ImageViews", "Mask", "average_pixels", "find_masks", "reduce_mask"]
-
 
 @dataclass(frozen=True)
 class Mask:
-    """A mask file.
-
-    Attributes:
-        path: image whose zero pixels do not count.
-        inverted: the other pixels do not count instead.
-    """
+    """An image file whose zero pixels do not count; if ``inverted``, the other pixels do not."""
 
     path: Path
     inverted: bool = False
@@ -51,11 +44,8 @@ def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) 
     masks = [_mask(folder, file, images) for file in files]
     found = [m for m in masks if m is not None]
     if found:
-        black = "not black" if found[0].inverted else "black"
-        warn_once(
-            f"{found[0].path.parent}: masks of {len(found)} of {len(files)} images are read; what is {black} "
-            "there does not count"
-        )
+        what = f"what is {'not ' if found[0].inverted else ''}black there does not count"
+        warn_once(f"{found[0].path.parent}: masks of {len(found)} of {len(files)} images are read; {what}")
     return masks
 
 
@@ -67,10 +57,8 @@ def _mask(folder: Path, file: Path, images: Path | None) -> Mask | None:
         name = file.relative_to(images)
     except ValueError:  # an image outside of the folder
         return None
-    places = dict.fromkeys(
-        (images.name.replace("images", "masks", 1) if images.name.startswith("images") else "masks", "masks")
-    )
-    for place in places:
+    own = images.name.replace("images", "masks", 1) if images.name.startswith("images") else "masks"
+    for place in dict.fromkeys((own, "masks")):
         for candidate in (name.with_suffix(".png"), name.with_name(name.name + ".png"), name):
             if (folder / place / candidate).is_file():
                 return Mask(folder / place / candidate)
@@ -95,23 +83,15 @@ _LINEAR = srgb_to_linear(torch.arange(256) / 255.0)
 
 @dataclass(frozen=True)
 class ImageFrame:
-    """An image file and its pose.
+    """An image file and its pose."""
 
-    Attributes:
-        name: unique within its split.
-        camera: the undistorted view at the size of the file.
-        info: header of the file.
-        distortion: lens of the photograph; None for a pinhole.
-        conditions: time, light, ...; empty for static scenes.
-    """
-
-    name: str
+    name: str  # unique within its split
     path: Path
-    camera: Camera
+    camera: Camera  # the undistorted view at the size of the file
     info: ImageInfo
     mask: Mask | None = None
-    distortion: Distortion | None = None
-    conditions: Conditions = field(default_factory=dict)
+    distortion: Distortion | None = None  # lens of the photograph; None for a pinhole
+    conditions: Conditions = field(default_factory=dict)  # time, light, ...; empty for static scenes
 
 
 @dataclass(frozen=True)
@@ -148,11 +128,7 @@ class ImageViews(ViewSet):
         downsample: integer factor; remainders at the right and bottom edges are cut off.
         to_linear: convert sRGB files to linear light before premultiplying and averaging.
 
-    Attributes:
-        scale: factor of linear colours.
-
-    Raises:
-        ConfigError: an image is smaller than the factor.
+    Raises ConfigError if an image is smaller than the factor.
     """
 
     def __init__(
@@ -164,7 +140,7 @@ class ImageViews(ViewSet):
     ) -> None:
         self._frames = list(frames)
         self._to_linear = to_linear
-        self.scale = 1.0
+        self.scale = 1.0  # of linear colours
         self._factor = downsample
         self._cameras = [_reduced(f, downsample) for f in self._frames]
         self._cache_bytes = cache_bytes
@@ -184,11 +160,7 @@ class ImageViews(ViewSet):
         return self._frames[index].path
 
     def pixels(self, index: int) -> Pixels:
-        """Return the pixels of a view.
-
-        Raises:
-            DataError: the file is missing, damaged or changed, or its mask leaves nothing.
-        """
+        """Read a view; raises DataError if the file is missing, damaged or changed, or its mask leaves nothing."""
         stored = self._load(range(len(self))[index])
         if self._to_linear:
             return self._linear(stored)
@@ -200,9 +172,8 @@ class ImageViews(ViewSet):
         if data.shape[-1] == 3:
             return Pixels(data, None, stored.mask)
         rgb, alpha = data[..., :3], data[..., 3]
-        return Pixels(
-            rgb.contiguous() if stored.premultiplied else rgb * alpha[..., None], alpha.contiguous(), stored.mask
-        )
+        rgb = rgb.contiguous() if stored.premultiplied else rgb * alpha[..., None]
+        return Pixels(rgb, alpha.contiguous(), stored.mask)
 
     def _linear(self, stored: _Stored) -> Pixels:
         rgb, alpha = stored.data[..., :3], stored.data[..., 3] if stored.data.shape[-1] == 4 else None
@@ -217,8 +188,7 @@ class ImageViews(ViewSet):
     ) -> dict[int, DataError]:
         """Decode all images, cache what fits, and return the errors of bad ones by index.
 
-        Args:
-            empty: whether an image may be fully transparent.
+        Unless ``empty``, a fully transparent image is bad.
         """
         faults = {}
         with ThreadPoolExecutor(4) as pool:
@@ -261,14 +231,10 @@ class ImageViews(ViewSet):
         if image.shape[-1] != frame.info.channels or (image.dtype != torch.uint8) != frame.info.linear:
             raise DataError(f"{frame.path}: file changed while it was in use; expected {frame.info.channels} channels")
         mask = None if frame.mask is None else read_mask(frame.mask.path, size) ^ frame.mask.inverted
-        if (
-            frame.info.linear
-            and image.shape[-1] == 4
-            and not bool(((image[..., 3] >= -1e-3) & (image[..., 3] <= 1.001)).all())
-        ):
-            raise DataError(
-                f"{frame.path}: alpha reaches {image[..., 3].float().abs().max().item():.4g}; expected 0..1"
-            )
+        if frame.info.linear and image.shape[-1] == 4:
+            alpha = image[..., 3]
+            if not bool(((alpha >= -1e-3) & (alpha <= 1.001)).all()):
+                raise DataError(f"{frame.path}: alpha reaches {alpha.float().abs().max().item():.4g}; expected 0..1")
         if frame.distortion is not None or self._factor > 1:
             image, mask = self._process(frame, image, mask)
             premultiplied = True
@@ -284,12 +250,10 @@ class ImageViews(ViewSet):
         """Undistort and reduce; colours become premultiplied, the number type stays."""
         eight_bit = image.dtype == torch.uint8
         if eight_bit and self._to_linear:
-            rgb = _LINEAR[image[..., :3].int()]
-            values = (
-                rgb
-                if image.shape[-1] == 3
-                else torch.cat([rgb * (image[..., 3:] / 255.0), image[..., 3:] / 255.0], dim=-1)
-            )
+            values = _LINEAR[image[..., :3].int()]
+            if image.shape[-1] == 4:
+                alpha = image[..., 3:] / 255.0
+                values = torch.cat([values * alpha, alpha], dim=-1)
             eight_bit = False
         else:
             values = image.float()
@@ -318,7 +282,6 @@ class ImageViews(ViewSet):
 def _reduced(frame: ImageFrame, factor: int) -> Camera:
     camera = frame.camera
     if min(camera.width, camera.height) < factor:
-        raise ConfigError(
-            f"scene.downsample is {factor}, but {frame.path} has only {camera.width}x{camera.height} pixels"
-        )
+        found = f"{frame.path} has only {camera.width}x{camera.height} pixels"
+        raise ConfigError(f"scene.downsample is {factor}, but {found}")
     return camera.reduced(factor)

@@ -16,26 +16,12 @@ from neuprim.core.data.ray_points import count_seeing_views, ray_points
 from neuprim.core.data.scene_frame import focus_point, optical_axes_meet
 from neuprim.core.errors import ConfigError
 
-__all__ = [
-    "box_points",
-    "check_point_count",
-    "drop_repeated_points",
-    "farthest_points",
-    "views_have_alpha",
-    "hull_points",
-    "initial_points",
-    "median_colors",
-    "draw_points",
-    "surrounding_points",
-]
-
-_FPS_WORK = 5e8
-"""Distances that exact farthest-point sampling may evaluate (about 1.5 s on one core); above, a grid thins the
-points."""
+_FPS_WORK = (
+    5e8  # distances that exact farthest-point sampling may evaluate (about 1.5 s); above, a grid thins the points
+)
 _COLOR_VIEWS = 100
 _CHUNK = 20_000
-_ROUNDS = 8
-"""Times that a box is filled, for points that cameras see."""
+_ROUNDS = 8  # times that a box is filled, for points that cameras see
 
 
 def initial_points(views: ViewSet, points: PointCloud | None, count: int, generator: torch.Generator) -> PointCloud:
@@ -76,8 +62,7 @@ def views_have_alpha(views: ViewSet) -> bool:
 
 def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
     """Draw at most ``count`` distinct points uniformly, in their own order."""
-    _, first = np.unique(points.means.numpy(), axis=0, return_index=True)
-    rows = torch.from_numpy(np.sort(first))
+    rows = _distinct_rows(points)
     if len(rows) > count:
         rows = rows[torch.randperm(len(rows), generator=generator)[:count]].sort().values
     return points.rows(rows)
@@ -86,11 +71,7 @@ def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> P
 def hull_points(views: ViewSet, count: int, generator: torch.Generator, resolution: int = 128) -> PointCloud:
     """Spread ``count`` points over the surface of the visual hull, with sub-voxel jitter and pixel colours.
 
-    Args:
-        resolution: voxels along the longest side of the hull.
-
-    Raises:
-        DataError: the masks have no common volume.
+    ``resolution`` is in voxels along the hull's longest side. Raises DataError if the masks have no common volume.
     """
     centers, voxel = hull_surface(views, resolution)
     if count <= len(centers):
@@ -125,14 +106,13 @@ def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointC
 
 def drop_repeated_points(points: PointCloud) -> PointCloud:
     """Remove repeated positions."""
+    rows = _distinct_rows(points)
+    return points if len(rows) == len(points.means) else points.rows(rows)
+
+
+def _distinct_rows(points: PointCloud) -> Tensor:
     _, first = np.unique(points.means.numpy(), axis=0, return_index=True)
-    if len(first) == len(points.means):
-        return points
-    rows = torch.from_numpy(np.sort(first))
-    return points.rows(rows)
-
-
-# ---------------------------------------------------------------- spreading
+    return torch.from_numpy(np.sort(first))
 
 
 def farthest_points(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -175,9 +155,6 @@ def _thinned(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return torch.from_numpy(shuffled[np.concatenate([first, rest])])
 
 
-# ---------------------------------------------------------------- colour
-
-
 def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
     """(N, C) per-channel median of the pixels that the points (N, 3) project to, straight colour.
 
@@ -185,9 +162,7 @@ def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
     the median of the others, or mid-grey.
     """
     indices = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(len(views), _COLOR_VIEWS))})
-    samples = torch.stack(
-        [_sample(views, i, means, matter) for i in indices]
-    )  # (V, N, C), NaN where a view does not count
+    samples = torch.stack([_sample(views, i, means, matter) for i in indices])  # (V, N, C), NaN where none counts
     colors = torch.cat([samples[:, i : i + _CHUNK].nanmedian(dim=0).values for i in range(0, len(means), _CHUNK)])
     hidden = colors.isnan().any(dim=-1)
     typical = colors.nanmedian(dim=0).values.nan_to_num(nan=0.5)
@@ -196,30 +171,26 @@ def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
 
 def _sample(views: ViewSet, index: int, means: Tensor, matter: float) -> Tensor:
     camera, pixels = views.view(index).camera, views.pixels(index)
-    spots, z = camera.project(means)
-    u, v = spots.unbind(-1)
-    inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    flat = torch.where(inside, v, 0.0).long() * camera.width + torch.where(inside, u, 0.0).long()
-    color = pixels.rgb.reshape(-1, pixels.rgb.shape[-1])[flat].clone()
+    inside = camera.sees(means)
+    column, row = torch.where(inside[:, None], camera.project(means)[0], 0.0).long().unbind(-1)
+    color = pixels.rgb[row, column]
     if pixels.alpha is not None:
-        alpha = pixels.alpha.reshape(-1)[flat]
+        alpha = pixels.alpha[row, column]
         inside &= alpha > matter
         color /= alpha.clamp_min(matter)[:, None]
     if pixels.mask is not None:
-        inside &= pixels.mask.reshape(-1)[flat]
-    color[~inside] = float("nan")
+        inside &= pixels.mask[row, column]
+    color[~inside] = math.nan
     return color
 
 
 _VIEWS = 100
-_CELLS = (12, 17, 24, 34, 48, 68, 96, 136, 192)
-"""Pixels looked at along an image's longer side, grid after grid."""
+_CELLS = (12, 17, 24, 34, 48, 68, 96, 136, 192)  # pixels looked at along an image's longer side, grid after grid
 _NEAREST = 8
+# Quantile of the depths of the nearest points. A wall's pixels beside an object lie beside points of both; a guess too
+# far is hidden or moves forward as it learns, one too near stands in front of other cameras.
 _FAR_SIDE = 0.75
-"""Of the depths of the nearest points. A wall's pixels beside an object lie beside points of both; a guess too far is
-hidden or moves forward as it learns, one too near stands in front of other cameras."""
-_SHELL = 0.1
-"""Share of the points that surround everything."""
+_SHELL = 0.1  # share of the points that surround everything
 
 
 def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
@@ -235,9 +206,8 @@ def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator
     wanted = count - len(shell.means)
     if len(lifted.means) > wanted:
         lifted = lifted.rows(torch.randperm(len(lifted.means), generator=generator)[:wanted].sort().values)
-    return drop_repeated_points(
-        PointCloud(torch.cat([lifted.means, shell.means]), torch.cat([lifted.colors, shell.colors]))
-    )
+    both = PointCloud(torch.cat([lifted.means, shell.means]), torch.cat([lifted.colors, shell.colors]))
+    return drop_repeated_points(both)
 
 
 def _lifted(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
@@ -250,11 +220,8 @@ def _lifted(views: ViewSet, given: Tensor, count: int, generator: torch.Generato
     for cells in _CELLS:
         for index in order:
             found, seen = _gaps(views, index, known, side / cells)
-            known, means, colors = (
-                np.concatenate([known, found]),
-                np.concatenate([means, found]),
-                np.concatenate([colors, seen]),
-            )
+            known, means = np.concatenate([known, found]), np.concatenate([means, found])
+            colors = np.concatenate([colors, seen])
         if len(means) >= count:
             break
     return PointCloud(torch.from_numpy(means[:count]).float(), torch.from_numpy(colors[:count]).float())
@@ -263,8 +230,7 @@ def _lifted(views: ViewSet, given: Tensor, count: int, generator: torch.Generato
 def _gaps(
     views: ViewSet, index: int, known: NDArray[np.float64], cell: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """(N, 3) positions and (N, C) colours of pixels ``cell`` apart without a known point that near, in image "
-    "and space."""
+    """Positions and colours of pixels ``cell`` apart without a known point that near, in image and space."""
     camera, image = views.view(index).camera, views.pixels(index)
     rotation, shift = camera.viewmat[:3, :3].double().numpy(), camera.viewmat[:3, 3].double().numpy()
     spots = _grid(camera.width, camera.height, cell)
@@ -309,13 +275,9 @@ def _shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator
     turn = k * (math.pi * (3.0 - math.sqrt(5.0)))
     ring = (1.0 - z * z).sqrt()
     means = center + radius * torch.stack([ring * turn.cos(), ring * turn.sin(), z], dim=-1)
-    seen = torch.zeros(many, dtype=torch.bool)
-    for camera in cameras:
-        seen |= camera.sees(means)
-    rows = seen.nonzero()[:, 0]
+    rows = torch.stack([camera.sees(means) for camera in cameras]).any(0).nonzero()[:, 0]
     if len(rows) > count:
         rows = rows[torch.randperm(len(rows), generator=generator)[:count]].sort().values
     chosen = means[rows].float()
-    return PointCloud(
-        chosen, median_colors(views, chosen) if len(chosen) else torch.zeros(0, views.pixels(0).rgb.shape[-1])
-    )
+    colors = median_colors(views, chosen) if len(chosen) else torch.zeros(0, views.pixels(0).rgb.shape[-1])
+    return PointCloud(chosen, colors)

@@ -15,10 +15,7 @@ from neuprim.core.io.ply import PlyVertices, read_ply
 from neuprim.core.model.colours.sh import C0
 from neuprim.core.notices import warn_once
 
-__all__ = ["COMPRESSED", "LINEAR", "read_points"]
-
-COMPRESSED = (".splat", ".spz", ".ksplat", ".sog", ".sogs", ".lcc")
-"""Suffixes of Gaussian formats that are named when they are refused."""
+COMPRESSED = (".splat", ".spz", ".ksplat", ".sog", ".sogs", ".lcc")  # refused by name
 
 LINEAR = "colours are linear light"
 """A comment of files whose colours are not sRGB; ``neuprim export --format gaussian-ply`` writes it."""
@@ -27,18 +24,10 @@ _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
-_LARGEST_LOG = 50.0
-"""Logarithms of sizes beyond this are no sizes; those below its negative are none at all."""
-
-_FLATNESS = 0.1
-"""Thickness of a Gaussian without a size along an axis, over its smallest size."""
-
-_FARTHEST = 1e4
-"""Distance of a point from the median point, over the median of all such distances, beyond which it does not belong to
-the scene."""
-
-_COARSE = 1e-3
-"""Of the size of the cloud: what coordinates may be rounded to without a word."""
+_LARGEST_LOG = 50.0  # logarithms of sizes beyond this are no sizes; those below its negative are none at all
+_FLATNESS = 0.1  # thickness of a Gaussian without a size along an axis, over its smallest size
+_FARTHEST = 1e4  # distance from the median point, over the median of these, beyond which a point does not belong there
+_COARSE = 1e-3  # of the size of the cloud: what coordinates may be rounded to without a warning
 
 
 def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
@@ -47,14 +36,11 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     Properties ``x y z`` are required. Colours come from ``f_dc_0..2`` or from ``red green blue`` (integers, or floats
     0..1), both taken for sRGB; points without are mid-grey. ``scale_0..2`` (logarithms of standard deviations) with
     ``rot_0..3`` (wxyz) make Gaussians of them, and ``opacity`` (a logit, infinite for 0 and 1) says how opaque they
-    are. ``scale_0..1`` alone are the discs of 2D Gaussian splatting,
-    ``scale_0`` alone are balls. All else is ignored, view-dependent colour too.
+    are. ``scale_0..1`` alone are the discs of 2D Gaussian splatting, ``scale_0`` alone are balls. All else is ignored,
+    view-dependent colour too. Colours get the data set's ``channels`` and ``color_space`` ("srgb" or "linear").
 
     A vertex that stands for no point is left out, and all such are counted in one warning: a NaN among what is read, a
     size or rotation that is none, a place far from all others.
-
-    Args:
-        channels: of the data set. color_space: "srgb" or "linear", what the colours become.
 
     Raises:
         DataError: a damaged or compressed file, or one without usable points.
@@ -123,9 +109,8 @@ def _sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
         return None
     if there != list(_SCALES[: len(there)]) or (len(there) > 1 and not set(_ROTATION) <= set(found.names)):
         lacking = [name for name in (*_SCALES, *_ROTATION) if name not in found.names]
-        warn_once(
-            f"{path}: has {', '.join(there)}, but no {', '.join(lacking)}; sizes are ignored, and come from distances"
-        )
+        what = f"has {', '.join(there)}, but no {', '.join(lacking)}"
+        warn_once(f"{path}: {what}; sizes are ignored, and come from distances")
         return None
     scales = found.columns(there)
     if len(there) == 1:
@@ -161,10 +146,8 @@ def _warn_of_rounding(found: PlyVertices, means: np.ndarray, path: Path) -> None
     largest = np.abs(means).max(initial=0.0)
     size, step = np.ptp(means, axis=0).max(), np.spacing(np.float32(largest))
     if found.rows.dtype["x"].itemsize == 4 and step > _COARSE * size > 0:
-        warn_once(
-            f"{path}: x y z are float, which rounds coordinates as large as {largest:.7g} to {step:.2g}; "
-            "expected double there"
-        )
+        what = f"x y z are float, which rounds coordinates as large as {largest:.7g} to {step:.2g}"
+        warn_once(f"{path}: {what}; expected double there")
 
 
 def _in_space(colors: Tensor, linear: bool, color_space: str) -> Tensor:

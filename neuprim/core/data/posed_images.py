@@ -23,34 +23,10 @@ from neuprim.core.io.images import ImageInfo
 from neuprim.core.notices import warn_once
 from neuprim.core.validation import Range, nonempty_text, validate_fields
 
-__all__ = [
-    "Background",
-    "BadViews",
-    "EveryNth",
-    "FolderSettings",
-    "HoldOut",
-    "IMAGE_SUFFIXES",
-    "MissingFiles",
-    "SplitName",
-    "find_data_folder",
-    "split_every_nth",
-    "find_image",
-    "frame_in_scene",
-    "missing_files_error",
-    "SceneDetails",
-    "assemble_dataset",
-    "exif_hint",
-    "unique_view_names",
-]
-
 Background = Literal["auto", "white", "black", "random"]
 
-EveryNth = Annotated[int, Range(at_least=2)]
-"""Every n-th image is held out."""
-
-HoldOut = Annotated[int, Range(at_least=2, also=(0,))]
-"""The same, or 0 where a split of its own is there to test on."""
-
+EveryNth = Annotated[int, Range(at_least=2)]  # every n-th image is held out
+HoldOut = Annotated[int, Range(at_least=2, also=(0,))]  # the same, or 0 where a split of its own is there to test on
 SplitName = Annotated[str, nonempty_text("the name in transforms_NAME.json")]
 
 
@@ -78,20 +54,16 @@ class FolderSettings:
 
 
 def find_data_folder(path: str | Path) -> Path:
-    """Return the existing folder of the ``path`` setting, ``~`` expanded.
-
-    Raises:
-        DataError: there is no such folder.
-    """
+    """Return the existing folder of the ``path`` setting, ``~`` expanded; raises DataError if there is none."""
+    expected = "expected the data set's folder (scene.path)"
     try:
         folder = Path(path).expanduser()
-        usable = folder.is_dir()
-    except (OSError, RuntimeError) as error:  # a name that is too long, a home folder that nobody has
-        raise DataError(f"{path}: {error}; expected the data set's folder (scene.path)") from None
-    if not usable:
+        if folder.is_dir():
+            return folder
         found = "is a file" if folder.exists() else "does not exist"
-        raise DataError(f"{folder}: {found}; expected the data set's folder (scene.path)")
-    return folder
+    except (OSError, RuntimeError) as error:  # a name that is too long, a home folder that nobody has
+        raise DataError(f"{path}: {error}; {expected}") from None
+    raise DataError(f"{folder}: {found}; {expected}")
 
 
 _P = ParamSpec("_P")
@@ -101,11 +73,8 @@ _T = TypeVar("_T")
 class BadViews:
     """Collects damaged views: unreadable images, impossible poses, masks that leave nothing.
 
-    A few are left out with a warning each. Contradictory keys are not damage, and are refused elsewhere.
-
-    Args:
-        where: file or folder, for messages.
-        strict: raise at the first bad view.
+    A few are left out with a warning each; if ``strict``, the first is raised. ``where`` names a file or folder in
+    messages. Contradictory keys are not damage, and are refused elsewhere.
     """
 
     def __init__(self, where: str, strict: bool) -> None:
@@ -129,18 +98,11 @@ class BadViews:
             self._first = error
 
     def settle(self, count: int) -> None:
-        """Warn of the bad ones of ``count`` views.
-
-        Raises:
-            DataError: most views are bad.
-        """
+        """Warn of the bad ones of ``count`` views; raises DataError where most are bad."""
         bad = len(self._faults)
         if 2 * bad > count:
-            raise (
-                self._first
-                if count == 1
-                else DataError(f"{self._first}; {bad} of {count} views of {self._where} are like this")
-            )
+            more = "" if count == 1 else f"; {bad} of {count} views of {self._where} are like this"
+            raise DataError(f"{self._first}{more}")
         for fault in self._faults[:_LISTED]:
             warn_once(fault)
         if bad > _LISTED:
@@ -171,10 +133,8 @@ def _warn_of_outside_images(where: str, home: Path, paths: Iterable[Path]) -> No
     own = own if own.is_dir() else own.parent
     outside = [path for path in paths if not path.resolve().is_relative_to(own)]
     if outside:
-        warn_once(
-            f"{where}: {len(outside)} of its images lie outside of {own}, the first {outside[0].resolve()}; "
-            "they are read as it says"
-        )
+        found = f"{len(outside)} of its images lie outside of {own}, the first {outside[0].resolve()}"
+        warn_once(f"{where}: {found}; they are read as it says")
 
 
 def _other_case(folder: Path, path: Path) -> Path | None:
@@ -194,9 +154,8 @@ def exif_hint(info: ImageInfo) -> str:
     if info.orientation < 5:
         return ""
     return (
-        f"; its EXIF orientation is {info.orientation}, so that other programs show it turned, and pixels are "
-        "read as they are stored, "
-        "as COLMAP reads them: give w, h of the stored pixels, or turn the pixels themselves"
+        f"; its EXIF orientation is {info.orientation}, so that other programs show it turned, and pixels are read as "
+        "they are stored, as COLMAP reads them: give w, h of the stored pixels, or turn the pixels themselves"
     )
 
 
@@ -209,24 +168,22 @@ def missing_files_error(where: str, names: Sequence[str], hint: str = "") -> Mis
 def unique_view_names(paths: Iterable[str], where: str) -> list[str]:
     """Return a file name per image path: its stem, or the whole path with ``_`` for ``/`` if stems repeat.
 
-    Raises:
-        DataError: a path occurs twice.
+    Raises DataError if a path occurs twice.
     """
     texts = [p.replace("\\", "/").removeprefix("./") for p in paths]
-    repeated = [p for p, n in Counter(texts).items() if n > 1]
-    if repeated:
-        raise DataError(f"{where}: image {repeated[0]!r} is listed {Counter(texts)[repeated[0]]} times; expected once")
-    stems = [_stem(p) for p in texts]
+    path, count = max(Counter(texts).items(), key=lambda item: item[1], default=("", 0))
+    if count > 1:
+        raise DataError(f"{where}: image {path!r} is listed {count} times; expected once")
+    stems = [_without_suffix(p.rstrip("/").rsplit("/", 1)[-1]) for p in texts]
     if len(set(stems)) < len(stems):
-        stems = [(_stem(p, whole=True)).replace("/", "_") for p in texts]
+        stems = [_without_suffix(p.strip("/")).replace("/", "_") for p in texts]
     if len(set(stems)) < len(stems):  # a_b.png beside a/b.png, or b.png beside b.jpg
         stems = [f"{i:04d}_{s}" for i, s in enumerate(stems)]
     return stems
 
 
-def _stem(path: str, whole: bool = False) -> str:
-    text = path.strip("/") if whole else path.rstrip("/").rsplit("/", 1)[-1]
-    return next((text[: -len(s)] for s in IMAGE_SUFFIXES if text.endswith(s)), text)
+def _without_suffix(text: str) -> str:
+    return next((text.removesuffix(s) for s in IMAGE_SUFFIXES if text.endswith(s)), text)
 
 
 def split_every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFrame], list[ImageFrame]]:
@@ -236,30 +193,17 @@ def split_every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFra
 
 @dataclass(frozen=True)
 class SceneDetails:
-    """What a format knows about a scene besides its images.
+    """What a format knows about a scene besides its images."""
 
-    Attributes:
-        up: (3,) upward direction; None takes the mean of the cameras' own.
-        points: starting points of the format, float64 in the coordinates of the file.
-        prefix: reduction that the files already have, e.g. "images_4".
-        start: rule for starting points; None takes ``points``, else infers them from images at rest
-            (:func:`neuprim.core.data.initial.initial_points`).
-        to_linear: convert sRGB files to linear light.
-        exposure: divisor of linear values, or a function of the training views that returns it.
-        extra: see :class:`~neuprim.core.data.dataset.Dataset`.
-        positions: names of conditions that are positions, float64 in the coordinates of the file.
-        home: the data set's folder, where it is not the one that ``where`` names.
-    """
-
-    up: Tensor | None = None
-    points: PointCloud | None = None
-    prefix: str = ""
-    start: StartingPoints | None = None
-    to_linear: bool = False
-    exposure: float | Callable[[ImageViews], float] = 1.0
-    extra: object = None
-    positions: Sequence[str] = ()
-    home: Path | None = None
+    up: Tensor | None = None  # (3,) upward direction; None takes the mean of the cameras' own
+    points: PointCloud | None = None  # starting points of the format, float64 in the coordinates of the file
+    prefix: str = ""  # reduction that the files already have, e.g. "images_4"
+    start: StartingPoints | None = None  # None takes points, else infers them from images at rest (initial_points)
+    to_linear: bool = False  # convert sRGB files to linear light
+    exposure: float | Callable[[ImageViews], float] = 1.0  # divisor of linear values, perhaps from the training views
+    extra: object = None  # of the Dataset
+    positions: Sequence[str] = ()  # conditions that are positions, float64 in the coordinates of the file
+    home: Path | None = None  # the data set's folder, where it is not the one that ``where`` names
 
 
 def assemble_dataset(
@@ -271,10 +215,7 @@ def assemble_dataset(
     context: SceneContext,
     details: SceneDetails = SceneDetails(),
 ) -> Dataset:
-    """Make a data set of two splits of image files.
-
-    Args:
-        where: file or folder that errors name.
+    """Make a data set of two splits of image files; errors name the file or folder ``where``.
 
     Raises:
         DataError: an empty split, mixed kinds of images, most images damaged, or any with ``settings.strict``.
@@ -330,9 +271,8 @@ def _check_splits(
     first = train[0]
     for frame in (*train, *test):
         if frame.info.linear != first.info.linear:
-            raise DataError(
-                f"{frame.path}: mixes OpenEXR (linear) and PNG/JPEG (sRGB) with {first.path}; expected one kind"
-            )
+            found = f"mixes OpenEXR (linear) and PNG/JPEG (sRGB) with {first.path}"
+            raise DataError(f"{frame.path}: {found}; expected one kind")
         if frame.info.channels != first.info.channels:
             found = f"image has {frame.info.channels} channels, {first.path} has {first.info.channels}"
             raise DataError(f"{frame.path}: {found}; expected all RGB or all RGBA")
@@ -340,9 +280,8 @@ def _check_splits(
 
 def _choose_background(where: str, background: str, alpha: bool) -> str:
     if background == "random" and not alpha:
-        raise ConfigError(
-            f"scene.background is 'random', but the images in {where} have no alpha; expected auto, white or black"
-        )
+        found = f"the images in {where} have no alpha"
+        raise ConfigError(f"scene.background is 'random', but {found}; expected auto, white or black")
     return ("white" if alpha else "black") if background == "auto" else background
 
 

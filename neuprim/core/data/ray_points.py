@@ -12,35 +12,24 @@ from neuprim.core.data.dataset import PointCloud, ViewSet
 from neuprim.core.data.scene_frame import camera_extent
 from neuprim.core.errors import DataError
 
-__all__ = ["GIVE_POINTS", "ray_points", "count_seeing_views"]
-
 GIVE_POINTS = "pass points with model.init.points=FILE.ply, or with ply_file_path in transforms.json"
 """What to do where no starting point can be inferred."""
 
 _VIEWS = 100
-_PROBES = 2000
-"""Pixels whose depth is looked for."""
-_OTHERS = 32
-"""Views that they are compared with."""
-_STEPS = 2.0 ** torch.arange(-2.0, 8.5, 0.5, dtype=torch.float64)
-"""Depths that are tried, in camera extents."""
-_INFINITY = 1e6
-"""In camera extents."""
-_SEEN = 0.1
-"""Share of these pixels that must be seen at a depth, for it to be judged."""
-_SAME = 1.02
-"""Up to this ratio of differences, infinity agrees with the images as well as the best depth does."""
-_TRIED = 8
-"""Depths of a ray, of which the one counts at which other views agree best."""
-_PRIOR = 0.5
-"""Weight of how well a depth fits all rays, beside how well it fits one: few views see a place, and some agree by
-chance."""
+_PROBES = 2000  # pixels whose depth is looked for
+_OTHERS = 32  # views that they are compared with
+_STEPS = 2.0 ** torch.arange(-2.0, 8.5, 0.5, dtype=torch.float64)  # depths that are tried, in camera extents
+_INFINITY = 1e6  # in camera extents
+_SEEN = 0.1  # share of these pixels that must be seen at a depth, for it to be judged
+_SAME = 1.02  # up to this ratio of differences, infinity agrees with the images as well as the best depth does
+_TRIED = 8  # depths of a ray, of which the one counts at which other views agree best
+_PRIOR = 0.5  # weight of how well a depth fits all rays, beside how well it fits one: some views agree by chance
 _ROUNDS = 8
 
 
 def count_seeing_views(views: ViewSet, means: Tensor) -> Tensor:
     """(N,) int64: how many of at most 100 views contain the points (N, 3)."""
-    return torch.stack([views.view(i).camera.sees(means) for i in _some(len(views), _VIEWS)]).sum(0)
+    return torch.stack([views.view(i).camera.sees(means) for i in evenly_spaced(len(views), _VIEWS)]).sum(0)
 
 
 def ray_points(
@@ -50,13 +39,8 @@ def ray_points(
 
     Depths range over those at which other views show the same colours. If no depth fits better than infinity,
     the cameras count as one and the depth unit is arbitrary. Points must be seen by two cameras, unless the
-    cameras count as one.
-
-    Args:
-        matter: alpha above which a pixel shows matter.
-
-    Returns:
-        The points, and the (N,) views that they come from.
+    cameras count as one. A pixel shows matter where alpha is above ``matter``. Returned are the points, and the (N,)
+    views that they come from.
 
     Raises:
         DataError: no two cameras see the same place, or no pixel shows matter.
@@ -79,14 +63,12 @@ def ray_points(
             break
     means, colors, owner = (torch.cat(parts)[:count] for parts in zip(*found, strict=True))
     if not len(means):
-        raise DataError(
-            f"no place is in the images of {needed} training cameras, so that no starting point can be "
-            f"inferred; {GIVE_POINTS}"
-        )
+        what = f"no place is in the images of {needed} training cameras"
+        raise DataError(f"{what}, so that no starting point can be inferred; {GIVE_POINTS}")
     return PointCloud(means, colors), owner
 
 
-def _some(count: int, most: int) -> list[int]:
+def evenly_spaced(count: int, most: int) -> list[int]:
     """At most ``most`` evenly spaced indices below ``count``."""
     return sorted({round(i * (count - 1) / max(min(count, most) - 1, 1)) for i in range(min(count, most))})
 
@@ -109,10 +91,8 @@ def _pixels(
             keep, color = keep & (alpha > matter), color / alpha.clamp_min(matter)[:, None]
         view = camera.viewmat.double()
         local = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, torch.ones_like(u)], dim=-1)
-        eye = camera.position.double().expand(len(local), 3)
-        found.append(
-            (eye[keep], (local @ view[:3, :3])[keep], color[keep].float(), torch.full((int(keep.sum()),), index))
-        )
+        eye, owner = camera.position.double().expand(len(local), 3), torch.full((len(local),), index)
+        found.append((eye[keep], (local @ view[:3, :3])[keep], color[keep].float(), owner[keep]))
     eyes, rays, colors, owner = (torch.cat(parts) for parts in zip(*found, strict=True))
     return eyes, rays, colors, owner
 
@@ -134,16 +114,15 @@ def _fitting(views: ViewSet, generator: torch.Generator, matter: float) -> tuple
         unit = max(1.0, 100.0 * unit) if len(cameras) > 1 and unit < 1 else 1.0
         return torch.tensor([1.0, 4.0], dtype=torch.float64) * unit, torch.zeros(2, dtype=torch.float64), 1
     fits = (mean <= (mean.min() + mean[-1]) / 2).nonzero()[:, 0]  # where colours agree better than half-way to infinity
-    chosen = slice(
-        max(int(fits[0]) - 1, 0), int(fits[-1]) + 1
-    )  # the nearest surfaces are few, and outweighed in the mean
+    # one depth nearer, as the nearest surfaces are few and outweighed in the mean
+    chosen = slice(max(int(fits[0]) - 1, 0), int(fits[-1]) + 1)
     return depths[chosen], mean[chosen].clamp_max(mean[-1]), 2
 
 
 def _difference(views: ViewSet, points: Tensor, colors: Tensor, owner: Tensor) -> Tensor:
     """(N,) median colour difference to other views at the points; NaN where no view shows them."""
     found = []
-    for index in _some(len(views), _OTHERS):
+    for index in evenly_spaced(len(views), _OTHERS):
         camera, pixels = views.view(index).camera, views.pixels(index)
         spots, _ = camera.project(points)
         inside = camera.sees(points) & (owner != index)

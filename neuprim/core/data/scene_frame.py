@@ -12,8 +12,6 @@ from neuprim.core.cameras import Camera
 from neuprim.core.cameras.world import World
 from neuprim.core.notices import warn_once
 
-__all__ = ["FAR", "optical_axes_meet", "camera_extent", "focus_point", "find_outliers", "choose_world"]
-
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
     """Radius of the bounding sphere of the cameras about their mean, times 1.1 (3D Gaussian splatting).
@@ -26,7 +24,7 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
     return radius if radius > 0 else 1.0
 
 
-_OUTLYING = 100.0
+_OUTLYING = 100.0  # of the median distance
 _OUTLYING_SHARE = 0.05
 
 
@@ -77,9 +75,7 @@ def _axes(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
     return positions[usual], forward[usual]
 
 
-FAR = 100.0
-"""Distance of the cameras from the origin, in extents of theirs, from which a scene is moved: float32 holds five digits
-of it there."""
+FAR = 100.0  # camera extents from the origin, beyond which a scene is moved: float32 holds five digits of it there
 
 
 def choose_world(cameras: Sequence[Camera], where: str = "cameras") -> World:
@@ -96,10 +92,8 @@ def choose_world(cameras: Sequence[Camera], where: str = "cameras") -> World:
     if far.any():
         row = int(far.nonzero()[0])
         place = ", ".join(f"{x + 0.0:.6g}" for x in centers[row].tolist())
-        warn_once(
-            f"{where}: {int(far.sum())} of {len(views)} cameras lie far from all others, the first at {place}; "
-            "they do not count for the scene's size"
-        )
+        found = f"{int(far.sum())} of {len(views)} cameras lie far from all others, the first at {place}"
+        warn_once(f"{where}: {found}; they do not count for the scene's size")
     center = centers[~far].mean(0)
     there = World.at(center.tolist())
     extent = camera_extent([there.scene_camera(c) for c in cameras])

@@ -40,9 +40,11 @@ from neuprim.core.io.images import image_info
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.notices import warn_once
 
-__all__ = ["TransformsLayout", "read_transforms_frames", "read_transforms_splits", "split_named_frames"]
-
 _POSES = ("transform_matrix", "R_opt", "T_opt")
+
+
+def _file_path(record: JsonReader) -> str:
+    return record.text("file_path")
 
 
 def _viewmat(record: JsonReader) -> Tensor:
@@ -51,23 +53,13 @@ def _viewmat(record: JsonReader) -> Tensor:
 
 @dataclass(frozen=True)
 class TransformsLayout:
-    """What differs between formats.
+    """What differs between formats."""
 
-    Attributes:
-        keys: further keys that the loader reads.
-        name: path of a frame's image, as the file has it.
-        image: image file of a frame in the data set's folder, or None.
-        viewmat: (4, 4) world to camera, OpenCV axes.
-        masks: whether a folder ``masks`` beside the images counts where the file names no mask.
-    """
-
-    keys: tuple[str, ...] = ()
-    name: Callable[[JsonReader], str] = lambda record: record.text("file_path")
-    image: Callable[[Path, JsonReader], Path | None] = lambda folder, record: find_image(
-        folder, record.text("file_path")
-    )
-    viewmat: Callable[[JsonReader], Tensor] = _viewmat
-    masks: bool = False
+    keys: tuple[str, ...] = ()  # further keys that the loader reads
+    name: Callable[[JsonReader], str] = _file_path  # path of a frame's image, as the file has it
+    image: Callable[[Path, JsonReader], Path | None] = lambda folder, frame: find_image(folder, _file_path(frame))
+    viewmat: Callable[[JsonReader], Tensor] = _viewmat  # (4, 4) world to camera, OpenCV axes
+    masks: bool = False  # whether a folder ``masks`` beside the images counts where the file names no mask
 
 
 def read_transforms_frames(
@@ -91,24 +83,20 @@ def read_transforms_frames(
     """
     for record in (document, *records):
         refuse_unsupported_keys(record)
-    names = [layout.name(r) for r in records]
-    files = [layout.image(folder, r) for r in records]
-    absent = [
-        f"{n}{r.values.get('file_ext') or ''}" for n, r, f in zip(names, records, files, strict=True) if f is None
-    ]
+    images = [(r, layout.image(folder, r)) for r in records]
+    absent = [f"{layout.name(r)}{r.values.get('file_ext') or ''}" for r, file in images if file is None]
     if absent and (not skip_missing or len(absent) == len(records)):
-        raise missing_files_error(document.where, absent, "" if skip_missing else _skip_hint(settings))
-    present = [(r, f, n) for r, f, n in zip(records, files, names, strict=True) if f is not None]
-    masks = _masks(folder, document, [(r, f) for r, f, _ in present], layout)
+        offered = hasattr(settings, "skip_missing") and not skip_missing
+        hint = "; scene.skip_missing=true leaves such frames out" if offered else ""
+        raise missing_files_error(document.where, absent, hint)
+    present = [(r, file) for r, file in images if file is not None]
+    masks = _masks(folder, document, present, layout)
+    names = unique_view_names([layout.name(r) for r, _ in present], document.where)
     kept: list[JsonReader] = []
     frames: list[ImageFrame] = []
     bad = BadViews(document.where, settings.strict)
-    for (record, file, _), mask, name in zip(
-        present, masks, unique_view_names([n for *_, n in present], document.where), strict=True
-    ):
-        fisheye = has_fisheye_lens(
-            record, document
-        )  # before anything else, as other keys mean nothing to a lens that is not known
+    for (record, file), mask, name in zip(present, masks, names, strict=True):
+        fisheye = has_fisheye_lens(record, document)  # first, as other keys mean nothing to a lens that is not known
         if not _damaged(record):
             layout.viewmat(record)  # a field that is missing or of another kind is no damage, and refused
         info = bad.read(name, image_info, file)
@@ -117,13 +105,11 @@ def read_transforms_frames(
             continue
         target = Target(info.width, info.height, str(file), exif_hint(info))
         camera = read_camera(record, document, target, viewmat, warn_once).validate(record.where)
-        told = (
-            any(r.has("w") for r in (record, document)) and info.width != info.height
-        )  # the size says which way up pixels are
-        if info.orientation > 1 and not (told and info.orientation > 4):
-            warn_once(
-                f"{file.parent}: images with an EXIF orientation are read as they are stored, as COLMAP reads them"
-            )
+        # a stated size says which way up pixels are
+        sized = (record.has("w") or document.has("w")) and info.width != info.height
+        if info.orientation > 1 and not (sized and info.orientation > 4):
+            what = "images with an EXIF orientation are read as they are stored, as COLMAP reads them"
+            warn_once(f"{file.parent}: {what}")
         kept.append(record)
         frames.append(ImageFrame(name, file, camera, info, mask, _distortion(record, document, fisheye)))
     bad.settle(len(present))
@@ -131,10 +117,6 @@ def read_transforms_frames(
     if unknown:
         warn_once(unknown)
     return kept, frames
-
-
-def _skip_hint(settings: FolderSettings) -> str:
-    return "; scene.skip_missing=true leaves such frames out" if hasattr(settings, "skip_missing") else ""
 
 
 def _pose(record: JsonReader, layout: TransformsLayout) -> Tensor:
@@ -161,8 +143,7 @@ def _numbers(value: object) -> list[float]:
 def _masks(
     folder: Path, document: JsonReader, present: Sequence[tuple[JsonReader, Path]], layout: TransformsLayout
 ) -> list[Mask | None]:
-    """The mask of every frame: what ``mask_path`` names, in the frame or in the file, else what lies beside the
-    images."""
+    """The mask of every frame: what ``mask_path`` of frame or file names, else what lies beside the images."""
     if layout.masks and not any(r.has("mask_path") for r in (document, *(r for r, _ in present))):
         return find_masks(folder, [file for _, file in present])
     masks, lost = [], []
@@ -186,28 +167,19 @@ def _distortion(record: JsonReader, document: JsonReader, fisheye: bool) -> Dist
     return Radial(*k, *p) if any(k) or any(p) else None
 
 
-# ---------------------------------------------------------------- splits
-
-Read = Callable[[str], list[ImageFrame]]
-
-
 def read_transforms_splits(
-    folder: Path, train: str, test: str, hold_out: int, read: Read
+    folder: Path, train: str, test: str, hold_out: int, read: Callable[[str], list[ImageFrame]]
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
     """Read (training, test) frames of ``transforms_SPLIT.json`` files.
 
-    With ``hold_out`` every so many training views are the test split.
-
-    Raises:
-        ConfigError: nothing to hold out.
-        DataError: as ``read``.
+    With ``hold_out`` every so many training views are the test split; raises ConfigError if there is nothing to hold
+    out.
     """
     frames = read(train)
     if hold_out:
         if len(frames) < 2:
-            raise ConfigError(
-                f"scene.hold_out is {hold_out}, but {folder} has only {len(frames)} training view; expected at least 2"
-            )
+            found = f"{folder} has only {len(frames)} training view"
+            raise ConfigError(f"scene.hold_out is {hold_out}, but {found}; expected at least 2")
         return split_every_nth(frames, hold_out)
     path = folder / f"transforms_{test}.json"
     hint = "; scene.hold_out=8 holds out every 8th training view instead"
@@ -242,16 +214,12 @@ def split_named_frames(
             raise missing_files_error(f"{document.where}: {key} names images that no frame has", unknown)
     held = [key for key in ("test_filenames", "val_filenames") if key in lists]
     judged = next((key for key in held if lists[key]), held[0] if held else "")
-    train_names = (
-        lists["train_filenames"] if "train_filenames" in lists else everything.difference(*(lists[key] for key in held))
-    )
+    train_names = lists.get("train_filenames", everything.difference(*(lists[key] for key in held)))
     test_names = lists[judged] if judged else everything - train_names
     shared = sorted(train_names & test_names)
     if shared:
-        raise DataError(
-            f"{document.where}: train_filenames and {judged} share {len(shared)} images, e.g. {shared[0]}; "
-            "expected none"
-        )
+        found = f"train_filenames and {judged} share {len(shared)} images, e.g. {shared[0]}"
+        raise DataError(f"{document.where}: {found}; expected none")
     return [f for n, f in listed.items() if n in train_names], [f for n, f in listed.items() if n in test_names]
 
 

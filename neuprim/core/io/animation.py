@@ -15,18 +15,16 @@ from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.io.files import atomic_path, checked_atomic_path
 from neuprim.core.io.images import pillow_image, to_uint8
 
-__all__ = ["FrameSpool", "write_animation"]
-
 
 def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: int = 80) -> None:
     """Write (H, W, 3 or 4) sRGB frames as an endless animation; the suffix picks the format; atomic.
 
-    GIF has 256 colours per frame and frame times in hundredths of a second, so its rate is the nearest possible one.
-    MP4 is H.264 with 4:2:0 colour and even sizes: an odd last row or column is repeated; RGB only.
+    GIF has frame times in hundredths of a second, so its rate is the nearest possible one. MP4 is H.264 with even
+    sizes: an odd last row or column is repeated; RGB only.
 
     Raises:
         BackendUnavailable: MP4 without the package ``av``.
-        DataError: no frames, frames of different shapes, an unknown suffix, a rate that is not positive, NaN values, or
+        DataError: no frames, frames of different shapes or with NaN, an unknown suffix, a rate that is not positive, or
             the file cannot be written.
     """
     _check_rate(path, len(frames), fps)
@@ -43,8 +41,7 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
 class FrameSpool:
     """Collect frames of one size in a temporary file, then write them as an animation; memory stays constant.
 
-    Args:
-        folder: of the temporary file, which has no name and disappears however this process ends.
+    The file in ``folder`` has no name and disappears however this process ends.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -75,9 +72,8 @@ class FrameSpool:
 
 def _check_rate(path: Path, count: int, fps: float) -> None:
     if not count or not 0.0 < fps < float("inf"):
-        raise DataError(
-            f"{path}: {count} frames at {fps} frames per second; expected at least one frame and a positive rate"
-        )
+        expected = "at least one frame and a positive rate"
+        raise DataError(f"{path}: {count} frames at {fps} frames per second; expected {expected}")
 
 
 def _save_animation(
@@ -98,9 +94,8 @@ def _write_mp4(path: Path, frames: Sequence[Tensor], fps: float) -> None:
     try:
         import av
     except ImportError as error:
-        raise BackendUnavailable(
-            f"{path}: MP4 needs the package av ({error}); pip install 'neuprim[video]', or use .webp"
-        ) from error
+        what = f"MP4 needs the package av ({error}); pip install 'neuprim[video]', or use .webp"
+        raise BackendUnavailable(f"{path}: {what}") from error
     height, width = frames[0].shape[:2]
     rows, columns = (list(range(n)) + [n - 1] * (n % 2) for n in (height, width))
     with atomic_path(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:

@@ -13,10 +13,7 @@ import numpy as np
 
 from neuprim.core.errors import DataError
 
-__all__ = ["read_arrays"]
-
-ArrayType = tuple[Any, tuple[int | None, ...]]
-"""dtype and shape; None for any length."""
+ArrayType = tuple[Any, tuple[int | None, ...]]  # dtype and shape; None for any length
 
 
 def read_arrays(path: Path, wanted: Mapping[str, ArrayType]) -> dict[str, np.ndarray]:
@@ -53,15 +50,10 @@ def _read_array(
         actual, _, kind = read(file)
         fits = len(actual) == len(shape) and all(w is None or n == w for n, w in zip(actual, shape, strict=True))
         if kind != np.dtype(dtype) or not fits:
-            raise ValueError(
-                f"{name} is {kind} of shape {actual}; expected {np.dtype(dtype)} of {_format_shape(shape)}"
-            )
+            expected = f"{np.dtype(dtype)} of {str(shape).replace('None', 'N')}"
+            raise ValueError(f"{name} is {kind} of shape {actual}; expected {expected}")
         if math.prod(actual) * kind.itemsize > entry.file_size:
             raise ValueError(f"{name} claims shape {actual}, and has {entry.file_size} bytes")
     with archive.open(entry) as file:
         result: np.ndarray = np.lib.format.read_array(file, allow_pickle=False)
     return result
-
-
-def _format_shape(shape: tuple[int | None, ...]) -> str:
-    return "(" + ", ".join("N" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"

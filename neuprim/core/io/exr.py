@@ -20,23 +20,8 @@ from torch import Tensor
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import checked_atomic_path
 
-__all__ = [
-    "MAX_PIXELS",
-    "ExrChannel",
-    "channel_name_error",
-    "check_pixel_count",
-    "default_channel_names",
-    "exr_channels",
-    "is_exr",
-    "read_exr",
-    "read_exr_layout",
-    "refuse_out_of_memory",
-    "write_exr",
-    "write_exr_layers",
-]
-
 MAX_PIXELS = 64 * 2**20
-"""Most pixels of an image: 67,108,864 (8192 x 8192). Larger images are refused before pixel memory is allocated."""
+"""Most pixels of an image (8192 x 8192). Larger ones are refused before pixel memory is allocated."""
 
 _MAX_VALUES = 16 * MAX_PIXELS  # of all channels of a file, as all are decoded together
 _MAX_HALF = 65504.0
@@ -58,12 +43,8 @@ def refuse_out_of_memory(path: Path) -> Iterator[None]:
     try:
         yield
     except MemoryError:
-        raise DataError(
-            f"{path}: reading the image takes more memory than there is; is it damaged, or too large?"
-        ) from None
-
-
-# ---------------------------------------------------------------- names of channels
+        what = "reading the image takes more memory than there is; is it damaged, or too large?"
+        raise DataError(f"{path}: {what}") from None
 
 
 def default_channel_names(count: int) -> tuple[str, ...]:
@@ -81,10 +62,8 @@ def channel_name_error(names: Sequence[Any]) -> str | None:
         if not isinstance(name, str):
             return f"[{i}] is of type {type(name).__name__}; expected text"
         if not name.strip() or name != name.strip() or not name.isprintable() or len(name.encode()) > _MAX_NAME_BYTES:
-            return (
-                f"[{i}] is {name[:60]!r}; "
-                f"expected 1 to {_MAX_NAME_BYTES} bytes of printable text without blanks around it"
-            )
+            expected = f"1 to {_MAX_NAME_BYTES} bytes of printable text without blanks around it"
+            return f"[{i}] is {name[:60]!r}; expected {expected}"
         if name == "A":
             return f"[{i}] is 'A'; expected another name, as A is alpha in OpenEXR files"
         if name in used:
@@ -93,15 +72,8 @@ def channel_name_error(names: Sequence[Any]) -> str | None:
     return None
 
 
-# ---------------------------------------------------------------- reading
-
-
 def is_exr(path: Path, required: bool = False) -> bool:
-    """Whether a file starts as OpenEXR; with ``required`` any other format raises.
-
-    Raises:
-        DataError: missing, empty or unreadable file.
-    """
+    """Whether a file starts as OpenEXR; raises DataError if it cannot be read or, with ``required``, does not."""
     try:
         with open(path, "rb") as file:
             head = file.read(8)
@@ -117,11 +89,7 @@ def is_exr(path: Path, required: bool = False) -> bool:
 
 
 def exr_channels(path: Path) -> tuple[str, ...]:
-    """Names of all channels of an OpenEXR file, in the file's alphabetical order.
-
-    Raises:
-        DataError: missing, empty, damaged, another format, or larger than :data:`MAX_PIXELS`.
-    """
+    """Names of all channels of an OpenEXR file, alphabetically; raises DataError as :func:`read_exr_layout`."""
     is_exr(path, required=True)
     return tuple(_read_header(path)[0])
 
@@ -140,10 +108,8 @@ def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[li
         names = [prefixes[0] + c for c in "RGBA" if prefixes[0] + c in channels] if len(prefixes) == 1 else []
         expected = "R, G, B and optionally A, of one layer"
     if not names or not set(names) <= channels.keys():
-        raise DataError(
-            f"{path}: OpenEXR channels are {', '.join(channels) or 'none'}; "
-            f"expected {expected or 'some to be asked for'}"
-        )
+        found = f"OpenEXR channels are {', '.join(channels) or 'none'}"
+        raise DataError(f"{path}: {found}; expected {expected or 'some to be asked for'}")
     if any(channels[n].xSampling != 1 or channels[n].ySampling != 1 for n in names):
         raise DataError(f"{path}: OpenEXR colour channels are subsampled; expected one value per pixel")
     return names, width, height
@@ -163,22 +129,16 @@ def _read_header(path: Path) -> tuple[dict[str, Any], int, int]:
     except Exception as error:  # also KeyError and UnicodeDecodeError, from damaged attributes
         raise DataError(f"{path}: OpenEXR header is truncated or corrupt ({type(error).__name__}: {error})") from None
     if parts != 1 or not flat:
-        raise DataError(
-            f"{path}: OpenEXR file has {parts} parts of type {header.get('type')}; "
-            "expected 1 part of flat scan lines or tiles"
-        )
+        found = f"OpenEXR file has {parts} parts of type {header.get('type')}"
+        raise DataError(f"{path}: {found}; expected 1 part of flat scan lines or tiles")
     if (low, high) != (full_low, full_high):
-        raise DataError(
-            f"{path}: OpenEXR data window {low}..{high} is not its display window {full_low}..{full_high}; "
-            "expected equal windows"
-        )
+        found = f"OpenEXR data window {low}..{high} is not its display window {full_low}..{full_high}"
+        raise DataError(f"{path}: {found}; expected equal windows")
     width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
     check_pixel_count(path, width, height)
     if width * height * len(channels) > _MAX_VALUES:
-        raise DataError(
-            f"{path}: header claims {len(channels)} channels of {width}x{height} pixels; "
-            f"at most {_MAX_VALUES} values are accepted"
-        )
+        found = f"header claims {len(channels)} channels of {width}x{height} pixels"
+        raise DataError(f"{path}: {found}; at most {_MAX_VALUES} values are accepted")
     return channels, width, height
 
 
@@ -194,9 +154,8 @@ def read_exr(path: Path, names: Sequence[str], width: int, height: int) -> Tenso
     except MemoryError:
         raise
     except Exception as error:
-        raise DataError(
-            f"{path}: OpenEXR data is truncated or corrupt ({error}); expected a complete {width}x{height} image"
-        ) from None
+        found = f"OpenEXR data is truncated or corrupt ({error})"
+        raise DataError(f"{path}: {found}; expected a complete {width}x{height} image") from None
     if any(p.dtype not in (np.float16, np.float32) for p in planes):
         kinds = ", ".join(str(p.dtype) for p in planes)
         raise DataError(f"{path}: OpenEXR colour channels are {kinds}; expected half or float")
@@ -204,75 +163,37 @@ def read_exr(path: Path, names: Sequence[str], width: int, height: int) -> Tenso
         actual = f"{planes[0].shape[1]}x{planes[0].shape[0]}"
         raise DataError(f"{path}: OpenEXR data is {actual}; expected {width}x{height} as in its header")
     pixels = np.stack(planes, axis=-1)
-    _check_finite(path, pixels)
-    return torch.from_numpy(pixels)
-
-
-def _check_finite(path: Path, pixels: np.ndarray) -> None:
-    """Raise DataError that names the first NaN or infinite value of (H, W, C) pixels."""
     bad = ~np.isfinite(pixels)
     if bad.any():
         row, column, channel = (int(i[0]) for i in np.nonzero(bad))
-        raise DataError(
-            f"{path}: value {pixels[row, column, channel]} at row {row}, column {column}, channel {channel}; "
-            "expected finite numbers"
-        )
-
-
-# ---------------------------------------------------------------- writing
+        found = f"value {pixels[row, column, channel]} at row {row}, column {column}, channel {channel}"
+        raise DataError(f"{path}: {found}; expected finite numbers")
+    return torch.from_numpy(pixels)
 
 
 @dataclass(frozen=True)
 class ExrChannel:
-    """One channel to write.
-
-    Attributes:
-        values: (H, W) finite numbers.
-        half: store 16-bit instead of 32-bit floats.
-    """
+    """One channel to write: (H, W) finite numbers, stored as 32-bit or 16-bit floats."""
 
     values: Tensor
     half: bool = False
 
 
-def write_exr(
-    path: Path,
-    image: Tensor,
-    half: bool = True,
-    extra: Mapping[str, Tensor] | None = None,
-    names: Sequence[str] | None = None,
-) -> None:
-    """Write (H, W, 3 or 4) *linear* values with premultiplied alpha, or (H, W, C) named channels, without clamping.
-
-    Args:
-        half: store colour as 16-bit instead of 32-bit floats.
-        extra: further channels by name, each (H, W), stored as 32-bit floats, e.g. ``{"Z": depth}``.
-        names: channel names of an image that is not R, G, B(, A).
+def write_exr(path: Path, image: Tensor, half: bool = True, names: Sequence[str] | None = None) -> None:
+    """Write (H, W, 3 or 4) *linear* values with premultiplied alpha, or (H, W, C) of channels ``names``; not clamped.
 
     Raises:
-        DataError: wrong shapes or names, colour values that are not finite or (with ``half``) beyond 65504, or the file
-            cannot be written.
+        DataError: wrong shapes or names, or as :func:`write_exr_layers`.
     """
     error = None if names is None else channel_name_error(names)
     if error:
         raise DataError(f"{path}: names{error}")
     counts = (3, 4) if names is None else (len(names),)
     if image.ndim != 3 or 0 in image.shape or image.shape[-1] not in counts:
-        expected = "(H, W, 3) or (H, W, 4)"
-        if names is not None:
-            expected = f"(H, W, {len(names)}), for the channels {', '.join(names)}"
+        expected = " or ".join(f"(H, W, {count})" for count in counts)
         raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected {expected}")
-    _check_finite(path, image.detach().cpu().float().numpy())
     names = names or "RGBA"[: image.shape[-1]]
-    channels = {name: _stored_values(path, name, image[..., i], half) for i, name in enumerate(names)}
-    for name, plane in (extra or {}).items():
-        if tuple(plane.shape) != tuple(image.shape[:2]) or name in channels:
-            raise DataError(
-                f"{path}: channel {name!r} has shape {tuple(plane.shape)}; "
-                f"expected {tuple(image.shape[:2])} and a name of its own"
-            )
-        channels[name] = _stored_values(path, name, plane, False)
-    _write_file(path, channels, {})
+    write_exr_layers(path, {name: ExrChannel(image[..., i], half) for i, name in enumerate(names)})
 
 
 def write_exr_layers(
@@ -291,33 +212,23 @@ def write_exr_layers(
     shapes = sorted({tuple(channel.values.shape) for channel in channels.values()})
     if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:
         raise DataError(f"{path}: channels to write have shapes {shapes}; expected one (H, W)")
-    for name, channel in channels.items():
-        bad = (~channel.values.isfinite()).nonzero()
-        if len(bad):
-            y, x = bad[0].tolist()
-            raise DataError(
-                f"{path}: channel {name}: value {float(channel.values[y, x])} at row {y}, column {x}; "
-                "expected finite numbers"
-            )
-    stored = {name: _stored_values(path, name, c.values, c.half) for name, c in channels.items()}
-    _write_file(path, stored, attributes or {})
-
-
-def _stored_values(path: Path, name: str, plane: Tensor, half: bool) -> np.ndarray:
-    values = plane.detach().cpu().float().numpy()
-    if half and np.abs(values).max() > _MAX_HALF:
-        raise DataError(
-            f"{path}: channel {name}: value {np.abs(values).max():.6g} does not fit 16-bit floats ({_MAX_HALF:.0f}); "
-            "write 32-bit floats (half=False)"
-        )
-    return np.ascontiguousarray(values, dtype=np.float16 if half else np.float32)
-
-
-def _write_file(path: Path, channels: dict[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
-    header = {**attributes, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    stored = {name: _stored_values(f"{path}: channel {name}", channel) for name, channel in channels.items()}
+    header = {**(attributes or {}), "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with checked_atomic_path(path) as temporary:
         try:
-            with OpenEXR.File(header, channels) as file:
+            with OpenEXR.File(header, stored) as file:
                 file.write(str(temporary))
         except RuntimeError as error:
             raise DataError(f"{path}: cannot be written ({error})") from None
+
+
+def _stored_values(where: str, channel: ExrChannel) -> np.ndarray:
+    values = channel.values.detach().cpu().float().numpy()
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        y, x = bad[0].tolist()
+        raise DataError(f"{where}: value {values[y, x]} at row {y}, column {x}; expected finite numbers")
+    if channel.half and np.abs(values).max() > _MAX_HALF:
+        found = f"value {np.abs(values).max():.6g} does not fit 16-bit floats ({_MAX_HALF:.0f})"
+        raise DataError(f"{where}: {found}; write 32-bit floats (half=False)")
+    return np.ascontiguousarray(values, dtype=np.float16 if channel.half else np.float32)

@@ -20,22 +20,6 @@ from neuprim.core.io.plain import load_json
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = [
-    "StagedOutput",
-    "atomic_path",
-    "cache_directory",
-    "checked_atomic_path",
-    "fill_folder",
-    "publish_folder",
-    "read_json",
-    "refuse_existing",
-    "remove_leftovers",
-    "staged",
-    "write_json",
-    "write_npy",
-    "write_text",
-]
-
 
 def cache_directory() -> Path:
     """The user's cache folder for this project; ``NEUPRIM_CACHE_DIR`` overrides the platform's convention."""
@@ -48,9 +32,6 @@ def cache_directory() -> Path:
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
     return base / "neuprim"
-
-
-# ---------------------------------------------------------------- one file
 
 
 @contextmanager
@@ -103,11 +84,8 @@ def write_text(path: Path, text: str) -> None:
 def read_json(path: Path, what: str, instead: str) -> Any:
     """Read a JSON file that neuprim wrote; None if there is no file.
 
-    Args:
-        what, instead: for the message: what the file should be, and what the user can do.
-
-    Raises:
-        DataError: the file cannot be read, is not JSON, or holds null.
+    Raises DataError where it cannot be read, is not JSON, or holds null; the message says ``what`` the file should be
+    and what the user can do ``instead``.
     """
     try:
         data = load_json(path.read_text(encoding="utf-8"))
@@ -179,17 +157,10 @@ def _is_running(number: str | None) -> bool:
 
 
 def publish_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
-    """Have ``write`` fill a folder that is renamed to ``final`` when it is done, unless a complete one exists.
+    """Have ``write`` fill a folder that is renamed to ``final`` when it is done, unless a ``complete`` one exists.
 
-    An interrupted call leaves nothing behind. Of several processes the first one wins, so all must write the same
-    files.
-
-    Args:
-        write: fills the empty folder that it is given.
-        complete: whether a folder has all files; an incomplete one at ``final`` is deleted.
-
-    Raises:
-        OSError: the folder cannot be written.
+    An interrupted call leaves nothing behind, and an incomplete folder at ``final`` is deleted. Of several processes
+    the first one wins, so all must write the same files. Raises OSError where the folder cannot be written.
     """
     if complete(final):
         return
@@ -214,9 +185,6 @@ def fill_folder(final: Path, write: Callable[[Path], None], complete: Callable[[
         shutil.rmtree(draft, ignore_errors=True)
 
 
-# ---------------------------------------------------------------- output of code that is not ours
-
-
 def refuse_existing(final: Path, overwrite: bool) -> None:
     """Raise ConfigError if ``final`` is a file or a folder that is not empty, unless it may be overwritten."""
     if overwrite or not os.path.lexists(final):
@@ -224,16 +192,14 @@ def refuse_existing(final: Path, overwrite: bool) -> None:
     if not final.is_dir():
         raise ConfigError(f"{final}: exists; --force replaces it, --out PATH writes elsewhere")
     if any(final.iterdir()):
-        raise ConfigError(
-            f"{final}: exists and is not empty; --force replaces files of the same name, --out PATH writes elsewhere"
-        )
+        remedy = "--force replaces files of the same name, --out PATH writes elsewhere"
+        raise ConfigError(f"{final}: exists and is not empty; {remedy}")
 
 
 class StagedOutput:
     """A place to write what becomes ``final`` once :meth:`publish` moves it.
 
-    Attributes:
-        out: a path with the name of ``final`` that does not exist yet, in a private folder of the same file system.
+    ``out`` has the name of ``final`` and does not exist yet, in a private folder of the same file system.
     """
 
     def __init__(self, folder: Path, final: Path, overwrite: bool) -> None:
@@ -257,8 +223,7 @@ class StagedOutput:
     def publish(self) -> None:
         """Move everything to its place, file by file, also into existing folders.
 
-        Raises:
-            ConfigError: something is in the way; then nothing is moved.
+        If something is in the way, nothing is moved and ConfigError is raised.
         """
         moves: list[tuple[Path, Path]] = []
         for entry in sorted(self._folder.iterdir()):

@@ -25,20 +25,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.exr import MAX_PIXELS, check_pixel_count, is_exr, read_exr, read_exr_layout, refuse_out_of_memory
 from neuprim.core.io.files import checked_atomic_path
 
-__all__ = [
-    "ImageInfo",
-    "image_info",
-    "linear_to_srgb",
-    "pillow_image",
-    "read_image",
-    "read_mask",
-    "srgb_to_linear",
-    "to_uint8",
-    "webp_data_uri",
-    "write_png",
-    "write_webp",
-]
-
+# formats that are refused by name -> byte offset of their signature, and possible signatures
 _OTHER_FORMATS = {
     "AVIF": (4, (b"ftypavif", b"ftypavis")),
     "HEIF": (4, (b"ftyphei", b"ftyphev", b"ftypmif1", b"ftypmsf1")),
@@ -48,31 +35,19 @@ _OTHER_FORMATS = {
     "JPEG 2000": (4, (b"jP  ",)),
     "JPEG XL": (0, (b"\xff\x0a", b"\0\0\0\x0cJXL ")),
 }
-"""Formats that are refused by name -> byte offset of their signature, and possible signatures."""
-
 _PNG_KINDS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 _EXIF_ORIENTATION = 0x0112
 
 
 @dataclass(frozen=True)
 class ImageInfo:
-    """What a file's header says.
-
-    Attributes:
-        width, height: pixels.
-        channels: 3 (RGB), 4 (RGBA), or the number of named channels.
-        linear: True for OpenEXR (linear light, premultiplied alpha), False for the others (sRGB, straight alpha).
-        orientation: EXIF's, 1 to 8; pixels are read as stored whatever it says.
-    """
+    """What a file's header says."""
 
     width: int
     height: int
-    channels: int
-    linear: bool
-    orientation: int = 1
-
-
-# ---------------------------------------------------------------- reading
+    channels: int  # 3 (RGB), 4 (RGBA), or the number of named channels
+    linear: bool  # OpenEXR: linear light, premultiplied alpha; the others: sRGB, straight alpha
+    orientation: int = 1  # EXIF's, 1 to 8; pixels are read as stored whatever it says
 
 
 def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
@@ -114,11 +89,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequen
 
 
 def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
-    """(H, W) bool from an 8-bit PNG, JPEG or WebP: True where any colour channel is not zero; alpha is ignored.
-
-    Raises:
-        DataError: as :func:`read_image`.
-    """
+    """(H, W) bool from a PNG, JPEG or WebP: True where any colour channel is not zero; raises as read_image."""
     with refuse_out_of_memory(path), _open_image(path) as image:
         _lossless_mode(path, image)
         _check_size(path, image.width, image.height, size)
@@ -144,15 +115,12 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
     except Exception as error:  # Pillow's plugins raise many types for damaged headers
         with open(path, "rb") as file:
             head = file.read(16)
+        expected = "PNG, JPEG, WebP or OpenEXR"
         for name, (at, signatures) in _OTHER_FORMATS.items():
             if head[at:].startswith(signatures):
-                raise DataError(
-                    f"{path}: image is {name}; expected PNG, JPEG, WebP or OpenEXR: convert it to one of them"
-                ) from None
-        raise DataError(
-            f"{path}: not a readable PNG or JPEG image ({type(error).__name__}: {error}); "
-            "expected PNG, JPEG, WebP or OpenEXR"
-        ) from None
+                raise DataError(f"{path}: image is {name}; expected {expected}: convert it to one of them") from None
+        found = f"not a readable PNG or JPEG image ({type(error).__name__}: {error})"
+        raise DataError(f"{path}: {found}; expected {expected}") from None
     with image:
         check_pixel_count(path, image.width, image.height)
         yield image
@@ -166,11 +134,7 @@ def _png_depth_and_kind(path: Path) -> tuple[int, int]:
 
 
 def _lossless_mode(path: Path, image: Image.Image) -> str:
-    """RGB or RGBA, whichever holds the image without loss.
-
-    Raises:
-        DataError: neither does, or it is an animation.
-    """
+    """RGB or RGBA, whichever holds the image without loss; raises DataError where neither does, and for animations."""
     depth, kind = _png_depth_and_kind(path)
     if depth == 16 or image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
         what = {"L": "8-bit grey JPEG", "CMYK": "CMYK JPEG"}.get(image.mode, f"{image.format} of mode {image.mode}")
@@ -203,21 +167,12 @@ def _decode(path: Path, image: Image.Image, mode: str) -> np.ndarray:
     except MemoryError:
         raise
     except Exception as error:  # Pillow's decoders raise OSError, SyntaxError, ValueError, struct.error, ...
-        raise DataError(
-            f"{path}: image data is truncated or corrupt ({error}); "
-            f"expected a complete {image.width}x{image.height} image"
-        ) from None
-
-
-# ---------------------------------------------------------------- writing
+        expected = f"a complete {image.width}x{image.height} image"
+        raise DataError(f"{path}: image data is truncated or corrupt ({error}); expected {expected}") from None
 
 
 def to_uint8(image: Tensor) -> Tensor:
-    """Display-referred values 0..1 of any shape as uint8, rounded and clamped; uint8 is returned unchanged.
-
-    Raises:
-        DataError: NaN values.
-    """
+    """Display-referred values 0..1 of any shape as uint8, rounded and clamped; raises DataError for NaN."""
     if image.dtype == torch.uint8:
         return image
     if torch.isnan(image).any():
@@ -226,11 +181,7 @@ def to_uint8(image: Tensor) -> Tensor:
 
 
 def pillow_image(path: Path, image: Tensor) -> Image.Image:
-    """Convert (H, W, 3 or 4) sRGB values to an 8-bit Pillow image; ``path`` is for messages.
-
-    Raises:
-        DataError: wrong shape or NaN values.
-    """
+    """Convert (H, W, 3 or 4) sRGB values to an 8-bit image; raises DataError with ``path`` for a shape or NaN."""
     if image.ndim != 3 or image.shape[-1] not in (3, 4) or 0 in image.shape:
         raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected (H, W, 3) or (H, W, 4)")
     try:
@@ -242,8 +193,7 @@ def pillow_image(path: Path, image: Tensor) -> Image.Image:
 def write_png(path: Path, image: Tensor) -> None:
     """Write (H, W, 3 or 4) sRGB values, float 0..1 (clamped, rounded) or uint8, with straight alpha; atomic.
 
-    Raises:
-        DataError: wrong shape, NaN values, or the file cannot be written.
+    Raises DataError for a wrong shape, NaN values, or where the file cannot be written.
     """
     picture = pillow_image(path, image)
     with checked_atomic_path(path) as temporary:
@@ -266,9 +216,6 @@ def webp_data_uri(image: Tensor, max_width: int, quality: int = 85) -> str:
     file = io.BytesIO()
     picture.save(file, "WEBP", quality=quality)
     return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
-
-
-# ---------------------------------------------------------------- transfer curve
 
 
 def srgb_to_linear(values: Tensor) -> Tensor:

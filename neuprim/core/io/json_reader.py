@@ -15,8 +15,6 @@ from torch import Tensor
 from neuprim.core.errors import DataError, cut
 from neuprim.core.io.plain import finite, load_json
 
-__all__ = ["JsonReader"]
-
 _MISSING = object()
 
 
@@ -31,23 +29,14 @@ def _describe(value: Any) -> str:
 
 @dataclass(frozen=True)
 class JsonReader:
-    """One JSON object and where it is.
-
-    Attributes:
-        values: the object's fields.
-        where: prefix of messages, e.g. ``"/data/transforms.json: frames[3]"``.
-    """
+    """One JSON object and where it is."""
 
     values: dict[str, Any]
-    where: str
+    where: str  # prefix of messages, e.g. "/data/transforms.json: frames[3]"
 
     @classmethod
     def open(cls, path: Path, max_bytes: float = math.inf) -> JsonReader:
-        """Read the object of a file of camera poses.
-
-        Raises:
-            DataError: missing, unreadable or larger file, not UTF-8, not JSON, or not an object at top level.
-        """
+        """Read the object of a file of camera poses; raises DataError for anything else."""
         try:
             if path.stat().st_size > max_bytes:
                 raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {max_bytes:.0f}")
@@ -126,8 +115,6 @@ class JsonReader:
         rows = self.values.get(key)
         expected = "4 rows of 4 numbers"
         if not isinstance(rows, list) or len(rows) not in (3, 4):
-            raise self.fail(key, expected)
-        if not all(isinstance(row, list) and len(row) == 4 for row in rows):
             raise self.fail(key, expected)
         matrix = self.array(key, (len(rows), 4), expected)
         last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)

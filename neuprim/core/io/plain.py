@@ -15,8 +15,6 @@ import yaml
 
 from neuprim.core.errors import cut
 
-__all__ = ["finite", "load_json", "load_yaml"]
-
 _MAX_DIGITS = 20  # of a whole number of 64 bits
 
 

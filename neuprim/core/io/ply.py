@@ -18,22 +18,10 @@ import numpy as np
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import atomic_path
 
-__all__ = ["PlyElement", "PlyList", "PlyVertices", "read_elements", "read_ply", "write_ply"]
-
-_NAMES = {
-    "i1": "char",
-    "u1": "uchar",
-    "i2": "short",
-    "u2": "ushort",
-    "i4": "int",
-    "u4": "uint",
-    "f4": "float",
-    "f8": "double",
-}
-_TYPES = {name: kind for kind, name in _NAMES.items()} | {
-    name: np.dtype(name).str[1:]
-    for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
-}
+_KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+_NAMES = dict(zip(_KINDS, ("char", "uchar", "short", "ushort", "int", "uint", "float", "double"), strict=True))
+_TYPES = {name: kind for kind, name in _NAMES.items()}
+_TYPES |= {np.dtype(kind).name: kind for kind in (*_KINDS, "i8", "u8")}  # "uint8" and the like
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER_BYTES = 4 * 2**20
 _MAX_PROPERTIES = 10_000
@@ -41,15 +29,10 @@ _MAX_PROPERTIES = 10_000
 
 @dataclass(frozen=True)
 class PlyVertices:
-    """Vertices of a file.
+    """Vertices of a file."""
 
-    Attributes:
-        rows: structured array (N,) with one field per scalar property, in the file's byte order.
-        comments: without the keyword.
-    """
-
-    rows: np.ndarray
-    comments: tuple[str, ...] = ()
+    rows: np.ndarray  # (N,) structured: one field per scalar property, in the file's byte order
+    comments: tuple[str, ...] = ()  # without the keyword
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,40 +62,26 @@ class PlyElement(PlyVertices):
 
 @dataclass(frozen=True)
 class _ElementHeader:
-    """An element of the header; fields are (property, type, type of the list's length or "" for a scalar)."""
-
     name: str
     count: int
-    fields: list[tuple[str, str, str]]
+    fields: list[tuple[str, str, str]]  # property, type, and the type of a list's length or "" for a scalar
 
 
 def write_ply(path: Path, rows: np.ndarray, comments: Sequence[str] = ()) -> None:
-    """Write a structured array as the vertices of a binary little-endian file, atomically.
-
-    Raises:
-        ValueError: a comment of more than one line.
-    """
+    """Write a structured array as the vertices of a binary file, atomically; each comment must be one line."""
     if any("\n" in c or "\r" in c for c in comments):
         raise ValueError("a PLY comment is one line")
     fields = [(name, rows.dtype[name].newbyteorder("<")) for name in rows.dtype.names or ()]
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        *(f"comment {c}" for c in comments),
-        f"element vertex {len(rows)}",
-    ]
-    lines += [f"property {_NAMES[dtype.str[1:]]} {name}" for name, dtype in fields] + ["end_header", ""]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
+    lines += [f"element vertex {len(rows)}", *(f"property {_NAMES[dtype.str[1:]]} {name}" for name, dtype in fields)]
+    lines += ["end_header", ""]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join(lines).encode("utf-8"))
         file.write(np.ascontiguousarray(rows.astype(fields)).tobytes())
 
 
 def read_ply(path: Path) -> PlyVertices:
-    """Read the vertices of a file.
-
-    Raises:
-        DataError: missing or damaged file; names the file, the problem and what was expected.
-    """
+    """Read the vertices of a file; raises DataError for a missing or damaged one."""
     try:
         with open(path, "rb") as file:
             return read_elements(file, path.stat().st_size, path, ("vertex",))["vertex"]
@@ -121,14 +90,9 @@ def read_ply(path: Path) -> PlyVertices:
 
 
 def read_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) -> dict[str, PlyElement]:
-    """Read the ``wanted`` elements that a file has and no data behind them; the header must have vertices.
+    """Read the ``wanted`` elements that a file of ``size`` bytes has and no data behind them.
 
-    Args:
-        size: of the file, in bytes.
-        path: for messages.
-
-    Raises:
-        DataError: as :func:`read_ply`.
+    The header must have vertices. Raises DataError as :func:`read_ply`; ``path`` is for messages.
     """
     order, elements, comments = _read_header(file, path)
     result: dict[str, PlyElement] = {}
@@ -137,9 +101,10 @@ def read_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) 
         if not missing:
             break
         left = size - file.tell()
-        rows, lists = (
-            _read_binary(file, path, element, order, left) if order else _read_ascii(file, path, element, left)
-        )
+        if order:
+            rows, lists = _read_binary(file, path, element, order, left)
+        else:
+            rows, lists = _read_ascii(file, path, element, left)
         if element.name in missing:
             result[element.name] = PlyElement(rows, comments, lists)
             missing.remove(element.name)
@@ -156,11 +121,8 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_ElementHeader],
         raw = file.readline(budget + 1)
         budget -= len(raw)
         if budget < 0 or not raw.endswith(b"\n"):
-            raise DataError(
-                f"{path}: header has no end_header"
-                + f" in {_MAX_HEADER_BYTES} bytes" * (budget < 0)
-                + "; expected a PLY file"
-            )
+            within = f" in {_MAX_HEADER_BYTES} bytes" if budget < 0 else ""
+            raise DataError(f"{path}: header has no end_header{within}; expected a PLY file")
         line = raw.decode("utf-8", "replace").rstrip("\r\n")
         words = line.split()
         if number == 0:
@@ -183,9 +145,8 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_ElementHeader],
         elif words == ["end_header"]:
             break
         else:
-            raise DataError(
-                f"{path}: header line {number + 1} is {line[:60]!r}; expected format, element, property or comment"
-            )
+            expected = "format, element, property or comment"
+            raise DataError(f"{path}: header line {number + 1} is {line[:60]!r}; expected {expected}")
     vertices = next((element for element in elements if element.name == "vertex"), None)
     if order is None or vertices is None or not vertices.fields:
         missing = "format" if order is None else "element vertex" if vertices is None else "property of the vertices"
@@ -208,9 +169,8 @@ def _parse_property(words: list[str], path: Path) -> tuple[str, str, str]:
         return words[2], _TYPES[words[1]], ""
     if len(words) == 5 and words[1] == "list" and words[3] in _TYPES and _TYPES.get(words[2], "f")[0] != "f":
         return words[4], _TYPES[words[3]], _TYPES[words[2]]
-    raise DataError(
-        f"{path}: {' '.join(words)[:60]!r}; expected a property as 'property float x' or 'property list uchar int x'"
-    )
+    expected = "a property as 'property float x' or 'property list uchar int x'"
+    raise DataError(f"{path}: {' '.join(words)[:60]!r}; expected {expected}")
 
 
 _Values = tuple[np.ndarray, dict[str, PlyList]]
@@ -229,9 +189,12 @@ def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str
     sizes = _first_sizes(file, fields, order)
     file.seek(start)
     if sizes is not None:
-        dtype = np.dtype(
-            [part for field_, size in zip(fields, sizes, strict=True) for part in _row_layout(field_, size, order)]
-        )
+        layout: list[tuple] = []
+        for (name, kind, length), size in zip(fields, sizes, strict=True):
+            layout += (
+                [("#" + name, order + length), (name, order + kind, (size,))] if length else [(name, order + kind)]
+            )
+        dtype = np.dtype(layout)
         if count * dtype.itemsize <= left:
             data = bytearray(file.read(count * dtype.itemsize))  # writable, unlike bytes
             table = np.frombuffer(data, dtype)
@@ -244,16 +207,9 @@ def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str
                 return rows, {name: PlyList(np.full(count, size), table[name].reshape(-1)) for name, size in lists}
             file.seek(start)
         elif not any(length for _, _, length in fields):
-            raise DataError(
-                f"{path}: {count} {_describe(element)} of {dtype.itemsize} bytes; "
-                f"only {left} bytes follow; expected a complete file"
-            )
+            found = f"{count} {_describe(element)} of {dtype.itemsize} bytes; only {left} bytes follow"
+            raise DataError(f"{path}: {found}; expected a complete file")
     return _read_row_by_row(file, path, element, order, left)
-
-
-def _row_layout(declared: tuple[str, str, str], size: int, order: str) -> list[tuple]:
-    name, kind, length = declared
-    return [("#" + name, order + length), (name, order + kind, (size,))] if length else [(name, order + kind)]
 
 
 def _first_sizes(file: BinaryIO, fields: list[tuple[str, str, str]], order: str) -> list[int] | None:
@@ -308,10 +264,8 @@ def _read_row_by_row(file: BinaryIO, path: Path, element: _ElementHeader, order:
 def _read_ascii(file: BinaryIO, path: Path, element: _ElementHeader, left: int) -> _Values:
     count, fields = element.count, element.fields
     if count * (2 * len(fields)) > left + 1:  # a digit and a blank each
-        raise DataError(
-            f"{path}: {count} {_describe(element)} of {len(fields)} numbers; only {left} bytes follow; "
-            "expected a complete file"
-        )
+        found = f"{count} {_describe(element)} of {len(fields)} numbers; only {left} bytes follow"
+        raise DataError(f"{path}: {found}; expected a complete file")
     scalars = [(name, kind) for name, kind, length in fields if not length]
     if not count or not fields:
         return np.zeros(0, [(name, "<" + kind) for name, kind in scalars]), {}
@@ -324,19 +278,18 @@ def _read_ascii(file: BinaryIO, path: Path, element: _ElementHeader, left: int) 
         else:
             table, lists = _read_ascii_lists(file, element)
     except (ValueError, IndexError) as error:
-        raise DataError(
-            f"{path}: {_describe(element)} are not numbers ({' '.join(str(error).split())[:120]})"
-        ) from error
+        reason = " ".join(str(error).split())[:120]
+        raise DataError(f"{path}: {_describe(element)} are not numbers ({reason})") from error
     if table.shape != (count, len(scalars)):
         found = f"{table.shape[0]} {_describe(element)} of {table.shape[1]} numbers"
         raise DataError(f"{path}: {found}; expected {count} of {len(scalars)}")
     rows = np.zeros(count, [(name, "<" + kind) for name, kind in scalars])
     for i, (name, kind) in enumerate(scalars):
         rows[name] = _cast(table[:, i], name, kind, path)
-    kinds = {name: kind for name, kind, length in fields if length}
-    return rows, {
-        name: PlyList(found.sizes, _cast(found.values, name, kinds[name], path)) for name, found in lists.items()
-    }
+    for name, kind, length in fields:
+        if length:
+            lists[name] = PlyList(lists[name].sizes, _cast(lists[name].values, name, kind, path))
+    return rows, lists
 
 
 def _cast(values: np.ndarray, name: str, kind: str, path: Path) -> np.ndarray:

@@ -21,30 +21,18 @@ from typing import Any, TypeVar
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NeuprimError, cut
 from neuprim.core.io.files import atomic_path, checked_atomic_path, fill_folder
 
-__all__ = ["MAX_WAIT", "POLL_INTERVAL", "WAIT_MESSAGE", "Store", "open_store"]
-
-MAX_WAIT = 60.0
-"""Seconds to wait for a shared folder that disappeared."""
-
-POLL_INTERVAL = 0.5
-"""Seconds between two checks whether it is back."""
-
-WAIT_MESSAGE = "waiting for"
-"""Start of the line that says so."""
-
+MAX_WAIT = 60.0  # seconds to wait for a shared folder that disappeared
+POLL_INTERVAL = 0.5  # seconds between two checks whether it is back
+WAIT_MESSAGE = "waiting for"  # start of the line that says so
 _DISAPPEARED = (errno.ENOENT, errno.ESTALE, errno.ENOTCONN, errno.EIO)
 _BUCKETS = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "oss")
-PROTOCOLS = ("file", "local", "memory", *_BUCKETS)
-"""Allowed protocols of a URL. fsspec's others run commands, open archives or chain stores."""
+PROTOCOLS = ("file", "local", "memory", *_BUCKETS)  # fsspec's others run commands, open archives or chain stores
 
 T = TypeVar("T")
 
 
 def open_store(address: str, copies: Path) -> Store:
-    """Open the store at a folder's path or a URL.
-
-    Args:
-        copies: local folder for copies of files that are fetched from an object store.
+    """Open the store at a folder's path or a URL; files of an object store are copied to the folder ``copies``.
 
     Raises:
         ConfigError: none of :data:`PROTOCOLS`, or a chain of them.
@@ -54,9 +42,8 @@ def open_store(address: str, copies: Path) -> Store:
     protocol, is_url, path = address.partition("://")
     if "::" in address or (is_url and protocol not in PROTOCOLS):
         what = "a chain of protocols" if "::" in address else f"protocol {cut(protocol)!r}"
-        raise ConfigError(
-            f"{cut(address)}: {what}; expected a folder, or a URL of {', '.join(PROTOCOLS)}, as s3://BUCKET/FOLDER"
-        )
+        expected = f"a folder, or a URL of {', '.join(PROTOCOLS)}, as s3://BUCKET/FOLDER"
+        raise ConfigError(f"{cut(address)}: {what}; expected {expected}")
     if not is_url:
         return Store.local(Path(address).expanduser().absolute())
     if protocol in ("file", "local"):
@@ -67,13 +54,11 @@ def open_store(address: str, copies: Path) -> Store:
         system, root = fsspec.core.url_to_fs(address)
     except ImportError as error:
         extra = ": pip install 'neuprim[s3]'" if protocol in ("s3", "s3a") else ""
-        raise BackendUnavailable(
-            f"{address}: {protocol}:// needs a package that is not installed ({_line(error)}){extra}"
-        ) from None
+        what = f"{protocol}:// needs a package that is not installed ({_line(error)}){extra}"
+        raise BackendUnavailable(f"{address}: {what}") from None
     except ValueError as error:
-        raise ConfigError(
-            f"{address}: {_line(error)}; expected a folder or a URL that fsspec knows, as s3://BUCKET/FOLDER"
-        ) from None
+        expected = "a folder or a URL that fsspec knows, as s3://BUCKET/FOLDER"
+        raise ConfigError(f"{address}: {_line(error)}; expected {expected}") from None
     except Exception as error:
         raise DataError(f"{address}: cannot be reached ({_line(error)})") from error
     digest = hashlib.sha256(address.rstrip("/").encode()).hexdigest()[:16]
@@ -83,11 +68,7 @@ def open_store(address: str, copies: Path) -> Store:
 class Store:
     """Folders of files in one place; the content of a name never changes, so local copies stay valid.
 
-    Args:
-        address: folder or URL, for messages.
-        path: the local folder itself, or that for copies of fetched files.
-        system: fsspec's file system; None for a local folder.
-        root: the place in ``system``.
+    ``path`` is the local folder itself, or that for copies of files from ``root`` in fsspec's ``system``.
     """
 
     def __init__(self, address: str, path: Path, system: Any = None, root: str = "") -> None:
@@ -100,7 +81,6 @@ class Store:
 
     @property
     def is_local(self) -> bool:
-        """Whether files are read in place."""
         return self._system is None
 
     def at(self, *names: str) -> Store:
@@ -230,10 +210,8 @@ class Store:
         notify(f"{WAIT_MESSAGE} {self.path}, which is gone")
         while self._is_gone():
             if time.monotonic() > deadline:
-                raise DataError(
-                    f"{self.path}: gone for {MAX_WAIT:.0f} s while it was in use; "
-                    "expected the folder there again (what it holds is kept)"
-                )
+                found = f"gone for {MAX_WAIT:.0f} s while it was in use"
+                raise DataError(f"{self.path}: {found}; expected the folder there again (what it holds is kept)")
             time.sleep(POLL_INTERVAL)
 
     @contextmanager

@@ -9,11 +9,8 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["ENVIRONMENT", "FLAG", "trusted", "trusting"]
-
 FLAG = "--trust"
-ENVIRONMENT = "NEUPRIM_TRUST"
-"""Environment variable that says the flag for every command; processes that a command starts inherit it."""
+ENVIRONMENT = "NEUPRIM_TRUST"  # says the flag for every command; processes that a command starts inherit it
 
 
 def trusted() -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib import import_module
 from typing import Any
 
 from neuprim.core.data import Dataset
@@ -29,10 +31,8 @@ def _check(model: Mapping[str, Any]) -> None:
     validate_choices(model["density"], "model.density", {"form": ("cosine", "gaussian"), **DENSITY_OPTIONS})
     others = [key for key in model["density"] if key != "form"]
     if model["density"].get("form") == "gaussian" and others:
-        raise ConfigError(
-            f"model.density.{others[0]}: of densities of the form cosine; expected none with "
-            "model.density.form=gaussian"
-        )
+        expected = "none with model.density.form=gaussian"
+        raise ConfigError(f"model.density.{others[0]}: of densities of the form cosine; expected {expected}")
     validate_choices(model["colour"], "model.colour", {})
 
 
@@ -41,19 +41,10 @@ def _trade(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
     return {**(DENSITY_TRADE if cosine else {}), "model.sh_degree": (0, 1, 2, 3)}
 
 
-# Loaders are imported when used: each pulls in a library of its own.
-
-
-def _solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.static.generated import load_solids
-
-    return load_solids(settings, context)
-
-
-def _room(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.static.generated import load_room
-
-    return load_room(settings, context)
+def _load(module: str, function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """Import a loader when it is used, as each pulls in a library of its own, and call it."""
+    loader: Callable[..., Dataset] = getattr(import_module(f"neuprim.tasks.static.{module}"), function)
+    return loader(settings, context)
 
 
 def _mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
@@ -61,27 +52,7 @@ def _mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         import trimesh  # noqa: F401
     except ImportError as error:
         raise BackendUnavailable(f"scene=mesh needs the package trimesh ({error}): pip install trimesh") from error
-    from neuprim.tasks.static.mesh import load
-
-    return load(settings, context)
-
-
-def _blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.static.datasets import load_blender
-
-    return load_blender(settings, context)
-
-
-def _nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.static.datasets import load_nerfstudio
-
-    return load_nerfstudio(settings, context)
-
-
-def _colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.static.datasets import load_colmap
-
-    return load_colmap(settings, context)
+    return _load("mesh", "load", settings, context)
 
 
 def _facts(dataset: Dataset) -> Mapping[str, Any]:
@@ -95,14 +66,28 @@ TASK = TaskSpec(
     summary="A scene that does not change, from posed images (spherical-harmonics colour)",
     config_package="neuprim.tasks.static.conf",
     scenes=(
-        SceneSpec("solids", "built in: sharp edges, thin rods, a curved handle; generated in seconds", _solids),
         SceneSpec(
-            "room", "built in: the solids in a textured room, taken like photographs: lens, exposures, points", _room
+            "solids",
+            "built in: sharp edges, thin rods, a curved handle; generated in seconds",
+            partial(_load, "generated", "load_solids"),
+        ),
+        SceneSpec(
+            "room",
+            "built in: the solids in a textured room, taken like photographs: lens, exposures, points",
+            partial(_load, "generated", "load_room"),
         ),
         SceneSpec("mesh", "your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE", _mesh),
-        SceneSpec("blender", "NeRF-synthetic layout: transforms_train.json, RGBA images", _blender),
-        SceneSpec("nerfstudio", "instant-ngp / nerfstudio transforms.json", _nerfstudio),
-        SceneSpec("colmap", "COLMAP sparse/0 and images (needs neuprim[colmap])", _colmap),
+        SceneSpec(
+            "blender",
+            "NeRF-synthetic layout: transforms_train.json, RGBA images",
+            partial(_load, "datasets", "load_blender"),
+        ),
+        SceneSpec(
+            "nerfstudio", "instant-ngp / nerfstudio transforms.json", partial(_load, "datasets", "load_nerfstudio")
+        ),
+        SceneSpec(
+            "colmap", "COLMAP sparse/0 and images (needs neuprim[colmap])", partial(_load, "datasets", "load_colmap")
+        ),
     ),
     build=_build,
     loss=photometric,

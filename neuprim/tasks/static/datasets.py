@@ -55,8 +55,6 @@ from neuprim.core.notices import warn_once
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import nonempty_text, validate
 
-__all__ = ["BlenderSettings", "ColmapSettings", "NerfstudioSettings", "load_blender", "load_colmap", "load_nerfstudio"]
-
 
 @dataclass(frozen=True)
 class BlenderSettings(FolderSettings):
@@ -75,9 +73,7 @@ class BlenderSettings(FolderSettings):
 def load_blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load a NeRF-synthetic folder; straight-alpha PNG is premultiplied in its stored sRGB values.
 
-    Raises:
-        ConfigError: unknown or impossible settings.
-        DataError: missing or damaged files, wrong or missing fields, mixed image sizes, impossible cameras.
+    Raises ConfigError for settings, and DataError for missing or damaged files, wrong fields or mixed image sizes.
     """
     asked = validate(BlenderSettings, settings, "scene")
     folder = find_data_folder(asked.path)
@@ -90,10 +86,8 @@ def load_blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         for frame in frames:
             info, first = frame.info, frames[0].info
             if (info.width, info.height) != (first.width, first.height):
-                found = (
-                    f"image is {info.width}x{info.height}; expected {first.width}x{first.height} as {frames[0].path}"
-                )
-                raise DataError(f"{frame.path}: {found}{exif_hint(info)}")
+                expected = f"{first.width}x{first.height} as {frames[0].path}{exif_hint(info)}"
+                raise DataError(f"{frame.path}: image is {info.width}x{info.height}; expected {expected}")
         return frames
 
     train, test = read_transforms_splits(folder, asked.train_split, asked.test_split, asked.hold_out, read)
@@ -117,10 +111,7 @@ class NerfstudioSettings(FolderSettings):
 def load_nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load a nerfstudio or instant-ngp capture; photographs are undistorted and masked.
 
-    Raises:
-        ConfigError: unknown or impossible settings.
-        DataError: missing or damaged files, wrong or missing fields, impossible cameras, an unknown camera model, empty
-            splits.
+    Raises ConfigError for settings, and DataError for missing or damaged files, wrong fields or empty splits.
     """
     asked = validate(NerfstudioSettings, settings, "scene")
     folder = find_data_folder(asked.path)
@@ -130,16 +121,13 @@ def load_nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Datas
     layout = TransformsLayout(keys=("ply_file_path", "train_filenames", "val_filenames", "test_filenames"), masks=True)
     records, frames = read_transforms_frames(folder, document, records, asked, layout, asked.skip_missing)
     train, test = split_named_frames(document, records, frames, asked.test_every)
-    points = _read_nerfstudio_points(folder, document) if document.has("ply_file_path") else None
+    points = None
+    if document.has("ply_file_path"):  # in the frame of the poses
+        cloud = folder / document.text("ply_file_path")
+        if not cloud.is_file():
+            raise missing_files_error(f"{document.where}: ply_file_path", [str(cloud)])
+        points = read_points(cloud, 3, "srgb")
     return assemble_dataset(str(path), folder.resolve().name, train, test, asked, context, SceneDetails(points=points))
-
-
-def _read_nerfstudio_points(folder: Path, document: JsonReader) -> PointCloud:
-    """Points of ``ply_file_path``, in the frame of the poses."""
-    path = folder / document.text("ply_file_path")
-    if not path.is_file():
-        raise missing_files_error(f"{document.where}: ply_file_path", [str(path)])
-    return read_points(path, 3, "srgb")
 
 
 @dataclass(frozen=True)
@@ -164,11 +152,8 @@ def load_colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
     Distorted models become pinholes of the same focal lengths. Pixels that a photograph does not show are masked.
 
-    Raises:
-        BackendUnavailable: pycolmap is not installed.
-        ConfigError: unknown or impossible settings.
-        DataError: missing or damaged files, unsupported or impossible cameras, image sizes that are no reduction of the
-            model's, no posed images, empty splits.
+    Raises ConfigError for settings, BackendUnavailable without pycolmap, and DataError for missing or damaged files,
+    impossible cameras, image sizes that are no reduction of the model's, no posed images or empty splits.
     """
     asked = validate(ColmapSettings, settings, "scene")
     folder = find_data_folder(asked.path)
@@ -197,17 +182,15 @@ def _read_colmap_frames(model: Path, folder: Path, reconstruction: Any, asked: C
     files = [place / i.name if (place / i.name).is_file() else find_image(place, i.name) for i in posed]
     absent = [i.name for i, file in zip(posed, files, strict=True) if file is None]
     if absent and (not asked.skip_missing or len(absent) == len(posed)):
-        raise missing_files_error(
-            str(place), absent, "" if asked.skip_missing else "; scene.skip_missing=true leaves such images out"
-        )
+        hint = "" if asked.skip_missing else "; scene.skip_missing=true leaves such images out"
+        raise missing_files_error(str(place), absent, hint)
     present = [(i, file) for i, file in zip(posed, files, strict=True) if file is not None]
-    _tell_unposed(place, {file for _, file in present}, model)
+    _warn_of_unposed_images(place, {file for _, file in present}, model)
     masks = find_masks(folder, [file for _, file in present], place)
+    names = unique_view_names([i.name for i, _ in present], str(model))
     frames: list[ImageFrame] = []
     bad = BadViews(str(model), asked.strict)
-    for (image, file), mask, name in zip(
-        present, masks, unique_view_names([i.name for i, _ in present], str(model)), strict=True
-    ):
+    for (image, file), mask, name in zip(present, masks, names, strict=True):
         where = f"{model}: camera {image.camera_id} of image {image.name}"
         read = bad.read(name, _info_and_pose, image, file, where)
         if read is None:
@@ -221,19 +204,13 @@ def _read_colmap_frames(model: Path, folder: Path, reconstruction: Any, asked: C
     return frames
 
 
-def _tell_unposed(place: Path, posed: set[Path], model: Path) -> None:
+def _warn_of_unposed_images(place: Path, posed: set[Path], model: Path) -> None:
     """Say how many images of the folder the model has no pose of."""
-    suffixes = {suffix.lower() for suffix in IMAGE_SUFFIXES}
-    others = [
-        p
-        for p in place.rglob("*")
-        if p.suffix.lower() in suffixes and p not in posed and not p.name.startswith("dynamic_mask_")
-    ]
+    images = {p for p in place.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES}
+    others = [p for p in images - posed if not p.name.startswith("dynamic_mask_")]
     if others:
-        warn_once(
-            f"{place}: {len(others)} of {len(posed) + len(others)} images have no pose in {model}, e.g. "
-            f"{min(others).name}; left out"
-        )
+        found = f"{len(others)} of {len(posed) + len(others)} images have no pose in {model}, e.g. {min(others).name}"
+        warn_once(f"{place}: {found}; left out")
 
 
 def _info_and_pose(image: Any, file: Path, where: str) -> tuple[ImageInfo, Tensor]:
@@ -244,16 +221,12 @@ def _info_and_pose(image: Any, file: Path, where: str) -> tuple[ImageInfo, Tenso
 
 def _colmap_camera(where: str, image: Any, viewmat: Tensor, file: Path, info: ImageInfo) -> Camera:
     lens = image.camera
+    size = f"{lens.width}x{lens.height}"
     if lens.width <= 0 or lens.height <= 0 or not np.isfinite(lens.params).all():
-        raise DataError(
-            f"{where}: size {lens.width}x{lens.height}, parameters {lens.params}; expected a positive size, "
-            "finite numbers"
-        )
+        raise DataError(f"{where}: size {size}, parameters {lens.params}; expected a positive size, finite numbers")
     if not is_resized_copy((lens.width, lens.height), (info.width, info.height)):
-        found = (
-            f"image is {info.width}x{info.height}; expected {lens.width}x{lens.height} ({where}) or a reduction of it"
-        )
-        raise DataError(f"{file}: {found}{exif_hint(info)}")
+        expected = f"{size} ({where}) or a reduction of it{exif_hint(info)}"
+        raise DataError(f"{file}: image is {info.width}x{info.height}; expected {expected}")
     fx, fy, cx, cy = pinhole_parameters(lens, where)
     return Camera(viewmat, fx, fy, cx, cy, int(lens.width), int(lens.height)).resized(info.width, info.height)
 
@@ -274,9 +247,8 @@ class _Lens(Distortion):
         return _Lens(lens.model_name, int(lens.width), int(lens.height), tuple(map(float, lens.params)), scale)
 
     def project(self, points: np.ndarray, camera: Camera) -> np.ndarray:
-        lens = import_pycolmap().Camera(
-            model=self.model, width=self.width, height=self.height, params=list(self.params)
-        )
+        size = {"width": self.width, "height": self.height}
+        lens = import_pycolmap().Camera(model=self.model, **size, params=list(self.params))
         rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
         return np.asarray(lens.img_from_cam(rays), dtype=np.float64) * self.scale
 
@@ -290,8 +262,6 @@ def _read_colmap_points(reconstruction: Any, model: Path) -> PointCloud | None:
     colors = np.array([p.color for p in points], dtype=np.float64) / 255.0
     keep = np.isfinite(means).all(axis=1)
     if not keep.all():
-        raise DataError(
-            f"{model}: points3D: {int((~keep).sum())} of {len(points)} points are not finite; expected finite "
-            "coordinates"
-        )
+        found = f"{int((~keep).sum())} of {len(points)} points are not finite"
+        raise DataError(f"{model}: points3D: {found}; expected finite coordinates")
     return PointCloud(torch.from_numpy(means), torch.from_numpy(colors).float())

@@ -14,8 +14,6 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
 
-__all__ = ["SphericalHarmonics"]
-
 
 class SphericalHarmonics(ColourField):
     """c = max(0, SH(direction camera -> mu) + 0.5), degree 0..3; C (degree + 1)^2 parameters.

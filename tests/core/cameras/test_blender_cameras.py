@@ -52,35 +52,17 @@ class Camera:
         wide, high = (side, side * y / x) if x >= y else (side * x / y, side)
         left, right = (-0.5 * wide + self.shift[0] * side, 0.5 * wide + self.shift[0] * side)
         bottom, top = (-0.5 * high + self.shift[1] * side, 0.5 * high + self.shift[1] * side)
-        return Matrix(
-            [
-                [2 / (right - left), 0, (right + left) / (right - left), 0],
-                [0, 2 / (top - bottom), (top + bottom) / (top - bottom), 0],
-                [0, 0, -1, -0.2],
-                [0, 0, -1, 0],
-            ]
-        )
+        across = [2 / (right - left), 0, (right + left) / (right - left), 0]
+        down = [0, 2 / (top - bottom), (top + bottom) / (top - bottom), 0]
+        return Matrix([across, down, [0, 0, -1, -0.2], [0, 0, -1, 0]])
 
 
-def run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, camera: Camera, size: tuple[int, int], percentage: int = 100
-) -> Path:
-    scene = SimpleNamespace(
-        camera=camera,
-        render=SimpleNamespace(
-            resolution_x=size[0],
-            resolution_y=size[1],
-            resolution_percentage=percentage,
-            fps=24,
-            fps_base=1.0,
-            pixel_aspect_x=1.0,
-            pixel_aspect_y=1.0,
-        ),
-        frame_start=3,
-        frame_end=7,
-        frame_step=2,
-        frame_set=lambda frame: setattr(camera, "x", float(frame)),
-    )
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, camera: Camera, size: tuple[int, int]) -> Path:
+    width, height = size
+    render = SimpleNamespace(resolution_x=width, resolution_y=height, resolution_percentage=100, fps=24, fps_base=1.0)
+    render.pixel_aspect_x = render.pixel_aspect_y = 1.0
+    scene = SimpleNamespace(camera=camera, render=render, frame_start=3, frame_end=7, frame_step=2)
+    scene.frame_set = lambda frame: setattr(camera, "x", float(frame))
     bpy = ModuleType("bpy")
     bpy.context = SimpleNamespace(scene=scene, evaluated_depsgraph_get=lambda: "depsgraph")  # type: ignore[attr-defined]
     bpy.path = SimpleNamespace(abspath=lambda text: str(tmp_path / text.removeprefix("//")))  # type: ignore[attr-defined]

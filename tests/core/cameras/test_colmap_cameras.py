@@ -30,27 +30,15 @@ def check(path: Path) -> None:
     found = read_camera_file(path)
     assert [name for name, _ in found.named] == ["a", "b"] and found.notes == () and found.times is None
     camera = found.named[0][1]
-    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height) == (
-        500,
-        510,
-        320.5,
-        240.25,
-        640,
-        480,
-    )
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (500, 510, 320.5, 240.25)
+    assert (camera.width, camera.height) == (640, 480)
     pixels, z = camera.project(torch.tensor([[1.5, 2.4, -1.0]], dtype=torch.float64))  # 0.5 right, 0.4 down, 2 ahead
     assert pixels[0].tolist() == pytest.approx([320.5 + 125, 240.25 + 102]) and float(z) == pytest.approx(2.0)
 
 
 def test_a_model_by_its_folder_its_files_and_its_project(tmp_path: Path) -> None:
     folder = model(tmp_path / "project" / "sparse" / "0")
-    for path in (
-        folder,
-        folder / "cameras.txt",
-        folder / "images.txt",
-        tmp_path / "project",
-        tmp_path / "project" / "sparse" / "0",
-    ):
+    for path in (folder, folder / "cameras.txt", folder / "images.txt", tmp_path / "project"):
         check(path)
 
 
@@ -67,10 +55,7 @@ def test_distortion_is_told_and_fisheyes_are_refused(tmp_path: Path) -> None:
     assert read_camera_file(straight).notes == ()
     for lens in ("OPENCV_FISHEYE 640 480 500 500 320 240 0 0 0 0", "FOV 640 480 500 500 320 240 0.5"):
         bent = model(tmp_path / lens[:3], f"1 {lens}\n")
-        with pytest.raises(
-            DataError,
-            match=r"camera 1 of image a.png: model is \w+; expected one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL",
-        ):
+        with pytest.raises(DataError, match=r"camera 1 of image a.png: model is \w+; expected one of SIMPLE_PINHOLE"):
             read_camera_file(bent)
 
 

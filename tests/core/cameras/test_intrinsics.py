@@ -28,13 +28,8 @@ ANGLE = 2 * math.atan(32 / 50)
 def camera(frame: dict[str, Any], file: dict[str, Any], target: Target = IMAGE) -> tuple[tuple[float, ...], list[str]]:
     """fx, fy, cx, cy and what was said."""
     said: list[str] = []
-    found = read_camera(
-        JsonReader({"transform_matrix": POSE, **frame}, "t.json: frames[0]"),
-        JsonReader(file, "t.json"),
-        target,
-        None,
-        said.append,
-    )
+    own = JsonReader({"transform_matrix": POSE, **frame}, "t.json: frames[0]")
+    found = read_camera(own, JsonReader(file, "t.json"), target, None, said.append)
     return tuple(round(v, 3) for v in (found.fx, found.fy, found.cx, found.cy)), said
 
 
@@ -71,11 +66,7 @@ def test_the_frames_own_wins_whole_and_lengths_follow_the_size(
     ("frame", "file", "words"),
     [
         ({}, {}, "frames\\[0\\]: no focal length"),
-        (
-            {},
-            {"fl_x": 50, "camera_angle_x": 0.9},
-            "t.json: fl_x means a focal length of 50 pixels, and camera_angle_x 66",
-        ),
+        ({}, {"fl_x": 50, "camera_angle_x": 0.9}, "t.json: fl_x means .* of 50 pixels, and camera_angle_x 66"),
         ({"fl_x": 50, "x_fov": 40}, {}, "frames\\[0\\]: fl_x means .* x_fov 87.9"),
         ({}, {"fl_y": 50, "y_fov": 40}, "fl_y means .* y_fov 65.9"),
         (
@@ -111,19 +102,14 @@ def test_the_sensors_angles_of_blender_give_way_to_lengths_in_pixels() -> None:
     fill."""
     angle = 2 * math.atan(36 / 2 / 50)
     focal = 72 * 50 / 36
-    found, said = camera(
-        {},
-        {"camera_angle_x": angle, "camera_angle_y": 0.471, "fl_x": focal, "fl_y": focal, "cx": 24, "cy": 36},
-        PORTRAIT,
-    )
+    lengths = {"fl_x": focal, "fl_y": focal, "cx": 24, "cy": 36}
+    found, said = camera({}, {"camera_angle_x": angle, "camera_angle_y": 0.471, **lengths}, PORTRAIT)
     assert found == (100, 100, 24, 36) and len(said) == 2 and all("is taken" in line for line in said)
 
 
 def test_a_lens_comes_whole_from_the_frame() -> None:
-    frame, file = (
-        JsonReader({"k1": 0.1}, "f"),
-        JsonReader({"k1": 0.5, "k2": 0.5, "camera_model": "OPENCV_FISHEYE"}, "t"),
-    )
+    frame = JsonReader({"k1": 0.1}, "f")
+    file = JsonReader({"k1": 0.5, "k2": 0.5, "camera_model": "OPENCV_FISHEYE"}, "t")
     assert (read_lens_coefficients(frame, file)["k1"], read_lens_coefficients(frame, file)["k2"]) == (0.1, 0.0)
     assert has_fisheye_lens(frame, file), "the model is not among the coefficients"
     assert not has_fisheye_lens(JsonReader({"camera_model": "OPENCV"}, "f"), file)
@@ -131,38 +117,23 @@ def test_a_lens_comes_whole_from_the_frame() -> None:
         has_fisheye_lens(JsonReader({"camera_model": "FULL_OPENCV"}, "f"), file)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("latlong", True),
-        ("equirectangular", 1),
-        ("ftheta_p1", 0.3),
-        ("ortho", True),
-        ("rolling_shutter", [0, 0.1, 0, 0]),
-        ("transform_matrix_start", POSE),
-        ("shift_x", 0.2),
-        ("k5", 0.01),
-        ("distortion_params", [0.1, 0, 0, 0]),
-        ("camera_type", "EQUIRECTANGULAR"),
-        ("lens_model", "fov"),
-        ("white_transparent", True),
-        ("driver_parameters", {"LightX": 1}),
-    ],
-)
-def test_keys_that_change_the_picture_are_refused_by_name(key: str, value: Any) -> None:
+REFUSED: dict[str, Any] = {"latlong": True, "equirectangular": 1, "ftheta_p1": 0.3, "ortho": True, "k5": 0.01}
+REFUSED |= {"rolling_shutter": [0, 0.1, 0, 0], "transform_matrix_start": POSE, "shift_x": 0.2, "lens_model": "fov"}
+REFUSED |= {"distortion_params": [0.1, 0, 0, 0], "camera_type": "EQUIRECTANGULAR", "white_transparent": True}
+REFUSED |= {"driver_parameters": {"LightX": 1}}
+
+
+@pytest.mark.parametrize("key", REFUSED)
+def test_keys_that_change_the_picture_are_refused_by_name(key: str) -> None:
     with pytest.raises(DataError, match=f"t.json: {key} "):
-        refuse_unsupported_keys(JsonReader({key: value}, "t.json"))
+        refuse_unsupported_keys(JsonReader({key: REFUSED[key]}, "t.json"))
 
 
 def test_unknown_keys_are_named_once_and_those_of_real_files_are_not() -> None:
-    file = JsonReader(
-        {"aabb_scale": 16, "applied_transform": POSE, "frames": [], "orientation_override": "none", "exposures": 1},
-        "t.json",
-    )
-    frames = [
-        JsonReader({"file_path": "a", "colmap_im_id": i, "sharpness": 3.0, "time": 0.1, "depth_file_path": "d"}, "f")
-        for i in range(3)
-    ]
+    known = {"aabb_scale": 16, "applied_transform": POSE, "frames": [], "orientation_override": "none"}
+    file = JsonReader({**known, "is_fisheye": False, "exposures": 1}, "t.json")
+    frame = {"file_path": "a", "colmap_im_id": 1, "sharpness": 3.0, "time": 0.1, "depth_file_path": "d"}
+    frames = [JsonReader(frame, "f")] * 3
     line = describe_unknown_keys(file, frames, ())
     assert line.startswith("t.json: keys that are not read: exposures, frames[].time; task=dynamic")
     assert describe_unknown_keys(file, frames, ("time", "exposures")) == ""

@@ -83,6 +83,20 @@ def test_hull_of_a_ball_is_its_surface() -> None:
     assert all((corners @ d).max() > 0.99 for d in torch.eye(3, dtype=torch.float64)), "all sides are covered"
 
 
+def test_starting_points_lie_along_the_axes_of_what_is_there() -> None:
+    """An ellipsoid with another radius along each axis: swapped axes would show."""
+    radii = torch.tensor([0.9, 0.5, 0.25], dtype=torch.float64)
+
+    def draw(camera: Camera) -> Pixels:
+        o, d = rays(camera)
+        o, d = (o - CENTER) / radii, d / radii
+        alpha = (torch.linalg.cross(o.expand_as(d), d).norm(dim=-1) < d.norm(dim=-1)).float()
+        return Pixels(alpha[..., None] * torch.ones(3), alpha)
+
+    means = initial_points(Views(draw), None, 2000, rng()).means.double() - CENTER
+    assert torch.allclose(means.amax(0), radii, atol=0.08) and torch.allclose(means.amin(0), -radii, atol=0.08)
+
+
 def test_thin_parts_survive() -> None:
     # a rod of 1.5 pixels' width, thinner than a coarse voxel by far
     def draw(camera: Camera) -> Pixels:
@@ -117,9 +131,8 @@ def test_masked_pixels_rule_nothing_out() -> None:
     full, _ = hull_surface(views, 32)
     hidden = views.images[0]
     assert hidden.alpha is not None
-    views.images[0] = Pixels(
-        hidden.rgb, torch.zeros_like(hidden.alpha), torch.zeros_like(hidden.alpha, dtype=torch.bool)
-    )
+    nothing = torch.zeros_like(hidden.alpha)
+    views.images[0] = Pixels(hidden.rgb, nothing, nothing.bool())
     assert abs(len(hull_surface(views, 32)[0]) - len(full)) < 0.2 * len(full)
 
 
@@ -141,9 +154,8 @@ def test_farthest_points_spread() -> None:
     gap = torch.cdist(cloud[rows], cloud[rows]).fill_diagonal_(9.0).min()
     drawn = cloud[torch.randperm(4000, generator=rng())[:200]]
     assert gap > 5 * torch.cdist(drawn, drawn).fill_diagonal_(9.0).min()
-    assert torch.cdist(cloud, cloud[rows]).min(dim=1).values.max() < gap + 1e-6, (
-        "farthest-point sampling covers to its own gap"
-    )
+    covered = torch.cdist(cloud, cloud[rows]).min(dim=1).values.max()
+    assert covered < gap + 1e-6, "farthest-point sampling covers to its own gap"
 
 
 def test_colors_are_straight_and_medians_over_the_views_that_show_the_point() -> None:
@@ -164,14 +176,12 @@ def test_photographs_start_in_a_box_where_the_cameras_look() -> None:
 
     views = Views(draw)
     points = initial_points(views, None, 2000, rng())
-    assert (points.means - CENTER).abs().max() <= 2.0 + 1e-5 and (
-        points.means.double().mean(0) - CENTER
-    ).abs().max() < 0.15
+    offsets = points.means.double() - CENTER
+    assert offsets.abs().max() <= 2.0 + 1e-5 and offsets.mean(0).abs().max() < 0.15
     assert torch.allclose(points.colors, torch.full((2000, 3), 0.3)) and points.means.unique(dim=0).shape[0] == 2000
     opaque = Views(lambda c: Pixels(draw(c).rgb, torch.ones(c.height, c.width)))
-    assert torch.equal(initial_points(opaque, None, 50, rng()).means, box_points(opaque, 50, rng()).means), (
-        "opaque alpha says nothing"
-    )
+    expected = box_points(opaque, 50, rng()).means
+    assert torch.equal(initial_points(opaque, None, 50, rng()).means, expected), "opaque alpha says nothing"
 
 
 def test_focus_point() -> None:

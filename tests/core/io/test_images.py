@@ -55,20 +55,18 @@ def test_floats_are_rounded_and_clamped(tmp_path: Path) -> None:
 
 
 def test_jpeg_by_content_not_by_name(tmp_path: Path) -> None:
-    Image.fromarray(np.full((8, 8, 3), 100, np.uint8)).save(tmp_path / "a.png", format="JPEG")
-    assert (images.read_image(tmp_path / "a.png").int() - 100).abs().max() <= 2
+    for shape in ((8, 8, 3), (8, 8)):
+        Image.fromarray(np.full(shape, 100, np.uint8)).save(tmp_path / "a.png", format="JPEG")
+        assert (images.read_image(tmp_path / "a.png").int() - 100).abs().max() <= 2
 
 
 @pytest.mark.parametrize(("half", "dtype"), [(True, torch.float16), (False, torch.float32)])
 def test_exr_is_linear_and_never_clamped(tmp_path: Path, half: bool, dtype: torch.dtype) -> None:
     values = torch.tensor([[[-2.0, 0.5, 1000.0, 0.25], [0.0, 1.5, 60000.0, 1.0]]])
-    write_exr(tmp_path / "a.exr", values, half=half, extra={"Z": torch.tensor([[1.0, float("inf")]])})
+    write_exr(tmp_path / "a.exr", values, half=half)
     read = images.read_image(tmp_path / "a.exr", (2, 1))
     assert read.dtype == dtype and torch.equal(read.float(), values)
     assert images.image_info(tmp_path / "a.exr") == images.ImageInfo(2, 1, 4, True)
-    assert OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()["Z"].pixels.tolist() == [
-        [1.0, float("inf")]
-    ]
 
 
 def test_missing_empty_foreign_and_folder(tmp_path: Path) -> None:
@@ -133,20 +131,12 @@ def test_a_lack_of_memory_is_one_line(tmp_path: Path, monkeypatch: pytest.Monkey
         images.read_mask(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize(("kind", "bytes_per_pixel"), [(0, 2), (2, 6), (6, 8)])
-def test_16_bit_png(tmp_path: Path, kind: int, bytes_per_pixel: int) -> None:
-    (tmp_path / "a.png").write_bytes(png(2, 2, 16, kind, (b"\0" + bytes(2 * bytes_per_pixel)) * 2))
-    refuse(tmp_path / "a.png", "16-bit", "expected 8-bit")
-
-
-def test_grey_and_cmyk_jpeg(tmp_path: Path) -> None:
-    Image.fromarray(np.full((4, 4), 100, np.uint8)).save(tmp_path / "a.jpg")
-    assert (images.read_image(tmp_path / "a.jpg").int() - 100).abs().max() <= 2
+def test_what_8_bit_rgb_cannot_hold_is_refused(tmp_path: Path) -> None:
+    for kind, size in ((0, 2), (2, 6), (6, 8)):
+        (tmp_path / "a.png").write_bytes(png(2, 2, 16, kind, (b"\0" + bytes(2 * size)) * 2))
+        refuse(tmp_path / "a.png", "16-bit", "expected 8-bit")
     Image.fromarray(noise(4, 4, 3)).convert("CMYK").save(tmp_path / "a.jpg")
     refuse(tmp_path / "a.jpg", "CMYK")
-
-
-def test_colour_key_is_not_dropped(tmp_path: Path) -> None:
     Image.fromarray(noise(4, 4, 3)).save(tmp_path / "a.png", transparency=(1, 2, 3))
     refuse(tmp_path / "a.png", "colour key")
 
@@ -217,10 +207,8 @@ def test_exr_write_refuses_what_it_cannot_hold(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
     with pytest.raises(DataError, match="half=False"):
         write_exr(path, torch.full((1, 1, 3), 1e6))
-    with pytest.raises(DataError, match="row 0, column 0, channel 0"):
+    with pytest.raises(DataError, match="channel R: value inf at row 0, column 0"):
         write_exr(path, torch.full((1, 1, 3), float("inf")))
-    with pytest.raises(DataError, match="'Z'"):
-        write_exr(path, torch.zeros(1, 1, 3), extra={"Z": torch.zeros(2, 1)})
     assert not os.listdir(tmp_path)
 
 
@@ -256,9 +244,6 @@ def test_masks_are_colours_that_are_not_zero(tmp_path: Path) -> None:
         images.read_mask(tmp_path / "m.png")
 
 
-# ---------------------------------------------------------------- OpenEXR layers
-
-
 def test_exr_of_one_named_layer(tmp_path: Path) -> None:
     planes = {f"View.{c}": np.full((2, 3), i, np.float32) for i, c in enumerate("RGB")}
     OpenEXR.File({"type": OpenEXR.scanlineimage}, planes).write(str(tmp_path / "a.exr"))
@@ -273,10 +258,8 @@ def test_exr_layers_keep_names_types_and_attributes(tmp_path: Path) -> None:
     write_exr_layers(tmp_path / "a.exr", channels, attributes)
     with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
         header, stored = dict(file.header()), {name: np.array(c.pixels) for name, c in file.channels().items()}
-    assert {name: str(pixels.dtype) for name, pixels in stored.items()} == {
-        **dict.fromkeys("RGB", "float16"),
-        "depth.Z": "float32",
-    }
+    kinds = {name: str(pixels.dtype) for name, pixels in stored.items()}
+    assert kinds == {**dict.fromkeys("RGB", "float16"), "depth.Z": "float32"}
     assert np.array_equal(stored["depth.Z"], values[..., 3].numpy())
     assert np.array_equal(stored["G"], values[..., 1].half().numpy())
     assert all(np.array_equal(header[key], value) for key, value in attributes.items())

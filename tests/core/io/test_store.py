@@ -23,11 +23,8 @@ Make = Callable[[], Store]
 @pytest.fixture(params=["folder", "file://", "memory://"])
 def make(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Make]:
     """The same place, as another process would open it."""
-    address = {
-        "folder": str(tmp_path / "s"),
-        "file://": f"file://{tmp_path}/s",
-        "memory://": "memory://neuprim-tests/s",
-    }[request.param]
+    places = {"folder": f"{tmp_path}/s", "file://": f"file://{tmp_path}/s", "memory://": "memory://neuprim-tests/s"}
+    address = places[request.param]
     copies = iter(range(100))
     yield lambda: open_store(address, tmp_path / f"copies-{next(copies)}").at("volumes", "key")
     if request.param == "memory://":
@@ -111,23 +108,14 @@ def test_no_bucket_is_made(tmp_path: Path) -> None:
 
 
 def test_addresses_that_nothing_can_be_made_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for address in (
-        "nonsense://x",
-        "ftp://user:pw@127.0.0.1:1/x",
-        "simplecache::s3://x",
-        "zip://x::https://y",
-        "github://a:b@c",
-        "memory::x",
-    ):
-        with pytest.raises(
-            ConfigError, match=r"expected a folder, or a URL of file, local, memory, s3, .*, as s3://BUCKET/FOLDER$"
-        ) as refused:
+    for address in ("nonsense://x", "ftp://user:pw@127.0.0.1:1/x", "github://a:b@c"):
+        with pytest.raises(ConfigError, match=rf"^{address}: protocol .*; expected a folder, or a URL of file, local"):
             open_store(address, tmp_path)
-        assert str(refused.value).startswith(f"{address}: {'a chain' if '::' in address else 'protocol'}")
+    for address in ("simplecache::s3://x", "zip://x::https://y", "memory::x"):
+        with pytest.raises(ConfigError, match=rf"^{address}: a chain of protocols"):
+            open_store(address, tmp_path)
     monkeypatch.setitem(sys.modules, "s3fs", None)
-    with pytest.raises(
-        BackendUnavailable, match=r"^s3://bucket: s3:// needs a package .*: pip install 'neuprim\[s3\]'$"
-    ):
+    with pytest.raises(BackendUnavailable, match=r"^s3://bucket: s3:// needs a package .*: pip install 'neuprim\[s3"):
         open_store("s3://bucket", tmp_path)
 
 
@@ -160,8 +148,6 @@ def test_a_moments_absence_is_survived_and_other_errors_are_not_tried_twice(
         store.retry(full, said.append)
     assert calls.count("full") == 1
 
-
-# ---------------------------------------------------------------- arrays
 
 WANTED = {"a": (np.float32, (None, 3)), "b": (np.float64, ())}
 

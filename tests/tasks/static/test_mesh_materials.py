@@ -100,10 +100,6 @@ def srgb(*linear: float) -> list[int]:
     return np.round(encode_srgb(np.array(linear, np.float32)) * 255).astype(int).tolist()
 
 
-# Light that is emitted
-# -----------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("lit", [False, True])
 def test_light_that_a_material_emits_is_added(tmp_path: Path, lit: bool) -> None:
     document = Document(tmp_path)
@@ -187,14 +183,10 @@ def test_textures_of_libraries_are_moved_and_in_folders_with_blanks(
     (tmp_path / "other.mtl").write_text("newmtl other\n")
     for libraries in ("my lib.mtl", "other.mtl my lib.mtl"):
         (tmp_path / "a.obj").write_text(
-            f"mtllib {libraries}\nusemtl my mat\nv -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 "
-            f"1\nf -4/-4 -3/-3 -2/-2 -1/-1\n"
+            f"mtllib {libraries}\nusemtl my mat\nv -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\n"
+            "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf -4/-4 -3/-3 -2/-2 -1/-1\n"
         )
         assert shown(tmp_path / "a.obj") == list(colour)
-
-
-# Base colours
-# ----------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("metallic", [{}, {"baseColorFactor": [0, 0, 1, 1]}, None])
@@ -206,6 +198,34 @@ def test_specular_glossiness_wins_over_what_stands_beside_it(tmp_path: Path, met
     assert shown(document.write()) == srgb(0.5, 0.25, 0)
     document.material["extensions"]["KHR_materials_pbrSpecularGlossiness"] = {"diffuseTexture": document.texture()}
     assert shown(document.write()) == list(RED)
+
+
+def test_base_colours_are_linear_and_multiply_those_of_vertices(tmp_path: Path) -> None:
+    """A factor as dark as an 8-bit linear value cannot hold."""
+    document = Document(tmp_path)
+    document.material["pbrMetallicRoughness"] = {"baseColorFactor": [0.0013, 0.25, 1.0, 1.0]}
+    document.primitive["attributes"]["COLOR_0"] = document.add(np.full((4, 4), 32768, np.uint16), normalized=True)
+    (part,) = parts_of(document.write())
+    np.testing.assert_allclose(part.colour, np.broadcast_to([0.00065, 0.125, 0.5], (2, 3, 3)), rtol=1e-4)
+
+
+def test_texture_coordinates_of_the_materials_own_set_are_moved_and_wrapped(tmp_path: Path) -> None:
+    """Half a texture to the right, from quantized coordinates; clamped along u, mirrored along v."""
+    document = Document(tmp_path)
+    moved = {"KHR_texture_transform": {"offset": [0.5, 0.0], "scale": [2.0, 1.0]}}
+    texture = {**document.texture(), "texCoord": 1, "extensions": moved}
+    document.material["pbrMetallicRoughness"] = {"baseColorTexture": texture}
+    document.json["textures"][0]["sampler"] = 0
+    document.json["samplers"] = [{"wrapS": 33071, "wrapT": 33648}]
+    document.json["images"][0]["uri"] = "the%20skin.png"
+    (tmp_path / "skinNone.png").rename(tmp_path / "the skin.png")
+    document.json["extensionsRequired"] = ["KHR_texture_transform", "KHR_mesh_quantization"]
+    uv = np.array([[0, 0], [0, 0], [255, 255], [0, 0]], np.uint8)
+    document.primitive["attributes"]["TEXCOORD_1"] = document.add(uv, normalized=True)
+    (part,) = parts_of(document.write())
+    assert part.material.wrap == ("clamp", "mirror") and part.uv is not None
+    # v upward: glTF's 0 is the upper edge
+    np.testing.assert_allclose(part.uv[0], [[0.5, 1.0], [0.5, 1.0], [2.5, 0.0]], atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["u1", "<u2", "<f4"])
@@ -224,36 +244,24 @@ def test_colours_of_vertices_of_every_type(tmp_path: Path, kind: str, width: int
     assert shown(document.write()) == srgb(1, 0.2, 0)  # opaque: alphaMode is
 
 
+BLEND, MASK = {"alphaMode": "BLEND"}, {"alphaMode": "MASK"}
+
+
 @pytest.mark.parametrize(
-    ("material", "alpha", "drawn", "said"),
+    ("mode", "opacity", "alpha", "drawn", "said"),
     [
-        ({"alphaMode": "BLEND", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.1]}}, None, False, True),
-        ({"alphaMode": "BLEND", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.8]}}, None, True, True),
-        ({"alphaMode": "BLEND", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}, None, True, False),
-        ({"alphaMode": "BLEND", "pbrMetallicRoughness": {}}, 0.2, False, True),
-        ({"alphaMode": "MASK", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.4]}}, None, False, False),
-        (
-            {"alphaMode": "MASK", "alphaCutoff": 0.3, "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.4]}},
-            None,
-            True,
-            False,
-        ),
-        (
-            {"alphaMode": "MASK", "alphaCutoff": 0.3, "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.4]}},
-            0.5,
-            False,
-            False,
-        ),
-        ({"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.1]}}, 0.1, True, False),
+        (BLEND, 0.1, None, False, True),
+        (BLEND, 0.8, None, True, True),
+        (BLEND, 1, None, True, False),
+        (BLEND, None, 0.2, False, True),
+        (MASK, 0.4, None, False, False),
+        ({**MASK, "alphaCutoff": 0.3}, 0.4, None, True, False),
+        ({**MASK, "alphaCutoff": 0.3}, 0.4, 0.5, False, False),
+        ({}, 0.1, 0.1, True, False),
     ],
 )
 def test_opacity_cuts_holes_and_translucency_is_said(
-    tmp_path: Path,
-    recwarn: pytest.WarningsRecorder,
-    material: dict[str, Any],
-    alpha: float | None,
-    drawn: bool,
-    said: bool,
+    tmp_path: Path, recwarn: Any, mode: Any, opacity: float | None, alpha: float | None, drawn: bool, said: bool
 ) -> None:
     """Of a pane before a red square."""
     document = Document(tmp_path)
@@ -262,14 +270,11 @@ def test_opacity_cuts_holes_and_translucency_is_said(
     attributes["POSITION"] = document.add(np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], np.float32))
     if alpha is not None:
         attributes["COLOR_0"] = document.add(np.array([[1, 1, 1, alpha]] * 4, np.float32))
-    document.json["materials"].append(material)
+    factor = {} if opacity is None else {"baseColorFactor": [1, 1, 1, opacity]}
+    document.json["materials"].append({"pbrMetallicRoughness": factor, **mode})
     document.json["meshes"][0]["primitives"].append({**document.primitive, "attributes": attributes, "material": 1})
     assert shown(document.write()) == ([255, 255, 255] if drawn else list(RED))
     assert any("2 faces are translucent" in str(w.message) for w in recwarn) == said
-
-
-# Extensions
-# ----------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -320,13 +325,29 @@ def test_what_a_file_offers_beside_compression_is_read(tmp_path: Path) -> None:
         parts_of(document.write())
 
 
-# Places
-# ----------------------------------------------------------------------------------------------------------------------
-
-
 def placed(path: Path) -> list[np.ndarray]:
     """The corners of every part, in the order of their middles."""
     return sorted((part.corners for part in parts_of(path)), key=lambda c: c.mean(axis=(0, 1)).tolist())
+
+
+def test_parts_stand_where_the_graph_puts_them(tmp_path: Path) -> None:
+    """Two uses of one part, one turned and mirrored below a node that scales."""
+    document, half = Document(tmp_path), math.sqrt(0.5)
+    turned = {"mesh": 0, "rotation": [0, 0, half, half], "translation": [10, 0, 1]}
+    document.json["nodes"] = [{"mesh": 0}, {"scale": [2, 2, -2], "children": [2]}, turned]
+    document.json["scenes"] = [{"nodes": [0, 1]}]
+    first, second = placed(document.write())
+    np.testing.assert_allclose(first[0], [[-1, -1, 0], [1, -1, 0], [1, 1, 0]])
+    np.testing.assert_allclose(second[0], [[22, -2, -2], [22, 2, -2], [18, 2, -2]], atol=1e-12)
+
+
+@pytest.mark.parametrize(("mode", "indices"), [(4, [0, 1, 2, 0, 2, 3]), (5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])])
+def test_triangles_strips_and_fans(tmp_path: Path, mode: int, indices: list[int]) -> None:
+    document = Document(tmp_path)
+    document.primitive |= {"mode": mode, "indices": document.add(np.array(indices, np.uint16)[:, None])}
+    (corners,) = placed(document.write())
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert len(corners) == 2 and np.allclose(across, [0, 0, 4])
 
 
 @pytest.mark.parametrize("kind", ["<f4", "i1", "<i2"])
@@ -343,14 +364,8 @@ def test_instances_are_expanded_below_their_node(tmp_path: Path, kind: str) -> N
         ),
         "SCALE": document.add(np.array([[1, 3, 1], [1, 1, -2]], np.float32)),
     }
-    document.json["nodes"] = [
-        {
-            "mesh": 0,
-            "translation": [0, 0, 5],
-            "scale": [2, 2, 2],
-            "extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}},
-        },
-    ]
+    extensions = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+    document.json["nodes"] = [{"mesh": 0, "translation": [0, 0, 5], "scale": [2, 2, 2], "extensions": extensions}]
     document.json["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
     second, first = placed(document.write())
     # a corner (x, y) becomes (x, 3y), turns to (-3y, x) and moves to (10 - 3y, x), which the node doubles
@@ -406,10 +421,6 @@ def test_a_skin_is_where_its_joints_are(tmp_path: Path) -> None:
     document.json["nodes"][3]["children"] = [1]
     with pytest.raises(DataError, match="joint 2 is outside of the scene"):
         parts_of(document.write())
-
-
-# STL
-# ----------------------------------------------------------------------------------------------------------------------
 
 
 def write_stl(path: Path, head: bytes, *attributes: int) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,10 +12,7 @@ import numpy as np
 
 from neuprim.core.errors import DataError
 
-__all__ = ["DENSE_LIMIT", "TILE_SIZES", "Bounds", "Grid", "Tiles", "scale_transform"]
-
-TILE_SIZES = (8, 128, 4096)
-"""Edges of a constant tile in voxels: in a lower node, in an upper node, in the root."""
+TILE_SIZES = (8, 128, 4096)  # edges of a constant tile in voxels: in a lower node, in an upper node, in the root
 
 DENSE_LIMIT = 2 * 2**30
 """Most bytes that :meth:`Grid.to_dense` takes unless told otherwise: 2 GiB."""
@@ -25,19 +23,12 @@ Bounds = tuple[tuple[int, int, int], tuple[int, int, int]]
 
 @dataclass(frozen=True, eq=False)
 class Tiles:
-    """T cubes of one value each.
+    """T cubes of one value each."""
 
-    Attributes:
-        origins: (T, 3) int32, the lowest index of each.
-        sizes: (T,) int32, edges in voxels, each one of :data:`TILE_SIZES`.
-        values: (T,) or (T, 3) float32.
-        active: (T,) bool.
-    """
-
-    origins: np.ndarray
-    sizes: np.ndarray
-    values: np.ndarray
-    active: np.ndarray
+    origins: np.ndarray  # (T, 3) int32, the lowest index of each
+    sizes: np.ndarray  # (T,) int32, edges in voxels, each one of TILE_SIZES
+    values: np.ndarray  # (T,) or (T, 3) float32
+    active: np.ndarray  # (T,) bool
 
     @staticmethod
     def none(channels: int = 1) -> Tiles:
@@ -52,8 +43,7 @@ class Tiles:
 def scale_transform(
     voxel_size: float | Sequence[float] = 1.0, translation: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
-    """(4, 4) index to world: voxels of an edge (one, or one per axis), the centre of voxel 0 at ``translation``; world
-    units."""
+    """(4, 4) index to world: voxels of an edge (one, or one per axis), the centre of voxel 0 at ``translation``."""
     matrix = np.eye(4)
     matrix[range(3), range(3)] = voxel_size
     matrix[:3, 3] = translation
@@ -67,29 +57,17 @@ class Grid:
     A voxel with index (i, j, k) has its *centre* at ``transform @ (i, j, k, 1)``. Voxels of no leaf and no tile have
     the background value and are not active. NaN and infinite values are kept as they are stored and counted in
     :attr:`non_finite`.
-
-    Attributes:
-        name: as in the file.
-        transform: (4, 4) float64, index to world, acting on column vectors.
-        background: () or (3,) float32.
-        origins: (L, 3) int32, the lowest index of each leaf, multiples of 8, all different.
-        values: (L, 8, 8, 8) or (L, 8, 8, 8, 3) float32, indexed x, y, z.
-        masks: (L, 8, 8, 8) bool, which voxels are active.
-        tiles: constant regions; none of them overlaps a leaf.
-        kind: ``fog volume``, ``staggered``, ``unknown`` or, if asked for, ``level set``.
-        half: store as 16-bit floats when written.
-        metadata: the grid's own.
     """
 
     name: str
-    transform: np.ndarray
-    background: np.ndarray
-    origins: np.ndarray
-    values: np.ndarray
-    masks: np.ndarray
-    tiles: Tiles
-    kind: str = "fog volume"
-    half: bool = False
+    transform: np.ndarray  # (4, 4) float64, index to world, acting on column vectors
+    background: np.ndarray  # () or (3,) float32
+    origins: np.ndarray  # (L, 3) int32, the lowest index of each leaf, multiples of 8, all different
+    values: np.ndarray  # (L, 8, 8, 8) or (L, 8, 8, 8, 3) float32, indexed x, y, z
+    masks: np.ndarray  # (L, 8, 8, 8) bool, which voxels are active
+    tiles: Tiles  # none of them overlaps a leaf
+    kind: str = "fog volume"  # or "staggered", "unknown" or, if asked for, "level set"
+    half: bool = False  # store as 16-bit floats when written
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
@@ -156,10 +134,7 @@ class Grid:
     @cached_property
     def active_voxels(self) -> int:
         """How many voxels are active, those of active tiles included."""
-        inside = sum(
-            size**3 * int(np.count_nonzero(self.tiles.sizes[self.tiles.active] == size)) for size in TILE_SIZES
-        )
-        return int(np.count_nonzero(self.masks)) + inside
+        return int(np.count_nonzero(self.masks)) + sum(s**3 for s in self.tiles.sizes[self.tiles.active].tolist())
 
     @cached_property
     def bounds(self) -> Bounds | None:
@@ -181,8 +156,7 @@ class Grid:
         return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
     def world_bounds(self) -> np.ndarray | None:
-        """(2, 3) float64: the box, in world units and axes, around all active voxels with their extent; None if there
-        is none."""
+        """(2, 3) float64 box, in world units and axes, around all active voxels with their extent; None without."""
         if self.bounds is None:
             return None
         corners = np.stack(np.meshgrid(*np.array(self.bounds, float).T - 0.5, indexing="ij"), -1).reshape(-1, 3)
@@ -208,13 +182,16 @@ class Grid:
 
     @property
     def sparse_bytes(self) -> int:
-        """Memory that the leaves take now."""
         return self.values.nbytes + self.masks.nbytes + self.origins.nbytes
 
     @property
     def dense_bytes(self) -> int:
         """Memory that the box of active voxels takes as one float32 array."""
-        return 0 if self.bounds is None else _volume(self.bounds) * 4 * self.channels
+        return (
+            0
+            if self.bounds is None
+            else math.prod(h - l for l, h in zip(*self.bounds, strict=True)) * 4 * self.channels
+        )
 
     def to_dense(
         self, bounds: Bounds | None = None, max_bytes: int = DENSE_LIMIT, non_finite: float | None = None
@@ -240,10 +217,8 @@ class Grid:
         shape = [t - b for t, b in zip(top, base, strict=True)]
         size = shape[0] * shape[1] * shape[2] * 4 * self.channels
         if size > max_bytes:
-            raise DataError(
-                f"grid {self.name!r}: {' x '.join(map(str, shape))} voxels take {size} bytes when dense; "
-                f"at most {max_bytes} are allowed"
-            )
+            found = f"{' x '.join(map(str, shape))} voxels take {size} bytes when dense"
+            raise DataError(f"grid {self.name!r}: {found}; at most {max_bytes} are allowed")
         padded = np.empty((*shape, *channels), np.float32)
         padded[...] = self.background
         first, last = np.array(base, np.int64), np.array(top, np.int64)
@@ -266,11 +241,6 @@ class Grid:
         for i in np.flatnonzero(meets & ~small):
             begin, stop = np.maximum(origins[i] - first, 0), np.minimum(origins[i] + tiles.sizes[i], last) - first
             padded[begin[0] : stop[0], begin[1] : stop[1], begin[2] : stop[2]] = tiles.values[i]
-
-
-def _volume(bounds: Bounds) -> int:
-    (a, b, c), (d, e, f) = bounds
-    return (d - a) * (e - b) * (f - c)
 
 
 def _blocks(padded: np.ndarray) -> np.ndarray:

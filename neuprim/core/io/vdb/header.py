@@ -18,38 +18,12 @@ import numpy as np
 
 from neuprim.core.errors import BackendUnavailable, DataError, nearest
 
-__all__ = [
-    "BLOSC",
-    "MAGIC",
-    "MASK",
-    "VERSIONS",
-    "ZIP",
-    "Cursor",
-    "FileHeader",
-    "GridHeader",
-    "blosc_module",
-    "compression_label",
-    "decompressor",
-    "open_cursor",
-    "parse_header",
-    "read_header",
-]
-
-ZIP, MASK, BLOSC = 1, 2, 4
-"""The bits of a grid's compression word."""
-
-_BLOSC_HEADER = struct.Struct("<4xI4xI")
-"""Of a Blosc chunk's 16 bytes: how many bytes it unpacks to, and how many it has."""
+ZIP, MASK, BLOSC = 1, 2, 4  # the bits of a grid's compression word
+_BLOSC_HEADER = struct.Struct("<4xI4xI")  # of a chunk's 16 bytes: how many it unpacks to, and how many it has
 
 
 class Cursor:
-    """A position in a file's bytes that cannot leave them.
-
-    Attributes:
-        path: the file, for messages.
-        data: all bytes of the file.
-        at, end: the next byte, and the first one that must not be read.
-    """
+    """A position ``at`` in the ``data`` of a file that cannot go beyond ``end``."""
 
     __slots__ = ("at", "data", "end", "path")
 
@@ -64,10 +38,8 @@ class Cursor:
     def need(self, count: int, what: str) -> None:
         """Raises DataError unless ``count`` more bytes are there."""
         if not 0 <= count <= self.end - self.at:
-            raise self.fail(
-                f"{what} at byte {self.at} needs {count} bytes, but {self.end - self.at} are left there; "
-                "truncated or damaged OpenVDB file"
-            )
+            found = f"{what} at byte {self.at} needs {count} bytes, but {self.end - self.at} are left there"
+            raise self.fail(f"{found}; truncated or damaged OpenVDB file")
 
     def take(self, count: int, what: str) -> bytes:
         self.need(count, what)
@@ -90,11 +62,7 @@ class Cursor:
 
 @contextmanager
 def open_cursor(path: Path) -> Iterator[Cursor]:
-    """A cursor at the start of a file, which is mapped rather than read.
-
-    Raises:
-        DataError: missing, empty, not a file, or not readable.
-    """
+    """A cursor at the start of a file, which is mapped rather than read; raises DataError where it cannot be."""
     if not path.exists():
         raise DataError(f"{path}: file not found; expected an OpenVDB file")
     if not path.is_file():
@@ -120,16 +88,12 @@ def blosc_module() -> Any:
     """The package ``blosc``, set to one thread.
 
     OpenVDB packs leaves in blocks of 256 bytes; with more threads every leaf of 2 KB would start and join them all.
-
-    Raises:
-        BackendUnavailable: it is not installed.
     """
     try:
         import blosc
     except ImportError as error:
-        raise BackendUnavailable(
-            f"Blosc-compressed OpenVDB files need the package blosc ({error}): pip install blosc"
-        ) from None
+        what = f"Blosc-compressed OpenVDB files need the package blosc ({error}): pip install blosc"
+        raise BackendUnavailable(what) from None
     blosc.set_nthreads(1)
     return blosc
 
@@ -171,9 +135,8 @@ def _unzip(chunk: bytes, size: int) -> bytes:
     except zlib.error as error:
         raise ValueError(f"a damaged zip chunk ({error})") from None
     if len(values) != size:
-        raise ValueError(
-            f"a zip chunk of {'more than ' * (len(values) > size)}{min(len(values), size)} bytes; expected {size}"
-        )
+        found = f"more than {size}" if len(values) > size else f"{len(values)}"
+        raise ValueError(f"a zip chunk of {found} bytes; expected {size}")
     return values
 
 
@@ -183,18 +146,10 @@ MAGIC = 0x56444220
 VERSIONS = (222, 224)
 """Oldest and newest file version read: 222 brought the present node layout, 223 Blosc, 224 changed point grids only."""
 
-LEVEL_SET = "level set"
-_VALUES = {"Tree_float_5_4_3": 1, "Tree_vec3s_5_4_3": 3}
+_CHANNELS = {"Tree_float_5_4_3": 1, "Tree_vec3s_5_4_3": 3}
 _HALF = "_HalfFloat"
-_DOUBLES = {
-    "UniformScaleMap": 15,
-    "ScaleMap": 15,
-    "UniformScaleTranslateMap": 18,
-    "ScaleTranslateMap": 18,
-    "TranslationMap": 3,
-    "AffineMap": 16,
-    "UnitaryMap": 16,
-}
+_DOUBLES = {"UniformScaleMap": 15, "ScaleMap": 15, "UniformScaleTranslateMap": 18, "ScaleTranslateMap": 18}
+_DOUBLES |= {"TranslationMap": 3, "AffineMap": 16, "UnitaryMap": 16}  # numbers that a map is stored as
 _METADATA = {
     "bool": "?", "int32": "i", "int64": "q", "float": "f", "double": "d",
     "vec2i": "2i", "vec2s": "2f", "vec2d": "2d", "vec3i": "3i", "vec3s": "3f", "vec3d": "3d",
@@ -203,31 +158,19 @@ _METADATA = {
 
 @dataclass(frozen=True)
 class GridHeader:
-    """One grid as its file describes it.
+    """One grid as its file describes it."""
 
-    Attributes:
-        name: unique in its file: second and later grids of one name get ``[1]``, ``[2]``, … as in OpenVDB.
-        type: OpenVDB's tree type, without the suffix for half floats.
-        half: its values are stored as 16-bit floats.
-        flags: compression bits.
-        metadata: the grid's own; values of types not known here are bytes.
-        map: name of the transform's class.
-        transform: (4, 4) float64, index to world, acting on column vectors; None if the map is of a class not known
-        here. parent: the grid whose tree this one shares; empty for nearly all.
-        tree_at, block, end: byte offsets of the tree, of its leaf buffers, and of the first byte after the grid.
-    """
-
-    name: str
-    type: str
-    half: bool
-    flags: int
-    metadata: Mapping[str, Any]
-    map: str
-    transform: np.ndarray | None
-    parent: str
-    tree_at: int
-    block: int
-    end: int
+    name: str  # unique in its file: second and later grids of one name get [1], [2], ... as in OpenVDB
+    type: str  # OpenVDB's tree type, without the suffix for half floats
+    half: bool  # its values are stored as 16-bit floats
+    flags: int  # compression bits
+    metadata: Mapping[str, Any]  # values of types not known here are bytes
+    map: str  # name of the transform's class
+    transform: np.ndarray | None  # (4, 4) float64, index to world, acting on column vectors; None of an unknown class
+    parent: str  # the grid whose tree this one shares; empty for nearly all
+    tree_at: int  # byte offset of the tree
+    block: int  # of its leaf buffers
+    end: int  # of the first byte after the grid
 
     @property
     def kind(self) -> str:
@@ -238,7 +181,7 @@ class GridHeader:
     @property
     def channels(self) -> int:
         """1 for float, 3 for vec3s, 0 for types that are not read."""
-        return _VALUES.get(self.type, 0)
+        return _CHANNELS.get(self.type, 0)
 
     @property
     def compression(self) -> str:
@@ -257,16 +200,14 @@ class GridHeader:
         if "ptdataidx" in self.type or "ptidx" in self.type:
             return f"holds points ({self.type}), which have no density; rasterise them to a fog volume first"
         if not self.channels:
-            return (
-                f"has values of type {self.type}; Tree_float_5_4_3 and Tree_vec3s_5_4_3 (also as half floats) are read"
-            )
+            return f"has values of type {self.type}; {' and '.join(_CHANNELS)} (also as half floats) are read"
         if self.transform is None:
             return f"has a transform of class {self.map}; known: {', '.join(_DOUBLES)}"
         return None
 
     def refusal(self) -> str | None:
         """Why this grid cannot serve as a volume, or None."""
-        if self.kind == LEVEL_SET:
+        if self.kind == "level set":
             return "is a level set: signed distances to a surface, not densities; convert it to a fog volume first"
         return self.undecodable()
 
@@ -282,11 +223,7 @@ class FileHeader:
     grids: tuple[GridHeader, ...]
 
     def grid(self, name: str) -> GridHeader:
-        """The grid called ``name``.
-
-        Raises:
-            DataError: there is none; the message has the nearest names.
-        """
+        """The grid called ``name``; raises DataError with the nearest names if there is none."""
         for grid in self.grids:
             if grid.name == name:
                 return grid
@@ -295,10 +232,9 @@ class FileHeader:
 
 
 def read_header(path: Path) -> FileHeader:
-    """Describes a file without decoding a tree.
+    """Describe a file without decoding a tree.
 
-    Raises:
-        DataError: not an OpenVDB file, a version outside :data:`VERSIONS`, written as a stream, truncated or damaged.
+    Raises DataError for another format, a version outside :data:`VERSIONS`, a stream, or a damaged file.
     """
     with open_cursor(Path(path)) as cursor:
         return parse_header(cursor)
@@ -307,9 +243,8 @@ def read_header(path: Path) -> FileHeader:
 def parse_header(cursor: Cursor) -> FileHeader:
     """:func:`read_header` for an open file whose cursor is at the start."""
     if cursor.end < 8 or cursor.unpack("q", "the magic number") != (MAGIC,):
-        raise cursor.fail(
-            f"starts with {cursor.data[:8].hex(' ')}; expected {MAGIC.to_bytes(8, 'little').hex(' ')} (an OpenVDB file)"
-        )
+        expected = f"{MAGIC.to_bytes(8, 'little').hex(' ')} (an OpenVDB file)"
+        raise cursor.fail(f"starts with {cursor.data[:8].hex(' ')}; expected {expected}")
     (version,) = cursor.unpack("I", "the file version")
     if not VERSIONS[0] <= version <= VERSIONS[1]:
         raise cursor.fail(f"OpenVDB file version {version}; expected {VERSIONS[0]} to {VERSIONS[1]}")
@@ -325,39 +260,35 @@ def parse_header(cursor: Cursor) -> FileHeader:
         cursor.at = grids[-1].end
     names = [grid.name for grid in grids]
     if len(set(names)) != len(names):
-        raise cursor.fail(
-            f"two grids have the name {next(n for n in names if names.count(n) > 1)!r}; expected unique names"
-        )
+        repeated = next(n for n in names if names.count(n) > 1)
+        raise cursor.fail(f"two grids have the name {repeated!r}; expected unique names")
     return FileHeader(cursor.path, version, (major, minor), metadata, tuple(grids))
 
 
+def _unique_name(text: str) -> str:
+    name, _, number = text.partition("\x1e")  # OpenVDB's mark between a name and its number
+    return f"{name}[{number}]" if number else name
+
+
 def _grid(cursor: Cursor, what: str) -> GridHeader:
-    name, _, suffix = cursor.text(f"name of {what}").partition("\x1e")  # OpenVDB's mark between a name and its number
-    name += f"[{suffix}]" if suffix else ""
+    name = _unique_name(cursor.text(f"name of {what}"))
     what = f"grid {name!r}"
     kind, parent = cursor.text(f"type of {what}"), cursor.text(f"parent of {what}")
     start, block, end = cursor.unpack("3q", f"offsets of {what}")
     if parent:
         block = end  # OpenVDB leaves it 0: the tree is the parent's
     if not cursor.at <= start <= block <= end <= len(cursor.data):
-        raise cursor.fail(
-            f"{what} claims bytes {start} to {block} to {end}; "
-            f"expected rising offsets from {cursor.at} to at most {len(cursor.data)}"
-        )
+        expected = f"rising offsets from {cursor.at} to at most {len(cursor.data)}"
+        raise cursor.fail(f"{what} claims bytes {start} to {block} to {end}; expected {expected}")
     inner = Cursor(cursor.path, cursor.data, start, end)
     (flags,) = inner.unpack("I", f"compression of {what}")
     if flags & ~(ZIP | MASK | BLOSC):
-        raise inner.fail(
-            f"{what} has compression bits {flags:#x}; expected a sum of 1 (zip), 2 (active values) and 4 (blosc)"
-        )
+        expected = "a sum of 1 (zip), 2 (active values) and 4 (blosc)"
+        raise inner.fail(f"{what} has compression bits {flags:#x}; expected {expected}")
     metadata = _metadata(inner, f"metadata of {what}")
     mapping, transform = _transform(inner, what)
-    half = kind.endswith(_HALF)
-    parent, _, suffix = parent.partition("\x1e")
-    parent += f"[{suffix}]" if suffix else ""
-    return GridHeader(
-        name, kind.removesuffix(_HALF), half, flags, metadata, mapping, transform, parent, inner.at, block, end
-    )
+    tree, half, parent = kind.removesuffix(_HALF), kind.endswith(_HALF), _unique_name(parent)
+    return GridHeader(name, tree, half, flags, metadata, mapping, transform, parent, inner.at, block, end)
 
 
 def _metadata(cursor: Cursor, what: str) -> dict[str, Any]:
@@ -373,9 +304,8 @@ def _metadata(cursor: Cursor, what: str) -> dict[str, Any]:
         elif layout is None:
             found[name] = raw
         elif size != struct.calcsize("<" + layout):
-            raise cursor.fail(
-                f"{name!r} in {what} has {size} bytes; expected {struct.calcsize('<' + layout)} for a {kind}"
-            )
+            expected = f"{struct.calcsize('<' + layout)} for a {kind}"
+            raise cursor.fail(f"{name!r} in {what} has {size} bytes; expected {expected}")
         else:
             values = struct.unpack("<" + layout, raw)
             found[name] = values if len(values) > 1 else values[0]
@@ -401,8 +331,6 @@ def _transform(cursor: Cursor, what: str) -> tuple[str, np.ndarray | None]:
         sound = bool(np.isfinite(matrix).all() and np.isfinite(size).all() and (size > 0).all())
         sound = sound and abs(np.linalg.det(matrix[:3, :3] / size)) > 1e-12 and bool((matrix[3] == (0, 0, 0, 1)).all())
     if not sound:
-        raise cursor.fail(
-            f"{what} has the transform {np.array2string(matrix, separator=', ')}; "
-            "expected finite numbers and voxels of some volume"
-        )
+        found = f"the transform {np.array2string(matrix, separator=', ')}"
+        raise cursor.fail(f"{what} has {found}; expected finite numbers and voxels of some volume")
     return mapping, matrix

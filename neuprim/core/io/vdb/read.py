@@ -28,17 +28,14 @@ from neuprim.core.io.vdb.header import (
     parse_header,
 )
 
-__all__ = ["ALL_VALUES", "LEAF_LIMIT", "LOWER", "UPPER", "Slots", "read_grid", "read_grids"]
-
 LEAF_LIMIT = 4 * 2**30
 """Most bytes of decoded leaves and tiles that :func:`read_grid` takes unless told otherwise: 4 GiB."""
 
 
 def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False) -> Grid:
-    """Reads one grid of a file; the others stay undecoded.
+    """Read one grid of a file; the others stay undecoded.
 
     Args:
-        path: an OpenVDB file of version 222 to 224.
         name: the grid, as :func:`~neuprim.core.io.vdb.header.read_header` lists it.
         max_bytes: most memory for its leaves and tiles; more is refused before it is taken.
         level_sets: read signed distances too, for inspection.
@@ -47,9 +44,7 @@ def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets:
         DataError: no such file or grid; points, a level set or another type that is not read; truncated or damaged.
         BackendUnavailable: the grid is Blosc-compressed, and the package ``blosc`` is missing.
     """
-    with open_cursor(Path(path)) as cursor:
-        file = parse_header(cursor)
-        return _read(cursor, file, file.grid(name), max_bytes, level_sets)
+    return next(read_grids(path, (name,), max_bytes=max_bytes, level_sets=level_sets))
 
 
 def read_grids(
@@ -59,10 +54,7 @@ def read_grids(
 
     Args:
         names: which, in this order; None for all that can be decoded (of level sets: if ``level_sets``), in file order.
-        path, max_bytes, level_sets: as in :func:`read_grid`; the limit is for each grid.
-
-    Raises:
-        DataError, BackendUnavailable: as :func:`read_grid`, when that grid's turn comes.
+        max_bytes, level_sets: as in :func:`read_grid`; the limit is for each grid. Errors are the same, too.
     """
     with open_cursor(Path(path)) as cursor:
         file = parse_header(cursor)
@@ -81,23 +73,11 @@ def _read(cursor: Cursor, file: FileHeader, header: GridHeader, max_bytes: int, 
     if header.parent:  # an instance: own transform and metadata, another grid's tree
         source = file.grid(header.parent)
         if source.parent or source.type != header.type:
-            raise cursor.fail(
-                f"{what} shares the tree of {header.parent!r}, which has none of its own or one of another type"
-            )
-    inner = Cursor(cursor.path, cursor.data, source.tree_at, source.end)
-    tree = _TreeReader(inner, source.block, source.flags, source.half, source.channels, what, max_bytes)
-    return Grid(
-        header.name,
-        header.transform,
-        tree.background,
-        tree.origins,
-        tree.values,
-        tree.masks,
-        tree.tiles,
-        header.kind,
-        header.half,
-        dict(header.metadata),
-    )
+            found = f"shares the tree of {header.parent!r}"
+            raise cursor.fail(f"{what} {found}, which has none of its own or one of another type")
+    tree = _TreeReader(cursor, source, what, max_bytes)
+    arrays = (tree.background, tree.origins, tree.values, tree.masks, tree.tiles)
+    return Grid(header.name, header.transform, *arrays, header.kind, header.half, dict(header.metadata))
 
 
 # ---------------------------------------------------------------- trees
@@ -109,20 +89,12 @@ ALL_VALUES = 6
 negative; 4: a mask chooses background or one value, given; 5: a mask chooses between two values, given.
 """
 
-_CHUNK = 1024
-"""Leaves decoded together: 2 MB of float32, which stays in a core's cache."""
-
-_LEAF = 512
+_CHUNK = 1024  # leaves decoded together: 2 MB of float32, which stay in a core's cache
+_LEAF = 512  # voxels
 
 
 class Slots:
-    """The children of an internal node.
-
-    Attributes:
-        count: how many: (2 ** log2) ** 3.
-        edge: voxels along one edge of a child.
-        offsets: (count, 3) int32, the lowest index of each relative to the node's.
-    """
+    """The children of an internal node: how many, voxels along an edge of each, and their lowest indices in it."""
 
     def __init__(self, log2: int, edge: int) -> None:
         self.count, self.edge = 1 << 3 * log2, edge
@@ -134,61 +106,42 @@ UPPER, LOWER = Slots(5, 128), Slots(4, 8)
 
 
 class _TreeReader:
-    """Decodes one tree.
+    """Decodes the tree of ``source`` into the arrays of a :class:`~neuprim.core.io.vdb.grid.Grid`.
 
-    Args:
-        cursor: at the first byte of the tree and ending with its grid.
-        block: where the leaf buffers begin.
-        flags, half, channels: how values are stored.
-        what: the grid, for messages.
-        max_bytes: most memory for the decoded leaves and tiles.
-
-    Attributes:
-        background: () or (3,) float32.
-        origins, values, masks, tiles: as in :class:`~neuprim.core.io.vdb.grid.Grid`.
-
-    Raises:
-        DataError: truncated, inconsistent or damaged, or leaves and tiles that take more than ``max_bytes``.
-        BackendUnavailable: Blosc chunks, but no package ``blosc``.
+    ``what`` names the grid in messages; leaves and tiles take at most ``max_bytes``.
     """
 
-    def __init__(
-        self, cursor: Cursor, block: int, flags: int, half: bool, channels: int, what: str, max_bytes: int
-    ) -> None:
-        self._buffers = Cursor(cursor.path, cursor.data, block, cursor.end)
-        self._cursor = Cursor(cursor.path, cursor.data, cursor.at, block)
-        self._flags, self._half, self._what = flags, half, what
-        self._shape = (3,) if channels == 3 else ()
-        self._stored = np.dtype("<f2" if half else "<f4")
-        self._stored_size = self._stored.itemsize * channels
-        self._full_size = 4 * channels
-        self._packed = bool(flags & (ZIP | BLOSC))
-        self._unpack = decompressor(flags)
+    def __init__(self, file: Cursor, source: GridHeader, what: str, max_bytes: int) -> None:
+        self._buffers = Cursor(file.path, file.data, source.block, source.end)
+        self._cursor = cursor = Cursor(file.path, file.data, source.tree_at, source.block)
+        self._flags, self._half, self._what = source.flags, source.half, what
+        self._shape = (3,) if source.channels == 3 else ()
+        self._stored = np.dtype("<f2" if source.half else "<f4")
+        self._stored_size = self._stored.itemsize * source.channels
+        self._full_size = 4 * source.channels
+        self._packed = bool(source.flags & (ZIP | BLOSC))
+        self._unpack = decompressor(source.flags)
         self._leaf_origins: list[np.ndarray] = []
         self._tiles: list[tuple[np.ndarray, int, np.ndarray, np.ndarray]] = []
         self._limit = max_bytes
         self._left = max_bytes  # what tiles have not taken yet
         self._topology()
         self.origins = np.concatenate(self._leaf_origins) if self._leaf_origins else np.zeros((0, 3), np.int32)
-        self.tiles = self._collect_tiles(channels)
+        self.tiles = self._collect_tiles(source.channels)
         count = len(self.origins)
         size = count * _LEAF * (self._full_size + 1)
         if size > self._left:
-            raise cursor.fail(
-                f"{what} has {count} leaves, which take {size} bytes in memory; at most {self._left} are allowed"
-            )
+            found = f"{count} leaves, which take {size} bytes in memory"
+            raise cursor.fail(f"{what} has {found}; at most {self._left} are allowed")
         self.values: np.ndarray = np.empty((count, _LEAF, *self._shape), np.float32)
         self.masks: np.ndarray = np.empty((count, _LEAF), bool)
         for first in range(0, count, _CHUNK):
             self._leaves(first, min(first + _CHUNK, count))
         if self._buffers.at != self._buffers.end:
-            raise cursor.fail(
-                f"{what}: leaf buffers end at byte {self._buffers.at}; the header says {self._buffers.end}"
-            )
+            found = f"leaf buffers end at byte {self._buffers.at}"
+            raise cursor.fail(f"{what}: {found}; the header says {self._buffers.end}")
         self.values = self.values.reshape(count, 8, 8, 8, *self._shape)
         self.masks = self.masks.reshape(count, 8, 8, 8)
-
-    # ---------------------------------------------------------------- topology
 
     def _topology(self) -> None:
         cursor, what = self._cursor, self._what
@@ -212,18 +165,16 @@ class _TreeReader:
 
     def _root_entry(self, seen: set[tuple[int, ...]], origin: tuple[int, ...]) -> None:
         if origin in seen or any(v % TILE_SIZES[2] for v in origin):
-            raise self._cursor.fail(
-                f"{self._what} has a root entry at {origin}; expected multiples of {TILE_SIZES[2]}, each once"
-            )
+            expected = f"multiples of {TILE_SIZES[2]}, each once"
+            raise self._cursor.fail(f"{self._what} has a root entry at {origin}; expected {expected}")
         seen.add(origin)
 
     def _upper(self, origin: np.ndarray) -> None:
         for child in UPPER.offsets[self._node(origin, UPPER)]:
             lower = origin + child
             leaves = LOWER.offsets[self._node(lower, LOWER)]
-            self._cursor.skip(
-                64 * len(leaves), f"masks of {len(leaves)} leaves of {self._what}"
-            )  # repeated with the buffers
+            # the masks are repeated with the buffers
+            self._cursor.skip(64 * len(leaves), f"masks of {len(leaves)} leaves of {self._what}")
             self._leaf_origins.append(lower + leaves)
 
     def _node(self, origin: np.ndarray, slots: Slots) -> np.ndarray:
@@ -232,8 +183,7 @@ class _TreeReader:
         children, active = (_bits(cursor.take(slots.count // 8, f"masks of {what}")) for _ in range(2))
         values = self._values(active, slots.count, what)
         if values is not None:
-            different = (values != self.background).any(-1) if self._shape else values != self.background
-            kept = np.flatnonzero((active | different) & ~children)
+            kept = np.flatnonzero(~children)
             self._keep_tiles(origin + slots.offsets[kept], slots.edge, values[kept], active[kept])
         return np.flatnonzero(children)
 
@@ -243,9 +193,8 @@ class _TreeReader:
         if kept.any():
             self._left -= int(np.count_nonzero(kept)) * (17 + self._full_size)
             if self._left < 0:
-                raise self._cursor.fail(
-                    f"{self._what} has tiles that take more bytes in memory than the {self._limit} allowed"
-                )
+                found = f"tiles that take more bytes in memory than the {self._limit} allowed"
+                raise self._cursor.fail(f"{self._what} has {found}")
             self._tiles.append((origins[kept], size, values[kept], active[kept]))
 
     def _collect_tiles(self, channels: int) -> Tiles:
@@ -253,14 +202,8 @@ class _TreeReader:
             return Tiles.none(channels)
         origins, sizes, values, active = zip(*self._tiles, strict=True)
         repeated = np.repeat(np.array(sizes, np.int32), [len(a) for a in active])
-        return Tiles(
-            np.concatenate(origins).astype(np.int32),
-            repeated,
-            np.concatenate(values).astype(np.float32),
-            np.concatenate(active),
-        )
-
-    # ---------------------------------------------------------------- values of one node
+        places, numbers = np.concatenate(origins).astype(np.int32), np.concatenate(values).astype(np.float32)
+        return Tiles(places, repeated, numbers, np.concatenate(active))
 
     def _values(self, active: np.ndarray, count: int, what: str) -> np.ndarray | None:
         """(count,) or (count, 3) float32; None where all of them are the background and not active."""
@@ -319,10 +262,8 @@ class _TreeReader:
     def _floats(self, raw: bytes) -> np.ndarray:
         return np.frombuffer(raw, "<f4").reshape(self._shape).astype(np.float32)
 
-    # ---------------------------------------------------------------- leaves
-
     def _leaves(self, first: int, last: int) -> None:
-        """Decodes leaves ``first`` to ``last`` - 1: one loop over their headers, then whole arrays."""
+        """Decode leaves ``first`` to ``last`` - 1: one loop over their headers, then whole arrays."""
         masks, special, whole, payloads = self._leaf_bytes(first, last)
         active = _bits(masks).reshape(-1, _LEAF)
         values = self.values[first:last]
@@ -345,8 +286,7 @@ class _TreeReader:
     def _leaf_bytes(
         self, first: int, last: int
     ) -> tuple[bytes, list[tuple[int, Any, Any, bytes | None]], list[int], bytes]:
-        """Masks, leaves with inactive values besides the background, leaves that store all values, and all stored
-        values."""
+        """Masks, leaves with inactive values that are not the background, leaves that store all values, and values."""
         cursor, what = self._buffers, f"a leaf of {self._what}"
         data, unpack, size_at = cursor.data, self._unpack, struct.Struct("<q").unpack_from
         unit, masked, packed, nothing = self._stored_size, self._flags & MASK, self._packed, self._half

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from neuprim.core.errors import DataError
 
-__all__ = ["Sequence", "VdbFrame", "sequence"]
-
 
 @dataclass(frozen=True)
 class VdbFrame:
@@ -22,17 +20,11 @@ class VdbFrame:
 
 @dataclass(frozen=True)
 class Sequence:
-    """Frames in the order of their numbers.
-
-    Attributes:
-        folder: where they are.
-        frames: one or more.
-        gaps: (first, last) number of every run of missing ones.
-    """
+    """One or more frames in the order of their numbers."""
 
     folder: Path
     frames: tuple[VdbFrame, ...]
-    gaps: tuple[tuple[int, int], ...]
+    gaps: tuple[tuple[int, int], ...]  # (first, last) number of every run of missing ones
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -41,24 +33,19 @@ class Sequence:
 def sequence(folder: Path, prefix: str | None = None) -> Sequence:
     """The .vdb files of a folder, sorted by the last number in each name: ``fire_9.vdb`` comes before ``fire_10.vdb``.
 
-    Args:
-        folder: not searched deeper.
-        prefix: what stands before the number, where a folder holds several sequences.
+    ``prefix`` is what stands before the number, where a folder holds several sequences; subfolders are not searched.
 
     Raises:
         DataError: no folder, no .vdb file, a name without a number, several prefixes, or one number twice.
     """
     folder = Path(folder)
+    expected = "expected a folder with .vdb files"
     try:
         if not folder.is_dir():
-            raise DataError(
-                f"{folder}: {'is a file' if folder.exists() else 'no such folder'}; expected a folder with .vdb files"
-            )
+            raise DataError(f"{folder}: {'is a file' if folder.exists() else 'no such folder'}; {expected}")
         paths = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".vdb" and p.is_file())
     except OSError as error:  # no permission, a name that is too long
-        raise DataError(
-            f"{folder}: cannot be read ({error.strerror or error}); expected a folder with .vdb files"
-        ) from error
+        raise DataError(f"{folder}: cannot be read ({error.strerror or error}); {expected}") from error
     found: dict[str, list[VdbFrame]] = {}
     odd: list[str] = []
     for path in paths:

@@ -17,41 +17,28 @@ from neuprim.core.io.vdb.grid import TILE_SIZES, Grid
 from neuprim.core.io.vdb.header import BLOSC, MAGIC, MASK, ZIP, blosc_module, compression_label
 from neuprim.core.io.vdb.read import ALL_VALUES, LOWER, UPPER, Slots
 
-__all__ = ["COMPRESSIONS", "write_vdb"]
-
 COMPRESSIONS = {"none": MASK, "zip": ZIP | MASK, "blosc": BLOSC | MASK}
-"""How values are packed; inactive ones that are the background are never stored."""
+"""Ways to pack values; inactive ones that are the background are never stored."""
 
 _VERSION = 224
 _LIBRARY = (10, 0)
 _EMPTY_BOX = ((2**31 - 1,) * 3, (-(2**31),) * 3)
-_OURS = (
-    "class",
-    "name",
-    "file_bbox_min",
-    "file_bbox_max",
-    "file_voxel_count",
-    "file_compression",
-    "is_saved_as_half_float",
-)
 _STALE = ("file_mem_bytes", "file_delayed_load")
 
 
 def write_vdb(
     path: Path, grids: Sequence[Grid], *, compression: str = "blosc", metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Writes grids to a file, whole or not at all.
+    """Write grids to a file, whole or not at all.
 
     Args:
-        path: replaced if it exists.
         grids: one or more, with different names. Those with ``half`` are rounded to 16-bit floats.
         compression: one of :data:`COMPRESSIONS`.
         metadata: of the file: str, bool, int, float, or three ints or floats each.
 
     Raises:
         DataError: names that repeat, leaves or tiles that overlap or are out of place, values that no half float holds,
-        a
-            transform that is no invertible affine map, or metadata of another type.
+            a transform that is no invertible affine map, or metadata of another type.
         BackendUnavailable: Blosc is asked for, and the package ``blosc`` is missing.
     """
     path = Path(path)
@@ -69,14 +56,10 @@ def write_vdb(
             where = f"{path}: grid {grid.name!r}"
             writer = _TreeWriter(grid, flags, where)
             kind = ("Tree_vec3s_5_4_3" if grid.channels == 3 else "Tree_float_5_4_3") + "_HalfFloat" * grid.half
-            start = file.tell() + len(_text(grid.name) + _text(kind) + _text("")) + 24
-            tree = (
-                struct.pack("<I", flags)
-                + _grid_metadata(grid, flags, where)
-                + _transform(grid.transform, where)
-                + writer.topology
-            )
+            own = struct.pack("<I", flags) + _grid_metadata(grid, flags, where) + _transform(grid.transform, where)
+            tree = own + writer.topology
             file.write(_text(grid.name) + _text(kind) + _text(""))
+            start = file.tell() + 24
             file.write(struct.pack("<3q", start, start + len(tree), start + len(tree) + len(writer.buffers)))
             file.write(tree)
             file.write(writer.buffers)
@@ -95,10 +78,8 @@ def _metadata(values: Mapping[str, Any], where: str) -> bytes:
     for name, value in values.items():
         kind, raw = _metadatum(value)
         if not kind:
-            raise DataError(
-                f"{where}: metadata {name!r} is {value!r}; "
-                "expected text, bool, int (64 bits), float, or three ints or floats"
-            )
+            expected = "text, bool, int (64 bits), float, or three ints or floats"
+            raise DataError(f"{where}: metadata {name!r} is {value!r}; expected {expected}")
         parts.append(_text(name) + _text(kind) + struct.pack("<I", len(raw)) + raw)
     return b"".join(parts)
 
@@ -124,24 +105,22 @@ def _metadatum(value: Any) -> tuple[str, bytes]:
 
 
 def _grid_metadata(grid: Grid, flags: int, where: str) -> bytes:
-    kept = {
-        k: v for k, v in grid.metadata.items() if k not in (*_OURS, *_STALE) and _metadatum(v)[0]
-    }  # foreign types are bytes
-    low, high = grid.bounds or ((0, 0, 0), (0, 0, 0))
-    box = (low, tuple(v - 1 for v in high)) if grid.bounds else _EMPTY_BOX  # OpenVDB's boxes include their upper corner
-    ours = (grid.kind, grid.name, *box, grid.active_voxels, compression_label(flags), bool(grid.half))
-    return _metadata(dict(sorted({**kept, **dict(zip(_OURS, ours, strict=True))}.items())), where)
+    # values of foreign types are bytes, which cannot be written
+    kept = {k: v for k, v in grid.metadata.items() if k not in _STALE and _metadatum(v)[0]}
+    box: tuple[tuple[int, ...], tuple[int, ...]] = _EMPTY_BOX
+    if grid.bounds:  # OpenVDB's boxes include their upper corner
+        box = grid.bounds[0], tuple(v - 1 for v in grid.bounds[1])
+    kept |= {"class": grid.kind, "name": grid.name, "file_bbox_min": box[0], "file_bbox_max": box[1]}
+    kept |= {"file_voxel_count": grid.active_voxels, "file_compression": compression_label(flags)}
+    kept |= {"is_saved_as_half_float": bool(grid.half)}
+    return _metadata(dict(sorted(kept.items())), where)
 
 
 def _transform(matrix: np.ndarray, where: str) -> bytes:
     """The simplest of OpenVDB's maps that is this transform."""
     matrix = np.asarray(matrix, np.float64)
-    if (
-        matrix.shape != (4, 4)
-        or not np.isfinite(matrix).all()
-        or (matrix[3] != (0, 0, 0, 1)).any()
-        or np.linalg.det(matrix) == 0
-    ):
+    sound = matrix.shape == (4, 4) and np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all()
+    if not sound or np.linalg.det(matrix) == 0:
         raise DataError(f"{where}: transform {matrix.tolist()}; expected an invertible affine (4, 4) matrix")
     scale, translation = np.diag(matrix)[:3], matrix[:3, 3]
     if (matrix[:3, :3] != np.diag(scale)).any():
@@ -174,42 +153,31 @@ class _TreeWriter:
 
     def _check(self) -> None:
         grid, tiles = self._grid, self._grid.tiles
-        if (
-            not np.isin(tiles.sizes, TILE_SIZES).all()
-            or (grid.origins % 8).any()
-            or (tiles.origins % tiles.sizes[:, None]).any()
-        ):
-            raise DataError(
-                f"{self._where}: leaves and tiles must start at multiples of their size (8, 128 or 4096 voxels)"
-            )
-        places = np.concatenate(
-            [np.c_[grid.origins, np.full(len(grid.origins), 8)], np.c_[tiles.origins, tiles.sizes]]
-        ).astype(np.int64)
+        sizes = np.concatenate([np.full(len(grid.origins), 8), tiles.sizes]).astype(np.int64)
+        origins = np.concatenate([grid.origins, tiles.origins]).astype(np.int64)
+        if not np.isin(sizes, TILE_SIZES).all() or (origins % sizes[:, None]).any():
+            found = "leaves and tiles must start at multiples of their size (8, 128 or 4096 voxels)"
+            raise DataError(f"{self._where}: {found}")
         for size in TILE_SIZES:
-            here = [tuple(p) for p in (places[places[:, 3] == size, :3] // size).tolist()]
-            smaller = {tuple(p) for p in (places[places[:, 3] < size, :3] // size).tolist()}
+            here = [tuple(p) for p in (origins[sizes == size] // size).tolist()]
+            smaller = {tuple(p) for p in (origins[sizes < size] // size).tolist()}
             if len(set(here)) != len(here) or not smaller.isdisjoint(here):
-                raise DataError(
-                    f"{self._where}: leaves or tiles overlap in blocks of {size} voxels; expected each voxel once"
-                )
+                found = f"leaves or tiles overlap in blocks of {size} voxels"
+                raise DataError(f"{self._where}: {found}; expected each voxel once")
         if grid.half:
             for values in (grid.values, tiles.values):
                 largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
                 if largest >= 65520:  # what rounds to infinity
-                    raise DataError(
-                        f"{self._where}: a value of magnitude {largest:g} does not fit a half float (65504 at most)"
-                    )
+                    found = f"a value of magnitude {largest:g} does not fit a half float (65504 at most)"
+                    raise DataError(f"{self._where}: {found}")
 
     def _root(self) -> bytes:
         grid = self._grid
         root = np.flatnonzero(grid.tiles.sizes == TILE_SIZES[2])
         small = np.flatnonzero(grid.tiles.sizes < TILE_SIZES[2])
         nodes = _grouped(TILE_SIZES[2], self._origins, self._tile_origins[small])
-        parts = [
-            struct.pack("<i", 1),
-            grid.background.astype("<f4").tobytes(),
-            struct.pack("<II", len(root), len(nodes)),
-        ]
+        parts = [struct.pack("<i", 1), grid.background.astype("<f4").tobytes()]
+        parts.append(struct.pack("<II", len(root), len(nodes)))
         for i in root:
             tile = struct.pack("<3i", *self._tile_origins[i].tolist()) + grid.tiles.values[i].astype("<f4").tobytes()
             parts.append(tile + struct.pack("<?", bool(grid.tiles.active[i])))
@@ -268,18 +236,15 @@ class _TreeWriter:
 def _grouped(
     size: int, leaves: np.ndarray, tiles: np.ndarray
 ) -> list[tuple[tuple[int, int, int], tuple[np.ndarray, np.ndarray]]]:
-    """The blocks of ``size`` voxels that hold leaves or tiles, with the indices of both in each, in order of their
-    corners."""
+    """The blocks of ``size`` voxels that hold leaves or tiles, by corner, with the indices of both in each."""
     corners, inverse = np.unique(np.concatenate([leaves, tiles]) // size * size, axis=0, return_inverse=True)
-    order = np.argsort(inverse, kind="stable")
-    parts = (
-        np.split(order, np.cumsum(np.bincount(inverse.ravel(), minlength=len(corners)))[:-1]) if len(corners) else []
-    )
-    count = len(leaves)
-    return [
-        ((x, y, z), (part[part < count], part[part >= count] - count))
-        for (x, y, z), part in zip(corners.tolist(), parts, strict=True)
-    ]
+    order, count = np.argsort(inverse, kind="stable"), len(leaves)
+    ends = np.cumsum(np.bincount(inverse.ravel(), minlength=len(corners))).tolist()
+    found, start = [], 0
+    for (x, y, z), end in zip(corners.tolist(), ends, strict=True):
+        part, start = order[start:end], end
+        found.append(((x, y, z), (part[part < count], part[part >= count] - count)))
+    return found
 
 
 def _slot(corners: np.ndarray, origin: tuple[int, int, int], slots: Slots) -> np.ndarray:
@@ -293,25 +258,19 @@ def _packer(flags: int, unit: int) -> Callable[[bytes], bytes]:
     """The function that packs values of ``unit`` bytes, with their length in front as OpenVDB has it."""
     if not flags & (ZIP | BLOSC):
         return lambda raw: raw
-    if flags & BLOSC:
-        blosc = blosc_module()
-        # what the Blosc library itself makes of no bytes, which the Python package refuses to pack: a header alone
-        nothing = struct.pack("<4B3I", 2, 1, 0x23, unit, 0, 1, 16)
-
-        def squeeze(raw: bytes) -> bytes:
-            if not raw:
-                return nothing
-            packed: bytes = blosc.compress(raw, typesize=unit, clevel=9, shuffle=blosc.SHUFFLE, cname="lz4")
-            return packed
-
-    else:
-
-        def squeeze(raw: bytes) -> bytes:
-            return zlib.compress(raw)
+    blosc = blosc_module() if flags & BLOSC else None
+    # what the Blosc library itself makes of no bytes, which the Python package refuses to pack: a header alone
+    nothing = struct.pack("<4B3I", 2, 1, 0x23, unit, 0, 1, 16)
 
     def pack(raw: bytes) -> bytes:
-        packed = squeeze(raw)
-        small = len(packed) < len(raw) or (not raw and bool(flags & BLOSC))
-        return struct.pack("<q", len(packed) if small else -len(raw)) + (packed if small else raw)
+        if blosc is None:
+            packed = zlib.compress(raw)
+        elif raw:
+            packed = blosc.compress(raw, typesize=unit, clevel=9, shuffle=blosc.SHUFFLE, cname="lz4")
+        else:
+            return struct.pack("<q", len(nothing)) + nothing
+        if len(packed) < len(raw):
+            return struct.pack("<q", len(packed)) + packed
+        return struct.pack("<q", -len(raw)) + raw
 
     return pack

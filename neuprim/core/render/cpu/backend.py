@@ -47,17 +47,22 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class _Prepared:
-    """What the backward pass shares with the forward pass of one frame."""
+    """What the backward pass shares with the forward pass of one frame.
+
+    Attributes:
+        tensors: parameters, and weights of colour networks, by name, all of one dtype.
+        tiles: tiles of an image; chunk: tiles that are one unit of work.
+    """
 
     request: Request
-    tensors: dict[str, Array]  # parameters, and weights of colour networks, by name, all of one dtype
+    tensors: dict[str, Array]
     view: View
     projected: Projected
     arrays: FrameArrays
     lists: TileLists
     net: Net | None
-    tiles: int  # of an image
-    chunk: int  # tiles that are one unit of work
+    tiles: int
+    chunk: int
 
     @property
     def parameters(self) -> Parameters:

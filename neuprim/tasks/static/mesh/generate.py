@@ -32,18 +32,11 @@ from neuprim.tasks.static.mesh.obj import read_obj
 from neuprim.tasks.static.mesh.ply_stl import read_ply_mesh, read_stl
 from neuprim.tasks.static.mesh.surface import Surface
 
-__all__ = ["GENERATOR_VERSION", "LIGHT", "MeshSettings", "generate", "load"]
-
+# Part of the cache's key: to be raised with every change to how models are read, placed, lit or looked at.
 GENERATOR_VERSION = 2
-"""Part of the cache's key: to be raised with every change to how models are read, placed, lit or looked at."""
 
-_READERS: dict[str, Callable[[ModelFolder], Model]] = {
-    ".glb": read_gltf,
-    ".gltf": read_gltf,
-    ".obj": read_obj,
-    ".ply": read_ply_mesh,
-    ".stl": read_stl,
-}
+_READERS: dict[str, Callable[[ModelFolder], Model]] = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
+_READERS |= {".ply": read_ply_mesh, ".stl": read_stl}
 
 
 def _dimmed(colour: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -51,8 +44,8 @@ def _dimmed(colour: tuple[float, float, float]) -> tuple[float, float, float]:
     return r, g, b
 
 
+# the daylight of the solids, as bright as white in the sun can be shown
 LIGHT = Daylight(DAYLIGHT.direction, *(_dimmed(colour) for colour in (DAYLIGHT.sun, DAYLIGHT.sky, DAYLIGHT.ground)))
-"""The daylight of the solids, as bright as white in the sun can be shown."""
 
 
 @dataclass(frozen=True)

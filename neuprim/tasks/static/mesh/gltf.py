@@ -37,15 +37,11 @@ from neuprim.tasks.static.mesh.model import (
     check_vertices,
 )
 
-__all__ = ["read_gltf"]
-
 _WRAPS = {33071: "clamp", 33648: "mirror"}
 _POINTS_AND_LINES, _TRIANGLES, _STRIP, _FAN = (0, 1, 2, 3), 4, 5, 6
 _MAX_DEPTH = 200
-_MAX_JOINTS = 32
-"""Joints per vertex."""
-_ROWS = 50_000
-"""Vertices that are skinned at once, which bounds the memory."""
+_MAX_JOINTS = 32  # per vertex
+_ROWS = 50_000  # vertices that are skinned at once, which bounds the memory
 
 
 class _Primitive(NamedTuple):
@@ -61,11 +57,7 @@ class _Primitive(NamedTuple):
 
 
 def read_gltf(folder: ModelFolder) -> Model:
-    """Read a .gltf or .glb file.
-
-    Raises:
-        DataError: damaged, of another version, compressed, or with references that lead nowhere.
-    """
+    """Read a .gltf or .glb file; raises DataError if damaged, compressed, or with references that lead nowhere."""
 
     def read() -> Model:
         reader = _Reader(GltfDocument(folder))
@@ -85,8 +77,6 @@ class _Reader:
         self.images: dict[str, bytes] = {}
         self.vertices = self.triangles = self.parts = self.skipped = 0
 
-    # ------------------------------------------------------------ surfaces
-
     def read_faces(self, materials: Mapping[str, Material]) -> tuple[list[Faces], int]:
         """Read all triangles of the scene that is shown, in place, and count their vertices."""
         nodes = self.document.entries("nodes")
@@ -98,18 +88,18 @@ class _Reader:
             node = nodes[i]
             if "mesh" not in node:
                 continue
-            number = to_index(node["mesh"])
-            mesh = self.document.content["meshes"][number]
-            weights = node.get("weights", mesh.get("weights", []))
+            number, places = to_index(node["mesh"]), [np.eye(4)]
             if "skin" in node:  # the surface is where its joints are, wherever its node is
                 pose = self._joint_matrices(self.document.content["skins"][to_index(node["skin"])], matrices)
-                primitives, places = self._read_mesh(mesh, materials, weights, pose), [np.eye(4)]
-            elif "weights" in node:
-                primitives, places = self._read_mesh(mesh, materials, weights), self._places(node, matrix)
+                primitives = self._read_mesh(number, node, materials, pose)
             else:
-                if number not in plain:
-                    plain[number] = self._read_mesh(mesh, materials, weights)
-                primitives, places = plain[number], self._places(node, matrix)
+                places = self._places(node, matrix)
+                if number in plain and "weights" not in node:
+                    primitives = plain[number]
+                else:
+                    primitives = self._read_mesh(number, node, materials)
+                    if "weights" not in node:
+                        plain[number] = primitives
             for place in places:
                 for primitive in primitives:
                     self._count(primitive)
@@ -128,18 +118,11 @@ class _Reader:
         check_limits(self.path, {"vertices": vertices, "faces": faces, "parts": parts})
 
     def _read_mesh(
-        self,
-        mesh: Mapping[str, Any],
-        materials: Mapping[str, Material],
-        weights: Sequence[float],
-        pose: NDArray | None = None,
+        self, number: int, node: Mapping[str, Any], materials: Mapping[str, Material], pose: NDArray | None = None
     ) -> list[_Primitive]:
-        """Read the triangles of a mesh.
-
-        Args:
-            weights: of its morph targets.
-            pose: (J, 4, 4) transforms of the joints of a skin.
-        """
+        """Read the triangles of a node's mesh, with (J, 4, 4) transforms of the joints of a skin."""
+        mesh = self.document.content["meshes"][number]
+        weights = [finite_number(w) for w in node.get("weights", mesh.get("weights", []))]
         found = []
         for primitive in mesh["primitives"]:
             mode = primitive.get("mode", _TRIANGLES)
@@ -151,13 +134,12 @@ class _Reader:
             position = self.document.content["accessors"][to_index(primitive["attributes"]["POSITION"])]
             if DRACO in primitive.get("extensions", {}) and "bufferView" not in position:
                 raise self.document.unsupported(DRACO)
-            found.append(self._read_primitive(primitive, mode, materials, [finite_number(w) for w in weights], pose))
+            found.append(self._read_primitive(primitive, materials, weights, pose))
         return found
 
     def _read_primitive(
         self,
         primitive: Mapping[str, Any],
-        mode: int,
         materials: Mapping[str, Material],
         weights: Sequence[float],
         pose: NDArray | None,
@@ -173,21 +155,19 @@ class _Reader:
             raise ValueError(f"an index of {index.max()}, with {count} vertices")
         name = str(to_index(primitive["material"])) if "material" in primitive else "none"
         material = materials[name]
-        normals, colour = None, None
+        normals, colour, uv, glow_uv = None, None, None, None
         if "NORMAL" in attributes:
-            normals = self._posed(
-                primitive, "NORMAL", self.document.array(attributes["NORMAL"], ["VEC3"], count), weights, pose
-            )
+            given = self.document.array(attributes["NORMAL"], ["VEC3"], count)
+            normals = self._posed(primitive, "NORMAL", given, weights, pose)
         if "COLOR_0" in attributes:
             colour = self.document.array(attributes["COLOR_0"], ["VEC3", "VEC4"], count)
             colour = (colour / np.float32(1 if colour.dtype.kind == "f" else np.iinfo(colour.dtype).max)).astype("f4")
-        uv, glow_uv = None, None
         if material.texture is not None:
             uv = self._texture_coordinates(primitive, name, "baseColorTexture")
         if material.glow is not None and material.glow.texture is not None:
             glow_uv = self._texture_coordinates(primitive, name, "emissiveTexture")
         positions = self._posed(primitive, "POSITION", positions, weights, pose)
-        faces = _triangles(index.astype(np.int64), mode)
+        faces = _triangles(index.astype(np.int64), primitive.get("mode", _TRIANGLES))
         return _Primitive(name, faces, positions, normals, colour, uv, glow_uv)
 
     def _texture_coordinates(self, primitive: Mapping[str, Any], name: str, key: str) -> NDArray[np.float32] | None:
@@ -239,22 +219,17 @@ class _Reader:
             positions = primitive.positions @ matrix[:3, :3].T + matrix[:3, 3]
             normals = None if primitive.normals is None else primitive.normals @ np.linalg.pinv(matrix[:3, :3])
         check_vertices(self.path, positions, faces)
-        colour, uv, glow_uv = (
-            None if values is None else values[faces] for values in (primitive.colour, primitive.uv, primitive.glow_uv)
-        )
-        normals = None if normals is None else normals[faces]
-        return Faces(positions[faces], primitive.material, normals, colour, uv, glow_uv)
-
-    # ------------------------------------------------------------ places
+        values: tuple[NDArray | None, ...] = (normals, primitive.colour, primitive.uv, primitive.glow_uv)
+        of_corners = (None if value is None else value[faces] for value in values)
+        return Faces(positions[faces], primitive.material, *of_corners)
 
     def _world_matrices(self, nodes: Sequence[Mapping[str, Any]]) -> dict[int, NDArray[np.float64]]:
         """(4, 4) scene from node, of the nodes of the scene that is shown."""
         children = [[to_index(child) for child in node.get("children", [])] for node in nodes]
         scenes = self.document.entries("scenes")
         if scenes:
-            roots = [
-                to_index(node) for node in scenes[to_index(self.document.content.get("scene", 0))].get("nodes", [])
-            ]
+            shown = scenes[to_index(self.document.content.get("scene", 0))]
+            roots = [to_index(node) for node in shown.get("nodes", [])]
         else:
             roots = sorted(set(range(len(nodes))) - {child for below in children for child in below})
         found: dict[int, NDArray[np.float64]] = {}
@@ -299,23 +274,20 @@ class _Reader:
             inverse = columns.transpose(0, 2, 1)[: len(joints)]
         return np.stack([matrices[joint] for joint in joints]) @ inverse
 
-    # ------------------------------------------------------------ colours
-
     def read_material(self, material: Mapping[str, Any]) -> Material:
         """Read a material and its textures."""
         base, extensions = _base_colour(material), material.get("extensions", {})
         factor = [finite_number(x) for x in base.get("baseColorFactor", (1.0, 1.0, 1.0))]
         mode = material.get("alphaMode", "OPAQUE")
-        cutoff = (
-            None if mode == "OPAQUE" else finite_number(material.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
-        )
+        cutoff = finite_number(material.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
         opacity = factor[3] if len(factor) > 3 and mode != "OPAQUE" else 1.0
         strength = finite_number(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
         light = [strength * finite_number(x) for x in material.get("emissiveFactor", (0.0, 0.0, 0.0))]
         glow = self._textured(light, material.get("emissiveTexture")) if any(light) else None
         found = self._textured(factor, base.get("baseColorTexture"))
         unlit = "KHR_materials_unlit" in extensions
-        return replace(found, opacity=opacity, cutoff=cutoff, blend=mode == "BLEND", glow=glow, unlit=unlit)
+        found = replace(found, opacity=opacity, cutoff=None if mode == "OPAQUE" else cutoff)
+        return replace(found, blend=mode == "BLEND", glow=glow, unlit=unlit)
 
     def _textured(self, factor: Sequence[float], texture_info: Mapping[str, Any] | None) -> Material:
         """A colour factor with the texture that it multiplies."""

@@ -20,42 +20,23 @@ from neuprim.core.io.plain import load_json
 from neuprim.core.notices import warn_once
 from neuprim.tasks.static.mesh.model import ModelFolder
 
-__all__ = ["DRACO", "GltfDocument", "finite_number", "parse_uri", "refuse_damaged_gltf", "to_index"]
-
 _GLB, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _COMPONENT_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_READ = {
-    "EXT_mesh_gpu_instancing",
-    "EXT_texture_webp",
-    "KHR_materials_emissive_strength",
-    "KHR_materials_pbrSpecularGlossiness",
-    "KHR_materials_unlit",
-    "KHR_mesh_quantization",
-    "KHR_texture_transform",
-}
-_HARMLESS = {
-    "EXT_instance_features",
-    "EXT_lights_ies",
-    "EXT_lights_image_based",
-    "EXT_mesh_features",
-    "EXT_structural_metadata",
-    "KHR_animation_pointer",
-    "KHR_audio_emitter",
-    "KHR_lights_punctual",
-    "KHR_materials_variants",  # the default is drawn
-    "KHR_xmp_json_ld",
-    "MSFT_lod",  # the finest is drawn
-}
+_READ = set(
+    "EXT_mesh_gpu_instancing EXT_texture_webp KHR_materials_emissive_strength KHR_materials_pbrSpecularGlossiness "
+    "KHR_materials_unlit KHR_mesh_quantization KHR_texture_transform".split()
+)
+# of KHR_materials_variants the default is drawn, of MSFT_lod the finest
+_HARMLESS = set(
+    "EXT_instance_features EXT_lights_ies EXT_lights_image_based EXT_mesh_features EXT_structural_metadata "
+    "KHR_animation_pointer KHR_audio_emitter KHR_lights_punctual KHR_materials_variants KHR_xmp_json_ld "
+    "MSFT_lod".split()
+)
 DRACO = "KHR_draco_mesh_compression"
-_COMPRESSION = {
-    "EXT_meshopt_compression",
-    "EXT_texture_avif",
-    DRACO,
-    "KHR_meshopt_compression",
-    "KHR_texture_basisu",
-    "MSFT_texture_dds",
-}
+_COMPRESSION = {DRACO, "EXT_meshopt_compression", "KHR_meshopt_compression"}
+_COMPRESSION |= {"EXT_texture_avif", "KHR_texture_basisu", "MSFT_texture_dds"}
+_DAMAGE = (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError, struct.error)
 
 _T = TypeVar("_T")
 
@@ -64,16 +45,7 @@ def refuse_damaged_gltf(path: Path, function: Callable[[], _T]) -> _T:
     """Call a function and turn what damaged documents raise into DataError."""
     try:
         return function()
-    except (
-        AttributeError,
-        IndexError,
-        KeyError,
-        OverflowError,
-        RecursionError,
-        TypeError,
-        ValueError,
-        struct.error,
-    ) as error:
+    except _DAMAGE as error:
         reason = f"nothing called {error}" if isinstance(error, KeyError) else str(error)
         raise DataError(f"{path}: damaged glTF ({' '.join(reason.split())[:160]}); expected glTF 2") from None
 
@@ -138,10 +110,8 @@ class GltfDocument:
 
     def unsupported(self, extension: str) -> DataError:
         """Return the error for an extension that is not read."""
-        return DataError(
-            f"{self.path}: needs the glTF extension {extension[:60]}, which is not read; "
-            "expected a plain export, not compressed"
-        )
+        found = f"needs the glTF extension {extension[:60]}, which is not read"
+        return DataError(f"{self.path}: {found}; expected a plain export, not compressed")
 
     def _read_buffer(self, index: int, entry: Mapping[str, Any], binary: bytes | None) -> bytes:
         if "uri" in entry:
@@ -168,9 +138,7 @@ class GltfDocument:
     def array(self, index: int, kinds: Sequence[str], length: int | None = None) -> NDArray:
         """Return the (N, C) values of an accessor; normalized integers as floats 0..1 or -1..1.
 
-        Args:
-            kinds: accepted types, e.g. "VEC3".
-            length: the number of vertices, where there must be one value for each.
+        ``kinds`` are accepted types, e.g. "VEC3"; ``length`` is the number of values, where there must be so many.
         """
         accessor = self.content["accessors"][to_index(index)]
         where, count, kind = f"accessors[{index}]", to_index(accessor["count"]), accessor["type"]

@@ -28,38 +28,23 @@ from neuprim.tasks.static.mesh.model import (
     check_limits,
 )
 
-__all__ = ["GREY", "SurfacePart", "Texture", "decode_texture", "read_surfaces"]
+GREY = parse_srgb("#b4b4b4")  # of what the file says no colour of
 
-GREY = parse_srgb("#b4b4b4")
-"""Of what the file says no colour of."""
-
-_FARTHEST_UV = 1e6
-"""Of texture coordinates: single precision has no fraction left there. What is beyond, or no number, is taken for 0."""
+_FARTHEST_UV = 1e6  # single precision has no fraction left there; coordinates beyond, or no numbers, are taken for 0
 
 
 @dataclass(frozen=True)
 class SurfacePart:
-    """One piece of the surface.
+    """One piece of the surface."""
 
-    Attributes:
-        corners: (F, 3, 3) float64 positions in the units and axes of the file, finite.
-        normals: (F, 3, 3) normals of the file, if any.
-        colour: (F, 3, 3) float32 linear RGB.
-        uv: (F, 3, 2) float32, v upward, if there is a texture.
-        material: provides the texture.
-        bare: whether the file has no colour for it.
-        alpha: (F, 3) float32 0..1; None for opaque.
-        glow: emitted light, as ``colour``, ``uv`` and ``material`` of another part.
-    """
-
-    corners: NDArray[np.float64]
-    normals: NDArray[np.float64] | None
-    colour: NDArray[np.float32]
-    uv: NDArray[np.float32] | None
-    material: Material
-    bare: bool
-    alpha: NDArray[np.float32] | None = None
-    glow: SurfacePart | None = None
+    corners: NDArray[np.float64]  # (F, 3, 3) positions in the units and axes of the file, finite
+    normals: NDArray[np.float64] | None  # (F, 3, 3) of the file, if any
+    colour: NDArray[np.float32]  # (F, 3, 3) linear RGB
+    uv: NDArray[np.float32] | None  # (F, 3, 2), v upward, if there is a texture
+    material: Material  # provides the texture
+    bare: bool  # whether the file has no colour for it
+    alpha: NDArray[np.float32] | None = None  # (F, 3) 0..1; None for opaque
+    glow: SurfacePart | None = None  # emitted light: colour, uv and material of another part
 
 
 def read_surfaces(model: Model) -> list[SurfacePart]:
@@ -112,10 +97,8 @@ def _coordinates(
     if material.texture is None:
         return None
     if uv is None:
-        warn_once(
-            f"{model.path}: texture {material.texture[:80]!r} has no coordinates on a part of {faces} faces; "
-            "drawn without it"
-        )
+        found = f"texture {material.texture[:80]!r} has no coordinates on a part of {faces} faces"
+        warn_once(f"{model.path}: {found}; drawn without it")
         return None
     with np.errstate(all="ignore"):
         moved = _moved(np.asarray(uv, np.float32), material)
@@ -131,22 +114,14 @@ def _moved(uv: NDArray[np.float32], material: Material) -> NDArray[np.float32]:
     return np.stack([down[..., 0], 1 - down[..., 1]], axis=-1)
 
 
-# ---------------------------------------------------------------- textures
-
-FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")
-"""What Pillow may decode: it knows formats that run other programs."""
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")  # what Pillow may decode: others run programs
 
 _LINEAR: NDArray[np.float32] = srgb_to_linear(torch.arange(256) / 255.0).numpy()
 _ROWS = 256
 
 
 class Texture:
-    """An image with its copies of half, a quarter, ... of the size.
-
-    Args:
-        pixels: (H, W, 4) uint8, sRGB with straight alpha.
-        wrap: "repeat", "clamp" or "mirror", along u and v.
-    """
+    """An image, (H, W, 4) uint8 sRGB with straight alpha, with its copies of half, a quarter, ... of the size."""
 
     def __init__(self, pixels: NDArray[np.uint8], wrap: tuple[str, str] = ("repeat", "repeat")) -> None:
         self.wrap = wrap
@@ -156,15 +131,16 @@ class Texture:
 
     @property
     def texels(self) -> int:
-        """Number of pixels of the image."""
         return self.levels[0].shape[0] * self.levels[0].shape[1]
 
-    def look_up(self, uv: NDArray[np.float32], blur: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(M, 4) linear RGB and alpha.
+    @property
+    def alpha(self) -> NDArray:
+        return self.levels[0][..., 3]
 
-        Args:
-            uv: (M, 2), v upward; (0, 0) is the lower left corner.
-            blur: (M,) texels along an axis that one ray stands for.
+    def look_up(self, uv: NDArray[np.float32], blur: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(M, 4) linear RGB and alpha at (M, 2) ``uv``, v upward from the lower left corner.
+
+        ``blur`` (M,) is the number of texels along an axis that one ray stands for.
         """
         level = np.clip(np.round(np.log2(np.maximum(blur, 1.0))), 0, len(self.levels) - 1).astype(np.intp)
         found = np.empty((len(uv), 4), dtype=np.float32)
@@ -218,14 +194,9 @@ def _halved(image: NDArray) -> NDArray[np.float16]:
 
 
 def decode_texture(path: Path, name: str, data: bytes, left: int = MAX_TEXELS) -> NDArray[np.uint8]:
-    """Decode an image to (H, W, 4) uint8, sRGB with straight alpha.
+    """Decode an image to (H, W, 4) uint8, sRGB with straight alpha, of at most ``left`` pixels.
 
-    Args:
-        path, name: model and image, for messages.
-        left: pixels that the limit for all textures leaves.
-
-    Raises:
-        DataError: damaged, of another format, or too large.
+    Raises DataError naming model and image if it is damaged, of another format, or too large.
     """
     where = f"{path}: texture {name[:80]!r}"
     try:
@@ -234,23 +205,16 @@ def decode_texture(path: Path, name: str, data: bytes, left: int = MAX_TEXELS) -
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
                 size = image.width * image.height
                 if size > min(MAX_PIXELS, left):
-                    most = (
-                        f"{MAX_PIXELS} are accepted"
-                        if size > MAX_PIXELS
-                        else f"{MAX_TEXELS} of all textures are accepted"
-                    )
-                    raise DataError(f"{where} has {image.width}x{image.height} pixels; at most {most}")
-                deep = image.mode.startswith("I")  # 16 bits of grey, which Pillow would cut off at 255
-                plain = (
-                    Image.fromarray((np.asarray(image, np.int64) >> 8).clip(0, 255).astype(np.uint8)) if deep else image
-                )
-                return np.array(plain.convert("RGBA"))
+                    most = f"{MAX_PIXELS}" if size > MAX_PIXELS else f"{MAX_TEXELS} of all textures"
+                    raise DataError(f"{where} has {image.width}x{image.height} pixels; at most {most} are accepted")
+                if image.mode.startswith("I"):  # 16 bits of grey, which Pillow would cut off at 255
+                    grey = (np.asarray(image, np.int64) >> 8).clip(0, 255).astype(np.uint8)
+                    return np.array(Image.fromarray(grey).convert("RGBA"))
+                return np.array(image.convert("RGBA"))
     except (DataError, MemoryError):
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise DataError(f"{where} claims more than {MAX_PIXELS} pixels; expected fewer") from None
     except Exception as error:  # Pillow's decoders raise OSError, SyntaxError, ValueError, struct.error, ...
-        said = " ".join(str(error).split())[:120]
-        raise DataError(
-            f"{where} cannot be decoded ({said}); expected {', '.join(FORMATS[:-1])} or {FORMATS[-1]}"
-        ) from None
+        reason, expected = " ".join(str(error).split())[:120], f"{', '.join(FORMATS[:-1])} or {FORMATS[-1]}"
+        raise DataError(f"{where} cannot be decoded ({reason}); expected {expected}") from None

@@ -1,5 +1,4 @@
-"""A mesh file with its materials, read together with the files it names: under size limits, from its own "
-"folder only."""
+"""A mesh file with its materials, read together with the files it names: under size limits, from its folder only."""
 
 from __future__ import annotations
 
@@ -20,147 +19,83 @@ from numpy.typing import NDArray
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.notices import warn_once
 
-__all__ = [
-    "MAX_FACES",
-    "MAX_PARTS",
-    "MAX_TEXELS",
-    "MAX_VERTICES",
-    "Faces",
-    "Material",
-    "Model",
-    "ModelFolder",
-    "Up",
-    "check_limits",
-    "check_vertices",
-    "find_model_file",
-]
-
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
+_SUFFIX_LIST = ", ".join(SUFFIXES[:-1]) + " or " + SUFFIXES[-1]
 
-MAX_BYTES = 512 * 2**20
-"""Size limit of the file and all files it names together."""
-
-MAX_FACES = 2_000_000
-"""Triangles; each instance of a mesh counts."""
-
+MAX_BYTES = 512 * 2**20  # of the file and all files it names together
+MAX_FACES = 2_000_000  # triangles; each instance of a mesh counts
 MAX_VERTICES = 3 * MAX_FACES
+MAX_PARTS = 20_000  # pieces with a material or transform of their own
+MAX_TEXELS = 128 * 2**20  # of all textures together
 
-MAX_PARTS = 20_000
-"""Pieces with a material or transform of their own."""
-
-MAX_TEXELS = 128 * 2**20
-"""Pixels of all textures together. A single image has at most :data:`neuprim.core.io.exr.MAX_PIXELS`."""
-
-Up = Literal["y", "z"]
-"""The axis of the file that points up."""
+Up = Literal["y", "z"]  # the axis of the file that points up
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
 
 
 @dataclass(frozen=True)
 class Material:
-    """Colour of a part of the surface.
+    """Colour of a part of the surface."""
 
-    Attributes:
-        colour: (3,) linear RGB factor of the texture and the vertex colours; None where the file has no colour.
-        texture: key of the image in :attr:`Model.images`.
-        wrap: behaviour of texture coordinates outside 0..1 along u and v: "repeat", "clamp" or "mirror".
-        transform: (2, 3) transform of texture coordinates whose v points down; None for the identity.
-        opacity: factor of the alpha of texture and vertices.
-        cutoff: alpha below which there is a hole; None where alpha is ignored.
-        blend: whether the file asks for translucency, which is not drawn.
-        glow: emitted light: its ``colour``, ``texture``, ``wrap`` and ``transform``.
-        unlit: whether colours are emitted instead of reflected.
-    """
-
-    colour: tuple[float, float, float] | None = None
-    texture: str | None = None
-    wrap: tuple[str, str] = ("repeat", "repeat")
-    transform: tuple[tuple[float, ...], ...] | None = None
-    opacity: float = 1.0
-    cutoff: float | None = None
-    blend: bool = False
-    glow: Material | None = None
-    unlit: bool = False
+    colour: tuple[float, float, float] | None = (
+        None  # linear RGB factor of texture and vertices; None: none in the file
+    )
+    texture: str | None = None  # key of the image in Model.images
+    wrap: tuple[str, str] = ("repeat", "repeat")  # outside 0..1 along u and v: "repeat", "clamp" or "mirror"
+    transform: tuple[tuple[float, ...], ...] | None = None  # (2, 3), of coordinates whose v points down
+    opacity: float = 1.0  # factor of the alpha of texture and vertices
+    cutoff: float | None = None  # alpha below which there is a hole; None where alpha is ignored
+    blend: bool = False  # whether the file asks for translucency, which is not drawn
+    glow: Material | None = None  # emitted light: its colour, texture, wrap and transform
+    unlit: bool = False  # whether colours are emitted instead of reflected
 
 
 @dataclass(frozen=True)
 class Faces:
-    """Triangles of one material.
+    """Triangles of one material."""
 
-    Attributes:
-        corners: (F, 3, 3) float64 positions in the units and axes of the file.
-        material: name of the material.
-        normals: (F, 3, 3) of any length, 0 where the file has none.
-        colour: (F, 3, 3) or, with alpha, (F, 3, 4), values 0..1.
-        uv, glow_uv: (F, 3, 2) coordinates in the colour and the emission texture, v upward.
-    """
-
-    corners: NDArray[np.float64]
+    corners: NDArray[np.float64]  # (F, 3, 3) positions in the units and axes of the file
     material: str = ""
-    normals: NDArray[np.float64] | None = None
-    colour: NDArray[np.float32] | None = None
-    uv: NDArray[np.floating] | None = None
-    glow_uv: NDArray[np.floating] | None = None
+    normals: NDArray[np.float64] | None = None  # (F, 3, 3) of any length, 0 where the file has none
+    colour: NDArray[np.float32] | None = None  # (F, 3, 3) or, with alpha, (F, 3, 4), values 0..1
+    uv: NDArray[np.floating] | None = None  # (F, 3, 2) coordinates in the colour texture, v upward
+    glow_uv: NDArray[np.floating] | None = None  # (F, 3, 2) in the emission texture
 
 
 @dataclass(frozen=True)
 class Model:
-    """A mesh file whose references are read and whose geometry is not parsed yet.
-
-    Attributes:
-        path: used in messages.
-        read_faces: parses the geometry: all triangles, and the number of vertices. Raises DataError for damaged data.
-        digest: hash of all bytes read and of the names of missing files.
-        materials: name -> material; "" is the material of surfaces without one.
-        images: name -> encoded bytes of a texture.
-        upward: the axis that points up by the convention of the format.
-        linear: whether vertex colours are linear light; sRGB otherwise.
-    """
+    """A mesh file whose references are read and whose geometry is not parsed yet."""
 
     path: Path
-    read_faces: Callable[[], tuple[list[Faces], int]]
-    digest: str
-    materials: dict[str, Material] = field(default_factory=dict)
-    images: dict[str, bytes] = field(default_factory=dict)
-    upward: Up = "z"
-    linear: bool = False
+    read_faces: Callable[[], tuple[list[Faces], int]]  # all triangles, and the number of vertices; raises DataError
+    digest: str  # hash of all bytes read and of the names of missing files
+    materials: dict[str, Material] = field(default_factory=dict)  # "" is the material of surfaces without one
+    images: dict[str, bytes] = field(default_factory=dict)  # name -> encoded bytes of a texture
+    upward: Up = "z"  # the axis that points up by the convention of the format
+    linear: bool = False  # whether vertex colours are linear light; sRGB otherwise
 
 
 def find_model_file(path: Path) -> Path:
-    """Return the existing mesh file of ``scene.path`` with ``~`` expanded.
-
-    Raises:
-        DataError: the file does not exist or has an unsupported suffix.
-    """
+    """Return the existing mesh file of ``scene.path`` with ``~`` expanded; raises DataError for any other."""
     try:
         file = path.expanduser()
         usable, there = file.is_file(), file.exists()
     except (OSError, RuntimeError) as error:
         raise DataError(f"{path}: {error}; expected a model's file (scene.path)") from None
     if not usable:
-        raise DataError(
-            f"{file}: {'is no file' if there else 'does not exist'}; expected a model's file (scene.path), "
-            f"{_list_suffixes()}"
-        )
+        found = "is no file" if there else "does not exist"
+        raise DataError(f"{file}: {found}; expected a model's file (scene.path), {_SUFFIX_LIST}")
     if file.suffix.lower() not in SUFFIXES:
         found = f"ends in {file.suffix!r}" if file.suffix else "has no suffix"
-        raise DataError(
-            f"{file}: {found}; expected {_list_suffixes()}" + (nearest(file.suffix, SUFFIXES) if file.suffix else "")
-        )
+        hint = nearest(file.suffix, SUFFIXES) if file.suffix else ""
+        raise DataError(f"{file}: {found}; expected {_SUFFIX_LIST}{hint}")
     return file
-
-
-def _list_suffixes() -> str:
-    return ", ".join(SUFFIXES[:-1]) + " or " + SUFFIXES[-1]
 
 
 class ModelFolder:
     """Reads a mesh file and the files beside and below it within a byte budget, and hashes everything it reads.
 
-    Args:
-        file: the mesh file.
-        skip_missing: warn about missing or refused textures and material files instead of raising.
+    With ``skip_missing`` missing or refused textures and material files are a warning instead of an error.
     """
 
     def __init__(self, file: Path, skip_missing: bool = False, budget: int = MAX_BYTES) -> None:
@@ -176,26 +111,18 @@ class ModelFolder:
         """Read the mesh file itself."""
         data = self._read(self.file, self.file.suffix.lower())
         if not data:
-            raise DataError(f"{self.file}: file is empty; expected a model, {_list_suffixes()}")
+            raise DataError(f"{self.file}: file is empty; expected a model, {_SUFFIX_LIST}")
         return data
 
     def read_required(self, reference: str, what: str) -> bytes:
-        """Read a file that the model cannot do without.
-
-        Raises:
-            DataError: the reference leaves the model's folder, does not exist or exceeds the budget.
-        """
+        """Read a needed file; raises DataError for one that leaves the model's folder, is missing or too large."""
         found, fault = self._resolve(reference, what)
         if found is None:
             raise DataError(fault)
         return found
 
     def read_optional(self, references: Sequence[str], what: str) -> bytes | None:
-        """Read the first existing spelling of a name; None, with a warning, if ``skip_missing`` allows it.
-
-        Raises:
-            DataError: as :meth:`read_required`.
-        """
+        """Read the first existing spelling of a name; None, with a warning, if ``skip_missing`` allows it."""
         faults = []
         for reference in references:
             found, fault = self._resolve(reference, what)
@@ -236,9 +163,8 @@ class ModelFolder:
                 raise ValueError("no base64")
             return base64.b64decode(unquote(body), validate=True)
         except (ValueError, binascii.Error) as error:
-            raise DataError(
-                f"{self.file}: embedded {what} is damaged ({error}); expected data:...;base64,..."
-            ) from None
+            found = f"embedded {what} is damaged ({error})"
+            raise DataError(f"{self.file}: {found}; expected data:...;base64,...") from None
 
     def _read(self, path: Path, name: str) -> bytes:
         try:
@@ -246,9 +172,8 @@ class ModelFolder:
                 size = os.fstat(file.fileno()).st_size
                 if size > self._budget:
                     more = "" if path == self.file else f" with what it names, up to {path.name},"
-                    raise DataError(
-                        f"{self.file}: the model{more} is larger than {MAX_BYTES >> 20} MiB; expected a smaller one"
-                    )
+                    found = f"the model{more} is larger than {MAX_BYTES >> 20} MiB"
+                    raise DataError(f"{self.file}: {found}; expected a smaller one")
                 data = file.read(size)
         except OSError as error:
             raise DataError(f"{path}: cannot be read ({error.strerror or error})") from None
@@ -265,15 +190,13 @@ def check_limits(path: Path, counts: Mapping[str, tuple[int, int]]) -> None:
 
 
 def check_vertices(path: Path, positions: NDArray[np.float64], faces: NDArray[np.integer]) -> None:
-    """Raise DataError if a face of ``faces`` (any shape) refers to a row of ``positions`` (V, 3) that is missing or
-    not finite."""
+    """Raise DataError if ``faces`` (any shape) refers to a row of ``positions`` (V, 3) that is missing or infinite."""
     if not faces.size:
         return
     low, high = int(faces.min()), int(faces.max())
     if low < 0 or high >= len(positions):
-        raise DataError(
-            f"{path}: a face has the vertex {high if low >= 0 else low} of {len(positions)}; expected one that is there"
-        )
+        found = f"a face has the vertex {high if low >= 0 else low} of {len(positions)}"
+        raise DataError(f"{path}: {found}; expected one that is there")
     bad = np.flatnonzero(~np.isfinite(positions).all(axis=1) & np.isin(np.arange(len(positions)), faces))
     if len(bad):
         raise DataError(f"{path}: vertex {bad[0]} is at {positions[bad[0]].tolist()}; expected finite numbers")

@@ -33,53 +33,42 @@ from neuprim.tasks.static.mesh.model import (
 )
 from neuprim.tasks.static.mesh.polygons import triangulate_polygons
 
-__all__ = ["read_obj"]
-
+# options of a texture that are followed by this many numbers, at most, and by one word
 _NUMBERS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}
-"""Options of a texture that are followed by this many numbers, at most."""
-
 _WORDS = {"-blendu", "-blendv", "-bm", "-boost", "-cc", "-clamp", "-imfchan", "-texres", "-type"}
-"""Options that are followed by one word."""
 
+# fewest and most numbers that are read of a vertex (x y z, then a colour or a weight), its texture coordinates and its
+# normal
 _WIDTHS = {"v": (3, 8), "vt": (1, 3), "vn": (3, 3)}
-"""Numbers of a vertex (x y z, then a colour or a weight), its texture coordinates and its normal: fewest and most that
-are read."""
-
-_NONE = -1
-"""The index of texture coordinates or a normal that a corner does without."""
+_NONE = -1  # the index of texture coordinates or a normal that a corner does without
 
 
 def read_obj(folder: ModelFolder) -> Model:
-    """Read an .obj file and its material libraries.
-
-    Raises:
-        DataError: too large, or with references that lead nowhere.
-    """
-    # names of materials are compared with those of the library, so both are decoded alike
-    data = folder.read_model().decode("utf-8", "replace").encode()
-    found = {"vertices": (data.count(b"\nv "), MAX_VERTICES), "faces": (data.count(b"\nf "), MAX_FACES)}
-    check_limits(folder.file, {**found, "changes of material": (data.count(b"usemtl "), MAX_PARTS)})
+    """Read an .obj file and its material libraries; raises DataError as :class:`ModelFolder`."""
+    text = folder.read_model().decode("utf-8", "replace")
+    found = {"vertices": (text.count("\nv "), MAX_VERTICES), "faces": (text.count("\nf "), MAX_FACES)}
+    check_limits(folder.file, {**found, "changes of material": (text.count("usemtl "), MAX_PARTS)})
     materials: dict[str, Material] = {}
     images: dict[str, bytes] = {}
-    wanted = [line.decode("utf-8", "replace") for line in re.findall(rb"(?m)^\s*mtllib[ \t]+(.+?)\s*$", data)]
-    libraries = [
-        name.strip() for line in wanted for name in re.findall(r"(?i).+?\.mtl(?=\s|$)", line) or [line]
-    ]  # names may hold blanks
-    for library in dict.fromkeys(libraries):
-        text = folder.read_optional([library, PurePosixPath(library.replace("\\", "/")).name], "material file")
-        if text is not None:
-            materials |= _library(text.decode("utf-8", "replace"), folder, images)
-    faces = partial(_read_faces, folder.file, data)
+    libraries: dict[str, None] = {}
+    for line in re.findall(r"(?m)^[ \t\r\f\v]*mtllib[ \t]+(.+?)\s*$", text):
+        names = re.findall(r"(?i).+?\.mtl(?=\s|$)", line) or [line]  # names may hold blanks
+        libraries.update((name.strip(), None) for name in names)
+    for library in libraries:
+        content = folder.read_optional([library, PurePosixPath(library.replace("\\", "/")).name], "material file")
+        if content is not None:
+            materials |= _library(content.decode("utf-8", "replace"), folder, images)
+    faces = partial(_read_faces, folder.file, text)
     return Model(folder.file, faces, folder.digest, materials, images, "y")
 
 
-def _read_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
+def _read_faces(path: Path, text: str) -> tuple[list[Faces], int]:
     """Read all triangles, by material, and count the vertices.
 
     Raises:
         DataError: a line that is damaged, a face with a vertex that is not there, or polygons that cross themselves.
     """
-    text = re.sub(r"\\\r?\n", " ", data.decode("utf-8", "replace"))
+    text = re.sub(r"\\\r?\n", " ", text)
     numbers, lengths = {key: array("d") for key in _WIDTHS}, {key: array("q") for key in _WIDTHS}
     indices, sizes, owners = array("q"), array("q"), array("q")
     names = {"": 0}
@@ -109,34 +98,28 @@ def _read_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
                 sizes.append(len(words) - 1)
                 owners.append(material)
         except (ValueError, OverflowError) as error:
-            said = f"{' '.join(line.split())[:60]!r} ({' '.join(str(error).split())[:80]})"
-            raise DataError(
-                f"{path}: line {number} is {said}; expected numbers, or f v/vt/vn ... with vertices that are there"
-            ) from None
+            found = f"{' '.join(line.split())[:60]!r} ({' '.join(str(error).split())[:80]})"
+            expected = "numbers, or f v/vt/vn ... with vertices that are there"
+            raise DataError(f"{path}: line {number} is {found}; expected {expected}") from None
     v, vt, vn = (_table(key, np.array(numbers.pop(key)), np.array(lengths.pop(key))) for key in _WIDTHS)
-    used = np.frombuffer(indices, np.int64).reshape(-1, 3) if indices else np.zeros((0, 3), np.int64)
+    used = np.array(indices, np.int64).reshape(-1, 3)
     check_vertices(path, v[:, :3], used[:, 0])
     for column, table, what in ((1, vt, "texture coordinates"), (2, vn, "normal")):
         if len(used) and used[:, column].max() >= len(table):
-            raise DataError(
-                f"{path}: a face has the {what} {used[:, column].max() + 1} of {len(table)}; expected one that is there"
-            )
-    corners = v[used[:, 0], :3]
-    faces, polygon = triangulate_polygons(
-        path, corners, np.frombuffer(sizes, np.int64) if sizes else np.zeros(0, np.int64)
-    )
-    owner = np.frombuffer(owners, np.int64)[polygon] if owners else polygon
+            found = f"a face has the {what} {used[:, column].max() + 1} of {len(table)}"
+            raise DataError(f"{path}: {found}; expected one that is there")
+    faces, polygon = triangulate_polygons(path, v[used[:, 0], :3], np.array(sizes, np.int64))
+    owner = np.array(owners, np.int64)[polygon]
     colours = _vertex_colours(path, v)
-    found = []
+    parts = []
     for name, index in names.items():
         mine = used[faces[owner == index]]
         if len(mine):
             normals = _looked_up(vn, mine[..., 2], 0.0) if len(vn) else None
             uv = _looked_up(vt[:, :2], mine[..., 1], np.nan) if (mine[..., 1] != _NONE).any() else None
-            found.append(
-                Faces(v[mine[..., 0], :3], name, normals, None if colours is None else colours[mine[..., 0]], uv, uv)
-            )
-    return found, len(v)
+            colour = None if colours is None else colours[mine[..., 0]]
+            parts.append(Faces(v[mine[..., 0], :3], name, normals, colour, uv, uv))
+    return parts, len(v)
 
 
 def _looked_up(table: NDArray[np.float64], index: NDArray[np.int64], missing: float) -> NDArray[np.float64]:
@@ -170,7 +153,7 @@ def _vertex_colours(path: Path, v: NDArray[np.float64]) -> NDArray[np.float32] |
 def _library(text: str, folder: ModelFolder, images: dict[str, bytes]) -> dict[str, Material]:
     found: dict[str, Material] = {}
     name = ""
-    told = set[str]()  # of what d is known, which wins over Tr
+    with_d = set[str]()  # materials whose d is known, which wins over Tr
     for line in text.splitlines():
         key, _, rest = line.strip().replace("\t", " ").partition(" ")
         key, words = key.lower(), rest.split()
@@ -188,20 +171,17 @@ def _library(text: str, folder: ModelFolder, images: dict[str, bytes]) -> dict[s
         elif key in ("map_kd", "map_ke"):
             image = _texture(words, rest, folder, images)
             if image is not None and key == "map_kd":
-                found[name] = replace(
-                    old, texture=image.texture, wrap=image.wrap, transform=image.transform, cutoff=0.5, blend=True
-                )
+                own = replace(image, colour=old.colour, opacity=old.opacity, glow=old.glow)
+                found[name] = replace(own, cutoff=0.5, blend=True)
             elif image is not None:
                 found[name] = replace(old, glow=replace(image, colour=glow.colour))
-        elif key == "d" or (key == "tr" and name not in told):
-            value = _number_of(words[-1], folder, name)
-            told |= {name} if key == "d" else set()
+        elif key == "d" or (key == "tr" and name not in with_d):
+            value = _opacity(words[-1], folder, name)
+            with_d |= {name} if key == "d" else set()
             found[name] = replace(old, opacity=value if key == "d" else 1 - value, cutoff=0.5, blend=True)
         elif key == "map_d" and _file_name(words, rest)[0] != old.texture:
-            warn_once(
-                f"{folder.file}: map_d of material {name[:40]!r} is not read; drawn as opaque as d and the "
-                "alpha of map_Kd say"
-            )
+            what = f"map_d of material {name[:40]!r} is not read"
+            warn_once(f"{folder.file}: {what}; drawn as opaque as d and the alpha of map_Kd say")
     return {name: _textured(material) for name, material in found.items()}
 
 
@@ -256,11 +236,10 @@ def _number(word: str) -> bool:
     return re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", word) is not None
 
 
-def _number_of(word: str, folder: ModelFolder, name: str) -> float:
+def _opacity(word: str, folder: ModelFolder, name: str) -> float:
     if not _number(word):
-        raise DataError(
-            f"{folder.file}: material {name[:40]!r} has the opacity {word[:20]!r}; expected a number from 0 to 1"
-        )
+        found = f"material {name[:40]!r} has the opacity {word[:20]!r}"
+        raise DataError(f"{folder.file}: {found}; expected a number from 0 to 1")
     return min(max(float(word), 0.0), 1.0)
 
 
@@ -270,8 +249,7 @@ def _colour(words: list[str], folder: ModelFolder, name: str) -> tuple[float, fl
         if not values.isfinite().all():
             raise ValueError
     except ValueError:
-        raise DataError(
-            f"{folder.file}: material {name[:40]!r} has the colour {' '.join(words)[:40]!r}; expected three numbers"
-        ) from None
+        found = f"material {name[:40]!r} has the colour {' '.join(words)[:40]!r}"
+        raise DataError(f"{folder.file}: {found}; expected three numbers") from None
     r, g, b = srgb_to_linear(values.clamp(0, 1)).tolist()
     return r, g, b

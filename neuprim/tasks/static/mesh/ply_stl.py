@@ -1,5 +1,4 @@
-"""PLY, with its vertices' or faces' colours or a texture, and STL, which may have colours: what headers claim is held
-against their bytes."""
+"""PLY, with colours of vertices or faces or a texture, and STL, which may have colours; headers are not trusted."""
 
 from __future__ import annotations
 
@@ -27,8 +26,6 @@ from neuprim.tasks.static.mesh.model import (
 )
 from neuprim.tasks.static.mesh.polygons import triangulate_polygons
 
-__all__ = ["read_ply_mesh", "read_stl"]
-
 _HEADER = 2**16
 _RGB = ("red", "green", "blue")
 _UV = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
@@ -38,23 +35,18 @@ _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute",
 def read_ply_mesh(folder: ModelFolder) -> Model:
     """Read a .ply file with its faces, and the texture that a comment ``TextureFile`` names.
 
-    Raises:
-        DataError: too large, no PLY file, or with a texture that leads nowhere.
+    Raises DataError for a file that is too large, no PLY, or has a texture that leads nowhere.
     """
     data = folder.read_model()
     end = data.find(b"end_header", 0, _HEADER)
-    if not data.startswith(b"ply") or end < 0:
-        found = (
-            f"starts with {data[:12]!r}"
-            if not data.startswith(b"ply")
-            else f"has no end_header in its first {_HEADER} bytes"
-        )
-        raise DataError(f"{folder.file}: {found}; expected a PLY file")
+    if not data.startswith(b"ply"):
+        raise DataError(f"{folder.file}: starts with {data[:12]!r}; expected a PLY file")
+    if end < 0:
+        raise DataError(f"{folder.file}: has no end_header in its first {_HEADER} bytes; expected a PLY file")
     header = data[:end].decode("utf-8", "replace")
     counts = {name: int(count) for name, count in re.findall(r"(?m)^element[ \t]+(\S+)[ \t]+(\d{1,18})\s*$", header)}
-    check_limits(
-        folder.file, {"vertices": (counts.get("vertex", 0), MAX_VERTICES), "faces": (counts.get("face", 0), MAX_FACES)}
-    )
+    vertices, faces = (counts.get("vertex", 0), MAX_VERTICES), (counts.get("face", 0), MAX_FACES)
+    check_limits(folder.file, {"vertices": vertices, "faces": faces})
     materials: dict[str, Material] = {}
     images: dict[str, bytes] = {}
     texture = re.search(r"(?mi)^comment[ \t]+TextureFile[ \t]+(.+?)\s*$", header)
@@ -83,9 +75,8 @@ def _read_ply_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
     if face is None or corners is None:
         strips = elements["tristrips"].lists if "tristrips" in elements else {}
         if strips or lists:
-            raise DataError(
-                f"{path}: faces are {', '.join([*strips, *lists])[:60]}; expected a list vertex_indices of every face"
-            )
+            found = ", ".join([*strips, *lists])[:60]
+            raise DataError(f"{path}: faces are {found}; expected a list vertex_indices of every face")
         return [], count
     index = corners.values.astype(np.int64)
     xyz = vertices.columns(("x", "y", "z"))
@@ -120,21 +111,14 @@ def _colours(element: PlyElement, path: Path) -> NDArray[np.float32] | None:
 
 
 def read_stl(folder: ModelFolder) -> Model:
-    """Read an .stl file.
-
-    A file is binary where its length is what byte 80 announces, whatever it starts with, else text.
-
-    Raises:
-        DataError: too large, or cut off.
-    """
+    """Read an .stl file: binary where its length is what byte 80 announces, whatever it starts with, else text."""
     data = folder.read_model()
     count = int.from_bytes(data[80:84], "little")
     text = len(data) != 84 + 50 * count or len(data) < 84
     if text:
         if data[:5].lower() != b"solid" or b"facet" not in data[:_HEADER]:
-            raise DataError(
-                f"{folder.file}: {count} faces announced; expected {84 + 50 * count} bytes for them, found {len(data)}"
-            )
+            expected = f"{84 + 50 * count} bytes for them, found {len(data)}"
+            raise DataError(f"{folder.file}: {count} faces announced; expected {expected}")
         check_limits(folder.file, {"solids": (data.lower().count(b"endsolid"), MAX_PARTS)})
         count = data.lower().count(b"endfacet")
     check_limits(folder.file, {"faces": (count, MAX_FACES)})

@@ -14,19 +14,10 @@ from numpy.typing import NDArray
 
 from neuprim.core.errors import DataError
 
-__all__ = ["triangulate_polygons"]
-
-_FANS = 8
-"""Corners that fans of all polygons are tried from, before ears of one are looked for."""
-
-_MOST_TESTS = 500_000
-"""Of ears, in a model: about 20 seconds."""
-
-_COSTLY = 500
-"""Corners of a polygon that make a test as long again."""
-
-_FLAT = 1e-10
-"""Twice an area, over the square of the polygon's size, that counts as none."""
+_FANS = 8  # corners that fans of all polygons are tried from, before ears of one are looked for
+_MOST_TESTS = 500_000  # of ears, in a model: about 20 seconds
+_COSTLY = 500  # corners of a polygon that make a test as long again
+_FLAT = 1e-10  # twice an area, over the square of the polygon's size, that counts as none
 
 
 def triangulate_polygons(
@@ -34,13 +25,8 @@ def triangulate_polygons(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Triangles of polygons: (T, 3) rows of ``corners``, and (T,) which polygon each is of, ascending.
 
-    Args:
-        path: for messages.
-        corners: (C, 3) finite, those of all polygons one after the other.
-        sizes: (P,) how many each has; of one or two corners there is no triangle.
-
-    Raises:
-        DataError: polygons that cross themselves.
+    ``corners`` (C, 3) are finite, those of all polygons one after the other, and each of the (P,) ``sizes`` says how
+    many a polygon has. Raises DataError for polygons that cross themselves.
     """
     first = np.cumsum(sizes) - sizes
     found, owners, crossed = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)], []
@@ -65,9 +51,8 @@ def triangulate_polygons(
             areas = _areas(points[left], normal[left], fan)
             line = np.linalg.norm(_crosses(points[left], fan), axis=2).max(axis=1) <= _FLAT if start == 0 else np.False_
             good = ((areas >= -_FLAT).all(axis=1) & (length[left, 0] > _FLAT)) | line
-            shown = good[:, None] & (
-                (areas > _FLAT) | np.reshape(line, (-1, 1))
-            )  # triangles without area are no faces of the file
+            # triangles without area are no faces of the file
+            shown = good[:, None] & ((areas > _FLAT) | np.reshape(line, (-1, 1)))
             found.append(index[left][:, fan][shown])
             owners.append(np.repeat(rows[left], shown.sum(axis=1)))
             left = left[~good]
@@ -81,10 +66,10 @@ def triangulate_polygons(
             found.append(index[i][ears])
             owners.append(np.full(len(ears), rows[i]))
     if crossed:
+        first = f"face {min(crossed)} of {sizes[min(crossed)]} corners"
         raise DataError(
-            f"{path}: {len(crossed)} of {len(sizes)} faces cross themselves, as face {min(crossed)} of "
-            f"{sizes[min(crossed)]} corners; "
-            "expected simple polygons. Triangulate the mesh in the program that wrote it"
+            f"{path}: {len(crossed)} of {len(sizes)} faces cross themselves, as {first}; expected simple polygons. "
+            "Triangulate the mesh in the program that wrote it"
         )
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")

@@ -17,22 +17,11 @@ from neuprim.scenes.shapes import Solid, corner_normals, uniform_colour
 from neuprim.tasks.static.mesh.materials import SurfacePart, Texture, decode_texture
 from neuprim.tasks.static.mesh.model import MAX_TEXELS, Model, Up
 
-__all__ = ["FARTHEST", "Surface", "scene_from_file"]
-
-FARTHEST = 1.3
-"""Of any vertex from the origin, in scene units: from where the cameras of ``solids`` are, that much is in view."""
-
-_DIGITS = 6
-"""After the point, of positions in scene units that count as one."""
-
-_LEAST_AREA = 1e-12
-"""Of a face, in square scene units: below that it has no normal in single precision."""
-
-_LAYERS = 64
-"""Of holes that a ray passes at most."""
-
-_MOST_AROUND = 64
-"""Faces around a vertex that are smoothed over; work and memory for a vertex grow with their square."""
+FARTHEST = 1.3  # of any vertex from the origin, in scene units: what the cameras of ``solids`` have in view
+_DIGITS = 6  # after the point, of positions in scene units that count as one
+_LEAST_AREA = 1e-12  # of a face, in square scene units: below that it has no normal in single precision
+_LAYERS = 64  # of holes that a ray passes at most
+_MOST_AROUND = 64  # faces around a vertex that are smoothed over; work and memory grow with their square
 
 _Pool = dict[tuple[str, tuple[str, str]], Texture]
 
@@ -61,14 +50,8 @@ def scene_from_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np.floa
 class Surface(Scene):
     """The parts of a model, ready for ray queries.
 
-    Args:
-        model: provides the images.
-        parts: see :func:`~neuprim.tasks.static.mesh.materials.read_surfaces`.
-        upward: "y" or "z".
-        spacing: distance of neighbouring rays at distance 1, for texture filtering.
-
-    Raises:
-        DataError: a model without size, or a texture that cannot be decoded.
+    ``spacing`` is the distance of neighbouring rays at distance 1, for texture filtering. Raises DataError for a model
+    without size, or a texture that cannot be decoded.
     """
 
     def __init__(
@@ -76,9 +59,8 @@ class Surface(Scene):
     ) -> None:
         matrix = scene_from_file(parts, upward)
         if matrix is None:
-            raise DataError(
-                f"{model.path}: the mesh is a point, or too large for numbers; expected a size from 1e-150 to 1e150"
-            )
+            found = "the mesh is a point, or too large for numbers"
+            raise DataError(f"{model.path}: {found}; expected a size from 1e-150 to 1e150")
         self.scene_from_file = matrix
         points = np.concatenate([(part.corners @ matrix[:3, :3].T + matrix[:3, 3]).reshape(-1, 3) for part in parts])
         first, same = trimesh.grouping.unique_rows(points, digits=_DIGITS)
@@ -92,15 +74,15 @@ class Surface(Scene):
             if not kept.any():
                 raise DataError(f"{found}; expected triangles")
             warn_once(f"{found}; left out")
-        faint = np.concatenate([_faint(part) for part in parts])
+        faint = np.concatenate([_transparent_faces(part) for part in parts])
         if not (kept & ~faint).any():
-            raise DataError(
-                f"{model.path}: no face has an opacity of at least 0.5; expected a model that is not all clear "
-                "(alpha, d, Tr)"
-            )
+            found = "no face has an opacity of at least 0.5"
+            raise DataError(f"{model.path}: {found}; expected a model that is not all clear (alpha, d, Tr)")
         kept &= ~faint
         mesh = _mesh(points, faces[kept])
-        normals = _smooth(_file_normals(parts, matrix[:3, :3])[kept], across[kept], mesh)
+        turn = matrix[:3, :3].T  # to the axes of the scene; 0 where the file has no normal
+        given = [np.zeros_like(part.corners) if part.normals is None else part.normals @ turn for part in parts]
+        normals = _smooth(np.concatenate(given)[kept], across[kept], mesh)
         super().__init__([Solid("mesh", mesh, uniform_colour("#ffffff"), 0.0, normals=normals)], engine)
         pool: _Pool = {}
         area = double / spacing**2
@@ -108,10 +90,7 @@ class Surface(Scene):
         _say_translucent(model, parts, pool)
         glows = [p.glow or replace(p, colour=np.zeros_like(p.colour), uv=None, alpha=None) for p in parts]
         self._glow = _Layer(model, glows, kept, area, pool) if any(p.glow for p in parts) else None
-        cutoffs = [
-            np.nan if p.material.cutoff is None or (p.uv is None and p.alpha is None) else p.material.cutoff
-            for p in parts
-        ]
+        cutoffs = [np.nan if p.uv is None and p.alpha is None else p.material.cutoff for p in parts]
         self._cutoff = np.repeat(np.array(cutoffs, np.float32), [len(part.colour) for part in parts])[kept]
         self._holes = bool((self._cutoff > 0).any())
 
@@ -161,21 +140,13 @@ class Surface(Scene):
 
 
 class _Layer:
-    """Colours of all drawn faces: values at corners, times textures.
+    """Colours of the faces that are ``kept`` (F,): values at corners, times textures.
 
-    Args:
-        kept: (F,) faces that are drawn.
-        area: (F,) twice the area of a face, in rays at distance 1.
-        pool: decoded textures by image and wrapping; new ones are added.
+    ``area`` (F,) is twice that of a face, in rays at distance 1. Decoded textures are added to ``pool``.
     """
 
     def __init__(
-        self,
-        model: Model,
-        parts: Sequence[SurfacePart],
-        kept: NDArray[np.bool_],
-        area: NDArray[np.float64],
-        pool: _Pool,
+        self, model: Model, parts: Sequence[SurfacePart], kept: NDArray[np.bool_], area: NDArray, pool: _Pool
     ) -> None:
         owner = np.full(len(parts), -1, dtype=np.intp)
         for i, part in enumerate(parts):
@@ -188,15 +159,11 @@ class _Layer:
             owner[i] = list(pool).index((name, wrap))
         self._textures = list(pool.values())
         self._texture = np.repeat(owner, [len(part.colour) for part in parts])[kept]
-        self._colour = np.ones((len(kept), 3, 4), np.float32)
-        self._colour[..., :3] = np.concatenate([part.colour for part in parts])
-        self._colour[..., 3] = np.concatenate(
-            [np.ones(part.colour.shape[:2]) if part.alpha is None else part.alpha for part in parts]
-        )
-        self._colour = self._colour[kept]
-        self._uv = np.concatenate(
-            [np.zeros((len(p.colour), 3, 2), np.float32) if p.uv is None else p.uv for p in parts]
-        )[kept]
+        rgb = np.concatenate([p.colour for p in parts])[kept]
+        alpha = np.concatenate([np.ones(p.colour.shape[:2]) if p.alpha is None else p.alpha for p in parts])[kept]
+        self._colour = np.concatenate([rgb, alpha[..., None]], axis=-1).astype(np.float32)
+        no_uv = [np.zeros((len(p.colour), 3, 2), np.float32) if p.uv is None else p.uv for p in parts]
+        self._uv = np.concatenate(no_uv)[kept]
         # texels per scene unit: the square root of the area in the texture over that in space, of every face
         sides = self._uv[:, 1:] - self._uv[:, :1]
         inside = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
@@ -214,7 +181,7 @@ class _Layer:
         return found
 
 
-def _faint(part: SurfacePart) -> NDArray[np.bool_]:
+def _transparent_faces(part: SurfacePart) -> NDArray[np.bool_]:
     """(F,) faces that are completely transparent."""
     if part.alpha is None or part.material.cutoff is None:
         return np.zeros(len(part.colour), dtype=np.bool_)
@@ -224,11 +191,7 @@ def _faint(part: SurfacePart) -> NDArray[np.bool_]:
 
 def _say_translucent(model: Model, parts: Sequence[SurfacePart], pool: _Pool) -> None:
     """Warn once of translucent faces, which are drawn opaque or left out."""
-    soft = {
-        key
-        for key, texture in pool.items()
-        if ((texture.levels[0][..., 3] > 0) & (texture.levels[0][..., 3] < 255)).any()
-    }
+    soft = {key for key, texture in pool.items() if np.any((0 < texture.alpha) & (texture.alpha < 255))}
     count = 0
     for part in parts:
         if part.material.blend and part.uv is not None and (part.material.texture, part.material.wrap) in soft:
@@ -236,10 +199,8 @@ def _say_translucent(model: Model, parts: Sequence[SurfacePart], pool: _Pool) ->
         elif part.material.blend and part.alpha is not None:
             count += int(((part.alpha > 0) & (part.alpha < 1)).any(axis=1).sum())
     if count:
-        warn_once(
-            f"{model.path}: {count} faces are translucent; drawn opaque where their opacity is at least 0.5, "
-            "left out elsewhere"
-        )
+        found = f"{count} faces are translucent"
+        warn_once(f"{model.path}: {found}; drawn opaque where their opacity is at least 0.5, left out elsewhere")
 
 
 def _mesh(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
@@ -250,13 +211,6 @@ def _mesh(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trim
     own = faces.copy()
     own[crowded] = len(points) + np.arange(len(alone))
     return trimesh.Trimesh(np.concatenate([points, points[alone]]), own, process=False)
-
-
-def _file_normals(parts: Sequence[SurfacePart], turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(F, 3, 3) normals of the file on the axes of the scene, any length; zero where there is none."""
-    return np.concatenate(
-        [np.zeros_like(part.corners) if part.normals is None else part.normals @ turn.T for part in parts]
-    )
 
 
 def _smooth(given: NDArray[np.float64], across: NDArray[np.float64], mesh: trimesh.Trimesh) -> NDArray[np.float64]:

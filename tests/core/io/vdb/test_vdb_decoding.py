@@ -6,12 +6,11 @@ import struct
 import sys
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from neuprim.core.io.vdb import read_grid, read_grids, read_header
+from neuprim.core.io.vdb import read_grid, read_grids, read_header, scale_transform
 from tests.core.io.vdb.vdb_bytes import LEAF_CORNER, bits, file_head, grid_bytes, one_grid, one_leaf, refused, text
 
 RNG = np.random.default_rng(11)
@@ -62,9 +61,8 @@ def test_inactive_values(tmp_path: Path, code: int, flags: int) -> None:
     grid = read_grid(path, "density")
     assert grid.origins.tolist() == [list(LEAF_CORNER)] and grid.background == BACKGROUND
     np.testing.assert_array_equal(grid.masks.ravel(), MASK)
-    np.testing.assert_array_equal(
-        grid.values.ravel(), np.where(MASK, VALUES, np.where(CHOSEN, on, off).astype(np.float32))
-    )
+    expected = np.where(MASK, VALUES, np.where(CHOSEN, on, off).astype(np.float32))
+    np.testing.assert_array_equal(grid.values.ravel(), expected)
 
 
 @pytest.mark.parametrize("flags", [0, 1, 2, 3, 4, 6])
@@ -76,13 +74,8 @@ def test_all_values_stored(tmp_path: Path, flags: int) -> None:
     if not flags & 2:  # internal nodes then store all of their values as well
         upper, lower = (b"\x06" + packed(bytes(4 * n), flags) for n in (32768, 4096))
         first = 4 + 4 + 8 + 12 + 8192
-        tree = (
-            tree[:first]
-            + upper
-            + tree[first + len(nodes) : first + len(nodes) + 1024]
-            + lower
-            + tree[first + 2 * len(nodes) + 1024 :]
-        )
+        second = first + len(nodes) + 1024
+        tree = tree[:first] + upper + tree[first + len(nodes) : second] + lower + tree[second + len(nodes) :]
     grid = read_grid(one_grid(tmp_path / "a.vdb", tree, buffers, flags=flags), "density")
     np.testing.assert_array_equal(grid.values.ravel(), VALUES)
     assert grid.active_voxels == MASK.sum() and len(grid.tiles) == 0
@@ -101,9 +94,8 @@ def test_half_floats_and_their_missing_lengths(tmp_path: Path) -> None:
 def test_vectors(tmp_path: Path) -> None:
     vectors = RNG.normal(size=(512, 3)).astype("<f4")
     body = b"\x05" + floats(1, 2, 3, 4, 5, 6) + bits(CHOSEN) + vectors[MASK].tobytes()
-    grid = read_grid(
-        one_grid(tmp_path / "a.vdb", *one_leaf(MASK, body, floats(0, 0, 0)), kind="Tree_vec3s_5_4_3"), "density"
-    )
+    leaf = one_leaf(MASK, body, floats(0, 0, 0))
+    grid = read_grid(one_grid(tmp_path / "a.vdb", *leaf, kind="Tree_vec3s_5_4_3"), "density")
     expected = np.where(MASK[:, None], vectors, np.where(CHOSEN[:, None], (4, 5, 6), (1, 2, 3)).astype(np.float32))
     np.testing.assert_array_equal(grid.values.reshape(512, 3), expected)
     assert grid.channels == 3 and grid.to_dense(((8, 0, 16), (16, 8, 24))).shape == (8, 8, 8, 3)
@@ -111,9 +103,8 @@ def test_vectors(tmp_path: Path) -> None:
 
 def test_tiles_of_all_levels(tmp_path: Path) -> None:
     tree = struct.pack("<if", 1, 0.0) + struct.pack("<II", 2, 1)
-    tree += struct.pack("<3ifB", 4096, 0, 0, 1.5, 1) + struct.pack(
-        "<3ifB", -4096, 0, 0, 0.0, 0
-    )  # the second says nothing
+    tree += struct.pack("<3ifB", 4096, 0, 0, 1.5, 1)
+    tree += struct.pack("<3ifB", -4096, 0, 0, 0.0, 0)  # says nothing
     upper_child, upper_active, lower_active = np.zeros(32768, bool), np.zeros(32768, bool), np.zeros(4096, bool)
     upper_child[0], upper_active[32768 - 1], lower_active[[1, 256]] = True, True, True
     tree += struct.pack("<3i", 0, 0, 0) + bits(upper_child) + bits(upper_active) + b"\0" + floats(2.5)
@@ -122,9 +113,8 @@ def test_tiles_of_all_levels(tmp_path: Path) -> None:
     rows = {tuple(o): (s, v, a) for o, s, v, a in zip(*(x.tolist() for x in vars(grid.tiles).values()), strict=True)}
     assert rows[4096, 0, 0] == (4096, 1.5, True) and rows[3968, 3968, 3968] == (128, 2.5, True)
     assert rows[0, 0, 8] == (8, 3.5, True) and rows[8, 0, 0] == (8, 4.5, True)
-    assert (
-        rows[0, 0, 0] == (8, 9.0, False) and len(rows) == 2 + 4096
-    )  # inactive tiles that are not the background count
+    # inactive tiles that are not the background count
+    assert rows[0, 0, 0] == (8, 9.0, False) and len(rows) == 2 + 4096
     assert grid.active_voxels == 4096**3 + 128**3 + 2 * 8**3
 
 
@@ -141,15 +131,12 @@ def test_versions(tmp_path: Path, version: int) -> None:
 
 
 MATRIX = np.array([[0.0, -2.0, 0.0, 5.0], [1.0, 0.0, 0.3, 6.0], [0.0, 0.0, 3.0, 7.0], [0.0, 0.0, 0.0, 1.0]])
-MAPS: dict[str, tuple[list[float], Any]] = {
-    "UniformScaleMap": ([0.5] * 15, np.diag([0.5, 0.5, 0.5, 1])),
-    "ScaleMap": ([1, 2, 3] + [9] * 12, np.diag([1, 2, 3, 1])),
-    "UniformScaleTranslateMap": (
-        [5, 6, 7, 2, 2, 2] + [9] * 12,
-        [[2, 0, 0, 5], [0, 2, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]],
-    ),
-    "ScaleTranslateMap": ([5, 6, 7, 1, 2, 3] + [9] * 12, [[1, 0, 0, 5], [0, 2, 0, 6], [0, 0, 3, 7], [0, 0, 0, 1]]),
-    "TranslationMap": ([5, 6, 7], [[1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]]),
+MAPS: dict[str, tuple[list[float], np.ndarray]] = {
+    "UniformScaleMap": ([0.5] * 15, scale_transform(0.5)),
+    "ScaleMap": ([1, 2, 3] + [9] * 12, scale_transform((1, 2, 3))),
+    "UniformScaleTranslateMap": ([5, 6, 7, 2, 2, 2] + [9] * 12, scale_transform(2, (5, 6, 7))),
+    "ScaleTranslateMap": ([5, 6, 7, 1, 2, 3] + [9] * 12, scale_transform((1, 2, 3), (5, 6, 7))),
+    "TranslationMap": ([5, 6, 7], scale_transform(1, (5, 6, 7))),
     "AffineMap": (MATRIX.T.ravel().tolist(), MATRIX),
 }
 
@@ -179,11 +166,8 @@ def test_unknown_maps_are_listed_and_refused(tmp_path: Path) -> None:
 def test_foreign_grids_are_skipped_unread(tmp_path: Path) -> None:
     """Their trees are noise here, and nobody notices; the grid behind them is read."""
     data = file_head(5)
-    for name, kind in (
-        ("flags", "Tree_int32_5_4_3"),
-        ("inside", "Tree_bool_5_4_3"),
-        ("pts", "Tree_ptdataidx32_5_4_3_Mask"),
-    ):
+    foreign = {"flags": "Tree_int32_5_4_3", "inside": "Tree_bool_5_4_3", "pts": "Tree_ptdataidx32_5_4_3_Mask"}
+    for name, kind in foreign.items():
         data += grid_bytes(len(data), b"noise" * 100, b"more noise", name=name, kind=kind)
     data += grid_bytes(len(data), *LEAF, name="sdf", kept={"class": ("string", b"level set")})
     data += grid_bytes(len(data), *LEAF)
@@ -206,14 +190,8 @@ def test_names_that_repeat_and_instances(tmp_path: Path) -> None:
     data = file_head(3)
     data += grid_bytes(len(data), *LEAF, name="density\x1e0")
     data += grid_bytes(len(data), *LEAF, name="density\x1e1", flags=2)
-    data += grid_bytes(
-        len(data),
-        b"",
-        b"",
-        name="copy",
-        parent="density\x1e0",
-        mapping=text("TranslationMap") + struct.pack("<3d", 1, 2, 3),
-    )
+    moved = text("TranslationMap") + struct.pack("<3d", 1, 2, 3)
+    data += grid_bytes(len(data), b"", b"", name="copy", parent="density\x1e0", mapping=moved)
     path = tmp_path / "a.vdb"
     path.write_bytes(data)
     assert [g.name for g in read_header(path).grids] == ["density[0]", "density[1]", "copy"]

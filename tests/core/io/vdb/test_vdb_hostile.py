@@ -11,15 +11,7 @@ import numpy as np
 import pytest
 
 from neuprim.core.io.vdb import read_grid, read_header
-from tests.core.io.vdb.vdb_bytes import (
-    bits,
-    file_head,
-    grid_bytes,
-    one_grid,
-    one_leaf,
-    refused,
-    text,
-)
+from tests.core.io.vdb.vdb_bytes import bits, file_head, grid_bytes, one_grid, one_leaf, refused, text
 
 FULL = np.ones(512, bool)
 GOOD = one_leaf(FULL, b"\0" + bytes(2048), bytes(4))
@@ -83,38 +75,40 @@ def blosc_claim(size: int) -> bytes:
 
 
 ZERO = b"\0" + struct.pack("<q", 0)
-TREES: list[tuple[bytes, bytes, int, tuple[str, ...]]] = [
-    (struct.pack("<ifII", 1, 0, 2**32 - 1, 0), b"", 2, ("4294967295 root tiles", "truncated")),
-    (struct.pack("<ifII", 1, 0, 0, 2**32 - 1), b"", 2, ("root child 1 of 4294967295",)),
-    (struct.pack("<ifII", 7, 0, 0, 0), b"", 2, ("7 buffers",)),
-    (struct.pack("<ifII3i", 1, 0, 0, 1, 5, 0, 0), b"", 2, ("(5, 0, 0)", "multiples of 4096")),
-    (
-        struct.pack("<ifII3ifB", 1, 0, 1, 1, 0, 0, 0, 1, 1) + struct.pack("<3i", 0, 0, 0),
-        b"",
-        2,
-        ("(0, 0, 0)", "each once"),
-    ),
-    (struct.pack("<ifII3i", 1, 0, 0, 1, 0, 0, 0) + b"\xff" * 4096 + bytes(4097), b"", 2, ("truncated",)),
-    (*one_leaf(FULL, b"\0" + bytes(2048), bytes(4), b"\x07"), 2, ("value code 7", "0 to 6")),
-    (*one_leaf(FULL, b"\x09" + bytes(2048), bytes(4)), 2, ("value code 9", "a leaf")),
-    (GOOD[0], GOOD[1] + b"x", 2, ("leaf buffers end",)),
-    (GOOD[0] + b"x", GOOD[1], 2, ("nodes end",)),
-    (GOOD[0], GOOD[1][:-1], 2, ("2048 bytes", "2047 are left")),
-    (*one_leaf(FULL, b"\0" + bomb(2**26), bytes(4), ZERO), 3, ("zip chunk of more than 2048",)),
-    (*one_leaf(FULL, b"\0" + bomb(2047), bytes(4), ZERO), 3, ("zip chunk of 2047",)),
-    (*one_leaf(FULL, b"\0" + struct.pack("<q", 9) + b"not a zip", bytes(4), ZERO), 3, ("damaged zip chunk",)),
-    (*one_leaf(FULL, b"\0" + struct.pack("<q", -(2**62)), bytes(4), ZERO), 3, (str(2**62), "expected 2048")),
-    (*one_leaf(FULL, b"\0" + struct.pack("<q", 2**62), bytes(4), ZERO), 3, (str(2**62), "truncated")),
-    (*one_leaf(FULL, b"\0" + blosc_claim(2**31 - 1), bytes(4), ZERO), 6, ("Blosc chunk of 32 bytes for 2147483647",)),
-    (*one_leaf(FULL, b"\0" + blosc_claim(2048), bytes(4), ZERO), 6, ("damaged Blosc chunk",)),
-    (*one_leaf(FULL, b"\0" + struct.pack("<q", 4) + b"abcd", bytes(4), ZERO), 6, ("Blosc chunk of 4 bytes",)),
+UPPER = struct.pack("<ifII3i", 1, 0, 0, 1, 0, 0, 0)  # a root with one child
+
+
+def packed_leaf(values: bytes) -> tuple[bytes, bytes]:
+    return one_leaf(FULL, b"\0" + values, bytes(4), ZERO)
+
+
+TREES: list[tuple[tuple[bytes, bytes], int, tuple[str, ...]]] = [
+    ((struct.pack("<ifII", 1, 0, 2**32 - 1, 0), b""), 2, ("4294967295 root tiles", "truncated")),
+    ((struct.pack("<ifII", 1, 0, 0, 2**32 - 1), b""), 2, ("root child 1 of 4294967295",)),
+    ((struct.pack("<ifII", 7, 0, 0, 0), b""), 2, ("7 buffers",)),
+    ((struct.pack("<ifII3i", 1, 0, 0, 1, 5, 0, 0), b""), 2, ("(5, 0, 0)", "multiples of 4096")),
+    ((struct.pack("<ifII3ifB3i", 1, 0, 1, 1, 0, 0, 0, 1, 1, 0, 0, 0), b""), 2, ("(0, 0, 0)", "each once")),
+    ((UPPER + b"\xff" * 4096 + bytes(4097), b""), 2, ("truncated",)),
+    (one_leaf(FULL, b"\0" + bytes(2048), bytes(4), b"\x07"), 2, ("value code 7", "0 to 6")),
+    (one_leaf(FULL, b"\x09" + bytes(2048), bytes(4)), 2, ("value code 9", "a leaf")),
+    ((GOOD[0], GOOD[1] + b"x"), 2, ("leaf buffers end",)),
+    ((GOOD[0] + b"x", GOOD[1]), 2, ("nodes end",)),
+    ((GOOD[0], GOOD[1][:-1]), 2, ("2048 bytes", "2047 are left")),
+    (packed_leaf(bomb(2**26)), 3, ("zip chunk of more than 2048",)),
+    (packed_leaf(bomb(2047)), 3, ("zip chunk of 2047",)),
+    (packed_leaf(struct.pack("<q", 9) + b"not a zip"), 3, ("damaged zip chunk",)),
+    (packed_leaf(struct.pack("<q", -(2**62))), 3, (str(2**62), "expected 2048")),
+    (packed_leaf(struct.pack("<q", 2**62)), 3, (str(2**62), "truncated")),
+    (packed_leaf(blosc_claim(2**31 - 1)), 6, ("Blosc chunk of 32 bytes for 2147483647",)),
+    (packed_leaf(blosc_claim(2048)), 6, ("damaged Blosc chunk",)),
+    (packed_leaf(struct.pack("<q", 4) + b"abcd"), 6, ("Blosc chunk of 4 bytes",)),
 ]
 
 
 @pytest.mark.parametrize("number", range(len(TREES)))
 def test_absurd_trees(tmp_path: Path, number: int) -> None:
-    tree, buffers, flags, words = TREES[number]
-    path = one_grid(tmp_path / "a.vdb", tree, buffers, flags=flags)
+    parts, flags, words = TREES[number]
+    path = one_grid(tmp_path / "a.vdb", *parts, flags=flags)
     assert len(read_header(path).grids) == 1
     tracemalloc.start()
     try:
@@ -128,14 +122,7 @@ def test_many_leaves_in_few_bytes_are_refused_before_they_take_memory(tmp_path: 
     """A node of 4096 leaves needs 64 bytes for each; with a small limit, nothing of 2 KB each is allocated."""
     upper = np.zeros(32768, bool)
     upper[0] = True
-    tree = (
-        struct.pack("<ifII3i", 1, 0, 0, 1, 0, 0, 0)
-        + bits(upper)
-        + bytes(4097)
-        + b"\xff" * 512
-        + bytes(513)
-        + bytes(4096 * 64)
-    )
+    tree = UPPER + bits(upper) + bytes(4097) + b"\xff" * 512 + bytes(513) + bytes(4096 * 64)
     path = one_grid(tmp_path / "a.vdb", tree, bytes(4096 * 65))
     tracemalloc.start()
     try:
@@ -150,19 +137,10 @@ def test_many_tiles_in_few_bytes_count_too(tmp_path: Path) -> None:
     """One node may hold 32,768 tiles, equal ones in few bytes; in memory they take 21 bytes each."""
     values = struct.pack("<32768f", *range(32768))
     chunk = zlib.compress(values)
-    tree = (
-        struct.pack("<ifII3i", 1, 0, 0, 1, 0, 0, 0)
-        + bytes(4096)
-        + b"\xff" * 4096
-        + b"\0"
-        + struct.pack("<q", len(chunk))
-        + chunk
-    )
-    path = one_grid(tmp_path / "a.vdb", tree, b"", flags=3)
-    refused(
-        lambda: read_grid(path, "density", max_bytes=32768 * 21 - 1), "a.vdb", "'density'", "tiles", str(32768 * 21 - 1)
-    )
-    grid = read_grid(path, "density", max_bytes=32768 * 21)
+    tree = UPPER + bytes(4096) + b"\xff" * 4096 + b"\0" + struct.pack("<q", len(chunk)) + chunk
+    path, most = one_grid(tmp_path / "a.vdb", tree, b"", flags=3), 32768 * 21
+    refused(lambda: read_grid(path, "density", max_bytes=most - 1), "a.vdb", "'density'", "tiles", str(most - 1))
+    grid = read_grid(path, "density", max_bytes=most)
     assert len(grid.tiles) == 32768 and grid.active_voxels == 4096**3 and grid.range == (0.0, 32767.0)
 
 

@@ -55,12 +55,9 @@ def test_info_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert [Path(f["path"]).name for f in report["files"]] == ["a_2.vdb", "a_3.vdb", "a_10.vdb"]
     assert report["notes"] == ["3 frames, 2 to 10; missing: 4–9"]
     first, second, last = (f["grids"][0] for f in report["files"])
-    assert (
-        first["voxel_size"] == [0.5] * 3 and first["bounds"] == [[0, 0, 0], [4, 4, 4]] and first["active_voxels"] == 64
-    )
-    assert (
-        first["range"] == [1.0, 1.0] and first["dense_bytes"] == 256 and first["compression"] == "blosc + active values"
-    )
+    assert first["voxel_size"] == [0.5] * 3 and first["bounds"] == [[0, 0, 0], [4, 4, 4]]
+    assert first["active_voxels"] == 64 and first["range"] == [1.0, 1.0] and first["dense_bytes"] == 256
+    assert first["compression"] == "blosc + active values"
     assert second["non_finite"] == 8 and second["range"] is None
     assert last["bounds"] is None and last["active_voxels"] == 0
 

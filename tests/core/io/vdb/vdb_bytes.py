@@ -98,17 +98,8 @@ def random_grid(
         flat = Tiles(np.array(origins, np.int32), np.array(sizes, np.int32), numbers, active)
     background = np.zeros((3,) if channels == 3 else (), np.float32)
     transform = scale_transform(0.5, (1.0, 2.0, 3.0))
-    return Grid(
-        name,
-        transform,
-        background,
-        corners.astype(np.int32),
-        values,
-        masks,
-        flat,
-        half=half,
-        metadata={"creator": "test"},
-    )
+    arrays = (background, corners.astype(np.int32), values, masks, flat)
+    return Grid(name, transform, *arrays, half=half, metadata={"creator": "test"})
 
 
 def sorted_tiles(tiles: Tiles) -> list[tuple[Any, ...]]:
@@ -134,11 +125,8 @@ def small_files(folder: Path) -> list[Path]:
     paths = []
     for compression in ("none", "zip", "blosc"):
         paths.append(folder / f"{compression}.vdb")
-        grids = [
-            random_grid(rng, name="a"),
-            random_grid(rng, half=True, name="b"),
-            random_grid(rng, channels=3, name="c"),
-        ]
+        grids = [random_grid(rng, name="a"), random_grid(rng, half=True, name="b")]
+        grids.append(random_grid(rng, channels=3, name="c"))
         write_vdb(paths[-1], grids, compression=compression)
     return paths
 

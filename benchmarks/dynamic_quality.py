@@ -120,24 +120,18 @@ def short_trial(args: argparse.Namespace, name: str, words: Sequence[str], seed:
 
 
 def control_trials(args: argparse.Namespace, data: Sequence[str], seed: int) -> list[Trial]:
-    changes: dict[str, Callable[[Fitted], None] | None] = {"true times": None, "shuffled times": shuffle_times}
     return [
         short_trial(args, f"control-{name}", data, seed, facts=(("part", "control"), ("name", name)), change=change)
-        for name, change in changes.items()
+        for name, change in (("true times", None), ("shuffled times", shuffle_times))
     ]
 
 
 def between_trials(args: argparse.Namespace, data: Sequence[str], seed: int) -> list[Trial]:
-    return [
-        short_trial(
-            args,
-            f"between-{every}",
-            (*data, f"scene.train_every={every}"),
-            seed,
-            facts=(("part", "between"), ("every", every)),
-        )
-        for every in (1, 2)
-    ]
+    found = []
+    for every in (1, 2):
+        words, facts = (*data, f"scene.train_every={every}"), (("part", "between"), ("every", every))
+        found.append(short_trial(args, f"between-{every}", words, seed, facts=facts))
+    return found
 
 
 def shuffle_times(fitted: Fitted) -> None:

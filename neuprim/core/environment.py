@@ -86,18 +86,9 @@ class Environment:
     def __init__(
         self, radiance: Tensor, up: Tensor | None = None, rotation: float = 0.0, where: str = "environment"
     ) -> None:
-        if (
-            radiance.dim() != 3
-            or radiance.shape[2] != 3
-            or radiance.shape[1] != 2 * radiance.shape[0]
-            or not radiance.numel()
-        ):
-            found = (
-                "x".join(str(n) for n in (radiance.shape[1], radiance.shape[0]))
-                if radiance.dim() == 3
-                else str(tuple(radiance.shape))
-            )
-            raise DataError(f"{where}: image is {found}; expected latitude and longitude, RGB, twice as wide as high")
+        if radiance.dim() != 3 or radiance.shape[1:] != (2 * len(radiance), 3) or not len(radiance):
+            shape = tuple(radiance.shape)
+            raise DataError(f"{where}: image has shape {shape}; expected (H, 2 H, 3), latitude and longitude, RGB")
         axes = _axes(torch.tensor([0.0, 0.0, 1.0]) if up is None else up)
         self._flux, self._moment = _cells(radiance, axes, math.radians(rotation), where)
 

@@ -107,7 +107,7 @@ def _make_draw(run: TrainedModel) -> Draw:
 
 def _measure_psnr(job: ExportJob, held: Primitives, views: Sequence[PageView], moment: Mapping[str, Tensor]) -> float:
     """Return the PSNR over some views of the page, or over an orbit if it has none, dB."""
-    if not views and not job.run.model.active_geometry(moment)[1].count:
+    if not views and not job.run.model.active(moment).geometry.count:
         return math.inf  # nothing is active anywhere: both are the background
     draw, shown = _make_draw(job.run), [(view.camera, view.conditions) for view in views[:_MEASURED]]
     shown = shown or [(view.camera, moment) for view in choose_comparison_views(job, "orbit", moment)[0]]

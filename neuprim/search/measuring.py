@@ -113,7 +113,7 @@ class EvaluationSetup:
         """Return the backend that draws a configuration."""
         model, view = self.prepare_model(config), config.scale_view(self.views[0].view)
         return backends.choose_backend(
-            model.lower_unchecked(view.camera, view.conditions), config.settings, view.camera
+            model.lower(view.camera, view.conditions, shaded=False), config.settings, view.camera
         )
 
     def unsupported(self, config: RenderConfig) -> str | None:

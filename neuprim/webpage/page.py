@@ -181,7 +181,7 @@ def fullest(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Ten
     """The conditions where a viewer begins; if no primitive is active there, those among them along one range where
     most are."""
     start = {one.spec.name: one.value for one in conditions}
-    if model.active_geometry(start)[1].count:
+    if model.active(start).geometry.count:
         return start
     ranges = [one.spec for one in conditions if one.spec.shape == () and one.spec.range[1] - one.spec.range[0] <= _WIDE]
     others = [
@@ -189,7 +189,7 @@ def fullest(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Ten
         for spec in ranges
         for x in torch.linspace(*spec.range, FRAMES).tolist()
     ]
-    return max(others, key=lambda found: model.active_geometry(found)[1].count, default=start)
+    return max(others, key=lambda found: model.active(found).geometry.count, default=start)
 
 
 @torch.no_grad()

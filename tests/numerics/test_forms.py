@@ -169,8 +169,8 @@ def test_a_wrong_opaque_density_is_named_wherever_it_is_asked() -> None:
     ("methods", "message"),
     [
         (
-            {"active_rows": lambda self, p, c: torch.tensor([3, 99])},
-            r"active_rows returned rows \[3, 99\]; expected ascending int64 rows \(M,\) from 0 to 19",
+            {"active_rows": lambda self, p, c: torch.tensor([3, N])},
+            r"active_rows returned rows \[3, 20\]; expected ascending int64 rows \(M,\) from 0 to 19",
         ),
         ({"active_rows": lambda self, p, c: torch.tensor([-1, 3])}, r"active_rows returned rows \[-1, 3\]"),
         (

@@ -35,7 +35,7 @@ from neuprim.core.model.fields import (
 from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.schema import InitContext, ParameterSpec
-from neuprim.core.model.tensors import function_fault
+from neuprim.core.model.tensors import Sizes, function_fault
 from neuprim.core.settings import RenderSettings
 
 
@@ -122,43 +122,27 @@ class Lowered:
         return check_result(found, (self.geometry.count, self.colour.channels), f"{self.source('colour')}: radiance")
 
     def optical_depth(self, pairs: Pairs) -> Tensor:
-        """(M,) float64 integrals of sigma along chords, unclamped.
-
-        Raises:
-            FormError: the density's own code returned something else.
-        """
-        return check_result(
-            self.density.optical_depth(pairs), (len(pairs),), f"{self.source('density')}: line_integral"
-        ).double()
+        """(M,) float64 integrals of sigma along chords, unclamped."""
+        found = self.density.optical_depth(pairs)
+        return check_result(found, (len(pairs),), f"{self.source('density')}: line_integral").double()
 
     def chord_colours(self, pairs: Pairs) -> Tensor:
-        """(M, C) float64 colours that are seen along chords.
-
-        Raises:
-            FormError: the colour's own code returned something else.
-        """
+        """(M, C) float64 colours that are seen along chords."""
         found = self.colour.chord_colours(pairs)
         return check_result(found, (len(pairs), self.colour.channels), f"{self.source('colour')}: radiance").double()
 
 
 @dataclass(frozen=True)
 class ActiveSet:
-    """The M active primitives, which can absorb anything under some conditions.
-
-    Attributes:
-        rows: (M,) int64 ascending rows of the model; None where all are.
-        params: all their tensors; own: those of the density field.
-        stored: their ellipsoids as stored, which :meth:`~neuprim.core.model.fields.DensityField.density` takes;
-        geometry: where they are.
-    """
+    """The M active primitives, which can absorb anything under some conditions."""
 
     field: DensityField
     conditions: Conditions
-    rows: Tensor | None
-    params: dict[str, Tensor]
-    own: dict[str, Tensor]
-    stored: Geometry
-    geometry: Geometry
+    rows: Tensor | None  # (M,) int64 ascending rows of the model; None where all are
+    params: dict[str, Tensor]  # all their tensors
+    own: dict[str, Tensor]  # those of the density field
+    stored: Geometry  # as DensityField.density takes it
+    geometry: Geometry  # where they are under the conditions
 
     def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
         """World density (P,), 1/scene unit, unclamped, of active primitives ``prim`` (P,), 0..M-1, at points ``x``
@@ -231,26 +215,30 @@ class Primitives:
         """Of some rows of all tensors, those that one field owns."""
         return {name: params[name] for name in self._names[field is self.colour]}
 
-    def lower(self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None) -> Lowered:
+    def lower(
+        self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None, shaded: bool = True
+    ) -> Lowered:
         """Fold a frame's conditions into closed forms; differentiable. Primitives that are not active in it are left
         out.
 
-        ``settings`` are for images that a colour field needs first, such as a shadow's; None: the defaults.
+        Args:
+            settings: for images that a colour field needs first, such as a shadow's; None: the defaults.
+            shaded: whether the colour field's :meth:`~neuprim.core.model.fields.ColourField.shade` is asked.
 
         Raises:
             FormError: a field hands over tensors that do not fit.
         """
         active = self.active(conditions)
-        geometry = active.geometry
-        names = (type(self.density).__name__, type(self.colour).__name__)
-        sizes = check_geometry(geometry, "geometry")
-        density = self._lower_density(active, conditions)
-        check_density(density, sizes, names[0])  # before the colour looks at it, which may draw it
+        geometry, (density, sizes) = (
+            active.geometry,
+            self._lower_density(active),
+        )  # before the colour, which may draw it
         own = self._of(self.colour, active.params)
         colour = self.colour.lower(own, geometry, camera, conditions)
+        names = (type(self.density).__name__, type(self.colour).__name__)
         check_colour(colour, sizes, names[1])
         check_channels(sizes["C"][0], self.colour)
-        found = self.colour.shade(geometry, density, conditions, settings or RenderSettings())
+        found = self.colour.shade(geometry, density, conditions, settings or RenderSettings()) if shaded else None
         shading = check_shading(found, geometry.count, method(self.colour, "shade"))
         if shading.primitives is not None:
             colour = colour.scaled(shading.primitives)
@@ -259,15 +247,17 @@ class Primitives:
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
         """Return geometry and density of the primitives active in a frame."""
         active = self.active(conditions)
-        density = self._lower_density(active, conditions)
-        check_density(density, check_geometry(active.geometry, "geometry"), type(self.density).__name__)
-        return active.geometry, density
+        return active.geometry, self._lower_density(active)[0]
 
-    def _lower_density(self, active: ActiveSet, conditions: Conditions) -> LoweredDensity:
+    def _lower_density(self, active: ActiveSet) -> tuple[LoweredDensity, Sizes]:
+        """The density, checked, and the sizes that its tensors share with the geometry."""
+        sizes = check_geometry(active.geometry, "geometry")
         try:
-            return self.density.lower(active.own, active.geometry, conditions)
+            density = self.density.lower(active.own, active.geometry, active.conditions)
         except FormError as error:  # of a sum of forms, which knows no field
             raise FormError(f"{method(self.density, 'lower')}: {error}") from error
+        check_density(density, sizes, type(self.density).__name__)
+        return density, sizes
 
     def component(self, name: str) -> Primitives:
         """The part of the extinction that comes from the source grid ``name``: every density times its share. KeyError:
@@ -295,14 +285,12 @@ class Primitives:
     def active(self, conditions: Conditions, dtype: torch.dtype | None = None) -> ActiveSet:
         """Return the primitives active in a frame; differentiable. With ``dtype``, detached and of that type."""
         rows = self.density.active_rows(self.of(self.density), conditions)
+        params = self.params
         if rows is not None:
-            check_rows(rows, self.count, f"{method(self.density, 'active_rows')} returned")
-        if rows is None:
-            params = self.params
-        else:
             from neuprim.core.model.rows import take_rows  # numba, loaded when first needed
 
-            params = take_rows(self.params, rows)
+            check_rows(rows, self.count, f"{method(self.density, 'active_rows')} returned")
+            params = take_rows(params, rows)
         if dtype is not None:
             params = {name: value.detach().to(dtype) for name, value in params.items()}
             conditions = {name: value.to(dtype) for name, value in conditions.items()}
@@ -312,27 +300,6 @@ class Primitives:
         if moved is not stored:
             check_geometry(moved, method(self.density, "move"), stored.count)
         return ActiveSet(self.density, conditions, rows, params, own, stored, moved)
-
-    def active_geometry(self, conditions: Conditions) -> tuple[Tensor | None, Geometry]:
-        """Return rows and geometry of the primitives active in a frame, None for all rows; without gradients."""
-        own = {name: value.detach() for name, value in self.of(self.density).items()}
-        rows = self.density.active_rows(own, conditions)
-        geometry = Geometry(*(self.params[name].detach() for name in ("means", "log_scales", "quats")))
-        if rows is not None:
-            check_rows(rows, self.count, f"{method(self.density, 'active_rows')} returned")
-            own, geometry = {name: value[rows] for name, value in own.items()}, geometry[rows]
-        moved = self.density.move(own, geometry, conditions)
-        check_geometry(moved, method(self.density, "move"), geometry.count)
-        return rows, moved
-
-    def lower_unchecked(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
-        """Lower without checks and shading, to find out the kinds of forms."""
-        active = self.active(conditions)
-        own = self._of(self.colour, active.params)
-        density = self._lower_density(active, conditions)
-        return Lowered(
-            active.geometry, density, self.colour.lower(own, active.geometry, camera, conditions), active.rows
-        )
 
     def to(self, device: torch.device) -> Primitives:
         """The same model on another device, without gradients; itself if it is there already."""

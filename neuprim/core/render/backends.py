@@ -247,7 +247,7 @@ def device_of(model: Primitives, settings: RenderSettings, camera: AnyCamera, co
         return hardware.current_device(hardware.CUDA if on_gpu else hardware.CPU)
     if gpu_unavailable() is None:
         rows = model.rows(torch.arange(min(model.count, _FEW), device=model.device))
-        lowered = Primitives(model.density, model.colour, rows).lower_unchecked(camera, conditions)
+        lowered = Primitives(model.density, model.colour, rows).lower(camera, conditions, shaded=False)
         if any(b.cannot_draw(lowered, camera) is None for b in TABLE if b.devices[0] == hardware.CUDA):
             return hardware.current_device(hardware.CUDA)
     return hardware.HOST

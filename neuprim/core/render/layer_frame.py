@@ -56,7 +56,7 @@ class LayerFrame:
         """(H, W, C) the frame over black without what :meth:`~neuprim.core.model.fields.ColourField.shade` multiplies
         its colours by."""
         with torch.no_grad():
-            forms = self.model.lower_unchecked(self.camera, self.conditions)
+            forms = self.model.lower(self.camera, self.conditions, shaded=False)
         return self._render(replace(self.lowered, colour=forms.colour, shade=None), self.settings).rgb
 
     @cached_property

@@ -48,26 +48,17 @@ class Case:
 
 @dataclass
 class Errors:
-    """Worst of some cases.
+    """Worst of some cases."""
 
-    Attributes:
-        forward: |dI|/S on solid chords.
-        thin: |dI|/S (S/S_c)^2 on thin ones, S_c the central chord's S, and the same for hits missed and misses hit.
-        With a soft edge, whose
-            integrals go as D^(p + 1/2), |dI|/S_c (S_c/S)^(2p - 1).
-        at: S/S_c where ``forward`` was found.
-        gradient: error of a parameter's gradient over the gradient's norm; ``parameter`` is the worst one.
-        hits: pixels compared.
-        wide: primitives that a fast backend drew in float64.
-    """
-
-    forward: float = 0.0
+    forward: float = 0.0  # |dI|/S on solid chords
+    # |dI|/S (S/S_c)^2 on thin ones, S_c the central chord's S, and the same for hits missed and misses hit. With a soft
+    # edge, whose integrals go as D^(p + 1/2), |dI|/S_c (S_c/S)^(2p - 1)
     thin: float = 0.0
-    gradient: float = 0.0
+    gradient: float = 0.0  # error of a parameter's gradient over the gradient's norm; parameter is the worst one
     parameter: str = ""
-    at: float = 1.0
-    hits: int = 0
-    wide: int = 0
+    at: float = 1.0  # S/S_c where forward was found
+    hits: int = 0  # pixels compared
+    wide: int = 0  # primitives that a fast backend drew in float64
     primitives: int = 0
     worst: dict[str, str] = field(default_factory=dict)
 

@@ -29,24 +29,17 @@ IMAGE = 5e-6  # of a pixel under tens of primitives, whose errors add up
 
 @dataclass(frozen=True)
 class Region:
-    """A part of the input space.
-
-    Attributes:
-        make: draws one case.
-        forward, gradient, thin: bounds (see :class:`~tests.numerics.extremes.measure.Errors`).
-        reason: why a bound is wider than the usual one; empty where none is.
-        whole: cases have several primitives: their images are compared, not single integrals.
-        edges: the exponents p that it is for.
-    """
+    """A part of the input space."""
 
     name: str
-    make: Callable[[np.random.Generator], Case]
+    make: Callable[[np.random.Generator], Case]  # draws one case
+    # bounds (see Errors)
     forward: float = FORWARD
     gradient: float = GRADIENT
     thin: float = THIN
-    reason: str = ""
-    whole: bool = False
-    edges: tuple[int, ...] = EDGES
+    reason: str = ""  # why a bound is wider than the usual one; empty where none is
+    whole: bool = False  # cases have several primitives: their images are compared, not single integrals
+    edges: tuple[int, ...] = EDGES  # the exponents p that it is for
 
     def case(self, number: int, edge: int = 0) -> Case:
         """Case ``number`` of this region; the same on every machine, and for every edge."""

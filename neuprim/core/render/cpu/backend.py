@@ -47,22 +47,17 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class _Prepared:
-    """What the backward pass shares with the forward pass of one frame.
-
-    Attributes:
-        tensors: parameters, and weights of colour networks, by name, all of one dtype.
-        tiles: tiles of an image; chunk: tiles that are one unit of work.
-    """
+    """What the backward pass shares with the forward pass of one frame."""
 
     request: Request
-    tensors: dict[str, Array]
+    tensors: dict[str, Array]  # parameters, and weights of colour networks, by name, all of one dtype
     view: View
     projected: Projected
     arrays: FrameArrays
     lists: TileLists
     net: Net | None
-    tiles: int
-    chunk: int
+    tiles: int  # of an image
+    chunk: int  # tiles that are one unit of work
 
     @property
     def parameters(self) -> Parameters:

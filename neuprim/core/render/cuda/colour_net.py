@@ -61,21 +61,14 @@ _FAST = wp.constant(d(FLOAT64_TURNS**2))
 
 @dataclass
 class Net:
-    """The networks of a frame.
+    """The networks of a frame; the parameters are contiguous, float32 or float64 alike."""
 
-    Attributes:
-        Wx: (N, H, 3), bias: (N, H), Wout: (N, C, H): the parameters, contiguous, float32 or float64 alike.
-        rows: (N, H net_columns(C), 4) float32, columns of :func:`~neuprim.core.render.cuda.layout.net_columns`.
-        fast: (N,) bool, where a unit turns too fast for float32.
-        wide: (M, H, 4) float64 (WX, WY, WZ, PHASE) of the primitives that are drawn in float64.
-    """
-
-    Wx: Tensor
-    bias: Tensor
-    Wout: Tensor
-    rows: Tensor
-    fast: Tensor
-    wide: Tensor
+    Wx: Tensor  # (N, H, 3)
+    bias: Tensor  # (N, H)
+    Wout: Tensor  # (N, C, H)
+    rows: Tensor  # (N, H net_columns(C), 4) float32, see net_columns
+    fast: Tensor  # (N,) bool, where a unit turns too fast for float32
+    wide: Tensor  # (M, H, 4) float64 (WX, WY, WZ, PHASE) of the primitives that are drawn in float64
 
     @property
     def hidden(self) -> int:

@@ -20,9 +20,8 @@ from neuprim.core.render.cuda.colour_net import (
     net_pairs_kernel,
     net_width,
 )
-from neuprim.core.render.cuda.entry import composite_kernel, uncomposite_kernel
 from neuprim.core.render.cuda.float64 import float64_opacity_kernel, float64_pairs_kernel
-from neuprim.core.render.cuda.forward import forward_kernel
+from neuprim.core.render.cuda.forward import composite_kernel, forward_kernel, uncomposite_kernel
 from neuprim.core.render.cuda.frame import Frame
 from neuprim.core.render.cuda.layout import Form
 from neuprim.core.settings import RenderSettings
@@ -40,47 +39,32 @@ _NUMBERS = {
 
 @dataclass
 class Composited:
-    """What a forward pass leaves.
+    """What a forward pass leaves."""
 
-    Attributes:
-        rgb: (H W, C); transmittance: (H W,); zsum: (H W,) sum of w z, empty if no depth is wanted.
-        spans: (pairs, 16) int16, offsets: (pairs + 1,) int32: the pixels that each pair covers
-            (:func:`~neuprim.core.render.cuda.binning.row_spans`).
-        hits: (slots, 2) opacity and transmittance before it, if they were kept; depths: (slots,) camera-z, if wanted;
-            hues: (slots, C) colours before max(0, .), of colour networks.
-        reached: (tiles,) int32, the pairs before it were composited.
-        in_float64: (D,) int32, the pairs that are drawn in float64, rising.
-        order: (slots,) int64 slots by pixel and entry, begins: (H W + 1,) int32 and owners: (slots,) int32, the pair of
-            each; where hits were sorted by entry.
-    """
-
-    rgb: Tensor
-    transmittance: Tensor
-    zsum: Tensor
-    spans: Tensor
-    offsets: Tensor
-    hits: Tensor
-    depths: Tensor
-    hues: Tensor
-    reached: Tensor
-    in_float64: Tensor
-    order: Tensor | None = None
-    begins: Tensor | None = None
-    owners: Tensor | None = None
+    rgb: Tensor  # (H W, C)
+    transmittance: Tensor  # (H W,)
+    zsum: Tensor  # (H W,) sum of w z, empty if no depth is wanted
+    spans: Tensor  # (pairs, 16) int16, which with the offsets say the pixels of each pair, see row_spans
+    offsets: Tensor  # (pairs + 1,) int32
+    hits: Tensor  # (slots, 2) opacity and transmittance before it, if they were kept
+    depths: Tensor  # (slots,) camera-z, if wanted
+    hues: Tensor  # (slots, C) colours before max(0, .), of colour networks
+    reached: Tensor  # (tiles,) int32, the pairs before it were composited
+    in_float64: Tensor  # (D,) int32, the pairs that are drawn in float64, rising
+    # where hits were sorted by entry:
+    order: Tensor | None = None  # (slots,) int64 slots by pixel and entry
+    begins: Tensor | None = None  # (H W + 1,) int32, first of each pixel
+    owners: Tensor | None = None  # (slots,) int32, pair of each slot
 
 
 @dataclass
 class ImageGradient:
-    """Gradients of an image, float32 and contiguous, and the error of each pixel for the contributions.
+    """Gradients of an image, float32 and contiguous, and the error of each pixel for the contributions."""
 
-    Attributes:
-        rgb: (H W, C); transmittance: (H W,), with the background's share; z: (H W,) or None; error: (H W,).
-    """
-
-    rgb: Tensor
-    transmittance: Tensor
-    z: Tensor | None
-    error: Tensor
+    rgb: Tensor  # (H W, C)
+    transmittance: Tensor  # (H W,), with the background's share
+    z: Tensor | None  # (H W,)
+    error: Tensor  # (H W,)
 
 
 def _numbers(tensor: Tensor) -> Any:

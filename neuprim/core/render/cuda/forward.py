@@ -195,7 +195,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
     return forward
 
 
-# ---- sort = "entry". Every hit is listed first, with a key of pixel and entry, and the list is sorted. A thread a pixel
+# ---- sort = "entry". Every hit is listed, with a key of pixel and entry, and the list is sorted. A thread a pixel
 # walks its part. Entries that agree in float32 keep the order of the centres, and so do all chords that the near plane
 # cuts: slots lie in that order, and the sort is stable. Nothing can stop early before the list is complete.
 

@@ -21,11 +21,10 @@ from shared.arguments import make_parser, require_folders
 from shared.records import RESULTS, read_record, update_record
 from shared.tables import DOCS, ROOT, between_markers, make_table
 
+from neuprim.config.command_settings import parse_duration
 from neuprim.core.compute.threads import cpu_name
 from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
-from neuprim.search.ablation import run_ablation
-from neuprim.search.ablation_folder import AblationRequest
-from neuprim.search.render_tradeoff import parse_budget
+from neuprim.search.ablation import AblationRequest, run_ablation
 
 VIEWS = 25
 """Held-out views, evenly spread: as many as the chair has."""
@@ -77,7 +76,9 @@ def measure(name: str, data: Path | None, out: Path) -> dict[str, Any]:
     scene = SCENES[name]
     where = [] if data is None else [f"{scene.data}={data.resolve()}"]
     words = [*scene.words, *where, "renderer.threads=1", f"output_dir={(out / name).resolve()}"]
-    _, record = run_ablation(AblationRequest(words, parse_budget(scene.budget), VIEWS, knobs=scene.knobs), print)
+    _, record = run_ablation(
+        AblationRequest(words, parse_duration(scene.budget, scene.budget), VIEWS, knobs=scene.knobs), print
+    )
     whole = record.to_dict()
     models = [
         {key: point[key] for key in KEYS} | {key: point["quality"][key] for key in ("psnr", "ssim")}

@@ -16,6 +16,7 @@ from neuprim.cli.command import (
     plain_console,
     take_render_overrides,
 )
+from neuprim.config.command_settings import parse_duration
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -73,13 +74,13 @@ def _tradeoff(args: argparse.Namespace) -> int:
 def _compare_rendering(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.search.points import TRADEOFF_FOLDER
-    from neuprim.search.render_tradeoff import TradeoffRequest, format_render_command, measure_tradeoff, parse_budget
+    from neuprim.search.render_tradeoff import TradeoffRequest, format_render_command, measure_tradeoff
 
     run_dir, views, repeats = Path(args.run_dir), args.views, args.repeats
     check_run_directory(run_dir)
     if args.seeds is not None:
         raise ConfigError("--seeds: of models that are trained (neuprim tradeoff task=NAME ...); a run has one")
-    budget = parse_budget(args.budget or "5m")
+    budget = parse_duration(args.budget or "5m", f"--budget {args.budget}")
     request = TradeoffRequest(run_dir, views, repeats, args.knobs, budget, args.words, args.lpips)
     folder = run_dir / TRADEOFF_FOLDER
     try:
@@ -99,15 +100,14 @@ def _compare_models(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.config.command_settings import take_launcher
     from neuprim.config.overrides import parse
-    from neuprim.search.ablation import format_run_command, run_ablation
-    from neuprim.search.ablation_folder import AblationRequest
-    from neuprim.search.render_tradeoff import parse_budget
+    from neuprim.search.ablation import AblationRequest, format_run_command, run_ablation
 
     launcher, words = take_launcher([args.run_dir, *args.words])
     said = [str(a.value) for a in parse(words) if a.key == "budget"]
     if said and args.budget is not None:
         raise ConfigError(f"budget={said[-1]} and --budget {args.budget}: expected one of them")
-    budget = parse_budget(said[-1], "budget=") if said else parse_budget(args.budget or "20m")
+    asked = f"budget={said[-1]}" if said else f"--budget {args.budget}"
+    budget = parse_duration(said[-1] if said else args.budget or "20m", asked)
     seeds = args.seeds or 1
     request = AblationRequest(words, budget, args.views, args.repeats, args.knobs, seeds, args.lpips, launcher)
     try:
@@ -143,7 +143,7 @@ def _build_table(title: str, record: Record, numbers: Sequence[int]) -> Table:
 
     trained = bool(record.points[0].run_dir)
     table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
-    names = ["#", "time", "ms", "frames/s", "PSNR", "SSIM", "exact", "bytes", "MB", *(["ms/step"] if trained else [])]
+    names = ["#", "time", "ms", "frames/s", "PSNR", "SSIM", "exact", "bytes", *(["ms/step"] if trained else [])]
     for name in names:
         table.add_column(name, justify="right", no_wrap=True)
     first = "centre" if trained else "ref."
@@ -159,9 +159,8 @@ def _format_cells(point: Point) -> tuple[str, ...]:
     times = ("–", "–", "–")
     if point.ms:
         times = (f"{point.ratio:.3f}{about}", f"{point.time:.2f}", f"{1e3 / point.time:.1f}")
-    memory = "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e6:.1f}"
     quality = (f"{q['psnr']:.2f}{seeds}", f"{q['ssim']:.4f}", f"{q['psnr_exact']:.1f}")
-    return (*times, *quality, f"{point.bytes:,}", memory, *([f"{point.ms_per_step:.1f}"] if point.run_dir else []))
+    return (*times, *quality, f"{point.bytes:,}", *([f"{point.ms_per_step:.1f}"] if point.run_dir else []))
 
 
 COMMAND = Command(

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,41 +25,24 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-__all__ = [
-    "HELD_OUT",
-    "LARGE",
-    "TRAINING",
-    "Chart",
-    "Dot",
-    "Points",
-    "curve_chart",
-    "draw_svg",
-    "front_chart",
-    "view_chart",
-    "write_png_charts",
-]
-
-# Placeholder colours that no chart uses otherwise. CSS variables replace them in an SVG, PNG_COLOURS in a PNG.
+# Placeholders that no chart uses otherwise; they become CSS variables in a page, and colours in a PNG.
 INK, GRID, TRAINING, HELD_OUT = "#010203", "#010204", "#010205", "#010206"
-VARIABLES = {INK: "var(--muted)", GRID: "var(--line)", TRAINING: "var(--training)", HELD_OUT: "var(--held-out)"}
-PNG_COLOURS = {INK: "#5d6670", GRID: "#e2e4e3", TRAINING: "#6884a6", HELD_OUT: "#c9551c"}
+_VARIABLES = {INK: "var(--muted)", GRID: "var(--line)", TRAINING: "var(--training)", HELD_OUT: "var(--held-out)"}
+_PNG_COLOURS = {INK: "#5d6670", GRID: "#e2e4e3", TRAINING: "#6884a6", HELD_OUT: "#c9551c"}
 
 SMALL, LARGE = (360, 210), (540, 300)
 """Sizes of a chart in points. Panels are about as wide in CSS pixels, so text keeps its size."""
 
-BUCKETS = 120
+_BUCKETS = 120
 """A band is drawn where there are more than twice so many points: medians, and the range of each of so many groups."""
 
-FEW = 40
+_FEW = 40
 """Points of a line up to which each is marked."""
 
-LOG_RATIO = 4.0
-"""A curve with ``log`` gets a logarithmic axis where its positive values span at least this factor."""
+_LOG_RATIO, _FRONT_LOG_RATIO = 4.0, 1.5
+"""An axis is logarithmic where its positive values, or the costs of a front, span at least this factor."""
 
-FRONT_LOG_RATIO = 1.5
-"""The same for the costs of a front."""
-
-LEAST_DECIBELS = 0.4
+_LEAST_DECIBELS = 0.4
 """Least range of the y axis of a front: smaller differences are invisible."""
 
 
@@ -90,11 +73,10 @@ class Points:
     def finite(self) -> Points:
         """Return those with finite coordinates."""
         x, y = np.asarray(self.x, dtype=np.float64), np.asarray(self.y, dtype=np.float64)
-        keep = np.isfinite(x) & np.isfinite(y)
-        rows = [i for i in range(len(keep)) if keep[i]]
+        rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y)).tolist()
         spread = [self.spread[i] for i in rows] if self.spread else ()
         labels = [self.labels[i] for i in rows] if self.labels else ()
-        return replace(self, x=x[keep], y=y[keep], spread=spread, labels=labels)
+        return replace(self, x=x[rows], y=y[rows], spread=spread, labels=labels)
 
 
 @dataclass(frozen=True)
@@ -130,8 +112,7 @@ class Chart:
         return [finite for points in self.points if len((finite := points.finite()).x)]
 
 
-@dataclass(frozen=True)
-class Dot:
+class Dot(NamedTuple):
     """A point of a Pareto front's chart.
 
     Attributes:
@@ -155,19 +136,17 @@ def curve_chart(
 
     Args:
         unit: "seconds", which become minutes or hours where they are many, or any other label of the x axis.
-        log: use a logarithmic y axis where the values span :data:`LOG_RATIO`.
+        log: use a logarithmic y axis where the values span a large factor.
     """
     known = [line.finite() for line in lines]
-    right = max((float(np.max(line.x)) for line in known if len(line.x)), default=0.0)
-    divisor = 1.0
+    right, divisor = float(max((np.max(line.x) for line in known if len(line.x)), default=0.0)), 1.0
     if unit == "seconds" and right >= 180:
         unit, divisor = ("minutes", 60.0) if right < 3 * 3600 else ("hours", 3600.0)
     values = np.concatenate([line.y for line in known]) if known else np.zeros(0)
-    log = log and values.size > 0 and values.min() > 0 and values.max() / values.min() >= LOG_RATIO
+    log = log and values.size > 0 and bool(values.min() > 0 and values.max() / values.min() >= _LOG_RATIO)
     scaled = [replace(line, x=np.asarray(line.x) / divisor) for line in known]
-    return Chart(
-        title, scaled, unit, size=size, left=0, right=right / divisor * 1.02 if right > 0 else 1, log_y=bool(log)
-    )
+    end = right / divisor * 1.02 if right > 0 else 1
+    return Chart(title, scaled, unit, size=size, left=0, right=end, log_y=log)
 
 
 def view_chart(title: str, values: Sequence[float | None], mean: float | None, lowest: str | None) -> Chart:
@@ -201,26 +180,20 @@ def front_chart(
         x_label += f" ({len(known) - len(drawn)} beyond {most:g})"
     marked = sorted((dot for dot in drawn if dot.mark is not None), key=lambda dot: dot.cost)
     others = [dot for dot in drawn if dot.mark is None]
-    points = [
-        Points(
-            [dot.cost for dot in group],
-            [dot.good for dot in group],
-            colour,
-            line and len(group) > 1,
-            size=size,
-            opacity=opacity,
-            spread=[dot.spread for dot in group],
-            labels=[dot.mark or "" for dot in group],
-        )
-        for group, colour, line, size, opacity in (
-            (others, TRAINING, False, 4.5, 0.75),
-            (marked, HELD_OUT, joined, 6.0, 1.0),
-        )
+
+    def points(dots: Sequence[Dot], colour: str, joined: bool, size: float, opacity: float) -> Points:
+        x, y, spread = [dot.cost for dot in dots], [dot.good for dot in dots], [dot.spread for dot in dots]
+        labels = [dot.mark or "" for dot in dots]
+        return Points(x, y, colour, joined, size=size, opacity=opacity, spread=spread, labels=labels)
+
+    both = [
+        points(others, TRAINING, False, 4.5, 0.75),
+        points(marked, HELD_OUT, joined and len(marked) > 1, 6.0, 1.0),
     ]
     costs = [dot.cost for dot in drawn]
-    log = bool(costs) and max(costs) / min(costs) >= FRONT_LOG_RATIO
+    log = bool(costs) and max(costs) / min(costs) >= _FRONT_LOG_RATIO
     ring = next(((dot.cost, dot.good) for dot in drawn if dot.reference), None)
-    return Chart(title, points, x_label, y_label, LARGE, ring=ring, log_x=log, least=LEAST_DECIBELS)
+    return Chart(title, both, x_label, y_label, LARGE, ring=ring, log_x=log, least=_LEAST_DECIBELS)
 
 
 def draw_svg(chart: Chart) -> str | None:
@@ -233,7 +206,7 @@ def draw_svg(chart: Chart) -> str | None:
     with _style():
         figure = Figure(figsize=(width / 72, height / 72))
         left, bottom = 41.4 / width, 42 / height  # room for the labels
-        _draw(figure.add_axes((left, bottom, 0.98 - left, 0.96 - bottom)), chart, {name: name for name in VARIABLES})
+        _draw(figure.add_axes((left, bottom, 0.98 - left, 0.96 - bottom)), chart, {name: name for name in _VARIABLES})
         return _to_element(figure, chart.title)
 
 
@@ -247,9 +220,9 @@ def write_png_charts(path: Path, charts: Sequence[Chart], rows: int = 1) -> None
         size = (columns * width / 72, rows * 1.12 * height / 72)
         figure = Figure(figsize=size, layout="constrained", facecolor="white")
         for axes, chart in zip(figure.subplots(rows, columns, squeeze=False).flat, charts, strict=False):
-            _draw(axes, chart, PNG_COLOURS)
-            axes.set_title(chart.title, fontsize=11, loc="left", color=PNG_COLOURS[INK])
-            axes.set_ylabel(chart.y_label, color=PNG_COLOURS[INK])
+            _draw(axes, chart, _PNG_COLOURS)
+            axes.set_title(chart.title, fontsize=11, loc="left", color=_PNG_COLOURS[INK])
+            axes.set_ylabel(chart.y_label, color=_PNG_COLOURS[INK])
         with atomic_path(path) as temporary:
             figure.savefig(temporary, format="png", dpi=130)
 
@@ -258,43 +231,40 @@ def write_png_charts(path: Path, charts: Sequence[Chart], rows: int = 1) -> None
 
 
 def _draw(axes: Axes, chart: Chart, palette: Mapping[str, str]) -> None:
-    known = chart.known()
+    known, ink, grid = chart.known(), palette[INK], palette[GRID]
     if chart.level is not None:
-        axes.axhline(chart.level, color=palette[INK], linewidth=1, linestyle=(0, (4, 3)), zorder=2)
+        axes.axhline(chart.level, color=ink, linewidth=1, linestyle=(0, (4, 3)), zorder=2)
         for points in known:
             axes.vlines(points.x, chart.level, points.y, color=palette[points.colour], linewidth=1, alpha=0.45)
     for points in known:
         _draw_points(axes, points, palette.get(points.colour, points.colour))
-        _draw_labels(axes, points, chart.level is not None, palette[INK])
+        _draw_labels(axes, points, chart.level is not None, ink)
+    if any(points.name for points in known):
+        axes.legend(frameon=False, labelcolor=ink)
     if chart.ring is not None:
-        x, y = chart.ring
-        axes.plot([x], [y], marker="o", markersize=11, markerfacecolor="none", markeredgecolor=palette[INK], zorder=4)
-    axes.set_xlabel(chart.x_label, color=palette[INK])
-    axes.margins(x=0.05, y=0.14 if chart.level is not None else 0.12 if chart.least else 0.05)
-    if chart.log_x:
-        axes.set_xscale("log")
-    if chart.log_y:
-        axes.set_yscale("log")
+        axes.plot(*chart.ring, marker="o", markersize=11, markerfacecolor="none", markeredgecolor=ink, zorder=4)
+    axes.set_xlabel(chart.x_label, color=ink)
+    axes.margins(x=0.05, y=0.05 if chart.level is None and not chart.least else 0.13)
+    axes.set_xscale("log" if chart.log_x else "linear")
+    axes.set_yscale("log" if chart.log_y else "linear")
     axes.set_xlim(chart.left, chart.right)
-    _set_ticks(axes.xaxis, 6, chart.log_x, _values(known, "x"), chart.whole)
-    _set_ticks(axes.yaxis, 5, chart.log_y, _values(known, "y"))
+    _set_ticks(axes.xaxis, 6, chart.log_x, np.concatenate([np.asarray(points.x) for points in known]), chart.whole)
+    _set_ticks(axes.yaxis, 5, chart.log_y, np.concatenate([np.asarray(points.y) for points in known]))
     bottom, top = axes.get_ylim()
     if top - bottom < chart.least:
         axes.set_ylim((bottom + top - chart.least) / 2, (bottom + top + chart.least) / 2)
-    axes.tick_params(colors=palette[GRID], labelcolor=palette[INK])
-    axes.grid(True, axis="both" if chart.least else "y", color=palette[GRID])
-    if any(points.name for points in known):
-        axes.legend(frameon=False, labelcolor=palette[INK])
+    axes.tick_params(colors=grid, labelcolor=ink)
+    axes.grid(True, axis="both" if chart.least else "y", color=grid)
     for spine in axes.spines.values():
-        spine.set_color(palette[GRID])
+        spine.set_color(grid)
 
 
 def _draw_points(axes: Axes, points: Points, colour: str) -> None:
     x, y = np.asarray(points.x), np.asarray(points.y)
-    marked = x.size == 1 if points.band else x.size <= FEW
+    marked = x.size == 1 if points.band else x.size <= _FEW
     size = points.size if points.size is not None else 4.0 if marked else 0.0
-    if points.band and x.size > 2 * BUCKETS:
-        groups = np.array_split(np.arange(x.size), BUCKETS)
+    if points.band and x.size > 2 * _BUCKETS:
+        groups = np.array_split(np.arange(x.size), _BUCKETS)
         middle, low, high = (np.array([f(y[group]) for group in groups]) for f in (np.median, np.min, np.max))
         x, y = np.array([x[group].mean() for group in groups]), middle
         axes.fill_between(x, low, high, color=colour, alpha=0.22, linewidth=0, zorder=2)
@@ -302,43 +272,20 @@ def _draw_points(axes: Axes, points: Points, colour: str) -> None:
         axes.plot(x, y, color=colour, linewidth=1.5, label=points.name or None, zorder=3)
     if size:
         errors = points.spread if any(points.spread) else None
-        axes.errorbar(
-            x,
-            y,
-            xerr=errors,
-            linestyle="none",
-            marker="o",
-            markersize=size,
-            markeredgewidth=0,
-            color=colour,
-            alpha=points.opacity,
-            elinewidth=1,
-            zorder=4,
-        )
+        look: Any = {"color": colour, "alpha": points.opacity, "zorder": 4}
+        axes.errorbar(x, y, xerr=errors, linestyle="none", marker="o", markersize=size, markeredgewidth=0, **look)
 
 
 def _draw_labels(axes: Axes, points: Points, aside: bool, colour: str) -> None:
     """Write each point's label below it, or ``aside``, towards the middle of the chart."""
-    for i, text in enumerate(points.labels):
+    for i, (x, y, text) in enumerate(zip(points.x, points.y, points.labels, strict=False)):
         if not text:
             continue
         right = i < len(points.labels) / 2
         offset = ((8 if right else -8), 0) if aside else (0, -13)
-        axes.annotate(
-            text,
-            (float(points.x[i]), float(points.y[i])),
-            offset,
-            textcoords="offset points",
-            ha="center" if not aside else "left" if right else "right",
-            va="center" if aside else "baseline",
-            fontsize=9,
-            color=colour,
-            parse_math=False,
-        )
-
-
-def _values(known: Sequence[Points], axis: str) -> NDArray[np.float64]:
-    return np.concatenate([np.asarray(getattr(points, axis), dtype=np.float64) for points in known])
+        across = "center" if not aside else "left" if right else "right"
+        style: Any = {"ha": across, "va": "center" if aside else "baseline", "color": colour}
+        axes.annotate(text, (x, y), offset, textcoords="offset points", fontsize=9, parse_math=False, **style)
 
 
 def _set_ticks(axis: Axis, most: int, log: bool, values: NDArray[np.float64], whole: bool = False) -> None:
@@ -347,7 +294,7 @@ def _set_ticks(axis: Axis, most: int, log: bool, values: NDArray[np.float64], wh
     if log:
         ratio = float(values.max() / values.min())
         few, many = (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
-        axis.set_major_locator(LogLocator(subs=(1.0,) if ratio > 300 else few if ratio > LOG_RATIO else many))
+        axis.set_major_locator(LogLocator(subs=(1.0,) if ratio > 300 else few if ratio > _LOG_RATIO else many))
         axis.set_minor_locator(NullLocator())
     else:
         axis.set_major_locator(MaxNLocator(nbins=most, steps=[1, 2, 2.5, 5, 10], integer=whole))
@@ -366,18 +313,9 @@ def _style() -> AbstractContextManager[None]:
     """Return matplotlib's settings of every chart, held from the axes' creation to the file."""
     import matplotlib  # slow to import, and only reports need it
 
-    settings: Any = {
-        "svg.fonttype": "none",
-        "svg.hashsalt": "neuprim",
-        "font.size": 10,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.spines.left": False,
-        "axes.axisbelow": True,
-        "grid.linewidth": 0.8,
-        "ytick.major.size": 0,
-        "xtick.major.size": 3,
-    }
+    settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "neuprim", "font.size": 10}
+    settings |= {f"axes.spines.{side}": False for side in ("top", "right", "left")}
+    settings |= {"axes.axisbelow": True, "grid.linewidth": 0.8, "ytick.major.size": 0, "xtick.major.size": 3}
     return matplotlib.rc_context(settings)
 
 
@@ -396,6 +334,6 @@ def _to_element(figure: Figure, label: str) -> str:
     prefix = re.sub(r"\W+", "-", label.lower()) + "-"
     body = re.sub(r'\bid="', f'id="{prefix}', body.replace("xlink:href", "href"))
     body = body.replace('href="#', f'href="#{prefix}').replace("url(#", f"url(#{prefix}")
-    for colour, variable in VARIABLES.items():
+    for colour, variable in _VARIABLES.items():
         body = body.replace(colour, variable)
     return re.sub(r"\s*\n\s*", " ", body)

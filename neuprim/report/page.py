@@ -18,31 +18,13 @@ from neuprim.report.charts import Chart, draw_svg
 from neuprim.report.pictures import Inlined, inline
 from neuprim.report.run_record import as_number
 
-__all__ = [
-    "MISSING",
-    "badge",
-    "banner",
-    "chart_panels",
-    "escape",
-    "fact_list",
-    "figure",
-    "format_bytes",
-    "format_count",
-    "format_decimal",
-    "format_duration",
-    "format_setting",
-    "masthead",
-    "number_table",
-    "picture",
-    "render_page",
-    "section",
-    "tiles",
-]
-
 MISSING = "–"
 
-PIXELATED_BELOW = 256
+_PIXELATED_BELOW = 256
 """Pictures narrower than this many pixels are enlarged with hard pixel edges."""
+
+Tile = tuple[str, str, str, str]
+"""Label, value, unit and note of a number in large type, as HTML."""
 
 
 def render_page(title: str, sections: Iterable[str], kind: str = "", policy: str = "", script: str = "") -> str:
@@ -56,7 +38,7 @@ def render_page(title: str, sections: Iterable[str], kind: str = "", policy: str
         script: HTML of a script, which ``policy`` must allow.
     """
     template = Template(files("neuprim.report").joinpath("page.html").read_text(encoding="utf-8"))
-    body = "\n".join(section for section in sections if section)
+    body = "\n".join(filter(None, sections))
     return template.substitute(title=escape(title), body=body, kind=kind, policy=policy, script=script)
 
 
@@ -68,39 +50,39 @@ def section(title: str, body: str) -> str:
     return f"<section><h2>{title}</h2>{body}</section>\n" if body else ""
 
 
+def note(text: str) -> str:
+    """Return a paragraph of explanation; takes HTML."""
+    return f'<p class="note">{text}</p>'
+
+
+def folded(title: str, body: str) -> str:
+    """Return HTML that opens with a click."""
+    return f"<details><summary>{title}</summary>{body}</details>"
+
+
 def masthead(eyebrow: str, title: str, more: str = "") -> str:
     """Return the head of a page: a small line, its heading, and more HTML."""
-    return (
-        f'<header class="masthead"><div><p class="eyebrow">{escape(eyebrow)}</p>\n<h1>{escape(title)}</h1>'
-        f"{more}</div></header>"
-    )
+    head = f'<p class="eyebrow">{escape(eyebrow)}</p>\n<h1>{escape(title)}</h1>'
+    return f'<header class="masthead"><div>{head}{more}</div></header>'
 
 
 def badge(name: str, text: str = "") -> str:
     """Return a marked note."""
-    return f'\n<p class="badge"><strong>{escape(name)}</strong> <span>{"" if not text else escape(text)}</span></p>'
+    return f'\n<p class="badge"><strong>{escape(name)}</strong> <span>{escape(text) if text else ""}</span></p>'
 
 
 def banner(notes: Iterable[str]) -> str:
     """Return notes, HTML, on what is not as it should be."""
-    return "".join(f'<p class="banner" role="status">{note}</p>' for note in notes)
+    return "".join(f'<p class="banner" role="status">{text}</p>' for text in notes)
 
 
-def tiles(items: Sequence[tuple[str, str, str, str]], lead: range = range(1)) -> str:
-    """Return numbers in large type.
-
-    Args:
-        items: label, value, unit and note of each, as HTML.
-        lead: those that stand out.
-    """
+def tiles(items: Sequence[Tile], lead: range = range(1)) -> str:
+    """Return numbers in large type; those of ``lead`` stand out."""
     cells = []
-    for i, (label, value, unit, note) in enumerate(items):
-        small = f"<small>{unit}</small>" if unit else ""
+    for i, (label, value, unit, text) in enumerate(items):
+        number = f"<dd>{value}{f'<small>{unit}</small>' if unit else ''}</dd>"
         kind = "tile lead" if i in lead else "tile"
-        cells.append(
-            f'<div class="{kind}"><dt>{label}</dt><dd>{value}{small}</dd><dd class="note" '
-            f'title="{note}">{note}</dd></div>'
-        )
+        cells.append(f'<div class="{kind}"><dt>{label}</dt>{number}<dd class="note" title="{text}">{text}</dd></div>')
     return f'<dl class="tiles">{"".join(cells)}</dl>'
 
 
@@ -117,9 +99,9 @@ def picture(shown: Inlined | None, caption: str, alternative: str, exists: bool 
     """Return a picture as :func:`figure` does; ``exists`` says whether one of None is damaged or missing."""
     under = f"<figcaption>{caption}</figcaption>" if caption else ""
     if shown is None:
-        note = "file damaged" if exists else "no picture"
-        return f'<figure{attributes}><div class="absent">{note}</div>{under}</figure>'
-    kind = ' class="pixelated"' if shown.width < PIXELATED_BELOW else ""
+        text = "file damaged" if exists else "no picture"
+        return f'<figure{attributes}><div class="absent">{text}</div>{under}</figure>'
+    kind = ' class="pixelated"' if shown.width < _PIXELATED_BELOW else ""
     size = f'width="{shown.width}" height="{shown.height}"'
     return f'<figure{attributes}><img src="{shown.url}" {size} alt="{alternative}"{kind}>{under}</figure>'
 
@@ -137,10 +119,14 @@ def chart_panels(charts: Iterable[tuple[str, Chart]], kind: str = "panels") -> s
 def number_table(head: Iterable[str], rows: Iterable[str], kind: str = "numbers") -> str:
     """Return a table of HTML rows under titles, as HTML."""
     titles = "".join(title if title.startswith("<th") else f"<th>{title}</th>" for title in head)
-    return (
-        f'<div class="scroll"><table class="{kind}"><thead><tr>{titles}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></div>"
-    )
+    table = f'<table class="{kind}"><thead><tr>{titles}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
+    return f'<div class="scroll">{table}</div>'
+
+
+def table_row(name: str, cells: Iterable[str], attributes: str = "") -> str:
+    """Return a row of a table: its heading and its cells, as HTML."""
+    body = "".join(cell if cell.startswith("<td") else f"<td>{cell}</td>" for cell in cells)
+    return f"<tr{attributes}><th scope=row>{name}</th>{body}</tr>"
 
 
 def fact_list(pairs: Iterable[tuple[str, object]]) -> str:
@@ -173,30 +159,35 @@ def format_decimal(value: float | None, digits: int) -> str:
     return f"{value:,.{digits}f}" if math.isfinite(value) else ("∞" if value > 0 else "−∞")
 
 
+def _finite_number(value: object) -> float | None:
+    found = as_number(value)
+    return found if found is not None and math.isfinite(found) else None
+
+
 def format_count(value: object) -> str:
     """Write a whole number with thousands separated; other numbers with up to two decimals."""
-    found = as_number(value)
-    if found is None or not math.isfinite(found):
+    found = _finite_number(value)
+    if found is None:
         return MISSING
     return f"{round(found):,}" if found == round(found) else f"{found:,.2f}"
 
 
 def format_bytes(value: object) -> tuple[str, str]:
     """Return (number, unit) of a size in bytes, in powers of 1000."""
-    found = as_number(value)
-    if found is None or not math.isfinite(found):
+    found = _finite_number(value)
+    if found is None:
         return MISSING, ""
     for unit in ("B", "kB", "MB"):
         if abs(found) < 1000:
-            return (f"{found:.0f}" if unit == "B" else f"{found:.3g}" if found < 100 else f"{found:.0f}"), unit
+            return (f"{found:.3g}" if unit != "B" and found < 100 else f"{found:.0f}"), unit
         found /= 1000
     return f"{found:,.2f}", "GB"
 
 
 def format_duration(seconds: object) -> str:
     """Write ``8.3 s``, ``4 min 07 s`` or ``2 h 05 min``."""
-    found = as_number(seconds)
-    if found is None or not math.isfinite(found) or found < 0:
+    found = _finite_number(seconds)
+    if found is None or found < 0:
         return MISSING
     if found < 59.95:
         return f"{found:.1f} s"

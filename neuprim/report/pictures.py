@@ -15,27 +15,21 @@ from torch import Tensor
 from neuprim.core.errors import ConfigError
 from neuprim.core.metrics import matched
 
-__all__ = ["ERROR_SCALE", "INLINE_LIMIT", "Inlined", "color_bar", "error_map", "inline"]
-
 ERROR_SCALE = 0.2
 """Error at the bright end of :func:`error_map` and of the report's colour bar."""
 
-INLINE_LIMIT = 400_000
+_INLINE_LIMIT = 400_000
 """Bytes up to which a picture enters the page unchanged; larger ones are compressed as WebP of quality 90."""
-
-COLOR_MAP = "inferno"
 
 
 def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> NDArray[np.uint8]:
-    """The error of a view in colour, on a fixed scale so that maps of different views and runs compare.
+    """Colour the error of a view on a fixed scale, so that maps of different views and runs compare.
 
     The mean absolute difference over channels runs linearly from 0 (black) to ``scale`` (pale yellow) through
-    matplotlib's perceptually uniform "inferno"; larger errors are drawn as ``scale``. The report's colour bar assumes
-    the default scale.
+    matplotlib's perceptually uniform "inferno"; larger errors are drawn as ``scale``.
 
     Args:
         rendered, truth: (H, W, C) float images in the same colour space.
-        scale: the error at the bright end, in the images' unit.
 
     Returns:
         (H, W, 3) uint8.
@@ -44,19 +38,19 @@ def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> ND
         raise ConfigError(f"scale of the error map must be positive, found {scale}")
     first, second = matched(rendered, truth)
     error = (first - second).abs().mean(-1).numpy()
-    return _table()[np.rint(np.clip(error / scale, 0.0, 1.0) * 255.0).astype(np.intp)]
+    return _color_table()[np.rint(np.clip(error / scale, 0.0, 1.0) * 255.0).astype(np.intp)]
 
 
 def color_bar(stops: int = 13) -> str:
-    """A CSS gradient of the error map's colours, left to right."""
-    rows = _table()[np.linspace(0, 255, stops).round().astype(np.intp)]
+    """Return a CSS gradient of the error map's colours, left to right."""
+    rows = _color_table()[np.linspace(0, 255, stops).round().astype(np.intp)]
     return "linear-gradient(to right, " + ", ".join("#{:02x}{:02x}{:02x}".format(*row) for row in rows.tolist()) + ")"
 
 
-def _table() -> NDArray[np.uint8]:
+def _color_table() -> NDArray[np.uint8]:
     from matplotlib import colormaps  # slow to import, and only reports need it
 
-    return np.asarray(colormaps[COLOR_MAP](np.arange(256), bytes=True))[:, :3]
+    return np.asarray(colormaps["inferno"](np.arange(256), bytes=True))[:, :3]
 
 
 @dataclass(frozen=True)
@@ -70,24 +64,18 @@ class Inlined:
 
 
 def inline(path: Path) -> Inlined | None:
-    """A picture file for an ``img`` element; None if it is damaged, as an interrupted run may leave it."""
+    """Return a picture file for an ``img`` element; None if it is damaged, as an interrupted run may leave it."""
     content = path.read_bytes()
     try:
         with Image.open(io.BytesIO(content)) as image:
             image.load()
-            width, height = image.size
-            kind = f"image/{(image.format or 'png').lower()}"
-            compressed = (
-                len(content) > INLINE_LIMIT
-                and image.mode in ("L", "P", "RGB", "RGBA")
-                and getattr(image, "n_frames", 1) == 1
-            )
+            kind, plain = f"image/{(image.format or 'png').lower()}", image.mode in ("L", "P", "RGB", "RGBA")
+            compressed = len(content) > _INLINE_LIMIT and plain and getattr(image, "n_frames", 1) == 1
             if compressed:
-                buffer = io.BytesIO()
-                image.convert("RGBA" if image.mode == "RGBA" or "transparency" in image.info else "RGB").save(
-                    buffer, "WEBP", quality=90, method=4
-                )
+                buffer, clear = io.BytesIO(), image.mode == "RGBA" or "transparency" in image.info
+                image.convert("RGBA" if clear else "RGB").save(buffer, "WEBP", quality=90, method=4)
                 content, kind = buffer.getvalue(), "image/webp"
+            url = f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+            return Inlined(url, *image.size, compressed)
     except (UnidentifiedImageError, OSError, SyntaxError):
         return None
-    return Inlined(f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}", width, height, compressed)

@@ -14,11 +14,9 @@ from torch import Tensor
 
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
-from neuprim.core.io.files import write_json
-from neuprim.core.io.plain import finite, load_json
+from neuprim.core.io.files import read_json, write_json
+from neuprim.core.io.plain import finite
 from neuprim.report.pictures import error_map
-
-__all__ = ["FILE", "Region", "RegionFile", "Regions", "read_regions", "worst_region"]
 
 FILE = "worst.json"
 """Beside the pictures in ``renders/``."""
@@ -35,8 +33,7 @@ _STEPS = 8
 
 @dataclass(frozen=True)
 class Region:
-    """A square of an image, in pixels from its upper left corner, and its PSNR in dB (infinite where nothing
-    differs)."""
+    """A square of an image, in pixels from its upper left corner, and its PSNR, dB (infinite where nothing differs)."""
 
     x: int
     y: int
@@ -44,13 +41,16 @@ class Region:
     psnr: float
 
     def of(self, image: Tensor) -> Tensor:
-        """(side, side, C) of an (H, W, C) image."""
+        """Return the (side, side, C) part of an (H, W, C) image."""
         return image[self.y : self.y + self.side, self.x : self.x + self.side]
 
 
 def worst_region(rendered: Tensor, truth: Tensor) -> Region:
-    """Where the mean squared error over a square of a quarter of the shorter side is largest; (H, W, C) images in the
-    same colour space."""
+    """Return the square of a quarter of the shorter side with the largest mean squared error.
+
+    Args:
+        rendered, truth: (H, W, C) images in the same colour space.
+    """
     height, width = truth.shape[:2]
     side = min(max(round(SHARE * min(height, width)), LEAST), height, width)
     error = (rendered.double() - truth.double()).square().mean(-1)[None, None]
@@ -80,17 +80,11 @@ class Regions:
         first, second = region.of(truth), region.of(rendered)
         shown = [images.to_uint8(self._display(x)) for x in (first, second)]
         self._found.append((region, name, torch.cat([*shown, torch.from_numpy(error_map(second, first))], dim=1)))
-        if len(self._found) > 2 * MOST:
-            self._worst()
-
-    def _worst(self) -> None:
         self._found.sort(key=lambda found: found[0].psnr)
         del self._found[MOST:]
 
     def write(self, folder: Path) -> None:
-        """``worst_000.png`` (truth, render and error side by side), the worst first, and ``worst.json`` that says what
-        they are."""
-        self._worst()
+        """Write ``worst_000.png`` (truth, render and error side by side), the worst first, and ``worst.json``."""
         entries = []
         for place, (region, name, picture) in enumerate(self._found):
             images.write_png(folder / f"worst_{place:03d}.png", picture)
@@ -100,7 +94,7 @@ class Regions:
 
 @dataclass(frozen=True)
 class RegionFile:
-    """One entry of ``worst.json``."""
+    """One entry of ``worst.json``: its picture, the view's name, dB, and the square as text."""
 
     path: Path
     name: str
@@ -109,39 +103,27 @@ class RegionFile:
 
 
 def read_regions(folder: Path) -> list[RegionFile]:
-    """What ``folder`` (``renders/``) has; empty without ``worst.json``, as older runs and those that have not ended
-    are.
+    """Read the regions of ``renders/``; empty without ``worst.json``.
 
     Raises:
         DataError: the file is damaged.
     """
     file = folder / FILE
-    if not file.is_file():
+    entries = read_json(file, "a list of regions", "evaluate the run again")
+    if entries is None:
         return []
-    try:
-        entries = load_json(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{file}: not valid JSON ({error})") from error
     if not isinstance(entries, list):
         raise DataError(f"{file}: expected a list, found {type(entries).__name__}")
-    return [entry for one in entries if (entry := _entry(folder, one)) is not None]
+    pictures = {path.name: path for path in folder.glob("worst_*.png")}
+    return [region for entry in entries if (region := _parse_entry(pictures, entry)) is not None]
 
 
-def _entry(folder: Path, one: Any) -> RegionFile | None:
-    """None for what is no region of a picture in this folder."""
-    if not isinstance(one, Mapping):
+def _parse_entry(pictures: Mapping[str, Path], entry: Any) -> RegionFile | None:
+    """Return a region; None for what is no region of a picture in the folder."""
+    if not isinstance(entry, Mapping) or not isinstance(entry.get("file"), str) or entry["file"] not in pictures:
         return None
-    name, psnr = one.get("file"), one.get("psnr")
-    numbers = [one.get(key) for key in ("x", "y", "side")]
-    if (
-        not isinstance(name, str)
-        or Path(name).name != name
-        or not name.startswith("worst_")
-        or name not in {f.name for f in folder.iterdir()}
-    ):
-        return None
-    value = finite(psnr)
+    value, numbers = finite(entry.get("psnr")), [entry.get(key) for key in ("x", "y", "side")]
     if value is None or not all(isinstance(n, int) for n in numbers):
         return None
     x, y, side = numbers
-    return RegionFile(folder / name, str(one.get("name")), value, f"{side}×{side} at ({x}, {y})")
+    return RegionFile(pictures[entry["file"]], str(entry.get("name")), value, f"{side}×{side} at ({x}, {y})")

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,10 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.plain import load_json, load_yaml
 from neuprim.report.regions import RegionFile, read_regions
 
-__all__ = ["RunRecord", "ViewFiles", "as_number", "read_run"]
-
 
 @dataclass(frozen=True)
 class ViewFiles:
-    """The pictures of one held-out view; ``stem`` is its name as file names spell it, ``index`` its place in the
-    split."""
+    """The pictures of one held-out view: its place in the split, its name as file names spell it, and their paths."""
 
     index: int
     stem: str
@@ -59,13 +56,8 @@ class RunRecord:
     clips: list[Path]
     regions: list[RegionFile]
 
-    @property
-    def finished(self) -> bool:
-        """Whether the final numbers are there."""
-        return self.metrics is not None
-
     def field(self, key: str) -> Any:
-        """A value of ``metrics.json``, None where the file or the key is missing."""
+        """Return a value of ``metrics.json``, None where the file or the key is missing."""
         return None if self.metrics is None else self.metrics.get(key)
 
     @property
@@ -74,7 +66,7 @@ class RunRecord:
         return str(self.field("shown") or "")
 
     def name_of(self, key: str) -> str | None:
-        """The task's or scene's name: from the metrics, else from the config (a string, or a section with ``name``)."""
+        """Return the task's or scene's name: from the metrics, else from the configuration."""
         value = self.field(key)
         if value is None:
             value = self.config.get(key)
@@ -83,12 +75,9 @@ class RunRecord:
         return None if value is None else str(value)
 
     def last(self, key: str) -> tuple[float, float] | None:
-        """(step, value) of the newest log line that has a finite number under ``key``."""
-        for line in reversed(self.log):
-            value = as_number(line.get(key))
-            if value is not None and math.isfinite(value):
-                return float(line["step"]), value
-        return None
+        """Return (step, value) of the newest log line that has a finite number under ``key``."""
+        steps, values = self.series("step", key)
+        return (steps[-1], values[-1]) if steps else None
 
     def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
         """Return the values of two keys over the log lines that have finite numbers for both."""
@@ -97,29 +86,20 @@ class RunRecord:
         return [a for a, _ in known], [b for _, b in known]
 
     def view_numbers(self, view: ViewFiles) -> Mapping[str, Any]:
-        """The entry of ``per_view`` that belongs to a view's pictures; empty where none does.
-
-        File names may spell a view's name with other punctuation. Numbers are shown only where the names agree apart
-        from that.
-        """
+        """Return the entry of ``per_view`` of a view's pictures; empty where the names do not agree."""
         entries = per_view(self)
-        named = [e for e in entries if str(e.get("name")) == view.stem]
-        if len(named) == 1:
-            return named[0]
-        if view.index < len(entries) and _plain(str(entries[view.index].get("name"))) == _plain(view.stem):
-            return entries[view.index]
-        alike = [e for e in entries if _plain(str(e.get("name"))) == _plain(view.stem)]
-        return alike[0] if len(alike) == 1 else {}
+        entry = entries[view.index] if view.index < len(entries) else {}
+        return entry if _plain(str(entry.get("name"))) == _plain(view.stem) else {}
 
 
 def per_view(run: RunRecord) -> list[Mapping[str, Any]]:
-    """The per-view entries of ``metrics.json``; empty where there are none."""
+    """Return the per-view entries of ``metrics.json``; empty where there are none."""
     entries = run.field("per_view")
     return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
 
 
 def as_number(value: object) -> float | None:
-    """``value`` as a float if it is a number and not NaN, else None."""
+    """Return ``value`` as a float if it is a number and not NaN, else None."""
     if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
         return None
     return float(value)
@@ -133,21 +113,30 @@ def read_run(run_dir: Path) -> RunRecord:
     """
     if not run_dir.is_dir():
         raise DataError(f"{run_dir}: not a directory")
-    config_file, metrics_file, log_file = (run_dir / name for name in ("config.yaml", "metrics.json", "metrics.jsonl"))
-    if not any(f.is_file() for f in (config_file, metrics_file, log_file)):
+    files = [run_dir / name for name in ("config.yaml", "metrics.json", "metrics.jsonl")]
+    if not any(f.is_file() for f in files):
         raise DataError(f"{run_dir}: not a run directory, it has none of config.yaml, metrics.json and metrics.jsonl")
-    config_text = _text(config_file)
-    config = {} if config_text is None else _parsed_config(config_file, config_text)
-    log, unreadable = _log(_text(log_file) or "")
-    views, orbit = _pictures(run_dir / "renders")
-    clips = sorted((run_dir / "renders").glob("clip_*.webp"))
-    regions = read_regions(run_dir / "renders")
+    config_text = _read_text(files[0])
+    config = _read_mapping(files[0], "YAML", lambda text: load_yaml(text) or {})
+    metrics = _read_mapping(files[1], "JSON", lambda text: load_json(text, infinite=True))
+    log, unreadable = _parse_log(_read_text(files[2]) or "")
+    renders = run_dir / "renders"
+    orbit, clips = renders / "orbit.webp", sorted(renders.glob("clip_*.webp"))
     return RunRecord(
-        run_dir, config_text, config, _metrics(metrics_file), log, unreadable, views, orbit, clips, regions
+        run_dir,
+        config_text,
+        config or {},
+        metrics,
+        log,
+        unreadable,
+        _find_views(renders),
+        orbit if orbit.is_file() else None,
+        clips,
+        read_regions(renders),
     )
 
 
-def _text(path: Path) -> str | None:
+def _read_text(path: Path) -> str | None:
     if not path.is_file():
         return None
     try:
@@ -156,38 +145,24 @@ def _text(path: Path) -> str | None:
         raise DataError(f"{path}: not UTF-8 text ({error})") from error
 
 
-def _parsed_config(path: Path, text: str) -> Mapping[str, Any]:
-    try:
-        config = load_yaml(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
-    if config is None:
-        return {}
-    if not isinstance(config, Mapping):
-        raise DataError(f"{path}: expected a mapping of settings, found {type(config).__name__}")
-    return config
-
-
-def _metrics(path: Path) -> Mapping[str, Any] | None:
-    text = _text(path)
+def _read_mapping(path: Path, kind: str, parse: Callable[[str], Any]) -> Mapping[str, Any] | None:
+    text = _read_text(path)
     if text is None:
         return None
     try:
-        metrics = load_json(text, infinite=True)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not valid JSON ({error})") from error
-    if not isinstance(metrics, Mapping):
-        raise DataError(f"{path}: expected an object, found {type(metrics).__name__}")
-    return metrics
+        data = parse(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: not valid {kind} ({' '.join(str(error).split())})") from error
+    if not isinstance(data, Mapping):
+        raise DataError(f"{path}: expected a mapping, found {type(data).__name__}")
+    return data
 
 
-def _log(text: str) -> tuple[list[Mapping[str, Any]], int]:
-    """Readable lines in order of steps, and the number of the others."""
+def _parse_log(text: str) -> tuple[list[Mapping[str, Any]], int]:
+    """Return readable lines in order of steps, and the number of the others."""
     lines: list[Mapping[str, Any]] = []
     unreadable = 0
-    for raw in text.splitlines():
-        if not raw.strip():
-            continue
+    for raw in filter(str.strip, text.splitlines()):
         try:
             line = load_json(raw, infinite=True)
         except (ValueError, RecursionError):
@@ -203,7 +178,7 @@ def _log(text: str) -> tuple[list[Mapping[str, Any]], int]:
     return lines, unreadable
 
 
-def _pictures(folder: Path) -> tuple[list[ViewFiles], Path | None]:
+def _find_views(folder: Path) -> list[ViewFiles]:
     groups: dict[str, set[str]] = defaultdict(set)
     for path in folder.glob("test_*.png"):
         match = re.match(r"test_(\d+)(_|$)", path.stem)
@@ -217,8 +192,7 @@ def _pictures(folder: Path) -> tuple[list[ViewFiles], Path | None]:
             folder / f"{stem}_{kind}.png" if f"{stem}_{kind}" in groups[index] else None for kind in ("truth", "error")
         )
         views.append(ViewFiles(int(index), stem[len(f"test_{index}_") :], folder / f"{stem}.png", truth, error))
-    orbit = folder / "orbit.webp"
-    return views, orbit if orbit.is_file() else None
+    return views
 
 
 def _plain(name: str) -> str:

@@ -13,30 +13,34 @@ from neuprim.core.metrics import from_json
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.report import page
 from neuprim.report.charts import HELD_OUT, Chart, Points, curve_chart, view_chart
-from neuprim.report.page import MISSING, escape, figure, format_count, format_decimal, format_duration, section
+from neuprim.report.page import (
+    MISSING,
+    Tile,
+    escape,
+    figure,
+    folded,
+    format_count,
+    format_decimal,
+    format_duration,
+    note,
+    section,
+)
 from neuprim.report.pictures import ERROR_SCALE, color_bar, inline
 from neuprim.report.run_record import RunRecord, ViewFiles, as_number, per_view, read_run
-
-__all__ = ["LIMIT", "Viewer", "write_report"]
 
 LIMIT = 4_000_000
 """Bytes of a report with a viewer in it; the viewer of a larger one becomes a page beside it."""
 
-MAX_VIEWS = 24
-"""Held-out views shown as pictures; of more, evenly spaced ones."""
-
-WORST_SHOWN = 12
+_WORST_SHOWN = 12
 """Worst regions that are shown unfolded."""
 
-SOURCES = {
+_SOURCES = {
     "generated": ("generated data", "ray-cast scenes of our own, not photographs"),
     "simulated": ("simulated data", "a stand-in for data that was not given"),
 }
 """Data source -> badge and explanation; real data has none."""
 
 _VIEWER_FILE = "viewer.html"
-
-Tile = tuple[str, str, str, str]
 
 
 @dataclass(frozen=True)
@@ -97,28 +101,26 @@ def _render(run: RunRecord, conditions: Sequence[ConditionSpec], viewer: Viewer 
 
 
 def _head(run: RunRecord) -> str:
-    """Task and scene, and a badge unless the data is real."""
+    """Return task and scene, and a badge unless the data is real."""
     source, drawn = run.field("data_source"), run.field("rendered_from")
     mark = ""
     if source is None:
         mark = page.badge("data source not recorded", "real, generated or simulated is not known")
     elif source != "real":
-        name, text = SOURCES.get(str(source), (str(source), "not photographs or captures"))
+        name, text = _SOURCES.get(str(source), (str(source), "not photographs or captures"))
         mark = page.badge(name, text if drawn is None else f"rendered from {drawn}, not photographs")
     return page.masthead(run.name_of("task") or "", run.name_of("scene") or "", mark)
 
 
 def _warnings(run: RunRecord) -> list[str]:
-    """No final metrics, unreadable log lines, views worse than nothing; as HTML."""
+    """Return notes, HTML: no final metrics, unreadable log lines, views worse than nothing."""
     notes = []
-    if not run.finished:
-        last = run.last("step")
-        step = "" if last is None else f"{format_count(last[1])}{_of_iterations(run)}"
-        where = f"The last logged step is {step}." if step else "No step was logged."
-        notes.append(
-            "<strong>This run has not finished.</strong> There is no metrics.json yet: it is still going, "
-            f"or it was interrupted. {where}"
-        )
+    if not run.metrics:
+        last, train = run.last("step"), run.config.get("train")
+        total = as_number(train.get("iterations")) if isinstance(train, Mapping) else None
+        of = "" if total is None else f" of {format_count(total)}"
+        where = f"The last logged step is {format_count(last[1])}{of}." if last else "No step was logged."
+        notes.append(f"<strong>This run has not finished.</strong> There is no metrics.json yet. {where}")
     if run.unreadable_lines:
         lines = "1 line" if run.unreadable_lines == 1 else f"{run.unreadable_lines} lines"
         notes.append(f"{lines} of metrics.jsonl could not be read and left out of the curves.")
@@ -130,19 +132,12 @@ def _warnings(run: RunRecord) -> list[str]:
     return notes
 
 
-def _of_iterations(run: RunRecord) -> str:
-    train = run.config.get("train")
-    total = as_number(train.get("iterations")) if isinstance(train, Mapping) else None
-    return "" if total is None else f" of {format_count(total)}"
-
-
 def _headline(run: RunRecord) -> str:
-    """The numbers in large type: final ones, or the last logged ones of an unfinished run; and the orbit."""
-    html = page.tiles(_final_tiles(run) if run.finished else _interim_tiles(run))
-    if run.finished:
+    """Return final numbers in large type, or the last logged ones of an unfinished run; and the orbit."""
+    html = page.tiles(_interim_tiles(run) if run.metrics is None else _final_tiles(run, run.metrics))
+    if run.metrics is not None:
         kept = run.field("checkpoint")
-        last = kept in (None, "last")
-        which = "the last checkpoint, not the best" if last else f"checkpoint “{escape(kept)}”"
+        which = "the last checkpoint, not the best" if kept in (None, "last") else f"checkpoint “{escape(kept)}”"
         html += f'<p class="rule">Metrics of {which}.</p>'
     if run.orbit is not None:
         caption = "camera orbit" + (f"; shown: {escape(run.shown)}" if run.shown else "")
@@ -151,49 +146,36 @@ def _headline(run: RunRecord) -> str:
     return html
 
 
-def _final_tiles(run: RunRecord) -> list[Tile]:
-    metrics = run.metrics or {}
+def _final_tiles(run: RunRecord, metrics: Mapping[str, object]) -> list[Tile]:
     mean, worst, ssim = (from_json(metrics, key) for key in ("psnr", "psnr_worst", "ssim"))
     views, split = len(per_view(run)), escape(metrics.get("split") or "held-out")
     shown = f"{format_count(views)} {split} view{'s' if views != 1 else ''}" if views else ""
-    empty = metrics.get("views_empty")
+    empty, worst_name = metrics.get("views_empty"), _worst_name(run)
     displayed = from_json(metrics, "ssim_3dgs")
     rule = "" if displayed is None else f"; as displayed, by 3DGS’s rule: {format_decimal(displayed, 4)}"
     each, steps = metrics.get("parameters_per_primitive"), metrics.get("iterations")
-    fps = as_number(metrics.get("render_fps"))
+    per_primitive = "" if each is None else f"{format_count(each)} per primitive"
+    iterations = "" if steps is None else f"{format_count(steps)} iterations"
+    fps, backend = as_number(metrics.get("render_fps")), metrics.get("backend")
+    speed, unit = format_decimal(fps, 1 if fps is None or fps < 100 else 0), "" if fps is None else "fps"
     return [
         _decibels("PSNR, mean", mean, shown),
-        _decibels("PSNR, worst view", worst, escape(_worst_name(run) or "") if _worst_name(run) else ""),
+        _decibels("PSNR, worst view", worst, escape(worst_name) if worst_name else ""),
         *([("Empty views", format_count(empty), "", "the model is not in them")] if empty else []),
         ("SSIM", format_decimal(ssim, 4), "", "" if ssim is None else f"mean over views{rule}"),
         *_lpips_tile(metrics),
         *_mask_tile(metrics),
         *_volume_tiles(metrics),
         ("Primitives", format_count(metrics.get("primitives")), "", ""),
-        (
-            "Parameters",
-            format_count(metrics.get("parameters")),
-            "",
-            "" if each is None else f"{format_count(each)} per primitive",
-        ),
+        ("Parameters", format_count(metrics.get("parameters")), "", per_primitive),
         ("Model size", *page.format_bytes(metrics.get("model_bytes")), ""),
-        (
-            "Training",
-            format_duration(metrics.get("train_seconds")),
-            "",
-            "" if steps is None else f"{format_count(steps)} iterations",
-        ),
-        (
-            "Rendering",
-            format_decimal(fps, 1 if fps is None or fps < 100 else 0),
-            "" if fps is None else "fps",
-            escape(metrics["backend"]) if metrics.get("backend") else "",
-        ),
+        ("Training", format_duration(metrics.get("train_seconds")), "", iterations),
+        ("Rendering", speed, unit, escape(backend) if backend else ""),
     ]
 
 
-def _decibels(label: str, value: float | None, note: str) -> Tile:
-    return label, format_decimal(value, 2), "" if value is None else "dB", note
+def _decibels(label: str, value: float | None, text: str) -> Tile:
+    return label, format_decimal(value, 2), "" if value is None else "dB", text
 
 
 def _lpips_tile(metrics: Mapping[str, object]) -> list[Tile]:
@@ -203,8 +185,7 @@ def _lpips_tile(metrics: Mapping[str, object]) -> list[Tile]:
         return [] if reason is None else [("LPIPS", MISSING, "", f"not measured: {escape(reason)}")]
     rule = from_json(metrics, "lpips_3dgs")
     more = "" if rule is None else f"; by 3DGS’s rule: {format_decimal(rule, 4)}"
-    network = escape(metrics.get("lpips_network"))
-    return [("LPIPS", format_decimal(value, 4), "", f"{network}, mean over views{more}")]
+    return [("LPIPS", format_decimal(value, 4), "", f"{escape(metrics.get('lpips_network'))}, mean over views{more}")]
 
 
 def _mask_tile(metrics: Mapping[str, object]) -> list[Tile]:
@@ -216,7 +197,7 @@ def _mask_tile(metrics: Mapping[str, object]) -> list[Tile]:
 
 
 def _volume_tiles(metrics: Mapping[str, object]) -> list[Tile]:
-    """The largest error of each known volume over the compared frames."""
+    """Return the largest error of each known volume over the compared frames."""
     tiles: list[Tile] = []
     for key, frames in metrics.items():
         if not key.endswith("_frames") or not isinstance(frames, list):
@@ -225,28 +206,26 @@ def _volume_tiles(metrics: Mapping[str, object]) -> list[Tile]:
         errors = [value for value in found if value is not None]
         if errors:
             what = "extinction" if key == "sigma_frames" else escape(key.removesuffix("_frames"))
-            largest = format_decimal(100 * max(errors), 0)
-            note = "of the frame’s largest value, on the files’ voxels"
-            tiles.append((f"Largest error of {what}", largest, "%", note))
+            text = "of the frame’s largest value, on the files’ voxels"
+            tiles.append((f"Largest error of {what}", format_decimal(100 * max(errors), 0), "%", text))
     return tiles
 
 
 def _interim_tiles(run: RunRecord) -> list[Tile]:
-    def tile(label: str, key: str, digits: int | None, unit: str = "") -> Tile:
+    tiles: list[Tile] = []
+    for label, key, digits, unit in (
+        ("PSNR, held-out", "eval_psnr", 2, "dB"),
+        ("PSNR, training view", "psnr", 2, "dB"),
+        ("Loss", "loss", 4, ""),
+        ("Primitives", "primitives", 0, ""),
+        ("Training", "seconds", 1, "s"),
+    ):
         last = run.last(key)
         if last is None:
-            return label, MISSING, "", "not logged yet"
-        value = format_count(last[1]) if digits is None else format_decimal(last[1], digits)
-        return label, value, unit, f"at step {format_count(last[0])}"
-
-    seconds = run.last("seconds")
-    return [
-        tile("PSNR, held-out", "eval_psnr", 2, "dB"),
-        tile("PSNR, training view", "psnr", 2, "dB"),
-        tile("Loss", "loss", 4),
-        tile("Primitives", "primitives", None),
-        ("Training", format_duration(seconds[1] if seconds else None), "", "so far" if seconds else "not logged yet"),
-    ]
+            tiles.append((label, MISSING, "", "not logged yet"))
+        else:
+            tiles.append((label, format_decimal(last[1], digits), unit, f"at step {format_count(last[0])}"))
+    return tiles
 
 
 def _worst_name(run: RunRecord) -> str | None:
@@ -256,7 +235,7 @@ def _worst_name(run: RunRecord) -> str | None:
 
 
 def _model(viewer: str, linked: str) -> str:
-    """The model to turn by hand: a page in this page, or a link to one."""
+    """Return the model to turn by hand: a page in this page, or a link to one."""
     if viewer:
         frame = f'<iframe title="the model, drawn by this browser" loading="lazy" srcdoc="{escape(viewer)}"></iframe>'
         use = "Drag to turn, wheel to zoom, Shift and drag to move."
@@ -271,7 +250,7 @@ def _model(viewer: str, linked: str) -> str:
 
 
 def _films(run: RunRecord) -> str:
-    """Held-out cameras over time, ground truth on the left and render on the right."""
+    """Return held-out cameras over time, ground truth on the left and render on the right."""
     figures = ""
     for path in run.clips:
         name = escape(path.stem.removeprefix("clip_"))
@@ -280,36 +259,29 @@ def _films(run: RunRecord) -> str:
 
 
 def _shown(run: RunRecord) -> str:
-    """A line on what pictures show of the channels, where that is not plain colour."""
-    return f'<p class="note">Shown: {escape(run.shown)}.</p>' if run.shown else ""
+    """Return a line on what pictures show of the channels, where that is not plain colour."""
+    return note(f"Shown: {escape(run.shown)}.") if run.shown else ""
 
 
 def _held_out(run: RunRecord) -> str:
-    """Each shown view: render, truth and error map with its numbers; the colour bar once."""
+    """Return each view: render, truth and error map with its numbers; the colour bar once."""
     if not run.views:
         return ""
-    shown = run.views
-    if len(shown) > MAX_VIEWS:
-        shown = [shown[round(i * (len(shown) - 1) / (MAX_VIEWS - 1))] for i in range(MAX_VIEWS)]
     rows, compressed = "", False
-    for view in shown:
+    for view in run.views:
         row, large = _view_row(run, view)
         rows, compressed = rows + row, compressed or large
-    notes = [f"{len(shown)} of {len(run.views)} views, evenly spaced."] if len(shown) < len(run.views) else []
-    if compressed:
-        exact = "the PNG files in renders/ are exact."
-        notes.append(f"Large pictures are compressed on this page (WebP, quality 90); {exact}")
+    exact = "Large pictures are compressed on this page (WebP, quality 90); the PNG files in renders/ are exact."
     ticks = "".join(f"<span>{'≥ ' if i == 4 else ''}{ERROR_SCALE * i / 4:g}</span>" for i in range(5))
     bar = (
         f'<div class="scale"><p>Error: mean absolute difference over {"all " if run.shown else ""}channels</p>'
         f'<div class="bar" style="background: {color_bar()}"></div><div class="ticks">{ticks}</div></div>'
     )
-    note = f'<p class="note">{" ".join(notes)}</p>' if notes else ""
-    return section("Held-out views", f"{_shown(run)}{bar}{rows}{note}")
+    return section("Held-out views", f"{_shown(run)}{bar}{rows}{note(exact) if compressed else ''}")
 
 
 def _view_row(run: RunRecord, view: ViewFiles) -> tuple[str, bool]:
-    """A view's pictures and numbers, and whether a picture was compressed."""
+    """Return a view's pictures and numbers, and whether a picture was compressed."""
     entry = run.view_numbers(view)
     name = escape(entry.get("name") or view.stem or view.index)
     figures, compressed = "", False
@@ -328,25 +300,21 @@ def _view_row(run: RunRecord, view: ViewFiles) -> tuple[str, bool]:
 
 
 def _worst_regions(run: RunRecord) -> str:
-    """The square of every held-out view with the largest error, worst first, folded after the first dozen."""
-    figures = [
-        figure(
-            region.path,
-            f"<b>{format_decimal(region.psnr, 1)}</b> dB in {escape(region.place)} of {escape(region.name)}",
-            f"worst region of view {escape(region.name)}: ground truth, render, error",
-        )
-        for region in run.regions
-    ]
+    """Return the square of every held-out view with the largest error, worst first, folded after the first dozen."""
+    figures = []
+    for region in run.regions:
+        name = escape(region.name)
+        caption = f"<b>{format_decimal(region.psnr, 1)}</b> dB in {escape(region.place)} of {name}"
+        figures.append(figure(region.path, caption, f"worst region of view {name}: ground truth, render, error"))
     if not figures:
         return ""
-    note = (
+    text = (
         "Of every view the square of a quarter of its shorter side with the largest error: ground truth, render, error."
     )
-    first, rest = figures[:WORST_SHOWN], figures[WORST_SHOWN:]
-    body = f'<p class="note">{note}</p><div class="regions">{"".join(first)}</div>'
+    first, rest = figures[:_WORST_SHOWN], figures[_WORST_SHOWN:]
+    body = f'{note(text)}<div class="regions">{"".join(first)}</div>'
     if rest:
-        folded = f'<div class="regions">{"".join(rest)}</div>'
-        body += f"<details><summary>{format_count(len(rest))} more</summary>{folded}</details>"
+        body += folded(f"{format_count(len(rest))} more", f'<div class="regions">{"".join(rest)}</div>')
     return section("Worst regions", body)
 
 
@@ -354,92 +322,84 @@ def _worst_regions(run: RunRecord) -> str:
 
 
 def _curves(run: RunRecord) -> str:
-    """PSNR and loss over time and steps, primitives over time, PSNR per view and frame."""
+    """Return PSNR and loss over time and steps, primitives over time, PSNR per view and frame."""
     views = [from_json(entry, "psnr") for entry in per_view(run)]
-    mean = from_json(run.metrics or {}, "psnr")
-    frames = run.field("per_frame")
-    over_frames = [
-        from_json(entry, "psnr") if isinstance(entry, Mapping) else None
-        for entry in (frames if isinstance(frames, list) else [])
+    mean, frames = from_json(run.metrics or {}, "psnr"), run.field("per_frame")
+    known = [
+        (i, value)
+        for i, entry in enumerate(frames if isinstance(frames, list) else [])
+        if isinstance(entry, Mapping) and (value := from_json(entry, "psnr")) is not None
     ]
-    known = [(i, value) for i, value in enumerate(over_frames) if value is not None]
     film = Points([i for i, _ in known], [value for _, value in known], HELD_OUT)
-    body = page.chart_panels(
-        (
-            ("PSNR over time, dB", _psnr_curve(run, "seconds", "PSNR over time")),
-            ("Loss over time", _training_curve(run, "seconds", "loss", "Loss over time", log=True)),
-            ("Primitives over time", _training_curve(run, "seconds", "primitives", "Primitives over time")),
-            ("PSNR over steps, dB", _psnr_curve(run, "step", "PSNR over steps")),
-            ("Loss over steps", _training_curve(run, "step", "loss", "Loss over steps", log=True)),
-            (
-                "PSNR per view, dB <small>dashed: mean</small>",
-                view_chart("PSNR per view", views, mean, _worst_name(run)),
-            ),
-            ("PSNR over the frames of a film, dB", curve_chart("PSNR over frames", "frame", [film])),
+    lines = [
+        _curve(run, x, key, title)
+        for x, key, title in (
+            ("seconds", "psnr", "PSNR over time"),
+            ("seconds", "loss", "Loss over time"),
+            ("seconds", "primitives", "Primitives over time"),
+            ("step", "psnr", "PSNR over steps"),
+            ("step", "loss", "Loss over steps"),
         )
-    )
+    ]
+    charts = [(f"{chart.title}, dB" if "PSNR" in chart.title else chart.title, chart) for chart in lines]
+    hung = view_chart("PSNR per view", views, mean, _worst_name(run))
+    charts.append(("PSNR per view, dB <small>dashed: mean</small>", hung))
+    charts.append(("PSNR over the frames of a film, dB", curve_chart("PSNR over frames", "frame", [film])))
+    body = page.chart_panels(charts)
     key = '<p class="key"><span class="training">training views</span><span class="held-out">held-out views</span></p>'
     return section("Curves", key + body) if body else ""
 
 
-def _psnr_curve(run: RunRecord, x: str, title: str) -> Chart:
-    training = Points(*run.series(x, "psnr"), band=True)
-    return curve_chart(title, _UNITS[x], [training, Points(*run.series(x, "eval_psnr"), HELD_OUT)])
-
-
-def _training_curve(run: RunRecord, x: str, key: str, title: str, log: bool = False) -> Chart:
-    return curve_chart(title, _UNITS[x], [Points(*run.series(x, key), band=True)], log)
-
-
-_UNITS = {"seconds": "seconds", "step": "steps"}
+def _curve(run: RunRecord, x: str, key: str, title: str) -> Chart:
+    """Return a chart of a logged number; that of PSNR with the held-out views."""
+    lines = [Points(*run.series(x, key), band=True)]
+    if key == "psnr":
+        lines.append(Points(*run.series(x, "eval_psnr"), HELD_OUT))
+    return curve_chart(title, "steps" if x == "step" else x, lines, log=key == "loss")
 
 
 # ---------------------------------------------------------------- tables
 
 
 def _view_table(run: RunRecord) -> str:
-    """Every held-out view's numbers, folded."""
+    """Return every held-out view's numbers, folded."""
     entries = per_view(run)
     if not entries:
         return ""
-    rows = [
-        f"<tr><td>{format_count(i)}</td><th scope=row>{escape(entry.get('name'))}</th>"
-        f"<td>{format_decimal(from_json(entry, 'psnr'), 3)}</td><td>{format_decimal(from_json(entry, 'ssim'), 5)}</td>"
-        f"<td>{format_decimal(as_number(entry.get('seconds')), 3)}</td></tr>"
-        for i, entry in enumerate(entries)
-    ]
-    table = page.number_table(("#", "view", "PSNR, dB", "SSIM", "render, s"), rows)
-    return f"<details><summary>All {format_count(len(entries))} held-out views</summary>{table}</details>"
+    rows = []
+    for entry in entries:
+        psnr, ssim = format_decimal(from_json(entry, "psnr"), 3), format_decimal(from_json(entry, "ssim"), 5)
+        seconds = format_decimal(as_number(entry.get("seconds")), 3)
+        rows.append(page.table_row(escape(entry.get("name")), (psnr, ssim, seconds)))
+    table = page.number_table(("view", "PSNR, dB", "SSIM", "render, s"), rows)
+    return folded(f"All {format_count(len(entries))} held-out views", table)
 
 
 def _settings(run: RunRecord) -> str:
-    """Every setting that is not at its default."""
+    """Return every setting that is not at its default."""
     changed = run.field("non_default")
     if not isinstance(changed, Mapping):
-        body = f'<p class="note">{MISSING} not recorded</p>'
+        body = note(f"{MISSING} not recorded")
     elif not changed:
-        body = '<p class="note">All settings are at their defaults.</p>'
+        body = note("All settings are at their defaults.")
     else:
-        rows = [f"<tr><th scope=row>{escape(key)}</th>{_change(pair)}</tr>" for key, pair in changed.items()]
+        rows = []
+        for key, pair in changed.items():
+            default, value = pair if isinstance(pair, list | tuple) and len(pair) == 2 else (None, pair)
+            first, second = (f"<code>{escape(page.format_setting(v))}</code>" for v in (default, value))
+            rows.append(page.table_row(escape(key), (f'<td class="default">{first}</td>', second)))
         body = page.number_table(("setting", "default", "this run"), rows, "")
     return section("Settings changed from their defaults", body)
 
 
-def _change(pair: object) -> str:
-    default, value = pair if isinstance(pair, list | tuple) and len(pair) == 2 else (None, pair)
-    first, second = (escape(page.format_setting(v)) for v in (default, value))
-    return f'<td class="default"><code>{first}</code></td><td><code>{second}</code></td>'
-
-
 def _facts(run: RunRecord) -> str:
-    """Where the numbers come from: split, data, machine, versions."""
-    channels = run.field("channels")
-    names = ", ".join(map(str, channels)) if isinstance(channels, list) else channels
-    before, after = ("split", "data_source", "color_space"), ("downsampling", "background", "seed", "iterations")
-    pairs = [(key, run.field(key)) for key in before]
-    pairs.append(("channels", names))
-    pairs += [(key, run.field(key)) for key in (*after, "checkpoint", "backend", "device")]
-    pairs = [(key.replace("_", " ").replace("color", "colour"), value) for key, value in pairs]
+    """Return where the numbers come from: split, data, machine, versions."""
+    keys = ("split", "data_source", "color_space", "channels", "downsampling", "background", "seed", "iterations")
+    pairs = [(key.replace("_", " "), run.field(key)) for key in (*keys, "checkpoint", "backend", "device")]
+    pairs = [
+        (key, ", ".join(map(str, value)) if key == "channels" and isinstance(value, list) else value)
+        for key, value in pairs
+    ]
     versions, made_by = run.field("versions"), run.field("made_by")
     pairs += versions.items() if isinstance(versions, Mapping) else [("versions", None)]
     if isinstance(made_by, Mapping):
@@ -448,21 +408,20 @@ def _facts(run: RunRecord) -> str:
 
 
 def _commands(run: RunRecord, conditions: Sequence[ConditionSpec]) -> str:
-    """The commands that go on from here, among them an animation of each condition of the task that has one."""
+    """Return the commands that go on from here, among them an animation of each condition of the task that has one."""
     folder = shlex.quote(str(run.run_dir))
     orbit = f"neuprim render {folder} --camera orbit"
     lines = [(f"neuprim eval {folder}", "measure again"), (orbit, "fly around the scene")]
     for spec in conditions:
         if spec.sweep:
-            name = spec.name.replace("_", " ")
             command = f"{orbit} {flag(spec.name)} {shlex.quote(spec.sweep)}"
-            lines.append((command, f"fly around it while the {name} changes"))
+            lines.append((command, f"fly around it while the {spec.name.replace('_', ' ')} changes"))
     items = "".join(f"<li><code>{escape(line)}</code><span>{escape(what)}</span></li>" for line, what in lines)
     return section("Go on", f'<ul class="commands">{items}</ul>')
 
 
 def _config(run: RunRecord) -> str:
-    """The resolved configuration, folded."""
+    """Return the resolved configuration, folded."""
     if run.config_text is None:
-        return '<p class="note">There is no config.yaml in this run directory.</p>'
-    return f"<details><summary>Full configuration</summary><pre><code>{escape(run.config_text)}</code></pre></details>"
+        return note("There is no config.yaml in this run directory.")
+    return folded("Full configuration", f"<pre><code>{escape(run.config_text)}</code></pre>")

@@ -9,56 +9,45 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from urllib.parse import quote
 
 from neuprim.core.io.files import write_text
 from neuprim.core.metrics import from_json
 from neuprim.report import page
 from neuprim.report.charts import LARGE, Points, curve_chart
-from neuprim.report.page import escape, format_bytes, format_count, format_decimal, format_duration, section
-from neuprim.report.run_record import RunRecord, ViewFiles
+from neuprim.report.page import escape, format_bytes, format_count, format_decimal, format_duration, note, section
+from neuprim.report.run_record import RunRecord
 
-__all__ = ["SweepRun", "numbers_of", "write_sweep_page"]
-
-LESS, MORE = "less", "more"
-BETTER: dict[str, str] = {
-    **dict.fromkeys(("psnr", "ssim", "render_fps", "sigma_correlation", "sigma_psnr"), MORE),
-    **dict.fromkeys(
-        (
-            "lpips",
-            "flip",
-            "model_bytes",
-            "primitives",
-            "parameters",
-            "train_seconds",
-            "sigma_relative",
-            "sigma_max_error",
-        ),
-        LESS,
-    ),
+_LESS, _MORE = "less", "more"
+_BETTER = {
+    **dict.fromkeys(("psnr", "ssim", "render_fps", "sigma_correlation", "sigma_psnr"), _MORE),
+    **dict.fromkeys(("lpips", "flip", "model_bytes", "primitives", "parameters", "train_seconds"), _LESS),
+    **dict.fromkeys(("sigma_relative", "sigma_max_error"), _LESS),
 }
 """Beginning of a metric's name -> whether more of it is better, or less. Of any other the page does not say."""
 
-FIRST = (
-    "psnr",
-    "ssim",
-    "psnr_worst",
-    "psnr_mask",
-    "lpips",
-    "primitives",
-    "model_bytes",
-    "train_seconds",
-    "render_fps",
-    "iterations",
+_FIRST = (
+    *("psnr", "ssim", "psnr_worst", "psnr_mask", "lpips"),
+    *("primitives", "model_bytes", "train_seconds", "render_fps", "iterations"),
 )
 """Metrics in the order of the table; the others follow."""
 
-NOT_COMPARED = ("psnr_black_image", "seed", "vdb_bytes")
+_TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "model_bytes": "model file", "train_seconds": "training"}
+
+_BEST = {
+    "psnr": "Best PSNR",
+    "ssim": "Best SSIM",
+    "model_bytes": "Smallest model",
+    "train_seconds": "Fastest training",
+}
+
+_NOT_COMPARED = ("psnr_black_image", "seed", "vdb_bytes")
 """Beginning of names of numbers that say something of the data or the request."""
 
 COLOURS = ("#4878a8", "#d9782d", "#4f9a56", "#c44e52", "#8a6fb3", "#8c6d52", "#cf79b0", "#7f7f7f", "#a3a23a", "#3fa6b5")
 """Of the first runs, on light and dark pages; of more runs than these a colour map's."""
 
-MOST_PICTURES, MOST_VIEWS = 8, 3
+_MOST_PICTURES, _MOST_VIEWS = 8, 3
 """Runs whose pictures are shown, and held-out views of each."""
 
 
@@ -84,14 +73,16 @@ class SweepRun:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Metric -> value of ``metrics.json``; none of a run that has not finished."""
-        return {} if self.run is None else numbers_of(self.run.metrics or {})
+        """Metric -> value of the single numbers of ``metrics.json``; none of a run that has not finished."""
+        metrics = {} if self.run is None else self.run.metrics or {}
+        found = {name: from_json(metrics, name) for name in metrics if not name.endswith("_infinite")}
+        return {name: value for name, value in found.items() if value is not None}
 
 
-def numbers_of(metrics: Mapping[str, object]) -> dict[str, float]:
-    """The single numbers of ``metrics.json``, infinite ones among them."""
-    found = {name: from_json(metrics, name) for name in metrics if not name.endswith("_infinite")}
-    return {name: value for name, value in found.items() if value is not None}
+def better(name: str) -> str | None:
+    """Return whether "more" or "less" of a metric is better; None where that is not known."""
+    known = [start for start in _BETTER if name == start or name.startswith(f"{start}_")]
+    return _BETTER[max(known, key=len)] if known and name != "parameters_per_primitive" else None
 
 
 def write_sweep_page(folder: Path, runs: Sequence[SweepRun], words: Sequence[str]) -> Path:
@@ -114,22 +105,11 @@ def write_sweep_page(folder: Path, runs: Sequence[SweepRun], words: Sequence[str
         drawn.facts(),
     ]
     nonce = hashlib.sha256("".join([script, *sections]).encode()).hexdigest()[:32]  # no text inside can know it
-    target = folder / "sweep.html"
-    text = page.render_page(
-        f"{folder.resolve().name} – sweep",
-        sections,
-        "compared",
-        f"; script-src 'nonce-{nonce}'",
-        f'<script nonce="{nonce}">\n{script}\n</script>',
-    )
-    write_text(target, text)
+    target, policy = folder / "sweep.html", f"; script-src 'nonce-{nonce}'"
+    element = f'<script nonce="{nonce}">\n{script}\n</script>'
+    title = f"{folder.resolve().name} – sweep"
+    write_text(target, page.render_page(title, sections, "compared", policy, element))
     return target
-
-
-def better(name: str) -> str | None:
-    """Whether "more" or "less" of a metric is better; None where that is not known."""
-    beginning = max((known for known in BETTER if name == known or name.startswith(f"{known}_")), key=len, default=None)
-    return None if beginning is None or name == "parameters_per_primitive" else BETTER[beginning]
 
 
 class _Page:
@@ -138,22 +118,21 @@ class _Page:
         self.numbers = {run.name: run.numbers for run in runs}
         self.runs = sorted(runs, key=lambda run: -self.numbers[run.name].get("psnr", -math.inf))
         self.colours = dict(zip((run.name for run in runs), _colours(len(runs)), strict=True))
-        self.metrics = self._metrics()
-
-    def _metrics(self) -> list[str]:
-        """Those of the table: of the known ones all that any run has, of the others those that differ."""
         names = dict.fromkeys(name for run in self.runs for name in self.numbers[run.name])
-        kept = [name for name in names if not name.startswith(NOT_COMPARED)]
+        kept = [name for name in names if not name.startswith(_NOT_COMPARED)]
         differ = {name for name in kept if len({self.numbers[run.name].get(name) for run in self.runs}) > 1}
-        first = [name for name in FIRST if name in kept]
-        return [*first, *(name for name in kept if name not in first and name in differ)]
+        first = [name for name in _FIRST if name in kept]
+        self.metrics = [*first, *(name for name in kept if name not in first and name in differ)]
+        self.best = {name: self._best(name) for name in {*self.metrics, *_BEST}}
 
-    # ------------------------------------------------------------ sections
+    def _best(self, name: str) -> SweepRun | None:
+        sign = {_MORE: 1.0, _LESS: -1.0, None: 0.0}[better(name)]
+        having = [run for run in self.runs if name in self.numbers[run.name] and sign]
+        return max(having, key=lambda run: sign * self.numbers[run.name][name], default=None)
 
     def heading(self) -> str:
         command = shlex.join(["neuprim", "run", "-m", *self.words])
-        line = f'\n<p class="note"><code>{escape(command)}</code></p>'
-        return page.masthead("sweep", self.folder.resolve().name, line)
+        return page.masthead("sweep", self.folder.resolve().name, "\n" + note(f"<code>{escape(command)}</code>"))
 
     def banner(self) -> str:
         lines = []
@@ -167,141 +146,105 @@ class _Page:
     def headline(self) -> str:
         done = sum(run.state == "done" for run in self.runs)
         tiles = [("Runs", format_count(len(self.runs)), "", f"{format_count(done)} done")]
-        for name, title in (
-            ("psnr", "Best PSNR"),
-            ("ssim", "Best SSIM"),
-            ("model_bytes", "Smallest model"),
-            ("train_seconds", "Fastest training"),
-        ):
-            best = self._best(name)
+        for name, title in _BEST.items():
+            best = self.best[name]
             if best is not None:
-                number, unit = _shown(name, self.numbers[best.name][name])
-                tiles.append((title, number, unit, escape(best.name)))
+                tiles.append((title, *_format_metric(name, self.numbers[best.name][name]), escape(best.name)))
         rule = "Metrics of the last checkpoints, on the held-out views of each run."
         return page.tiles(tiles, lead=range(1, len(tiles))) + f'<p class="rule">{rule}</p>'
 
     def table(self) -> str:
         keys = list(dict.fromkeys(key for run in self.runs for key in run.swept))
-        best = {name: self._best(name) for name in self.metrics}
         heads = [escape(title) for title in ("run", *keys, "state")]
-        heads += [
-            f'<th data-metric="{escape(m)}" data-better="{better(m) or ""}">{escape(_title(m))}</th>'
-            for m in self.metrics
-        ]
-        rows = [self._row(run, keys, best) for run in self.runs]
+        options = ""
+        for name in self.metrics:
+            title, known = escape(_TITLES.get(name, name.replace("_", " "))), better(name)
+            heads.append(f'<th data-metric="{escape(name)}" data-better="{known or ""}">{title}</th>')
+            options += "" if known is None else f'<option value="{escape(name)}">{title}</option>'
+        rows = [self._row(run, keys) for run in self.runs]
         table = page.number_table([*heads, "seconds in all"], rows, "numbers runs")
-        options = "".join(
-            f'<option value="{escape(name)}">{escape(_title(name))}</option>'
-            for name in self.metrics
-            if better(name) is not None
-        )
-        choice = (
-            f'<p class="choose" hidden><label for="metric">Best by</label><select id="metric">{options}</select><b '
-            f'id="best"></b></p>'
-            if options
-            else ""
-        )
-        note = '<p class="note">Orange: the best of a column. A name leads to the run’s own report.</p>'
-        return section("All runs", choice + table + note)
+        choice = ""
+        if options:
+            label = '<label for="metric">Best by</label>'
+            choice = f'<p class="choose" hidden>{label}<select id="metric">{options}</select><b id="best"></b></p>'
+        text = "Orange: the best of a column. A name leads to the run’s own report."
+        return section("All runs", choice + table + note(text))
 
-    def _row(self, run: SweepRun, keys: Sequence[str], best: Mapping[str, SweepRun | None]) -> str:
-        chip = f'<span class="chip" style="background: {self.colours[run.name]}"></span>'
+    def _row(self, run: SweepRun, keys: Sequence[str]) -> str:
         name = escape(run.name)
         if run.run is not None and (run.run.run_dir / "report.html").is_file():
-            name = f'<a href="{escape(_link(run.name))}">{name}</a>'
-        cells = [f"<th scope=row>{chip}{name}</th>", *(f"<td>{escape(run.swept.get(key))}</td>" for key in keys)]
-        cells.append(
-            f"<td>{escape(run.state)}</td>" if run.state == "done" else f'<td class="bad">{escape(run.state)}</td>'
-        )
+            name = f'<a href="{escape(quote(run.name))}/report.html">{name}</a>'
+        cells = [escape(run.swept.get(key)) for key in keys]
+        bad = "" if run.state == "done" else ' class="bad"'
+        cells.append(f"<td{bad}>{escape(run.state)}</td>")
         for metric in self.metrics:
-            value, first = self.numbers[run.name].get(metric), best[metric]
-            kind = (
-                ' class="best"'
-                if first is not None and value == self.numbers[first.name][metric] and len(self.runs) > 1
-                else ""
-            )
-            cells.append(
-                f"<td{kind} "
-                f'data-value="{"" if value is None else _sortable(value)}">'
-                f"{' '.join(filter(None, _shown(metric, value)))}</td>"
-            )
+            value, best = self.numbers[run.name].get(metric), self.best[metric]
+            first = best is not None and value == self.numbers[best.name][metric] and len(self.runs) > 1
+            data = "" if value is None else repr(value).replace("inf", "Infinity")
+            text = " ".join(filter(None, _format_metric(metric, value)))
+            kind = ' class="best"' if first else ""
+            cells.append(f'<td{kind} data-value="{data}">{text}</td>')
         cells.append(f'<td data-value="{run.seconds:.3f}">{format_decimal(run.seconds, 1)}</td>')
-        return f'<tr data-run="{escape(run.name)}">{"".join(cells)}</tr>'
+        return page.table_row(self._chip(run) + name, cells, f' data-run="{escape(run.name)}"')
+
+    def _chip(self, run: SweepRun) -> str:
+        return f'<span class="chip" style="background: {self.colours[run.name]}"></span>'
 
     def charts(self) -> str:
         known = [(run, run.run) for run in self.runs if run.run is not None]
         charts = []
-        for x, unit, title in (
-            ("seconds", "seconds", "Held-out PSNR over training time, dB"),
-            ("step", "steps", "Held-out PSNR over steps, dB"),
-        ):
+        for x, unit, title in (("seconds", "seconds", "training time"), ("step", "steps", "steps")):
             lines = [Points(*record.series(x, "eval_psnr"), self.colours[run.name]) for run, record in known]
+            title = f"Held-out PSNR over {title}, dB"
             charts.append((title, curve_chart(title, unit, lines, size=LARGE)))
         panels = page.chart_panels(charts, "charts")
-        keys = "".join(
-            f'<li><span class="chip" style="background: {self.colours[run.name]}"></span>{escape(run.name)}</li>'
-            for run, _ in known
-        )
+        keys = "".join(f"<li>{self._chip(run)}{escape(run.name)}</li>" for run, _ in known)
         return section("Curves", f'{panels}<ul class="keys">{keys}</ul>') if panels else ""
 
     def pictures(self) -> str:
-        """The same views of the best runs; runs of different data have views of their own."""
+        """Return the same views of the best runs; runs of different data have views of their own."""
         groups: dict[tuple[str | None, str | None], list[tuple[SweepRun, RunRecord]]] = {}
         for run in self.runs:
             if run.run is not None and run.run.views:
                 groups.setdefault((run.run.name_of("task"), run.run.name_of("scene")), []).append((run, run.run))
-        body = "".join(self._group(members, len(groups) > 1) for members in groups.values())
+        body = ""
+        for (task, scene), members in groups.items():
+            body += f"<h3>{escape(task)} / {escape(scene)}</h3>" if len(groups) > 1 else ""
+            body += _side_by_side(members)
         return section("Held-out views side by side", body) if body else ""
 
-    def _group(self, members: Sequence[tuple[SweepRun, RunRecord]], titled: bool) -> str:
-        shown = members[:MOST_PICTURES]
-        views = _spread(shown[0][1].views, MOST_VIEWS)
-        html = (
-            f"<h3>{escape(shown[0][1].name_of('task'))} / {escape(shown[0][1].name_of('scene'))}</h3>" if titled else ""
-        )
-        if len(shown) < len(members):
-            html += f'<p class="note">{len(shown)} of {len(members)} runs, those with the best PSNR.</p>'
-        for view in views:
-            figures = "" if view.truth is None else _figure(view.truth, "ground truth", view.stem, None)
-            for run, record in shown:
-                same = next((own for own in record.views if own.index == view.index and own.stem == view.stem), None)
-                if same is not None:
-                    psnr = from_json(record.view_numbers(same), "psnr")
-                    figures += _figure(
-                        same.render, f"{escape(run.name)} <b>{format_decimal(psnr, 2)}</b> dB", view.stem, run.name
-                    )
-            html += f'<h3>{escape(view.stem or view.index)}</h3><div class="pictures">{figures}</div>'
-        return html
-
     def facts(self) -> str:
-        tried = [run for run in self.runs if run.attempts > 1]
         pairs = [("directory", str(self.folder)), ("all numbers", "sweep.csv"), ("what was asked", "sweep.json")]
-        pairs += [(f"{run.name}", f"started {run.attempts} times, as its worker died") for run in tried]
+        tried = [run for run in self.runs if run.attempts > 1]
+        pairs += [(run.name, f"started {run.attempts} times, as its worker died") for run in tried]
         pairs += [("time of all runs together", format_duration(sum(run.seconds for run in self.runs)))]
         return section("Where the numbers come from", page.fact_list(pairs))
 
-    def _best(self, name: str) -> SweepRun | None:
-        sign = {MORE: 1.0, LESS: -1.0, None: math.nan}[better(name)]
-        having = [run for run in self.runs if name in self.numbers[run.name]]
-        return (
-            None if math.isnan(sign) else max(having, key=lambda run: sign * self.numbers[run.name][name], default=None)
-        )
+
+def _side_by_side(members: Sequence[tuple[SweepRun, RunRecord]]) -> str:
+    """Return a few views, evenly spread, of the first runs, which are the best."""
+    shown, views = members[:_MOST_PICTURES], members[0][1].views
+    few = min(len(views), _MOST_VIEWS)
+    html = ""
+    if len(shown) < len(members):
+        html += note(f"{len(shown)} of {len(members)} runs, those with the best PSNR.")
+    for view in (views[i] for i in sorted({round(k * (len(views) - 1) / max(few - 1, 1)) for k in range(few)})):
+        name = escape(view.stem or view.index)
+        figures = "" if view.truth is None else page.figure(view.truth, "ground truth", f"view {name}, ground truth")
+        for run, record in shown:
+            same = next((own for own in record.views if (own.index, own.stem) == (view.index, view.stem)), None)
+            if same is not None:
+                psnr, of = format_decimal(from_json(record.view_numbers(same), "psnr"), 2), escape(run.name)
+                caption, attribute = f"{of} <b>{psnr}</b> dB", f' data-run="{of}"'
+                figures += page.figure(same.render, caption, f"view {name}, {of}", attribute)
+        html += f'<h3>{name}</h3><div class="pictures">{figures}</div>'
+    return html
 
 
-def _title(name: str) -> str:
-    return {
-        "psnr": "PSNR",
-        "ssim": "SSIM",
-        "lpips": "LPIPS",
-        "model_bytes": "model file",
-        "train_seconds": "training",
-    }.get(name, name.replace("_", " "))
-
-
-def _shown(name: str, value: float | None) -> tuple[str, str]:
-    """(number, unit) of a metric's value."""
+def _format_metric(name: str, value: float | None) -> tuple[str, str]:
+    """Return (number, unit) of a metric's value."""
     if value is None:
-        return format_decimal(None, 0), ""
+        return page.MISSING, ""
     if name.endswith("bytes"):
         return format_bytes(value)
     if name.endswith("seconds"):
@@ -311,27 +254,6 @@ def _shown(name: str, value: float | None) -> tuple[str, str]:
     if name.startswith(("primitives", "parameters", "iterations", "train_views")):
         return format_count(value), ""
     return format_decimal(value, 1 if name.endswith("fps") else 4), ""
-
-
-def _sortable(value: float) -> str:
-    return repr(value) if math.isfinite(value) else ("Infinity" if value > 0 else "-Infinity")
-
-
-def _link(name: str) -> str:
-    from urllib.parse import quote
-
-    return f"{quote(name)}/report.html"
-
-
-def _figure(path: Path, caption: str, view: str, run: str | None) -> str:
-    attribute = "" if run is None else f' data-run="{escape(run)}"'
-    return page.figure(path, caption, f"view {escape(view)}, {escape(run or 'ground truth')}", attribute)
-
-
-def _spread(views: Sequence[ViewFiles], most: int) -> list[ViewFiles]:
-    """As many, evenly."""
-    few = min(len(views), most)
-    return [views[i] for i in sorted({round(k * (len(views) - 1) / max(few - 1, 1)) for k in range(few)})]
 
 
 def _colours(number: int) -> Iterable[str]:

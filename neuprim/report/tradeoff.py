@@ -16,13 +16,13 @@ from neuprim.core.io.images import write_png
 from neuprim.core.metrics import from_json
 from neuprim.report import page as elements
 from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
-from neuprim.report.page import escape, format_bytes, format_count, format_decimal, section
+from neuprim.report.page import escape, format_bytes, format_count, format_decimal, note, section
 from neuprim.report.pictures import Inlined, color_bar, error_map, inline
-
-__all__ = ["Picture", "write_tradeoff"]
 
 _SLOWEST = 12.0
 """Multiples of the reference's time beyond which points are off the charts."""
+
+Command = Callable[[Sequence[str]], str]
 
 
 class Picture(NamedTuple):
@@ -45,9 +45,7 @@ _RENDERED = _Texts("speed and accuracy of a finished run", "the reference", "the
 _TRAINED = _Texts("trade-offs of trained models", "the centre", "the ground truth", 0.2)
 
 
-def write_tradeoff(
-    folder: Path, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Callable[[Sequence[str]], str]
-) -> None:
+def write_tradeoff(folder: Path, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Command) -> None:
     """Write ``tradeoff.html`` and ``front.png`` into ``folder``.
 
     Args:
@@ -72,9 +70,7 @@ def write_tradeoff(
 
 
 class _Page:
-    def __init__(
-        self, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Callable[[Sequence[str]], str]
-    ) -> None:
+    def __init__(self, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Command) -> None:
         self.record, self.points, self.pictures, self.command = record, record["points"], pictures, command
         self.front: dict[str, list[int]] = {name: list(record["front"][name]) for name in ("speed", "size")}
         self.trained = bool(self.points[0].get("run_dir"))
@@ -93,10 +89,7 @@ class _Page:
         return float(self.points[number].get("time_ratio_spread") or 0.0)
 
     def name(self, number: int) -> str:
-        if self.trained:
-            return str(self.points[number]["name"])
-        words = self.points[number]["words"]
-        return " ".join(word.removeprefix("renderer.") for word in words) or "as the run draws"
+        return str(self.points[number]["name"])
 
     def gain(self, front: str, number: int) -> str:
         if front == "speed":
@@ -110,12 +103,11 @@ class _Page:
     # ------------------------------------------------------------ sections
 
     def heading(self) -> str:
-        r, more = self.record, ""
-        if r["data_source"] != "real":
-            more = elements.badge(f"{r['data_source']} data")
+        source = self.record["data_source"]
+        more = "" if source == "real" else elements.badge(f"{source} data")
         if self.trained:
-            more += f'\n<p class="note">{escape(r["length"])}</p>'
-        return elements.masthead(self.texts.eyebrow, f"{r['task']} / {r['scene']}", more)
+            more += "\n" + note(escape(self.record["length"]))
+        return elements.masthead(self.texts.eyebrow, f"{self.record['task']} / {self.record['scene']}", more)
 
     def tiles(self) -> str:
         base = self.points[0]
@@ -134,8 +126,8 @@ class _Page:
 
     def fronts(self) -> list[Chart]:
         """Return PSNR against time and against bytes; of a finished run the latter of smaller points alone."""
-        numbers, bytes_of = range(len(self.points)), [float(p["bytes"]) for p in self.points]
-        sized = [i for i in numbers if self.trained or i == 0 or bytes_of[i] < bytes_of[0]]
+        bytes_of = [float(point["bytes"]) for point in self.points]
+        sized = [i for i, size in enumerate(bytes_of) if self.trained or i == 0 or size < bytes_of[0]]
         dots = [Dot(bytes_of[i], self.quality(i), 0.0, self._mark("size", i), i == 0) for i in sized]
         return [
             self._time_chart("PSNR against time", "psnr", True),
@@ -155,41 +147,13 @@ class _Page:
 
     def charts(self) -> str:
         charts = [*self.fronts(), self._time_chart("PSNR against the exact image", "psnr_exact", False)]
-        note = (
-            f"Ringed: {self.texts.reference}. Orange and numbered: the front. Bars: half of the interquartile range of "
-            "all rounds."
-        )
+        text = f"Ringed: {self.texts.reference}. Orange and numbered: the front. Bars: half of the interquartile range."
         if self.trained:
-            note += " Trainings with another seed differ by some hundredths to tenths of a decibel."
-        else:
-            note += self._march_note()
-            charts += self._march_charts()
+            text += " Trainings with another seed differ by some hundredths to tenths of a decibel."
         panels = elements.chart_panels([(f"{escape(chart.title)}, dB", chart) for chart in charts], "charts")
-        return section("Fronts", f'{panels}<p class="note">{note}</p>')
+        return section("Fronts", panels + note(text))
 
-    def _march_charts(self) -> list[Chart]:
-        rows = self.record["marching"].get("rows", [])
-        if not rows:
-            return []
-        dots = [
-            Dot(row["seconds"] / rows[0]["seconds"], row["psnr"], 0.0, str(row["samples"]))
-            for row in rows[1:]
-            if row["psnr"] is not None
-        ]
-        axis = "time of the integrals, as a multiple of the closed form's"
-        return [front_chart("Sampled chords against the closed form", axis, "dB", dots)]
-
-    def _march_note(self) -> str:
-        marching = self.record["marching"]
-        if "rows" not in marching:
-            return f" Sampling of chords: not measured, {escape(marching.get('not_measured'))}."
-        width, height = marching["image_size"]
-        return (
-            f" Sampled chords: n midpoint samples on each of {format_count(marching['chords'])} chords of an image of "
-            f"{width}×{height}, in float64; the numbers are n."
-        )
-
-    def cards(self, front: str, title: str, note: str) -> str:
+    def cards(self, front: str, title: str, text: str) -> str:
         """Return a card with picture, numbers and command for every point of a front."""
         cards = [self._card(-1, "ground truth", "")] if -1 in self.pictures else []
         if 0 not in self.front[front]:
@@ -197,9 +161,9 @@ class _Page:
         for place, number in enumerate(self.front[front], 1):
             cards.append(self._card(number, f"{place}. {escape(self.name(number))}", self.gain(front, number)))
         bar = f'<span class="bar" style="background: {color_bar()}"></span>'
-        ticks = f'<p class="note">Difference: 0{bar}{self.texts.difference:g} or more.</p>'
-        note = f"{note} Beside the picture: its difference from {self.texts.compared_with}."
-        return section(title, f'<p class="note">{note}</p>{ticks}<div class="points">{"".join(cards)}</div>')
+        text += f" Beside the picture: its difference from {self.texts.compared_with}."
+        scale = note(f"Difference: 0{bar}{self.texts.difference:g} or more.")
+        return section(title, f'{note(text)}{scale}<div class="points">{"".join(cards)}</div>')
 
     def _card(self, number: int, heading: str, gain: str) -> str:
         html = f'<article class="point"><header><span class="gain">{gain}</span><h3>{heading}</h3></header>'
@@ -223,56 +187,45 @@ class _Page:
         return f'<div class="pair">{"".join(figures)}</div>'
 
     def table(self) -> str:
-        columns: dict[str, Callable[[int, Mapping[str, Any]], str]] = {
-            "PSNR": lambda i, p: format_decimal(self.quality(i), 3),
-            "change": lambda i, p: self.change(i),
-            "SSIM": lambda i, p: format_decimal(self.quality(i, "ssim"), 4),
-            "against exact, dB": lambda i, p: format_decimal(self.quality(i, "psnr_exact"), 1),
-            "time": lambda i, p: format_decimal(p.get("time_ratio"), 3),
-            "±": lambda i, p: format_decimal(self.spread(i), 3) if len(p["ratios"]) > 2 else elements.MISSING,
-            "ms": lambda i, p: format_decimal(p.get("ms_per_frame"), 2),
-            "frames/s": lambda i, p: format_decimal(p.get("frames_per_second"), 1),
-            "bytes": lambda i, p: format_count(p["bytes"]),
-            "memory, MB": lambda i, p: format_decimal(None if p["peak_bytes"] is None else p["peak_bytes"] / 1e6, 1),
-            "rounds": lambda i, p: format_count(len(p["ms"])),
-        }
-        if self.trained:
-            columns |= {
-                "primitives": lambda i, p: format_count(p["primitives"]),
-                "numbers each": lambda i, p: format_count(p["parameters_per_primitive"]),
-                "steps": lambda i, p: format_count(p["steps"]),
-                "ms a step": lambda i, p: format_decimal(p["ms_per_step"], 2),
-                "seconds": lambda i, p: format_decimal(p["seconds"], 1),
-            }
-        marked = set(self.front["speed"]) | set(self.front["size"])
-        rows = []
-        for i, point in enumerate(self.points):
-            cells = "".join(f"<td>{cell(i, point)}</td>" for cell in columns.values())
-            kind = ' class="front"' if i in marked else ""
-            rows.append(f"<tr{kind}><th scope=row>{escape(self.name(i))}</th>{cells}</tr>")
-        note = (
-            f'<p class="note">Time and ± are multiples of the time of {self.texts.reference} in the same round; '
-            f"orange: "
-            "on a front.</p>"
-        )
+        names = ["point", "PSNR", "change", "SSIM", "against exact, dB", "time", "±", "ms", "frames/s", "bytes"]
+        names += ["rounds"]
+        names += ["primitives", "numbers each", "steps", "ms a step", "seconds"] if self.trained else []
+        rows, marked = [], {*self.front["speed"], *self.front["size"]}
+        for i, p in enumerate(self.points):
+            cells = [
+                format_decimal(self.quality(i), 3),
+                self.change(i),
+                format_decimal(self.quality(i, "ssim"), 4),
+                format_decimal(self.quality(i, "psnr_exact"), 1),
+                format_decimal(p.get("time_ratio"), 3),
+                format_decimal(p.get("time_ratio_spread"), 3),
+                format_decimal(p.get("ms_per_frame"), 2),
+                format_decimal(p.get("frames_per_second"), 1),
+                format_count(p["bytes"]),
+                format_count(len(p["ms"])),
+            ]
+            if self.trained:
+                cells += [format_count(p[name]) for name in ("primitives", "parameters_per_primitive", "steps")]
+                cells += [format_decimal(p["ms_per_step"], 2), format_decimal(p["seconds"], 1)]
+            rows.append(elements.table_row(escape(self.name(i)), cells, ' class="front"' if i in marked else ""))
+        text = f"Time and ± are multiples of the time of {self.texts.reference} in the same round; orange: on a front."
         title = f"All {format_count(len(self.points))} {'models' if self.trained else 'points'}"
-        return section(title, elements.number_table(["point", *columns], rows) + note)
+        return section(title, elements.number_table(names, rows) + note(text))
 
     def left_out(self) -> str:
-        rows = []
-        for one in self.record["left_out"]:
-            cells = "".join(f"<td>{escape(text)}</td>" for text in (" ".join(one["words"]), one["reason"]))
-            rows.append(f"<tr><th scope=row>{escape(one['knob'])}</th>{cells}</tr>")
+        rows = [
+            elements.table_row(escape(one["knob"]), (escape(" ".join(one["words"])), escape(one["reason"])))
+            for one in self.record["left_out"]
+        ]
         return section("Not measured", elements.number_table(("knob", "point", "why"), rows, "")) if rows else ""
 
     def facts(self) -> str:
-        r, same = self.record, self.record["same"]
-        pairs = [("views", ", ".join(same["views"])), ("image size", "×".join(map(str, same["image_size"])))]
-        exact = r.get("exact", {})
+        r, same, exact = self.record, self.record["same"], self.record.get("exact", {})
         text = str(exact.get("drawn_by", elements.MISSING))
         if not exact.get("float64", True):
             size = "×".join(map(str, exact["checked_size"]))
             text += f"; {format_decimal(exact['psnr_against_float64'], 0)} dB from float64 at {size}"
+        pairs = [("views", ", ".join(same["views"])), ("image size", "×".join(map(str, same["image_size"])))]
         pairs += [("exact images", text), ("backend", str(r["backend"]))]
         if self.trained:
             pairs += [

@@ -8,13 +8,12 @@ from pathlib import Path
 from types import TracebackType
 
 from neuprim.core.io.files import write_text
-from neuprim.core.io.plain import finite, load_json
+from neuprim.core.io.plain import load_json
 from neuprim.core.metrics import psnr
-from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.measure import render_image
 
-__all__ = ["evaluate_curve_point", "next_evaluation_progress", "open_curve", "read_curve"]
+__all__ = ["evaluate_curve_point", "next_evaluation_progress", "open_curve"]
 
 _VIEWS = 5  # held-out views behind the curve's eval_psnr
 _PSNR_MAX = 200.0  # dB; equal images have an infinite one
@@ -58,24 +57,6 @@ def open_curve(path: Path, step: int) -> Curve:
                 continue  # a line that a kill cut short
     write_text(path, "".join(f"{text}\n" for text in kept))
     return Curve(path)
-
-
-def read_curve(path: Path, settings: TrainSettings) -> tuple[tuple[float, float], ...]:
-    """(used fraction of the budget, PSNR of the held-out views behind the curve, dB) of every evaluation in
-    metrics.jsonl; none of a file that is not there."""
-    found = []
-    for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else ():
-        try:
-            line = load_json(text, infinite=True)
-            value, step, seconds = (finite(line.get(name)) for name in ("eval_psnr", "step", "seconds"))
-        except (ValueError, AttributeError, RecursionError):
-            continue  # a line that a kill cut short
-        if value is not None and step is not None and seconds is not None:
-            used = [
-                part / whole for part, whole in ((step, settings.iterations), (seconds, settings.max_seconds)) if whole
-            ]
-            found.append((min(max(used, default=1.0), 1.0), value))
-    return tuple(found)
 
 
 def next_evaluation_progress(trainer: Trainer) -> float:

@@ -10,37 +10,29 @@ import math
 import shlex
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from neuprim.config import RunConfig, compose, find_run_plugins, task_of
+from neuprim.config.command_settings import LauncherSettings
+from neuprim.config.outputs import ROOT
 from neuprim.config.overrides import parse, quote_override
 from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset_check import check_dataset
-from neuprim.core.errors import ConfigError, NeuprimError, nearest
-from neuprim.report.tradeoff import Picture, write_tradeoff
-from neuprim.runs.events import Event, Note, Preparing, Step
+from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
+from neuprim.core.validation import validate
+from neuprim.report.tradeoff import write_tradeoff
 from neuprim.runs.fit import use_one_torch_thread
 from neuprim.runs.ground_truth import render_ground_truth_for_training
 from neuprim.runs.launch.executors import count_parallel_jobs
 from neuprim.runs.launch.launcher import use_launcher_threads
 from neuprim.runs.open import load_dataset
 from neuprim.runs.run_directory import lock_directory
-from neuprim.search.ablation_folder import (
-    TRIALS,
-    AblationRequest,
-    check_folder,
-    compose_centre,
-    describe_identity,
-    parse_plan,
-    resume_record,
-)
 from neuprim.search.ablation_plan import (
     CENTRE,
     Plan,
@@ -51,20 +43,24 @@ from neuprim.search.ablation_plan import (
     override,
     plan_lengths,
 )
-from neuprim.search.eval_views import eval_views, fill_masked
+from neuprim.search.eval_views import EvalView, eval_views
 from neuprim.search.measuring import (
-    MEMORY_UNKNOWN,
     EvaluationSetup,
+    Renderer,
     TimedPoint,
+    describe_conditions,
+    describe_setup,
     load_setup,
     measure_point,
     render_exact,
+    render_front_pictures,
     time_points,
 )
 from neuprim.search.points import COMBINED, TRADEOFF_FILE, Record, read_record, write_csv
-from neuprim.search.trials import Outcome, Trial, launch_trials, run_trial
+from neuprim.search.trials import Outcome, Trial, TrialFailed, launch_trials
 
-__all__ = ["format_run_command", "run_ablation"]
+TRIALS = "trials"
+"""Folder of the models."""
 
 _PACES, _TRAINING = 0.2, 0.5
 """Shares of the budget for measuring step times, and, of the rest, for training single changes."""
@@ -77,11 +73,33 @@ _EXACT = 0.004
 
 _MAX_COMBINATIONS = 12
 
-_MAX_PSNR = 200.0
-"""dB that stand for equal images."""
-
 Progress = Callable[[str, float], None]
 Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class AblationRequest:
+    """What to train and measure.
+
+    Attributes:
+        words: overrides of ``neuprim run``; they define the centre and, with ``output_dir``, the folder of the set.
+        budget: seconds for everything, about; what does not fit is left out.
+        views: evaluation views, evenly spread.
+        repeats: rounds of timing.
+        knobs: names of those to change; empty for all.
+        seeds: trainings of every model.
+        lpips: weights for LPIPS; None for those of the configuration.
+        launcher: where models are trained; they are measured here.
+    """
+
+    words: Sequence[str]
+    budget: float = 1200.0
+    views: int = 5
+    repeats: int = 15
+    knobs: Sequence[str] = ()
+    seeds: int = 1
+    lpips: Path | None = None
+    launcher: LauncherSettings = LauncherSettings()  # noqa: RUF009 (frozen)
 
 
 def format_run_command(overrides: Sequence[str]) -> str:
@@ -99,67 +117,70 @@ def run_ablation(
     Raises:
         NeuprimError: invalid overrides, no such knob, data that cannot be read, or a folder that holds something else.
     """
-    words, folder, centre = compose_centre(request)
-    task = task_of(centre)
+    words, folder, centre = _compose_centre(request)
+    file, task = folder / TRADEOFF_FILE, task_of(centre)
     with use_one_torch_thread(), use_launcher_threads(request.launcher), ExitStack() as stack:
         stack.enter_context(find_run_plugins(centre).attribute_errors())
         variants = list_variants(centre, task)
         for name in request.knobs:
             if name not in variants:
-                raise ConfigError(
-                    f"--knobs {name}: no such knob of a model of task {task.name!r}{nearest(name, variants)}"
-                )
-        before = read_record(folder / TRADEOFF_FILE)
-        check_folder(folder, before, centre, request)
+                known = nearest(name, variants)
+                raise ConfigError(f"--knobs {name}: no such knob of a model of task {task.name!r}{known}")
+        before = read_record(file)
+        _check_folder(folder, before, centre, request)
         stack.enter_context(lock_directory(folder, "set"))
-        plan = parse_plan(folder / TRADEOFF_FILE, before)
+        plan = None if before is None else _parse_plan(file, before)
         render_ground_truth_for_training(centre, request.launcher, progress)
         dataset = load_dataset(centre, task, progress)
         check_dataset(dataset, task.conditions)
-        record = resume_record(folder, before, describe_identity(centre, dataset, request), tell)
-        session = _Session(request, _Set(folder, words, centre, dataset, plan), record, tell, progress)
+        views = eval_views(dataset, request.views)
+        if not views:
+            raise DataError(f"{dataset.name} has no test views; expected some to measure on")
+        record = _resume_record(folder, before, _identity(centre, views, request), tell)
+        session = _Session(request, _Set(folder, words, centre, dataset, views), plan, record, progress)
         chosen = {name: own for name, own in variants.items() if not request.knobs or name in request.knobs}
         for name, own in chosen.items():
             if not own:
                 record.leave_out(name, (), "the centre has no other value")
-        pictures = session.run([Variant(CENTRE), *_interleave(chosen)])
+        # The first of every knob, then the second, so that short budgets change as many knobs as possible.
+        rungs = [variant for rung in zip_longest(*chosen.values()) for variant in rung if variant is not None]
+        session.run([Variant(CENTRE), *rungs])
+        progress("pictures of the front", 0.0)
+        pictures = render_front_pictures(record, views, session.renderer)
     write_tradeoff(folder, record.to_dict(), pictures, format_run_command)
     return folder, record
 
 
-def _interleave(variants: Mapping[str, Sequence[Variant]]) -> Iterator[Variant]:
-    """Yield the first of every knob, then the second, so that short budgets change as many knobs as possible."""
-    for rung in zip_longest(*variants.values()):
-        yield from (variant for variant in rung if variant is not None)
-
-
 @dataclass
 class _Set:
+    """A set of models: its folder, the centre's overrides and configuration, its data, and the evaluation views."""
+
     folder: Path
     words: list[str]
     centre: RunConfig
     dataset: Dataset
-    plan: Plan | None
+    views: list[EvalView]
 
 
 class _Session:
     """Train and measure a set within the budget."""
 
-    def __init__(self, request: AblationRequest, models: _Set, record: Record, tell: Tell, progress: Progress) -> None:
-        self.request, self.set, self.record, self.tell, self.progress = request, models, record, tell, progress
-        self.views = eval_views(models.dataset, request.views)
+    def __init__(
+        self, request: AblationRequest, models: _Set, plan: Plan | None, record: Record, progress: Progress
+    ) -> None:
+        self.request, self.set, self.record, self.progress = request, models, record, progress
+        self._plan = plan
         spent = record.facts.get("spent_seconds", 0.0)
         self._begun = time.monotonic() - (float(spent) if isinstance(spent, int | float) else 0.0)
         self._planned_at = 0.0
         self._step_times: StepTimes | None = None
         self._setups: dict[str, EvaluationSetup] = {}
         self._workers, self._threads = count_parallel_jobs(request.launcher, 1000)
-        self._notes: set[str] = set()
 
     @property
     def plan(self) -> Plan:
-        assert self.set.plan is not None
-        return self.set.plan
+        assert self._plan is not None, "made by measuring step times"
+        return self._plan
 
     @property
     def spent(self) -> float:
@@ -171,8 +192,8 @@ class _Session:
         """Seconds until a share of what remained after planning is used."""
         return self._planned_at + part * max(self.request.budget - self._planned_at, 0.0) - self.spent
 
-    def run(self, wanted: Sequence[Variant]) -> dict[int, Picture]:
-        """Train single changes, then combinations; returns pictures of the fronts."""
+    def run(self, wanted: Sequence[Variant]) -> None:
+        """Train single changes, then combinations, and find the fronts."""
         with limit_process_threads(self._threads):  # as the trainings have
             wanted = self._measure_paces(wanted)
         alone = len({variant.knob for variant in wanted}) <= 2  # the centre and one knob: nothing to combine
@@ -182,17 +203,20 @@ class _Session:
         self._train(self._combinations(), _COMBINED)
         self._train(wanted, _COMBINED)
         self._take_times(1.0)
-        self._describe()
-        self.record.find_fronts(lambda point: True, lambda point: True)
+        self.record.facts |= {
+            **describe_setup(self._setup(self.record.points[0].run_dir)),
+            "preset": self.set.centre.preset,
+            "words": list(self.set.words),
+            "seeds": self.request.seeds,
+            "budget_seconds": self.request.budget,
+            "length": self.plan.describe(),
+        }
+        self.record.find_fronts()
         self._write()
         write_csv(self.set.folder / "tradeoff.csv", self.record)
-        self.progress("pictures of the front", 0.0)
-        return self._render_pictures()
 
     def _write(self) -> None:
-        self.record.facts["spent_seconds"] = self.spent
-        if self.set.plan is not None:
-            self.record.facts["plan"] = vars(self.set.plan)
+        self.record.facts |= {"spent_seconds": self.spent, "plan": vars(self.plan)}
         self.record.write(self.set.folder / TRADEOFF_FILE)
 
     # ------------------------------------------------------------ step times
@@ -200,21 +224,20 @@ class _Session:
     def _measure_paces(self, wanted: Sequence[Variant]) -> list[Variant]:
         """Return the variants whose step time is known; makes the plan."""
         kept, latest = list[Variant](), self.spent + _PACES * (self.request.budget - self.spent)
-        paces = dict(self.set.plan.paces) if self.set.plan is not None else {}
+        paces = {CENTRE: 1.0} if self._plan is None else dict(self._plan.paces)
         for number, variant in enumerate(wanted):
             self.progress(f"step time of {variant.name}", number / len(wanted))
-            known = not variant.turned or variant.name in paces
-            late = not known and self.spent > latest
+            late = variant.name not in paces and variant.turned and self.spent > latest
             reason = self._no_time() if late else self._find_pace(variant, paces)
             if reason is None:
                 kept.append(variant)
             else:
                 self.record.leave_out(variant.knob, variant.label, reason)
-        if self.set.plan is None:
+        if self._plan is None:
             lengths = [variant.length for variant in kept for _ in range(self.request.seeds)]
             seconds = _TRAINING * (self.request.budget - self.spent) * self._workers
-            self.set.plan = plan_lengths(self.set.centre, self._times().seconds, seconds, lengths)
-        self.plan.paces.update(paces)
+            self._plan = plan_lengths(self.set.centre, self._times().seconds, seconds, lengths)
+        self._plan.paces.update(paces)
         return kept
 
     def _times(self) -> StepTimes:
@@ -247,39 +270,31 @@ class _Session:
         """Train and measure what is missing and fits; the centre and begun trainings always do."""
         known = {(point.turned, point.length) for point in self.record.points}
         todo = [variant for variant in wanted if (variant.turned, variant.length) not in known]
-        several = max(self._workers // self.request.seeds, 1)
+        seeds = self.request.seeds
+        several = max(self._workers // seeds, 1)
         for first in range(0, len(todo), several):
             batch: list[Variant] = []
             for variant in todo[first : first + several]:
                 begun = (self._run_dir(variant, 0) / "checkpoint.safetensors").exists()
-                rounds = math.ceil((len(batch) + 1) * self.request.seeds / self._workers)
+                rounds = math.ceil((len(batch) + 1) * seeds / self._workers)
                 if not begun and variant.name != CENTRE and rounds * self.plan.seconds > self._left(part):
                     self.record.leave_out(variant.knob, variant.label, self._no_time())
                     continue
                 self.record.left_out = [one for one in self.record.left_out if one.words != variant.label]
                 batch.append(variant)
             text = f"training {first + 1} of {len(todo)}, {', '.join(variant.name for variant in batch)}"
-            for variant, outcomes in zip(batch, self._run_trials(batch, text), strict=True):
-                if not isinstance(outcomes, NeuprimError):
-                    self._measure(variant, outcomes)
+            trials = [self._trial(variant, seed) for variant in batch for seed in range(seeds)]
+            hear = lambda fraction, text=text: self.progress(text, fraction)  # noqa: E731
+            results = launch_trials(trials, self.request.launcher, self.set.folder, hear) if trials else []
+            for i, variant in enumerate(batch):
+                own = results[i * seeds : (i + 1) * seeds]
+                failed = next((result for result in own if result.state == "failed"), None)
+                if failed is None:
+                    self._measure(variant, [result.value for result in own])
                 elif variant.name == CENTRE:
-                    raise outcomes
+                    raise TrialFailed(failed.line)
                 else:
-                    self.record.leave_out(variant.knob, variant.label, str(outcomes))
-
-    def _run_trials(self, variants: Sequence[Variant], text: str) -> list[list[Outcome] | NeuprimError]:
-        """Return the outcomes of every seed of each variant, or why there are none."""
-        groups = [[self._trial(variant, seed) for seed in range(self.request.seeds)] for variant in variants]
-        if self.request.launcher.name != "inline":
-            hear = lambda part: self.progress(text, part)  # noqa: E731
-            return launch_trials(groups, self.request.launcher, self.set.folder, hear)
-        outcomes: list[list[Outcome] | NeuprimError] = []
-        for group in groups:
-            try:
-                outcomes.append([run_trial(trial, self.set.dataset, self._listener(text)) for trial in group])
-            except NeuprimError as error:
-                outcomes.append(error)
-        return outcomes
+                    self.record.leave_out(variant.knob, variant.label, failed.line)
 
     def _trial(self, variant: Variant, seed: int) -> Trial:
         words = self.plan.overrides(variant, self.set.words, self.set.centre)
@@ -292,27 +307,19 @@ class _Session:
         suffix = f"_seed-{self.set.centre.seed + seed}" if seed else ""
         return self.set.folder / TRIALS / (variant.folder + suffix)
 
-    def _listener(self, text: str) -> Callable[[Event], None]:
-        def hear(event: Event) -> None:
-            match event:
-                case Step():
-                    self.progress(text, event.progress)
-                case Preparing():
-                    self.progress(f"{text}: {event.text}", event.fraction)
-                case Note() if event.text not in self._notes:
-                    self._notes.add(event.text)
-                    self.tell(event.text)
-
-        return hear
-
     # ------------------------------------------------------------ measuring
 
     def _setup(self, run_dir: str) -> EvaluationSetup:
         if run_dir not in self._setups:
-            loaded = self.set.dataset, self.views
+            loaded = self.set.dataset, self.set.views
             path = self.set.folder / run_dir
-            self._setups[run_dir] = load_setup(path, (), len(self.views), self.request.lpips, loaded)
+            self._setups[run_dir] = load_setup(path, (), len(self.set.views), self.request.lpips, loaded)
         return self._setups[run_dir]
+
+    def renderer(self, number: int) -> tuple[EvaluationSetup, Renderer]:
+        """Return the setup of a point's model, and what draws it."""
+        setup = self._setup(self.record.points[number].run_dir)
+        return setup, setup.renderer(setup.reference)
 
     def _measure(self, variant: Variant, outcomes: Sequence[Outcome]) -> None:
         first, run_dir = outcomes[0], self._run_dir(variant, 0).relative_to(self.set.folder).as_posix()
@@ -322,7 +329,7 @@ class _Session:
         exact = render_exact(setup, _EXACT * self.request.budget, float64)  # all models alike
         self.record.facts.setdefault("exact", exact.to_dict())
         point, _ = measure_point(setup, variant.knob, setup.reference, exact)
-        means = {name: float(np.mean([getattr(one, name) for one in outcomes])) for name in ("psnr", "ssim")}
+        means = {name: statistics.fmean(getattr(one, name) for one in outcomes) for name in ("psnr", "ssim")}
         trained = replace(
             point,
             words=tuple(self.plan.overrides(variant, self.set.words, self.set.centre)),
@@ -334,7 +341,7 @@ class _Session:
             steps=first.steps,
             seconds=first.seconds,
             steps_in_turns=(self.plan.paces[variant.name],),
-            seeds=tuple(min(one.psnr, _MAX_PSNR) for one in outcomes),
+            seeds=tuple(one.psnr for one in outcomes),
             run_dir=run_dir,
         )
         self.record.points.append(trained)
@@ -342,63 +349,99 @@ class _Session:
 
     def _take_times(self, part: float) -> None:
         """Time all models that lack rounds."""
-        timed = []
-        for point in self.record.points:
-            setup = self._setup(point.run_dir)
-            timed.append(TimedPoint(point, lambda s=setup: s.renderer(s.reference), self.request.repeats))  # type: ignore[misc]
+        points, timed = self.record.points, list[TimedPoint]()
+        for number, point in enumerate(points):
+            timed.append(TimedPoint(point, lambda i=number: self.renderer(i)[1], self.request.repeats))  # type: ignore[misc]
 
         def done(number: int, count: int) -> None:
             self._write()
             self.progress(f"round {number} of {count}, {len(timed)} models", number / count)
 
-        if any(len(one.point.ms) < one.rounds for one in timed):
-            time_points(timed, self.views, time.monotonic() + self._left(part), done)
-        for point in self.record.points:
-            point.centre_ms = statistics.median(self.record.points[0].ms)
+        time_points(timed, self.set.views, time.monotonic() + self._left(part), done)
+        for point in points:
+            point.centre_ms = statistics.median(points[0].ms)
 
     def _combinations(self) -> list[Variant]:
         """Return combinations of earlier sessions, and as many new ones as there is time for."""
         points = self.record.points
-        old = [Variant(COMBINED, point.turned) for point in points if point.knob == COMBINED]
+        allowed = [Variant(COMBINED, point.turned) for point in points if point.knob == COMBINED]
         rounds = self._left(_COMBINED) / max(self.plan.seconds * self.request.seeds, 1e-9)
-        most = min(int(self._workers * rounds), _MAX_COMBINATIONS - len(old))
-        new = [Variant(COMBINED, way) for way in combine_models(points, most)]
-        allowed = []
-        for variant in new:
+        most = min(int(self._workers * rounds), _MAX_COMBINATIONS - len(allowed))
+        for way in combine_models(points, most):
+            variant = Variant(COMBINED, way)
             reason = self._find_pace(variant, self.plan.paces)
             if reason is None:
                 allowed.append(variant)
             else:
                 self.record.leave_out(variant.knob, variant.label, reason)
-        return [*old, *allowed]
+        return allowed
 
-    def _describe(self) -> None:
-        centre, setup = self.set.centre, self._setup(self.record.points[0].run_dir)
-        self.record.facts |= {
-            "task": centre.task,
-            "scene": centre.scene_name,
-            "preset": centre.preset,
-            "dataset": self.set.dataset.name,
-            "data_source": self.set.dataset.data_source,
-            "words": list(self.set.words),
-            "seeds": self.request.seeds,
-            "budget_seconds": self.request.budget,
-            "length": self.plan.describe(),
-            "backend": setup.backend(setup.reference).name,
-            "not_measured": {} if setup.lpips else {"lpips": "no weights were given (--lpips FILE)"},
-        }
-        if not Path("/proc/self/clear_refs").exists():
-            self.record.facts["not_measured"]["peak_bytes"] = MEMORY_UNKNOWN
 
-    def _render_pictures(self) -> dict[int, Picture]:
-        """Return pictures of the fronts' models beside the ground truth, which is under -1."""
-        points = self.record.points
-        centre = self._setup(points[0].run_dir)
-        view = max(self.views, key=lambda one: float(centre.channels.display(one.image).var()))
-        wanted = centre.display(view.image)
-        pictures = {-1: Picture(wanted, None)}
-        for number in dict.fromkeys((0, *self.record.speed, *self.record.size)):
-            setup = self._setup(points[number].run_dir)
-            image = setup.renderer(setup.reference)(view.view)
-            pictures[number] = Picture(centre.display(fill_masked(image, view)), wanted)
-        return pictures
+# ---------------------------------------------------------------- the folder
+
+
+def _compose_centre(request: AblationRequest) -> tuple[list[str], Path, RunConfig]:
+    """Return the centre's overrides, the folder of the set, and the centre's configuration."""
+    said = parse(request.words)
+    words = [a.text for a in said if a.key not in ("output_dir", "resume", "budget")]
+    places = [a.value for a in said if a.key == "output_dir" and a.value is not None]
+    centre = compose([*words, "output_dir=null"], check_output=False)
+    folder = Path(str(places[-1])).expanduser() if places else ROOT / f"tradeoff-{centre.task}-{centre.scene_name}"
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"output_dir={folder}: is a file; expected a directory")
+    return words, folder, centre
+
+
+def _centre_settings(centre: RunConfig) -> dict[str, Any]:
+    own = ("output_dir", "resume", "overrides", "non_default", "made_by")
+    return {name: value for name, value in centre.to_dict().items() if name not in own}
+
+
+def _check_folder(folder: Path, before: Record | None, centre: RunConfig, request: AblationRequest) -> None:
+    """Refuse a folder that holds something else, or another set."""
+    if before is None:
+        if folder.is_dir() and any(folder.iterdir()) and not (folder / TRIALS).is_dir():
+            raise ConfigError(f"output_dir={folder}: holds something else; expected a new directory, or that of a set")
+        return
+    if before.same.get("kind") != "models":
+        raise DataError(f"{folder / TRADEOFF_FILE}: of a finished run; expected another output_dir=DIR for trainings")
+    wanted = {"centre": _centre_settings(centre), "seeds": request.seeds}
+    changed = [name for name, value in wanted.items() if before.same.get(name) != value]
+    if changed:
+        expected = "expected the same overrides, or another output_dir=DIR"
+        raise ConfigError(f"{folder}: holds a set with another {' and '.join(changed)}; {expected}")
+
+
+def _identity(centre: RunConfig, views: Sequence[EvalView], request: AblationRequest) -> dict[str, Any]:
+    """Return what must be equal to keep earlier measurements; JSON-able."""
+    return {
+        "kind": "models",
+        "centre": _centre_settings(centre),
+        "seeds": request.seeds,
+        "lpips": str(request.lpips or centre.metrics.lpips or ""),
+        **describe_conditions(views),
+    }
+
+
+def _resume_record(folder: Path, before: Record | None, identity: Mapping[str, Any], tell: Tell) -> Record:
+    """Return the earlier record; without points if they were measured otherwise."""
+    if before is None:
+        return Record(dict(identity))
+    facts: dict[str, Any] = {name: before.facts[name] for name in ("spent_seconds", "exact") if name in before.facts}
+    changed = [name for name in identity if before.same.get(name) != identity[name]]
+    if changed:
+        what = " and ".join(changed)
+        tell(f"{folder / TRADEOFF_FILE}: measured with another {what}; models are kept, and measured anew")
+        return Record(dict(identity), facts)
+    points = [p for p in before.points if p.run_dir and (folder / p.run_dir / "model.safetensors").exists()]
+    if not points or points[0].name != CENTRE:
+        return Record(dict(identity), facts)
+    tell(f"{folder / TRADEOFF_FILE}: {len(points)} models are kept; delete the folder to train anew")
+    return Record(dict(identity), facts, points)
+
+
+def _parse_plan(file: Path, record: Record) -> Plan | None:
+    try:
+        return validate(Plan, record.facts["plan"], "plan") if "plan" in record.facts else None
+    except ConfigError as error:
+        raise DataError(f"{file}: damaged ({error}); delete the folder to train anew") from error

@@ -7,7 +7,7 @@ import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 from neuprim.config import RunConfig
 from neuprim.config.overrides import parse, quote_override
@@ -15,14 +15,13 @@ from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer
 from neuprim.core.used_settings import build_settings
+from neuprim.core.validation import Range
 from neuprim.plugins.returns import call_task_trade
 from neuprim.runs.fit import prepare_training, use_one_torch_thread
 from neuprim.runs.training import compile_for_run
-from neuprim.search.config_values import get_setting
 from neuprim.search.pareto import Step, combine_steps
 from neuprim.search.points import COMBINED, Point, name_variant
-
-__all__ = ["CENTRE", "Plan", "StepTimes", "Variant", "combine_models", "list_variants", "override", "plan_lengths"]
+from neuprim.search.trial_runner import get_setting
 
 CENTRE = "centre"
 """Name of the model that others are compared with."""
@@ -95,10 +94,10 @@ class Plan:
         paces: name of a variant -> seconds per step over the centre's.
     """
 
-    steps: int
+    steps: Annotated[int, Range(at_least=1)]
     seconds: float
     whole: int
-    paces: dict[str, float] = field(default_factory=lambda: {CENTRE: 1.0})
+    paces: dict[str, Annotated[float, Range(above=0)]] = field(default_factory=lambda: {CENTRE: 1.0})
 
     def overrides(self, variant: Variant, words: Sequence[str], centre: RunConfig) -> list[str]:
         """Return what trains a variant; interventions into the population are as many as in a full run."""

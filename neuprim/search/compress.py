@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from neuprim.config import find_run_plugins
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
-from neuprim.core.compression import DEFAULT_LEVEL, bit_table
-from neuprim.core.data import Dataset
+from neuprim.core.compression import DEFAULT_LEVEL, BitTable, Quantizers, bit_table
 from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.files import refuse_existing
+from neuprim.core.model.primitives import Primitives
 from neuprim.runs.finetune import steps_in
 from neuprim.runs.fit import use_one_torch_thread
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import COMPRESSED, load_dataset, load_run
-from neuprim.search.quantized_finetune import QuantizedModel, TrainingData, finetune_for_table, quantize_within
-
-__all__ = ["DEFAULT_TOLERANCE", "CompressRequest", "Compression", "StoredParameter", "compress_run"]
+from neuprim.search.quantized_finetune import (
+    Progress,
+    QuantizedModel,
+    TrainingData,
+    finetune_for_table,
+    quantize_within,
+)
 
 DEFAULT_TOLERANCE = 0.1
 """dB that training views may lose."""
@@ -52,12 +57,15 @@ class CompressRequest:
     tolerance: float | None = None
 
     @property
+    def by_level(self) -> bool:
+        return self.level is not None or bool(self.bits)
+
+    @property
     def trains(self) -> bool:
         return bool(self.steps) or (self.steps is None and self.seconds > 0)
 
 
-@dataclass(frozen=True)
-class StoredParameter:
+class StoredParameter(NamedTuple):
     """A parameter's bits per number, as text, its bytes in float32 and in the file."""
 
     name: str
@@ -82,13 +90,11 @@ class Compression:
     after: int
     measured: dict[str, tuple[float, float]]
     seconds: float
-    steps: int = 0
-    notes: tuple[str, ...] = ()
+    steps: int
+    notes: tuple[str, ...]
 
 
-def compress_run(
-    request: CompressRequest, progress: Callable[[str, float], None] = lambda text, fraction: None
-) -> Compression:
+def compress_run(request: CompressRequest, progress: Progress = lambda text, fraction: None) -> Compression:
     """Write a run's model as a compressed file, atomically, and measure the loss where the run's data are available.
 
     Fine-tuning renders every image from quantized numbers (straight-through gradients). The trained or the untrained
@@ -97,8 +103,8 @@ def compress_run(
     Raises:
         NeuprimError: no such run, level or parameter, numbers that cannot be stored, or an existing file.
     """
-    run_dir, by_level = request.run_dir, request.level is not None or bool(request.bits)
-    if request.tolerance is not None and by_level:
+    run_dir = request.run_dir
+    if request.tolerance is not None and request.by_level:
         other = "--bits" if request.bits else "--level"
         raise ConfigError(f"--tolerance {request.tolerance:g}: decides the bits of every number; expected no {other}")
     final = request.out or run_dir / COMPRESSED
@@ -108,52 +114,51 @@ def compress_run(
     config, task, model, header = load_run(run_dir)
     config = replace(config, output_dir=run_dir)
     table = bit_table(DEFAULT_LEVEL if request.level is None else request.level, request.bits, model.specs)
-    notes = ["its primitives are in another order than the run's"]
-    plugins = find_run_plugins(config)
-    dataset: Dataset | None = None
-    try:
-        progress("reading the run's data", 0.0)
-        dataset = load_dataset(config, task, run_dir=run_dir)
-        with plugins.attribute_errors():
-            check_dataset(dataset, task.conditions)
-    except NeuprimError as error:
-        dataset = None
-        untrained = " and it was not trained for few bits" if request.trains else ""
-        notes.append(f"the loss was not measured{untrained}, as the run's data cannot be read: {error}")
-        if not by_level:
-            notes.append(f"no training views decide the bits; they are of --level {DEFAULT_LEVEL}")
-    start = time.perf_counter()
+    notes, plugins = ["its primitives are in another order than the run's"], find_run_plugins(config)
+    stored, steps, dataset = model, 0, None
+    coding: BitTable | Quantizers = table
     with plugins.attribute_errors():
-        quantized: QuantizedModel | None = None
-        if dataset is not None and (request.trains or not by_level):
+        progress("reading the run's data", 0.0)
+        try:
+            dataset = load_dataset(config, task, run_dir=run_dir)
+            check_dataset(dataset, task.conditions)
+        except NeuprimError as error:
+            dataset = None
+            untrained = " and it was not trained for few bits" if request.trains else ""
+            notes.append(f"the loss was not measured{untrained}, as the run's data cannot be read: {error}")
+            if not request.by_level:
+                notes.append(f"no training views decide the bits; they are of --level {DEFAULT_LEVEL}")
+        start = time.perf_counter()
+        if dataset is not None and (request.trains or not request.by_level):
             with use_one_torch_thread():
-                data = TrainingData(config, task, dataset)
-                steps = request.steps
-                if steps is None:
-                    steps = steps_in(request.seconds, config, task, dataset, model)
-                if by_level:
-                    quantized = finetune_for_table(data, model, table, steps, progress)
-                else:
-                    tolerance = DEFAULT_TOLERANCE if request.tolerance is None else request.tolerance
-                    quantized = quantize_within(data, model, tolerance, steps, progress)
+                quantized = _quantize(request, TrainingData(config, task, dataset), model, table, progress)
+            stored, coding, steps = quantized.model, quantized.quantizers, quantized.steps
             notes += quantized.notes
         text = (run_dir / "config.yaml").read_text(encoding="utf-8")
-        whole, coding = (model, table) if quantized is None else (quantized.model, quantized.quantizers)
-        sizes = save_compressed(final, whole, task.name, extra_of(header), coding, text)
-    seconds = time.perf_counter() - start
+        sizes = save_compressed(final, stored, task.name, extra_of(header), coding, text)
+        seconds = time.perf_counter() - start
+        measured: dict[str, tuple[float, float]] = {}
+        if dataset is not None:
+            progress("measuring test views", 0.0)
+            decoded, _ = load_model(final, task)
+            before, after = (measure_quality(one, task, dataset, config.renderer) for one in (model, decoded))
+            measured = {name: (before[i], after[i]) for i, name in enumerate(("psnr", "ssim"))}
     parameters = tuple(
         StoredParameter(s.name, sizes[s.name].bits, 4 * model.count * s.size, sizes[s.name].size)
         for s in model.specs
         if s.size
     )
-    measured: dict[str, tuple[float, float]] = {}
-    if dataset is not None:
-        decoded, _ = load_model(final, task)
-        with plugins.attribute_errors():
-            progress("measuring test views", 0.0)
-            before, after = (measure_quality(one, task, dataset, config.renderer) for one in (model, decoded))
-        measured = {name: (before[i], after[i]) for i, name in enumerate(("psnr", "ssim"))}
-    float_bytes, steps_made = sum(p.before for p in parameters), 0 if quantized is None else quantized.steps
-    return Compression(
-        final, parameters, float_bytes, final.stat().st_size, measured, seconds, steps_made, tuple(notes)
-    )
+    floats = sum(p.before for p in parameters)
+    return Compression(final, parameters, floats, final.stat().st_size, measured, seconds, steps, tuple(notes))
+
+
+def _quantize(
+    request: CompressRequest, data: TrainingData, model: Primitives, table: BitTable, progress: Progress
+) -> QuantizedModel:
+    steps = request.steps
+    if steps is None:
+        steps = steps_in(request.seconds, data.config, data.task, data.dataset, model)
+    if request.by_level:
+        return finetune_for_table(data, model, table, steps, progress)
+    tolerance = DEFAULT_TOLERANCE if request.tolerance is None else request.tolerance
+    return quantize_within(data, model, tolerance, steps, progress)

@@ -1,8 +1,7 @@
-"""Measure models: images against ground truth and exact images, file size, memory, and frame times in rounds."""
+"""Measure models: images against ground truth and exact images, file size, and frame times in rounds."""
 
 from __future__ import annotations
 
-import ctypes
 import math
 import platform
 import statistics
@@ -10,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,23 +24,12 @@ from neuprim.core.metrics import psnr, ssim, ssim_3dgs
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
+from neuprim.report.tradeoff import Picture
 from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.render_config import RenderConfig, estimate_file_bytes, parse_render_config
 from neuprim.search.eval_views import EvalView, eval_views, fill_masked
-from neuprim.search.points import Point
-
-__all__ = [
-    "MEMORY_UNKNOWN",
-    "EvaluationSetup",
-    "ExactImages",
-    "TimedPoint",
-    "describe_machine",
-    "load_setup",
-    "measure_memory",
-    "measure_point",
-    "render_exact",
-    "time_points",
-]
+from neuprim.search.points import Point, Record
+from neuprim.version import __version__
 
 _MAX_CACHED = 1 << 29
 """Bytes of prepared models that are kept between rounds."""
@@ -53,14 +41,12 @@ _WARM_UP_SIZE = 16
 """Pixels of the side of a first image, so that compiling and loading are no part of a frame's time."""
 
 _MAX_PSNR = 400.0
-"""dB that stand for equal images, as JSON has no infinity."""
+"""dB of exact images that equal those in float64, as JSON has no infinity."""
 
 _CHECK_SIZE = 48
 """Pixels of the longer side of the image that checks exact images against float64."""
 
-MEMORY_UNKNOWN = "the peak of a process's memory can be reset on Linux alone"
-
-T = TypeVar("T")
+Renderer = Callable[[View], Tensor]
 
 
 @dataclass
@@ -75,20 +61,7 @@ class EvaluationSetup:
     views: list[EvalView]
     file: Path
     lpips: Lpips | None = None
-    _prepared: dict[tuple[tuple[str, ...], str], Primitives] = field(default_factory=dict)
-
-    @property
-    def double(self) -> Primitives:
-        """The model in float64."""
-        params = {name: value.detach().double() for name, value in self.model.params.items()}
-        return Primitives(self.model.density, self.model.colour, params)
-
-    def small_view(self, longer: int) -> View:
-        """Return the first view with at most so many pixels on its longer side."""
-        view = self.views[0].view
-        width, height = view.camera.width, view.camera.height
-        scale = min(1.0, longer / max(width, height))
-        return replace(view, camera=view.camera.resized(max(1, round(scale * width)), max(1, round(scale * height))))
+    _prepared: dict[tuple[object, ...], Primitives] = field(default_factory=dict)
 
     def overrides(self, config: RenderConfig) -> tuple[str, ...]:
         """Return what reproduces a configuration with ``neuprim render``."""
@@ -99,8 +72,8 @@ class EvaluationSetup:
 
     def prepare_model(self, config: RenderConfig) -> Primitives:
         """Return the model as a configuration draws it, on its device; recent ones are cached."""
-        changes = RenderConfig(reduced=config.reduced, storage=config.storage).to_overrides(RenderConfig().settings)
-        key = changes, f"{config.settings.backend} {config.settings.device}"
+        changes = (tuple(config.reduced.items()), tuple(config.storage.items()))
+        key = (*changes, config.settings.backend, config.settings.device)
         if key not in self._prepared:
             model = move_to_render_device(config.prepare_model(self.model), config.settings, self.views[0].view)
             cached = (*self._prepared.values(), model)
@@ -112,9 +85,8 @@ class EvaluationSetup:
     def backend(self, config: RenderConfig) -> backends.Backend:
         """Return the backend that draws a configuration."""
         model, view = self.prepare_model(config), config.scale_view(self.views[0].view)
-        return backends.choose_backend(
-            model.lower(view.camera, view.conditions, shaded=False), config.settings, view.camera
-        )
+        lowered = model.lower(view.camera, view.conditions, shaded=False)
+        return backends.choose_backend(lowered, config.settings, view.camera)
 
     def unsupported(self, config: RenderConfig) -> str | None:
         """Return why a configuration cannot be drawn here; None if it can."""
@@ -125,7 +97,7 @@ class EvaluationSetup:
             return str(error)
         return None
 
-    def renderer(self, config: RenderConfig) -> Callable[[View], Tensor]:
+    def renderer(self, config: RenderConfig) -> Renderer:
         """Return what draws views of a configuration, with its model prepared."""
         model = self.prepare_model(config)
         return lambda view: config.render_view(model, view, self.dataset.background)
@@ -167,10 +139,33 @@ def load_setup(
     return EvaluationSetup(config, model, dataset, channels, reference, chosen, file, distance)
 
 
-def describe_machine() -> dict[str, Any]:
-    """Return the machine and the versions, as records compare them."""
-    versions = {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__}
-    return {"machine": {"cpu": cpu_name(), "cores": core_count()}, "versions": versions}
+def describe_conditions(views: Sequence[EvalView]) -> dict[str, Any]:
+    """Return views, machine and versions of measurements, which must be equal to keep them."""
+    camera = views[0].view.camera
+    return {
+        "views": [one.view.name for one in views],
+        "image_size": [camera.width, camera.height],
+        "machine": {"cpu": cpu_name(), "cores": core_count()},
+        "versions": {
+            "neuprim": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
+    }
+
+
+def describe_setup(setup: EvaluationSetup) -> dict[str, Any]:
+    """Return facts of a measured run, for readers of the record."""
+    return {
+        "task": setup.config.task,
+        "scene": setup.config.scene_name,
+        "dataset": setup.dataset.name,
+        "data_source": setup.dataset.data_source,
+        "backend": setup.backend(setup.reference).name,
+        "shown": setup.channels.shown,
+        "not_measured": {} if setup.lpips is not None else {"lpips": "no weights were given (--lpips FILE)"},
+    }
 
 
 # ---------------------------------------------------------------- exact images
@@ -213,8 +208,13 @@ def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = 
     """
     settings = replace(setup.reference.settings, alpha_min=0.0, transmittance_min=0.0)
     uncut, oracle = RenderConfig(settings), RenderConfig(replace(settings, backend=backends.REFERENCE, device="auto"))
-    double, small, background = setup.double, setup.small_view(_CHECK_SIZE), setup.dataset.background.double()
-    size = (small.camera.width, small.camera.height)
+    model, view, background = setup.model, setup.views[0].view, setup.dataset.background.double()
+    params = {name: value.detach().double() for name, value in model.params.items()}
+    double = Primitives(model.density, model.colour, params)
+    width, height = view.camera.width, view.camera.height
+    scale = min(1.0, _CHECK_SIZE / max(width, height))
+    size = (max(1, round(scale * width)), max(1, round(scale * height)))
+    small = replace(view, camera=view.camera.resized(*size))
     start = time.perf_counter()
     check = oracle.render_view(double, small, background)
     pixels = sum(v.view.camera.width * v.view.camera.height for v in setup.views) / len(setup.views)
@@ -232,21 +232,19 @@ def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = 
 
 
 def measure_point(setup: EvaluationSetup, knob: str, config: RenderConfig, exact: ExactImages) -> tuple[Point, float]:
-    """Measure images, size and memory of a configuration; returns the point, and the seconds of all images.
+    """Measure images and size of a configuration; returns the point, and the seconds of all images.
 
     Numbers are means over views. ``psnr_exact`` is that of the mean squared error over all views, and at most the
     accuracy of the exact images themselves.
     """
     model, draw = setup.prepare_model(config), setup.renderer(config)
     rows: list[dict[str, float]] = []
-    peaks: list[int] = []
     seconds = 0.0
     _warm_up(draw, setup.views[0].view)
     for view, ideal in zip(setup.views, exact.images, strict=True):
         start = time.perf_counter()
-        image, peak = measure_memory(lambda: draw(view.view), model.device)  # noqa: B023 (called at once)
+        image = draw(view.view)
         seconds += time.perf_counter() - start
-        peaks += [] if peak is None else [peak]
         image = fill_masked(image, view)
         shown, wanted = setup.display(image), setup.display(view.image)
         row = {"psnr": psnr(image, view.image, view.mask), "ssim": ssim(image, view.image)}
@@ -261,38 +259,28 @@ def measure_point(setup: EvaluationSetup, knob: str, config: RenderConfig, exact
     exactness = -10.0 * math.log10(error) if error > 0 else math.inf
     quality["psnr_exact"] = exactness if exact.error is None else min(exactness, exact.error)
     size = estimate_file_bytes(setup.file, setup.model, model, config.storage)
-    return Point(knob, setup.overrides(config), quality, size, max(peaks, default=None)), seconds
+    return Point(knob, setup.overrides(config), quality, size), seconds
 
 
-def measure_memory(call: Callable[[], T], device: torch.device) -> tuple[T, int | None]:
-    """Return a call's result, and the bytes by which memory rose at its peak; None where the system cannot tell.
+def render_front_pictures(
+    record: Record, views: Sequence[EvalView], renderer: Callable[[int], tuple[EvaluationSetup, Renderer]]
+) -> dict[int, Picture]:
+    """Return pictures of the fronts' points, of the view with most contrast, and the ground truth under -1.
 
-    On a GPU, memory allocated by torch. On the CPU, the resident set of the whole process.
+    Args:
+        renderer: number of a point -> its setup and what draws it.
     """
-    if device.type != "cpu":
-        torch.cuda.reset_peak_memory_stats(device)
-        before = torch.cuda.memory_allocated(device)
-        result = call()
-        return result, max(0, torch.cuda.max_memory_allocated(device) - before)
-    try:
-        ctypes.CDLL(None).malloc_trim(0)
-    except (OSError, AttributeError, TypeError):
-        pass  # another libc: freed memory may stay, and the rise looks smaller than it is
-    try:
-        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-    except OSError:
-        return call(), None
-    resident = _kilobytes("VmRSS")
-    result = call()
-    peak = _kilobytes("VmHWM")
-    return result, None if resident is None or peak is None else max(0, peak - resident) * 1024
-
-
-def _kilobytes(name: str) -> int | None:
-    for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
-        if line.startswith(f"{name}:"):
-            return int(line.split()[1])
-    return None
+    setup, _ = renderer(0)
+    view = max(views, key=lambda one: float(setup.channels.display(one.image).var()))
+    truth = setup.display(view.image)
+    pictures = {-1: Picture(truth, None)}
+    trained = bool(record.points[0].run_dir)  # models are compared with the truth, ways to draw with the reference
+    for number in dict.fromkeys((0, *record.speed, *record.size)):
+        own, draw = renderer(number)
+        shown = own.display(fill_masked(draw(view.view), view))
+        against = truth if trained else None if number == 0 else pictures[0].image
+        pictures[number] = Picture(shown, against)
+    return pictures
 
 
 # ---------------------------------------------------------------- frame times
@@ -302,7 +290,7 @@ class TimedPoint(NamedTuple):
     """A point to time: what returns its renderer, and how many rounds it should have."""
 
     point: Point
-    renderer: Callable[[], Callable[[View], Tensor]]
+    renderer: Callable[[], Renderer]
     rounds: int
 
 
@@ -319,18 +307,17 @@ def time_points(
         deadline: of :func:`time.monotonic`; no round starts after it, except the first.
         done: called with (round, of how many) after each.
     """
-    reference, order = timed[0], torch.Generator().manual_seed(len(timed[0].point.ms))
+    order = torch.Generator().manual_seed(len(timed[0].point.ms))
     most = max(one.rounds - len(one.point.ms) for one in timed)
     for number in range(most):
-        due = [one for one in timed[1:] if len(one.point.ms) < one.rounds]
-        if number and not due:
-            return
         start = time.monotonic()
-        turn = [reference, *due]
+        turn = [timed[0], *(one for one in timed[1:] if len(one.point.ms) < one.rounds)]
+        if number and len(turn) == 1:
+            return
         if number == 0:
             for one in turn:
                 _warm_up(one.renderer(), views[0].view)
-        slots = torch.tensor([0] * (1 + len(due) // _PER_REFERENCE) + list(range(1, len(turn))))
+        slots = torch.tensor([0] * (1 + (len(turn) - 1) // _PER_REFERENCE) + list(range(1, len(turn))))
         milliseconds: list[list[float]] = [[] for _ in turn]
         ratios: list[list[float]] = [[] for _ in turn]
         for view in views:
@@ -353,5 +340,5 @@ def time_points(
             return
 
 
-def _warm_up(draw: Callable[[View], Tensor], view: View) -> None:
+def _warm_up(draw: Renderer, view: View) -> None:
     draw(replace(view, camera=view.camera.resized(_WARM_UP_SIZE, _WARM_UP_SIZE)))

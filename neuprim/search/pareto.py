@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from itertools import zip_longest
 from typing import NamedTuple, TypeVar
 
-__all__ = ["Objectives", "Step", "chain_steps", "combine_steps", "pareto_front", "spread_evenly"]
-
 T = TypeVar("T")
 
 

@@ -20,19 +20,7 @@ from neuprim.core.metrics import from_json, to_json
 from neuprim.core.validation import Range, coerce, validate
 from neuprim.search.pareto import Objectives, pareto_front
 
-__all__ = [
-    "COMBINED",
-    "REFERENCE",
-    "TRADEOFF_FILE",
-    "TRADEOFF_FOLDER",
-    "LeftOut",
-    "Point",
-    "Record",
-    "read_record",
-    "write_csv",
-]
-
-FORMAT = 1
+_FORMAT = 1
 
 TRADEOFF_FILE, TRADEOFF_FOLDER = "tradeoff.json", "tradeoff"
 """Name of the record, and its folder in the directory of a finished run."""
@@ -40,8 +28,10 @@ TRADEOFF_FILE, TRADEOFF_FOLDER = "tradeoff.json", "tradeoff"
 REFERENCE, COMBINED = "reference", "combined"
 """In place of a knob's name: the point that others are compared with, and points that change several knobs."""
 
-_SURVEY_COLUMNS = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
-_COLUMNS = ("time ratio", "ms per frame", "frames/s", "PSNR against exact", "peak bytes", "speed front", "size front")
+_COLUMNS = (
+    *("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians"),  # of the survey
+    *("time ratio", "ms per frame", "frames/s", "PSNR against exact", "speed front", "size front"),
+)
 _MODEL_COLUMNS = ("numbers per primitive", "training steps", "training seconds", "ms per step", "command")
 
 _DIGITS = 2
@@ -49,10 +39,12 @@ _DIGITS = 2
 
 _Positive = Annotated[float, Range(above=0)]
 
+_DRAWN = ("knob", "words", "bytes", "ms", "ratios", "rounds")
 _TRAINED = (
     *("turned", "length", "primitives", "parameters_per_primitive", "steps", "seconds"),
     *("centre_ms", "steps_in_turns", "seeds", "run_dir"),
 )
+"""Fields of every point, and those of trained models."""
 
 
 @dataclass
@@ -64,12 +56,10 @@ class Point:
         words: overrides that reproduce it.
         quality: psnr, ssim, ssim_3dgs, psnr_exact, ssim_exact; lpips and lpips_3dgs where there are weights.
         bytes: size of the model file.
-        peak_bytes: rise of memory while a frame is drawn; None where the system cannot tell.
         ms: mean milliseconds per frame of each round of timing.
         ratios: the same over the reference's of that round.
         rounds: limit of rounds; None for the request's.
         turned, length: of a trained model, the overrides over the centre's, and the share of the full training.
-        primitives, parameters_per_primitive, steps, seconds: of a trained model.
         centre_ms: median milliseconds per frame of the centre over all rounds.
         steps_in_turns: seconds per training step over the centre's.
         seeds: PSNR of each seed; ``quality`` has the means.
@@ -80,7 +70,6 @@ class Point:
     words: tuple[str, ...]
     quality: dict[str, float]
     bytes: int
-    peak_bytes: int | None = None
     ms: list[_Positive] = field(default_factory=list)
     ratios: list[_Positive] = field(default_factory=list)
     rounds: int | None = None
@@ -142,11 +131,10 @@ class Point:
         quality: dict[str, Any] = {}
         for name, value in self.quality.items():
             quality |= to_json(name, value)
-        data = {**asdict(self), "quality": quality}
+        fields = asdict(self)
+        data = {"name": self.name, "quality": quality, **{name: fields[name] for name in _DRAWN}}
         if self.run_dir:
-            data |= {"name": self.name, "ms_per_step": self.ms_per_step}
-        else:
-            data = {name: value for name, value in data.items() if name not in _TRAINED}
+            data |= {name: fields[name] for name in _TRAINED} | {"ms_per_step": self.ms_per_step}
         if self.ms:
             data |= {"ms_per_frame": self.time, "frames_per_second": 1e3 / self.time, "time_ratio": self.ratio}
             data |= {"time_ratio_spread": self.spread, "time_ratio_doubt": self.doubt}
@@ -157,8 +145,7 @@ class Point:
         """Invert :meth:`to_dict`; raises KeyError, TypeError, ValueError or ConfigError for anything else."""
         names = [name.removesuffix("_infinite") for name in data["quality"]]
         quality = {name: value for name in names if (value := from_json(data["quality"], name)) is not None}
-        needed = ("knob", "words", "bytes", "peak_bytes", "ms", "ratios", "rounds")
-        own = {name: data[name] for name in (*needed, *(_TRAINED if data.get("run_dir") else ()))}
+        own = {name: data[name] for name in (*_DRAWN, *(_TRAINED if data.get("run_dir") else ()))}
         return replace(validate(cls, {**own, "quality": {}}, "points"), quality=quality)
 
 
@@ -186,7 +173,6 @@ class Record:
         facts: further facts for readers: the run, its data, the exact images.
         points: the reference first.
         speed, size: numbers of the points on the fronts of time and of bytes against PSNR, best quality first.
-        marching: closed form against ray marching, of a finished run.
     """
 
     same: dict[str, Any]
@@ -195,7 +181,6 @@ class Record:
     left_out: list[LeftOut] = field(default_factory=list)
     speed: list[int] = field(default_factory=list)
     size: list[int] = field(default_factory=list)
-    marching: dict[str, Any] = field(default_factory=dict)
 
     def find(self, words: Sequence[str]) -> Point | None:
         """Return the point of these overrides."""
@@ -207,30 +192,33 @@ class Record:
         others = [one for one in self.left_out if (one.knob, one.words) != (knob, words)]
         self.left_out = [*others, LeftOut(knob, words, reason)]
 
-    def find_fronts(self, in_speed: Callable[[Point], bool], in_size: Callable[[Point], bool]) -> None:
+    def find_fronts(
+        self,
+        in_speed: Callable[[Point], bool] = lambda point: True,
+        in_size: Callable[[Point], bool] = lambda point: True,
+    ) -> None:
         """Compute both fronts, of the points that may be on each."""
 
-        def quality(i: int) -> float:
-            return round(self.points[i].quality["psnr"], _DIGITS)
-
-        def time(i: int) -> Objectives:
-            return Objectives(self.points[i].ratio, quality(i), self.points[i].doubt)
-
-        numbers = range(len(self.points))
-        self.speed = pareto_front([i for i in numbers if self.points[i].ratios and in_speed(self.points[i])], time)
-        sizes = [i for i in numbers if in_size(self.points[i])]
-        self.size = pareto_front(sizes, lambda i: Objectives(float(self.points[i].bytes), quality(i)))
+        quality = [round(point.quality["psnr"], _DIGITS) for point in self.points]
+        points = list(enumerate(self.points))
+        self.speed = pareto_front(
+            [i for i, point in points if point.ratios and in_speed(point)],
+            lambda i: Objectives(self.points[i].ratio, quality[i], self.points[i].doubt),
+        )
+        self.size = pareto_front(
+            [i for i, point in points if in_size(point)],
+            lambda i: Objectives(float(self.points[i].bytes), quality[i]),
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values."""
         return {
-            "format": FORMAT,
+            "format": _FORMAT,
             "same": self.same,
             **self.facts,
             "points": [point.to_dict() for point in self.points],
             "left_out": [asdict(one) for one in self.left_out],
             "front": {"speed": self.speed, "size": self.size},
-            "marching": self.marching,
         }
 
     def write(self, path: Path) -> None:
@@ -247,17 +235,17 @@ def read_record(path: Path) -> Record | None:
     if data is None:
         return None
     try:
-        if data["format"] != FORMAT:
-            expected = f"this neuprim reads {FORMAT}; delete it to measure anew"
+        if data["format"] != _FORMAT:
+            expected = f"this neuprim reads {_FORMAT}; delete it to measure anew"
             raise DataError(f"{path}: format {data['format']!r}; {expected}")
         points = [Point.from_dict(entry) for entry in data["points"]]
         left_out = [validate(LeftOut, entry, "left_out") for entry in data["left_out"]]
         speed, size = (coerce(data["front"][name], list[int], f"front.{name}") for name in ("speed", "size"))
         if not points or not all(0 <= number < len(points) for number in (*speed, *size)):
             raise ValueError(f"front: expected numbers of the {len(points)} points")
-        known = ("format", "same", "points", "left_out", "front", "marching")
+        known = ("format", "same", "points", "left_out", "front")
         facts = {key: value for key, value in data.items() if key not in known}
-        return Record(dict(data["same"]), facts, points, left_out, speed, size, dict(data["marching"]))
+        return Record(dict(data["same"]), facts, points, left_out, speed, size)
     except (KeyError, TypeError, AttributeError, ValueError, ConfigError) as error:
         what = f"{type(error).__name__}: {error}"
         raise DataError(f"{path}: not a record of `neuprim tradeoff` ({what}); delete it to measure anew") from error
@@ -271,22 +259,20 @@ def write_csv(path: Path, record: Record, primitives: int = 0) -> None:
     """
     # The survey's LPIPS is that of VGG; another network's would not compare.
     lpips = "lpips_3dgs" if record.same.get("lpips") == "vgg" else ""
+    trained = any(point.run_dir for point in record.points)
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    trained = any(point.run_dir for point in record.points)
-    writer.writerow((*_SURVEY_COLUMNS, *_COLUMNS, *(_MODEL_COLUMNS if trained else ())))
+    writer.writerow((*_COLUMNS, *(_MODEL_COLUMNS if trained else ())))
     for number, point in enumerate(record.points):
-        quality = [_format(point.quality.get(name)) for name in ("psnr", "ssim_3dgs", lpips)]
-        row: list[object] = [point.name, *quality, point.bytes, point.primitives or primitives]
+        psnr, ssim, distance, exact = (
+            "" if (value := point.quality.get(name)) is None else f"{value:.6g}"
+            for name in ("psnr", "ssim_3dgs", lpips, "psnr_exact")
+        )
+        row: list[object] = [point.name, psnr, ssim, distance, point.bytes, point.primitives or primitives]
         row += [f"{point.ratio:.4f}", f"{point.time:.4f}", f"{1e3 / point.time:.2f}"] if point.ms else [""] * 3
-        row += [_format(point.quality.get("psnr_exact")), "" if point.peak_bytes is None else point.peak_bytes]
-        row += [int(number in record.speed), int(number in record.size)]
+        row += [exact, int(number in record.speed), int(number in record.size)]
         if trained:
             row += [point.parameters_per_primitive, point.steps, f"{point.seconds:.3f}", f"{point.ms_per_step:.4f}"]
             row.append(shlex.join(["neuprim", "run", *point.words]))
         writer.writerow(row)
     write_text(path, buffer.getvalue())
-
-
-def _format(value: float | None) -> str:
-    return "" if value is None else f"{value:.6g}"

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from neuprim.config import RunConfig, find_run_plugins
 from neuprim.core.channels import find_channels
@@ -26,13 +24,12 @@ from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.finetune import fine_tuner, steps_in
 from neuprim.runs.fit import Fitted, keep_model_settings, make_loss, use_one_torch_thread
 from neuprim.runs.kept import PRUNED, kept_shares
-from neuprim.runs.measure import measure_quality, render_image
+from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device, read_metrics
 from neuprim.runs.training import save_training
+from neuprim.search.eval_views import eval_views, measure_eval_views
 from neuprim.search.pruning_cuts import count_stored_numbers, cut_to_loss, list_reductions, price_cuts, zero_masks
 from neuprim.search.training_quality import TrainingQuality
-
-__all__ = ["ModelShrinker", "PruneRequest", "Pruning", "PruningStage", "prune_run"]
 
 MAX_ROUNDS, _LONG_ROUND, _MIN_ROUND = 3, 1300, 600
 """Rounds of fine-tuning, unless a round would be longer than these steps; least steps of a round. Every round ends at
@@ -50,7 +47,7 @@ _REMAINING, _BROUGHT = 0.3, 0.35
 _ENOUGH, _FREE = 0.1, 0.02
 """Shares of the tolerance: below the first nothing more is cut, and the second counts as no loss."""
 
-_TIMED_FRAMES = 12
+_TIMED_VIEWS = 12
 
 Progress = Callable[[str, float], None]
 
@@ -240,8 +237,7 @@ class PruneRequest:
 
     Attributes:
         tolerance: dB that training views may lose.
-        seconds: of fine-tuning, about.
-        steps: of fine-tuning instead, for the same model on every machine.
+        seconds: of fine-tuning, about; steps: so many instead, for the same model on every machine.
         out: the new run directory; None for the run's name with "-pruned".
         overwrite: whether existing files may be replaced.
         hold_out: n > 1: leave every n-th training view out of training and decisions; 0: none.
@@ -278,6 +274,22 @@ class Pruning:
     steps: int
     seconds: float
 
+    def to_dict(self, request: PruneRequest) -> dict[str, Any]:
+        """Return the content of ``pruned.json``."""
+        return {
+            "format": 1,
+            "pruned_from": str(request.run_dir),
+            "tolerance": request.tolerance,
+            "steps": self.steps,
+            "seconds": self.seconds,
+            "before": self.before,
+            "after": self.after,
+            "reduced": list(self.words),
+            "kept": self.kept,
+            "judged_psnr": list(self.judged),
+            "stages": [asdict(stage) for stage in self.stages],
+        }
+
 
 def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction: None) -> Pruning:
     """Remove primitives, units and parts of fields as far as training views allow, with fine-tuning in between.
@@ -302,19 +314,16 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
         check_dataset(dataset, task.conditions)
         if request.hold_out:
             dataset = replace(dataset, train=hold_out_views(dataset, request.hold_out).train)
-        begun = time.monotonic()
-        steps = request.steps
+        begun, steps = time.monotonic(), request.steps
         if steps is None:
             steps = steps_in(request.seconds, config, task, dataset, model)
         shrinker = ModelShrinker(config, task, dataset, request.tolerance, steps, progress)
         small, words = shrinker.shrink(model)
         seconds = time.monotonic() - begun
-        judged = (shrinker.base, shrinker.quality(small))
+        judged, stages = (shrinker.base, shrinker.quality(small)), tuple(shrinker.stages)
         progress("measuring test views", 1.0)
-        rates = _frame_rates(config, dataset, (model, small))
         measured = measure_quality(model, task, dataset, config.renderer)
-        before = _describe(model, model_file(request.run_dir), measured, rates[0])
-        stages = tuple(shrinker.stages)
+        before = _describe(model, model_file(request.run_dir), measured, config, dataset)
         if count_stored_numbers(small) >= count_stored_numbers(model):
             return Pruning(None, before, before, (), kept_shares(model), judged, stages, steps, seconds)
         progress("pictures and report", 1.0)
@@ -326,29 +335,21 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
         save_training(fitted)
         evaluate_fitted(fitted, final)
         metrics = read_metrics(final)
-        after = _describe(small, final / "model.safetensors", (metrics["psnr"], metrics["ssim"]), rates[1])
+        measured = metrics["psnr"], metrics["ssim"]
+        after = _describe(small, final / "model.safetensors", measured, config, dataset)
     result = Pruning(final, before, after, words, kept_shares(small), judged, stages, steps, seconds)
-    write_json(final / PRUNED, _to_dict(request, result))
+    write_json(final / PRUNED, result.to_dict(request))
     return result
 
 
-def _frame_rates(config: RunConfig, dataset: Dataset, models: Sequence[Primitives]) -> list[float]:
-    """Return median frames/s of test views, drawn in turns, so that load of the machine affects all models."""
-    models = [move_to_render_device(model, config.renderer, dataset.test.view(0)) for model in models]
-    seconds: list[list[float]] = [[] for _ in models]
-    for turn in range(_TIMED_FRAMES + 1):
-        view = dataset.test.view(turn * len(dataset.test) // (_TIMED_FRAMES + 1))
-        for model, own in zip(models, seconds, strict=True):
-            begun = time.perf_counter()
-            render_image(model, view, config.renderer, dataset.background)
-            if turn:  # the first frame loads and compiles
-                own.append(time.perf_counter() - begun)
-    return [1.0 / max(float(np.median(own)), 1e-9) for own in seconds]
-
-
-def _describe(model: Primitives, file: Path, measured: tuple[float, float], rate: float) -> dict[str, float]:
+def _describe(
+    model: Primitives, file: Path, measured: tuple[float, float], config: RunConfig, dataset: Dataset
+) -> dict[str, float]:
+    views = eval_views(dataset, _TIMED_VIEWS)
+    moved = move_to_render_device(model, config.renderer, views[0].view)
+    ms = measure_eval_views(moved, views, config.renderer, dataset.background).ms_per_frame
     facts = {"primitives": model.count, "numbers": count_stored_numbers(model), "bytes": file.stat().st_size}
-    return {**facts, "psnr": measured[0], "ssim": measured[1], "frames_per_second": rate}
+    return {**facts, "psnr": measured[0], "ssim": measured[1], "frames_per_second": 1e3 / ms}
 
 
 def _fit_pruned(
@@ -368,20 +369,3 @@ def _fit_pruned(
     trainer = Trainer(model, dataset, make_loss(config, task), settings, config.renderer, config.seed)
     trainer.zero_masks = zero_masks(trainer.model)
     return Fitted(config, task, dataset, find_channels(task, dataset), trainer)
-
-
-def _to_dict(request: PruneRequest, result: Pruning) -> dict[str, Any]:
-    """Return the content of ``pruned.json``."""
-    return {
-        "format": 1,
-        "pruned_from": str(request.run_dir),
-        "tolerance": request.tolerance,
-        "steps": result.steps,
-        "seconds": result.seconds,
-        "before": result.before,
-        "after": result.after,
-        "reduced": list(result.words),
-        "kept": result.kept,
-        "judged_psnr": list(result.judged),
-        "stages": [asdict(stage) for stage in result.stages],
-    }

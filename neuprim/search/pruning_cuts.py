@@ -16,8 +16,6 @@ from neuprim.core.model.reduction import reduce_model
 from neuprim.core.train.sensitivity import Sensitivity
 from neuprim.search.training_quality import TrainingQuality
 
-__all__ = ["count_stored_numbers", "cut_to_loss", "list_reductions", "price_cuts", "zero_masks"]
-
 _CONTRAST = 0.05
 """Mean squared difference of a primitive's colour from its background, where :func:`price_cuts` cannot measure it."""
 

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from copy import copy
 from typing import NamedTuple
 
-from torch import Tensor
-
 from neuprim.config import RunConfig
 from neuprim.core.compression import (
     BitTable,
@@ -25,15 +23,6 @@ from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.runs.finetune import fine_tuner
 from neuprim.search.pruning_cuts import zero_masks
 from neuprim.search.training_quality import TrainingQuality
-
-__all__ = [
-    "QuantizationSearch",
-    "QuantizedModel",
-    "TrainingData",
-    "dequantize",
-    "finetune_for_table",
-    "quantize_within",
-]
 
 Progress = Callable[[str, float], None]
 
@@ -134,7 +123,8 @@ def finetune_for_table(
     whole = canonicalize(model)
     quantizers, quality = fit_quantizers(whole, table), TrainingQuality.of_run(data.config, data.dataset)
     before = quality(dequantize(whole, quantizers))
-    trained = _finetune(data, whole, quantizers, steps, lambda share: progress("training for few bits", share))
+    progress("training for few bits", 0.0)
+    trained = _finetune(data, whole, quantizers, steps)
     after = quality(dequantize(trained, quantizers))
     if after > before:
         return QuantizedModel(trained, quantizers, steps)
@@ -160,28 +150,25 @@ def quantize_within(
     best: tuple[Primitives, Quantizers, float] | None = None
     rounds = min(max(steps // _ROUND_STEPS, 1), _MAX_ROUNDS) if steps else 0
     for number in range(rounds):
-
-        def show(part: float, number: int = number) -> None:
-            progress("training for few bits", (number + part) / rounds)
-
         share = _error_share(at_once)
         quantizers = search.fit(share)
         own = steps * (number + 1) // rounds - steps * number // rounds
-        search = search.with_model(_finetune(data, search.model, quantizers, own, show))
+        progress("training for few bits", number / rounds)
+        search = search.with_model(_finetune(data, search.model, quantizers, own))
         lost = base - quality(dequantize(search.model, quantizers))
         if lost <= tolerance and (best is None or share > best[2]):
             best = search.model, quantizers, share
         at_once = max(at_once + (_AIM * tolerance - lost) / _SLOPE, 0.25 * at_once)
     if best is None:  # of the trained and the untrained model the one that can be stored more coarsely
         progress("looking for the coarsest numbers", 1.0)
+        for one in [untrained, search] if rounds else [untrained]:
 
-        def find(one: QuantizationSearch) -> tuple[Primitives, Quantizers, float]:
-            def accept(quantizers: Quantizers) -> bool:
-                return base - quality(dequantize(one.model, quantizers)) <= tolerance
+            def accept(quantizers: Quantizers, model: Primitives = one.model) -> bool:
+                return base - quality(dequantize(model, quantizers)) <= tolerance
 
-            return one.model, *one.find_coarsest(accept, _error_share(tolerance))
-
-        best = max(map(find, [untrained, search] if rounds else [untrained]), key=lambda each: each[2])
+            found = one.model, *one.find_coarsest(accept, _error_share(tolerance))
+            best = found if best is None or found[2] > best[2] else best
+    assert best is not None
     whole, quantizers, share = best
     note = f"rounding may add {share:.1%} to the squared error; the last bit of every number is worth the same"
     return QuantizedModel(whole, quantizers, steps, (note,))
@@ -192,21 +179,13 @@ def _error_share(decibels: float) -> float:
     return float(min(max(10 ** (decibels / 10) - 1, _FINEST), _COARSEST))
 
 
-def _finetune(
-    data: TrainingData, model: Primitives, quantizers: Quantizers, steps: int, progress: Callable[[float], None]
-) -> Primitives:
+def _finetune(data: TrainingData, model: Primitives, quantizers: Quantizers, steps: int) -> Primitives:
     """Train a canonical model, rendering every image from quantized numbers."""
     trainer = fine_tuner(data.config, data.task, data.dataset, model, steps)
     trainer.zero_masks = zero_masks(trainer.model)
     on_device = {name: quantizer.to(trainer.device) for name, quantizer in quantizers.items()}
-
-    def quantize(params: dict[str, Tensor]) -> dict[str, Tensor]:
-        return fake_quantize(params, on_device)
-
-    trainer.fake_quantize = quantize
-    for done in range(steps):
+    trainer.fake_quantize = lambda params: fake_quantize(params, on_device)
+    for _ in range(steps):
         trainer.train_step()
-        if done % 20 == 0:
-            progress(done / steps)
     params = {name: value.detach().cpu() for name, value in trainer.model.params.items()}
     return Primitives(model.density, model.colour, params)

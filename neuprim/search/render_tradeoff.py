@@ -15,26 +15,23 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import find_run_plugins
-from neuprim.config.command_settings import parse_duration
-from neuprim.core.compute import device
 from neuprim.core.compute.threads import core_count
-from neuprim.core.errors import ConfigError, NeuprimError, nearest
+from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
-from neuprim.core.render.quadrature import compare_quadrature
-from neuprim.report.tradeoff import Picture, write_tradeoff
+from neuprim.report.tradeoff import write_tradeoff
 from neuprim.runs.fit import use_one_torch_thread
 from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RenderConfig
-from neuprim.search.eval_views import fill_masked
 from neuprim.search.measuring import (
-    MEMORY_UNKNOWN,
     EvaluationSetup,
     ExactImages,
     TimedPoint,
-    describe_machine,
+    describe_conditions,
+    describe_setup,
     load_setup,
     measure_point,
     render_exact,
+    render_front_pictures,
     time_points,
 )
 from neuprim.search.pareto import Step, combine_steps
@@ -48,9 +45,6 @@ from neuprim.search.points import (
     read_record,
     write_csv,
 )
-from neuprim.version import __version__
-
-__all__ = ["TradeoffRequest", "format_render_command", "measure_tradeoff", "parse_budget"]
 
 _EXACT, _IMAGES, _TIMES, _COMBINED = 0.2, 0.45, 0.65, 0.85
 """Shares of the budget by which exact images, images and times of single changes, and combinations should be done."""
@@ -60,19 +54,8 @@ _ONE_POINT = 0.1
 
 _COMBINATIONS = 24
 
-_CHORDS_SIZE = 96
-"""Pixels of the longer side of the image that compares the closed form with sampled chords."""
-
 Progress = Callable[[str, float], None]
-
-
-def parse_budget(budget: str, prefix: str = "--budget ") -> float:
-    """Return the seconds of a budget such as 90s, 5m or 1h; messages begin with ``prefix``.
-
-    Raises:
-        ConfigError: an invalid budget.
-    """
-    return parse_duration(budget, f"{prefix}{budget}")
+Tell = Callable[[str], None]
 
 
 def format_render_command(run_dir: str, overrides: Sequence[str]) -> str:
@@ -144,9 +127,7 @@ def list_knobs(reference: RenderConfig, model: Primitives) -> dict[str, list[Ren
 
 
 def measure_tradeoff(
-    request: TradeoffRequest,
-    tell: Callable[[str], None] = lambda text: None,
-    progress: Progress = lambda text, fraction: None,
+    request: TradeoffRequest, tell: Tell = lambda text: None, progress: Progress = lambda text, fraction: None
 ) -> Record:
     """Measure, and write ``tradeoff.json``, ``tradeoff.csv``, ``tradeoff.html`` and ``front.png``.
 
@@ -168,18 +149,18 @@ def measure_tradeoff(
         reason = setup.unsupported(setup.reference)
         if reason is not None:
             raise ConfigError(reason)
+        record.facts |= {**describe_setup(setup), "primitives": setup.model.count}
         session = _Session(request, setup, record, progress)
-        _describe(record, setup)
         session.measure([(REFERENCE, setup.reference), *session.single_changes(knobs)], _IMAGES)
         session.take_times(_TIMES)
         session.measure([(COMBINED, config) for config in session.combinations()], _COMBINED)
         session.take_times(1.0)
-        record.marching = record.marching or _compare_marching(setup)
-        record.find_fronts(session.draws_the_stored_model, session.draws_as_the_reference)
+        record.find_fronts(session.stores_the_reference, session.draws_the_reference)
         record.write(folder / TRADEOFF_FILE)
         write_csv(folder / "tradeoff.csv", record, setup.model.count)
         progress("pictures of the front", 0.0)
-        pictures = session.render_pictures()
+        configs = [setup.parse(point.words) for point in record.points]
+        pictures = render_front_pictures(record, setup.views, lambda i: (setup, setup.renderer(configs[i])))
     write_tradeoff(folder, record.to_dict(), pictures, lambda w: format_render_command(str(request.run_dir), w))
     return record
 
@@ -212,20 +193,16 @@ class _Session:
             if self.request.knobs and name not in self.request.knobs:
                 continue
             if not configs:
-                why = "this process has one core" if name == "threads" else "the run has no other value"
-                self.record.leave_out(name, (), why)
+                self.record.leave_out(name, (), "there is no other value")
             for config in configs:
                 reason = self.setup.unsupported(config)
                 if reason is not None:
                     self.record.leave_out(name, self.setup.overrides(config), reason)
                 elif name != "backend" or self.setup.backend(config).name != base:
                     yield name, config
-        for kind, own in (("density", self.setup.model.density), ("colour", self.setup.model.colour)):
-            if not self.request.knobs and not own.reductions():
-                self.record.leave_out(kind, (), f"{type(own).__name__} has no reductions as it is")
 
     def measure(self, wanted: Sequence[tuple[str, RenderConfig]], part: float) -> None:
-        """Measure images, bytes and memory of the configurations that the record lacks."""
+        """Measure images and bytes of the configurations that the record lacks."""
         for number, (knob, config) in enumerate(wanted):
             words = self.setup.overrides(config)
             if self.record.find(words) is not None:
@@ -260,8 +237,7 @@ class _Session:
 
     def take_times(self, part: float) -> None:
         """Time all points that lack rounds."""
-        repeats = self.request.repeats
-        timed = []
+        repeats, timed = self.request.repeats, list[TimedPoint]()
         for point in self.record.points:
             config = self.setup.parse(point.words)
             rounds = min(repeats, point.rounds or repeats)
@@ -271,20 +247,19 @@ class _Session:
             self.record.write(self.file)
             self.progress(f"round {number} of {count}, {len(timed)} points", number / count)
 
-        if any(len(one.point.ms) < one.rounds for one in timed):
-            time_points(timed, self.setup.views, self._deadline(part), done)
+        time_points(timed, self.setup.views, self._deadline(part), done)
 
-    def draws_the_stored_model(self, point: Point) -> bool:
+    def stores_the_reference(self, point: Point) -> bool:
         """Return whether a point stores the model as the reference does: storage does not change times."""
         return self.setup.parse(point.words).storage == self.setup.reference.storage
 
-    def draws_as_the_reference(self, point: Point) -> bool:
+    def draws_the_reference(self, point: Point) -> bool:
         """Return whether a point draws as the reference does, so that only its bytes differ."""
         config, reference = self.setup.parse(point.words), self.setup.reference
         return config.settings == reference.settings and config.resolution == reference.resolution
 
     def combinations(self) -> list[RenderConfig]:
-        """Return promising combinations of single changes, for time and for bytes."""
+        """Return earlier and new combinations of single changes, for time and for bytes."""
         base, *others = self.record.points
         faster, smaller, known = [], [], []
         for point in others:
@@ -293,50 +268,33 @@ class _Session:
             if point.knob == COMBINED or len(turned) != 1:
                 continue
             knob, loss = turned[0].partition("=")[0], base.quality["psnr"] - point.quality["psnr"]
-            if point.ratios and point.ratio < 1.0 - point.doubt and self.draws_the_stored_model(point):
+            if point.ratios and point.ratio < 1.0 - point.doubt and self.stores_the_reference(point):
                 faster.append(Step(knob, turned[0], -math.log(point.ratio), loss))
-            if point.bytes < base.bytes and self.draws_as_the_reference(point):
+            if point.bytes < base.bytes and self.draws_the_reference(point):
                 smaller.append(Step(knob, turned[0], math.log(base.bytes / point.bytes), loss))
-        ways = combine_steps((faster, smaller), known, _COMBINATIONS)
-        old = [self.setup.parse(point.words) for point in others if point.knob == COMBINED]
-        new = []
-        for way in ways:
+        configs = [self.setup.parse(point.words) for point in others if point.knob == COMBINED]
+        for way in combine_steps((faster, smaller), known, _COMBINATIONS):
             changed = {word.partition("=")[0] for word in way}
             kept = [word for word in base.words if word.partition("=")[0] not in changed]
-            new.append(self.setup.parse([*kept, *way]))
-        return [*old, *new]
-
-    def render_pictures(self) -> dict[int, Picture]:
-        """Return pictures of the fronts' points: of the view with most contrast, and its ground truth under -1."""
-        setup, record = self.setup, self.record
-        view = max(setup.views, key=lambda one: float(setup.channels.display(one.image).var()))
-        pictures = {-1: Picture(setup.display(view.image), None)}
-        for number in dict.fromkeys((0, *record.speed, *record.size)):
-            draw = setup.renderer(setup.parse(record.points[number].words))
-            shown = setup.display(fill_masked(draw(view.view), view))
-            pictures[number] = Picture(shown, None if number == 0 else pictures[0].image)
-        return pictures
+            configs.append(self.setup.parse([*kept, *way]))
+        return configs
 
 
 def _identity(setup: EvaluationSetup) -> dict[str, Any]:
     """Return what must be equal to keep earlier points; JSON-able."""
-    camera, config = setup.views[0].view.camera, setup.config
-    about = describe_machine()
-    used = setup.backend(setup.reference).computing_on(setup.reference.settings)
+    config, conditions = setup.config, describe_conditions(setup.views)
+    conditions["machine"]["device"] = setup.backend(setup.reference).computing_on(setup.reference.settings)
     return {
         "model": hashlib.sha256(setup.file.read_bytes()).hexdigest(),
         "settings": asdict(config.renderer),
         "reference": list(setup.overrides(setup.reference)),
         "scene": {"name": config.scene_name, **{key: str(value) for key, value in config.scene.items()}},
-        "views": [one.view.name for one in setup.views],
-        "image_size": [camera.width, camera.height],
         "lpips": None if setup.lpips is None else setup.lpips.network,
-        "machine": {**about["machine"], "device": used},
-        "versions": {"neuprim": __version__, **about["versions"]},
+        **conditions,
     }
 
 
-def _resume_record(path: Path, identity: dict[str, Any], tell: Callable[[str], None]) -> Record:
+def _resume_record(path: Path, identity: dict[str, Any], tell: Tell) -> Record:
     """Return the earlier record if nothing changed, else an empty one."""
     before = read_record(path)
     if before is None:
@@ -348,37 +306,3 @@ def _resume_record(path: Path, identity: dict[str, Any], tell: Callable[[str], N
     tell(f"{path}: {len(before.points)} points measured already are kept; delete it to measure anew")
     before.left_out.clear()
     return before
-
-
-def _describe(record: Record, setup: EvaluationSetup) -> None:
-    record.facts |= {
-        "task": setup.config.task,
-        "scene": setup.config.scene_name,
-        "dataset": setup.dataset.name,
-        "data_source": setup.dataset.data_source,
-        "primitives": setup.model.count,
-        "backend": setup.backend(setup.reference).name,
-        "shown": setup.channels.shown,
-        "not_measured": {} if setup.lpips is not None else {"lpips": "no weights were given (--lpips FILE)"},
-    }
-    on_cpu = setup.prepare_model(setup.reference).device.type == device.CPU
-    if on_cpu and not Path("/proc/self/clear_refs").exists():
-        record.facts["not_measured"]["peak_bytes"] = MEMORY_UNKNOWN
-
-
-def _compare_marching(setup: EvaluationSetup) -> dict[str, Any]:
-    """Compare the closed form with sampled chords, on a small view in float64."""
-    view, settings = setup.small_view(_CHORDS_SIZE), setup.reference.settings
-    try:
-        rows = compare_quadrature(setup.double.lower(view.camera, view.conditions, settings), view.camera, settings)
-    except NeuprimError as error:
-        return {"not_measured": str(error)}
-    data = [
-        {**{name: getattr(row, name) for name in ("samples", "max_abs", "seconds")}, "psnr": _finite(row.psnr)}
-        for row in rows
-    ]
-    return {"image_size": [view.camera.width, view.camera.height], "chords": rows[0].chords, "rows": data}
-
-
-def _finite(value: float) -> float | None:
-    return None if math.isinf(value) else value

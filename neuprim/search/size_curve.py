@@ -12,21 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-__all__ = [
-    "FIRST_GAIN",
-    "SEED_NOISE",
-    "STEP_RATIO",
-    "Curve",
-    "Forecast",
-    "Proposal",
-    "climb",
-    "fit_line",
-    "forecast_quality",
-    "from_decibels",
-    "propose_size",
-    "to_decibels",
-]
-
 STEP_RATIO, _MIN_RATIO, _MAX_RATIO = 0.75, 0.5, 1.0
 """Gain of a doubling of steps over that of the doubling before: usual, least and largest measured."""
 

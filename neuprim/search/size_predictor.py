@@ -19,8 +19,6 @@ from neuprim.search.size_curve import (
 )
 from neuprim.search.target_record import Attempt, Purpose, SettingChange, TargetRecord
 
-__all__ = ["ALLOWANCE", "MIN_MARGIN", "SizePredictor", "exceeded_limit", "format_forecast"]
-
 ALLOWANCE, MIN_MARGIN = 0.1, 0.05
 """dB above the target that full runs aim at, and need at least: the cost of quantization."""
 
@@ -63,7 +61,7 @@ class SizePredictor:
 
     def _forecast(self, name: str) -> dict[int, Forecast]:
         lengths: dict[int, dict[int, float]] = {}
-        for attempt in self._relevant("size", "knob", "longer"):
+        for attempt in self._relevant("size", "knob"):
             steps = int(attempt.measured("steps"))
             lengths.setdefault(attempt.count, {})[steps] = self._with_current_settings(name, attempt)
         gains = []
@@ -141,7 +139,7 @@ class SizePredictor:
 
     def limit(self) -> int | None:
         """Return the primitives that the limits of bytes and speed allow; None without limits or trials."""
-        trials = [a for a in self._relevant("size", "longer", "full") if a.packed]
+        trials = [a for a in self._relevant("size", "full") if a.packed]
         limits = []
         if self.target.megabytes is not None and trials:
             sizes = [(a.count, a.packed * math.prod(t.size for t in self._changes_since(a))) for a in trials]

@@ -16,13 +16,10 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.task import TaskSpec
 from neuprim.core.used_settings import build_settings
 from neuprim.plugins.returns import call_task_trade
-from neuprim.search.config_values import get_setting, override_settings
 from neuprim.search.size_curve import Curve, Proposal, climb, fit_line, propose_size, to_decibels
 from neuprim.search.size_predictor import ALLOWANCE, MIN_MARGIN, SizePredictor, exceeded_limit, format_forecast
 from neuprim.search.target_record import Attempt, SettingChange, SettingValue, TargetRecord
-from neuprim.search.trial_runner import VIEWS, TrialRunner
-
-__all__ = ["SizeSearch"]
+from neuprim.search.trial_runner import VIEWS, TrialRunner, get_setting, override_settings
 
 _MAX_MARGIN, _NEAR = 0.3, 1.08
 """A full run is good enough within these dB above the target, if at most this factor above the predicted size."""
@@ -360,7 +357,7 @@ class SizeSearch:
 
     def _reserve(self, primitives: int) -> float:
         """Return the seconds for what follows a full run: evaluation, pictures, quantization."""
-        trials = self.record.finished("size", "longer", "full")
+        trials = self.record.finished("size", "full")
         frame = fit_line([(a.count, a.measured("ms_per_frame")) for a in trials], primitives) / 1e3
         held_out = min(VIEWS, len(self.dataset.train) // self.record.hold_out)
         frames = 6 * held_out + 3 * len(self.dataset.test) + 40

@@ -9,12 +9,11 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from neuprim.config import RunConfig, find_run_plugins, task_of
@@ -26,38 +25,34 @@ from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.files import atomic_path, write_text
-from neuprim.core.metrics import psnr, ssim
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.events import Events, Finishing, Preparing, ignore_event
+from neuprim.runs.fit import prepare_training
 from neuprim.runs.ground_truth import render_ground_truth_for_training
 from neuprim.runs.launch.launcher import use_launcher_threads
-from neuprim.runs.measure import measure_quality, render_image
+from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import COMPRESSED, load_dataset, move_to_render_device, read_metrics
 from neuprim.runs.run_directory import lock_directory
-from neuprim.runs.training import train_in_directory
-from neuprim.search.eval_views import eval_views, fill_masked
+from neuprim.runs.training import compile_for_run, train_in_directory
+from neuprim.search.eval_views import eval_views, measure_eval_views
 from neuprim.search.pruning import PruneRequest, prune_run
 from neuprim.search.quantized_finetune import QuantizationSearch, dequantize
-from neuprim.search.size_curve import to_decibels
 from neuprim.search.size_predictor import ALLOWANCE, MIN_MARGIN, SizePredictor, exceeded_limit
 from neuprim.search.size_search import SizeSearch
 from neuprim.search.target_record import TARGET_FILE, Attempt, TargetRecord, read_target_record
 from neuprim.search.training_quality import TrainingQuality
 from neuprim.search.trial_runner import VIEWS, TrialRunner, default_compressed_bytes
 
-__all__ = ["choose_full_run", "choose_hold_out", "run_target"]
-
 _FIRST_SHARE = 0.05
 """Share of the squared error at which the search for coarse numbers begins."""
-
-_NOTABLE = 0.3
-"""dB between test views and held-out views that are reported."""
 
 _MAX_TUNING, _MIN_TUNING = 3, 600
 """Most steps of fine-tuning over those of the full run, and least steps with which pruning is worth it."""
 
 _KEPT = ("model.safetensors", "checkpoint.safetensors", "metrics.jsonl")
+
+_MEASURES = ("psnr", "ssim")
 
 
 def run_target(
@@ -72,7 +67,7 @@ def run_target(
 
     Args:
         config: its primitives are the first size tried, its iterations the most of a run.
-        budget: seconds of search, training and measuring.
+        budget: seconds of search, training and measuring; compiling kernels does not count.
         clock: seconds, monotonic.
         launcher: where trainings run.
 
@@ -84,13 +79,8 @@ def run_target(
     record = _resume_record(config, {**target.given(), "budget": budget})
     if record.achieved:
         return record
-    plugins, begun = find_run_plugins(config), clock()
-    with (
-        lock_directory(config.output_dir, "search"),
-        plugins.attribute_errors(),
-        use_launcher_threads(launcher),
-    ):
-        task = task_of(config)
+    plugins, begun, task, folder = find_run_plugins(config), clock(), task_of(config), config.output_dir
+    with lock_directory(folder, "search"), plugins.attribute_errors(), use_launcher_threads(launcher):
 
         def progress(text: str, fraction: float) -> None:
             events(Preparing(text, fraction))
@@ -99,6 +89,9 @@ def run_target(
         dataset = load_dataset(config, task, progress)
         check_dataset(dataset, task.conditions)
         record.hold_out = choose_hold_out(dataset)
+        loaded = clock()
+        compile_for_run(prepare_training(config, dataset=dataset).trainer, events)
+        begun += clock() - loaded
         runner = TrialRunner(config, dataset, record, events, clock, launcher, begun - record.spent)
         try:
             search = SizeSearch(config, target, dataset, record, runner)
@@ -125,42 +118,31 @@ def _check_config(config: RunConfig) -> None:
         )
     if train.iterations == 0:
         raise ConfigError("train.iterations=0: a run with a target has to train; expected a positive number")
+    decides = "a target decides how many primitives there are"
     if population.strategy == "gradient":
-        raise ConfigError(
-            "train.population.strategy=gradient: it decides how many primitives there are, so that a target cannot; "
-            "expected relocate or fixed"
-        )
+        raise ConfigError(f"train.population.strategy=gradient: {decides}; expected relocate or fixed")
     if population.grow_to is not None:
-        raise ConfigError(
-            f"train.population.grow_to={population.grow_to}: a target decides how many primitives there are; "
-            "expected null"
-        )
+        raise ConfigError(f"train.population.grow_to={population.grow_to}: {decides}; expected null")
 
 
 def _resume_record(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
     """Return the earlier record. Another target or budget keeps the trainings and starts its seconds anew."""
-    own = ("output_dir", "resume", "overrides", "non_default", "made_by")
+    own, folder = ("output_dir", "resume", "overrides", "non_default", "made_by"), config.output_dir
     same: dict[str, Any] = json.loads(json.dumps({k: v for k, v in config.to_dict().items() if k not in own}))
-    before = read_target_record(config.output_dir) if config.resume else None
+    before = read_target_record(folder) if config.resume else None
     if before is None:
-        if (config.output_dir / "config.yaml").exists():
-            raise ConfigError(
-                f"output_dir={config.output_dir}: holds a run without a target; expected a new directory, "
-                "or that of a target run"
-            )
+        if (folder / "config.yaml").exists():
+            expected = "expected a new directory, or that of a target run"
+            raise ConfigError(f"output_dir={folder}: holds a run without a target; {expected}")
         return TargetRecord(asked, same)
     different = [key for key in same if before.same.get(key) != same[key]]
     if different:
-        raise ConfigError(
-            f"{config.output_dir / TARGET_FILE}: begun with another {', '.join(different)}; expected the same "
-            "overrides, or a new output_dir"
-        )
+        expected = "expected the same overrides, or a new output_dir"
+        raise ConfigError(f"{folder / TARGET_FILE}: begun with another {', '.join(different)}; {expected}")
     if before.asked == asked:
         return before
     finished = [a for a in before.attempts if a.outcome is not None]
-    return replace(
-        TargetRecord(asked, same), length=before.length, attempts=finished, before=len(before.finished("full"))
-    )
+    return TargetRecord(asked, same, length=before.length, attempts=finished, before=len(before.finished("full")))
 
 
 # ---------------------------------------------------------------- the result
@@ -168,12 +150,13 @@ def _resume_record(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
 
 @dataclass(frozen=True)
 class _Result:
-    """The result after a stage.
+    """The model after a stage.
 
     Attributes:
         run_dir: the run directory, or that of the pruned model in it.
         held: PSNR and SSIM of held-out views; test: of test views.
         packed: bytes of the smallest file.
+        facts: what the stages add to the record.
     """
 
     run_dir: Path
@@ -211,20 +194,11 @@ def _publish(runner: TrialRunner, predictor: SizePredictor) -> None:
         record.why += [record.out_of_reach] if record.out_of_reach else []
     else:
         record.why.append(f"{target} is met on the views held out")
-    for name, goal in target.quality.items():
-        test, held_value, wanted = (to_decibels(name, v) for v in (result.test[name], result.held[name], goal))
-        if abs(test - held_value) > _NOTABLE:
-            side = "above" if test >= wanted else "below"
-            record.why.append(
-                f"{name} of the test views is {test - held_value:+.2f} dB from that of the views held out, and {side} "
-                "the target; test views decide nothing"
-            )
-    metrics = read_metrics(result.run_dir)
     record.achieved = {
         "run_dir": str(result.run_dir),
         "primitives": result.facts.get("pruned", {}).get("primitives", attempt.count),
         "held_out": result.held,
-        "test_before_storing": {name: metrics[name] for name in ("psnr", "ssim")},
+        "test_before_storing": _test_quality(result.run_dir),
         "test": result.test,
         "fps": 1e3 / attempt.measured("ms_per_frame"),
         "model_bytes": (result.run_dir / "model.safetensors").stat().st_size,
@@ -233,6 +207,11 @@ def _publish(runner: TrialRunner, predictor: SizePredictor) -> None:
         "predicted": attempt.predicted,
         "seconds": runner.spent,
     }
+
+
+def _test_quality(run_dir: Path) -> dict[str, float]:
+    metrics = read_metrics(run_dir)
+    return {name: float(metrics[name]) for name in _MEASURES}
 
 
 def _write_run(runner: TrialRunner, attempt: Attempt) -> _Result:
@@ -249,22 +228,18 @@ def _write_run(runner: TrialRunner, attempt: Attempt) -> _Result:
     write_text(folder / "config.yaml", final.to_yaml())
     dataset = replace(runner.dataset, train=fitted.dataset.train)
     metrics = evaluate_fitted(replace(fitted, config=final, dataset=dataset), folder)
-    names = ("psnr", "ssim")
-    held_out_values = {name: attempt.measured(name) for name in names}
-    metrics = read_metrics(folder)
-    return _Result(folder, held_out_values, {n: float(metrics[n]) for n in names}, int(metrics["model_bytes"]), {})
+    held = {name: attempt.measured(name) for name in _MEASURES}
+    return _Result(folder, held, _test_quality(folder), int(metrics["model_bytes"]), {})
 
 
 def _measure_held_out(runner: TrialRunner, model: Primitives) -> dict[str, float]:
     """Return PSNR and SSIM of the held-out views that evaluated the trainings."""
     dataset, settings = hold_out_views(runner.dataset, runner.record.hold_out), runner.config.renderer
-    views, rows = eval_views(dataset, VIEWS), []
+    views = eval_views(dataset, VIEWS)
     with torch.no_grad():
         model = move_to_render_device(model, settings, views[0].view)
-        for one in views:
-            image = fill_masked(render_image(model, one.view, settings, dataset.background), one)
-            rows.append((psnr(image, one.image, one.mask), ssim(image, one.image)))
-    return dict(zip(("psnr", "ssim"), (float(np.mean(column)) for column in zip(*rows, strict=True)), strict=True))
+        quality = measure_eval_views(model, views, settings, dataset.background)
+    return {"psnr": quality.psnr, "ssim": quality.ssim}
 
 
 def _prune(runner: TrialRunner, predictor: SizePredictor, attempt: Attempt, before: _Result) -> _Result:
@@ -284,18 +259,18 @@ def _prune(runner: TrialRunner, predictor: SizePredictor, attempt: Attempt, befo
         return before
     task = task_of(runner.config)
     model, _ = load_model(made.run_dir / "model.safetensors", task)
-    held_values, metrics = _measure_held_out(runner, model), read_metrics(made.run_dir)
+    held = _measure_held_out(runner, model)
     old, new = (default_compressed_bytes(one, task) for one in (before.run_dir, made.run_dir))
-    kept = predictor.margin(held_values) >= 0 and new < old
+    kept = predictor.margin(held) >= 0 and new < old
     runner.tell(
         f"pruned: {model.count:,} primitives, {new / 1e3:.1f} kB in place of {old / 1e3:.1f}, held out "
-        f"{held_values['psnr']:.2f} dB, ssim {held_values['ssim']:.4f}; {'kept' if kept else 'not worth it'}"
+        f"{held['psnr']:.2f} dB, ssim {held['ssim']:.4f}; {'kept' if kept else 'not worth it'}"
     )
     if not kept:
         return before
-    test = {name: float(metrics[name]) for name in ("psnr", "ssim")}
     pruned = {"primitives": model.count, "bytes_usual": new, "bytes_usual_before": old}
-    return _Result(made.run_dir, held_values, test, int(made.after["bytes"]), {**before.facts, "pruned": pruned})
+    facts = {**before.facts, "pruned": pruned}
+    return _Result(made.run_dir, held, _test_quality(made.run_dir), int(made.after["bytes"]), facts)
 
 
 def _quantize(runner: TrialRunner, predictor: SizePredictor, before: _Result) -> _Result:
@@ -317,10 +292,10 @@ def _quantize(runner: TrialRunner, predictor: SizePredictor, before: _Result) ->
         return file.stat().st_size
 
     def accept(quantizers: Quantizers) -> bool:
-        values: Mapping[str, float] = _measure_held_out(runner, dequantize(search.model, quantizers))
-        return (
-            predictor.margin(values) >= least if target.quality else before.held["psnr"] - values["psnr"] <= ALLOWANCE
-        )
+        held = _measure_held_out(runner, dequantize(search.model, quantizers))
+        if target.quality:
+            return predictor.margin(held) >= least
+        return before.held["psnr"] - held["psnr"] <= ALLOWANCE
 
     if target.quality or target.megabytes is None:
         quantizers, share = search.find_coarsest(accept, _FIRST_SHARE)
@@ -329,8 +304,7 @@ def _quantize(runner: TrialRunner, predictor: SizePredictor, before: _Result) ->
         quantizers, share = search.find_finest(lambda tried: save(tried) <= most, _FIRST_SHARE)
     size = save(quantizers)
     decoded, _ = load_model(file, task)
-    test = dict(
-        zip(("psnr", "ssim"), measure_quality(decoded, task, runner.dataset, runner.config.renderer), strict=True)
-    )
+    quality = measure_quality(decoded, task, runner.dataset, runner.config.renderer)
+    test = dict(zip(_MEASURES, quality, strict=True))
     facts = {**before.facts, "rounding": share, "file": str(file)}
     return replace(before, held=_measure_held_out(runner, decoded), packed=size, test=test, facts=facts)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,13 +10,11 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.files import read_json, write_json
 from neuprim.core.validation import validate
 
-__all__ = ["TARGET_FILE", "Attempt", "Purpose", "SettingChange", "SettingValue", "TargetRecord", "read_target_record"]
-
 TARGET_FILE = "target.json"
 
-FORMAT = 1
+_FORMAT = 1
 
-Purpose = Literal["pace", "size", "knob", "longer", "full"]
+Purpose = Literal["pace", "size", "knob", "full"]
 
 SettingValue = int | float | str
 
@@ -32,9 +29,8 @@ class Attempt:
         primitives, steps: as requested.
         max_seconds: limit of a full run; None for trials.
         predicted: measure -> [value, doubt], predicted before a full run.
-        outcome: of the training, on held-out training views; see :class:`neuprim.search.trials.Outcome`.
+        outcome: fields of :class:`neuprim.search.trials.Outcome`, on held-out training views.
         packed: bytes of the model compressed at the default level.
-        pace: seconds of a step.
         seconds: of all of it, by the search's clock.
     """
 
@@ -46,12 +42,10 @@ class Attempt:
     predicted: dict[str, list[float]] = field(default_factory=dict)
     outcome: dict[str, Any] | None = None
     packed: int = 0
-    pace: float | None = None
     seconds: float = 0.0
 
     @property
     def folder(self) -> str:
-        """Name of its folder."""
         changes = [f"{key.rpartition('.')[2]}-{value}" for key, value in sorted(self.words.items())]
         limit = [] if self.max_seconds is None else [f"{self.max_seconds:g}s"]
         first = f"{'full-' if self.purpose == 'full' else ''}{self.primitives}"
@@ -146,7 +140,7 @@ class TargetRecord:
 
     def write(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / TARGET_FILE, {"format": FORMAT, **dataclasses.asdict(self)})
+        write_json(folder / TARGET_FILE, {"format": _FORMAT, **asdict(self)})
 
 
 def read_target_record(folder: Path) -> TargetRecord | None:
@@ -160,14 +154,16 @@ def read_target_record(folder: Path) -> TargetRecord | None:
     if data is None:
         return None
     try:
-        if data["format"] != FORMAT:
-            raise DataError(f"{file}: format {data['format']!r}; this neuprim reads {FORMAT}; delete it to search anew")
-        record = validate(TargetRecord, {f.name: data[f.name] for f in dataclasses.fields(TargetRecord)})
+        if data["format"] != _FORMAT:
+            raise DataError(
+                f"{file}: format {data['format']!r}; this neuprim reads {_FORMAT}; delete it to search anew"
+            )
+        record = validate(TargetRecord, {f.name: data[f.name] for f in fields(TargetRecord)})
         for attempt in record.attempts:
             if not (attempt.primitives > 0 and attempt.steps > 0 and Path(attempt.folder).name == attempt.folder):
                 raise ValueError("attempts: expected positive primitives and steps, and settings that name a folder")
             if attempt.outcome is not None:
-                [attempt.measured(name) for name in ("psnr", "ssim", "primitives", "bytes", "ms_per_frame")]
+                [attempt.measured(name) for name in ("psnr", "ssim", "primitives", "bytes", "pace", "ms_per_frame")]
         return record
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError, ConfigError) as error:
         what = f"{type(error).__name__}: {error}"

@@ -15,8 +15,6 @@ from neuprim.core.render import RenderSettings
 from neuprim.core.volumes.points import values_at
 from neuprim.runs.measure import render_image
 
-__all__ = ["TrainingQuality"]
-
 _VIEWS, _QUICK_VIEWS = 24, 8
 """Views that decide, and how many of them intermediate evaluations use."""
 

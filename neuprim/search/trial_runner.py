@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, is_dataclass, replace
+from dataclasses import fields as fields_of
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from neuprim.config import RunConfig, task_of
 from neuprim.config.command_settings import LauncherSettings
@@ -17,16 +16,11 @@ from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.settings import PopulationSettings
-from neuprim.runs.events import Event, Events, Note, Preparing, Step
+from neuprim.runs.events import Events, Note, Preparing
 from neuprim.runs.launch.executors import count_parallel_jobs
-from neuprim.runs.launch.jobs import ENDED, JobStatus
-from neuprim.runs.training import COMPILING
-from neuprim.search.config_values import override_settings
 from neuprim.search.size_curve import fit_line
 from neuprim.search.target_record import Attempt, TargetRecord
-from neuprim.search.trials import Outcome, Trial, TrialFailed, launch_jobs, run_trial, run_trial_job, trial_job
-
-__all__ = ["TARGET_FOLDER", "VIEWS", "StepClock", "TrialRunner", "default_compressed_bytes"]
+from neuprim.search.trials import Outcome, Trial, TrialFailed, launch_trials, run_trial
 
 TARGET_FOLDER = "target"
 """Folder of the trainings, in the run directory."""
@@ -40,42 +34,7 @@ _PARALLEL = 2
 _MIN_EVERY = 5
 """Least steps between two interventions into the population, which need statistics."""
 
-_MAX_PSNR = 200.0
-"""dB that stand for equal images, as JSON has no infinity."""
-
-_FEW_STEPS = 64
-"""With fewer steps, a single slow one would spoil the mean."""
-
-
-@dataclass
-class StepClock:
-    """Pass events on, and measure the time of a step and of compiling kernels."""
-
-    clock: Callable[[], float]
-    events: Events
-    compiling: float = 0.0
-    _steps: list[float] = field(default_factory=list)
-    _last: float | None = None
-    _compiling_since: float | None = None
-
-    def __call__(self, event: Event) -> None:
-        self.events(event)
-        now = self.clock()
-        if isinstance(event, Preparing) and event.text == COMPILING and self._compiling_since is None:
-            self._compiling_since = now
-        if isinstance(event, Step):
-            if self._compiling_since is not None:
-                self.compiling, self._compiling_since = self.compiling + now - self._compiling_since, None
-            if self._last is not None:
-                self._steps.append(now - self._last)
-            self._last = now
-
-    @property
-    def pace(self) -> float | None:
-        """Seconds of a step: the mean, or the median of few; None of fewer than two."""
-        if not self._steps:
-            return None
-        return max((statistics.median if len(self._steps) < _FEW_STEPS else statistics.mean)(self._steps), 1e-9)
+_OPTIONS = "task.options."
 
 
 @dataclass
@@ -83,10 +42,8 @@ class TrialRunner:
     """Train what a search requests, unless its record has the outcome.
 
     Attributes:
-        config: where the search starts.
-        dataset: the whole scene.
-        clock: seconds, monotonic.
-        begun: clock at the start of the budget.
+        config: where the search starts; dataset: the whole scene.
+        clock: seconds, monotonic; begun: its value at the start of the budget.
     """
 
     config: RunConfig
@@ -156,48 +113,38 @@ class TrialRunner:
                 self._train(attempt)
         return attempts
 
+    def _trial(self, attempt: Attempt) -> Trial:
+        return Trial(self.configure(attempt), self.record.hold_out, VIEWS)
+
     def _train(self, attempt: Attempt) -> None:
-        watch, start = StepClock(self.clock, self.events), self.clock()
+        start = self.clock()
         try:
-            outcome = run_trial(self._trial(attempt), self.dataset, watch)
+            outcome = run_trial(self._trial(attempt), self.dataset, self.events)
         finally:
-            self.begun += watch.compiling  # compiling happens once per installation
-            attempt.seconds += self.clock() - start - watch.compiling
-            attempt.pace = watch.pace or attempt.pace
+            attempt.seconds += self.clock() - start
             self.write()
         self._finish(attempt, outcome)
 
-    def _launch(self, attempts: Sequence[Attempt]) -> None:
-        jobs = [trial_job(attempt.folder, self._trial(attempt), run_attempt_job) for attempt in attempts]
-        threads = count_parallel_jobs(self.launcher, _PARALLEL)[
-            1
-        ]  # the same for one or several, so that step times compare
-        done = [0.0] * len(jobs)
-
-        def hear(number: int, status: JobStatus) -> None:
-            done[number] = 1.0 if status.state in ENDED else status.progress
-            self.events(Preparing(f"{len(jobs)} trainings at work", sum(done) / len(done)))
-
-        folder = self.config.output_dir / TARGET_FOLDER
-        results = launch_jobs(jobs, replace(self.launcher, threads=threads), folder, hear)
-        self.begun += max((result.value.compiling for result in results if result.value is not None), default=0.0)
+    def _launch(self, attempts: list[Attempt]) -> None:
+        # The same number of threads for one or several, so that step times compare.
+        settings = replace(self.launcher, threads=count_parallel_jobs(self.launcher, _PARALLEL)[1])
+        text = f"{len(attempts)} trainings at work"
+        results = launch_trials(
+            [self._trial(attempt) for attempt in attempts],
+            settings,
+            self.config.output_dir / TARGET_FOLDER,
+            lambda fraction: self.events(Preparing(text, fraction)),
+        )
         for attempt, result in zip(attempts, results, strict=True):
-            if result.value is not None:
-                attempt.seconds += result.value.seconds
-                attempt.pace = result.value.pace or attempt.pace
-                self._finish(attempt, result.value.outcome)
+            if result.state != "failed":
+                attempt.seconds += result.seconds
+                self._finish(attempt, result.value)
         for result in results:
             if result.state == "failed":
                 raise TrialFailed(result.line)
 
-    def _trial(self, attempt: Attempt) -> Trial:
-        return Trial(self.configure(attempt), self.record.hold_out, VIEWS)
-
     def _finish(self, attempt: Attempt, outcome: Outcome) -> None:
-        values = dataclasses.asdict(outcome)
-        del values["curve"]
-        attempt.outcome = {**values, "psnr": min(outcome.psnr, _MAX_PSNR)}
-        attempt.pace = attempt.pace or outcome.seconds / max(outcome.steps, 1)
+        attempt.outcome = asdict(outcome)
         if attempt.purpose != "pace":
             config = self.configure(attempt)
             attempt.packed = default_compressed_bytes(config.output_dir, task_of(config))
@@ -207,36 +154,19 @@ class TrialRunner:
 
     def pace(self, primitives: float) -> float:
         """Return the expected seconds of a step."""
-        trained = self.record.finished("size", "longer", "full")
         # The few steps of the first attempt are the poorest estimate.
-        known = {a.count: a.pace for a in trained or self.record.finished("pace") if a.pace is not None}
-        return fit_line(list(known.items()), primitives)
+        trained = self.record.finished("size", "full") or self.record.finished("pace")
+        return fit_line(list({a.count: a.measured("pace") for a in trained}.items()), primitives)
 
     def overhead(self) -> float:
         """Return the seconds of a trial beside its steps: initialization, evaluation."""
-        finished = self.record.finished("size", "longer") or self.record.finished("pace")
-        return max((a.seconds - (a.pace or 0.0) * a.steps for a in finished[-3:]), default=0.0)
+        finished = self.record.finished("size") or self.record.finished("pace")
+        return max((a.seconds - a.measured("pace") * a.steps for a in finished[-3:]), default=0.0)
 
     def fits(self, primitives: int, steps: float, share: float) -> bool:
         """Return whether a trial ends within a share of the budget."""
         seconds = self.pace(primitives) * steps + max(self.overhead(), 0.0)
         return self.spent + seconds <= share * self.record.asked["budget"]
-
-
-class LaunchedOutcome(NamedTuple):
-    """Result of a job: the outcome, seconds of a step, of compiling, and of everything else."""
-
-    outcome: Outcome
-    pace: float | None
-    compiling: float
-    seconds: float
-
-
-def run_attempt_job(data: Mapping[str, Any], attempt: int, events: Events) -> LaunchedOutcome:
-    """Run the training of a job, and time it."""
-    start, watch = time.monotonic(), StepClock(time.monotonic, events)
-    outcome = run_trial_job(data, attempt, watch)
-    return LaunchedOutcome(outcome, watch.pace, watch.compiling, time.monotonic() - start - watch.compiling)
 
 
 def default_compressed_bytes(folder: Path, task: TaskSpec) -> int:
@@ -247,3 +177,51 @@ def default_compressed_bytes(folder: Path, task: TaskSpec) -> int:
     size = file.stat().st_size
     file.unlink()
     return size
+
+
+# ---------------------------------------------------------------- settings by dotted names
+
+
+def get_setting(config: RunConfig, key: str) -> Any:
+    """Return a setting below ``model``, ``train`` or ``task.options``; None where the configuration lacks it."""
+    group, path = _locate(key)
+    node = getattr(config, group)
+    for part in path:
+        node = node.get(part) if isinstance(node, Mapping) else getattr(node, part, None)
+    return node
+
+
+def override_settings(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
+    """Return the configuration with other settings, and with its record of what is not a default."""
+    for key, value in values.items():
+        non_default = dict(config.non_default)
+        for name, before, after in _flatten(key, get_setting(config, key), value):
+            default = non_default.pop(name, (before, before))[0]
+            if after != default:
+                non_default[name] = (default, after)
+        group, path = _locate(key)
+        changed = _replace_nested(getattr(config, group), path, value)
+        config = replace(config, **{group: changed}, non_default=non_default)
+    return config
+
+
+def _locate(key: str) -> tuple[str, list[str]]:
+    """Return the attribute of a configuration, and the path of a setting below it."""
+    if key.startswith(_OPTIONS):
+        return "options", key.removeprefix(_OPTIONS).split(".")
+    group, *path = key.split(".")
+    return group, path
+
+
+def _replace_nested(node: Any, path: list[str], value: Any) -> Any:
+    first, *rest = path
+    if isinstance(node, Mapping):
+        return {**node, first: _replace_nested(node.get(first), rest, value) if rest else value}
+    return replace(node, **{first: _replace_nested(getattr(node, first), rest, value) if rest else value})
+
+
+def _flatten(key: str, before: Any, after: Any) -> list[tuple[str, Any, Any]]:
+    """Return (dotted name, value before, value after) of a setting, or of every setting of a group."""
+    if not is_dataclass(before):
+        return [(key, before, after)]
+    return [(f"{key}.{f.name}", getattr(before, f.name), getattr(after, f.name)) for f in fields_of(before)]

@@ -9,47 +9,43 @@ from __future__ import annotations
 
 import json
 import statistics
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from neuprim.config import RunConfig, find_run_plugins, made_now, task_of
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.data import Dataset
-from neuprim.core.errors import DataError, NeuprimError
+from neuprim.core.errors import ConfigError, DataError, NeuprimError
 from neuprim.core.io.files import read_json, write_json
-from neuprim.core.metrics import from_json, psnr, ssim, to_json
-from neuprim.runs.curve import read_curve
-from neuprim.runs.events import Events, Finishing, Note, Preparing, ignore_event
-from neuprim.runs.fit import Fitted
+from neuprim.core.validation import validate
+from neuprim.runs.events import Event, Events, Finishing, Note, Preparing, Step, ignore_event
 from neuprim.runs.launch.jobs import ENDED, Job, JobStatus, Result
-from neuprim.runs.launch.launcher import LAUNCH_FOLDER, OnStatus, launch
-from neuprim.runs.measure import render_image
+from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch
 from neuprim.runs.open import load_dataset
 from neuprim.runs.run_directory import lock_directory
 from neuprim.runs.training import train_in_directory
-from neuprim.search.eval_views import eval_views, fill_masked
-
-__all__ = ["TRIAL_FILE", "Outcome", "Trial", "TrialFailed", "launch_jobs", "launch_trials", "read_outcome", "run_trial"]
+from neuprim.search.eval_views import eval_views, measure_eval_views
 
 TRIAL_FILE = "trial.json"
 
-FORMAT = 1
+_FORMAT = 1
 
 _UNTRAINED = ("output_dir", "resume", "overrides", "non_default")
 """Parts of a configuration that do not change the training."""
 
+_FEW_STEPS = 64
+"""With fewer steps, a single slow one would spoil the mean of their times."""
+
+Progress = Callable[[float], None]
+
 
 @dataclass(frozen=True)
 class Trial:
-    """A training to make.
+    """A training to make, in the ``output_dir`` of its configuration.
 
     Attributes:
-        config: its ``output_dir`` is the trial's folder.
         hold_out: n > 1: evaluate on every n-th training view, which is not trained on; 0: on the test views.
         views: evaluate at most this many views, evenly spread.
     """
@@ -65,11 +61,9 @@ class Outcome:
 
     Attributes:
         psnr, ssim: means over the evaluation views, in the data set's colour space.
-        parameters_per_primitive: numbers of a primitive.
         bytes: size of ``model.safetensors``.
-        steps, seconds: of training.
+        seconds: of training; pace: of a step.
         ms_per_frame: median over the evaluation views.
-        curve: (used fraction of the budget, PSNR of a few views), a pair every ``train.eval_every``.
     """
 
     psnr: float
@@ -79,30 +73,31 @@ class Outcome:
     bytes: int
     steps: int
     seconds: float
+    pace: float
     ms_per_frame: float
-    curve: tuple[tuple[float, float], ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {**asdict(self), **to_json("psnr", self.psnr), "curve": [list(point) for point in self.curve]}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Outcome:
-        """Invert :meth:`to_dict`; raises KeyError, TypeError or ValueError for anything else."""
-        quality = from_json(data, "psnr")
-        if quality is None:
-            raise ValueError("psnr is not a number")
-        counts = {name: int(data[name]) for name in ("primitives", "parameters_per_primitive", "bytes", "steps")}
-        numbers = {name: float(data[name]) for name in ("ssim", "seconds", "ms_per_frame")}
-        curve = tuple((float(progress), float(value)) for progress, value in data["curve"])
-        return cls(psnr=quality, curve=curve, **counts, **numbers)  # type: ignore[arg-type]
 
 
 class TrialFailed(NeuprimError):
     """A launched trial failed; the text says why."""
 
 
-# ---------------------------------------------------------------- one trial
+class _StepTimes:
+    """Pass events on, and collect the times of training steps."""
+
+    def __init__(self, events: Events) -> None:
+        self.events, self._ends = events, list[float]()
+
+    def __call__(self, event: Event) -> None:
+        self.events(event)
+        if isinstance(event, Step):
+            self._ends.append(event.report.seconds)
+
+    def pace(self, usual: float) -> float:
+        """Return the seconds of a step: the mean, or the median of few; ``usual`` where none was made."""
+        steps = [b - a for a, b in zip(self._ends, self._ends[1:], strict=False)]
+        if not steps:
+            return usual
+        return max((statistics.median if len(steps) < _FEW_STEPS else statistics.fmean)(steps), 1e-9)
 
 
 def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ignore_event) -> Outcome:
@@ -117,31 +112,45 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
         DataError: the folder holds another run, or a damaged ``trial.json``.
         NeuprimError: as :func:`neuprim.runs.run.run`.
     """
-    folder = trial.config.output_dir
+    config, folder = trial.config, trial.config.output_dir
+    file = folder / TRIAL_FILE
     with lock_directory(folder, "trial"):
-        asked, before = _request(trial), _read_record(folder / TRIAL_FILE)
+        asked, before = _request(trial), _read_record(file)
         if before is None and (folder / "config.yaml").exists():
             raise DataError(f"{folder}: holds a run and no {TRIAL_FILE}; expected a new folder, or that of a trial")
-        same = before is not None and before["asked"] == asked
-        if before is not None and not same:
-            changed = ", ".join(sorted(_changed_keys(before["asked"], asked)))
-            events(Note(f"{folder}: made with another {changed}; trained anew"))
+        changed = set() if before is None else _changed_keys(before["asked"], asked)
+        if changed:
+            events(Note(f"{folder}: made with another {', '.join(sorted(changed))}; trained anew"))
             (folder / "checkpoint.safetensors").unlink(missing_ok=True)
+        same = before is not None and not changed
         complete = all((folder / name).exists() for name in ("config.yaml", "model.safetensors"))
         if before is not None and same and complete and before["outcome"] and before["views"] == trial.views:
-            return _parse_outcome(folder / TRIAL_FILE, before["outcome"])
-        record = {"format": FORMAT, "asked": asked, "views": trial.views, "outcome": None}
-        write_json(folder / TRIAL_FILE, record)
-        plugins = find_run_plugins(trial.config)
+            return _parse_outcome(file, before["outcome"])
+        record = {"format": _FORMAT, "asked": asked, "views": trial.views, "outcome": None}
+        write_json(file, record)
+        plugins = find_run_plugins(config)
         with plugins.attribute_errors():
-            fitted, interrupted = train_in_directory(
-                replace(trial.config, resume=same), events, dataset, trial.hold_out
-            )
+            times = _StepTimes(events)
+            fitted, interrupted = train_in_directory(replace(config, resume=same), times, dataset, trial.hold_out)
             if interrupted:
                 raise KeyboardInterrupt
             events(Finishing("measuring evaluation views"))
-            outcome = _evaluate(fitted, trial.views)
-        write_json(folder / TRIAL_FILE, {**record, "outcome": outcome.to_dict()})
+            fitted.unlock()
+            views = eval_views(fitted.dataset, trial.views)
+            quality = measure_eval_views(fitted.model, views, config.renderer, fitted.dataset.background)
+        steps, seconds = fitted.trainer.step, fitted.trainer.elapsed
+        outcome = Outcome(
+            psnr=quality.psnr,
+            ssim=quality.ssim,
+            primitives=fitted.model.count,
+            parameters_per_primitive=fitted.model.parameters_per_primitive,
+            bytes=(folder / "model.safetensors").stat().st_size,
+            steps=steps,
+            seconds=seconds,
+            pace=times.pace(seconds / max(steps, 1)),
+            ms_per_frame=quality.ms_per_frame,
+        )
+        write_json(file, {**record, "outcome": asdict(outcome)})
         return outcome
 
 
@@ -152,35 +161,7 @@ def read_outcome(folder: Path) -> Outcome | None:
         DataError: ``trial.json`` is damaged.
     """
     record = _read_record(folder / TRIAL_FILE)
-    return (
-        None if record is None or record["outcome"] is None else _parse_outcome(folder / TRIAL_FILE, record["outcome"])
-    )
-
-
-def _evaluate(fitted: Fitted, views: int) -> Outcome:
-    fitted.unlock()
-    model, dataset, config = fitted.model, fitted.dataset, fitted.config
-    rows, seconds = [], []
-    chosen = eval_views(dataset, views)
-    render_image(model, chosen[0].view, config.renderer, dataset.background)  # the first frame loads and compiles
-    for one in chosen:
-        start = time.perf_counter()
-        image = render_image(model, one.view, config.renderer, dataset.background)
-        seconds.append(time.perf_counter() - start)
-        image = fill_masked(image, one)
-        rows.append((psnr(image, one.image, one.mask), ssim(image, one.image)))
-    mean_psnr, mean_ssim = (float(np.mean(column)) for column in zip(*rows, strict=True))
-    return Outcome(
-        psnr=mean_psnr,
-        ssim=mean_ssim,
-        primitives=model.count,
-        parameters_per_primitive=model.parameters_per_primitive,
-        bytes=(config.output_dir / "model.safetensors").stat().st_size,
-        steps=fitted.trainer.step,
-        seconds=fitted.trainer.elapsed,
-        ms_per_frame=1e3 * statistics.median(seconds),
-        curve=read_curve(config.output_dir / "metrics.jsonl", config.train),
-    )
+    return None if record is None or not record["outcome"] else _parse_outcome(folder / TRIAL_FILE, record["outcome"])
 
 
 def _request(trial: Trial) -> dict[str, Any]:
@@ -208,30 +189,23 @@ def _read_record(file: Path) -> dict[str, Any] | None:
         return None
     if not isinstance(data, dict) or not isinstance(data.get("asked"), dict) or not {"outcome", "views"} <= data.keys():
         raise DataError(f"{file}: not the record of a trial; delete its folder to train anew")
-    if data.get("format") != FORMAT:
-        expected = f"this neuprim reads {FORMAT}; delete its folder to train anew"
+    if data.get("format") != _FORMAT:
+        expected = f"this neuprim reads {_FORMAT}; delete its folder to train anew"
         raise DataError(f"{file}: format {data.get('format')!r}; {expected}")
     return data
 
 
-def _parse_outcome(file: Path, data: Any) -> Outcome:
+def _parse_outcome(file: Path, data: object) -> Outcome:
     try:
-        return Outcome.from_dict(data)
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        what = f"{type(error).__name__}: {error}"
-        raise DataError(f"{file}: not the record of a trial ({what}); delete its folder to train anew") from error
+        return validate(Outcome, data, "outcome")
+    except ConfigError as error:
+        raise DataError(f"{file}: not the record of a trial ({error}); delete its folder to train anew") from error
 
 
 # ---------------------------------------------------------------- trials as jobs
 
 _datasets: dict[str, Dataset] = {}
 """Scene of this worker's last trial; all trials of a search have one scene."""
-
-
-def trial_job(name: str, trial: Trial, function: Callable[..., Any]) -> Job:
-    """Return the job that calls a module-level ``function(data, attempt, events)`` with a trial as plain values."""
-    data = {"config": trial.config.to_dict(), "hold_out": trial.hold_out, "views": trial.views}
-    return Job(name, f"{function.__module__}:{function.__name__}", data)
 
 
 def run_trial_job(data: Mapping[str, Any], attempt: int, events: Events) -> Outcome:
@@ -244,51 +218,34 @@ def run_trial_job(data: Mapping[str, Any], attempt: int, events: Events) -> Outc
     return run_trial(Trial(config, data["hold_out"], data["views"]), _datasets[key], events)
 
 
-def launch_jobs(jobs: Sequence[Job], settings: LauncherSettings, folder: Path, hear: OnStatus) -> list[Result]:
-    """Run jobs of a search in ``folder``; returns results in their order.
+def launch_trials(
+    trials: Sequence[Trial], settings: LauncherSettings, folder: Path, progress: Progress
+) -> list[Result]:
+    """Run trials as jobs in the folder of a search; returns results with outcomes, or why one failed, in their order.
+
+    Args:
+        progress: called with the finished fraction.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C; finished work is kept.
         RuntimeError: a bug in a job, with its traceback.
     """
-    results = [
-        r for r in launch(jobs, settings, folder / LAUNCH_FOLDER, hear) if r is not None and r.state != "interrupted"
-    ]
-    for result in results:
-        if result.trace:
-            raise RuntimeError(f"in a worker of launcher={settings.name}:\n{result.trace}")
-    if len(results) < len(jobs):
-        raise KeyboardInterrupt
-    return results
-
-
-def launch_trials(
-    groups: Sequence[Sequence[Trial]], settings: LauncherSettings, folder: Path, progress: Callable[[float], None]
-) -> list[list[Outcome] | NeuprimError]:
-    """Launch groups of trials together; returns the outcomes of each group, or why one of it failed.
-
-    Args:
-        folder: of the search.
-        progress: called with the finished fraction.
-
-    Raises:
-        KeyboardInterrupt, RuntimeError: as :func:`launch_jobs`.
-    """
-    jobs = [
-        trial_job(f"{group}-{number}", trial, run_trial_job)
-        for group, trials in enumerate(groups)
-        for number, trial in enumerate(trials)
-    ]
+    call = f"{run_trial_job.__module__}:{run_trial_job.__name__}"
+    jobs = []
+    for number, one in enumerate(trials):
+        data = {"config": one.config.to_dict(), "hold_out": one.hold_out, "views": one.views}
+        jobs.append(Job(f"{number}-{one.config.output_dir.name}", call, data))
     done = [0.0] * len(jobs)
 
     def hear(number: int, status: JobStatus) -> None:
         done[number] = 1.0 if status.state in ENDED else status.progress
         progress(sum(done) / len(done))
 
-    results = iter(launch_jobs(jobs, settings, folder, hear))
-    outcomes: list[list[Outcome] | NeuprimError] = []
-    for trials in groups:
-        own = [next(results) for _ in trials]
-        failed = next((result for result in own if result.state == "failed"), None)
-        outcomes.append([result.value for result in own] if failed is None else TrialFailed(failed.line))
-    return outcomes
+    results = [result for result in launch(jobs, settings, folder / LAUNCH_FOLDER, hear) if result is not None]
+    results = [result for result in results if result.state != "interrupted"]
+    for result in results:
+        if result.trace:
+            raise RuntimeError(f"in a worker of launcher={settings.name}:\n{result.trace}")
+    if len(results) < len(jobs):
+        raise KeyboardInterrupt
+    return results

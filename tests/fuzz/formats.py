@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -370,21 +370,19 @@ def _records(folder: Path) -> None:
         folder / "target"
     )
     points = [
-        Point("reference", (), {"psnr": 30.0}, 100, None, [1.0, 1.1, 1.2], [1.0] * 3),
-        Point("sort", ("renderer.sort=entry",), {"psnr": 29.0}, 100, 5, [0.5], [0.5]),
+        Point("reference", (), {"psnr": 30.0}, 100, [1.0, 1.1, 1.2], [1.0] * 3),
+        Point("sort", ("renderer.sort=entry",), {"psnr": 29.0}, 100, [0.5], [0.5]),
     ]
     (folder / "run/tradeoff").mkdir()
     Record({"views": 1}, {}, points, [LeftOut("a", ("b=1",), "why")], [0, 1], [0]).write(
         folder / "run/tradeoff/tradeoff.json"
     )
-    outcome = Outcome(30.0, 0.9, 40, 12, 1000, 50, 1.5, 10.0, ((0.5, 20.0),))
-    (folder / "trial.json").write_text(json.dumps({"format": 1, "asked": {}, "views": 3, "outcome": outcome.to_dict()}))
+    outcome = Outcome(30.0, 0.9, 40, 12, 1000, 50, 1.5, 0.03, 10.0)
+    (folder / "trial.json").write_text(json.dumps({"format": 1, "asked": {}, "views": 3, "outcome": asdict(outcome)}))
     write_status(folder / "status.json", JobStatus())
 
 
 def _read_records(folder: Path) -> None:
-    from neuprim.core.train.settings import TrainSettings
-    from neuprim.runs import curve
     from neuprim.runs.chunks import read_chunk_record as read_chunks
     from neuprim.runs.launch.jobs import read_status
     from neuprim.runs.sweep import read_sweep, read_sweep_runs, write_csv
@@ -395,7 +393,6 @@ def _read_records(folder: Path) -> None:
     from neuprim.viewer.quality import read_front
 
     _read_run(folder)
-    curve.read_curve(folder / "run/metrics.jsonl", TrainSettings())
     if (sweep := read_sweep(folder)) is not None:
         write_csv(folder / "out.csv", read_sweep_runs(folder, sweep))
         sweep.write(folder / "again")

@@ -16,16 +16,7 @@ from tests.browsers import browser
 
 def run(folder: Path, psnr: float, size: int, **more: object) -> None:
     (folder / "renders").mkdir(parents=True)
-    metrics = {
-        "task": "static",
-        "scene": "solids",
-        "psnr": psnr,
-        "ssim": 0.9,
-        "model_bytes": size,
-        "iterations": 10,
-        "seed": 1,
-        **more,
-    }
+    metrics = {"task": "static", "scene": "solids", "psnr": psnr, "ssim": 0.9, "model_bytes": size, "seed": 1, **more}
     (folder / "metrics.json").write_text(json.dumps(metrics))
     lines = [{"step": s, "seconds": s / 10, "eval_psnr": psnr - 10 + s} for s in (5, 10)]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -39,17 +30,8 @@ def sweep(folder: Path) -> Path:
     runs = []
     for name, (psnr, size) in numbers.items():
         run(folder / name, psnr, size, lpips=None if name == "small" else 0.1 + psnr / 100)
-        runs.append(
-            SweepRun(
-                name,
-                {"model.primitives": str(size)},
-                "done",
-                "",
-                2.0,
-                2 if name == "small" else 1,
-                read_run(folder / name),
-            )
-        )
+        attempts, swept = 2 if name == "small" else 1, {"model.primitives": str(size)}
+        runs.append(SweepRun(name, swept, "done", "", 2.0, attempts, read_run(folder / name)))
     runs.append(SweepRun("gone", {"model.primitives": "7"}, "failed", "no <images>", 0.1, 1, None))
     return write_sweep_page(folder, runs, ["task=static", "model.primitives=1,2"])
 
@@ -76,13 +58,7 @@ def test_it_stands_without_scripts_in_the_order_of_psnr(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        *(
-            ("psnr", "more"),
-            ("psnr_mask", "more"),
-            ("lpips_3dgs", "less"),
-            ("model_bytes", "less"),
-            ("render_fps", "more"),
-        ),
+        *(("psnr", "more"), ("psnr_mask", "more"), ("lpips_3dgs", "less"), ("render_fps", "more")),
         *(("parameters_per_primitive", None), ("iterations", None), ("glow", None), ("psnrx", None)),
     ],
 )

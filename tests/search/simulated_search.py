@@ -23,7 +23,15 @@ __all__ = ["Curves", "SimulatedRunner", "attempt", "from_grid", "interpolate", "
 
 def attempt(count: int, steps: int, psnr: float, purpose: Any = "size", **more: Any) -> Attempt:
     """Return a finished training that nobody made."""
-    outcome = {"psnr": psnr, "ssim": 0.9, "primitives": count, "steps": steps, "bytes": 1, "ms_per_frame": 10.0}
+    outcome = {
+        "psnr": psnr,
+        "ssim": 0.9,
+        "primitives": count,
+        "steps": steps,
+        "bytes": 1,
+        "pace": 0.01,
+        "ms_per_frame": 10.0,
+    }
     words = more.pop("words", {})
     return Attempt(purpose, words, count, steps, outcome={**outcome, **more}, packed=1000 + 20 * count)
 
@@ -93,10 +101,10 @@ class SimulatedRunner(TrialRunner):
         noise = 0.1 * math.sin(12.9898 * attempt.primitives + 78.233 * (self.seed + 1) + steps)
         psnr = interpolate(curves.psnr, place) - missing + noise
         pace = 1e-3 + 1e-6 * attempt.primitives
-        attempt.pace, attempt.seconds = pace, pace * steps + 0.1
+        attempt.seconds = pace * steps + 0.1
         self.now += attempt.seconds
         counts = {"primitives": attempt.primitives, "steps": steps, "bytes": 1, "ms_per_frame": 1.0}
-        attempt.outcome = {"psnr": psnr, "ssim": 0.9, **counts}
+        attempt.outcome = {"psnr": psnr, "ssim": 0.9, "pace": pace, **counts}
         attempt.packed = round(math.exp(interpolate(curves.log_bytes, place)))
 
 

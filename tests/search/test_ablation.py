@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,10 @@ from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError, NonFiniteError
 from neuprim.runs.events import Events
 from neuprim.runs.fit import fit
+from neuprim.runs.launch.jobs import Result
 from neuprim.runs.open import load_run
-from neuprim.search import ablation, ablation_plan
-from neuprim.search.ablation import run_ablation
-from neuprim.search.ablation_folder import TRIALS, AblationRequest
+from neuprim.search import ablation, ablation_plan, trials
+from neuprim.search.ablation import TRIALS, AblationRequest, run_ablation
 from neuprim.search.ablation_plan import CENTRE, Plan, Variant, plan_lengths
 from neuprim.search.points import COMBINED, Record, read_record
 from neuprim.search.trials import Outcome, Trial, read_outcome, run_trial
@@ -111,52 +112,38 @@ def test_failures_and_equal_models_are_left_out(scene: Path, tmp_path: Path, mon
             raise NonFiniteError("gradient of W1 is not finite")
         return run_trial(trial, dataset, events)
 
-    monkeypatch.setattr(ablation, "run_trial", failing)
-    _, record = run_ablation(request(scene, tmp_path / "set", knobs=("model.neurons",)))
-    assert names(record) == {CENTRE, "neurons=0", "neurons=2"}
-    assert [(one.words, one.reason) for one in record.left_out] == [
-        (("model.neurons=8",), "gradient of W1 is not finite")
-    ]
-    _, record = run_ablation(request(scene, tmp_path / "paper", "preset=paper", knobs=("model.density.edge",)))
-    assert (("model.density.edge=0",), "the same model as the centre") in [(o.words, o.reason) for o in record.left_out]
+    knob = "model.neurons"
+    offered = [Variant(knob, (f"{knob}={n}",)) for n in (2, 4, 8)]
+    monkeypatch.setattr(ablation, "list_variants", lambda *args: {knob: offered})
+    monkeypatch.setattr(trials, "run_trial", failing)
+    _, record = run_ablation(request(scene, tmp_path / "set", knobs=(knob,)))
+    assert names(record) == {CENTRE, "neurons=2"}
+    assert {one.words[0]: one.reason for one in record.left_out} == {
+        "model.neurons=4": "the same model as the centre",
+        "model.neurons=8": "gradient of W1 is not finite",
+    }
 
 
-@pytest.mark.slow
-def test_launched_trainings_make_the_same_set(
+def test_an_interrupted_set_continues_with_trainings_launched_together(
     scene: Path, measured: tuple[Path, Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batches: list[int] = []
 
-    def together(groups: list[list[Trial]], *args: Any) -> list[list[Outcome]]:
-        batches.append(len(groups))
-        return [[run_trial(trial) for trial in group] for group in groups]
-
-    monkeypatch.setattr(ablation, "launch_trials", together)
-    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
-    _, record = run_ablation(request(scene, tmp_path / "set", launcher=LauncherSettings("processes")))
-    assert max(batches) > 1 and names(record) == SINGLES
-    assert record.points[0].quality["psnr"] == measured[1].points[0].quality["psnr"]
-
-
-def test_an_interrupted_set_continues(
-    scene: Path, measured: tuple[Path, Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trained: list[str] = []
-
-    def stopped(trial: Trial, dataset: Dataset | None, events: Events) -> Outcome:
-        if len(trained) == 3:
+    def launch(wanted: list[Trial], settings: LauncherSettings, *args: Any) -> list[Result]:
+        if len(batches) == 1:
             raise KeyboardInterrupt
-        trained.append(trial.config.output_dir.name)
-        return run_trial(trial, dataset, events)
+        batches.append(len(wanted))
+        return [Result("done", run_trial(trial)) for trial in wanted]
 
-    monkeypatch.setattr(ablation, "run_trial", stopped)
-    knobs = ("model.neurons",)
+    monkeypatch.setattr(ablation, "launch_trials", launch)
+    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
+    again = request(scene, tmp_path / "set", knobs=("model.neurons",), launcher=LauncherSettings("processes"))
     with pytest.raises(KeyboardInterrupt):
-        run_ablation(request(scene, tmp_path / "set", knobs=knobs))
+        run_ablation(again)
     monkeypatch.undo()
     half = read_record(tmp_path / "set" / "tradeoff.json")
-    assert half is not None and len(half.points) == 3
-    _, record = run_ablation(request(scene, tmp_path / "set", knobs=knobs))
+    assert batches == [2] and half is not None and names(half) == {CENTRE, "neurons=2"}
+    _, record = run_ablation(replace(again, launcher=LauncherSettings()))
     assert names(record) == {CENTRE, "neurons=0", "neurons=2", "neurons=8"}
     assert record.points[0].quality["psnr"] == measured[1].points[0].quality["psnr"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuprim.core.compression import Quantizers, bit_table, canonicalize, fake_quantize, fit_quantizers
+from neuprim.core.compression import Quantizers, bit_table, canonicalize, fit_quantizers
 from neuprim.core.compression.quantizers import Columns
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
@@ -17,6 +17,7 @@ from neuprim.runs.open import load_dataset, load_run
 from neuprim.search.quantized_finetune import (
     QuantizationSearch,
     TrainingData,
+    dequantize,
     finetune_for_table,
     quantize_within,
 )
@@ -92,54 +93,56 @@ def test_what_is_to_stay_zero_does_and_nothing_else(run_dir: Path, dataset: Data
 # ---------------------------------------------------------------- few bits
 
 
-def test_training_for_few_bits_wins_back_what_they_cost(run_dir: Path, dataset: Dataset) -> None:
-    config, task, model, _ = load_run(run_dir)
-    table = bit_table(5, [], model.specs)
-    judge = TrainingQuality(dataset, config.renderer)
+@pytest.fixture
+def data(run_dir: Path, dataset: Dataset) -> TrainingData:
+    config, task, _, _ = load_run(run_dir)
+    return TrainingData(config, task, dataset)
 
-    def read_back(one: Primitives, made: dict) -> float:  # type: ignore[type-arg]
-        return judge(
-            Primitives(one.density, one.colour, {n: v.detach() for n, v in fake_quantize(one.params, made).items()})
-        )
 
-    plain = canonicalize(model)
-    at_once = read_back(plain, fit_quantizers(plain, table))
-    fewer = finetune_for_table(TrainingData(config, task, dataset), model, table, 150, lambda text, fraction: None)
-    assert fewer.steps == 150 and fewer.notes == ()
-    assert read_back(fewer.model, fewer.quantizers) > at_once + 0.2
-    again = finetune_for_table(
-        TrainingData(config, task, dataset), model, table, 150, lambda text, fraction: None
-    ).model
-    assert all(torch.equal(again.params[name], value) for name, value in fewer.model.params.items())
+def ignore(text: str, fraction: float) -> None:
+    pass
+
+
+def equal(a: Primitives, b: Primitives) -> bool:
+    return all(torch.equal(a.params[name], value) for name, value in b.params.items())
+
+
+def test_training_for_few_bits_wins_back_what_they_cost(run_dir: Path, data: TrainingData) -> None:
+    model, quality = load_run(run_dir)[2], TrainingQuality(data.dataset, data.config.renderer)
+    table, plain = bit_table(5, [], model.specs), canonicalize(model)
+    at_once = quality(dequantize(plain, fit_quantizers(plain, table)))
+    fewer, again = (finetune_for_table(data, model, table, 150, ignore) for _ in range(2))
+    assert fewer.steps == 150 and fewer.notes == () and equal(again.model, fewer.model)
+    assert quality(dequantize(fewer.model, fewer.quantizers)) > at_once + 0.2
 
 
 @pytest.mark.parametrize("steps", [0, 200])
-def test_a_tolerance_is_kept(run_dir: Path, dataset: Dataset, steps: int) -> None:
-    config, task, model, _ = load_run(run_dir)
-    judge = TrainingQuality(dataset, config.renderer)
-    base = judge(model)
+def test_a_tolerance_is_kept(run_dir: Path, data: TrainingData, steps: int) -> None:
+    model, quality = load_run(run_dir)[2], TrainingQuality(data.dataset, data.config.renderer)
+    base = quality(model)
     for allowed in (0.1, 0.5):
-        fewer = quantize_within(TrainingData(config, task, dataset), model, allowed, steps, lambda text, fraction: None)
-        back = {n: v.detach() for n, v in fake_quantize(fewer.model.params, fewer.quantizers).items()}
-        assert base - judge(Primitives(fewer.model.density, fewer.model.colour, back)) <= allowed + 1e-6
+        fewer = quantize_within(data, model, allowed, steps, ignore)
+        assert base - quality(dequantize(fewer.model, fewer.quantizers)) <= allowed + 1e-6
         assert torch.equal(fewer.model.params["W1"], canonicalize(model).params["W1"]) == (steps == 0)
 
 
 def test_training_that_spoils_the_model_is_not_stored(
-    run_dir: Path, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+    run_dir: Path, data: TrainingData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config, task, model, _ = load_run(run_dir)
-    plain = quantize_within(TrainingData(config, task, dataset), model, 0.2, 0, lambda text, fraction: None)
+    model = load_run(run_dir)[2]
+    plain = quantize_within(data, model, 0.2, 0, ignore)
     monkeypatch.setattr("neuprim.runs.finetune.LEAST_START", 300.0)
-    found = quantize_within(TrainingData(config, task, dataset), model, 0.2, 20, lambda text, fraction: None)
-    assert all(torch.equal(found.model.params[name], value) for name, value in plain.model.params.items())
-    assert found.notes == plain.notes and found.steps == 20
+    found = quantize_within(data, model, 0.2, 20, ignore)
+    assert equal(found.model, plain.model) and found.notes == plain.notes and found.steps == 20
+    fewer = finetune_for_table(data, model, bit_table(1, [], model.specs), 20, ignore)
+    assert fewer.steps == 20 and len(fewer.notes) == 1 and "brought nothing" in fewer.notes[0]
+    assert equal(fewer.model, canonicalize(model))
 
 
 @pytest.mark.parametrize("start", [1e-3, 0.1, 20.0])
-def test_the_coarsest_numbers_that_are_enough_are_found(run_dir: Path, dataset: Dataset, start: float) -> None:
-    config, _, model, _ = load_run(run_dir)
-    rounding = QuantizationSearch(model, dataset, TrainingQuality(dataset, config.renderer))
+def test_the_coarsest_numbers_that_are_enough_are_found(run_dir: Path, data: TrainingData, start: float) -> None:
+    quality = TrainingQuality(data.dataset, data.config.renderer)
+    rounding = QuantizationSearch(load_run(run_dir)[2], data.dataset, quality)
 
     def width(made: Quantizers) -> float:
         scheme = made["sh_dc"]
@@ -151,15 +154,3 @@ def test_the_coarsest_numbers_that_are_enough_are_found(run_dir: Path, dataset: 
     assert width(coarse) > wanted and 0.2999 <= above < 0.4
     made, share = rounding.find_coarsest(lambda m: width(m) <= wanted, start)
     assert width(made) <= wanted < width(rounding.fit(1.1 * share)) and 0.2 < share <= 0.3001
-
-
-def test_where_training_brings_nothing_the_model_is_stored_as_it_is(
-    run_dir: Path, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config, task, model, _ = load_run(run_dir)
-    monkeypatch.setattr("neuprim.runs.finetune.START", 3e4)  # rates that spoil everything
-    fewer = finetune_for_table(
-        TrainingData(config, task, dataset), model, bit_table(1, [], model.specs), 20, lambda text, fraction: None
-    )
-    assert fewer.steps == 20 and len(fewer.notes) == 1 and "brought nothing" in fewer.notes[0]
-    assert all(torch.equal(fewer.model.params[name], value) for name, value in canonicalize(model).params.items())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,23 +15,25 @@ import pytest
 from neuprim.config import RunConfig, compose
 from neuprim.config.command_settings import LauncherSettings, Target
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.runs.events import Event, Note, Step, ignore_event
-from neuprim.runs.launch.jobs import Job, Result, perform
+from neuprim.runs.events import Event, Note, Step
+from neuprim.runs.launch.jobs import Result
 from neuprim.runs.measure import evaluate_run
-from neuprim.runs.open import read_metrics
-from neuprim.search import pruning
+from neuprim.runs.open import load_dataset, read_metrics
+from neuprim.search import pruning, size_search, target, trial_runner
 from neuprim.search.target import run_target
 from neuprim.search.target_record import TargetRecord, read_target_record
+from neuprim.search.trials import Outcome, Trial, run_trial
+from neuprim.tasks.static import TASK
 from tests.systems import posix
 
 BUDGET = 400.0
 
+WORDS = (
+    "task=static scene=solids scene.size=32 scene.train_views=16 scene.test_views=3 model.primitives=40 "
+    "model.neurons=2 train.iterations=320 train.population.every=20 train.population.grow_from=1 renderer.threads=1"
+).split()
 
-@pytest.fixture(scope="module", autouse=True)
-def short_orbits() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 4)
-        yield
+Met = tuple[Path, TargetRecord, "Clock"]
 
 
 class Clock:
@@ -45,7 +48,7 @@ class Clock:
 
     def hear(self, event: Event) -> None:
         if isinstance(event, Step):
-            self.now += 0.1 + 2e-4 * event.report.primitives
+            self.now += pace(event.report.primitives)
             self.steps += 1
             if self.steps == self.stop_after:
                 signal.raise_signal(signal.SIGINT)
@@ -53,85 +56,60 @@ class Clock:
             self.notes.append(event.text)
 
 
-# A step costs the same from the first on (grow_from), so that a resumed training is timed by its remaining steps.
-WORDS = (
-    "task=static scene=solids scene.size=32 scene.train_views=16 scene.test_views=3 model.primitives=40 "
-    "model.neurons=2 "
-    "train.iterations=320 train.population.every=20 train.population.grow_from=1 renderer.threads=1"
-).split()
+def pace(primitives: int) -> float:
+    return 0.1 + 2e-4 * primitives
+
+
+def timed(trial: Trial, *args: Any) -> Outcome:
+    outcome = run_trial(trial, *args)
+    return replace(outcome, pace=pace(outcome.primitives))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def clocked_trials() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 4)
+        patch.setattr(trial_runner, "run_trial", timed)
+        patch.setattr(size_search, "_MAX_SIZES", 3)
+        patch.setattr(size_search, "_MAX_CHANGES", 1)
+        yield
 
 
 def config(out: Path, *more: str) -> RunConfig:
     return compose([*WORDS, f"output_dir={out}", *more])
 
 
-def searched(
-    out: Path, target: Target, *more: str, budget: float = BUDGET, clock: Clock | None = None
-) -> tuple[TargetRecord, Clock]:
+def search(out: Path, psnr: float, *more: str, clock: Clock | None = None) -> tuple[TargetRecord, Clock]:
     clock = clock or Clock()
-    return run_target(config(out, *more), target, budget, clock.hear, clock), clock
+    return run_target(config(out, *more), Target(psnr=psnr), BUDGET, clock.hear, clock), clock
 
 
 @pytest.fixture(scope="module")
-def met(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TargetRecord, Clock]:
+def met(tmp_path_factory: pytest.TempPathFactory) -> Met:
     out = tmp_path_factory.mktemp("targets") / "met"
-    return out, *searched(out, Target(psnr=20.0))
+    return out, *search(out, 20.0)
 
 
 def trainings(record: TargetRecord) -> list[tuple[Any, ...]]:
     return [(a.purpose, a.words, a.primitives, a.steps, a.measured("psnr")) for a in record.attempts]
 
 
-@pytest.mark.slow
-def test_launched_it_trains_two_lengths_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a launcher that works here, at the pace that the clock says."""
-    asked: list[list[str]] = []
-
-    def launched(jobs: list[Job], settings: LauncherSettings, folder: Path, hear: Any) -> list[Result]:
-        asked.append([job.name for job in jobs])
-        assert settings.threads == 1 and folder == tmp_path / "run" / "target"
-        results = [perform(job, 0, ignore_event) for job in jobs]
-        for job, result in zip(jobs, results, strict=True):
-            own = RunConfig.from_dict(job.data["config"])
-            steps, primitives = own.train.iterations, own.model.primitives
-            pace = 0.1 + 2e-4 * primitives
-            clock.now += pace * (steps or 0) / len(jobs)
-            results[results.index(result)] = replace(
-                result, value=result.value._replace(pace=pace, compiling=0.0, seconds=pace * (steps or 0))
-            )
-        return results
-
-    clock = Clock()
-    monkeypatch.setattr("neuprim.search.trial_runner.launch_jobs", launched)
-    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
-    settings = LauncherSettings("processes")
-    record = run_target(config(tmp_path / "run"), Target(psnr=20.0), BUDGET, clock.hear, clock, settings)
-    sizes = [names for names in asked if len(names) == 2]
-    assert sizes and len(asked[0]) == 1, "the pace alone, then pairs"
-    assert record.achieved["held_out"]["psnr"] >= 20.0 and all(a.outcome is not None for a in record.attempts)
-    assert (tmp_path / "run" / "model.neuprim").exists() and not (tmp_path / "run" / ".lock").exists()
-
-
-# ---------------------------------------------------------------- what a search leaves
-
-
-def test_the_target_is_met_within_the_budget(met: tuple[Path, TargetRecord, Clock]) -> None:
-    _, record, clock = met
-    assert record.warning is None and record.achieved["held_out"]["psnr"] >= 20.0
-    assert record.achieved["held_out"]["psnr"] < 20.8
+def test_the_target_is_met_within_the_budget(met: Met) -> None:
+    out, record, clock = met
+    assert record.warning is None and 20.0 <= record.achieved["held_out"]["psnr"] < 20.8
     assert clock.now <= BUDGET and record.spent == pytest.approx(clock.now, abs=1.0)
     assert {a.purpose for a in record.attempts} >= {"pace", "size", "full"}
     assert any("is met on the views held out" in why for why in record.why)
+    again, later = search(out, 20.0, "resume=true")
+    assert later.steps == 0 and again == record, "the same command again trains nothing"
 
 
-def test_a_usual_run_directory_is_left(met: tuple[Path, TargetRecord, Clock]) -> None:
+def test_a_usual_run_directory_is_left(met: Met) -> None:
     out, record, _ = met
     files = ("config.yaml", "model.safetensors", "checkpoint.safetensors", "metrics.json", "metrics.jsonl")
     assert {*files, "renders", "report.html", "target", "target.json"} <= {p.name for p in out.iterdir()}
     assert not list(out.rglob("packed.neuprim")) and read_target_record(out) == record
-    assert Path(record.achieved["file"]).name == "model.neuprim" and Path(record.achieved["file"]).parent == Path(
-        record.achieved["run_dir"]
-    )
+    assert Path(record.achieved["file"]) == Path(record.achieved["run_dir"]) / "model.neuprim"
     chosen = next(a for a in record.attempts if a.folder == record.chosen)
     again, metrics = RunConfig.from_yaml(out), read_metrics(out)
     assert again.output_dir == out and again.model.primitives == metrics["primitives"] == chosen.count
@@ -140,106 +118,57 @@ def test_a_usual_run_directory_is_left(met: tuple[Path, TargetRecord, Clock]) ->
     assert evaluate_run(out)["psnr"] == pytest.approx(metrics["psnr"], abs=1e-6)
 
 
-def test_the_same_command_again_trains_nothing(met: tuple[Path, TargetRecord, Clock]) -> None:
+def test_another_target_keeps_the_trainings(met: Met, tmp_path: Path) -> None:
     out, record, _ = met
-    again, clock = searched(out, Target(psnr=20.0), "resume=true")
-    assert clock.steps == 0 and again == record
-
-
-def test_another_target_keeps_the_trainings(met: tuple[Path, TargetRecord, Clock], tmp_path: Path) -> None:
-    import shutil
-
-    out, record, _ = met
-    copy = tmp_path / "copy"
+    copy, clock = tmp_path / "copy", Clock()
     shutil.copytree(out, copy)
-    again, clock = searched(copy, Target(megabytes=0.004), "resume=true")
+    again = run_target(config(copy, "resume=true"), Target(megabytes=0.004), BUDGET, clock.hear, clock)
     assert trainings(again)[:3] == trainings(record)[:3] and any("are kept" in note for note in clock.notes)
     assert again.asked == {"megabytes": 0.004, "budget": BUDGET} and again.achieved["packed_bytes"] <= 4000
     assert again.warning is None
 
 
 @posix
-def test_ctrl_c_and_resume_end_where_an_uninterrupted_search_ends(
-    met: tuple[Path, TargetRecord, Clock], tmp_path: Path
+def test_an_interrupted_search_ends_like_one_that_was_not_and_test_views_decide_nothing(
+    met: Met, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """With other test views, and interrupted in trials and in full runs, the search is the same to the last digit."""
     _, whole, clock = met
-    out = tmp_path / "interrupted"
+    out, views = tmp_path / "interrupted", "scene.test_views=2"
+    monkeypatch.setattr(target, "_publish", lambda runner, predictor: None)
     for share in (0.2, 0.5):
+        again = ["resume=true"] if out.exists() else []
         with pytest.raises(KeyboardInterrupt):
-            searched(
-                out,
-                Target(psnr=20.0),
-                *(["resume=true"] if out.exists() else []),
-                clock=Clock(round(share * clock.steps)),
-            )
+            search(out, 20.0, views, *again, clock=Clock(round(share * clock.steps)))
         assert read_target_record(out) is not None
-    record, rest = searched(out, Target(psnr=20.0), "resume=true")
-    assert trainings(record) == trainings(whole) and record.chosen == whole.chosen
-    assert 0 < rest.steps < 0.6 * clock.steps
+    record, rest = search(out, 20.0, views, "resume=true")
+    assert trainings(record) == trainings(whole) and 0 < rest.steps < 0.6 * clock.steps
 
 
-# ---------------------------------------------------------------- what cannot be
+def test_launched_it_trains_two_lengths_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, clock = list[int](), Clock()
+    dataset = load_dataset(config(tmp_path / "run"), TASK)
 
+    def launch(trials: list[Trial], settings: LauncherSettings, folder: Path, progress: Any) -> list[Result]:
+        asked.append(len(trials))
+        assert settings.threads == 1 and folder == tmp_path / "run" / "target"
+        outcomes = [timed(trial, dataset) for trial in trials]
+        seconds = [outcome.pace * outcome.steps for outcome in outcomes]
+        clock.now += max(seconds)
+        return [Result("done", one, seconds=each) for one, each in zip(outcomes, seconds, strict=True)]
 
-def test_what_is_out_of_reach_is_said_and_the_best_is_made(tmp_path: Path) -> None:
-    record, clock = searched(tmp_path / "run", Target(psnr=60))
-    said = next(i for i, note in enumerate(clock.notes) if "target.psnr=60 is out of reach" in note)
-    assert said < next(i for i, note in enumerate(clock.notes) if note.startswith("full run"))
-    assert record.warning is not None and "target.psnr=60 is missed" in record.warning
-    assert (tmp_path / "run" / "model.neuprim").exists() and clock.now <= BUDGET
-
-
-def test_test_views_decide_nothing(met: tuple[Path, TargetRecord, Clock], tmp_path: Path) -> None:
-    """With other test views the search is the same to the last digit."""
-    record, _ = searched(tmp_path / "run", Target(psnr=20.0), "scene.test_views=2")
-    assert trainings(record) == trainings(met[1])
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["train.max_seconds=60"], "train.max_seconds=60: a run with a target has its seconds from budget="),
-        (["preset=paper"], "train.population.strategy=gradient: it decides"),
-        (["train.population.grow_to=50"], "train.population.grow_to=50: a target decides"),
-        (["train.iterations=0"], "train.iterations=0"),
-    ],
-)
-def test_settings_that_a_target_decides_are_refused(more: list[str], message: str, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError) as refused:
-        searched(tmp_path / "run", Target(psnr=20), *more)
-    assert str(refused.value).startswith(message) and not (tmp_path / "run").exists()
-
-
-def test_a_budget_without_room_for_a_run_says_what_it_takes(tmp_path: Path) -> None:
-    with pytest.raises(
-        ConfigError,
-        match=r"budget=20s: a full run of 40 primitives would have \d+ steps; expected 256 or more, or \d+ s",
-    ):
-        searched(tmp_path / "run", Target(psnr=20), budget=20.0)
-
-
-def test_too_few_views_to_hold_some_out(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="3 training views; a target needs 4 or more"):
-        searched(tmp_path / "run", Target(psnr=20), "scene.train_views=3")
-
-
-def test_a_search_of_another_model_is_not_gone_on_with(met: tuple[Path, TargetRecord, Clock]) -> None:
-    with pytest.raises(ConfigError, match=r"target.json: begun with another model"):
-        searched(met[0], Target(psnr=20.0), "resume=true", "model.sh_degree=1")
-
-
-def test_a_run_without_a_target_is_not_overwritten(tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text("task: {}\n")
-    with pytest.raises(ConfigError, match="holds a run without a target"):
-        searched(tmp_path, Target(psnr=20.0), "resume=true")
-
-
-# ---------------------------------------------------------------- finishing
+    monkeypatch.setattr(trial_runner, "launch_trials", launch)
+    monkeypatch.setattr(target, "_publish", lambda runner, predictor: None)
+    monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
+    settings = LauncherSettings("processes")
+    record = run_target(config(tmp_path / "run"), Target(psnr=20.0), BUDGET, clock.hear, clock, settings)
+    assert asked[:2] == [1, 2], "the pace alone, then pairs"
+    assert all(a.outcome is not None for a in record.attempts) and record.finished("full")
+    assert not (tmp_path / "run" / ".lock").exists()
 
 
 def test_what_is_left_of_the_budget_prunes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Views held out are not trained on by the pruning either; what is pruned is taken only where it is smaller and
-    still meets the target."""
+    """Pruning does not train on held-out views. Its model is taken if it is smaller and still meets the target."""
     learned: list[int] = []
 
     class Watched(pruning.ModelShrinker):
@@ -248,7 +177,9 @@ def test_what_is_left_of_the_budget_prunes(tmp_path: Path, monkeypatch: pytest.M
             super().__post_init__()
 
     monkeypatch.setattr(pruning, "ModelShrinker", Watched)
-    record, clock = searched(tmp_path / "run", Target(psnr=19.0), "train.iterations=640", budget=1200.0)
+    monkeypatch.setattr(target, "_MIN_TUNING", 100)
+    monkeypatch.setattr(target, "_MAX_TUNING", 1)
+    record, clock = search(tmp_path / "run", 19.0)
     assert learned == [8], "of sixteen"
     said = [note for note in clock.notes if note.startswith("pruned: ")]
     assert len(said) == 1 or "nothing could be pruned" in record.why
@@ -257,5 +188,36 @@ def test_what_is_left_of_the_budget_prunes(tmp_path: Path, monkeypatch: pytest.M
     assert record.achieved["held_out"]["psnr"] >= 19.0 and record.warning is None
     file = Path(record.achieved["file"])
     assert file.exists() and (file.parent.name == "pruned") == pruned
-    if said:
-        assert json.loads((tmp_path / "run" / "pruned" / "pruned.json").read_text())
+    assert not said or json.loads((tmp_path / "run" / "pruned" / "pruned.json").read_text())
+
+
+# ---------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["train.max_seconds=60"], "train.max_seconds=60: a run with a target has its seconds from budget="),
+        (["preset=paper"], "train.population.strategy=gradient: a target decides"),
+        (["train.population.grow_to=50"], "train.population.grow_to=50: a target decides"),
+        (["train.iterations=0"], "train.iterations=0"),
+    ],
+)
+def test_settings_that_a_target_decides_are_refused(more: list[str], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as refused:
+        search(tmp_path / "run", 20.0, *more)
+    assert str(refused.value).startswith(message) and not (tmp_path / "run").exists()
+
+
+def test_what_cannot_be_searched_is_refused(met: Met, tmp_path: Path) -> None:
+    expected = r"budget=20s: a full run of 40 primitives would have \d+ steps; expected 256 or more, or \d+ s"
+    clock = Clock()
+    with pytest.raises(ConfigError, match=expected):
+        run_target(config(tmp_path / "short"), Target(psnr=20.0), 20.0, clock.hear, clock)
+    with pytest.raises(DataError, match="3 training views; a target needs 4 or more"):
+        search(tmp_path / "few", 20.0, "scene.train_views=3")
+    with pytest.raises(ConfigError, match=r"target.json: begun with another model"):
+        search(met[0], 20.0, "resume=true", "model.sh_degree=1")
+    (tmp_path / "config.yaml").write_text("task: {}\n")
+    with pytest.raises(ConfigError, match="holds a run without a target"):
+        search(tmp_path, 20.0, "resume=true")

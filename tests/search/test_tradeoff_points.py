@@ -15,7 +15,7 @@ from neuprim.search.points import COMBINED, REFERENCE, LeftOut, Point, Record, r
 
 def drawn(*words: str, psnr: float = 30.0, ratio: float = 1.0, size: int = 100) -> Point:
     quality = {"psnr": psnr, "ssim": 0.9, "ssim_3dgs": 0.91, "psnr_exact": float("inf"), "lpips_3dgs": 0.2}
-    return Point(COMBINED if words else REFERENCE, words, quality, size, 7, [10 * ratio] * 3, [ratio] * 3)
+    return Point(COMBINED if words else REFERENCE, words, quality, size, [10 * ratio] * 3, [ratio] * 3)
 
 
 def trained(name: str, psnr: float, seconds: float = 2.0) -> Point:
@@ -33,9 +33,7 @@ def trained(name: str, psnr: float, seconds: float = 2.0) -> Point:
 
 @pytest.mark.parametrize("points", [[drawn(), drawn("renderer.sort=entry", psnr=29, ratio=0.5)], [trained("1", 20.0)]])
 def test_what_is_written_is_read(points: list[Point], tmp_path: Path) -> None:
-    record = Record(
-        {"views": ["a"]}, {"task": "static"}, points, [LeftOut("a", ("b=1",), "why")], marching={"rows": []}
-    )
+    record = Record({"views": ["a"]}, {"task": "static"}, points, [LeftOut("a", ("b=1",), "why")])
     record.find_fronts(lambda p: True, lambda p: p is points[0])
     record.write(tmp_path / "tradeoff.json")
     assert read_record(tmp_path / "tradeoff.json") == record and read_record(tmp_path / "none.json") is None

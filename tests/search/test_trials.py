@@ -25,7 +25,6 @@ from neuprim.search.trials import (
     TRIAL_FILE,
     Outcome,
     Trial,
-    TrialFailed,
     launch_trials,
     read_outcome,
     run_trial,
@@ -70,18 +69,12 @@ def test_a_trial_is_a_run_without_report_and_pictures(done: tuple[Path, Outcome]
 def test_an_outcome_is_what_evaluating_the_folder_measures(done: tuple[Path, Outcome]) -> None:
     folder, outcome = done
     metrics = evaluate_run(folder)
-    assert outcome.psnr == pytest.approx(metrics["psnr"], abs=1e-9) and outcome.ssim == pytest.approx(
-        metrics["ssim"], abs=1e-9
-    )
+    assert outcome.psnr == pytest.approx(metrics["psnr"], abs=1e-9)
+    assert outcome.ssim == pytest.approx(metrics["ssim"], abs=1e-9)
     assert outcome.primitives == 40 and outcome.parameters_per_primitive == metrics["parameters_per_primitive"]
     assert outcome.bytes == (folder / "model.safetensors").stat().st_size and outcome.steps == STEPS
-    assert outcome.seconds > 0 and outcome.ms_per_frame > 0
-    assert [progress for progress, _ in outcome.curve] == [0.25, 0.5, 0.75, 1.0] and outcome.curve[-1][
-        1
-    ] == pytest.approx(outcome.psnr, abs=1e-3)
-    assert Outcome.from_dict(json.loads(json.dumps(outcome.to_dict()))) == outcome == read_outcome(folder)
-    perfect = replace(outcome, psnr=float("inf"))
-    assert Outcome.from_dict(json.loads(json.dumps(perfect.to_dict(), allow_nan=False))) == perfect
+    assert 0 < outcome.pace < outcome.seconds and outcome.ms_per_frame > 0
+    assert outcome == read_outcome(folder)
 
 
 def test_what_is_done_is_read_back_and_nothing_is_loaded(
@@ -89,11 +82,7 @@ def test_what_is_done_is_read_back_and_nothing_is_loaded(
 ) -> None:
     folder, outcome = done
     monkeypatch.setattr("neuprim.runs.fit.load_dataset", lambda *args: pytest.fail("loaded"))
-    before = (folder / "checkpoint.safetensors").stat().st_mtime_ns
-    assert (
-        run_trial(Trial(config_of(scene, folder))) == outcome
-        and (folder / "checkpoint.safetensors").stat().st_mtime_ns == before
-    )
+    assert run_trial(Trial(config_of(scene, folder))) == outcome
 
 
 def test_other_settings_are_trained_anew_and_said(scene: Path, tmp_path: Path) -> None:
@@ -103,24 +92,16 @@ def test_other_settings_are_trained_anew_and_said(scene: Path, tmp_path: Path) -
     said = [event.text for event in heard if isinstance(event, Note)]
     assert f"{folder}: made with another model.neurons; trained anew" in said and steps_of(heard) == STEPS
     assert second.parameters_per_primitive < first.parameters_per_primitive
-    heard.clear()
     run_trial(Trial(config_of(scene, folder, "model.neurons=0"), hold_out=3), events=heard.append)
-    assert (
-        any("another hold_out" in event.text for event in heard if isinstance(event, Note)) and steps_of(heard) == STEPS
-    )
+    assert any("another hold_out" in event.text for event in heard if isinstance(event, Note))
 
 
 def test_other_views_are_measured_and_not_trained_for(scene: Path, tmp_path: Path) -> None:
     folder, heard = tmp_path / "t", list[Event]()
     both = run_trial(Trial(config_of(scene, folder)))
     one = run_trial(Trial(config_of(scene, folder), views=1), events=heard.append)
-    metrics = evaluate_run(folder)
-    assert (
-        steps_of(heard) == 0
-        and one.psnr == pytest.approx(metrics["per_view"][0]["psnr"])
-        and one.psnr != both.psnr
-        and one.steps == STEPS
-    )
+    assert steps_of(heard) == 0 and one.psnr != both.psnr and one.steps == STEPS
+    assert one.psnr == pytest.approx(evaluate_run(folder)["per_view"][0]["psnr"])
 
 
 def test_views_that_judge_are_not_learned_from(scene: Path, tmp_path: Path) -> None:
@@ -179,7 +160,7 @@ def test_interrupted_it_goes_on_to_the_same_end(
         and read_outcome(folder) is None
     )
     outcome = run_trial(Trial(config_of(scene, folder)), events=heard.append)
-    assert steps_of(heard) == STEPS - 16 and outcome.psnr == done[1].psnr and len(outcome.curve) == 4
+    assert steps_of(heard) == STEPS - 16 and outcome.psnr == done[1].psnr
     assert (folder / "model.safetensors").read_bytes() != b"" and outcome.steps == STEPS
 
 
@@ -201,7 +182,7 @@ def test_a_damaged_record_is_refused(scene: Path, tmp_path: Path, text: str) -> 
         run_trial(Trial(config_of(scene, tmp_path)))
 
 
-@pytest.mark.parametrize("change", [{"psnr": "much"}, {"curve": [1]}, {"bytes": None}])
+@pytest.mark.parametrize("change", [{"psnr": "much"}, {"pace": []}, {"bytes": None}])
 def test_a_damaged_outcome_is_refused(done: tuple[Path, Outcome], tmp_path: Path, change: dict[str, object]) -> None:
     record = json.loads((done[0] / TRIAL_FILE).read_text())
     write_json(tmp_path / TRIAL_FILE, {**record, "outcome": {**record["outcome"], **change}})
@@ -217,9 +198,8 @@ def test_launched_trials_equal_those_of_this_process(tmp_path: Path, monkeypatch
     here, there = (Trial(compose(words(scene, tmp_path / name, 20)), views=2) for name in ("in_1", "in_2"))
     gone = replace(there, config=compose(words(tmp_path / "nowhere", tmp_path / "gone", 20)))
     progress: list[float] = []
-    first, second = launch_trials([[there], [gone]], processes(), tmp_path, progress.append)
-    expected = run_trial(here)
-    assert isinstance(first, list)
-    assert (first[0].psnr, first[0].ssim, first[0].bytes) == (expected.psnr, expected.ssim, expected.bytes)
-    assert isinstance(second, TrialFailed) and "nowhere" in str(second)
+    first, second = launch_trials([there, gone], processes(), tmp_path, progress.append)
+    expected, found = run_trial(here), first.value
+    assert (found.psnr, found.ssim, found.bytes) == (expected.psnr, expected.ssim, expected.bytes)
+    assert second.state == "failed" and "nowhere" in second.line
     assert progress == sorted(progress) and progress[-1] == 1.0 and not (tmp_path / "launch").exists()

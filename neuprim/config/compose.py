@@ -283,17 +283,12 @@ def _make_config(
         scene_name=scene.spec.name,
         scene=full["scene"],
         preset=chosen.preset,
-        model=settings.model,
-        train=settings.train,
-        renderer=settings.renderer,
-        metrics=settings.metrics,
         output_dir=output_directory(settings.output_dir, chosen.name, settings.resume, check_output),
-        seed=settings.seed,
-        resume=settings.resume,
         options=options,
         unused=unused_settings(spec, loss),
         non_default=preset | _find_differences(_flatten(plain, _validate_settings(plain)), _flatten(full, settings)),
         made_by=made_by,
+        **{name: getattr(settings, name) for name in ("model", "train", "renderer", "metrics", "seed", "resume")},
     )
     return config, base.paths
 

@@ -141,28 +141,35 @@ class RunConfig:
         if not isinstance(scene_name, str):
             raise ConfigError("scene.name: missing; expected a name")
         loss = None if stored.train.loss is None else split_plugin_name(stored.train.loss)[1]
-        names = {"task.name": stored.task.name, "scene.name": scene_name, "train.loss": loss}
-        for (key, name), kind in zip(names.items(), ("task", "scene", "loss"), strict=True):
-            maker = None if stored.made_by is None else getattr(stored.made_by, kind)
-            if maker is not None and maker.name != name:
-                raise ConfigError(f"made_by.{kind}.name: found {maker.name!r}; expected {name!r}, as {key} says")
+        names = {
+            "task": ("task.name", stored.task.name),
+            "scene": ("scene.name", scene_name),
+            "loss": ("train.loss", loss),
+        }
+        for kind, plugin in ({} if stored.made_by is None else stored.made_by.plugins).items():
+            key, name = names[kind]
+            if plugin.name != name:
+                raise ConfigError(f"made_by.{kind}.name: found {plugin.name!r}; expected {name!r}, as {key} says")
+        same = (
+            "preset",
+            "model",
+            "train",
+            "renderer",
+            "metrics",
+            "seed",
+            "resume",
+            "overrides",
+            "non_default",
+            "made_by",
+        )
         return cls(
             task=stored.task.name,
             scene_name=scene_name,
             scene=scene,
-            preset=stored.preset,
-            model=stored.model,
-            train=stored.train,
-            renderer=stored.renderer,
-            metrics=stored.metrics,
             output_dir=Path(stored.output_dir),
-            seed=stored.seed,
-            resume=stored.resume,
             options=stored.task.options,
             unused=unused,
-            overrides=stored.overrides,
-            non_default=stored.non_default,
-            made_by=stored.made_by,
+            **{name: getattr(stored, name) for name in same},
         )
 
 

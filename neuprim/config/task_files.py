@@ -83,22 +83,23 @@ def presets(spec: TaskSpec) -> list[str]:
 def check_groups(spec: TaskSpec) -> None:
     """Raise ConfigError when the configuration package cannot be used or lacks a file that a run would need."""
     who = f"task {spec.name!r}"
-    if not (package_root(spec) / "task" / f"{spec.name}.yaml").is_file():
-        raise ConfigError(f"{who}: {spec.config_package} has no task/{spec.name}.yaml")
     if not spec.scenes:
         raise ConfigError(f"{who}: its TaskSpec has no scenes")
-    for scene in spec.scenes:
-        if scene.name not in _list_files(spec, "scene"):
-            raise ConfigError(f"{who}: {spec.config_package} has no scene/{spec.name}/{scene.name}.yaml")
+    places = [f"task/{spec.name}.yaml", *(f"scene/{spec.name}/{scene.name}.yaml" for scene in spec.scenes)]
+    for place in places:
+        _require_file(spec.config_package, place, who)
     if not presets(spec):
         raise ConfigError(f"{who}: {spec.config_package} has no preset/{spec.name}/*.yaml")
 
 
 def check_scene(spec: TaskSpec, scene: str, package: str) -> None:
     """Raise ConfigError when the package that adds ``scene`` to a task has no YAML file for it."""
-    who = f"scene {scene!r} of task {spec.name!r}"
-    if not (_open_package(package, who) / "scene" / spec.name / f"{scene}.yaml").is_file():
-        raise ConfigError(f"{who}: {package} has no scene/{spec.name}/{scene}.yaml")
+    _require_file(package, f"scene/{spec.name}/{scene}.yaml", f"scene {scene!r} of task {spec.name!r}")
+
+
+def _require_file(package: str, place: str, who: str) -> None:
+    if not (_open_package(package, who) / place).is_file():
+        raise ConfigError(f"{who}: {package} has no {place}")
 
 
 def package_root(spec: TaskSpec) -> Traversable:
@@ -232,23 +233,24 @@ def read_levels(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, Level] |
     who = f"task {spec.name!r}: {place}"
     node = read_yaml(file, who)
     try:
-        refuse_unknown(node, ("preset", "levels"), "")
+        return _read_levels(node, presets)
     except ConfigError as error:
         raise ConfigError(f"{who}: {error}") from error
+
+
+def _read_levels(node: Mapping[str, Any], presets: Sequence[str]) -> dict[int, Level]:
+    refuse_unknown(node, ("preset", "levels"), "")
     preset, levels = node.get("preset"), node.get("levels")
-    if not isinstance(preset, str) or preset not in presets:
-        raise ConfigError(f"{who}: preset={format_value(preset)}: no such preset{nearest(str(preset), presets)}")
+    if preset not in presets:
+        raise ConfigError(f"preset={format_value(preset)}: no such preset{nearest(str(preset), presets)}")
     if not isinstance(levels, Mapping) or list(levels) != list(LEVELS):
-        found = format_value(list(levels)) if isinstance(levels, Mapping) else format_value(levels)
-        raise ConfigError(f"{who}: levels: found {found}; expected {LEVELS[0]} to {LEVELS[-1]}, in this order")
-    return {
-        number: Level(preset, _level_settings(given, f"{who}: levels.{number}")) for number, given in levels.items()
-    }
-
-
-def _level_settings(given: Any, who: str) -> tuple[Assignment, ...]:
-    if not isinstance(given, Mapping) or any(str(key).partition(".")[0] not in PRESET_GROUPS for key in given):
-        raise ConfigError(
-            f"{who}: found {format_value(given)}; expected settings of model, train and renderer by their dotted keys"
-        )
-    return tuple(Assignment(key, value, quote_override(key, value)) for key, value in given.items())
+        found = format_value(list(levels) if isinstance(levels, Mapping) else levels)
+        raise ConfigError(f"levels: found {found}; expected {LEVELS[0]} to {LEVELS[-1]}, in this order")
+    made = {}
+    for number, given in levels.items():
+        if not isinstance(given, Mapping) or any(str(key).partition(".")[0] not in PRESET_GROUPS for key in given):
+            groups = "settings of model, train and renderer by their dotted keys"
+            raise ConfigError(f"levels.{number}: found {format_value(given)}; expected {groups}")
+        settings = tuple(Assignment(key, value, quote_override(key, value)) for key, value in given.items())
+        made[number] = Level(str(preset), settings)
+    return made

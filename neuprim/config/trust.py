@@ -40,16 +40,15 @@ def check_stored(config: RunConfig, typed: Mapping[str, Any] | None = None) -> N
         "metrics.lpips": config.metrics.lpips,
     }
     for key, value in _texts("", tree):
-        given = typed is not None and any(key == name or key.startswith(f"{name}.") for name in typed)
-        if given or not (
-            _is_address(value) or (key == f"scene.{_WRITTEN}" and not _inside(value, config.source.parent))
-        ):
+        if typed is not None and any(key == name or key.startswith(f"{name}.") for name in typed):
             continue
-        what = (
-            "an address, which would be contacted"
-            if _is_address(value)
-            else "a folder outside of the run, which would be written to"
-        )
+        share = value.startswith("\\\\" if os.name != "nt" else ("\\\\", "//"))
+        if share or "://" in value or "::" in value:  # a URL, a chain of them, or a Windows share
+            what = "an address, which would be contacted"
+        elif key == f"scene.{_WRITTEN}" and not _inside(value, config.source.parent):
+            what = "a folder outside of the run, which would be written to"
+        else:
+            continue
         allow = f"type {key}=... to use it" if typed is not None else f"{FLAG} allows it"
         raise ConfigError(
             f"{config.source}: {key} is {cut(value)!r}, {what}; {allow}, {ENVIRONMENT}=1 in the "
@@ -72,11 +71,6 @@ def refuse_links(run_dir: Path) -> None:
             raise ConfigError(
                 f"{entry.path}: is a link to {there}, outside of the run; expected a folder, or {FLAG} to write there"
             )
-
-
-def _is_address(value: str) -> bool:
-    """Whether a text leads to another machine: a URL, a chain of them, or a Windows share."""
-    return "://" in value or "::" in value or value.startswith("\\\\" if os.name != "nt" else ("\\\\", "//"))
 
 
 def _inside(value: str, run_dir: Path) -> bool:

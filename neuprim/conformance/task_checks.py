@@ -20,6 +20,7 @@ from neuprim.conformance.task_under_test import ConformanceError, TaskUnderTest,
 from neuprim.core import checkpoint
 from neuprim.core.channels import find_channels
 from neuprim.core.compression import LEVELS, canonicalize
+from neuprim.core.conditions import read_conditions
 from neuprim.core.data import View
 from neuprim.core.errors import CheckpointError, ConfigError, FormError, NeuprimError
 from neuprim.core.layers import LayerFrame
@@ -250,7 +251,7 @@ def _check_parsing(t: TaskUnderTest, spec: ConditionSpec, where: str) -> None:
     near = torch.allclose(values[0].float(), expected, rtol=1e-4, atol=1e-6)
     t.require(near, f"{where}: parse({text!r})", values[0].tolist(), expected.tolist())
     if spec.sweep:
-        count = len(spec.parse(spec.sweep))
+        count = len(read_conditions([spec], {spec.name: spec.sweep})[spec.name])
         t.require(count > 1, f"{where}: frames of its sweep {spec.sweep!r}", count, "two or more, an animation")
     try:
         spec.parse("no such value")

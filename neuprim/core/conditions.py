@@ -157,8 +157,7 @@ def _values(spec: ConditionSpec, text: str) -> list[Tensor]:
             raise
         first, last = float(found[1]), float(found[2])
         try:
-            for end in (first, last):
-                _parsed(spec, _plain(end))
+            ends = [value for end in (first, last) for value in _parsed(spec, _plain(end))]
         except NeuprimError:
             pass  # the task's message about the whole text says more than one about an end
         else:
@@ -167,7 +166,8 @@ def _values(spec: ConditionSpec, text: str) -> list[Tensor]:
                 raise ConfigError(
                     f"{flag(spec.name)} {text}: expected FIRST:LAST or FIRST:LAST:COUNT, 2 to {_MOST} frames"
                 ) from None
-            numbers = (first + (last - first) * i / (count - 1) for i in range(count))
+            dtype = ends[0].dtype if ends[0].is_floating_point() else torch.float64
+            numbers = torch.linspace(first, last, count, dtype=dtype).tolist()
             return [value for x in numbers for value in _parsed(spec, _plain(x))]
         raise
 

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.conditions import FRAMES
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import GroundTruth
 from neuprim.core.errors import ConfigError
@@ -23,7 +22,7 @@ from neuprim.tasks.dynamic import evaluation
 from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 
-__all__ = ["TASK", "parse_times"]
+__all__ = ["TASK", "parse_time"]
 
 
 def _check(model: Mapping[str, Any]) -> None:
@@ -95,24 +94,17 @@ def _load_multiview(settings: Mapping[str, Any], context: SceneContext) -> Datas
     return load(settings, context)
 
 
-def parse_times(text: str) -> list[Tensor]:
-    """Parse times xi in 0..1 after ``--time``: "0.5" is one, "0:1" sixty from 0 to 1, "0:1:100" a hundred.
-
-    Raises:
-        ConfigError: no such form, times outside 0..1, or a count below 2.
-    """
-    expected = "expected a time in 0..1, as 0.5, or FIRST:LAST or FIRST:LAST:COUNT, as 0:1:100"
-    parts = text.split(":")
+def parse_time(text: str) -> list[Tensor]:
+    """Parse a time in 0..1 after ``--time``; raise ConfigError for anything else."""
     try:
-        times = [float(part) for part in parts[:2]]
-        count = int(parts[2]) if len(parts) == 3 else FRAMES
+        time = float(text)
     except ValueError:
-        raise ConfigError(f"--time {text}: {expected}") from None
-    if len(parts) > 3 or not all(math.isfinite(t) and 0.0 <= t <= 1.0 for t in times) or not 2 <= count <= 100_000:
-        raise ConfigError(f"--time {text}: {expected}")
-    if len(times) == 1:
-        return [torch.tensor(times[0])]
-    return list(torch.linspace(times[0], times[1], count))
+        time = math.nan
+    if not 0.0 <= time <= 1.0:
+        raise ConfigError(
+            f"--time {text}: expected a time in 0..1, as 0.5, or FIRST:LAST or FIRST:LAST:COUNT, as 0:1:100"
+        )
+    return [torch.tensor(time)]
 
 
 _VOLUME_SCENES = {
@@ -139,7 +131,7 @@ TASK = TaskSpec(
     loss=photometric,
     check=_check,
     trade=_trade,
-    conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_times, sweep="0:1"),),
+    conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_time, sweep="0:1"),),
     fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
     mask=evaluation.mask,

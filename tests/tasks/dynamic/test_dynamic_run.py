@@ -17,7 +17,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.runs.open import load_run
 from neuprim.runs.run import run
-from neuprim.tasks.dynamic import TASK, parse_times
+from neuprim.tasks.dynamic import TASK, parse_time
 from tests.reports import offered
 from tests.tasks.dynamic import sequences
 from tests.tasks.dynamic.sequences import blob
@@ -110,10 +110,10 @@ def test_cameras_of_a_file_need_a_time(finished: Path, tmp_path: Path, capsys: p
     assert main([*words, "--space", "scene"]) == 0
 
 
-@pytest.mark.parametrize("text", ["2", "-0.1", "0:2", "nan", "a", "0:1:1", "0:1:2:3", "", "0:1:1e9"])
+@pytest.mark.parametrize("text", ["2", "-0.1", "nan", "a", "0:1", ""])
 def test_impossible_times(text: str) -> None:
     with pytest.raises(ConfigError, match=r"expected a time in 0\.\.1"):
-        parse_times(text)
+        parse_time(text)
 
 
 def test_resuming_equals_going_on(files: Path, tmp_path: Path) -> None:

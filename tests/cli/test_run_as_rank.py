@@ -21,14 +21,8 @@ from neuprim.core.train.distributed.torchrun import TorchrunRank
 from tests.ranks import ThreadGroup, results, run_ranks
 
 WORDS = ["task=static", "scene=solids"]
-ALL = {
-    "RANK": "0",
-    "WORLD_SIZE": "2",
-    "LOCAL_RANK": "0",
-    "LOCAL_WORLD_SIZE": "2",
-    "MASTER_ADDR": "here",
-    "MASTER_PORT": "1",
-}
+SECOND = {"RANK": "1", "LOCAL_RANK": "1", "MASTER_ADDR": "localhost", "MASTER_PORT": "1"}
+SECOND |= {"WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2"}
 
 
 def test_all_ranks_write_where_the_first_one_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -47,33 +41,21 @@ def test_all_ranks_write_where_the_first_one_does(tmp_path: Path, monkeypatch: p
     assert places[0] == places[1]
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        [*WORDS, "target.psnr=30", "budget=10m"],
-        [*WORDS, "launcher=processes"],
-        [*WORDS, "viewer=true"],
-        [*WORDS, "output_dir=taken"],
-    ],
-)
+@pytest.mark.parametrize("word", ["target.psnr=30", "launcher=processes", "viewer=true", "output_dir=taken"])
 def test_what_the_first_rank_refuses_the_others_do_not_repeat(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "file").touch()
-    first, second = run_ranks(2, lambda group: _compose(words, False, group))
+    first, second = run_ranks(2, lambda group: _compose([*WORDS, word], False, group))
     assert isinstance(first, ConfigError) and isinstance(second, RankError) and second.reported
 
 
 def test_one_run_alone_is_shared(tmp_path: Path) -> None:
     first, _ = run_ranks(2, lambda group: _compose(WORDS, True, group))
     assert isinstance(first, ConfigError)
-    assert (
-        str(first)
-        == "2 processes of torchrun fit one scene together; expected neither -m, --config, --cfg, a target, a "
-        "launcher, nor a viewer"
-    )
+    assert str(first).startswith("2 processes of torchrun fit one scene together; expected neither -m, --config")
 
 
 @pytest.mark.parametrize(
@@ -88,10 +70,7 @@ def test_a_gpu_for_each_rank(gpus: int, device: str, wrong: bool, monkeypatch: p
     config = compose(WORDS, check_output=False)
     config = replace(config, renderer=replace(config.renderer, device=device))
     if wrong:
-        with pytest.raises(
-            BackendUnavailable,
-            match=rf"renderer\.device={device}: 1 GPUs for 2 ranks",
-        ):
+        with pytest.raises(BackendUnavailable, match=rf"renderer\.device={device}: 1 GPUs for 2 ranks"):
             _select_gpu(config, TorchrunRank(1, 2, 1, 2, ""))
     else:
         _select_gpu(config, TorchrunRank(1, 2, 1, 2, ""))
@@ -140,7 +119,7 @@ def test_nobody_to_meet_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     from datetime import timedelta
 
     monkeypatch.setattr(process_group, "MEETING", timedelta(seconds=1))
-    for name, value in {**ALL, "RANK": "1", "LOCAL_RANK": "1", "MASTER_ADDR": "localhost"}.items():
+    for name, value in SECOND.items():
         monkeypatch.setenv(name, value)
     assert main(["run", *WORDS]) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("neuprim")]

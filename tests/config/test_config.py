@@ -43,33 +43,19 @@ def test_another_strategy_starts_with_all_primitives_unless_growth_is_typed() ->
         return compose(["task=static", *words]).train.population.grow_from
 
     assert grow_from() == 0.5
-    for word in (
-        "train.population.strategy=fixed",
-        "train.population={strategy: fixed}",
-        "train.population.strategy=gradient",
-    ):
-        assert grow_from(word) == 1.0
+    assert grow_from("train.population.strategy=fixed") == grow_from("train.population={strategy: fixed}") == 1.0
     assert grow_from("train.population.strategy=relocate") == 0.5
     with pytest.raises(ConfigError, match=r"grow_from=0\.5: fixed does not grow that way"):
         grow_from("train.population.strategy=fixed", "train.population.grow_from=0.5")
 
 
 def test_free_dictionaries_need_no_plus(toy: Path) -> None:
-    c = toys(
-        "train.rates.w2=1e-3",
-        "+train.rates.b2=2",
-        "model.init.mode=paper",
-        "model.init.deep={a:[1,2]}",
-        "task.options.gain=3",
-    )
+    rates = ["train.rates.w2=1e-3", "+train.rates.b2=2", "train.rate_units.glow=extent"]
+    c = toys(*rates, "model.init.mode=paper", "model.init.deep={a:[1,2]}", "task.options.gain=3")
     assert c.train.rates == {"means": 1e-3, "w2": 1e-3, "b2": 2.0}
     assert c.model.init == {"mode": "paper", "deep": {"a": [1, 2]}}
-    assert c.options == {"gain": 3}
+    assert (c.options, c.train.rate_units) == ({"gain": 3}, {"glow": "extent"})
     assert c.non_default["train.rates.w2"] == (None, 1e-3)
-    units = toys("train.rate_units.glow=extent")  # a parameter that only another package knows
-    assert units.train.rate_units == {"glow": "extent"} and units.non_default == {
-        "train.rate_units.glow": (None, "extent")
-    }
 
 
 def test_typed_seconds_are_all_of_the_budget(toy: Path) -> None:
@@ -104,11 +90,7 @@ def test_interpolation_follows_the_override(toy: Path) -> None:
         (["scene=[1]"], "expected the name of a scene"),
         (["effort=true"], "effort=true: expected a level from 1 (fast) to 9 (good)"),
         (["preset=lng"], "preset=lng: task 'toy' has no such preset; did you mean 'long'?"),
-        (["train.iterations=abc"], "train.iterations=abc: expected a whole number"),
-        (["train.rates.w2=fast"], "train.rates.w2=fast: expected a finite number"),
-        (["train.rates=3"], "train.rates=3: expected entries"),
         (["model=3"], "model is a group of settings"),
-        (["renderer.backend=cpuu"], "renderer.backend=cpuu: expected auto, cuda, cpu or reference"),
         (["scene.size=big"], "scene.size=big: expected a whole number"),
         (["scene=files"], "scene.path: required and not given; expected a directory or file, as scene.path=PATH"),
         (["scene=files", "scene.path=null"], "scene.path: required and not given"),
@@ -211,12 +193,8 @@ def test_occupied_directory_is_refused(toy: Path) -> None:
 
 
 def test_expand_sweep() -> None:
-    assert expand_sweep(["a=1,2", "b=3", "c=x,y"]) == [
-        ["a=1", "b=3", "c=x"],
-        ["a=1", "b=3", "c=y"],
-        ["a=2", "b=3", "c=x"],
-        ["a=2", "b=3", "c=y"],
-    ]
+    made = expand_sweep(["a=1,2", "b=3", "c=x,y"])
+    assert made == [[a, "b=3", c] for a in ("a=1", "a=2") for c in ("c=x", "c=y")]
     assert expand_sweep(["a=range(1,4)"]) == [["a=1"], ["a=2"], ["a=3"]]
     assert expand_sweep(["a=choice(x,y)"]) == [["a=x"], ["a=y"]]
     assert expand_sweep(["a=[1,2]", "p='x,y=z w'"]) == [["a=[1,2]", "p='x,y=z w'"]]
@@ -267,18 +245,11 @@ def test_a_wrong_combination_stops_the_sweep_before_it_starts(toy: Path) -> None
 
 
 def test_yaml_round_trip(toy: Path) -> None:
-    c = toys(
-        "scene=files",
-        "scene.path='a: b, #c'",
-        "train.rates.w2=1e-5",
-        "train.max_seconds=3",
-        "scene.downsample=2",
-        "model.init={l:[1]}",
-    )
+    words = ["scene.path='a: b, #c'", "train.rates.w2=1e-5", "train.max_seconds=3", "scene.downsample=2"]
+    c = toys("scene=files", *words, "model.init={l:[1]}")
     Path("run").mkdir()
     Path("run/config.yaml").write_text(c.to_yaml())
-    assert RunConfig.from_yaml("run") == c
-    assert RunConfig.from_yaml(Path("run/config.yaml")) == c
+    assert RunConfig.from_yaml("run") == RunConfig.from_yaml(Path("run/config.yaml")) == c
 
 
 @pytest.mark.parametrize(
@@ -295,10 +266,8 @@ def test_yaml_round_trip(toy: Path) -> None:
 def test_damaged_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str, text: str) -> None:
     monkeypatch.chdir(tmp_path)
     Path("config.yaml").write_text(content)
-    with pytest.raises(CheckpointError) as caught:
+    with pytest.raises(CheckpointError, match=rf"config\.yaml.*{text}"):
         RunConfig.from_yaml("config.yaml")
-    assert "config.yaml" in str(caught.value)
-    assert text in str(caught.value)
     assert not Path("hacked").exists()
 
 
@@ -306,58 +275,53 @@ def test_damaged_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content:
     ("old", "new", "text"),
     [
         ("iterations: 7", "iteratons: 7", "train.iteratons: no such setting; did you mean 'train.iterations'"),
-        ("iterations: 7", "iterations: many", "train.iterations=many: expected a whole number"),
         ("preset: quick", "preset: [3]", "preset=[3]: expected text"),
         ("preset: quick", "persett: quick", "persett: no such setting; did you mean 'preset'"),
         ("non_default: {}", "non_default: {a: 3}", "non_default.a=3: expected a list"),
         ("output_dir: outputs/toy-ball", "output_dir: null", "output_dir: missing"),
         ("overrides:", "overrides: 3\n#", "overrides=3: expected a list"),
-        ("backend: auto", "backend: abacus", "renderer.backend=abacus"),
     ],
 )
 def test_impossible_settings_in_a_file(toy: Path, old: str, new: str, text: str) -> None:
-    content = toys().to_yaml()
+    content = toys().to_yaml().replace("\n- task=toy", "" if old == "overrides:" else " []")
     assert old in content
-    content = (
-        content.replace("\n- task=toy", "").replace("overrides:", "overrides: []")
-        if old != "overrides:"
-        else content.replace("\n- task=toy", "")
-    )
     Path("config.yaml").write_text(content.replace(old, new))
     with pytest.raises(ConfigError) as caught:
         RunConfig.from_yaml("config.yaml")
-    assert str(caught.value).startswith("config.yaml: ")
-    assert text in str(caught.value)
+    assert str(caught.value).startswith("config.yaml: ") and text in str(caught.value)
 
 
 # ---------------------------------------------------------------- the static task's files
 
 
-@pytest.mark.parametrize(
-    ("scene", "preset"),
-    list(
-        zip(
-            ["solids", "room", "mesh", "blender", "nerfstudio"],
-            ["quick", "paper", "paper_real", "paper_200", "paper_5k"],
-            strict=True,
-        )
-    ),
-)
-def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, scene: str) -> None:
+STRATEGIES = {
+    "quick": "relocate",
+    "paper": "gradient",
+    "paper_real": "gradient",
+    "paper_200": "fixed",
+    "paper_5k": "fixed",
+}
+
+
+@pytest.mark.parametrize("preset", STRATEGIES)
+def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str) -> None:
     monkeypatch.chdir(tmp_path)
-    path = [] if scene in ("solids", "room") else ["scene.path=data"]
-    c = compose([f"scene={scene}", f"preset={preset}", *path])
-    assert (c.task, c.scene_name, c.preset) == ("static", scene, preset)
+    c = compose(["scene=blender", f"preset={preset}", "scene.path=data"])
+    assert (c.task, c.scene_name, c.preset) == ("static", "blender", preset)
     gain = {"log_gain"} if preset == "quick" else set()
     assert set(c.train.rates) == {"means", "log_scales", "quats", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest"} | gain
-    strategies = {
-        "quick": "relocate",
-        "paper": "gradient",
-        "paper_real": "gradient",
-        "paper_200": "fixed",
-        "paper_5k": "fixed",
-    }
-    assert c.train.population.strategy == strategies[preset]
+    assert c.train.population.strategy == STRATEGIES[preset]
+
+
+def test_a_preset_starts_from_others(toy: Path) -> None:
+    folder = toy / "conf" / "preset" / "toy"
+    (folder / "longer.yaml").write_text("defaults: [long, _self_]\ntrain: {iterations: 800}\n")
+    c = toys("preset=longer")
+    assert (c.model.primitives, c.train.iterations) == (9, 800)
+    for names, text in (("[longer]", "starts from itself"), ("[nowhere]", "cannot be read"), ("3", "expected a list")):
+        (folder / "longer.yaml").write_text(f"defaults: {names}\n")
+        with pytest.raises(ConfigError, match=f"preset/toy/.*{text}"):
+            toys("preset=longer")
 
 
 @pytest.mark.parametrize("scene", ["mesh", "blender", "nerfstudio", "colmap"])

@@ -132,13 +132,14 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
     typed = {a.key: a.value for a in assignments}
     choices: dict[str, str | None] = {key: _read_choice(assignments, key) for key in CHOICES}
     begun = find_resumed_run(typed, choices, stored is not None)
+    earlier = [config for config in (begun, stored) if config is not None]
+    for config in earlier:
+        check_stored(config, typed)
     if begun is not None:
         choices = resumed_choices(begun, choices)
     elif stored is not None:
-        check_stored(stored, typed)
         choices = stored_choices(stored, choices)
     values = [a for a in assignments if a.key not in CHOICES]
-    earlier = [config for config in (begun, stored) if config is not None]
     try:
         config, paths = _make_config(_select(choices), values, earlier, check_output)
     except UnknownPlugin:

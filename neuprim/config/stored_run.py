@@ -10,7 +10,7 @@ from neuprim.config.checks import CHOICES
 from neuprim.config.outputs import DEFAULT_TASK, output_directory, run_name
 from neuprim.config.run_config import RunConfig, flatten
 from neuprim.config.task_files import task_choices
-from neuprim.config.trust import check_stored, refuse_links
+from neuprim.config.trust import refuse_links
 from neuprim.core.errors import ConfigError
 from neuprim.core.notices import warn_once
 from neuprim.core.validation import format_value
@@ -111,7 +111,7 @@ def find_resumed_run(typed: Mapping[str, Any], choices: Choices, has_file: bool)
         has_file: whether ``--config`` gives settings.
 
     Raises:
-        ConfigError: only the directory was typed, and no run is there; or the run reaches what the user does not trust.
+        ConfigError: only the directory was typed, and no run is there; or a folder in it is a link out of it.
         CheckpointError, ConfigError: its ``config.yaml`` is damaged. Where settings were typed, unknown ones in the
             file are a warning.
         UnknownPlugin: the place follows from a task, which is not installed.
@@ -128,14 +128,12 @@ def find_resumed_run(typed: Mapping[str, Any], choices: Choices, has_file: bool)
     if (directory / "config.yaml").is_file() and (bare or not (directory / _SEARCH).exists()):
         refuse_links(directory)
         try:
-            begun = RunConfig.from_yaml(directory)
+            return RunConfig.from_yaml(directory)
         except ConfigError as error:  # as of a version with other settings
             if bare:
                 raise
             warn_once(f"{error}; the run goes on with what was typed alone")
             return None
-        check_stored(begun, typed)
-        return begun
     if bare:
         hint = ", or -m for the sweep there" if (directory / _SWEEP).is_file() else ""
         raise ConfigError(

@@ -41,14 +41,16 @@ def test_all_ranks_write_where_the_first_one_does(tmp_path: Path, monkeypatch: p
     assert places[0] == places[1]
 
 
-@pytest.mark.parametrize("word", ["target.psnr=30", "launcher=processes", "viewer=true", "output_dir=taken"])
+@pytest.mark.parametrize(
+    "words", ["target.psnr=30 budget=10m", "launcher=processes", "viewer=true", "output_dir=taken"]
+)
 def test_what_the_first_rank_refuses_the_others_do_not_repeat(
-    word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "file").touch()
-    first, second = run_ranks(2, lambda group: _compose([*WORDS, word], False, group))
+    first, second = run_ranks(2, lambda group: _compose([*WORDS, *words.split()], False, group))
     assert isinstance(first, ConfigError) and isinstance(second, RankError) and second.reported
 
 

@@ -50,7 +50,9 @@ def run(checkout: Path, words: list[str]) -> dict[str, Any]:
     environment = {**os.environ, "PYTHONPATH": str(checkout.resolve())}
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "neuprim", "run", *words, f"output_dir='{folder}/run'"]
-        subprocess.run(command, env=environment, cwd=checkout, stdout=subprocess.DEVNULL, check=True)
+        done = subprocess.run(command, env=environment, cwd=checkout, capture_output=True, text=True)
+        if done.returncode:
+            raise SystemExit(f"{checkout}: {done.stderr}")
         metrics: dict[str, Any] = json.loads(Path(folder, "run", "metrics.json").read_text(encoding="utf-8"))
     return metrics
 

@@ -35,17 +35,6 @@ from neuprim.runs.launch.launcher import LAUNCH_FOLDER, check_launcher, launch
 from neuprim.runs.open import make_scene_context, model_file, read_metrics
 from neuprim.runs.training import BetweenSteps, do_nothing_between, train_in_directory
 
-__all__ = [
-    "CHUNKS_FILE",
-    "CHUNKS_FOLDER",
-    "ChunkRecord",
-    "ChunkRow",
-    "ChunksMissing",
-    "JOINT_SHARE",
-    "read_chunk_record",
-    "train_in_chunks",
-]
-
 CHUNKS_FILE, CHUNKS_FOLDER = "chunks.json", "chunks"
 """In a run's directory: the record, and the runs of the chunks."""
 

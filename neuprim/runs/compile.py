@@ -16,8 +16,6 @@ import torch
 
 from neuprim.core.compute.kernels import cache_directory, sources_hash
 
-__all__ = ["KernelCompilation", "is_compiled", "compile_in_background", "main", "mark_compiled", "kernel_variant"]
-
 _LIMIT = 600.0  # seconds after which the run goes on alone
 
 

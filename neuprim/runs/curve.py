@@ -13,8 +13,6 @@ from neuprim.core.metrics import psnr
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.measure import render_image
 
-__all__ = ["evaluate_curve_point", "next_evaluation_progress", "open_curve"]
-
 _VIEWS = 5  # held-out views behind the curve's eval_psnr
 _PSNR_MAX = 200.0  # dB; equal images have an infinite one
 

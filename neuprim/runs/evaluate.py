@@ -22,8 +22,6 @@ from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import measure_views, render_image, summarize_metrics
 from neuprim.webpage.scene import held_out, scene_page, start_of
 
-__all__ = ["evaluate_fitted"]
-
 _SHOWN_VIEWS = 8  # held-out views in renders/ and the report
 _ORBIT_FRAMES = 36
 
@@ -69,7 +67,7 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
             truth = clip.source.pixels(i).over(dataset.background)
             add_frame(clip, i, render_image(model, clip.source.view(i), config.renderer, dataset.background), truth)
     size = (directory / "model.safetensors").stat().st_size
-    metrics = summarize_metrics(config, model, task, dataset, channels, views, size, fitted.training, fitted.lpips)
+    metrics = summarize_metrics(fitted.job, channels, views, size, fitted.training, fitted.lpips)
     write_json(directory / "metrics.json", metrics)
     views_around = call_task_orbit(task, dataset, _ORBIT_FRAMES)
     frames = [channels.display(render_image(model, v, config.renderer, dataset.background)) for v in views_around]

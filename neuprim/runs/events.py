@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 from neuprim.core.train.trainer import StepReport
 
-__all__ = ["Evaluated", "Event", "Events", "Finishing", "Note", "Preparing", "Step", "ignore_event"]
-
 
 @dataclass(frozen=True)
 class Preparing:

@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 
-from neuprim.config import RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.compression import is_compressed
 from neuprim.core.conditions import flag, named, read_conditions, split_words
@@ -26,8 +25,6 @@ from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
 from neuprim.runs.open import COMPRESSED, load_run, open_run
 from neuprim.version import __version__
-
-__all__ = ["EXPORTS_FILE", "export_run", "import_model", "import_run"]
 
 Progress = Callable[[str, float], None]
 
@@ -301,7 +298,6 @@ def _write_run(path: Path, out: Path, config: str, write: Callable[[Path], objec
         (output / "config.yaml").write_text(config, encoding="utf-8", newline="")
         try:
             write(output)
-            RunConfig.from_yaml(output / "config.yaml")
             load_run(output, named=False)
         except (NeuprimError, ValueError, TypeError) as error:  # of a file that is not yet there under this name
             raise DataError(f"{path}: {str(error).replace(str(output), 'its model')}") from error

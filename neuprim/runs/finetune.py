@@ -13,8 +13,6 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import keep_model_settings, make_loss
 
-__all__ = ["fine_tuner", "steps_in"]
-
 BEGIN = 0.8
 """Progress of the run that the fine-tuning stands for at its first step."""
 

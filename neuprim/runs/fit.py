@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from neuprim.config import RunConfig, find_run_plugins, made_now, scene_of, task_of
+from neuprim.config import Job, RunConfig, find_run_plugins, made_now, scene_of, task_of
 from neuprim.core.channels import Channels, find_channels
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
@@ -35,22 +35,6 @@ from neuprim.runs.events import Evaluated, Events, Note, Preparing, Step, ignore
 from neuprim.runs.measure import measure_views, summarize_metrics
 from neuprim.runs.open import load_dataset
 
-__all__ = [
-    "Fitted",
-    "TrainerFactory",
-    "train_to_end",
-    "fit",
-    "is_chunked",
-    "refuse_chunks",
-    "make_loss",
-    "make_trainer",
-    "use_one_torch_thread",
-    "prepare_training",
-    "train_steps",
-    "compile_kernels",
-]
-
-
 TrainerFactory = Callable[[RunConfig, TaskSpec, Dataset, Loss], Trainer]
 """(configuration, its task, its data, its loss) -> the trainer of a model that is there already."""
 
@@ -73,6 +57,11 @@ class Fitted:
         return self.trainer.model
 
     @property
+    def job(self) -> Job:
+        """Configuration, task, data and model."""
+        return Job(self.config, self.task, self.dataset, self.model)
+
+    @property
     def training(self) -> dict[str, Any]:
         """Steps done and seconds that they took, as ``metrics.json`` has them."""
         return {"iterations": self.trainer.step, "train_seconds": self.trainer.elapsed}
@@ -86,22 +75,10 @@ class Fitted:
         """The content of ``metrics.json``, measured on the views that judge; the model's size is that of its
         tensors."""
         self.unlock()
-        views = measure_views(
-            self.model, self.task, self.dataset, self.config.renderer, self.channels, lpips=self.lpips
-        )
+        job, settings = self.job, self.config.renderer
+        views = measure_views(self.model, self.task, self.dataset, settings, self.channels, lpips=self.lpips)
         size = 4 * sum(value.numel() for value in self.model.params.values())
-        return summarize_metrics(
-            self.config,
-            self.model,
-            self.task,
-            self.dataset,
-            self.channels,
-            views,
-            size,
-            self.training,
-            self.lpips,
-            self.split,
-        )
+        return summarize_metrics(job, self.channels, views, size, self.training, self.lpips, self.split)
 
 
 def fit(config: RunConfig, events: Events = ignore_event, dataset: Dataset | None = None) -> Fitted:
@@ -118,7 +95,7 @@ def fit(config: RunConfig, events: Events = ignore_event, dataset: Dataset | Non
 
 
 def train_to_end(fitted: Fitted, events: Events = ignore_event) -> Fitted:
-    """Train what :func:`start` made to the end of its budget; returns it."""
+    """Train to the end of the budget; returns what was passed."""
     compile_kernels(fitted.trainer)
     with use_one_torch_thread():
         for _ in train_steps(fitted.trainer, events):
@@ -139,8 +116,7 @@ def prepare_training(
 
     Args:
         hold_out: n > 1: every n-th training view takes the place of the test views; 0: the data are taken as they are.
-        What a task knows of
-            its test views, and checks here, is of those that the data set came with.
+            What a task knows of its test views, and checks here, is of those that the data set came with.
         make: what makes the trainer; None: :func:`make_trainer`, of a fresh model.
         group: the ranks that train the model together; None for one process.
     """

@@ -21,15 +21,6 @@ from neuprim.runs.launch.jobs import Job, JobStatus, Result
 from neuprim.runs.launch.launcher import OnStatus, launch
 from neuprim.runs.open import make_scene_context
 
-__all__ = [
-    "render_ground_truth_of_runs",
-    "render_ground_truth_for_training",
-    "render_frames_job",
-    "render_ground_truth",
-    "split_frames",
-    "load_ground_truth",
-]
-
 _MOST = 16
 """Frames that a worker takes at a time."""
 

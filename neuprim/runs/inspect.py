@@ -32,8 +32,6 @@ from neuprim.runs.events import Events, Note, ignore_event
 from neuprim.runs.kept import PRUNED, describe_kept_shares, kept_shares
 from neuprim.runs.open import open_run
 
-__all__ = ["OUTPUTS", "Request", "inspect_run"]
-
 FILMS = (".webp", ".gif", ".mp4")
 OUTPUTS = (".png", *FILMS, ".html", ".vdb")
 """What ``--out`` may end in."""

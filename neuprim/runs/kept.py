@@ -6,8 +6,6 @@ from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import count_numbers, nonzero_rows
 
-__all__ = ["PRUNED", "kept_shares", "describe_kept_shares"]
-
 PRUNED = "pruned.json"
 """Of the directory of a pruned model: how it came to be."""
 

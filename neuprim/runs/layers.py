@@ -29,8 +29,6 @@ from neuprim.plugins.returns import draw_task_layer
 from neuprim.runs.render_config import RenderConfig
 from neuprim.version import __version__
 
-__all__ = ["DATATYPES", "Layers", "linear_light"]
-
 DATATYPES = ("half", "float")
 """Of light and alpha in a file; other numbers are 32-bit floats in either."""
 
@@ -42,9 +40,7 @@ def linear_light(image: Tensor, color_space: str, alpha: Tensor | None = None) -
     """(H, W, C) linear light of an image in a data set's colour space; sRGB values lose what is below 0.
 
     Args:
-        alpha: (H, W) that the image is premultiplied by. The curve is that of the colour without it: what is linear is
-        the light of the
-            matter that is seen, times how much of the pixel it covers.
+        alpha: (H, W) that the image is premultiplied by. The curve applies to the colour without it.
     """
     if color_space == "linear":
         return image

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.config import RunConfig, find_run_plugins
+from neuprim.config import Job, find_run_plugins
 from neuprim.core.channels import Channels, find_channels
 from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
@@ -42,16 +42,6 @@ from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render
 from neuprim.runs.render_config import estimate_file_bytes, parse_render_config
 from neuprim.version import __version__
 
-__all__ = [
-    "ViewMetrics",
-    "render_image",
-    "render_light_sum",
-    "evaluate_run",
-    "measure_views",
-    "measure_quality",
-    "summarize_metrics",
-]
-
 _VISIBLE = 20 * math.log10(255)
 """dB: smaller errors than one of 255 levels are not visible, and an empty frame's black image has no error at all."""
 
@@ -66,10 +56,10 @@ class ViewMetrics:
         black: PSNR of an image of the background alone.
         empty: the model is not in the view; the image is the background alone.
         more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``,
-        ``ssim_display`` of what the
-            task's own display shows; ``psnr_gain`` of opaque photographs; ``ssim_3dgs``, ``lpips``; ``psnr_mask`` and
-            ``mse_mask`` inside the task's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without
-            anything on it; what the task's :attr:`~neuprim.core.task.TaskSpec.judge` adds.
+            ``ssim_display`` of what the task's own display shows; ``psnr_gain`` of opaque photographs; ``ssim_3dgs``,
+            ``lpips``; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and
+            ``psnr_black_image_mask`` of an image without anything on it; what the task's
+            :attr:`~neuprim.core.task.TaskSpec.judge` adds.
     """
 
     name: str
@@ -209,9 +199,8 @@ def evaluate_run(run_dir: Path, lpips: str | Path | None = None, words: Sequence
 
     Args:
         lpips: weights for LPIPS; without, those that the run names.
-        words: of an operating point (:mod:`neuprim.runs.render_config`), over how the run draws; ``model_bytes`` is the
-        size of the run's file
-            but for what these change.
+        words: overrides of a render configuration (:mod:`neuprim.runs.render_config`); ``model_bytes`` is the size of
+            the run's file but for what these change.
     """
     config, task, model, header = load_run(run_dir)
     point = parse_render_config(words, config.renderer, model)
@@ -228,14 +217,11 @@ def evaluate_run(run_dir: Path, lpips: str | Path | None = None, words: Sequence
         size = estimate_file_bytes(path, model, part, point.storage)
         model = move_to_render_device(part, config.renderer, dataset.test.view(0))
         views = measure_views(model, task, dataset, config.renderer, channels, lpips=distance, paint=point.render_view)
-        return summarize_metrics(config, model, task, dataset, channels, views, size, training, distance)
+        return summarize_metrics(Job(config, task, dataset, model), channels, views, size, training, distance)
 
 
 def summarize_metrics(
-    config: RunConfig,
-    model: Primitives,
-    task: TaskSpec,
-    dataset: Dataset,
+    job: Job,
     channels: Channels,
     views: Sequence[ViewMetrics],
     model_bytes: int,
@@ -243,11 +229,15 @@ def summarize_metrics(
     lpips: Lpips | None = None,
     split: str = "test",
 ) -> dict[str, Any]:
-    """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them.
+    """The content of ``metrics.json``.
 
     Args:
+        job: with its data and its model.
+        training: iterations and train_seconds as the run recorded them.
         split: what the judging views are; those that are not the data set's test views make none of the task's films.
     """
+    config, task, dataset, model = job.config, job.task, job.dataset, job.model
+    assert dataset is not None and model is not None
     worst, camera = min(views, key=lambda v: v.psnr), dataset.test.view(0).camera
     lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions, config.renderer)
     backend = choose_backend(lowered, config.renderer)
@@ -260,7 +250,7 @@ def summarize_metrics(
         "split": split,
         **to_json("psnr", float(np.mean([v.psnr for v in views]))),
         "ssim": float(np.mean([v.ssim for v in views])),
-        **_means(views),
+        **means([v.more for v in views]),
         **_lpips(views, lpips),
         **to_json("psnr_worst", worst.psnr),
         "view_worst": worst.name,
@@ -303,11 +293,6 @@ def _entry(view: ViewMetrics) -> dict[str, Any]:
     for name, value in view.more.items():
         entry |= to_json(name, value)
     return entry
-
-
-def _means(views: Sequence[ViewMetrics]) -> dict[str, Any]:
-    """Means over views of the further numbers, and PSNRs of mean squared errors ("pooled"); see ``TaskSpec.judge``."""
-    return means([v.more for v in views])
 
 
 def _lpips(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dict[str, Any]:

@@ -25,18 +25,6 @@ from neuprim.plugins.attribution import attribute_errors
 from neuprim.plugins.provenance import warn_of_other_neuprim
 from neuprim.plugins.registry import PluginError
 
-__all__ = [
-    "COMPRESSED",
-    "make_scene_context",
-    "load_dataset",
-    "load_run",
-    "model_file",
-    "open_run",
-    "move_to_render_device",
-    "read_metrics",
-]
-
-
 COMPRESSED = "model.neuprim"
 """A run's model in few bits, as ``neuprim compress`` writes it."""
 

@@ -22,8 +22,6 @@ from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.metrics import from_json
 from neuprim.runs.fit import compile_kernels, prepare_training, use_one_torch_thread
 
-__all__ = ["Figures", "Planned", "Row", "Table", "budget_words", "compared", "pace", "plan", "tables"]
-
 _KINDS = ("psnr", "ssim", "lpips")
 _OURS = {"psnr": "psnr", "ssim": "ssim_3dgs", "lpips": "lpips_3dgs"}
 _UNITS = {"s": 1, "m": 60, "h": 3600}

@@ -33,20 +33,6 @@ from neuprim.core.model.reduction import KINDS, reduce_model, reduction_names, v
 from neuprim.core.render import RenderSettings, backends, render
 from neuprim.core.validation import Range, coerce, validate
 
-__all__ = [
-    "ALL_GROUPS",
-    "FLOAT32",
-    "FORMATS",
-    "GROUPS",
-    "HEADS",
-    "RenderConfig",
-    "StorageFormat",
-    "emulate_storage",
-    "estimate_file_bytes",
-    "parse_render_config",
-    "storage_bytes",
-]
-
 HEADS = ("renderer", "resolution", "density", "colour", "store")
 """First parts of the keys."""
 

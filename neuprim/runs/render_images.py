@@ -31,8 +31,6 @@ from neuprim.runs.open import load_dataset, load_run, move_to_render_device
 from neuprim.runs.render_config import parse_render_config
 from neuprim.runs.run_directory import refuse_results
 
-__all__ = ["FORMATS", "SETS", "RenderRequest", "render_run", "with_conditions"]
-
 SPACES = WORLD, SCENE = ("world", "scene")
 """Whose coordinates a file of cameras has, after ``--space``."""
 

@@ -16,8 +16,6 @@ from neuprim.runs.fit import is_chunked, refuse_chunks
 from neuprim.runs.run_directory import lock_directory
 from neuprim.runs.training import BetweenSteps, do_nothing_between, train_in_directory
 
-__all__ = ["run"]
-
 
 def run(
     config: RunConfig,
@@ -39,9 +37,8 @@ def run(
         launcher: where the chunks of a scene are fitted, if it is fitted in chunks.
 
     Raises:
-        NeuprimError: the input's fault, another process that is at work there, or numbers that left the finite;
-        whatever was on disk before
-            is intact.
+        NeuprimError: the input's fault, another process that is at work there, or numbers that are not finite;
+            whatever was on disk before is intact.
         RankError: another rank ended; what was trained is in the checkpoint.
     """
     directory = config.output_dir

@@ -17,8 +17,6 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import remove_leftovers
 from neuprim.core.io.plain import load_json
 
-__all__ = ["LOCK_FILE", "discard_results", "lock_directory", "refuse_results", "result_files"]
-
 LOCK_FILE = ".lock"
 """In the directory while it is locked; it names the process."""
 

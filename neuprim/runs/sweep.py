@@ -29,20 +29,6 @@ from neuprim.runs.launch.launcher import LAUNCH_FOLDER, OnStatus, check_launcher
 from neuprim.runs.open import model_file
 from neuprim.runs.run_directory import lock_directory
 
-__all__ = [
-    "SWEEP_FILE",
-    "SweepRecord",
-    "SweepRow",
-    "fit_job",
-    "is_complete",
-    "read_sweep",
-    "read_sweep_overrides",
-    "read_sweep_runs",
-    "run_job",
-    "run_sweep",
-    "write_csv",
-]
-
 SWEEP_FILE = "sweep.json"
 """Of a sweep's directory."""
 
@@ -241,8 +227,7 @@ def run_sweep(
     Args:
         configs: as :func:`~neuprim.config.compose_all` gives them, all in one directory.
         words: what the sweep was asked for.
-        on_status: called with (place in ``configs``, status) whenever there is something new; once of each run that is
-            kept.
+        on_status: called with (place in ``configs``, status) whenever it is new; once for each run that is kept.
 
     Returns:
         the record, and a result for each configuration; None of those that Ctrl-C came before.

@@ -40,12 +40,9 @@ from neuprim.runs.fit import (
 from neuprim.runs.interrupt import interruptible
 from neuprim.runs.run_directory import discard_results
 
-__all__ = ["COMPILING", "BetweenSteps", "do_nothing_between", "compile_for_run", "save_training", "train_in_directory"]
-
 BetweenSteps = Callable[[Fitted, threading.Event], None]
 """Called on the training's thread before its first step and after every one, with what is trained and the event that
-ends the training as
-Ctrl-C does. It may look at the state, save it and wait, and must not change it."""
+ends the training as Ctrl-C does. It may read the state, save it and wait, and must not change it."""
 
 COMPILING = "compiling kernels, once per installation (about a minute)"
 
@@ -69,7 +66,8 @@ def train_in_directory(
     Args:
         dataset: the scene of the configuration, if it is loaded already.
         hold_out: n > 1: every n-th training view is a test view, and no other is; see
-        :func:`~neuprim.core.data.dataset.hold_out_views`. between: called between steps, see :data:`Between`.
+            :func:`~neuprim.core.data.dataset.hold_out_views`.
+        between: called between steps, see :data:`BetweenSteps`.
         make: what makes the trainer of a model that is there already; None: a fresh model is trained.
         group: the ranks that train the model together; None for one process.
 

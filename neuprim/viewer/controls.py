@@ -19,12 +19,9 @@ from neuprim.core.settings import SortOrder
 from neuprim.viewer.session import DEFAULT_LONGEST, Pose, Session
 from neuprim.viewer.viewer_scene import list_quantities
 
-__all__ = ["ConditionControls", "RenderControls", "ViewControls", "format_condition"]
-
 _MAX_SLIDER_RANGE = 1e4
 _PLAY_FPS = 12.0
 _NUMBERS = ("samples", "alpha_max", "alpha_min", "transmittance_min", "near")
-_OWN_SETTINGS = "settings below"
 _NO_VIEW = "none"
 _PANEL_HALF = 320  # pixels that half of the panel has at least, on a high-density screen
 
@@ -168,21 +165,8 @@ class RenderControls:
                 hint = "as `neuprim render` takes it: resolution=0.5 density.neurons=1"
                 self._overrides = gui.add_text("operating point", "", hint=hint)
                 self._overrides.on_update(lambda _: self._apply())
-                self._add_front(gui)
             for name, control in inputs.items():
                 control.on_update(lambda event, name=name: self._set_setting(name, event.target.value))
-
-    def _add_front(self, gui: Any) -> None:
-        names = [" ".join(words) for words, _ in self.session.scene.front]
-        if not names:
-            return
-        hint = "the front that `neuprim tradeoff` found"
-        chosen = gui.add_dropdown("measured", [_OWN_SETTINGS, *names], initial_value=_OWN_SETTINGS, hint=hint)
-
-        def choose() -> None:
-            self._overrides.value = "" if chosen.value == _OWN_SETTINGS else chosen.value
-
-        chosen.on_update(lambda _: choose())
 
     def _set_session(self, name: str, value: Any) -> None:
         setattr(self.session, name, value)

@@ -2,48 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.cameras import Camera
 from neuprim.core.channels import Channels
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render import RenderSettings
-from neuprim.core.render.near_plane import resolve_near
+from neuprim.core.render import RenderSettings, render
 from neuprim.inspect.field import measure_absorption
 from neuprim.inspect.views import unit_sphere
 from neuprim.viewer.session import Session
 from neuprim.viewer.viewer_scene import Viewpoint
-
-__all__ = [
-    "Ellipsoids",
-    "PrimitiveControls",
-    "describe_primitive",
-    "list_ellipsoids",
-    "make_ellipsoid",
-    "pick_primitive",
-]
 
 _MAX_NUMBERS = 24  # of a parameter that are written out
 _NONE, _WIRE, _SOLID = "none", "wire", "solid"
 _MAX_ELLIPSOIDS, _DEFAULT_ELLIPSOIDS = 20_000, 1_000
 
 
-@dataclass(frozen=True, eq=False)
-class Ellipsoids:
-    """M ellipsoids of a frame.
-
-    Attributes:
-        rows: (M,) int64 of the model.
-        positions: (M, 3), scales: (M, 3) semi-axes, scene units; wxyz: (M, 4) unit quaternions. float32.
-        colours: (M, 3) uint8 sRGB at their centres, as seen from the frame's camera.
-    """
+class Ellipsoids(NamedTuple):
+    """M ellipsoids of a frame: (M,) rows of the model; (M, 3) centres, (M, 4) unit quaternions and (M, 3) semi-axes,
+    float32, scene units; (M, 3) uint8 sRGB colours at their centres, as seen from the frame's camera."""
 
     rows: np.ndarray
     positions: np.ndarray
@@ -96,42 +79,20 @@ def pick_primitive(
 ) -> int | None:
     """Return the row of the primitive with the largest weight along a ray from the camera; None if the ray is empty.
 
-    As in the reference renderer, chords are cut at the near plane and sorted by the depth of the centres.
-
     Args:
         direction: (3,) of the ray, scene axes, any norm.
     """
-    with torch.no_grad():
-        lowered = model.to(torch.device("cpu")).lower(viewpoint.camera, viewpoint.conditions, settings)
-        g, origin = lowered.geometry, viewpoint.camera.position.double()
-        d = torch.as_tensor(np.asarray(direction, np.float64))
-        d = d / d.norm()
-        forward = viewpoint.camera.viewmat[2, :3].double()
-        near = resolve_near(settings, g.means, [viewpoint.camera]).near_plane / max(float(forward @ d), 1e-9)
-        offset = origin - g.means.double()
-        axes = g.scales.double()
-        p, v = (
-            (g.rotations.double().transpose(1, 2) @ x[..., None])[..., 0] / axes for x in (offset, d.expand_as(offset))
-        )
-        a = v.square().sum(-1)
-        middle = -(p * v).sum(-1) / a
-        D = 1 - (p + middle[:, None] * v).square().sum(-1)
-        half = (D.clamp_min(0) / a).sqrt()
-        t0, t1 = (middle - half).clamp_min(near), middle + half
-        prim = ((D > 0) & (t1 > near)).nonzero()[:, 0]
-        depth = -(offset[prim] @ forward)  # offset points from the centre to the camera
-        prim = prim[torch.argsort(depth, stable=True)]
-        if not len(prim):
-            return None
-        pairs = Pairs.of(g, prim, origin, d.expand(len(prim), 3), t0[prim], t1[prim])
-        alpha = -torch.expm1(-lowered.optical_depth(pairs).clamp_min(0))
-        alpha = alpha.clamp_max(settings.alpha_max)
-        alpha = torch.where(alpha >= settings.alpha_min, alpha, 0.0)
-        weight = alpha * torch.cat([torch.ones(1, dtype=alpha.dtype), (1 - alpha).cumprod(0)[:-1]])
-        best = int(weight.argmax())
-        if float(weight[best]) <= 0:
-            return None
-        return int(prim[best]) if lowered.rows is None else int(lowered.rows[prim[best]])
+    camera = viewpoint.camera
+    x, y, z = (camera.viewmat[:3, :3].double() @ torch.as_tensor(np.asarray(direction, np.float64))).tolist()
+    if z <= 0:
+        return None
+    ray = Camera(camera.viewmat, camera.fx, camera.fy, 0.5 - camera.fx * x / z, 0.5 - camera.fy * y / z, 1, 1)
+    params = {name: value.detach().clone().requires_grad_() for name, value in model.params.items()}
+    output = render(Primitives(model.density, model.colour, params), ray, viewpoint.conditions, settings)
+    contributions = output.request_contributions(torch.ones(1, 1, device=output.rgb.device))
+    output.rgb.sum().backward()
+    weight, _ = contributions.of_all(model.count)
+    return int(weight.argmax()) if len(weight) and float(weight.max()) > 0 else None
 
 
 def describe_primitive(model: Primitives, row: int) -> str:

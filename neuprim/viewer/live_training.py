@@ -27,8 +27,6 @@ from neuprim.viewer.session import Session
 from neuprim.viewer.view import SessionManager
 from neuprim.viewer.viewer_scene import ViewerScene
 
-__all__ = ["Curve", "LiveTraining", "TrainingControls", "TrainingProgress"]
-
 _UPDATE_SECONDS = 0.5  # between updates of a page's numbers
 _PAUSE_SECONDS = 0.1  # between checks of a paused training
 _PLOT_HEIGHT = 150  # pixels
@@ -36,28 +34,23 @@ _SMOOTHING = 0.98
 
 
 class Curve:
-    """A curve of at most ``limit`` points. When it is full, every other point is dropped and half as many are added."""
+    """A curve of finite values."""
 
-    def __init__(self, limit: int = 1000) -> None:
-        self._limit, self._every, self._count = limit, 1, 0
+    def __init__(self) -> None:
         self.x: list[float] = []
         self.y: list[float] = []
 
     def add(self, x: float, y: float) -> None:
         """Add a point, unless it is not finite."""
-        if not math.isfinite(y):
-            return
-        if self._count % self._every == 0:
-            self.x.append(x)
+        if math.isfinite(y):
             self.y.append(y)
-            if len(self.x) >= self._limit:
-                self.x, self.y, self._every = self.x[::2], self.y[::2], 2 * self._every
-        self._count += 1
+            self.x.append(x)
 
-    def to_arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Copy x and y, (P,) float64."""
-        count = min(len(self.x), len(self.y))
-        return np.array(self.x[:count]), np.array(self.y[:count])
+    def to_arrays(self, limit: int = 1000) -> tuple[np.ndarray, np.ndarray]:
+        """Copy x and y of at most ``limit`` points at equal distances; safe while another thread adds some."""
+        count = len(self.x)
+        every = -(-count // limit) or 1
+        return np.array(self.x[:count:every]), np.array(self.y[:count:every])
 
 
 class TrainingProgress:

@@ -16,8 +16,6 @@ from neuprim.core.render import RenderSettings
 from neuprim.runs.render_config import RenderConfig, parse_render_config
 from neuprim.search.points import TRADEOFF_FOLDER, read_record
 
-__all__ = ["SMOOTH_SECONDS", "QualityLadder", "QualityLevel", "read_front"]
-
 SMOOTH_SECONDS = 0.05  # that an image may take while the camera moves
 
 _HALVINGS = 4

@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 
-__all__ = ["RenderQueue"]
-
 
 @dataclass(frozen=True)
 class _Job:

@@ -13,8 +13,6 @@ from typing import Any
 from neuprim.config.command_settings import ViewerSettings
 from neuprim.core.errors import BackendUnavailable, ConfigError
 
-__all__ = ["PageServer", "is_loopback", "require_viser"]
-
 
 def require_viser() -> Any:
     """Import viser.
@@ -55,8 +53,7 @@ class PageServer:
 
     def __init__(self, settings: ViewerSettings, title: str) -> None:
         viser = require_viser()
-        from neuprim.viewer.auth import TokenAuth
-        from neuprim.viewer.messages import refuse_message
+        from neuprim.viewer.auth import TokenAuth, refuse_message
 
         self._on_refusal: Callable[[int, str], None] = lambda client, reason: None
         auth = TokenAuth(settings.host)
@@ -85,7 +82,7 @@ class PageServer:
         try:
             from viser import _messages
 
-            from neuprim.viewer.messages import is_known_protocol
+            from neuprim.viewer.auth import is_known_protocol
 
             for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
                 self.viser._websock_server.unregister_handler(kind)

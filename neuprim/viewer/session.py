@@ -22,8 +22,6 @@ from neuprim.viewer.quality import SMOOTH_SECONDS, QualityLadder, QualityLevel
 from neuprim.viewer.render_queue import RenderQueue
 from neuprim.viewer.viewer_scene import COLOUR, ViewerScene, Viewpoint
 
-__all__ = ["Pose", "Session", "fit_size"]
-
 _STILL_SECONDS = 0.2  # without a change before the full image is drawn
 _REDRAW_SECONDS, _REDRAW_SHARE = 1.0, 9.0  # a growing model is redrawn after this time, or this many drawing times
 _FULL_QUALITY, _FAST_QUALITY = 95, 75  # of JPEG

@@ -27,8 +27,6 @@ from neuprim.viewer.server import PageServer, require_viser
 from neuprim.viewer.session import Session
 from neuprim.viewer.viewer_scene import ViewerScene, Viewpoint
 
-__all__ = ["SessionManager", "open_scene", "view_run"]
-
 _POLL_SECONDS = 0.25  # between checks whether the viewer is to end
 
 

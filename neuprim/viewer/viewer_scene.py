@@ -28,8 +28,6 @@ from neuprim.runs.render_config import RenderConfig
 from neuprim.viewer.quality import Front
 from neuprim.webpage.scene import held_out, start_of
 
-__all__ = ["Picture", "ViewComparison", "ViewerScene", "Viewpoint", "draw_viewpoint", "list_quantities"]
-
 COLOUR, ALPHA, DEPTH = "colour", "alpha", "depth"
 
 _MAX_RAYS = 2**26  # the renderer draws them at once in 2 GB

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import neuprim.runs.evaluate
-import neuprim.runs.training
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import DataError
-from neuprim.runs.events import Event, Events, Finishing, Preparing, Step
+from neuprim.runs.events import Event, Events, Preparing, Step
 from neuprim.runs.launch.jobs import Job
 from neuprim.runs.sweep import fit_job
 
-PHASES = ("loading", "compiling", "training", "finishing")
+PHASES = ("loading", "training")
+"""Without a checkpoint, and with one; tests/runs/test_resume.py kills at any moment."""
 
 
 def job(name: str, function: Any, data: Any = None) -> Job:
@@ -75,24 +75,15 @@ def fit_and_die(data: Mapping[str, Any], attempt: int, events: Events) -> str:
     neuprim.runs.evaluate._ORBIT_FRAMES = 2
     phase = data["phase"] if attempt == 0 else None
 
-    def kill(*args: Any) -> None:
-        os.kill(os.getpid(), signal.SIGKILL)
-
     def heard(event: Event) -> None:
         events(event)
-        now = {Preparing: "loading", Finishing: "finishing"}.get(type(event))
+        now = "loading" if isinstance(event, Preparing) else ""
         if isinstance(event, Step) and event.report.step == 40:
             now = "training"
-        if now == phase is not None:
-            kill()
+        if now == phase:
+            os.kill(os.getpid(), signal.SIGKILL)
 
-    before = neuprim.runs.training.compile_for_run
-    if phase == "compiling":
-        neuprim.runs.training.compile_for_run = kill
-    try:
-        return fit_job(data["config"], attempt, heard)
-    finally:
-        neuprim.runs.training.compile_for_run = before
+    return fit_job(data["config"], attempt, heard)
 
 
 def wait_for(file: Path, seconds: float = 60.0) -> None:
@@ -100,14 +91,3 @@ def wait_for(file: Path, seconds: float = 60.0) -> None:
     while not file.exists():
         assert time.monotonic() < late, f"{file} is not there"
         time.sleep(0.05)
-
-
-def fit_one_and_die(data: Mapping[str, Any], attempt: int, events: Events) -> str:
-    """A run; of the last chunk of a run in chunks, killed after half of its steps."""
-
-    def watched(event: Event) -> None:
-        if isinstance(event, Step) and event.progress > 0.5 and data["output_dir"].endswith("frames_3-6"):
-            os.kill(os.getpid(), signal.SIGKILL)
-        events(event)
-
-    return fit_job(data, attempt, watched)

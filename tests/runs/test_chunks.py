@@ -24,7 +24,6 @@ from neuprim.runs.fit import fit
 from neuprim.runs.open import load_run, read_metrics
 from neuprim.runs.run import run
 from neuprim.tasks.dynamic.density import TimeDensity
-from tests.runs.launching import processes
 from tests.tasks.dynamic.sequences import blob
 
 NAMES = ["frames_1-4", "frames_3-6"]
@@ -164,21 +163,6 @@ def _fail_first(data: Any, attempt: int, events: Any) -> str:
     if str(data["output_dir"]).endswith(NAMES[0]):
         raise DataError("no luck")
     return fit_job(data, attempt, events)
-
-
-@pytest.mark.slow
-def test_a_killed_chunk_is_made_anew_by_the_command_that_goes_on(
-    files: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Under another launcher; its worker dies in the middle of the training."""
-    monkeypatch.setattr(chunks, "_FIT_JOB", "tests.runs.launching:fit_one_and_die")
-    out = tmp_path / "run"
-    with pytest.raises(ChunksMissing, match="frames_3-6: its worker died"):
-        run(compose(words(files, out, "train.checkpoint_every_seconds=0")), launcher=processes(retries=0))
-    assert (out / "chunks" / NAMES[1] / "checkpoint.safetensors").is_file()
-    monkeypatch.undo()
-    run(compose(words(files, out, "train.checkpoint_every_seconds=0", "resume=true")), launcher=processes())
-    assert all(torch.equal(value, model_of(finished)[name]) for name, value in model_of(out).items())
 
 
 def test_other_chunks_than_it_was_begun_with_are_refused(finished: Path, files: Path, tmp_path: Path) -> None:

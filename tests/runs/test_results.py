@@ -108,10 +108,3 @@ def test_a_full_disk_names_the_file_and_keeps_lines_whole(tmp_path: Path, monkey
     with pytest.raises(OSError, match="No space left") as refused:
         write_text(tmp_path / "report.html", "x")
     assert refused.value.filename == str(tmp_path / "report.html") and not list(tmp_path.glob(".*"))
-
-
-@pytest.mark.parametrize("format_name", ["html", "vdb", "ply", "gaussian-ply", "mesh", "npz"])
-def test_help_lists_every_format(format_name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", "--help"]) == 0
-    text = capsys.readouterr().out
-    assert f"  {format_name}  (" in text and "vdb|ply" not in text

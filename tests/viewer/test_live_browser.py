@@ -1,14 +1,13 @@
-"""The viewer in a real browser: a finished run and one that is trained, what a person does there, and what a stranger's
-names cannot do."""
+"""The viewer of a training in a real browser: what a person does there, and that a run's name is never markup."""
 
 from __future__ import annotations
 
 import io
-import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,34 +19,14 @@ pytest.importorskip("viser", reason="the package viser is not installed")
 
 from neuprim.config import compose
 from neuprim.config.command_settings import ViewerSettings
-from neuprim.runs.events import Event
 from neuprim.runs.run import run
 from neuprim.viewer.live_training import LiveTraining
-from neuprim.viewer.view import view_run
 from tests.browsers import browser
 from tests.core import tiny
-from tests.short_runs import fit, words
+from tests.short_runs import words
 
 HOSTILE = "<img src=x onerror=alert(1)>"
 PATIENCE = 60.0
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    with browser() as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short run under a name that is markup."""
-    folder = tmp_path_factory.mktemp("viewed")
-    scene = tiny.write_blender(folder / "two")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 4)
-        fit(words(scene, folder / "plain", 120))
-    shutil.move(folder / "plain", folder / HOSTILE)
-    return folder / HOSTILE
 
 
 class Tab:
@@ -99,39 +78,46 @@ class Tab:
 
 
 @contextmanager
-def open_tab(started: Any, address: str) -> Iterator[Tab]:
-    page = started.new_page(viewport={"width": 800, "height": 600})
-    tab = Tab(page, address)
-    tab.until(
-        lambda: page.get_by_label("show", exact=True).count() > 0 or page.get_by_role("tab").count() > 0, "controls"
-    )
-    yield tab
-    page.close()
+def training(folder: Path) -> Iterator[LiveTraining]:
+    """A training with a page, on a thread of its own, in a folder whose name is markup."""
+    config = compose(words(tiny.write_blender(folder / "two"), folder / "plain", 100_000))
+    config = replace(config, output_dir=folder / HOSTILE)
+    ended: list[BaseException] = []
+
+    def train() -> None:
+        try:
+            run(config, live, live.between)
+        except KeyboardInterrupt as stop:
+            ended.append(stop)
+
+    with LiveTraining(ViewerSettings(port=0), config, lambda address: None, lambda event: None) as live:
+        thread = threading.Thread(target=train)
+        thread.start()
+        try:
+            yield live
+        finally:
+            live.stop()
+            thread.join(PATIENCE)
+    assert not thread.is_alive() and len(ended) == 1 and (config.output_dir / "report.html").exists()
 
 
-@pytest.fixture(scope="module")
-def address(finished: Path) -> Iterator[str]:
-    """Of a viewer of the finished run, which has a thread of its own."""
-    addresses, end, opened = list[str](), threading.Event(), threading.Event()
+def test_a_person_looks_at_a_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Watches the curve, pauses, steps and saves; turns the model, shows alpha, a held-out view and ellipsoids; picks a
+    primitive; and ends it."""
+    monkeypatch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 4)
+    with browser() as chromium, training(tmp_path) as live:
+        page = chromium.new_page(viewport={"width": 800, "height": 600})
+        tab = Tab(page, live.address)
+        tab.until(lambda: page.locator(".uplot").count() == 1 and live.progress.step > 100, "a curve")
+        page.get_by_label("pause").click()
+        tab.until(lambda: live.paused, "the pause")
+        step = live.progress.step
+        page.get_by_text("one step").click()
+        tab.until(lambda: live.progress.step == step + 1, "one more step")
+        page.get_by_text("checkpoint", exact=True).click()
+        tab.until((tmp_path / HOSTILE / "checkpoint.safetensors").exists, "a checkpoint")
 
-    def told(address: str) -> None:
-        addresses.append(address)
-        opened.set()
-
-    thread = threading.Thread(target=view_run, args=(finished, ViewerSettings(port=0), told), kwargs={"end": end})
-    thread.start()
-    try:
-        assert opened.wait(PATIENCE)
-        yield addresses[0]
-    finally:
-        end.set()
-        thread.join(20)
-        assert not thread.is_alive()
-
-
-def test_a_person_looks_at_a_run(address: str, chromium: Any) -> None:
-    with open_tab(chromium, address) as tab:
-        page = tab.page
+        page.get_by_role("tab", name="View").click()
         tab.until(lambda: tab.picture().std() > 15, "a picture of the model")
         seen = tab.settled()
         page.mouse.move(200, 300)
@@ -148,6 +134,7 @@ def test_a_person_looks_at_a_run(address: str, chromium: Any) -> None:
         page.get_by_role("option").nth(1).click()
         tab.until(lambda: page.get_by_text("ground truth, and the model", exact=True).count() > 0, "the truth")
         seen = tab.moved(seen)
+
         page.get_by_role("tab", name="Primitives").click()
         tab.choose("ellipsoids", "solid")
         solid = tab.moved(seen)
@@ -160,45 +147,12 @@ def test_a_person_looks_at_a_run(address: str, chromium: Any) -> None:
         def described() -> bool:  # the page listens to clicks a moment after the box was ticked
             page.mouse.click(int(x) + 20, int(y) + 160)
             page.wait_for_timeout(500)
-            return "semi-axes" in str(
-                page.evaluate("[...document.querySelectorAll('textarea')].map(e => e.value).join()")
-            )
+            texts = page.evaluate("[...document.querySelectorAll('textarea')].map(e => e.value).join()")
+            return "semi-axes" in str(texts)
 
         tab.until(described, "its parameters")
-        assert page.evaluate("document.body.innerText").count(HOSTILE) == 1, "the run's name is text"
+        assert page.evaluate("document.body.innerText").count(HOSTILE) >= 1, "the run's name is text"
+        page.get_by_role("tab", name="Training").click()
+        page.get_by_text("stop", exact=True).click()
+        tab.until(lambda: "ended" in page.evaluate("document.body.innerText"), "the end")
         assert tab.faults == [] and tab.elsewhere == []
-
-
-def test_a_person_looks_at_a_training(tmp_path: Path, chromium: Any) -> None:
-    scene = tiny.write_blender(tmp_path / "two")
-    config, events = compose(words(scene, tmp_path / "out", 100_000)), list[Event]()
-    with LiveTraining(ViewerSettings(port=0), config, lambda address: None, events.append) as live:
-        ended: list[BaseException] = []
-
-        def train() -> None:
-            try:
-                run(config, live, live.between)
-            except KeyboardInterrupt as stop:
-                ended.append(stop)
-
-        thread = threading.Thread(target=train)
-        thread.start()
-        try:
-            with open_tab(chromium, live.address) as tab:
-                page = tab.page
-                tab.until(lambda: page.locator(".uplot").count() == 1, "a curve")
-                page.get_by_label("pause").click()
-                tab.until(lambda: live.paused, "the pause")
-                tab.settled()
-                step = live.progress.step
-                page.get_by_text("one step").click()
-                tab.until(lambda: live.progress.step == step + 1, "one more step")
-                page.get_by_text("checkpoint", exact=True).click()
-                tab.until((config.output_dir / "checkpoint.safetensors").exists, "a checkpoint")
-                page.get_by_text("stop", exact=True).click()
-                thread.join(PATIENCE)
-                assert not thread.is_alive() and tab.faults == [] and tab.elsewhere == []
-        finally:
-            live.stop()
-            thread.join(PATIENCE)
-    assert len(ended) == 1 and (config.output_dir / "report.html").exists()

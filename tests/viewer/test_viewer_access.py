@@ -30,8 +30,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
 from neuprim.tasks.static import TASK
 from neuprim.tasks.static.fields import SphericalHarmonics
-from neuprim.viewer.auth import TokenAuth
-from neuprim.viewer.messages import is_known_protocol, refuse_message
+from neuprim.viewer.auth import TokenAuth, is_known_protocol, refuse_message
 from neuprim.viewer.render_queue import RenderQueue
 from neuprim.viewer.server import PageServer, is_loopback
 from neuprim.viewer.view import SessionManager
@@ -159,14 +158,6 @@ def test_pages_of_another_viser_are_not_served(monkeypatch: pytest.MonkeyPatch) 
     assert is_known_protocol(messages)
 
 
-def test_a_token_is_never_that_of_another() -> None:
-    gates = [TokenAuth() for _ in range(3)]
-    assert len({gate.token for gate in gates}) == 3 and all(len(gate.token) == 43 for gate in gates)
-    headers = Headers({"Host": "localhost:80", "Cookie": f"neuprim-80={gates[0].token}"})
-    assert gates[0].refuse_request("/", headers) is None and gates[1].refuse_request("/", headers) is not None
-    assert gates[0].page_address("::1", 8) == f"http://[::1]:8/?token={gates[0].token}"
-
-
 def test_ports_and_hosts_that_are_not_to_be_had(page: PageServer) -> None:
     port = page.viser.get_port()
     with pytest.raises(ConfigError, match=f"port {port}.*expected an address of this machine and a free port"):
@@ -207,20 +198,9 @@ def test_a_server_answers_to_its_own_names_alone(listens: str, good: list[str], 
         assert found is None or found.startswith("this server's name is localhost or 127.0.0.1 or [::1]")
 
 
-@pytest.mark.parametrize(
-    ("host", "own"),
-    [
-        ("127.0.0.1", True),
-        ("::1", True),
-        ("localhost", True),
-        ("127.8.1.2", True),
-        ("0.0.0.0", False),
-        ("10.0.0.3", False),
-        ("a.b", False),
-    ],
-)
-def test_what_counts_as_this_machine_alone(host: str, own: bool) -> None:
-    assert is_loopback(host) is own
+def test_what_counts_as_this_machine_alone() -> None:
+    assert all(map(is_loopback, ("127.0.0.1", "::1", "localhost", "127.8.1.2")))
+    assert not any(map(is_loopback, ("0.0.0.0", "10.0.0.3", "a.b")))
 
 
 def reason(message: Any, handle: Any = None) -> str | None:
@@ -242,37 +222,30 @@ def test_what_a_page_sends_passes() -> None:
         assert reason(message) is None
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"fov": NAN}, {"fov": 1e9}, {"fov": 0}, {"fov": -1}, {"image_width": 10**7}, {"image_height": -1},
-        {"image_width": NAN},
-        {"image_height": 0.5}, {"position": (NAN, 0, 0)}, {"position": (0, -INF, 0)}, {"position": (0, 0)},
-        {"position": [0] * 10_000},
-        {"position": (1e300, 0, 0)}, {"wxyz": (0, 0, 0, 0)}, {"wxyz": (1, 1, 1, 1)}, {"look_at": None}, {"near": "x"},
-        {"far": True},
-        {"removed": True}, {"type": "ShareUrlRequest"}, {"type": "FileTransferStartUpload"}, {"type": ["a"]},
-        {"type": None},
-    ],
-)  # fmt: skip
-def test_other_cameras_do_not(change: dict[str, Any]) -> None:
-    found = reason({**CAMERA, **change})
-    assert found is not None and "\n" not in found and len(found) < 300
+CHANGES: list[dict[str, Any]] = [
+    {"fov": NAN}, {"fov": 1e9}, {"fov": 0}, {"fov": -1}, {"image_width": 10**7}, {"image_height": -1},
+    {"image_width": NAN}, {"image_height": 0.5}, {"position": (NAN, 0, 0)}, {"position": (0, -INF, 0)},
+    {"position": (0, 0)},
+    {"position": [0] * 10_000},
+    {"position": (1e300, 0, 0)}, {"wxyz": (0, 0, 0, 0)}, {"wxyz": (1, 1, 1, 1)}, {"look_at": None}, {"near": "x"},
+    {"far": True}, {"removed": True}, {"type": "ShareUrlRequest"}, {"type": "FileTransferStartUpload"}, {"type": ["a"]},
+    {"type": None},
+]  # fmt: skip
+UPDATE = {"type": "GuiUpdateMessage", "uuid": "a"}
 
 
 @pytest.mark.parametrize(
     "message",
     [
+        *({**CAMERA, **change} for change in CHANGES),
         b"", b"\x00", b"\xc1", b"\x91" * 60_000, b"\xdf\xff\xff\xff\xff", b"\xdd\xff\xff\xff\xff", "text", [1], None,
-        {}, {"type": "X"},
-        {**CLICK, "event_type": "rect-select"}, {**CLICK, "ray_direction": None},
+        {}, {"type": "X"}, {**CLICK, "event_type": "rect-select"}, {**CLICK, "ray_direction": None},
         {**CLICK, "screen_pos": [(0, 0)] * 99},
-        {"type": "GuiUpdateMessage", "uuid": "a"}, {"type": "GuiUpdateMessage", "uuid": 1, "updates": {"value": 1}},
-        {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"update_cb": []}},
-        {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 1, "removed": True}},
-        {"type": "GuiUpdateMessage", "uuid": "none there", "updates": {"value": 1}},
+        UPDATE, {**UPDATE, "uuid": 1, "updates": {"value": 1}}, {**UPDATE, "updates": {"update_cb": []}},
+        {**UPDATE, "updates": {"value": 1, "removed": True}}, {**UPDATE, "uuid": "none there", "updates": {"value": 1}},
         {"type": "CommandTriggerMessage", "uuid": "a"}, {"type": "GetRenderResponseMessage", "payload": b""},
     ],
+    ids=range(44),
 )  # fmt: skip
 def test_other_messages_do_not(message: Any) -> None:
     found = reason(message)

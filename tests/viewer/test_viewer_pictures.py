@@ -202,15 +202,15 @@ def test_a_pose_is_its_camera_in_any_window() -> None:
 
 
 def weights(model: Primitives, look: Viewpoint, x: float, y: float) -> torch.Tensor:
-    """(N,) what each primitive contributes to the image at a place of it, by the renderer's own sums."""
-    camera = look.camera
+    """(N,) what each primitive contributes to the image at a place of it: an image of as many channels as there are
+    primitives, each of which is white in its own."""
+    camera, count = look.camera, model.count
     one = type(camera)(camera.viewmat, camera.fx, camera.fy, camera.cx - x + 0.5, camera.cy - y + 0.5, 1, 1)
-    for value in model.params.values():
-        value.requires_grad_()
-    output = render(model, one, look.conditions, SETTINGS)
-    tally = output.request_contributions(torch.ones(1, 1))
-    output.rgb.sum().backward()
-    return tally.of_all(model.count)[0].detach()
+    own = {name: value for name, value in model.params.items() if name not in model.of(model.colour)}
+    lit = (torch.eye(count) - 0.5) / 0.28209479177387814
+    white = Primitives(model.density, SphericalHarmonics(0, count), {**own, "sh_dc": lit})
+    with torch.no_grad():
+        return render(white, one, look.conditions, SETTINGS).rgb[0, 0]
 
 
 @pytest.mark.parametrize("timed", [False, True])

@@ -29,14 +29,13 @@ from neuprim.core.render.backends import device_of
 from neuprim.core.render.near_plane import resolve_near, scene_extent
 from neuprim.core.render.output import Contributions, sum_contributions
 from neuprim.core.task import Loss, Supervision
-from neuprim.core.train.exposure import Exposures
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.point_loss import PointResult, point_loss
 from neuprim.core.train.population import Change, make_population
 from neuprim.core.train.regularization import MaxScreenSize, scale_anisotropy
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer_state import check_state, hash_names, select_prefix
-from neuprim.core.train.training_views import Prefetcher, reduce_view, resolution_factor
+from neuprim.core.train.training_views import Exposures, Prefetcher, reduce_view, resolution_factor
 
 MIN_COOLDOWN = 0.02
 """Smallest factor of the learning rates in a cool-down."""

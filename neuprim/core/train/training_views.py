@@ -1,17 +1,23 @@
-"""Load training views: one view ahead on a GPU, and at a lower resolution early in the training."""
+"""Training views: loaded one ahead on a GPU, reduced early in the training, with a gain per photograph."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from dataclasses import replace
+
+import torch
+from torch import Tensor
 
 from neuprim.core.data import Pixels, View
 from neuprim.core.data.image_views import average_pixels, reduce_mask
 
 _MIN_SIDE = 16
 """Pixels along a side that no reduction goes below."""
+
+_BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 
 
 class Prefetcher:
@@ -70,3 +76,58 @@ def reduce_view(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
     alpha = None if pixels.alpha is None else average_pixels(pixels.alpha[..., None], factor)[..., 0]
     mask = None if pixels.mask is None else reduce_mask(pixels.mask, factor)
     return replace(view, camera=camera.reduced(factor)), Pixels(average_pixels(pixels.rgb, factor), alpha, mask)
+
+
+class Exposures:
+    """A factor per training view and channel, by which a rendered image is multiplied before it is compared.
+
+    Adam learns the logarithms of the factors, each in the steps that use its view. The geometric mean over the views
+    stays 1, so that the model keeps the photographs' mean exposure, with which held-out views are rendered.
+
+    Args:
+        views: number of training views.
+        channels: number of colour channels.
+        rate: learning rate of the logarithms.
+    """
+
+    def __init__(self, views: int, channels: int, rate: float, device: torch.device) -> None:
+        self.rate = rate
+        self.log_gain = torch.zeros(views, channels, device=device)
+        self.m, self.v = torch.zeros_like(self.log_gain), torch.zeros_like(self.log_gain)
+        self.seen = torch.zeros(views, dtype=torch.int64)
+        self._applied: dict[int, Tensor] = {}
+
+    def apply(self, index: int, rgb: Tensor) -> Tensor:
+        """(H, W, C) as the camera of view ``index`` would have exposed it."""
+        gain = self.log_gain[index].clone().requires_grad_()
+        self._applied[index] = gain
+        return rgb * gain.exp()
+
+    def gradient(self, index: int) -> list[float] | None:
+        """Gradient of the logarithms of a view's factors, after its backward pass; None without one."""
+        grad = self._applied.pop(index).grad
+        return None if grad is None else [float(x) for x in grad.tolist()]
+
+    def step(self, gradients: Mapping[int, list[float] | None]) -> None:
+        """Move the factors of a step's views by their gradients."""
+        for index, numbers in gradients.items():
+            if numbers is None:
+                continue
+            grad = torch.tensor(numbers, device=self.log_gain.device)
+            self.seen[index] += 1
+            n = int(self.seen[index])
+            self.m[index] += (1 - _BETA1) * (grad - self.m[index])
+            self.v[index] += (1 - _BETA2) * (grad.square() - self.v[index])
+            scale = math.sqrt(1 - _BETA2**n) / (1 - _BETA1**n)
+            self.log_gain[index] -= self.rate * scale * self.m[index] / (self.v[index].sqrt() + _EPS)
+        if gradients:
+            self.log_gain -= self.log_gain.mean(0)
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors from which :meth:`load_state` goes on."""
+        return {"log_gain": self.log_gain, "m": self.m, "v": self.v, "seen": self.seen}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Continue from a checked state."""
+        self.log_gain, self.m, self.v = state["log_gain"], state["m"], state["v"]
+        self.seen = state["seen"].cpu()

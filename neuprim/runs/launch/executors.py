@@ -30,8 +30,6 @@ from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.runs.launch.jobs import Result
 from neuprim.runs.launch.worker import CACHE_VARIABLES, Task, interrupt, is_working, worker_environment
 
-__all__ = ["Executor", "Processes", "Ray", "Slurm", "WorkerDied", "count_parallel_jobs", "divide_cores"]
-
 _GRACE = 60.0
 """Seconds that a worker has to write its checkpoint when its launcher is gone."""
 

@@ -23,7 +23,6 @@ from neuprim.core.validation import validate
 if TYPE_CHECKING:
     from neuprim.runs.events import Event, Events
 
-__all__ = ["ENDED", "Job", "JobStatus", "Result", "StatusListener", "perform", "read_status", "write_status"]
 
 ENDED = ("done", "failed", "interrupted")
 """States of a job that is over."""

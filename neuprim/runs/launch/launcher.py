@@ -19,16 +19,6 @@ from neuprim.runs.launch.executors import Executor, Processes, Ray, Slurm, Worke
 from neuprim.runs.launch.jobs import Job, JobStatus, Result, StatusListener, perform, read_status
 from neuprim.runs.launch.worker import Task, worker_environment
 
-__all__ = [
-    "LAUNCH_FOLDER",
-    "OnResult",
-    "OnStatus",
-    "check_launcher",
-    "ignore_status",
-    "launch",
-    "use_launcher_threads",
-]
-
 LAUNCH_FOLDER = "launch"
 """In a sweep's directory: statuses while it works, and the logs of workers that printed something."""
 

@@ -17,8 +17,6 @@ from typing import Self
 
 from neuprim.runs.launch.jobs import Job, Result, StatusListener, perform, write_status
 
-__all__ = ["CACHE_VARIABLES", "Task", "interrupt", "is_working", "worker_environment"]
-
 CACHE_VARIABLES = ("NEUPRIM_CACHE_DIR", "NUMBA_CACHE_DIR")
 """Variables that a worker gets from its launcher, as a cluster may not pass them on."""
 

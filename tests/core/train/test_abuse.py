@@ -95,23 +95,6 @@ def test_short_abuse(abuse: str) -> None:
     endure(abuse, 150)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("abuse", ABUSES)
-def test_long_abuse(abuse: str) -> None:
-    endure(abuse, 5000)
-
-
-def test_abuses_mean_what_they_say() -> None:
-    inside = abused("a camera inside", 1, 12)
-    red = tiny.truth().geometry
-    eye = inside.dataset.train.view(0).camera.position.float() - red.means[0]
-    assert ((eye @ red.rotations[0]) / red.scales[0]).norm() < 0.1
-    assert len(abused("one view", 1, 12).dataset.train) == 1
-    assert abused("black images", 1, 12).dataset.train.pixels(2).rgb.abs().max() == 0
-    plain, fast = abused("one view", 1, 12), abused("rates times ten", 1, 12)
-    assert all(fast.rates()[k] == pytest.approx(10 * v) for k, v in plain.rates().items())
-
-
 def test_a_run_forced_out_of_the_finite_keeps_the_checkpoint_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

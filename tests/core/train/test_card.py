@@ -16,7 +16,7 @@ from torch import Tensor
 from neuprim.config import RunConfig, compose
 from neuprim.core.compute import device
 from neuprim.core.data import Dataset, Pixels
-from neuprim.core.errors import DataError, NonFiniteError
+from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import Fitted, prepare_training
@@ -116,19 +116,6 @@ def test_a_card_trains_what_the_processor_trains(task: str, tmp_path: Path, monk
         assert b.loss == pytest.approx(a.loss, rel=2e-2) and b.psnr == pytest.approx(a.psnr, abs=0.2)
     assert heard[0].loss == pytest.approx(told[0].loss, rel=1e-5)
     assert all(torch.equal(tensors[name], mine[name]) for name in ("generator", "order", "adam.age"))
-
-
-def test_first_gradients_are_the_processors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before Adam divides them by their size, after which rounding of what is nearly zero is a step like any other."""
-    config = configured("static", tmp_path)
-    own, _ = trained(config, None, 1)
-    with pretended(monkeypatch):
-        other, _ = trained(config, own.dataset, 1)
-        moments = {name: value.cpu() for name, value in other.trainer.optimizer.m.items()}
-    for name, value in own.trainer.optimizer.m.items():
-        assert bool(value.any()) or name == "sh_rest"
-        least = 1e-9 if name == "quats" else 0.0  # all of it is rounding, as fresh primitives are balls
-        assert torch.allclose(moments[name], value, rtol=1e-4, atol=1e-5 * float(value.abs().max()) + least), name
 
 
 @pytest.mark.parametrize("strategy", ["relocate", "gradient"])
@@ -265,16 +252,6 @@ def trainer_order(trainer: Trainer) -> list[int]:
     generator.set_state(trainer.generator.get_state())
     found: list[int] = torch.randperm(len(trainer.dataset.train), generator=generator).tolist()
     return found
-
-
-def test_a_loss_or_gradient_that_is_not_finite_is_refused_there_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pretended(monkeypatch):
-        trainer = tiny.trainer(tiny.two_primitives(), 12)
-        trainer.train_step()
-        with torch.no_grad():
-            trainer.model.params["b2"][3] = torch.nan
-        with pytest.raises(NonFiniteError, match="b2 of primitive 3 is not finite"):
-            trainer.train_step()
 
 
 # ---------------------------------------------------------------- the pretence itself

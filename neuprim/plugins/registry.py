@@ -223,10 +223,13 @@ class PluginGroup(Generic[T]):
         for dist in metadata.distributions():
             try:
                 entries = [entry for entry in dist.entry_points if entry.group == self.entry_points]
+                if not entries:
+                    continue
                 name, version = str(dist.metadata["Name"] or ""), str(dist.metadata["Version"] or "")
+                hidden = metadata.distribution(name).locate_file("") != dist.locate_file("")
             except Exception:  # a half-removed package must not take the others along
                 continue
-            if canonicalize_name(name) in packages:  # a copy further down sys.path, which is not imported
+            if hidden or canonicalize_name(name) in packages:  # a copy further down sys.path, which is not imported
                 continue
             packages.add(canonicalize_name(name))
             found += [(PluginInfo(entry.name, name, version, entry.value), entry) for entry in entries]

@@ -23,8 +23,6 @@ from neuprim.tasks.relight.lighting import (
     typical_light,
 )
 
-__all__ = ["TASK"]
-
 _SETTINGS: dict[str, tuple[Any, ...] | type] = {
     "form": (*FORMS, "harmonics"),
     "hidden": int,
@@ -34,12 +32,12 @@ _SETTINGS: dict[str, tuple[Any, ...] | type] = {
 }
 
 
-def _colour(model: Mapping[str, Any], channels: int = 3, falloff: bool = False, typical: float = 1.0) -> ColourField:
-    chosen = dict(model["colour"])
-    if chosen.get("form") == "harmonics":
-        return LightHarmonics(chosen.get("degree", 5), channels, falloff, typical)
-    chosen.pop("degree", None)
-    return LightNetwork(channels=channels, falloff=falloff, typical=typical, **chosen)
+def _colour(model: Mapping[str, Any], falloff: bool = False, typical: float = 1.0) -> ColourField:
+    chosen = {"form": "additive", "degree": 5, **model["colour"]}
+    degree = chosen.pop("degree")
+    if chosen["form"] == "harmonics":
+        return LightHarmonics(degree, falloff=falloff, typical=typical)
+    return LightNetwork(falloff=falloff, typical=typical, **chosen)
 
 
 def _check(model: Mapping[str, Any]) -> None:
@@ -54,11 +52,7 @@ def _check(model: Mapping[str, Any]) -> None:
 def _trade(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
     if model["colour"].get("form") == "harmonics":
         return {**DENSITY_TRADE, "model.colour.degree": (1, 2, 3, 5)}
-    return {
-        **DENSITY_TRADE,
-        "model.colour.hidden": (0, 4, 8, 12),
-        "model.colour.visibility": ("none", "primitive", "pixel"),
-    }
+    return {**DENSITY_TRADE, "model.colour.hidden": (0, 4, 8, 12), "model.colour.visibility": VISIBILITY}
 
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
@@ -67,9 +61,8 @@ def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, Co
             f"{dataset.name}: {dataset.channels} colour channels; task relight expects 3, as light_intensity has"
         )
     falloff = lighting_of(dataset).falloff == "inverse_square"
-    return CosineDensity(model["neurons"], **model["density"]), _colour(
-        model, dataset.channels, falloff, typical_light(dataset, falloff)
-    )
+    density = CosineDensity(model["neurons"], **model["density"])
+    return density, _colour(model, falloff, typical_light(dataset, falloff))
 
 
 # Loaders are imported when used: each pulls in modules of its own.
@@ -104,7 +97,11 @@ TASK = TaskSpec(
     trade=_trade,
     conditions=(
         ConditionSpec(
-            *("light", (3,), "position, scene units", (-1e6, 1e6), parse_lights),
+            "light",
+            (3,),
+            "position, scene units",
+            (-1e6, 1e6),
+            parse_lights,
             sweep="orbit",
             in_frames=orbit_in_frames,
             place=parse_lights,

@@ -6,9 +6,9 @@
     multiplicative   c = V E max(0, albedo (1 + w_out . h))    no tinting: 91 parameters
 
 E is the light's intensity, divided by the squared distance where the dataset says so, over that of a typical training
-light, so that learning rates do not depend on the data's unit of light. V is the visibility of the light from the
-primitive (:mod:`neuprim.tasks.relight.visibility`) or 1. Everything but W_x x~ is constant over a primitive, so it
-folds into the closed form :class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
+light. V is the visibility of the light from the primitive (:mod:`neuprim.tasks.relight.visibility`) or 1. Everything
+but W_x x~ is constant over a primitive, so it folds into the closed form
+:class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
 """
 
 from __future__ import annotations
@@ -27,13 +27,27 @@ from neuprim.core.model.edge import sinc
 from neuprim.core.model.fields import ColourField, Conditions, Constant, LoweredDensity, RayNet, Shading, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
-from neuprim.core.model.schema import InitContext, ParameterSpec, Params
+from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.settings import RenderSettings
-from neuprim.tasks.relight.visibility import light_visibility
 
 FORMS = ("additive", "multiplicative")
 
 VISIBILITY = ("none", "primitive", "pixel")
+"""Where the light's depth images are read: nowhere, at centres of primitives, or at the point that a pixel shows."""
+
+_DARKEST = 1e-3
+"""Smallest initial colour: at zero and below, max(0, .) passes no gradient and black stays black."""
+
+
+def _require_count(value: object, low: int, high: float, name: str) -> None:
+    if not isinstance(value, int) or not low <= value <= high:
+        expected = f"at least {low}" if high == math.inf else f"{low}..{high}"
+        raise ValueError(f"{name} {value!r}; expected {expected}")
+
+
+def _require_typical(typical: float) -> None:
+    if not 0 < typical < math.inf:
+        raise ValueError(f"typical light {typical!r}; expected a number above 0")
 
 
 class LightNetwork(ColourField):
@@ -42,9 +56,8 @@ class LightNetwork(ColourField):
     Args:
         hidden: H, 0..16.
         form: one of :data:`FORMS`.
-        visibility: where the light's depth images are looked up: nowhere ("none": equation 14 as printed), at the
-            centres of primitives ("primitive"), or at the point that each pixel shows ("pixel").
-        boost: beta. 1 starts flat in the light's direction, 30 overfits (method: relighting).
+        visibility: one of :data:`VISIBILITY`; equation 14 as printed has "none".
+        boost: beta. 1 starts flat in the light's direction, 30 overfits.
         falloff: divide the light's intensity by the squared distance, in scene units.
         typical: E of a typical training light, in the data's units.
     """
@@ -61,18 +74,15 @@ class LightNetwork(ColourField):
         falloff: bool = False,
         typical: float = 1.0,
     ) -> None:
-        if not isinstance(hidden, int) or not 0 <= hidden <= 16:
-            raise ValueError(f"{hidden!r} hidden units; expected 0..16")
-        if not isinstance(channels, int) or channels < 1:
-            raise ValueError(f"{channels!r} colour channels; expected at least 1")
+        _require_count(hidden, 0, 16, "hidden units")
+        _require_count(channels, 1, math.inf, "colour channels")
+        _require_typical(typical)
         if form not in FORMS:
             raise ValueError(f"form {form!r}; expected {' or '.join(FORMS)}")
         if visibility not in VISIBILITY:
             raise ValueError(f"visibility {visibility!r}; expected {', '.join(VISIBILITY[:-1])} or {VISIBILITY[-1]}")
         if not 0 < boost <= 100:
             raise ValueError(f"boost {boost!r}; expected a number in (0, 100]")
-        if not 0 < typical < math.inf:
-            raise ValueError(f"typical light {typical!r}; expected a number above 0")
         self.typical = float(typical)
         self.hidden, self.channels, self.form = hidden, channels, form
         self.visibility, self.boost, self.falloff = visibility, float(boost), bool(falloff)
@@ -92,7 +102,7 @@ class LightNetwork(ColourField):
             ParameterSpec("net_view", (H, 3), 1e-2, lambda c: c.uniform(H, 3, bound=1 / 3)),
             ParameterSpec("net_light", (H, 3), 1e-2, lambda c: c.uniform(H, 3, bound=1 / 3)),
             ParameterSpec("net_phase", (H,), 1e-2, lambda c: c.uniform(H, bound=math.pi / self.boost)),
-            ParameterSpec("net_out", outputs, 2e-2, lambda c: c.uniform(*outputs, bound=_output(c))),
+            ParameterSpec("net_out", outputs, 2e-2, lambda c: c.uniform(*outputs, bound=c.number("output", 0.05))),
         ]
 
     def shade(
@@ -100,6 +110,8 @@ class LightNetwork(ColourField):
     ) -> Shading | None:
         if self.visibility == "none":
             return None
+        from neuprim.tasks.relight.visibility import light_visibility  # numba, loaded when first needed
+
         visible = light_visibility(geometry, density, conditions["light"], settings)
         return Shading(pixels=visible) if self.visibility == "pixel" else Shading(primitives=visible(geometry.means))
 
@@ -160,14 +172,6 @@ class LightNetwork(ColourField):
         return canonicalize_cosines(params, ("net_x", "net_view", "net_light"), "net_phase", "net_out", self.boost)
 
 
-_DARKEST = 1e-3
-"""Smallest initial colour: at zero and below, max(0, .) passes no gradient and black stays black."""
-
-
-def _output(ctx: InitContext) -> float:
-    return ctx.number("output", 0.05)
-
-
 # ---------------------------------------------------------------- pruning
 
 
@@ -178,12 +182,7 @@ def prune_hidden_units(
 
     Removed units leave their mean: of cos(phi + beta (W_x x~ + W_d d + W_l l)) with x~ over the ellipsoid, d and l over
     all directions, it is cos(phi) b(|beta W_x diag|) sinc(|beta W_d|) sinc(|beta W_l|), b the mean over a ball. The
-    variance follows from cos^2 = (1 + cos 2(.))/2.
-
-    Args:
-        params: c_dc (N, C), net_x, net_view and net_light (N, H, 3), net_phase (N, H), and net_out (N, C, H), or (N, 1,
-            H) of the multiplicative form.
-        multiplicative: the form; there the mean becomes part of the albedo.
+    variance follows from cos^2 = (1 + cos 2(.))/2. In the multiplicative form the mean becomes part of the albedo.
     """
     net_x, view, light = (params[name].double() * boost for name in ("net_x", "net_view", "net_light"))
     phase, out = boost * params["net_phase"].double(), params["net_out"].double()
@@ -198,10 +197,9 @@ def prune_hidden_units(
     variance = (1 + mean_of(2)) / 2 - mean.square()
     order = (out.square().sum(1) * variance).argsort(dim=1, descending=True, stable=True)
     kept, gone = order[:, :keep].sort(dim=1).values, order[:, keep:]
-    fewer = {
-        name: params[name].gather(1, kept[..., None].expand(-1, -1, 3)).contiguous()
-        for name in ("net_x", "net_view", "net_light")
-    }
+    vectors = ("net_x", "net_view", "net_light")
+    rows = kept[..., None].expand(-1, -1, 3)
+    fewer = {name: params[name].gather(1, rows).contiguous() for name in vectors}
     fewer["net_phase"] = params["net_phase"].gather(1, kept).contiguous()
     outputs = out.shape[1]
     stays = params["net_out"].gather(2, kept[:, None].expand(-1, outputs, -1))
@@ -211,12 +209,8 @@ def prune_hidden_units(
         return {**params, **fewer, "net_out": stays.contiguous(), "c_dc": (base + left).to(params["c_dc"])}
     # c_dc (1 + left + w . h) = c_dc (1 + left) (1 + w/(1 + left) . h); where little would be left, only the units go
     scale = torch.where(1 + left > 0.1, 1 + left, torch.ones_like(left))
-    return {
-        **params,
-        **fewer,
-        "net_out": (stays.double() / scale[:, :, None]).to(params["net_out"]).contiguous(),
-        "c_dc": (base * scale).to(params["c_dc"]),
-    }
+    fewer["net_out"] = (stays.double() / scale[:, :, None]).to(params["net_out"]).contiguous()
+    return {**params, **fewer, "c_dc": (base * scale).to(params["c_dc"])}
 
 
 # ---------------------------------------------------------------- spherical harmonics of the light
@@ -229,10 +223,8 @@ class LightHarmonics(ColourField):
     """
 
     def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False, typical: float = 1.0) -> None:
-        if not isinstance(degree, int) or not 0 <= degree <= 8:
-            raise ValueError(f"spherical-harmonics degree {degree!r}; expected 0..8")
-        if not 0 < typical < math.inf:
-            raise ValueError(f"typical light {typical!r}; expected a number above 0")
+        _require_count(degree, 0, 8, "spherical-harmonics degree")
+        _require_typical(typical)
         self.degree, self.channels, self.falloff, self.typical = degree, channels, bool(falloff), float(typical)
 
     def settings(self) -> dict[str, Any]:
@@ -240,7 +232,7 @@ class LightHarmonics(ColourField):
 
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, (self.degree + 1) ** 2 - 1
-        specs = [ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(1e-3).float())]
+        specs = [ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(_DARKEST).float())]
         if rest:
             specs.append(ParameterSpec("light_sh", (rest, C), 1e-2, lambda c: torch.zeros(c.count, rest, C)))
         return specs
@@ -254,7 +246,6 @@ class LightHarmonics(ColourField):
         return LightHarmonics(**{**self.settings(), "degree": value}), truncate_bands(params, "light_sh", value)
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Coefficients, each of one channel."""
         return coefficients(self.degree, self.channels, "light_sh")
 
     def script(self) -> str:
@@ -265,23 +256,19 @@ class LightHarmonics(ColourField):
         to_light = device.to_like(conditions["light"], color) - geometry.means
         squared = to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_distance(geometry))
         if self.degree:
-            bands = real_harmonics(normalize_direction(to_light, geometry.length_scale.detach()[:, None]), self.degree)[
-                :, 1:
-            ]
-            color = color + (bands[:, :, None] * params["light_sh"]).sum(1)
-        strength = (
-            device.to_like(conditions["light_intensity"], color) / self.typical / (squared if self.falloff else 1.0)
-        )
+            bands = real_harmonics(normalize_direction(to_light, geometry.length_scale.detach()[:, None]), self.degree)
+            color = color + (bands[:, 1:, None] * params["light_sh"]).sum(1)
+        strength = device.to_like(conditions["light_intensity"], color) / self.typical
+        strength = strength / (squared if self.falloff else 1.0)
         return Constant(color.clamp_min(0.0) * strength)
 
 
 def real_harmonics(directions: Tensor, degree: int) -> Tensor:
-    """(N, (degree + 1)^2) orthonormal real spherical harmonics of unit directions, bands in order, m = -l..l, by
-    recurrence.
+    """(N, (degree + 1)^2) orthonormal real spherical harmonics of unit directions, bands in order, m = -l..l.
 
-    The associated Legendre functions without the Condon-Shortley phase: P_m^m = (2m - 1)!! sin^m, P_{m+1}^m = (2m + 1)
-    z P_m^m, (l - m) P_l^m = (2l - 1) z P_{l-1}^m - (l + m - 1) P_{l-2}^m; sin^m cos(m phi) and sin^m sin(m phi) are
-    polynomials in x, y.
+    By recurrence of the associated Legendre functions without the Condon-Shortley phase: P_m^m = (2m - 1)!! sin^m,
+    P_{m+1}^m = (2m + 1) z P_m^m, (l - m) P_l^m = (2l - 1) z P_{l-1}^m - (l + m - 1) P_{l-2}^m; sin^m cos(m phi) and
+    sin^m sin(m phi) are polynomials in x, y.
     """
     x, y, z = directions.unbind(-1)
     cosine, sine = [torch.ones_like(x)], [torch.zeros_like(x)]
@@ -299,28 +286,22 @@ def real_harmonics(directions: Tensor, degree: int) -> Tensor:
     for l in range(degree + 1):
         for m in range(-l, l + 1):
             a = abs(m)
-            scale = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - a) / math.factorial(l + a)) * (
-                math.sqrt(2) if m else 1
-            )
+            ratio = math.factorial(l - a) / math.factorial(l + a)
+            scale = math.sqrt((2 * l + 1) / (4 * math.pi) * ratio) * (math.sqrt(2) if m else 1)
             columns.append(scale * legendre[l, a] * (cosine[a] if m >= 0 else sine[a]))
     return torch.stack(columns, -1)
 
 
 # ---------------------------------------------------------------- directions
 
-_MIN_LENGTH = 1e-6
-"""Length in units of ``size`` below which a direction fades; its gradient, 1/length, stays below 1e6 per size."""
-_MIN_LIGHT_DISTANCE = 1e-4
-"""Distance in units of a primitive's size below which a light does not get stronger."""
+_MIN_LENGTH = 1e-6  # in units of ``size``; a direction's gradient, 1/length, stays below 1e6 per size
+_MIN_LIGHT_DISTANCE = 1e-4  # in units of a primitive's size; a nearer light does not get stronger
 
 
 def normalize_direction(vector: Tensor, size: Tensor | float = 1.0) -> Tensor:
-    """(..., 3) unit vectors; vectors shorter than 1e-6 of ``size`` are scaled by 1e6/size, so that zero stays zero.
+    """(..., 3) unit vectors; vectors shorter than 1e-6 of ``size`` (..., 1) are scaled by 1e6/size.
 
-    No square leaves float32's range.
-
-    Args:
-        size: (..., 1) unit of length, e.g. the size of the primitive that the vector starts from.
+    So zero stays zero, and no square leaves float32's range.
     """
     scaled = vector / vector.detach().abs().amax(-1, keepdim=True).clamp_min(_MIN_LENGTH * size)
     return scaled / scaled.norm(dim=-1, keepdim=True).clamp_min(1.0)

@@ -34,12 +34,8 @@ def mask(dataset: Dataset, index: int) -> Tensor | None:
     return None if alpha is None else alpha > _MIN_ALPHA
 
 
-def metrics(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
+def metrics(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor, structure: bool = True) -> dict[str, float]:
     """:func:`scores`, and where the dataset has them the errors of pixel classes and the PSNR of the view's part."""
-    return _view_metrics(dataset, index, rendered, truth, structure=True)
-
-
-def _view_metrics(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor, structure: bool) -> dict[str, float]:
     known, result = lighting_of(dataset), scores(rendered, truth, structure)
     part = next((p for p in known.parts if dataset.test.view(index).name.startswith(p)), None)
     if part is not None:
@@ -60,19 +56,16 @@ def diagnose(dataset: Dataset, model: Primitives) -> dict[str, Any]:
 
 def baselines(dataset: Dataset) -> dict[str, dict[str, Any]]:
     """Mean scores over the test views of images without a model, by name; without SSIM and FLIP, which are slow."""
-    result = {"black": _mean_metrics(dataset, lambda i, truth: torch.zeros_like(truth))}
-    for name, guess in lighting_of(dataset).baselines.items():
-        result[name] = _mean_metrics(dataset, lambda i, truth, guess=guess: guess(i))  # type: ignore[misc]
-    return result
 
+    def mean_of(guess: Callable[[int], Tensor] | None) -> dict[str, Any]:
+        entries = []
+        for i in range(len(dataset.test)):
+            truth = dataset.test.pixels(i).over(dataset.background)
+            image = torch.zeros_like(truth) if guess is None else guess(i)
+            entries.append(metrics(dataset, i, image, truth, structure=False))
+        return mean_metrics(entries)
 
-def _mean_metrics(dataset: Dataset, guess: Callable[[int, Tensor], Tensor]) -> dict[str, Any]:
-    """Mean scores over the test views of ``guess(index, truth)``, an (H, W, 3) image."""
-    entries = []
-    for i in range(len(dataset.test)):
-        truth = dataset.test.pixels(i).over(dataset.background)
-        entries.append(_view_metrics(dataset, i, guess(i, truth), truth, structure=False))
-    return mean_metrics(entries)
+    return {"black": mean_of(None)} | {name: mean_of(guess) for name, guess in lighting_of(dataset).baselines.items()}
 
 
 def clips(dataset: Dataset) -> Sequence[Clip]:
@@ -89,11 +82,10 @@ def facts(dataset: Dataset) -> dict[str, Any]:
 def orbit(dataset: Dataset, frames: int) -> list[View]:
     """Views that circle the scene while the light circles it the other way at its mean distance and height."""
     training = [dataset.train.view(i).conditions for i in range(len(dataset.train))]
-    up, center = (x.double() / n for x, n in ((dataset.up, dataset.up.double().norm()), (dataset.center, 1.0)))
+    up, center = dataset.up.double() / dataset.up.double().norm(), dataset.center.double()
     offsets = torch.stack([c["light"] for c in training]).double() - center
     radius, sine = offsets.norm(dim=-1).mean(), ((offsets @ up) / offsets.norm(dim=-1).clamp_min(1e-30)).mean()
-    helper = torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())]
-    side = torch.linalg.cross(up, helper)
+    side = torch.linalg.cross(up, torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())])
     side = side / side.norm()
     other = torch.linalg.cross(up, side)
     intensity = torch.stack([c["light_intensity"] for c in training]).mean(0)
@@ -110,11 +102,9 @@ def orbit(dataset: Dataset, frames: int) -> list[View]:
 
 
 def scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> dict[str, float]:
-    """``psnr_linear_clamped``, ``psnr_display``, ``ssim_display`` and, where its package is installed, ``flip``.
+    """``psnr_linear_clamped``, ``psnr_display`` and, with ``structure``, ``ssim_display`` and ``flip`` if installed.
 
-    Args:
-        rendered, truth: (H, W, 3) linear light over the exposure.
-        structure: measure the last two as well, which take longest.
+    ``rendered`` and ``truth`` are (H, W, 3), linear light over the exposure.
     """
     first, second = rendered.clamp(0.0, 1.0), truth.clamp(0.0, 1.0)
     result = {"psnr_linear_clamped": psnr(first, second)}
@@ -130,9 +120,7 @@ def scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> dict[str,
 def class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, float]:
     """``mse_NAME`` (linear_clamped) and ``pixels_NAME`` of every class that the image has, to be pooled over views.
 
-    Args:
-        rendered, truth: (H, W, 3) linear light over the exposure.
-        classes: (H, W) uint8, indices of :data:`PIXEL_CLASSES`.
+    ``classes`` (H, W) uint8 are indices of :data:`PIXEL_CLASSES`.
 
     Raises:
         DataError: the map has another size than the images, or a value that is no class.
@@ -154,9 +142,8 @@ def class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, 
 def class_shares(maps: list[Tensor]) -> dict[str, float]:
     """Share of each class, in percent of the pixels that are not background."""
     counts = torch.stack([torch.bincount(m.reshape(-1).long(), minlength=len(PIXEL_CLASSES)) for m in maps]).sum(0)
-    return {
-        name: 100.0 * float(counts[i]) / max(float(counts[1:].sum()), 1.0) for i, name in enumerate(PIXEL_CLASSES) if i
-    }
+    whole = max(float(counts[1:].sum()), 1.0)
+    return {name: 100.0 * float(counts[i]) / whole for i, name in enumerate(PIXEL_CLASSES) if i}
 
 
 # ---------------------------------------------------------------- layers
@@ -184,4 +171,3 @@ LAYERS = (
         ("Y",),
     ),
 )
-"""What :attr:`~neuprim.core.task.TaskSpec.layers` of the task holds."""

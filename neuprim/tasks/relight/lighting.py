@@ -24,11 +24,16 @@ from neuprim.core.io.json_reader import JsonReader
 if TYPE_CHECKING:
     from neuprim.core.data.image_views import ImageViews
 
-
 Falloff = Literal["none", "inverse_square"]
 
 EXPOSURE_PERCENTILE = 99.5
 """An automatic exposure lets this percentile of the training images' values be 1."""
+
+MAX_LIGHT_ANGLE = 15.0
+"""Degrees from every training light beyond which a direction counts as unseen."""
+
+_ORBIT = (4.5, 40.0, 60)  # distance in scene units, polar angle in degrees, frames
+_MAX_DIRECTIONS = 256  # of training lights in a model's header
 
 
 @dataclass(frozen=True)
@@ -87,10 +92,19 @@ def percentile_exposure(views: ImageViews, where: str) -> float:
     return value
 
 
-# ---------------------------------------------------------------- the command line
+def typical_light(dataset: Dataset, falloff: bool) -> float:
+    """Median over the training views of the light's mean intensity, with ``falloff`` over its squared distance; 1 if
+    that is zero, as for a dataset in the dark."""
+    values = []
+    for i in range(len(dataset.train)):
+        conditions = dataset.train.view(i).conditions
+        squared = (conditions["light"].double() - dataset.center.double()).square().sum().clamp_min(1e-30)
+        values.append(conditions["light_intensity"].double().mean() / (squared if falloff else 1.0))
+    found = float(torch.stack(values).median())
+    return found if 0 < found < math.inf else 1.0
 
-ORBIT = (4.5, 40.0, 60)
-"""Distance in scene units, polar angle in degrees and frames of ``--light orbit``."""
+
+# ---------------------------------------------------------------- the command line
 
 
 def parse_lights(text: str, world: World | None = None) -> list[Tensor]:
@@ -103,21 +117,19 @@ def parse_lights(text: str, world: World | None = None) -> list[Tensor]:
         ConfigError: another form, or numbers that are not finite.
     """
     expected = "expected x,y,z or orbit or orbit:DISTANCE:POLAR_DEGREES:FRAMES"
-    if text.split(":")[0] == "orbit":
-        parts = text.split(":")[1:]
-        try:
-            values = [float(p) for p in parts] + list(ORBIT[len(parts) :])
-            distance, polar, frames = values[0], values[1], int(values[2])
-        except (ValueError, IndexError, OverflowError):
-            raise ConfigError(f"--light {text}: {expected}") from None
-        if len(parts) > 3 or not (0 < distance < 1e6 and 0 <= polar <= 180 and 2 <= frames <= 100_000):
-            raise ConfigError(f"--light {text}: {expected}")
-        across, height = distance * math.sin(math.radians(polar)), distance * math.cos(math.radians(polar))
-        turns = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames)
-        return list(
-            torch.stack([across * turns.cos(), across * turns.sin(), torch.full_like(turns, height)], -1).float()
-        )
-    return [(world or World()).scene_points(_numbers(text, "light", expected)).float()]
+    kind, *parts = text.split(":")
+    if kind != "orbit":
+        return [(world or World()).scene_points(_numbers(text, "light", expected)).float()]
+    try:
+        values = [float(p) for p in parts] + list(_ORBIT[len(parts) :])
+        distance, polar, frames = values[0], values[1], int(values[2])
+    except (ValueError, IndexError, OverflowError):
+        raise ConfigError(f"--light {text}: {expected}") from None
+    if len(parts) > 3 or not (0 < distance < 1e6 and 0 <= polar <= 180 and 2 <= frames <= 100_000):
+        raise ConfigError(f"--light {text}: {expected}")
+    across, height = distance * math.sin(math.radians(polar)), distance * math.cos(math.radians(polar))
+    turns = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames)
+    return list(torch.stack([across * turns.cos(), across * turns.sin(), torch.full_like(turns, height)], -1).float())
 
 
 def orbit_in_frames(text: str, count: int) -> str | None:
@@ -125,7 +137,7 @@ def orbit_in_frames(text: str, count: int) -> str | None:
     parts = text.split(":")
     if parts[0] != "orbit" or len(parts) > 3:
         return None
-    return ":".join([*parts, *(f"{x:g}" for x in ORBIT[len(parts) - 1 : 2]), str(count)])
+    return ":".join([*parts, *(f"{x:g}" for x in _ORBIT[len(parts) - 1 : 2]), str(count)])
 
 
 def parse_intensities(text: str) -> list[Tensor]:
@@ -151,40 +163,14 @@ def _numbers(text: str, name: str, expected: str) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def typical_light(dataset: Dataset, falloff: bool) -> float:
-    """Median over the training views of the light's mean intensity, with ``falloff`` over its squared distance.
-
-    1 if that is zero, as for a dataset in the dark.
-    """
-    values = []
-    for i in range(len(dataset.train)):
-        conditions = dataset.train.view(i).conditions
-        squared = (conditions["light"].double() - dataset.center.double()).square().sum().clamp_min(1e-30)
-        values.append(conditions["light_intensity"].double().mean() / (squared if falloff else 1.0))
-    found = float(torch.stack(values).median())
-    return found if 0 < found < math.inf else 1.0
-
-
 # ---------------------------------------------------------------- environments
-
-MAX_LIGHT_ANGLE = 15.0
-"""Degrees from every training light beyond which a direction counts as unseen."""
-
-_MAX_DIRECTIONS = 256  # of training lights in a model's header
 
 
 def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: float) -> dict[str, Any]:
-    """Summarise the training lights for a model's header.
+    """Summarise the training lights (L, 3) for a model's header.
 
-    Args:
-        lights: (L, 3) positions, scene units.
-        center: (3,) of the scene.
-        falloff: see :class:`Lighting`.
-        exposure: of the data set.
-
-    Returns:
-        mean ``distance`` from the centre; ``directions``, at most 256, chosen by farthest-point sampling; ``falloff``;
-        ``exposure``.
+    Gives the mean ``distance`` from the scene's centre, at most 256 ``directions`` by farthest-point sampling,
+    ``falloff`` and ``exposure``.
     """
     offsets = lights.double() - center.double()
     distance = offsets.norm(dim=-1)
@@ -194,9 +180,10 @@ def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: flo
     while len(chosen) < min(_MAX_DIRECTIONS, len(units)):
         chosen.append(int(nearest.argmin()))
         nearest = torch.maximum(nearest, units @ units[chosen[-1]])
+    directions = [[round(float(x), 4) for x in units[i]] for i in chosen]
     return {
         "distance": float(distance.mean()),
-        "directions": [[round(float(x), 4) for x in units[i]] for i in chosen],
+        "directions": directions,
         "falloff": falloff,
         "exposure": float(exposure),
     }
@@ -221,35 +208,33 @@ def illuminate(environment: Environment, count: int, facts: Mapping[str, Any]) -
         DataError: facts that are missing or damaged.
     """
     data = JsonReader(dict(facts), "the model's header: data")
-    center = data.array("center", (3,), "3 numbers")
-    up = data.array("up", (3,), "3 numbers")
+    center, up = (data.array(name, (3,), "3 numbers") for name in ("center", "up"))
     lights = data.values.get("lights")
     if not isinstance(lights, dict):
         raise data.fail("lights", "an object with distance, directions, falloff and exposure")
     known = JsonReader(lights, f"{data.where}: lights")
     distance = known.number("distance", "a distance above 0", 0.0)
     exposure = known.number("exposure", "a number above 0", 0.0)
-    if known.text("falloff") not in ("none", "inverse_square"):
+    falloff = known.text("falloff")
+    if falloff not in ("none", "inverse_square"):
         raise known.fail("falloff", "none or inverse_square")
     listed = known.values.get("directions")
     number = len(listed) if isinstance(listed, list) and 0 < len(listed) <= _MAX_DIRECTIONS else 1
     trained = known.array("directions", (number, 3), f"1 to {_MAX_DIRECTIONS} directions of 3 numbers")
     trained = trained / trained.norm(dim=-1, keepdim=True).clamp_min(1e-30)
-    factor = exposure * (distance**2 if known.values["falloff"] == "inverse_square" else 1.0 / math.pi)
+    factor = exposure * (distance**2 if falloff == "inverse_square" else 1.0 / math.pi)
     beams = environment.beams(count)
     frames = [
         {"light": (center + distance * d).float(), "light_intensity": (factor * e).float()}
         for d, e in zip(beams.directions, beams.irradiance, strict=True)
     ]
     if not frames:
-        return Illumination(
-            ({"light": (center + distance * up).float(), "light_intensity": torch.zeros(3)},),
-            ("the environment is black",),
-        )
+        dark = {"light": (center + distance * up).float(), "light_intensity": torch.zeros(3)}
+        return Illumination((dark,), ("the environment is black",))
     unseen = environment.share_beyond(trained, MAX_LIGHT_ANGLE)
     extrapolated = ((beams.directions @ trained.T).amax(1) < math.cos(math.radians(MAX_LIGHT_ANGLE))).tolist()
-    far = (
+    note = (
         f"{unseen:.0%} of the environment's light comes from more than {MAX_LIGHT_ANGLE:g} degrees off every training "
         "light, where the model guesses"
     )
-    return Illumination(tuple(frames), (far,) if unseen > 0.01 else (), tuple(extrapolated))
+    return Illumination(tuple(frames), (note,) if unseen > 0.01 else (), tuple(extrapolated))

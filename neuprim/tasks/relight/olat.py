@@ -1,36 +1,23 @@
-"""One light at a time: the layout of GS³ and NRHints, read as their files say, which is not always what their loaders
-do.
+"""One light at a time: ``transforms_SPLIT.json`` in the layout of GS³ and NRHints.
 
-``transforms_SPLIT.json`` holds, in the file or in a frame, which wins:
+In the file or in a frame, which wins:
 
 * ``camera_intrinsics``: [cx, cy, fx, fy] in pixels, in this order; or ``camera_angle_x``, the horizontal field of view
-  in radians,
-  with square pixels and the principal point in the middle; or any other keys of :mod:`neuprim.core.cameras.intrinsics`.
+  in radians; or any other keys of :mod:`neuprim.core.cameras.intrinsics`.
 * ``pl_intensity``: three numbers or one; default 1. (GS³ does not read it.)
-* ``camera_near``, ``camera_far``: default 3 and 10 as in NRHints. Checked, but nothing depends on them: what lies in
-  front of the
-  camera is drawn.
+* ``camera_near``, ``camera_far``: default 3 and 10 as in NRHints. Checked, but nothing depends on them.
 
-and per frame:
+Per frame:
 
-* ``img_path``: the image with its suffix, absolute or in the data set's folder. Files that GS³ saved on another machine
-  name that
-  machine's folders, so the longest tail of the path that is there counts. Where none is, or none is given:
-* ``file_path`` in the data set's folder, followed by ``file_ext``; without one, as written, else with .png, .jpg,
-  .jpeg, .webp or .exr.
+* ``img_path``: the image with its suffix. GS³ saves paths of the machine it ran on, so the longest tail of the path
+  that exists in the data set's folder counts.
+* ``file_path``, where no ``img_path`` exists, followed by ``file_ext`` or any known suffix.
 * ``pl_pos``: the point light, world; required.
 * ``transform_matrix``: camera to world, OpenGL axes.
-* ``R_opt`` (3, 3) and ``T_opt`` (3,): an optimised pose that GS³ writes and reads *instead of* ``transform_matrix``:
-  the world-to-camera
-  matrix with OpenCV axes is [R_opt^T | T_opt]. ``pl_pos`` in such a file is the optimised light.
-  ``scene.ignore_corrections=true`` takes ``transform_matrix`` all the same.
+* ``R_opt`` (3, 3), ``T_opt`` (3,): an optimised pose that GS³ writes and reads *instead of* ``transform_matrix``: the
+  world-to-camera matrix with OpenCV axes is [R_opt^T | T_opt].
 
-PNG and JPEG hold sRGB with straight alpha and become linear light; OpenEXR is linear and premultiplied and stays so.
-
-Settings beside the common ones (``background`` is black by default): ``train_split``, ``test_split`` (names in the
-files' names),
-``hold_out`` (n > 1 makes every n-th training view the test split and leaves the real one unread, for tuning),
-``falloff`` ("none" or "inverse_square"), ``exposure`` (a number or "auto") and ``ignore_corrections``.
+PNG and JPEG hold sRGB with straight alpha and become linear light; OpenEXR is linear and premultiplied.
 """
 
 from __future__ import annotations
@@ -60,7 +47,6 @@ from neuprim.core.data.posed_images import (
 from neuprim.core.data.transforms_json import TransformsLayout, read_transforms_frames, read_transforms_splits
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
-from neuprim.core.model.fields import Conditions
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import Range, validate
 from neuprim.tasks.relight.lighting import Lighting, percentile_exposure
@@ -68,13 +54,34 @@ from neuprim.tasks.relight.lighting import Lighting, percentile_exposure
 _KEYS = ("camera_near", "camera_far", "img_path", "file_ext", "pl_pos", "pl_intensity", "R_opt", "T_opt")
 
 
+@dataclass(frozen=True)
+class OlatSettings(FolderSettings):
+    """Settings of ``scene=olat``.
+
+    Attributes:
+        train_split, test_split: names in transforms_NAME.json.
+        hold_out: n: evaluate on every n-th training view instead of the test split, for tuning; 0 for that split.
+        falloff: "inverse_square" where the light weakens with the square of its distance.
+        exposure: images are divided by this; "auto": by the 99.5th percentile of the training images.
+        ignore_corrections: poses are transform_matrix, even where a frame has the optimised R_opt and T_opt.
+    """
+
+    background: Background = "black"
+    train_split: SplitName = "train"
+    test_split: SplitName = "test"
+    hold_out: HoldOut = 0
+    falloff: Literal["none", "inverse_square"] = "none"
+    exposure: Annotated[float, Range(above=0)] | Literal["auto"] = 1.0
+    ignore_corrections: bool = False
+
+
 def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """The scene in the folder ``settings["path"]``, in linear light over the exposure.
+    """Load the scene in the folder ``settings["path"]``, in linear light over the exposure.
 
     Raises:
         ConfigError: unknown or impossible settings.
         DataError: missing or damaged files, wrong or missing fields, impossible cameras, empty splits, black images
-        with exposure=auto.
+            with exposure=auto.
     """
     options = validate(OlatSettings, settings, "scene")
     folder = find_data_folder(options.path)
@@ -85,23 +92,16 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         options.hold_out,
         lambda split: read_split(folder, split, options),
     )
-    return assemble_dataset(
-        str(folder),
-        folder.resolve().name,
-        train,
-        test,
-        options,
-        context,
-        SceneDetails(
-            up=torch.tensor([0.0, 0.0, 1.0]),
-            to_linear=True,
-            exposure=(lambda views: percentile_exposure(views, str(folder)))
-            if options.exposure == "auto"
-            else options.exposure,
-            extra=Lighting(options.falloff),
-            positions=("light",),
-        ),
+    details = SceneDetails(
+        up=torch.tensor([0.0, 0.0, 1.0]),
+        to_linear=True,
+        exposure=(lambda views: percentile_exposure(views, str(folder)))
+        if options.exposure == "auto"
+        else options.exposure,
+        extra=Lighting(options.falloff),
+        positions=("light",),
     )
+    return assemble_dataset(str(folder), folder.resolve().name, train, test, options, context, details)
 
 
 def read_split(folder: Path, split: str, options: OlatSettings) -> list[ImageFrame]:
@@ -116,12 +116,12 @@ def read_split(folder: Path, split: str, options: OlatSettings) -> list[ImageFra
         raise document.fail("camera_far", f"a distance above camera_near, {near:g}")
     layout = TransformsLayout(_KEYS, _name, _image, lambda record: _viewmat(record, options.ignore_corrections))
     records, frames = read_transforms_frames(folder, document, list(document.objects("frames")), options, layout)
-    return [replace(frame, conditions=_light(record, document)) for record, frame in zip(records, frames, strict=True)]
-
-
-def _light(record: JsonReader, document: JsonReader) -> Conditions:
-    position = record.array("pl_pos", (3,), "the point light's position, 3 numbers")
-    return {"light": position, "light_intensity": _intensity(record if record.has("pl_intensity") else document)}
+    lit = []
+    for record, frame in zip(records, frames, strict=True):
+        light = record.array("pl_pos", (3,), "the point light's position, 3 numbers")
+        intensity = _intensity(record if record.has("pl_intensity") else document)
+        lit.append(replace(frame, conditions={"light": light, "light_intensity": intensity}))
+    return lit
 
 
 def _name(record: JsonReader) -> str:
@@ -134,7 +134,7 @@ def _image(folder: Path, record: JsonReader) -> Path | None:
         parts = record.text("img_path").replace("\\", "/").split("/")
         tails = (
             _file(folder / "/".join(parts[i:])) for i in range(len(parts))
-        )  # a path from the root stays one when joined
+        )  # an absolute path stays one when joined
         found = next((file for file in tails if file is not None), None)
         if found is not None or not record.has("file_path"):
             return found
@@ -181,24 +181,3 @@ def _intensity(source: JsonReader) -> Tensor:
     if bool((value < 0).any()):
         raise DataError(f"{source.where}: pl_intensity is {source.values['pl_intensity']}; expected {expected}")
     return value.float()
-
-
-@dataclass(frozen=True)
-class OlatSettings(FolderSettings):
-    """What the user may set.
-
-    Attributes:
-        train_split, test_split: names in transforms_NAME.json.
-        hold_out: n: evaluate on every n-th training view instead of the test split, for tuning; 0 for that split.
-        falloff: "inverse_square" where the light weakens with the square of its distance, "none" where the images do
-        not show that. exposure: images are divided by this; "auto": by the 99.5th percentile of the training images.
-        ignore_corrections: poses are transform_matrix, even where a frame has the optimised R_opt and T_opt.
-    """
-
-    background: Background = "black"
-    train_split: SplitName = "train"
-    test_split: SplitName = "test"
-    hold_out: HoldOut = 0
-    falloff: Literal["none", "inverse_square"] = "none"
-    exposure: Annotated[float, Range(above=0)] | Literal["auto"] = 1.0
-    ignore_corrections: bool = False

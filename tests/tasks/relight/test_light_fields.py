@@ -17,6 +17,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.train.splitting import split_primitives
+from neuprim.tasks.relight import visibility
 from neuprim.tasks.relight.colour import FORMS, LightHarmonics, LightNetwork, real_harmonics
 from neuprim.tasks.relight.lighting import parse_intensities, parse_lights
 from neuprim.tasks.relight.visibility import BIAS, SOFTNESS, light_visibility
@@ -32,18 +33,12 @@ def shade(form: RayNet, local: Tensor) -> Tensor:
     return (form.base + (form.Wout * hidden[:, None]).sum(-1)).clamp_min(0)
 
 
-# ---------------------------------------------------------------- what is stored
-
-
 def test_equation_14_has_the_papers_number_of_parameters() -> None:
     generator = torch.Generator().manual_seed(0)
     context = InitContext(torch.rand(4, 3), torch.ones(4), torch.rand(4, 3), generator)
     assert Primitives.initialise(CosineDensity(8), LightNetwork(), context).parameters_per_primitive == 158
     assert Primitives.initialise(CosineDensity(8), LightHarmonics(5), context).parameters_per_primitive == 159
     assert Primitives.initialise(CosineDensity(8), LightNetwork(0), context).parameters_per_primitive == 54
-
-
-# ---------------------------------------------------------------- equation 14
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -59,11 +54,8 @@ def test_the_closed_form_is_the_network(form: str) -> None:
     l = c["light"].double() - means
     distance = l.norm(dim=1, keepdim=True)
     d, l = d / d.norm(dim=1, keepdim=True), l / distance
-    inputs = (
-        (p["net_x"] * local[:, None]).sum(-1)
-        + (p["net_view"] * d[:, None]).sum(-1)
-        + (p["net_light"] * l[:, None]).sum(-1)
-    )
+    pairs = zip(("net_x", "net_view", "net_light"), (local, d, l), strict=True)
+    inputs = sum((p[name] * value[:, None]).sum(-1) for name, value in pairs)
     hidden = torch.cos(2.5 * (inputs + p["net_phase"]))
     out = (p["net_out"] * hidden[:, None]).sum(-1)
     expected = p["c_dc"] + out if form == "additive" else p["c_dc"] * (1 + out)
@@ -92,11 +84,9 @@ def test_a_split_carries_the_colour(form: str) -> None:
 
 
 @pytest.mark.parametrize("where", [(0.0, 0.0, 0.0), (1e8, 0.0, 1e8), (0.3, 0.2, -50.0)])
-@pytest.mark.parametrize("visibility", ["none", "primitive", "pixel"])
-def test_lights_at_a_centre_at_infinity_and_below_the_ground(
-    where: tuple[float, float, float], visibility: str
-) -> None:
-    field = LightNetwork(4, visibility=visibility)
+@pytest.mark.parametrize("kind", ["none", "primitive", "pixel"])
+def test_lights_at_a_centre_at_infinity_and_below_the_ground(where: tuple[float, float, float], kind: str) -> None:
+    field = LightNetwork(4, visibility=kind)
     m = model(field, torch.float32)
     c = light(*where)
     if where == (0.0, 0.0, 0.0):
@@ -120,13 +110,13 @@ def slabs() -> tuple[Geometry, Cosine]:
     )
 
 
-def test_what_lies_behind_something_is_in_its_shadow() -> None:
+def test_what_lies_behind_something_is_in_its_shadow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(visibility, "BIAS", 0.0875)
     geometry, density = slabs()
-    straight = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), SETTINGS, bias=0.0875)(geometry.means)
+    straight = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), SETTINGS)(geometry.means)
     assert float(straight[3]) < 0.05 and bool((straight[[0, 1, 2, 4, 5]] > 0.8).all())
-    slanted = light_visibility(
-        geometry, density, torch.tensor([4.0, 0.0, 1.0 + 4.0 * (1.0 / 0.75)]), SETTINGS, bias=0.0875
-    )(geometry.means)
+    aside = torch.tensor([4.0, 0.0, 1.0 + 4.0 * (1.0 / 0.75)])
+    slanted = light_visibility(geometry, density, aside, SETTINGS)(geometry.means)
     assert float(slanted[2]) < 0.3 and float(slanted[3]) > 0.8
 
 
@@ -208,9 +198,6 @@ def test_a_flat_floor_does_not_shadow_itself(polar: float) -> None:
     assert not len(under) or float(light_visibility(geometry, density, light, SETTINGS)(under).max()) < 0.1
 
 
-# ---------------------------------------------------------------- harmonics
-
-
 def test_the_recurrence_agrees_with_the_renderers_harmonics() -> None:
     d = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     d = d / d.norm(dim=1, keepdim=True)
@@ -225,9 +212,6 @@ def test_harmonics_are_orthonormal() -> None:
     d = torch.stack([(1 - z * z).sqrt() * phi.cos(), (1 - z * z).sqrt() * phi.sin(), z], -1)
     y = real_harmonics(d, 5)
     assert torch.allclose(y.T @ y * (4 * math.pi / n), torch.eye(36, dtype=torch.float64), atol=1e-3)
-
-
-# ---------------------------------------------------------------- words
 
 
 def test_lights_on_the_command_line() -> None:

@@ -1,10 +1,9 @@
-"""Measures of relit images, their means, FLIP where it is installed, and the settings' files."""
+"""Measures of relit images, their means, and FLIP where it is installed."""
 
 from __future__ import annotations
 
 import sys
 import types
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,10 +12,8 @@ import torch
 from neuprim.core.errors import DataError
 from neuprim.core.metrics import means, psnr
 from neuprim.scenes import PIXEL_CLASSES
-from neuprim.tasks.relight import evaluation, olat
+from neuprim.tasks.relight import evaluation
 from neuprim.tasks.relight.evaluation import class_errors, class_shares, scores
-
-CONF = Path(olat.__file__).parent / "conf" / "scene" / "relight"
 
 
 def images(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -73,7 +70,3 @@ def test_flip_joins_the_scores_where_it_is_installed(monkeypatch: pytest.MonkeyP
     reference, test, dynamic_range, options = calls[0]
     assert dynamic_range == "LDR" and options["applyMagma"] is False and reference.dtype == test.dtype == "float32"
     assert abs(reference.mean() - evaluation.linear_to_srgb(truth).numpy().mean()) < 1e-6
-
-
-# Settings' files
-# ----------------------------------------------------------------

@@ -17,14 +17,9 @@ from neuprim.core.io.exr import write_exr
 from neuprim.runs.run import run
 from tests.reports import offered
 
-SCENE = [
-    "task=relight",
-    "scene=lit_solids",
-    "scene.size=32",
-    "scene.train_views=24",
-    "scene.test_views=6",
-    "scene.supersampling=1",
-]
+SCENE = (
+    "task=relight scene=lit_solids scene.size=32 scene.train_views=24 scene.test_views=6 scene.supersampling=1".split()
+)
 SMALL = ["model.primitives=150", "model.neurons=2", "model.colour.hidden=3", "train.max_seconds=null"]
 
 
@@ -43,19 +38,8 @@ def test_a_run_learns(finished: Path) -> None:
 
 def test_the_light_goes_round(finished: Path, tmp_path: Path) -> None:
     target = tmp_path / "film.webp"
-    words = [
-        "render",
-        str(finished),
-        "--camera",
-        "orbit",
-        "--frames",
-        "1",
-        "--light",
-        "orbit:4:40:5",
-        "--out",
-        str(target),
-    ]
-    assert main(words) == 0
+    words = ["render", str(finished), "--camera", "orbit", "--frames", "1", "--light", "orbit:4:40:5"]
+    assert main([*words, "--out", str(target)]) == 0
     with Image.open(target) as film:
         assert getattr(film, "n_frames", 1) == 5
 
@@ -83,16 +67,8 @@ def test_a_missing_condition_is_asked_for_by_its_flag(
 def test_light_from_all_around(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sky = torch.linspace(1.0, 0.0, 16)[:, None, None].expand(16, 32, 3)
     write_exr(tmp_path / "sky.exr", sky, half=False)
-    words = [
-        "render",
-        str(finished),
-        "--environment",
-        str(tmp_path / "sky.exr"),
-        "--environment-samples",
-        "5",
-        "--frames",
-        "3",
-    ]
+    around = ["--environment", str(tmp_path / "sky.exr"), "--environment-samples", "5"]
+    words = ["render", str(finished), *around, "--frames", "3"]
     assert main([*words, "--camera", "test", "--out", str(tmp_path / "test")]) == 0
     assert len(list((tmp_path / "test").glob("*.png"))) == 6
     assert main([*words, "--camera", "orbit", "--out", str(tmp_path / "film.webp")]) == 0

@@ -165,11 +165,15 @@ class _Hierarchy:
         self._tree: Any = (corners[self._order], *boxes_and_links)  # leaves read neighbouring memory
 
     def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        index, u, v, distance = _trace(*self._tree, o, d, np.full(len(o), np.inf), False)
+        index, u, v, distance = self._trace(o, d, np.full(len(o), np.inf), False)
         return np.where(index >= 0, self._order[index], -1), u, v, distance
 
     def any(self, o: NDArray, d: NDArray, distance: NDArray) -> NDArray[np.bool_]:
-        return _trace(*self._tree, o, d, distance.astype(np.float64), True)[0] >= 0
+        return self._trace(o, d, distance.astype(np.float64), True)[0] >= 0
+
+    def _trace(self, o: NDArray, d: NDArray, limits: NDArray, any_hit: bool) -> Any:
+        corners, low, high, links = self._tree
+        return _trace(corners, low, high, links, o, d, limits, any_hit)
 
 
 def _build_boxes(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:

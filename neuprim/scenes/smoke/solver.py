@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Annotated, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -331,7 +331,7 @@ def _emit(state: GasState, velocity: Tensor, source: Source, time: float) -> tup
         field[source.where] += share * (value - field[source.where])
         return field
 
-    changed = {}
+    changed: dict[str, Any] = {}
     for name in ("density", "temperature", "fuel"):
         if (value := getattr(source, name)) is not None:
             changed[name] = towards(getattr(state, name), value)

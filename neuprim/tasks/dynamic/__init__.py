@@ -22,8 +22,6 @@ from neuprim.tasks.dynamic import evaluation
 from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 
-__all__ = ["TASK", "parse_time"]
-
 
 def _check(model: Mapping[str, Any]) -> None:
     validate_choices(model["density"], "model.density", {"time": str, "divide_above": float, **DENSITY_OPTIONS})

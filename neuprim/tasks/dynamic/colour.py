@@ -23,11 +23,8 @@ FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
 
 _TIME_TENSORS = ("time_poly", "time_cos", "time_sin")
 
-_TIMES = 256
-"""Times at which fewer terms are fitted to all terms."""
-
-_CONDITION = 1e-7
-"""Smallest relative singular value of a fit; weaker coefficients would not survive float32."""
+_FITTED_TIMES = 256  # at which fewer terms are fitted to all terms
+_MIN_SINGULAR = 1e-7  # relative singular value of a fit; weaker coefficients would not survive float32
 
 
 class TimeHarmonics(ColourField):
@@ -88,14 +85,13 @@ class TimeHarmonics(ColourField):
         field = TimeHarmonics(**{**self.settings(), name: value})
         if name == "degree":
             return field, sh.truncate_bands(params, "sh_rest", value)
-        times = (torch.arange(_TIMES, dtype=torch.float64) + 0.5) / _TIMES
+        times = (torch.arange(_FITTED_TIMES, dtype=torch.float64) + 0.5) / _FITTED_TIMES
         all_terms, fewer_terms = (
             torch.stack([torch.cat([torch.ones_like(x)[None], *f._terms(x).values()]) for x in times])
             for f in (self, field)
         )
-        fit = (
-            torch.linalg.pinv(fewer_terms, rtol=_CONDITION) @ all_terms
-        )  # coefficients of all terms -> of those that stay
+        # coefficients of all terms -> of those that stay
+        fit = torch.linalg.pinv(fewer_terms, rtol=_MIN_SINGULAR) @ all_terms
         stored = torch.cat([params["sh_dc"][:, None], *(params[key] for key in _TIME_TENSORS if key in params)], 1)
         sizes = {key: len(basis) for key, basis in field._terms(times[0]).items()}
         dc, *rest = (device.to_like(fit, stored.double()) @ stored.double()).to(stored).split([1, *sizes.values()], 1)
@@ -105,9 +101,8 @@ class TimeHarmonics(ColourField):
 
     def _terms(self, xi: Tensor) -> dict[str, Tensor]:
         """Basis of each tensor at a time, float64."""
-        waves = (
-            FREQUENCIES[self.frequencies] * xi * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
-        )
+        turn = FREQUENCIES[self.frequencies] * xi
+        waves = turn * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
         powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)
         return dict(zip(_TIME_TENSORS, (powers, waves.cos(), waves.sin()), strict=True))
 
@@ -121,11 +116,9 @@ class TimeHarmonics(ColourField):
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """Coefficients of the direction, per channel, and single terms in time."""
-        return (*sh.coefficients(self.degree, self.channels, "sh_rest"), *self._time_units())
-
-    def _time_units(self) -> tuple[PrunableUnit, ...]:
         terms = zip(_TIME_TENSORS, (self.powers, self.waves, self.waves), strict=True)
-        return tuple(PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, count in terms for i in range(count))
+        units = (PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, count in terms for i in range(count))
+        return (*sh.coefficients(self.degree, self.channels, "sh_rest"), *units)
 
     def script(self) -> str:
         return read_script(__package__, "colour.js")

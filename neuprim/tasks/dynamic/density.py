@@ -10,9 +10,8 @@ Parts that vary are chosen by name and joined by "+":
 xi is time over the sequence, 0..1. Primitives outside their window are dropped from a frame before anything is
 computed.
 
-A model joined from chunks of a sequence stores, for every primitive, the number of its chunk. Neighbouring chunks
-overlap in time. Over an overlap from a to b the earlier chunk's weight falls linearly from 1 to 0 and the later one's
-rises from 0 to 1, so that weights add up to 1 and no primitive counts at times that its chunk has not seen.
+A model joined from chunks of a sequence stores the chunk of every primitive. Neighbouring chunks overlap in time: over
+an overlap the earlier chunk's weight falls linearly from 1 to 0 and the later one's rises from 0 to 1.
 
 Where several grids make the extinction (smoke and flames), each of ``components`` adds one parameter, share_NAME: the
 primitive's share of that grid, as a logit.
@@ -48,7 +47,7 @@ PARTS = ("phase", "offset", "window", "motion")
 """What may vary in time."""
 
 OFFSET_TERMS = 4
-_MOTION = ("velocity", "acceleration")
+_OFFSETS, _MOTION = ("offset_cos", "offset_sin"), ("velocity", "acceleration")
 _SHARE = "share_"
 
 
@@ -138,9 +137,8 @@ class TimeDensity(DensityField):
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
-        return cls(
-            time="+".join(PARTS), gain=True, seams=[(0.0, 1.0)], components=("density", "temperature")
-        ).parameters()
+        every = cls(time="+".join(PARTS), gain=True, seams=[(0.0, 1.0)], components=("density", "temperature"))
+        return every.parameters()
 
     def parameters(self) -> list[ParameterSpec]:
         K = self.static.neurons
@@ -148,10 +146,7 @@ class TimeDensity(DensityField):
         if "phase" in self.parts:
             specs.append(ParameterSpec("W_t", (K,), 3e-3, lambda c: c.uniform(K, bound=c.number("rate", 0.1))))
         if "offset" in self.parts:
-            specs += [
-                ParameterSpec(name, (OFFSET_TERMS,), 3e-3, _zeros(OFFSET_TERMS))
-                for name in ("offset_cos", "offset_sin")
-            ]
+            specs += [ParameterSpec(name, (OFFSET_TERMS,), 3e-3, _zeros(OFFSET_TERMS)) for name in _OFFSETS]
         if "window" in self.parts:
             specs.append(ParameterSpec("window_center", (1,), 3e-3, _initial_center))
             specs.append(ParameterSpec("log_window", (1,), 1e-2, _initial_log_window))
@@ -168,12 +163,9 @@ class TimeDensity(DensityField):
     def largest(self, params: Params, geometry: Geometry) -> Tensor:
         changed = dict(params)
         if "offset" in self.parts:
-            changed["b2"] = params["b2"] + (params["offset_cos"].abs() + params["offset_sin"].abs()).sum(
-                1, keepdim=True
-            )
+            most = (params["offset_cos"].abs() + params["offset_sin"].abs()).sum(1, keepdim=True)
+            changed["b2"] = params["b2"] + most
         return self.static.largest(changed, geometry)
-
-    # ------------------------------------------------------------ one frame
 
     def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
         if "window" not in self.parts and not self.seams:
@@ -224,22 +216,19 @@ class TimeDensity(DensityField):
             self.lower(params, geometry, conditions), self.move(params, geometry, conditions), prim, x
         )
 
-    # ------------------------------------------------------------ population
-
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
         children = split_cosine(params, old, new, self.static.omega0, self.static.edge)
         if "offset" in self.parts:
             scale = split_scale(old, new, self.static.edge)
-            for name in ("offset_cos", "offset_sin"):
+            for name in _OFFSETS:
                 children[name] = params[name] * scale.to(params["b2"])[:, None]
         return children
 
     def canonicalize(self, params: Params) -> dict[str, Tensor]:
         if not self.static.neurons and "offset" not in self.parts:
             return self.static.canonicalize(params)
-        return canonicalize_cosines(
-            params, ("W1", "W_t") if "phase" in self.parts else ("W1",), "b1", "w2", self.static.omega0
-        )
+        rates = ("W1", "W_t") if "phase" in self.parts else ("W1",)
+        return canonicalize_cosines(params, rates, "b1", "w2", self.static.omega0)
 
     def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
         """Halve windows longer than ``divide_above``; the halves overlap, as windows fade at their ends.
@@ -298,7 +287,7 @@ class TimeDensity(DensityField):
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         scaled = self.static.scale_density(params, factor)
-        for name in ("offset_cos", "offset_sin"):
+        for name in _OFFSETS:
             if name in params:
                 scaled[name] = params[name] * factor[:, None]
         return scaled
@@ -331,11 +320,8 @@ def _initial_log_window(ctx: InitContext) -> Tensor:
 
 # ---------------------------------------------------------------- dropping a part of time
 
-_MEAN_TIMES = 128
-"""Times of a mean: the middles of as many equal parts of the sequence."""
-
-_MIDDLE = 0.5
-"""Reference time of motion without a window."""
+_MEAN_TIMES = 128  # of a mean: the middles of as many equal parts of the sequence
+_MIDDLE = 0.5  # reference time of motion without a window
 
 
 def drop_time_terms(params: Params, geometry: Geometry, part: str, omega0: float) -> dict[str, Tensor]:
@@ -369,10 +355,9 @@ def _time_weights(params: Params) -> list[tuple[Tensor, Tensor]]:
     factors = [_window_factor(params, xi) for xi in times]
     total = torch.stack(factors).sum(0)
     active = total > 0
-    return [
-        (xi, torch.where(active, f / total.where(active, torch.ones_like(total)), 1.0 / _MEAN_TIMES))
-        for xi, f in zip(times, factors, strict=True)
-    ]
+    divisor = total.where(active, torch.ones_like(total))
+    weights = (torch.where(active, factor / divisor, 1.0 / _MEAN_TIMES) for factor in factors)
+    return list(zip(times, weights, strict=True))
 
 
 def _mean_phase(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:

@@ -1,8 +1,4 @@
-"""Evaluate models of moving scenes: masks, films, image layers, and the extinction against that of the source files.
-
-A scene from volumes knows its files (:class:`~neuprim.tasks.dynamic.volume.dataset.Recording`); a scene of images knows
-nothing beyond them. Code that reads volumes is imported when it is used.
-"""
+"""Evaluate models of moving scenes: masks, films, image layers, and the extinction against that of the source files."""
 
 from __future__ import annotations
 
@@ -122,4 +118,3 @@ LAYERS = (
         absorption,
     ),
 )
-"""Layers of the task's images."""

@@ -2,8 +2,7 @@
 
 Either ``transforms_SPLIT.json`` per split, whose scenes have z upwards, or one ``transforms.json``, of which every n-th
 frame by name is a test view unless it lists ``train_filenames``, ``val_filenames`` or ``test_filenames``; if both
-exist, the splits count. Cameras, lenses and masks are those of :mod:`neuprim.core.data.transforms_json`; images are
-PNG, JPEG or OpenEXR. Each view has the condition "time", a 0-dim float32 tensor, 0..1.
+exist, the splits count. Each view has the condition "time", a 0-dim float32 tensor, 0..1.
 """
 
 from __future__ import annotations
@@ -88,15 +87,9 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         [r for s in splits.values() for r in s], _unused_splits(folder, splits), options.time_range
     )
     read = {split: _frames(options, documents[split], splits[split], time_range)[1] for split in splits}
-    return assemble_dataset(
-        str(folder),
-        name,
-        read[options.train_split],
-        read[options.test_split],
-        options,
-        context,
-        SceneDetails(up=torch.tensor([0.0, 0.0, 1.0]), start=moving_points),
-    )
+    details = SceneDetails(up=torch.tensor([0.0, 0.0, 1.0]), start=moving_points)
+    train, test = read[options.train_split], read[options.test_split]
+    return assemble_dataset(str(folder), name, train, test, options, context, details)
 
 
 def _frames(
@@ -119,11 +112,7 @@ def _frames(
 
 
 def _time_range(records: Sequence[JsonReader], others: Sequence[Path], setting: str) -> _TimeRange:
-    """The times that become 0 and 1, after checking the time of every frame.
-
-    Args:
-        records: of all frames in use.
-        others: files of further splits, which count for "auto" only.
+    """The times of these records that become 0 and 1; files of further splits count for "auto" only.
 
     Raises:
         DataError: a frame without a time, times that are no finite numbers or out of range, "auto" with a single time.
@@ -203,15 +192,12 @@ class MultiviewSettings(FolderSettings):
 
 # ---------------------------------------------------------------- starting points
 
-_SHARED = 2
-"""Cameras per time for a hull of a single time; with fewer, neighbours in time are added."""
-_RUN = 4
+_MIN_SHARED = 2  # cameras per time for a hull of a single time; with fewer, neighbours in time are added
+_RUN = 4  # neighbours in time
 _MOMENTS = 64
 _RESOLUTION = 64
-_SEEN = 0.75
-"""Share of the cameras that must see a place: places in two of four frusta only are often taken for matter."""
-_MATTER = 0.1
-"""Least opacity of matter; the edges of smoke are seldom more opaque."""
+_SEEN = 0.75  # share of the cameras that must see a place; half of them often take empty space for matter
+_MATTER = 0.1  # least opacity of matter; the edges of smoke are seldom more opaque
 
 
 def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
@@ -220,14 +206,11 @@ def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> Poi
     Visual hulls of single moments are united over time; one hull of all masks would carve away whatever moves. If
     several cameras share each time, a moment is one time. If every image has its own time, as in D-NeRF, a moment is a
     run of four neighbours in time: a thing that moves by less than its own size meanwhile keeps its middle, and the
-    next, overlapping runs supply the rest. (Tested alternatives lose the ends of a path or fill the room.)
+    next, overlapping runs supply the rest.
 
     Points lie on the surfaces of these hulls, each with the "time" and the colour of one moment. Cameras without a
     common target give points along rays (:func:`~neuprim.core.data.ray_points.ray_points`). Without alpha, or if every
     image has its own time and all hulls are empty, points fill a box in front of the cameras at random times.
-
-    Args:
-        views: each with the condition "time", 0..1.
 
     Raises:
         ConfigError: ``count`` is not positive.
@@ -268,11 +251,10 @@ def _hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Gen
     centers, owner = torch.cat(surfaces), torch.cat(owners)
     voxel = torch.cat([torch.full((len(s),), side) for s, side in zip(surfaces, sides, strict=True)])
     rows = _one_per_cell(centers, float(np.median(sides)), generator)
-    rows = (
-        rows[farthest_points(centers[rows], count, generator)]
-        if count <= len(rows)
-        else rows[torch.arange(count) % len(rows)]
-    )
+    if count <= len(rows):
+        rows = rows[farthest_points(centers[rows], count, generator)]
+    else:
+        rows = rows[torch.arange(count) % len(rows)]
     jitter = torch.rand((len(rows), 3), generator=generator) - 0.5
     means, owner = centers[rows] + jitter * voxel[rows, None], owner[rows]
     colors = torch.empty_like(means)
@@ -287,10 +269,10 @@ def _moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:
     """(views, time) of at most _MOMENTS moments in order of time; and whether moments are single times."""
     values = times.tolist()
     sharing = Counter(values)
-    shared = float(np.median(list(sharing.values()))) >= _SHARED
+    shared = float(np.median(list(sharing.values()))) >= _MIN_SHARED
     order = sorted(range(len(values)), key=values.__getitem__)  # stable: equal times stay in order of their views
     if shared:
-        moments = [([i for i in order if values[i] == t], t) for t in sorted(sharing) if sharing[t] >= _SHARED]
+        moments = [([i for i in order if values[i] == t], t) for t in sorted(sharing) if sharing[t] >= _MIN_SHARED]
     else:
         last = max(0, len(order) - _RUN)
         runs = [order[start : start + _RUN] for start in sorted({*range(0, last + 1, _RUN // 2), last})]

@@ -4,25 +4,22 @@ that lies there."""
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from neuprim.core.data import Dataset
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import write_vdb
 from neuprim.tasks.dynamic.volume import capture as capturing
 from neuprim.tasks.dynamic.volume.dataset import FrameViews, FrameVoxels, Voxels
-from tests.tasks.dynamic.sequences import blob, dataset, recorded
+from tests.tasks.dynamic.sequences import dataset, recorded, write_blobs
 
 
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
-    made = tmp_path / "files"
-    made.mkdir()
-    for number in (1, 2, 3):
-        write_vdb(made / f"ball_{number}.vdb", blob(9.0 + number))
-    return made
+    return write_blobs(tmp_path / "files", {number: 9.0 + number for number in (1, 2, 3)})
 
 
 @pytest.mark.parametrize("address", ["DIR/shared", "file://DIR/shared", "memory://neuprim-truth"])
@@ -37,9 +34,7 @@ def test_the_same_data_set_from_anywhere(
     assert recorded(data).folder.path.name == recorded(plain).folder.path.name, "keyed alike"
     for i in range(0, len(plain.train), 5):
         a, b = plain.train.pixels(i), data.train.pixels(i)
-        assert (
-            torch.equal(a.rgb, b.rgb) and a.alpha is not None and b.alpha is not None and torch.equal(a.alpha, b.alpha)
-        )
+        assert torch.equal(a.rgb, b.rgb) and torch.equal(a.alpha, b.alpha)
     clouds = [d.initial_points(50, torch.Generator().manual_seed(0)) for d in (plain, data)]
     assert torch.equal(clouds[0].means, clouds[1].means) and plain.exposure == data.exposure
     assert data.points is not None and plain.points is not None
@@ -66,13 +61,8 @@ def test_damage_and_strange_files_are_refused_by_name(files: Path, tmp_path: Pat
         DataError, match=r"cam_00\.exr: 1,0\d\d,\d\d\d bytes; expected at most .*; delete the folder .*frame_00002"
     ):
         data.train.pixels(1)
-    np.savez(
-        frame / "points.npz",
-        means=np.zeros((9, 2), np.float32),
-        weight=1.0,
-        brightest=np.float32(1),
-        colors=np.zeros((9, 3), np.float32),
-    )
+    points = {"means": np.zeros((9, 2), np.float32), "colors": np.zeros((9, 3), np.float32)}
+    np.savez(frame / "points.npz", **points, weight=1.0, brightest=np.float32(1))
     with pytest.raises(
         DataError, match=r"points\.npz: damaged \(means is float32 of shape \(9, 2\).*delete its folder"
     ):
@@ -99,22 +89,18 @@ def test_damage_and_strange_files_are_refused_by_name(files: Path, tmp_path: Pat
 
 
 def test_memory_is_bounded_by_the_setting_whatever_the_length(files: Path, tmp_path: Path) -> None:
+    def caches(data: Dataset) -> list[Any]:
+        assert isinstance(data.train, FrameViews) and isinstance(data.test, FrameViews)
+        assert isinstance(data.points, FrameVoxels)
+        return [data.train._images, data.test._images, data.points._voxels]
+
     data = dataset(files, tmp_path, memory=1, size=96, cameras=9)
-    assert (
-        isinstance(data.train, FrameViews)
-        and isinstance(data.test, FrameViews)
-        and isinstance(data.points, FrameVoxels)
-    )
-    assert data.train.memory + data.test.memory + data.points.memory == pytest.approx(2**20)
-    for views in (data.train, data.test):
+    train, test, voxels = caches(data)
+    assert train._memory + test._memory + voxels._memory == pytest.approx(2**20)
+    for views, cache in ((data.train, train), (data.test, test)):
         for i in range(len(views)):
             views.pixels(i)
-        assert 0 < sum(kept.nbytes for kept in views._cache.values()) <= max(views.memory, 96 * 96 * 8)
-    assert len(data.train._cache) < len(data.train)
-    usual = dataset(files, tmp_path)
-    assert (
-        isinstance(usual.train, FrameViews)
-        and isinstance(usual.test, FrameViews)
-        and isinstance(usual.points, FrameVoxels)
-    )
-    assert [round(part.memory) / 2**20 for part in (usual.train, usual.test, usual.points)] == [768, 128, 512]
+        assert 0 < sum(image.nbytes for image in cache._items.values()) <= max(cache._memory, 96 * 96 * 8)
+    assert len(train._items) < len(data.train)
+    usual = [round(cache._memory) / 2**20 for cache in caches(dataset(files, tmp_path))]
+    assert usual == [768, 128, 512]

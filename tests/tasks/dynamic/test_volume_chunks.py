@@ -7,18 +7,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import write_vdb
 from neuprim.core.task import Chunks, SceneContext
 from neuprim.tasks.dynamic import evaluation
 from neuprim.tasks.dynamic.volume.chunks import MAX_FRAMES, MIN_FRAMES, count_chunks
 from neuprim.tasks.dynamic.volume.scene import open_volumes, split_chunks
-from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
+from tests.tasks.dynamic.sequences import dataset, empty_frame, recorded, write_blobs
 
 NUMBERS = (2, 3, 5, 6, 7, 8, 10, 11, 12)
 EMPTY = 3
@@ -28,10 +27,10 @@ SEEN = ["2:6", "5:10", "8:12"]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine frames with gaps, the first three of which are empty."""
-    made = tmp_path_factory.mktemp("files")
-    for step, number in enumerate(NUMBERS):
-        empty = [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))]
-        write_vdb(made / f"ball_{number}.vdb", empty if step < EMPTY else blob(6.0 + step))
+    centers = {number: 6.0 + step for step, number in enumerate(NUMBERS)}
+    made = write_blobs(tmp_path_factory.mktemp("files"), centers)
+    for number in NUMBERS[:EMPTY]:
+        write_vdb(made / f"ball_{number}.vdb", empty_frame())
     return made
 
 
@@ -46,23 +45,16 @@ def chunks(folder: Path, cache: Path, *words: str) -> Chunks | None:
 
 
 def config_of(folder: Path, *words: str) -> dict[str, Any]:
-    scene = [
-        "task=dynamic",
-        "scene=vdb",
-        f"scene.vdb='{folder}'",
-        "scene.size=24",
-        "scene.cameras=6",
-        "scene.samples=1",
-        "scene.look=smoke_fire",
-    ]
-    return compose([*scene, *words], check_output=False).to_dict()
+    scene = ["task=dynamic", "scene=vdb", f"scene.vdb='{folder}'", "scene.look=smoke_fire"]
+    small = ["scene.size=24", "scene.cameras=6", "scene.samples=1"]
+    return compose([*scene, *small, *words], check_output=False).to_dict()
 
 
 # ---------------------------------------------------------------- how many
 
 
 @pytest.mark.parametrize(
-    ("asked", "frames", "images", "expected"),
+    ("requested", "frames", "images", "expected"),
     [
         (None, 500, 0, 1),
         (1, 500, 0, 1),
@@ -76,28 +68,18 @@ def config_of(folder: Path, *words: str) -> dict[str, Any]:
     ],
 )
 def test_the_number_follows_from_frames_and_memory(
-    asked: int | str | None, frames: int, images: int, expected: int
+    requested: int | str | None, frames: int, images: int, expected: int
 ) -> None:
-    assert count_chunks(asked, frames, images, 1) == expected
+    assert count_chunks(requested, frames, images, 1) == expected
 
 
 @pytest.mark.parametrize(
-    ("asked", "frames", "said"),
-    [
-        (
-            5,
-            9,
-            "scene.chunks=5: there are 9 frames to learn from; "
-            "expected at most 4, as a chunk has at least two of its own",
-        ),
-        (2, 3, "scene.chunks=2: there are 3 frames to learn from; expected null: a chunk has at least two of its own"),
-        (2, 1, "scene.chunks=2: there is 1 frame to learn from; expected null: a chunk has at least two of its own"),
-    ],
+    ("requested", "frames", "message"),
+    [(5, 9, "there are 9 frames .* at most 4, as"), (2, 3, "expected null: a chunk"), (2, 1, "there is 1 frame")],
 )
-def test_more_than_the_frames_allow_is_refused(asked: int, frames: int, said: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        count_chunks(asked, frames, 0, 1)
-    assert str(caught.value) == said
+def test_more_than_the_frames_allow_is_refused(requested: int, frames: int, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"scene.chunks={requested}: .*{message}"):
+        count_chunks(requested, frames, 0, 1)
 
 
 # ---------------------------------------------------------------- which frames
@@ -107,9 +89,8 @@ def test_chunks_share_out_frames_and_see_one_more_at_each_seam(folder: Path, cac
     found = chunks(folder, cache, "scene.chunks=3")
     assert found is not None
     assert [part.settings["scene.span"] for part in found.parts] == SEEN and found.parts[0].name == "frames_02-06"
-    assert sum(part.primitives for part in found.parts) == pytest.approx(1) and sum(
-        part.steps for part in found.parts
-    ) == pytest.approx(1)
+    assert sum(part.primitives for part in found.parts) == pytest.approx(1)
+    assert sum(part.steps for part in found.parts) == pytest.approx(1)
     assert [part.steps for part in found.parts] == pytest.approx([4 / 13, 5 / 13, 4 / 13])
     shares = [part.primitives for part in found.parts]  # by the matter that they see: in one frame, four and four
     assert shares == pytest.approx([1 / 9, 4 / 9, 4 / 9], rel=0.05)
@@ -161,14 +142,8 @@ def test_a_span_has_the_whole_sequences_times_box_light_and_images(folder: Path,
 
 
 def test_files_of_a_span_are_its_frames_in_the_sequences_time(folder: Path, tmp_path: Path) -> None:
-    settings: Mapping[str, Any] = {
-        "vdb": str(folder),
-        "size": 24,
-        "cameras": 6,
-        "samples": 1,
-        "look": "smoke_fire",
-        "span": "5:10",
-    }
+    small = {"vdb": str(folder), "size": 24, "cameras": 6, "samples": 1}
+    settings: Mapping[str, Any] = {**small, "look": "smoke_fire", "span": "5:10"}
     source = open_volumes(settings, SceneContext(0, tmp_path / "cache"))
     assert list(source.placement.numbers) == [5, 6, 7, 8, 10]
     assert source.placement.times["time"] == pytest.approx([0.3, 0.4, 0.5, 0.6, 0.8])

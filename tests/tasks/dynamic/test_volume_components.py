@@ -29,11 +29,8 @@ SHIFT = (4.0, -2.0, 0.0)
 
 def ball(centre: tuple[float, float, float], radius: float, peak: float, size: int = 16) -> np.ndarray:
     """(n, n, n) values that fall from the middle to the edge of a ball, indices."""
-    index = np.stack(np.meshgrid(*(np.arange(size, dtype=np.float32),) * 3, indexing="ij"), -1)
-    found: np.ndarray = peak * np.clip(
-        1 - np.linalg.norm(index - np.array(centre, np.float32), axis=-1) / radius, 0, None
-    )
-    return found.astype(np.float32)
+    index = np.stack(np.meshgrid(*(np.arange(size),) * 3, indexing="ij"), -1)
+    return np.clip(peak * (1 - np.linalg.norm(index - centre, axis=-1) / radius), 0, None).astype(np.float32)
 
 
 def fire(frame: int, half: bool = True) -> list[Grid]:
@@ -108,9 +105,8 @@ def test_flames_beyond_the_density_and_on_other_voxels_absorb(other: float, tmp_
         cell = abs(np.linalg.det(medium.scene_from_index[:3, :3]))
         flames = (medium.values[..., 0] - medium.scattering).sum() * cell
         assert flames == pytest.approx(expected, rel=0.02), frame.path.name
-        corners = (
-            medium.scene_from_index[:3, :3] @ np.argwhere(medium.values[..., 0] > 1).T + medium.scene_from_index[:3, 3:]
-        )
+        filled = np.argwhere(medium.values[..., 0] > 1).T
+        corners = medium.scene_from_index[:3, :3] @ filled + medium.scene_from_index[:3, 3:]
         assert (corners.min(1) >= capture.bounds[0]).all() and (corners.max(1) <= capture.bounds[1]).all()
 
 
@@ -148,15 +144,8 @@ SMALL = ["scene.size=24", "scene.cameras=6", "scene.samples=1", "model.primitive
 
 
 def words(files: Path, out: Path, *more: str) -> list[str]:
-    return [
-        "task=dynamic",
-        "scene=vdb",
-        f"scene.vdb='{files}'",
-        f"output_dir='{out}'",
-        "renderer.threads=1",
-        *SMALL,
-        *more,
-    ]
+    scene = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", f"output_dir='{out}'", "renderer.threads=1"]
+    return [*scene, *SMALL, *more]
 
 
 def test_no_primitive_goes_beyond_the_largest_extinction(files: Path, tmp_path: Path) -> None:
@@ -189,11 +178,8 @@ def test_exported_density_is_the_files_own(files: Path, tmp_path: Path) -> None:
             box = grid.world_bounds()
             half = np.array(grid.voxel_size) / 2
             assert grid.range is not None and grid.range[1] <= source.range[1] * 1.001
-            assert (
-                box is not None
-                and (box[0] >= world[0] - half - 1e-6).all()
-                and (box[1] <= world[1] + half + 1e-6).all()
-            )
+            assert box is not None and (box[0] >= world[0] - half - 1e-6).all()
+            assert (box[1] <= world[1] + half + 1e-6).all()
         assert report.errors[f"frame_{number:04d}.file_relative_l2"] < 0.4
     assert any("flames absorb, too" in note for note in report.notes)
     header = open_run(out).header["world"]

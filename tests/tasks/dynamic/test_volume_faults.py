@@ -15,35 +15,23 @@ from neuprim.tasks.dynamic.volume.dataset import FrameViews
 from neuprim.tasks.dynamic.volume.medium import build_medium
 from neuprim.tasks.dynamic.volume.optics import optics_preset, override_optics
 from neuprim.tasks.dynamic.volume.survey import Normalisation
-from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
+from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, empty_frame, recorded, write_blobs
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Two frames with density, temperature and flames."""
-    made = tmp_path / "files"
-    made.mkdir()
-    for number in (1, 2):
-        write_vdb(made / f"ball_{number}.vdb", blob(10.0 + number, ("density", "temperature", "flames")))
-    return made
+    return write_blobs(tmp_path / "files", {1: 11.0, 2: 12.0}, ("density", "temperature", "flames"))
 
 
 # ---------------------------------------------------------------- optics
 
 
 def test_optics_of_every_form() -> None:
-    look = override_optics(
-        optics_preset("smoke_fire"),
-        {
-            "extinction": 3,
-            "albedo": [1, 0.5, 0],
-            "gradient": [[1, 0, 0], [0, 0, 1]],
-            "light": {"irradiance": [1, 2, 3]},
-        },
-    )
-    assert (
-        look.extinction == 3 and look.albedo == (1.0, 0.5, 0.0) and look.gradient == ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-    )
+    changes = {"extinction": 3, "albedo": [1, 0.5, 0], "gradient": [[1, 0, 0], [0, 0, 1]]}
+    look = override_optics(optics_preset("smoke_fire"), {**changes, "light": {"irradiance": [1, 2, 3]}})
+    assert look.extinction == 3 and look.albedo == (1.0, 0.5, 0.0)
+    assert look.gradient == ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
     assert look.light is not None and look.light.irradiance == (1.0, 2.0, 3.0)
     original = optics_preset("smoke_fire").light
     assert original is not None and look.light.direction == original.direction
@@ -74,16 +62,12 @@ def test_the_box_is_that_of_the_grid_that_the_look_absorbs_by(folder: Path, tmp_
 def test_a_frame_without_the_grid_that_absorbs_takes_no_other(folder: Path, tmp_path: Path) -> None:
     write_vdb(folder / "ball_2.vdb", blob(12.0, ("temperature",)))
     data = dataset(folder, tmp_path, look="smoke_fire")
-    recording = recorded(data)
-    assert (
-        recording.capture.medium(recording.capture.frames[1]).empty
-        and not recording.capture.medium(recording.capture.frames[0]).empty
-    )
+    capture = recorded(data).capture
+    assert capture.medium(capture.frames[1]).empty and not capture.medium(capture.frames[0]).empty
 
 
 def test_a_look_whose_grids_are_missing(folder: Path, tmp_path: Path) -> None:
-    for number in (1, 2):
-        write_vdb(folder / f"ball_{number}.vdb", blob(10.0 + number, ("density",)))
+    write_blobs(folder, {1: 11.0, 2: 12.0}, ("density",))
     message = r"files: this look absorbs by temperature, and the files have density \('density'\)"
     with pytest.raises(DataError, match=message):
         dataset(folder, tmp_path, look="embergen_fire")
@@ -138,8 +122,7 @@ def test_more_starting_points_than_were_kept_are_distinct(
 
 
 def test_matter_in_frames_that_are_not_learned_from(folder: Path, tmp_path: Path) -> None:
-    empty = [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))]
-    write_vdb(folder / "ball_1.vdb", empty)
+    write_vdb(folder / "ball_1.vdb", empty_frame())
     with pytest.raises(DataError, match=r"no frame to learn from absorbs light; .*scene\.train_every"):
         dataset(folder, tmp_path, train_every=2).initial_points(5, torch.Generator().manual_seed(0))
 
@@ -152,6 +135,3 @@ def test_light_beyond_half_floats(folder: Path, tmp_path: Path) -> None:
         dataset(folder, tmp_path, optics={"emission": 1e7})
     with pytest.raises(DataError, match="every frame is black"):
         dataset(folder, tmp_path, optics={"extinction": 1e-12, "flame_extinction": 0.0})
-
-
-# ---------------------------------------------------------------- the cache

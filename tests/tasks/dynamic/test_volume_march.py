@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuprim.tasks.dynamic.volume.medium import Medium
-from neuprim.tasks.dynamic.volume.raymarch import render_medium
+from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
 from tests.tasks.dynamic.volumes import box, camera, grey, march_slowly, ragged, sheet
 
 pytestmark = pytest.mark.usefixtures("either_kernel")

@@ -20,8 +20,7 @@ from neuprim.core.model.schema import InitContext
 from neuprim.core.volumes.grid import lattice
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.dynamic.volume.ground_truth import compare_extinction, sample_extinction
-from neuprim.tasks.dynamic.volume.medium import Medium
-from neuprim.tasks.dynamic.volume.raymarch import render_medium
+from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
 from neuprim.tasks.dynamic.volume.scene import open_volumes
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.tasks.dynamic.sequences import blob, dataset, recorded

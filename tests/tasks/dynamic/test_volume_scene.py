@@ -10,28 +10,32 @@ import pytest
 import torch
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import write_vdb
 from neuprim.core.volumes.grid import lattice
 from neuprim.tasks.dynamic import evaluation
 from neuprim.tasks.dynamic.volume import capture as capturing
 from neuprim.tasks.dynamic.volume.ground_truth import sample_extinction
 from neuprim.tasks.dynamic.volume.scene import choose_frames
-from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
+from tests.tasks.dynamic.sequences import (
+    MIDDLE,
+    ORIGIN,
+    VOXEL,
+    blob,
+    dataset,
+    empty_frame,
+    recorded,
+    to_world,
+    write_blobs,
+)
 
 NUMBERS = (2, 9, 10, 11)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Frames 2 (empty), 9, 10 and 11 of a ball that moves along x."""
-    made = tmp_path / "files"
-    made.mkdir()
-    write_vdb(
-        made / "ball_2.vdb",
-        [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))],
-    )
-    for step, number in enumerate(NUMBERS[1:]):
-        write_vdb(made / f"ball_{number}.vdb", blob(8.0 + 4 * step))
+    """Frames 2 (empty), 9, 10 and 11 of an ellipsoid that moves along x."""
+    made = write_blobs(tmp_path / "files", {number: 8.0 + 4 * step for step, number in enumerate(NUMBERS[1:])})
+    write_vdb(made / "ball_2.vdb", empty_frame())
     return made
 
 
@@ -39,12 +43,8 @@ def test_frames_in_numerical_order_cameras_and_times(folder: Path, tmp_path: Pat
     data = dataset(folder, tmp_path)
     assert [f.number for f in recorded(data).capture.frames] == list(NUMBERS)
     assert len(data.train) == 4 * 4 and len(data.test) == 2 * 4
-    assert [round(float(data.test.view(i).conditions["time"]), 4) for i in range(4)] == [
-        0,
-        0.7778,
-        0.8889,
-        1,
-    ]  # by number
+    times = [round(float(data.test.view(i).conditions["time"]), 4) for i in range(4)]
+    assert times == [0, 0.7778, 0.8889, 1]  # by number
     assert data.data_source == "real" and data.color_space == "linear"
     assert evaluation.clips(data)[1].views == range(4, 8)
     trained, held_out = (
@@ -83,12 +83,12 @@ def test_starting_points_lie_where_and_when_there_is_matter(folder: Path, tmp_pa
     again = data.initial_points(500, torch.Generator().manual_seed(1))
     assert torch.equal(cloud.means, again.means) and torch.equal(cloud.conditions["time"], again.conditions["time"])
     assert cloud.steps == {"time": pytest.approx(1 / 9)} == cloud.rows(torch.arange(3)).steps
-    world = recorded(data).capture.normalisation.to_world(cloud.means.numpy())
+    world = to_world(recorded(data).capture, cloud.means.double().numpy())
     for time, center in ((7 / 9, 8.0), (8 / 9, 12.0), (1.0, 16.0)):
         here = (cloud.conditions["time"] - time).abs() < 1e-6
         assert 100 < int(here.sum()) < 250
-        middle = np.array([10.0 + VOXEL * center, VOXEL * 12, -3 + VOXEL * 12])
-        assert np.linalg.norm(world[here.numpy()] - middle, axis=1).max() < VOXEL * 6
+        middle = np.array(ORIGIN) + VOXEL * np.array([center, *MIDDLE])
+        assert (np.abs(world[here.numpy()] - middle).max(0) < VOXEL * np.array([6, 4.5, 7.5])).all()
     assert bool(((cloud.means >= data.bounds[0] - 0.05) & (cloud.means <= data.bounds[1] + 0.05)).all())
 
 
@@ -109,15 +109,8 @@ def test_a_second_call_renders_nothing_and_an_interrupted_one_goes_on(
 
 def test_whatever_matters_is_part_of_the_key(folder: Path, tmp_path: Path) -> None:
     names = {recorded(dataset(folder, tmp_path)).folder.path}
-    for change in (
-        {"size": 20},
-        {"samples": 2},
-        {"cameras": 5},
-        {"field_of_view": 30.0},
-        {"look": "dust_tornado"},
-        {"optics": {"extinction": 3.0}},
-        {"frames": "9:11"},
-    ):
+    changes = ({"size": 20}, {"samples": 2}, {"cameras": 5}, {"field_of_view": 30.0}, {"look": "dust_tornado"})
+    for change in (*changes, {"optics": {"extinction": 3.0}}, {"frames": "9:11"}):
         names.add(recorded(dataset(folder, tmp_path, **change)).folder.path)
     write_vdb(folder / "ball_11.vdb", blob(17.0))
     names.add(recorded(dataset(folder, tmp_path)).folder.path)
@@ -128,9 +121,8 @@ def test_every_nth_frame_may_be_left_out_of_training(folder: Path, tmp_path: Pat
     data = dataset(folder, tmp_path, train_every=2)
     assert len(data.train) == 4 * 2 and len(data.test) == 2 * 4
     assert {round(float(data.train.view(i).conditions["time"]), 3) for i in range(8)} == {0.0, 0.889}
-    assert {
-        round(t, 3) for t in data.initial_points(50, torch.Generator().manual_seed(0)).conditions["time"].tolist()
-    } == {0.889}
+    started = data.initial_points(50, torch.Generator().manual_seed(0)).conditions["time"]
+    assert {round(t, 3) for t in started.tolist()} == {0.889}
     whole = dataset(folder, tmp_path)
     assert torch.equal(data.train.pixels(1).rgb, whole.train.pixels(2).rgb)
 
@@ -142,13 +134,10 @@ def test_the_files_extinction_on_a_lattice(folder: Path, tmp_path: Path) -> None
     medium = recording.capture.medium(recording.capture.frames[1])
     found = sample_extinction(medium, matrix, shape)
     peak = np.array(np.unravel_index(found.argmax(), shape))
-    world = recording.capture.normalisation.to_world((matrix[:3, :3].numpy() @ peak + matrix[:3, 3].numpy())[None])[0]
-    assert np.linalg.norm(world - np.array([14.0, 6.0, 3.0])) < VOXEL
+    world = to_world(recording.capture, matrix[:3, :3].numpy() @ peak + matrix[:3, 3].numpy())
+    assert np.linalg.norm(world - (np.array(ORIGIN) + VOXEL * np.array([8, *MIDDLE]))) < VOXEL
     assert found.max() == pytest.approx(float(medium.values[..., 0].max()), rel=0.15)
     assert not sample_extinction(recording.capture.medium(recording.capture.frames[0]), matrix, shape).any()
-
-
-# ---------------------------------------------------------------- bad input
 
 
 def test_frames_that_do_not_exist(folder: Path, tmp_path: Path) -> None:
@@ -162,24 +151,16 @@ def test_a_grid_by_another_name(folder: Path, tmp_path: Path) -> None:
         DataError, match=r"scene\.grids\.density=densty: no frame has such a grid; did you mean 'density'"
     ):
         dataset(folder, tmp_path, grids={"density": "densty"})
-    other = tmp_path / "other"
-    other.mkdir()
-    for number in (1, 2):
-        write_vdb(other / f"x{number}.vdb", blob(10.0 + number, ("soup",)))
+    other = write_blobs(tmp_path / "other", {1: 11.0, 2: 12.0}, ("soup",))
     with pytest.raises(DataError, match=r"no grid of density or temperature; found: soup \(readable\)"):
         dataset(other, tmp_path)
     assert dataset(other, tmp_path, grids={"density": "soup"}).exposure > 0
 
 
 def test_a_look_chosen_by_the_grids(folder: Path, tmp_path: Path) -> None:
-    assert recorded(dataset(folder, tmp_path, look="auto")).capture.optics.extinction_grids == (
-        "density",
-        "temperature",
-    )
-    other = tmp_path / "hot"
-    other.mkdir()
-    for number in (1, 2):
-        write_vdb(other / f"x{number}.vdb", blob(10.0 + number, ("temperature", "flames")))
+    recording = recorded(dataset(folder, tmp_path, look="auto"))
+    assert recording.capture.optics.extinction_grids == ("density", "temperature")
+    other = write_blobs(tmp_path / "hot", {1: 11.0, 2: 12.0}, ("temperature", "flames"))
     data = dataset(other, tmp_path, look="auto")
     recording = recorded(data)
     assert recording.capture.optics.extinction_grids == ("temperature",)
@@ -195,13 +176,7 @@ def test_damaged_points_say_what_to_do(folder: Path, tmp_path: Path) -> None:
 
 def test_voxel_sizes_and_bounds_may_change(folder: Path, tmp_path: Path) -> None:
     before = dataset(folder, tmp_path).test.pixels(2)
-    index = np.stack(np.meshgrid(*(np.arange(48, dtype=np.float32),) * 3, indexing="ij"), -1)
-    value = np.clip(1 - np.linalg.norm(index - np.array([24, 24, 24], np.float32), axis=-1) / 10, 0, None)
-    fine = scale_transform(VOXEL / 2, (10.0, 0.0, -3.0))
-    write_vdb(
-        folder / "ball_10.vdb",
-        [Grid.from_dense(n, value * (0.2 if n == "flames" else 1), transform=fine) for n in ("density", "flames")],
-    )
+    write_vdb(folder / "ball_10.vdb", blob(12.0, fine=2))
     after = dataset(folder, tmp_path).test.pixels(2)
     assert before.alpha is not None and after.alpha is not None
     assert float((before.alpha - after.alpha).abs().mean()) < 0.01 < float(before.alpha.mean())

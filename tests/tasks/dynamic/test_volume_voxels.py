@@ -12,31 +12,23 @@ import torch
 from neuprim.config import compose
 from neuprim.core.data.dataset import PointSamples
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import write_vdb
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import fit, prepare_training
 from neuprim.tasks.dynamic.volume.dataset import FrameVoxels, Voxels
-from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
+from tests.tasks.dynamic.sequences import VOXEL, dataset, empty_frame, recorded, write_blobs
 
-SMALL = [
-    "scene.size=24",
-    "scene.cameras=6",
-    "scene.samples=1",
-    "model.primitives=80",
-    "model.neurons=0",
-    "train.max_seconds=null",
-]
+SMALL = (
+    "scene.size=24 scene.cameras=6 scene.samples=1 model.primitives=80 model.neurons=0 train.max_seconds=null".split()
+)
 SOFT = ["model.density.edge=2", "model.density.gain=true"]
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Frames 1 to 4 of a ball that moves along x, and an empty frame 5."""
-    folder = tmp_path_factory.mktemp("ball")
-    for number in range(1, 5):
-        write_vdb(folder / f"ball_{number}.vdb", blob(6.0 + 3 * number))
-    empty = Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))
-    write_vdb(folder / "ball_5.vdb", [empty])
+    """Frames 1 to 4 of an ellipsoid that moves along x, and an empty frame 5."""
+    folder = write_blobs(tmp_path_factory.mktemp("ball"), {n: 6.0 + 3 * n for n in range(1, 5)})
+    write_vdb(folder / "ball_5.vdb", empty_frame())
     return folder
 
 
@@ -90,6 +82,18 @@ def test_points_are_voxel_centres_with_the_files_own_values(files: Path, tmp_pat
             assert 0.7 <= share < 0.98 and not inside.all()  # some lie beside the matter, some beyond the box
 
 
+def test_points_anywhere_fill_the_box_along_every_axis(files: Path, tmp_path: Path) -> None:
+    points = supervision(files, tmp_path)
+    drawn = frames_of(points, 200)
+    low, high = points.capture.bounds
+    assert len({round(float(side), 2) for side in high - low}) == 3, "no two axes are alike"
+    margin, voxel = 0.1 * (high - low).max(), VOXEL * points.capture.normalisation.scale
+    # the first tenth of a draw lies anywhere; an empty frame has no voxels of its own
+    anywhere = [one.points[:40].numpy() for name in drawn if name != "frame_0005" for one in drawn[name]]
+    places = np.concatenate(anywhere)
+    assert np.allclose([places.min(0), places.max(0)], [low - margin, high + margin], atol=voxel)
+
+
 def test_an_empty_frame_is_learned_as_empty(files: Path, tmp_path: Path) -> None:
     for samples in frames_of(supervision(files, tmp_path), 300)["frame_0005"]:
         assert len(samples.points) == 400 and not bool(samples.sigma.any()) and samples.sigma_scale > 1
@@ -107,10 +111,8 @@ def test_a_chunk_of_a_sequence_and_frames_left_out(files: Path, tmp_path: Path) 
 
 def test_the_generator_alone_decides(files: Path, tmp_path: Path) -> None:
     points = supervision(files, tmp_path)
-    made = [
-        [points.draw(50, g) for _ in range(6)]
-        for g in (torch.Generator().manual_seed(1), torch.Generator().manual_seed(1))
-    ]
+    generators = [torch.Generator().manual_seed(1) for _ in range(2)]
+    made = [[points.draw(50, g) for _ in range(6)] for g in generators]
     for a, b in zip(*made, strict=True):
         assert a.name == b.name and torch.equal(a.points, b.points) and torch.equal(a.sigma, b.sigma)
 
@@ -119,20 +121,20 @@ def test_voxels_are_read_once_kept_beside_the_images_and_bounded(
     files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = supervision(files, tmp_path)
-    read = [first.voxels(t) for t in range(5)]
+    read = [first._voxels[t] for t in range(5)]
     reads: list[int] = []
     monkeypatch.setattr(type(first.capture), "medium", lambda self, frame: reads.append(frame.number))
     again = supervision(files, tmp_path)
-    again.memory = read[0].bytes + read[1].bytes
+    again._voxels._memory = read[0].bytes + read[1].bytes
     for t, expected in enumerate(read):
-        found = again.voxels(t)
+        found = again._voxels[t]
         assert np.array_equal(found.index, expected.index) and np.array_equal(found.values, expected.values)
-        assert sum(v.bytes for v in again._cache.values()) <= again.memory
+        assert sum(v.bytes for v in again._voxels._items.values()) <= again._voxels._memory
     assert not reads
     path = again.capture.fetch_points(again.folder, again.frames[0]).with_name("voxels.npz")
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(DataError, match=r"voxels\.npz: damaged .*delete it"):
-        supervision(files, tmp_path).voxels(0)
+        supervision(files, tmp_path)._voxels[0]
 
 
 def test_values_at_indices_are_those_of_the_grid() -> None:
@@ -155,21 +157,12 @@ def test_it_learns_the_voxels_better_than_images_alone(files: Path, supervision:
     for kind in ("images", supervision):
         results[kind] = fit(compose(words(files, *budget, f"train.supervision={kind}"), check_output=False)).metrics()
     images, voxels = results["images"], results[supervision]
-    assert (
-        voxels["sigma_relative_l2_middle"]
-        < (0.6 if supervision == "voxels" else 0.9) * images["sigma_relative_l2_middle"]
-    )
+    bound = 0.6 if supervision == "voxels" else 0.9
+    assert voxels["sigma_relative_l2_middle"] < bound * images["sigma_relative_l2_middle"]
     assert voxels["psnr_mask"] > voxels["psnr_black_image_mask"] + (2 if supervision == "voxels" else 4)
 
 
 def test_auto_is_images_where_there_are_no_voxels() -> None:
-    words = [
-        "task=static",
-        "scene=solids",
-        "scene.size=16",
-        "scene.train_views=4",
-        "scene.test_views=1",
-        "model.primitives=10",
-    ]
+    words = "task=static scene=solids scene.size=16 scene.train_views=4 scene.test_views=1 model.primitives=10".split()
     found = prepare_training(compose([*words, "train.supervision=auto"], check_output=False)).trainer
     assert found.settings.supervision == "images" and "voxel_sigma" not in found.train_step().parts

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.io.vdb import Grid
-from neuprim.tasks.dynamic.volume.medium import Medium
+from neuprim.tasks.dynamic.volume.raymarch import Medium
 
 
 def camera(

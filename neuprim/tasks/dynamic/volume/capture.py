@@ -30,9 +30,9 @@ from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.notices import warn_once
 from neuprim.core.volumes.source import Extent
-from neuprim.tasks.dynamic.volume.medium import Medium, build_medium
+from neuprim.tasks.dynamic.volume.medium import build_medium
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics
-from neuprim.tasks.dynamic.volume.raymarch import render_medium
+from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
 from neuprim.tasks.dynamic.volume.survey import GridReader, Normalisation
 
 RENDERER_VERSION = 2
@@ -53,11 +53,9 @@ class Capture:
 
     Attributes:
         frames: the files, in order.
-        reader: which grids mean what.
-        cameras: all of them, those held out included.
-        samples: rays per pixel side.
+        cameras: all of them, those held out included; ``samples``: rays per pixel side.
         bounds: (2, 3) box around all matter, scene units.
-        device: what renders them. Images of a GPU have their own folder, as their last bits differ.
+        device: what renders. Images of a GPU have their own folder, as their last bits differ.
         ends: frame numbers whose times are 0 and 1; None: the first and the last frame's.
         measured: frame number -> extent of its extinction grid; empty if unknown.
     """
@@ -96,15 +94,8 @@ class Capture:
         """A short hash of everything; files count by name, size and modification time."""
         stats = [(f.number, str(f.path), f.path.stat().st_size, f.path.stat().st_mtime_ns) for f in self.frames]
         cameras = [(c.viewmat.tolist(), c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in self.cameras]
-        parts = [
-            RENDERER_VERSION,
-            stats,
-            asdict(self.optics),
-            dict(self.reader.names),
-            cameras,
-            self.samples,
-            self.normalisation.to_json(),
-        ]
+        optics, names, normalisation = asdict(self.optics), dict(self.reader.names), self.normalisation.to_json()
+        parts = [RENDERER_VERSION, stats, optics, names, cameras, self.samples, normalisation]
         parts += [self.device.type] * hardware.has_warp(self.device)
         return hashlib.sha256(json.dumps(parts, default=_to_plain).encode()).hexdigest()[:16]
 
@@ -113,13 +104,9 @@ class Capture:
         grids = self.reader.read(frame.path)
         if self.reader.extinction not in grids and not (self.components and self.optics.flame_grid in grids):
             return Medium.nothing()
+        optics = replace(self.optics, extinction_grids=(self.reader.extinction,))
         try:
-            return build_medium(
-                grids,
-                replace(self.optics, extinction_grids=(self.reader.extinction,)),
-                self.normalisation,
-                where=self.device,
-            )
+            return build_medium(grids, optics, self.normalisation, where=self.device)
         except DataError as error:
             raise DataError(f"{frame.path}: {error}") from error
 
@@ -170,13 +157,8 @@ class Capture:
                 )
             brightest = max(brightest, peak)
             write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
-        largest = medium.values[..., 0].max(initial=0.0)
-        np.savez(
-            folder / LAST_FILE,
-            brightest=np.float32(brightest),
-            largest=np.float32(largest),
-            **_sample_points(medium, frame.number),
-        )
+        largest, points = np.float32(medium.values[..., 0].max(initial=0.0)), _sample_points(medium, frame.number)
+        np.savez(folder / LAST_FILE, brightest=np.float32(brightest), largest=largest, **points)
 
 
 def _sample_points(medium: Medium, seed: int) -> dict[str, Any]:
@@ -254,13 +236,11 @@ class RenderedFrames(GroundTruth):
     def write(self, frame: int, tell: Callable[[str], None] = warn_once) -> None:
         """Render a frame and store it, unless it exists by then."""
 
-        def attempt() -> None:
-            self.store.write_folder(
-                self.frames[frame], lambda folder: self.capture.render(self.capture.frames[frame], folder), LAST_FILE
-            )
+        def render(folder: Path) -> None:
+            self.capture.render(self.capture.frames[frame], folder)
 
         with _describe_write_errors(self.store):
-            self.store.retry(attempt, tell)
+            self.store.retry(lambda: self.store.write_folder(self.frames[frame], render, LAST_FILE), tell)
 
     def complete(self) -> None:
         with _describe_write_errors(self.store):
@@ -327,13 +307,8 @@ def hemisphere_cameras(
     low, high = (math.sin(math.radians(e)) for e in elevations)
     if up not in UP_AXES:
         raise ConfigError(f"up {up!r}; expected 'y' or 'z'")
-    if (
-        size < 1
-        or cameras < 4
-        or distance <= 0.0
-        or not 0.0 < field_of_view < 180.0
-        or not -90 <= elevations[0] < elevations[1] <= 90
-    ):
+    sound = size >= 1 and cameras >= 4 and distance > 0.0 and 0.0 < field_of_view < 180.0
+    if not sound or not -90 <= elevations[0] < elevations[1] <= 90:
         raise ConfigError(
             f"size {size}, cameras {cameras}, distance {distance}, field_of_view {field_of_view}, "
             f"elevations {elevations}; "

@@ -21,11 +21,8 @@ from neuprim.core.task import Chunk, Chunks
 from neuprim.tasks.dynamic.density import ChunkOverlaps, TimeDensity
 from neuprim.tasks.dynamic.volume.capture import Capture
 
-MAX_FRAMES = 100
-"""Most frames of an automatic chunk."""
-
-MIN_FRAMES = 25
-"""Fewest frames of an automatic chunk: primitives are active for much of a sequence, and chunks cut that short."""
+MAX_FRAMES, MIN_FRAMES = 100, 25
+"""Frames of an automatic chunk: primitives are active for much of a sequence, and short chunks cut that short."""
 
 _TIME_POWERS = {"window_center": 1, "velocity": -1, "acceleration": -2, "W_t": -1}
 """Parameters in units of the sequence's time -> power of time in them."""
@@ -64,7 +61,6 @@ def plan_chunks(
     """Plan the chunks of a sequence; None if no frame holds anything.
 
     Args:
-        capture: of the whole sequence.
         every: every n-th frame is used for training.
         count: two or more chunks of at least two frames each.
         weight: total extinction of a frame; primitives are divided by it, like the starting points of one run.

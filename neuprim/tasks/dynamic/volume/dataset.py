@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -26,12 +26,33 @@ from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.notices import warn_once
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.ground_truth import placement_of
-from neuprim.tasks.dynamic.volume.medium import Medium
+from neuprim.tasks.dynamic.volume.raymarch import Medium
 
 TRAINING_MEMORY, _TEST_MEMORY, _VOXEL_MEMORY = 6 / 11, 1 / 11, 4 / 11
 """Shares of the memory for training images, test images (read in order) and voxels."""
 
 _MIN_ALPHA = 1.0 / 255.0  # of a pixel that shows matter
+
+T = TypeVar("T")
+
+
+class _RecentlyUsed(Generic[T]):
+    """Items by index, read when first used; the least recently used are dropped beyond ``memory`` bytes."""
+
+    def __init__(self, read: Callable[[int], T], size: Callable[[T], int], memory: float) -> None:
+        self._read, self._size, self._memory = read, size, memory
+        self._items: OrderedDict[int, T] = OrderedDict()
+        self._bytes = 0
+
+    def __getitem__(self, index: int) -> T:
+        if index in self._items:
+            self._items.move_to_end(index)
+            return self._items[index]
+        self._items[index] = found = self._read(index)
+        self._bytes += self._size(found)
+        while len(self._items) > 1 and self._bytes > self._memory:
+            self._bytes -= self._size(self._items.popitem(last=False)[1])
+        return found
 
 
 class FrameViews(ViewSet):
@@ -41,7 +62,7 @@ class FrameViews(ViewSet):
         folder: store of the images.
         exposure: radiance that becomes 1.
         every: use every n-th frame only; times stay those of the whole sequence.
-        memory: bytes of decoded images in memory; the least recently used are dropped.
+        memory: bytes of decoded images in memory.
     """
 
     def __init__(
@@ -53,51 +74,41 @@ class FrameViews(ViewSet):
         every: int = 1,
         memory: float = math.inf,
     ) -> None:
-        self.capture, self.folder, self.cameras = capture, folder, list(cameras)
-        self.exposure, self.memory = exposure, memory
-        self._cache: OrderedDict[int, Tensor] = OrderedDict()
+        self.capture, self.folder, self.cameras, self.exposure = capture, folder, list(cameras), exposure
+        self._images = _RecentlyUsed(self._decode, lambda rgba: rgba.numel() * 2, memory)
         self.frames = capture.frames[::every]
         self.times = [torch.tensor(capture.time(frame)) for frame in self.frames]
 
     def __len__(self) -> int:
         return len(self.cameras) * len(self.times)
 
+    def _split(self, index: int) -> tuple[int, int]:
+        """The number of a view's camera, and the position of its frame."""
+        camera, frame = divmod(index, len(self.times))
+        return self.cameras[camera], frame
+
     def view(self, index: int) -> View:
-        c, t = divmod(index, len(self.times))
-        frame = self.frames[t]
-        return View(
-            f"cam_{self.cameras[c]:02d}_frame_{frame.number:04d}",
-            self.capture.cameras[self.cameras[c]],
-            {"time": self.times[t]},
-        )
+        camera, t = self._split(index)
+        name = f"cam_{camera:02d}_frame_{self.frames[t].number:04d}"
+        return View(name, self.capture.cameras[camera], {"time": self.times[t]})
 
     def pixels(self, index: int) -> Pixels:
-        rgba = self._decode(index).float()
+        rgba = self._images[index].float()
         return Pixels(rgba[..., :3] / self.exposure, rgba[..., 3])
 
     def _decode(self, index: int) -> Tensor:
-        if index in self._cache:
-            self._cache.move_to_end(index)
-            return self._cache[index]
-        c, t = divmod(index, len(self.times))
-        camera = self.capture.cameras[self.cameras[c]]
-        frame, number = self.frames[t], self.cameras[c]
+        number, t = self._split(index)
+        camera, frame = self.capture.cameras[number], self.frames[t]
 
         def read() -> Tensor:
             path = self.capture.fetch_image(self.folder, frame, number)
             return images.read_image(path, (camera.width, camera.height))
 
         try:
-            rgba = self.folder.retry(read, warn_once)
+            return self.folder.retry(read, warn_once).half()
         except DataError as error:
-            raise DataError(
-                f"{error}; delete the folder {self.folder.at(self.capture.frame_folder(frame)).address} "
-                "to render the frame again"
-            ) from error
-        self._cache[index] = rgba = rgba.half()
-        while len(self._cache) > 1 and len(self._cache) * rgba.numel() * 2 > self.memory:
-            self._cache.popitem(last=False)
-        return rgba
+            address = self.folder.at(self.capture.frame_folder(frame)).address
+            raise DataError(f"{error}; delete the folder {address} to render the frame again") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +116,6 @@ class Recording:
     """A rendered volume sequence, for starting points and evaluation; a dataset's ``extra``.
 
     Attributes:
-        name: of the dataset.
         folder: store of the rendered images.
         exposure: the brightest radiance that any camera sees.
         weights: total extinction of each frame.
@@ -157,11 +167,10 @@ class Recording:
         frames = len(self.capture.frames)
         camera = index // frames
         if camera not in self._masks:
-            alphas = (self.test.pixels(i).alpha for i in range(camera * frames, (camera + 1) * frames))
-            union = torch.zeros(
-                self.test.view(index).camera.height, self.test.view(index).camera.width, dtype=torch.bool
-            )
-            for alpha in alphas:
+            lens = self.test.view(index).camera
+            union = torch.zeros(lens.height, lens.width, dtype=torch.bool)
+            for i in range(camera * frames, (camera + 1) * frames):
+                alpha = self.test.pixels(i).alpha
                 assert alpha is not None
                 union |= alpha > _MIN_ALPHA
             self._masks[camera] = union
@@ -170,13 +179,8 @@ class Recording:
 
 @dataclass(frozen=True)
 class TrainingFrames:
-    """What a run uses of a sequence.
-
-    Attributes:
-        every: every n-th frame is used for training.
-        span: numbers of the first and last frame for training and evaluation; None: all. The exposure is that of all.
-        memory: bytes of decoded images and voxels in memory.
-    """
+    """What a run uses of a sequence: every n-th frame for training, numbers of the first and last frame for training
+    and evaluation (None: all), and bytes of decoded images and voxels in memory."""
 
     every: int = 1
     span: tuple[int, int] | None = None
@@ -194,10 +198,6 @@ def volume_dataset(
 ) -> Dataset:
     """The dataset of a rendered sequence; colours are linear radiance over the brightest value that any camera sees.
 
-    Args:
-        folder: store of the capture's images.
-        held_out: indices of the test cameras.
-
     Raises:
         DataError: every frame is black, or a file is damaged.
     """
@@ -212,9 +212,7 @@ def volume_dataset(
     training = [c for c in range(len(capture.cameras)) if c not in held_out]
     train = FrameViews(capture, folder, training, exposure, used.every, used.memory * TRAINING_MEMORY)
     test = FrameViews(capture, folder, held_out, exposure, memory=used.memory * _TEST_MEMORY)
-    weights = [
-        float(read_points_file(capture.fetch_points(folder, frame), "weight")["weight"]) for frame in capture.frames
-    ]
+    weights = [total_extinction(capture, folder, frame) for frame in capture.frames]
     recording = Recording(name, capture, folder, exposure, weights, used.every, test)
     voxels = FrameVoxels(capture, folder, train, weights[:: used.every], used.memory * _VOXEL_MEMORY)
     camera = capture.cameras[0]
@@ -258,14 +256,15 @@ def read_points_file(path: Path, *names: str) -> dict[str, Any]:
         raise DataError(f"{error}; delete its folder to render the frame again") from error
 
 
+def total_extinction(capture: Capture, store: Store, frame: VdbFrame) -> float:
+    """The total extinction of a frame, from its points file."""
+    return float(read_points_file(capture.fetch_points(store, frame), "weight")["weight"])
+
+
 # ---------------------------------------------------------------- voxels to learn from
 
-_NEAR, _FAR = 0.2, 0.1
-"""Shares of the points around voxels with matter, and anywhere in the box."""
-
-_ANY_FRAME = 0.1
-"""Share of the draws that take any frame, so that nearly empty frames are learned as well."""
-
+_NEAR, _FAR = 0.2, 0.1  # shares of the points around voxels with matter, and anywhere in the box
+_ANY_FRAME = 0.1  # share of the draws that take any frame, so that nearly empty frames are learned as well
 _MAX_OFFSET = 6  # voxels from one with matter, along each axis
 _MARGIN = 0.1  # on each side of the sequence's box, in its longest side
 
@@ -286,7 +285,6 @@ class Voxels:
     Attributes:
         index: (V,) int64 ascending, flat indices (i Y + j) Z + k of a grid of ``shape``.
         values: (V, C) float32: sigma, sigma times radiance (3), and the extinction grid's part if flames add to sigma.
-        shape: of the grid.
         scene_from_index: (4, 4) float64.
     """
 
@@ -319,14 +317,9 @@ class Voxels:
 
     def write(self, path: Path) -> None:
         """Write a file of arrays. Raises OSError."""
+        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _VOXEL_ARRAYS}
         with open(path, "wb") as file:
-            np.savez(
-                file,
-                index=self.index,
-                values=self.values,
-                shape=np.array(self.shape),
-                scene_from_index=self.scene_from_index,
-            )
+            np.savez(file, **arrays)
 
     @staticmethod
     def read(path: Path) -> Voxels:
@@ -338,11 +331,8 @@ class Voxels:
         found = read_arrays(path, _VOXEL_ARRAYS)
         index, values, matrix = found["index"], found["values"], found["scene_from_index"]
         x, y, z = (int(n) for n in found["shape"])
-        inside = (
-            min(x, y, z) >= 0
-            and x * y * z < 2**62
-            and (not len(index) or (index[0] >= 0 and index[-1] < x * y * z and bool((np.diff(index) > 0).all())))
-        )
+        ascending = not len(index) or (index[0] >= 0 and index[-1] < x * y * z and bool((np.diff(index) > 0).all()))
+        inside = min(x, y, z) >= 0 and x * y * z < 2**62 and ascending
         finite = np.isfinite(values).all() and np.isfinite(matrix).all()
         if len(index) != len(values) or values.shape[1] not in (4, 5) or not inside or not finite:
             raise DataError(
@@ -371,24 +361,24 @@ class FrameVoxels(PointSupervision):
     sequence's.
 
     Args:
-        folder: store of the capture's images. Voxels of a frame are stored there as well, as their light is slow.
+        folder: store of the images. Voxels of a frame are stored there as well, as their light takes long to compute.
         views: whose frames, times and exposure are used.
         weights: total extinction of each of these frames.
-        memory: bytes of voxels in memory; the least recently used are dropped.
+        memory: bytes of voxels in memory.
     """
 
     def __init__(
         self, capture: Capture, folder: Store, views: FrameViews, weights: Sequence[float], memory: float
     ) -> None:
         self.capture, self.folder, self.frames, self.times = capture, folder, list(views.frames), list(views.times)
-        self.exposure, self.memory, self.components = views.exposure, memory, capture.components
+        self.exposure, self.components = views.exposure, capture.components
         shares = torch.tensor(weights, dtype=torch.float64)
         self.chances = (1 - _ANY_FRAME) * shares / shares.sum().clamp_min(1e-300) + _ANY_FRAME / len(self.frames)
-        self._cache: OrderedDict[int, Voxels] = OrderedDict()
+        self._voxels = _RecentlyUsed(self._read, lambda voxels: voxels.bytes, memory)
 
     def draw(self, count: int, generator: torch.Generator) -> PointSamples:
         t = int(torch.multinomial(self.chances, 1, generator=generator))
-        voxels = self.voxels(t)
+        voxels = self._voxels[t]
         near, far = round(_NEAR * count), round(_FAR * count)
         if not len(voxels.index):
             near, far = 0, count
@@ -408,36 +398,24 @@ class FrameVoxels(PointSupervision):
         points = cells @ voxels.scene_from_index[:3, :3].T + voxels.scene_from_index[:3, 3]
         sigma, light, part = voxels.rms
         fallback = self.capture.optics.extinction or 1.0  # for empty frames
+        # the extinction grid's part of sigma; all of sigma in a frame without flames
+        parts = torch.from_numpy(values[:, 4 if values.shape[1] > 4 else 0].copy())
         return PointSamples(
-            f"frame_{self.frames[t].number:04d}",
-            {"time": self.times[t]},
-            torch.from_numpy(points).float(),
-            torch.from_numpy(values[:, 0].copy()),
-            torch.from_numpy(values[:, 1:4] / np.float32(self.exposure)),
-            sigma or fallback,
-            (light or fallback) / self.exposure,
-            {name: (self._part(values), part or sigma or fallback) for name in self.components},
+            name=f"frame_{self.frames[t].number:04d}",
+            conditions={"time": self.times[t]},
+            points=torch.from_numpy(points).float(),
+            sigma=torch.from_numpy(values[:, 0].copy()),
+            source=torch.from_numpy(values[:, 1:4] / np.float32(self.exposure)),
+            sigma_scale=sigma or fallback,
+            source_scale=(light or fallback) / self.exposure,
+            components=dict.fromkeys(self.components, (parts, part or sigma or fallback)),
         )
 
-    @staticmethod
-    def _part(values: np.ndarray) -> Tensor:
-        """(M,) the extinction grid's part of sigma; all of sigma in a frame without flames."""
-        return torch.from_numpy(values[:, 4 if values.shape[1] > 4 else 0].copy())
-
-    def voxels(self, t: int) -> Voxels:
-        """The voxels of a frame, from memory, from the store, or from the frame's file."""
-        if t in self._cache:
-            self._cache.move_to_end(t)
-            return self._cache[t]
-        self._cache[t] = found = self._read(self.frames[t])
-        while len(self._cache) > 1 and sum(v.bytes for v in self._cache.values()) > self.memory:
-            self._cache.popitem(last=False)
-        return found
-
-    def _read(self, frame: VdbFrame) -> Voxels:
-        return self.folder.retry(lambda: self._read_or_make(frame), warn_once)
+    def _read(self, t: int) -> Voxels:
+        return self.folder.retry(lambda: self._read_or_make(self.frames[t]), warn_once)
 
     def _read_or_make(self, frame: VdbFrame) -> Voxels:
+        """The voxels of a frame from the store, or from the frame's file."""
         name = f"{self.capture.frame_folder(frame)}/voxels.npz"
         path = self.folder.fetch_file(name, _MAX_VOXEL_BYTES)
         if not path.is_file():

@@ -19,7 +19,7 @@ from neuprim.core.volumes.density_errors import NUMBERS, DensityTruth, TruthFram
 from neuprim.core.volumes.grid import voxels_within
 from neuprim.core.volumes.source import Placement, VolumeSource
 from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.medium import Medium
+from neuprim.tasks.dynamic.volume.raymarch import Medium
 
 THIRDS = ("early", "middle", "late")
 
@@ -31,11 +31,7 @@ def sample_extinction(
     where: torch.device = device.HOST,
     part: bool = False,
 ) -> np.ndarray:
-    """(X, Y, Z) float32 extinction at a lattice's points, trilinear, computed on the device ``where``.
-
-    Args:
-        part: only the extinction grid's part.
-    """
+    """(X, Y, Z) float32 extinction at a lattice's points, trilinear; with ``part`` only the extinction grid's part."""
     if medium.values.size == 0:
         return np.zeros(shape, np.float32)
     chain = np.linalg.inv(medium.scene_from_index) @ scene_from_index.numpy()
@@ -54,9 +50,8 @@ def sample_extinction(
 class VolumeTruth(DensityTruth):
     """The frames of ``path`` or the scene's own; grids, optics, placement and times are those of the scene.
 
-    A frame's time follows from its number: the scene's first is 0 and its last 1. Frames of a folder outside these are
-    left out; a single file outside them has no time. Models are compared on a frame's own voxels within the sequence's
-    box.
+    Frames of a folder outside the scene's times are left out; a single file outside them has no time. Models are
+    compared on a frame's own voxels within the sequence's box.
 
     Raises:
         DataError: no file, or no frame within the scene's times.
@@ -76,12 +71,8 @@ class VolumeTruth(DensityTruth):
             files = [VdbFrame(int(numbers[-1]) if numbers else -1, path)]
         self._files = files
         self._cached: tuple[int, Medium] | None = None
-        self.frames = [
-            TruthFrame(
-                file.path.name, {"time": torch.tensor(capture.time(file))} if first <= file.number <= last else {}
-            )
-            for file in files
-        ]
+        timed = [{"time": torch.tensor(capture.time(f))} if first <= f.number <= last else {} for f in files]
+        self.frames = [TruthFrame(file.path.name, times) for file, times in zip(files, timed, strict=True)]
 
     def medium(self, frame: int) -> Medium:
         """The medium of a frame's file; the last one is cached, as grids are requested in parts."""

@@ -1,129 +1,21 @@
-"""An absorbing, emitting medium on a voxel grid, and how grids become one."""
+"""How the grids of a frame become a medium: extinction, single scattering and the glow of flames."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import torch
 from scipy import ndimage
-from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, Grid
 from neuprim.tasks.dynamic.volume.optics import Optics
-from neuprim.tasks.dynamic.volume.raymarch import light_transmittance
+from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance
 from neuprim.tasks.dynamic.volume.survey import Normalisation
-
-_NEGLIGIBLE = 1e-7
-"""Below this optical depth across a cell, and this fraction of the strongest source, a voxel counts as empty."""
-
-
-@dataclass(frozen=True, eq=False)
-class Medium:
-    """Extinction and source on voxel centres, trilinear between them.
-
-    The radiance along a ray is L = ∫ T(s) σ(s) c(s) ds with T(s) = exp(-∫₀ˢ σ), and alpha = 1 - T at its end.
-
-    Attributes:
-        values: (X, Y, Z, 4) float32, C-contiguous: σ, σ·c_R, σ·c_G, σ·c_B at voxel centres. σ is extinction in 1/scene
-            unit, c the source radiance in linear RGB. The outermost voxels are zero, so that the field is continuous;
-            :meth:`padded` adds that layer. No voxels at all is an empty medium.
-        scene_from_index: (4, 4) float64, affine and invertible: the centre of voxel (i, j, k) is at it @ (i, j, k, 1).
-        non_finite: number of source voxels that were NaN or infinite and count as 0.
-        scattering: (X, Y, Z) float32, the extinction grid's part of σ if flames add to it; None if it is all of σ.
-    """
-
-    values: np.ndarray
-    scene_from_index: np.ndarray
-    non_finite: int = 0
-    scattering: np.ndarray | None = None
-    _on_device: dict[torch.device, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        v, m = self.values, self.scene_from_index
-        if v.ndim != 4 or v.shape[3] != 4 or v.dtype != np.float32 or not v.flags.c_contiguous:
-            raise DataError(
-                f"medium: values are {v.dtype} of shape {v.shape}; expected contiguous float32 (X, Y, Z, 4)"
-            )
-        if m.shape != (4, 4) or m.dtype != np.float64 or not np.isfinite(m).all() or (m[3] != (0, 0, 0, 1)).any():
-            raise DataError(
-                f"medium: scene_from_index is {m.dtype} of shape {m.shape}; expected a finite affine float64 (4, 4)"
-            )
-        if self.empty:
-            return
-        edges = np.linalg.norm(m[:3, :3], axis=0)
-        if (edges == 0).any() or abs(np.linalg.det(m[:3, :3] / edges)) < 1e-9:
-            raise DataError("medium: scene_from_index is singular; expected voxels with a volume")
-        if not np.isfinite(v).all() or float(v[..., 0].min()) < 0:
-            raise DataError("medium: values are NaN, infinite or of negative extinction; expected finite ones")
-        if any(face.any() for face in (v[0], v[-1], v[:, 0], v[:, -1], v[:, :, 0], v[:, :, -1])):
-            raise DataError("medium: the outermost voxels are not zero; Medium.padded adds a layer that is")
-
-    @staticmethod
-    def padded(
-        values: np.ndarray, scene_from_index: np.ndarray, non_finite: int = 0, scattering: np.ndarray | None = None
-    ) -> Medium:
-        """The medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels; ``scene_from_index`` is of
-        ``values``."""
-        shift = np.eye(4)
-        shift[:3, 3] = -1.0
-        around = np.zeros((*(n + 2 for n in values.shape[:3]), 4), np.float32)
-        around[1:-1, 1:-1, 1:-1] = values
-        padded = None if scattering is None else np.pad(scattering, 1)
-        return Medium(around, np.asarray(scene_from_index, np.float64) @ shift, non_finite, padded)
-
-    @staticmethod
-    def nothing() -> Medium:
-        """An empty medium."""
-        return Medium(np.zeros((0, 0, 0, 4), np.float32), np.eye(4))
-
-    @property
-    def empty(self) -> bool:
-        """No voxels, or not enough for a cell between them."""
-        return min(self.values.shape[:3]) < 2
-
-    @property
-    def bytes(self) -> int:
-        """Memory of ``values`` and ``skips``."""
-        return self.values.nbytes + (0 if self.empty else int(np.prod([n - 1 for n in self.values.shape[:3]])))
-
-    def to_device(self, where: torch.device) -> tuple[Tensor, Tensor]:
-        """``values`` and ``skips`` as tensors on a device; cached for further cameras."""
-        if where not in self._on_device:
-            values, skips = (device.copy_from_host(torch.from_numpy(x), where) for x in (self.values, self.skips))
-            self._on_device[where] = values, skips
-        return self._on_device[where]
-
-    @cached_property
-    def index_from_scene(self) -> np.ndarray:
-        """(4, 4) float64 inverse of ``scene_from_index``."""
-        return np.linalg.inv(self.scene_from_index)
-
-    @cached_property
-    def skips(self) -> np.ndarray:
-        """(X-1, Y-1, Z-1) uint8: chessboard distance in cells to the nearest one that holds anything; 0 for those, 255
-        if far or none.
-
-        A ray in a cell of distance d may leave the cube of 2d-1 cells around it at once.
-        """
-        if self.empty:
-            return np.zeros((0, 0, 0), np.uint8)
-        diagonal = float(np.abs(self.scene_from_index[:3, :3]).sum())
-        source = np.abs(self.values[..., 1:]).max(-1)
-        filled = (self.values[..., 0] * diagonal > _NEGLIGIBLE) | (source > _NEGLIGIBLE * float(source.max()))
-        for axis in range(3):  # a cell holds something if one of its eight corners does
-            filled = np.delete(filled, -1, axis) | np.delete(filled, 0, axis)
-        if not filled.any():
-            return np.full(filled.shape, 255, np.uint8)
-        return np.minimum(ndimage.distance_transform_cdt(~filled, "chessboard"), 255).astype(np.uint8)
-
-
-# ---------------------------------------------------------------- from grids to a medium
 
 _BLACK_BODY_STEPS = 1024  # entries of the table of black bodies; linear between them
 
@@ -138,8 +30,7 @@ def build_medium(
     """Build the medium of one frame on the voxels of its extinction grid.
 
     Other grids are sampled at those voxels' centres, trilinearly unless their transform is the same. If flames absorb,
-    the medium contains all of them. An empty frame gives an empty medium. :attr:`Medium.non_finite` counts the NaN and
-    infinite voxels of all grids that were used.
+    the medium contains all of them. An empty frame gives an empty medium.
 
     Args:
         grids: by meaning; those that the optics do not use are ignored.
@@ -171,12 +62,10 @@ def build_medium(
     scene_from_index[:3, 3] += scene_from_index[:3, :3] @ np.array(box[0], np.float64)
     arriving: np.ndarray = np.array(optics.ambient, np.float32)
     if optics.light is not None:
-        lit = light_transmittance(Medium.padded(values, scene_from_index), optics.light.direction, threads, where)[
-            1:-1, 1:-1, 1:-1
-        ]
-        arriving = arriving + lit[..., None] * (
-            np.array(optics.light.irradiance, np.float32) / np.float32(4.0 * math.pi)
-        ).astype(np.float32)
+        padded = Medium.padded(values, scene_from_index)
+        lit = light_transmittance(padded, optics.light.direction, threads, where)[1:-1, 1:-1, 1:-1]
+        irradiance = np.array(optics.light.irradiance, np.float32) / np.float32(4.0 * math.pi)
+        arriving = arriving + lit[..., None] * irradiance.astype(np.float32)
     albedo, more = _albedo(grids, optics, base.transform, box, scene_from_index)
     values[..., 1:] = sigma_s[..., None] * (albedo * arriving)
     if flame is not None and optics.emission > 0.0:
@@ -192,10 +81,8 @@ def _transform_bounds(grid: Grid, transform: np.ndarray) -> Bounds | None:
     corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)
     chain = np.linalg.inv(transform) @ grid.transform
     index = corners @ chain[:3, :3].T + chain[:3, 3]
-    low, high = (
-        np.ceil(index.min(0) - 1e-6).astype(int).tolist(),
-        (np.floor(index.max(0) + 1e-6).astype(int) + 1).tolist(),
-    )
+    low = np.ceil(index.min(0) - 1e-6).astype(int).tolist()
+    high = (np.floor(index.max(0) + 1e-6).astype(int) + 1).tolist()
     return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 
@@ -207,11 +94,11 @@ def _unite_boxes(a: Bounds | None, b: Bounds | None) -> Bounds | None:
 
 
 def _same_voxels(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two index-to-world maps have the same voxels, to a millionth of one; the offset from the world's origin
-    may be large."""
-    return np.allclose(a[:3, :3], b[:3, :3], rtol=0, atol=1e-9 * float(np.abs(b[:3, :3]).max())) and np.allclose(
-        np.linalg.inv(b) @ a[:, 3], [0, 0, 0, 1], rtol=0, atol=1e-6
-    )
+    """Whether two index-to-world maps have the same voxels, to a millionth of one."""
+    scale = float(np.abs(b[:3, :3]).max())
+    shift = np.linalg.inv(b) @ a[:, 3]  # not a difference, as the world's origin may be far away
+    same_axes = np.allclose(a[:3, :3], b[:3, :3], rtol=0, atol=1e-9 * scale)
+    return same_axes and np.allclose(shift, [0, 0, 0, 1], rtol=0, atol=1e-6)
 
 
 def _sample_grid(grid: Grid, transform: np.ndarray, box: Bounds, channels: int) -> tuple[np.ndarray, int]:
@@ -224,9 +111,8 @@ def _sample_grid(grid: Grid, transform: np.ndarray, box: Bounds, channels: int) 
     if grid.bounds is None:
         return np.zeros((*(h - l for l, h in zip(*box, strict=True)), *((3,) * (channels == 3))), np.float32), 0
     low, high = (tuple(v + pad for v in corner) for corner, pad in zip(grid.bounds, (-1, 1), strict=True))
-    own, bad = _replace_non_finite(
-        grid.to_dense(((low[0], low[1], low[2]), (high[0], high[1], high[2])), limit * channels)
-    )
+    around = ((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    own, bad = _replace_non_finite(grid.to_dense(around, limit * channels))
     matrix = np.linalg.inv(grid.transform) @ transform
     offset = matrix[:3, :3] @ np.array(box[0], np.float64) + matrix[:3, 3] - np.array(low)
     shape = tuple(h - l for l, h in zip(*box, strict=True))
@@ -263,9 +149,8 @@ def _albedo(
     indices = np.meshgrid(*(np.arange(n) for n in sizes), indexing="ij", sparse=True)
     height = sum(scene_from_index[axis, a] * indices[a] for a in range(3)) + scene_from_index[axis, 3] + 0.5
     stops = np.linspace(0.0, 1.0, len(optics.gradient))
-    return albedo * np.stack([np.interp(height, stops, [s[c] for s in optics.gradient]) for c in range(3)], -1).astype(
-        np.float32
-    ), 0
+    colours = [np.interp(height, stops, [stop[c] for stop in optics.gradient]) for c in range(3)]
+    return albedo * np.stack(colours, -1).astype(np.float32), 0
 
 
 def _glow(flame: np.ndarray, optics: Optics) -> np.ndarray:
@@ -273,9 +158,8 @@ def _glow(flame: np.ndarray, optics: Optics) -> np.ndarray:
     low, high = optics.flame_range
     table = black_body_rgb(np.linspace(*optics.kelvin, _BLACK_BODY_STEPS), optics.kelvin[1]) * optics.emission
     where = np.clip((flame - low) / (high - low), 0.0, 1.0) * (_BLACK_BODY_STEPS - 1)
-    return np.stack([np.interp(where, np.arange(_BLACK_BODY_STEPS), table[:, c]) for c in range(3)], -1).astype(
-        np.float32
-    )
+    entries = np.arange(_BLACK_BODY_STEPS)
+    return np.stack([np.interp(where, entries, table[:, c]) for c in range(3)], -1).astype(np.float32)
 
 
 # ---------------------------------------------------------------- black bodies
@@ -298,11 +182,8 @@ def _lobe(mean: float, below: float, above: float) -> np.ndarray:
 @lru_cache(maxsize=1)
 def _observer() -> np.ndarray:
     """(3, L) colour matching functions, CIE 1931 2° observer: the fit of Wyman, Sloan and Shirley (JCGT 2013)."""
-    x = (
-        0.362 * _lobe(442.0, 0.0624, 0.0374)
-        + 1.056 * _lobe(599.8, 0.0264, 0.0323)
-        - 0.065 * _lobe(501.1, 0.0490, 0.0382)
-    )
+    x = 0.362 * _lobe(442.0, 0.0624, 0.0374) + 1.056 * _lobe(599.8, 0.0264, 0.0323)
+    x -= 0.065 * _lobe(501.1, 0.0490, 0.0382)
     y = 0.821 * _lobe(568.8, 0.0213, 0.0247) + 0.286 * _lobe(530.9, 0.0613, 0.0322)
     z = 1.217 * _lobe(437.0, 0.0845, 0.0278) + 0.681 * _lobe(459.0, 0.0385, 0.0725)
     return np.stack([x, y, z])

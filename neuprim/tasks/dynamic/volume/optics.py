@@ -31,22 +31,26 @@ Direction = Annotated[
     tuple[Coordinate, Coordinate, Coordinate], Accepts(any, "three numbers that are not all 0, as [0, 0, 1]")
 ]
 
+FlameRange = Annotated[tuple[Level, Level], Accepts(lambda ends: ends[0] < ends[1], "two rising numbers, as [0, 1]")]
+KelvinRange = Annotated[
+    tuple[Kelvin, Kelvin], Accepts(lambda k: k[0] <= k[1], "two rising numbers within 0..1e5, as [1000, 2000]")
+]
+Gradient = Annotated[tuple[RGB, ...], Accepts(bool, "colours from bottom to top, as [[1, 0, 0], [0, 0, 1]]")]
+ExtinctionGrids = Annotated[
+    tuple[str, ...],
+    Accepts(
+        lambda names: bool(names) and set(names) <= set(GRIDS),
+        f"a list of {', '.join(GRIDS)} (scene.grids says which grid that is)",
+    ),
+]
+
 DATA_DEPENDENT = ("extinction", "flame_extinction", "flame_range")
 """Settings that are derived from the values of given files, unless the user sets them."""
 
 
-def _are_grids(names: tuple[str, ...]) -> bool:
-    return bool(names) and set(names) <= set(GRIDS)
-
-
 @dataclass(frozen=True)
 class Light:
-    """A light at infinity.
-
-    Attributes:
-        direction: towards the light, scene axes, any length.
-        irradiance: RGB on a plane facing it, in the unit of radiance times steradian.
-    """
+    """A light at infinity: its direction, scene axes, any length, and RGB irradiance on a plane that faces it."""
 
     direction: Direction
     irradiance: RGB
@@ -73,40 +77,27 @@ class Optics:
 
     Attributes:
         extinction_grids: names in order of preference; the first that a file has is d.
-        extinction: σ per unit of d, 1/scene unit.
-        albedo: scattered part of the light that hits σ_s; ``color_grid`` or ``gradient`` multiply it.
         ambient: radiance that arrives from everywhere, unshadowed.
-        light: one directional light, or none.
         flame_grid: f; a file without it does not glow.
         flame_range: values of f that mean ``kelvin``'s ends.
-        kelvin: temperatures of the ends.
         emission: strength of the glow, radiance of the hottest flame; 0 for none.
-        flame_extinction: σ per unit of f, 1/scene unit.
         color_grid: a vec3s grid that multiplies the albedo, clamped to 0..1.
         gradient: RGB from the bottom to the top of the unit box, where a file has no ``color_grid``.
         up: 'y' or 'z', for the gradient.
     """
 
-    extinction_grids: Annotated[
-        tuple[str, ...], Accepts(_are_grids, f"a list of {', '.join(GRIDS)} (scene.grids says which grid that is)")
-    ] = ("density", "temperature")
+    extinction_grids: ExtinctionGrids = ("density", "temperature")
     extinction: NotNegative = 10.0
     albedo: RGB = (1.0, 1.0, 1.0)
     ambient: RGB = (0.0, 0.0, 0.0)
     light: Light | None = None
     flame_grid: GridMeaning = "flames"
-    flame_range: Annotated[
-        tuple[Level, Level], Accepts(lambda ends: ends[0] < ends[1], "two rising numbers, as [0, 1]")
-    ] = (0.0, 1.0)
-    kelvin: Annotated[
-        tuple[Kelvin, Kelvin], Accepts(lambda k: k[0] <= k[1], "two rising numbers within 0..1e5, as [1000, 2000]")
-    ] = (1000.0, 2000.0)
+    flame_range: FlameRange = (0.0, 1.0)
+    kelvin: KelvinRange = (1000.0, 2000.0)
     emission: NotNegative = 0.0
     flame_extinction: NotNegative = 0.0
     color_grid: GridMeaning | None = None
-    gradient: (
-        Annotated[tuple[RGB, ...], Accepts(bool, "colours from bottom to top, as [[1, 0, 0], [0, 0, 1]]")] | None
-    ) = None
+    gradient: Gradient | None = None
     up: Axis = "z"
 
     def __post_init__(self) -> None:
@@ -139,11 +130,7 @@ EMBERGEN_FIRE = Optics(
     kelvin=(1050.0, 2155.0),
     emission=2.0,
 )
-"""EmberGen's free fire, which has no density: hot gas absorbs, flames glow, and a grey of 0.05 shows the rest.
-
-The strength of the glow beside the grey decides how dark the images are beside their brightest pixel, and so what a
-black image scores: ``benchmarks/dynamic_quality.py`` prints it beside every number.
-"""
+"""EmberGen's free fire, which has no density: hot gas absorbs, flames glow, and a grey of 0.05 shows the rest."""
 
 SMOKE_FIRE = Optics(
     extinction=14.0,

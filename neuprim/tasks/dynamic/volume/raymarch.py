@@ -1,4 +1,4 @@
-"""March rays through the cells between voxel centres of a medium: ground-truth images and a light's transmittance.
+"""A voxel medium, and rays through the cells between voxel centres: ground-truth images, and a light's transmittance.
 
 A cell is the cube between eight voxel centres. Along a straight line through it a trilinear field is a cubic
 polynomial, which two Gauss points integrate exactly, so a ray's optical depth has no discretisation error. For the
@@ -11,38 +11,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+from scipy import ndimage
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.errors import ConfigError
+from neuprim.core.errors import ConfigError, DataError
 
 _ROWS_PER_JOB, _SLICES_PER_JOB = 4, 2
-
-
-class VoxelMedium(Protocol):
-    """What rays need of a :class:`~neuprim.tasks.dynamic.volume.medium.Medium`, which imports this module."""
-
-    @property
-    def values(self) -> np.ndarray: ...
-    @property
-    def empty(self) -> bool: ...
-    @property
-    def skips(self) -> np.ndarray: ...
-    @property
-    def index_from_scene(self) -> np.ndarray: ...
-    def to_device(self, where: torch.device) -> tuple[Tensor, Tensor]: ...
-
-
 _GAUSS = 0.5 - math.sqrt(3.0) / 6.0
 _FAR = 1e30
 _OPAQUE = np.float32(1e-4)
@@ -54,8 +41,104 @@ _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 _C2, _C3, _C4, _C5, _C6, _C7 = (np.float32(1.0 / n) for n in range(2, 8))
 
 
+_NEGLIGIBLE = 1e-7
+"""Below this optical depth across a cell, and this fraction of the strongest source, a voxel counts as empty."""
+
+
+@dataclass(frozen=True, eq=False)
+class Medium:
+    """Extinction and source on voxel centres, trilinear between them; without voxels an empty medium.
+
+    The radiance along a ray is L = ∫ T(s) σ(s) c(s) ds with T(s) = exp(-∫₀ˢ σ), and alpha = 1 - T at its end.
+
+    Attributes:
+        values: (X, Y, Z, 4) float32, C-contiguous: σ in 1/scene unit, and σ times the source radiance in linear RGB.
+            The outermost voxels are zero, so that the field is continuous; :meth:`padded` adds that layer.
+        scene_from_index: (4, 4) float64, affine and invertible: the centre of voxel (i, j, k) is at it @ (i, j, k, 1).
+        non_finite: number of source voxels that were NaN or infinite and count as 0.
+        scattering: (X, Y, Z) float32, the extinction grid's part of σ if flames add to it; None if it is all of σ.
+    """
+
+    values: np.ndarray
+    scene_from_index: np.ndarray
+    non_finite: int = 0
+    scattering: np.ndarray | None = None
+    _on_device: dict[torch.device, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        v, m = self.values, self.scene_from_index
+        if v.ndim != 4 or v.shape[3] != 4 or v.dtype != np.float32 or not v.flags.c_contiguous:
+            raise DataError(
+                f"medium: values are {v.dtype} of shape {v.shape}; expected contiguous float32 (X, Y, Z, 4)"
+            )
+        if m.shape != (4, 4) or m.dtype != np.float64 or not np.isfinite(m).all() or (m[3] != (0, 0, 0, 1)).any():
+            raise DataError(
+                f"medium: scene_from_index is {m.dtype} of shape {m.shape}; expected a finite affine float64 (4, 4)"
+            )
+        if self.empty:
+            return
+        edges = np.linalg.norm(m[:3, :3], axis=0)
+        if (edges == 0).any() or abs(np.linalg.det(m[:3, :3] / edges)) < 1e-9:
+            raise DataError("medium: scene_from_index is singular; expected voxels with a volume")
+        if not np.isfinite(v).all() or float(v[..., 0].min()) < 0:
+            raise DataError("medium: values are NaN, infinite or of negative extinction; expected finite ones")
+        if any(face.any() for face in (v[0], v[-1], v[:, 0], v[:, -1], v[:, :, 0], v[:, :, -1])):
+            raise DataError("medium: the outermost voxels are not zero; Medium.padded adds a layer that is")
+
+    @staticmethod
+    def padded(
+        values: np.ndarray, scene_from_index: np.ndarray, non_finite: int = 0, scattering: np.ndarray | None = None
+    ) -> Medium:
+        """The medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels."""
+        shift = np.eye(4)
+        shift[:3, 3] = -1.0
+        around = np.zeros((*(n + 2 for n in values.shape[:3]), 4), np.float32)
+        around[1:-1, 1:-1, 1:-1] = values
+        padded = None if scattering is None else np.pad(scattering, 1)
+        return Medium(around, np.asarray(scene_from_index, np.float64) @ shift, non_finite, padded)
+
+    @staticmethod
+    def nothing() -> Medium:
+        """An empty medium."""
+        return Medium(np.zeros((0, 0, 0, 4), np.float32), np.eye(4))
+
+    @property
+    def empty(self) -> bool:
+        """No voxels, or not enough for a cell between them."""
+        return min(self.values.shape[:3]) < 2
+
+    def to_device(self, where: torch.device) -> tuple[Tensor, Tensor]:
+        """``values`` and ``skips`` as tensors on a device; cached for further cameras."""
+        if where not in self._on_device:
+            values, skips = (device.copy_from_host(torch.from_numpy(x), where) for x in (self.values, self.skips))
+            self._on_device[where] = values, skips
+        return self._on_device[where]
+
+    @cached_property
+    def index_from_scene(self) -> np.ndarray:
+        """(4, 4) float64 inverse of ``scene_from_index``."""
+        return np.linalg.inv(self.scene_from_index)
+
+    @cached_property
+    def skips(self) -> np.ndarray:
+        """(X-1, Y-1, Z-1) uint8: chessboard distance in cells to the nearest one that holds anything, at most 255.
+
+        A ray in a cell of distance d may leave the cube of 2d-1 cells around it at once.
+        """
+        if self.empty:
+            return np.zeros((0, 0, 0), np.uint8)
+        diagonal = float(np.abs(self.scene_from_index[:3, :3]).sum())
+        source = np.abs(self.values[..., 1:]).max(-1)
+        filled = (self.values[..., 0] * diagonal > _NEGLIGIBLE) | (source > _NEGLIGIBLE * float(source.max()))
+        for axis in range(3):  # a cell holds something if one of its eight corners does
+            filled = np.delete(filled, -1, axis) | np.delete(filled, 0, axis)
+        if not filled.any():
+            return np.full(filled.shape, 255, np.uint8)
+        return np.minimum(ndimage.distance_transform_cdt(~filled, "chessboard"), 255).astype(np.uint8)
+
+
 def render_medium(
-    medium: VoxelMedium,
+    medium: Medium,
     camera: Camera,
     samples: int = 2,
     subdivisions: int = 1,
@@ -64,15 +147,15 @@ def render_medium(
 ) -> Tensor:
     """Render a medium: (H, W, 4) float32 linear premultiplied RGBA without a background, on the CPU.
 
-    L = ∫ T σ c ds and alpha = 1 - T per ray, averaged over a pixel. Alpha is exact up to rounding, radiance of fourth
-    order. A ray ends where T < 1e-4. The result does not depend on ``threads``.
+    Alpha is exact up to rounding, radiance of fourth order. A ray ends where T < 1e-4. The result does not depend on
+    ``threads``; devices differ by rounding.
 
     Args:
         camera: pinhole, scene units.
         samples: rays per pixel side, on a regular grid.
         subdivisions: sub-intervals per cell; more than 1 only to verify the error.
         threads: 0 for all cores.
-        where: the device that computes; devices differ by rounding.
+        where: the device that computes.
     """
     if samples < 1 or subdivisions < 1:
         raise ConfigError(f"samples {samples}, subdivisions {subdivisions}; expected at least 1")
@@ -90,34 +173,18 @@ def render_medium(
             values, skips, place, lenses, camera.width, camera.height, samples, subdivisions
         ).cpu()
     image = np.zeros((camera.height, camera.width, 4), np.float32)
-    parallel_for(
-        radiances,
-        camera.height,
-        _ROWS_PER_JOB,
-        threads,
-        medium.values,
-        medium.skips,
-        np.ascontiguousarray(pose),
-        lens,
-        camera.width,
-        samples,
-        subdivisions,
-        image,
-    )
+    rays = (np.ascontiguousarray(pose), lens, camera.width, samples, subdivisions)
+    parallel_for(radiances, camera.height, _ROWS_PER_JOB, threads, medium.values, medium.skips, *rays, image)
     return torch.from_numpy(image)
 
 
 def light_transmittance(
-    medium: VoxelMedium, direction: Sequence[float], threads: int = 0, where: torch.device = device.HOST
+    medium: Medium, direction: Sequence[float], threads: int = 0, where: torch.device = device.HOST
 ) -> np.ndarray:
     """(X, Y, Z) float32 exp(-∫ σ ds) from each voxel centre towards a directional light, exact up to rounding.
 
-    Voxels without extinction get 1 without a ray: nothing there scatters.
-
-    Args:
-        direction: towards the light, scene axes, any length > 0.
-        threads: 0 for all cores.
-        where: the device that computes.
+    ``direction`` points to the light, scene axes, any length > 0. Voxels without extinction get 1 without a ray:
+    nothing there scatters.
     """
     towards = np.array(direction, np.float64)
     length = float(np.linalg.norm(towards)) if towards.shape == (3,) else 0.0
@@ -220,8 +287,7 @@ def _gains(a, b):  # type: ignore[no-untyped-def]
         q, last = _fading(b)
         return p, rest * q, rest * last
     mean, rest = _fading(depth)
-    # depths up to the points if extinction is linear between and beyond them; the first may come out as a trifle below
-    # zero
+    # depths up to the points if extinction is linear; the first may come out slightly below zero
     p, q = _transmittance(_HALF * a - _LESS * b), _transmittance(_MORE * a + _HALF * b)
     whole = a * p + b * q
     scale = mean * depth / whole if whole > _TINY else _ONE
@@ -235,13 +301,13 @@ _FREE = ("nsz", "contract", "reassoc")
 def _generator(context, flat, o, dy, dx, x1, y1, z1, x2, y2, z2):  # type: ignore[no-untyped-def]
     """Trilinear values of the four channels at two points of one cell, eight numbers: one vector of four per corner.
 
-    Written in LLVM's vectors because its optimiser does not find them in scalar code; without them an image takes 1.4
-    times as long.
+    Written in LLVM's vectors because its optimiser does not find them in scalar code, which takes 1.4 times as long.
 
     Args:
-        flat: float32 array of the interleaved voxels. o, dy, dx: uint64, offsets of the cell's lowest corner and
-        between neighbours
-            in y and x; those in z are 4 apart. x1 … z2: float32 fractions within the cell.
+        flat: float32 array of the interleaved voxels.
+        o, dy, dx: uint64, offsets of the cell's lowest corner and between neighbours in y and x; those in z are 4
+            apart.
+        x1 … z2: float32 fractions within the cell.
     """
     signature = types.UniTuple(types.float32, 8)(flat, o, dy, dx, *(types.float32,) * 6)
     number, vector = ir.IntType(32), ir.VectorType(ir.FloatType(), 4)
@@ -289,7 +355,7 @@ def radiances(start, stop, values, skips, pose, lens, width, samples, parts, ima
     """Image rows start … stop.
 
     Args:
-        values: (X, Y, Z, 4) float32. skips: (X-1, Y-1, Z-1) uint8. See Medium.
+        values, skips: of a :class:`Medium`.
         pose: (3, 4) float64, camera axes to indices; its lengths are scene units on the camera's side.
         lens: (4,) float64 fx fy cx cy.
         samples: rays per pixel side. parts: sub-intervals per cell.
@@ -333,17 +399,11 @@ def radiances(start, stop, values, skips, pose, lens, width, samples, parts, ima
                         begin = t
                         while begin < out and through > _OPAQUE:
                             s = begin + part * _GAUSS
-                            x1, y1, z1 = (
-                                np.float32(ox + s * rx - i),
-                                np.float32(oy + s * ry - j),
-                                np.float32(oz + s * rz - k),
-                            )
+                            x1, y1 = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j)
+                            z1 = np.float32(oz + s * rz - k)
                             s = begin + part * (1.0 - _GAUSS)
-                            x2, y2, z2 = (
-                                np.float32(ox + s * rx - i),
-                                np.float32(oy + s * ry - j),
-                                np.float32(oz + s * rz - k),
-                            )
+                            x2, y2 = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j)
+                            z2 = np.float32(oz + s * rz - k)
                             s1, r1, g1, b1, s2, r2, g2, b2 = _two_points(flat, o, dy, dx, x1, y1, z1, x2, y2, z2)
                             half = np.float32(0.5 * part)
                             s1 *= half
@@ -415,11 +475,8 @@ def depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignore[no-un
                     if skip == 0 and out > t:
                         for point in range(2):
                             s = t + (out - t) * (_GAUSS if point == 0 else 1.0 - _GAUSS)
-                            x, y, z = (
-                                np.float32(ox + s * rx - i),
-                                np.float32(oy + s * ry - j),
-                                np.float32(oz + s * rz - k),
-                            )
+                            x, y = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j)
+                            z = np.float32(oz + s * rz - k)
                             depth += 0.5 * (out - t) * _between(sigma, i, j, k, x, y, z)
                     i = _next(ox, rx, i, reach, out, tx == out)
                     j = _next(oy, ry, j, reach, out, ty == out)

@@ -158,17 +158,11 @@ def _radiances() -> Any:
                         begin = d(t)
                         while begin < out and through > _OPAQUE:
                             s = begin + part * d(_LOW)
-                            x1, y1, z1 = (
-                                f(origin[0] + s * rx - d(i)),
-                                f(origin[1] + s * ry - d(j)),
-                                f(origin[2] + s * rz - d(k)),
-                            )
+                            x1, y1 = f(origin[0] + s * rx - d(i)), f(origin[1] + s * ry - d(j))
+                            z1 = f(origin[2] + s * rz - d(k))
                             s = begin + part * d(_HIGH)
-                            x2, y2, z2 = (
-                                f(origin[0] + s * rx - d(i)),
-                                f(origin[1] + s * ry - d(j)),
-                                f(origin[2] + s * rz - d(k)),
-                            )
+                            x2, y2 = f(origin[0] + s * rx - d(i)), f(origin[1] + s * ry - d(j))
+                            z2 = f(origin[2] + s * rz - d(k))
                             one = _between(values, i, j, k, x1, y1, z1)
                             two = _between(values, i, j, k, x2, y2, z2)
                             half = f(d(0.5) * part)
@@ -258,12 +252,7 @@ def _extinctions() -> Any:
 def radiances(
     values: Tensor, skips: Tensor, pose: Tensor, lens: Tensor, width: int, height: int, samples: int, subdivisions: int
 ) -> Tensor:
-    """(H, W, 4) float32 premultiplied RGBA, on the device of the voxels.
-
-    Args:
-        values, skips: of a :class:`~neuprim.tasks.dynamic.volume.medium.Medium`. pose (3, 4), lens (4,), float64: see
-            :func:`~neuprim.tasks.dynamic.volume.raymarch.radiances`.
-    """
+    """(H, W, 4) float32 premultiplied RGBA, on the device of the voxels; arguments as of the kernel of the CPU."""
     image = torch.empty(height * width, 4, dtype=torch.float32, device=values.device)
     launch(
         _radiances(), height * width,

@@ -6,6 +6,7 @@ import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,7 +16,7 @@ import torch
 from neuprim.core.data import Dataset, DataSource
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.store import Store, open_store
-from neuprim.core.io.vdb import VdbFrame, sequence
+from neuprim.core.io.vdb import sequence
 from neuprim.core.notices import warn_once
 from neuprim.core.task import Chunks, SceneContext
 from neuprim.core.validation import Accepts, Range, coerce, nonempty_text, validate, validate_fields
@@ -23,7 +24,7 @@ from neuprim.core.volumes.source import Extent
 from neuprim.scenes.smoke.generate import TIMESTEPS, Resolution, simulate_smoke
 from neuprim.tasks.dynamic.volume.capture import Capture, RenderedFrames, hemisphere_cameras
 from neuprim.tasks.dynamic.volume.chunks import count_chunks, plan_chunks
-from neuprim.tasks.dynamic.volume.dataset import TRAINING_MEMORY, TrainingFrames, read_points_file, volume_dataset
+from neuprim.tasks.dynamic.volume.dataset import TRAINING_MEMORY, TrainingFrames, total_extinction, volume_dataset
 from neuprim.tasks.dynamic.volume.ground_truth import CaptureSource
 from neuprim.tasks.dynamic.volume.optics import (
     DATA_DEPENDENT,
@@ -35,9 +36,6 @@ from neuprim.tasks.dynamic.volume.optics import (
     override_optics,
 )
 from neuprim.tasks.dynamic.volume.survey import Normalisation, data_dependent_optics, find_grids, survey_frames
-
-_AUTOMATIC_LOOKS = ("smoke_fire", "embergen_fire")
-"""Presets of ``scene.look=auto`` for files with a density, and for those where the hot gas itself absorbs."""
 
 # ---------------------------------------------------------------- settings
 
@@ -62,21 +60,16 @@ class VolumeSettings:
 
     Attributes:
         vdb: folder of .vdb files, or None to simulate.
-        simulation: name of the built-in simulation.
-        resolution: voxels across the simulation's box.
-        timesteps: of the simulation; None: as many as the scene has.
+        simulation: name of the built-in simulation; ``resolution``: voxels across its box; ``timesteps``: None: all.
         frames: "all", "FIRST:LAST" or "FIRST:LAST:STEP" by number, LAST included.
         span: "FIRST:LAST" by number, the frames for training and evaluation; times, box, exposure and images stay those
             of all ``frames``. None: all.
         chunks: number of chunks of time, each trained in its own run; "auto": see
             :func:`~neuprim.tasks.dynamic.volume.chunks.count_chunks`; None or 1: one run.
         grids: meaning -> name in the files.
-        look: name of a preset of the optics, or "auto".
-        optics: changes to the preset's settings.
-        size: width and height of the images in pixels.
-        cameras: on the upper hemisphere; two are held out.
-        field_of_view: of the cameras, degrees.
-        samples: rays per pixel side.
+        look: name of a preset of the optics, or "auto"; ``optics``: changes to the preset's settings.
+        size: width and height of the images in pixels; ``samples``: rays per pixel side.
+        cameras: on the upper hemisphere; two are held out. ``field_of_view``: degrees.
         train_every: train on every n-th frame only; the test views keep all.
         up: "y" or "z", the upward axis of the files.
         cache: folder or URL where the ground truth is stored; None: the user's cache on this machine.
@@ -116,12 +109,13 @@ class VolumeSettings:
     def memory_bytes(self) -> float:
         return self.memory * 2.0**20
 
-    def resolve_optics(self, automatic: str) -> Optics:
-        """The preset with the user's changes; ``automatic`` is the one for "auto".
+    def resolve_optics(self, has_density: bool = True) -> Optics:
+        """The preset with the user's changes; "auto" is for files with a density, or those whose hot gas absorbs.
 
         Raises:
             ConfigError: no such preset or setting, or an impossible value.
         """
+        automatic = "smoke_fire" if has_density else "embergen_fire"
         preset = optics_preset(automatic if self.look == "auto" else self.look, self.up)
         return override_optics(preset, self.optics)
 
@@ -185,15 +179,9 @@ def load_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     _report_chosen_extinctions(scene)
     span = scene.span()
     images = scene.rendered_frames(context).render_missing(context.progress)
-    return volume_dataset(
-        scene.name,
-        scene.source,
-        scene.capture,
-        images,
-        scene.held_out,
-        torch.tensor(UP_AXES[scene.settings.up], dtype=torch.float64),
-        TrainingFrames(scene.settings.train_every, span, scene.settings.memory_bytes),
-    )
+    up = torch.tensor(UP_AXES[scene.settings.up], dtype=torch.float64)
+    used = TrainingFrames(scene.settings.train_every, span, scene.settings.memory_bytes)
+    return volume_dataset(scene.name, scene.source, scene.capture, images, scene.held_out, up, used)
 
 
 def open_ground_truth(
@@ -223,29 +211,34 @@ def split_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | N
     scene = _prepare({name: value for name, value in config["scene"].items() if name != "name"}, context)
     options, capture = scene.settings, scene.capture
     frames, camera = len(capture.frames[:: options.train_every]), capture.cameras[0]
-    rgba_half = 4 * 2
     views = frames * (len(capture.cameras) - len(scene.held_out))
-    image_bytes = views * camera.width * camera.height * rgba_half
+    image_bytes = views * camera.width * camera.height * 4 * 2  # RGBA in half floats
     count = count_chunks(options.chunks, frames, image_bytes, options.memory_bytes * TRAINING_MEMORY)
     if count == 1:
         return None
     store = scene.rendered_frames(context).render_missing(context.progress)
-
-    def total_extinction(frame: VdbFrame) -> float:
-        return float(read_points_file(capture.fetch_points(store, frame), "weight")["weight"])
-
-    return plan_chunks(capture, options.train_every, count, total_extinction, config)
+    weight = partial(total_extinction, capture, store)
+    return plan_chunks(capture, options.train_every, count, weight, config)
 
 
 def _prepare(
     settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
 ) -> _PreparedScene:
     options = validate(VolumeSettings, settings, "scene")
-    options.resolve_optics(_AUTOMATIC_LOOKS[0])  # report typing errors before anything is simulated
-    folder, name, source = _find_files(options, context)
-    frames = _find_frames(folder, options)
+    options.resolve_optics()  # report typing errors before anything is simulated
+    source: DataSource = "simulated" if options.vdb is None else "real"
+    if options.vdb is not None:
+        folder, name = options.vdb, options.vdb.name
+    else:
+        assert options.simulation is not None, "settings were checked"
+        run = (options.simulation, options.timesteps, options.resolution, context.seed)
+        folder = simulate_smoke(*run, context.cache_dir, context.progress)
+        name = f"{options.simulation} (simulated)"
+    files = sequence(folder).frames
+    chosen = set(choose_frames(options.frames, [f.number for f in files], str(folder)))
+    frames = [f for f in files if f.number in chosen]
     reader = find_grids(frames, {str(meaning): name for meaning, name in options.grids.items()})
-    optics = options.resolve_optics(_AUTOMATIC_LOOKS["density" not in reader.names])
+    optics = options.resolve_optics("density" in reader.names)
     reader = reader.with_extinction(optics.extinction_grids, folder)
     measured: Mapping[int, Extent] = {}
     if known is None:
@@ -265,48 +258,23 @@ def _prepare(
         reader = dataclasses.replace(reader, names=known["grids"])
         normalisation, bounds = Normalisation.from_json(known["normalisation"]), np.array(known["bounds"])
     train, test = hemisphere_cameras(options.size, options.cameras, up=options.up, field_of_view=options.field_of_view)
+    cameras, device = [*train, *test], context.device
     capture = Capture(
-        frames,
-        reader,
-        optics,
-        [*train, *test],
-        options.samples,
-        normalisation,
-        bounds,
-        context.device,
-        measured=measured,
+        frames, reader, optics, cameras, options.samples, normalisation, bounds, device, measured=measured
     )
     return _PreparedScene(options, name, source, capture, range(len(train), len(train) + len(test)))
-
-
-def _find_files(options: VolumeSettings, context: SceneContext) -> tuple[Path, str, DataSource]:
-    if options.vdb is not None:
-        return options.vdb, options.vdb.name, "real"
-    assert options.simulation is not None, "settings were checked"
-    folder = simulate_smoke(
-        options.simulation, options.timesteps, options.resolution, context.seed, context.cache_dir, context.progress
-    )
-    return folder, f"{options.simulation} (simulated)", "simulated"
-
-
-def _find_frames(folder: Path, options: VolumeSettings) -> list[VdbFrame]:
-    frames = sequence(folder).frames
-    chosen = set(choose_frames(options.frames, [f.number for f in frames], str(folder)))
-    return [f for f in frames if f.number in chosen]
 
 
 def _report_chosen_extinctions(scene: _PreparedScene) -> None:
     """Print one line with the extinctions that were chosen instead of the preset's."""
     capture = scene.capture
-    preset = scene.settings.resolve_optics(_AUTOMATIC_LOOKS["density" not in capture.reader.names])
+    preset = scene.settings.resolve_optics("density" in capture.reader.names)
     grids = {"extinction": capture.reader.extinction, "flame_extinction": "flames"}
     lines = []
     for key, meaning in grids.items():
         value, usual = getattr(capture.optics, key), getattr(preset, key)
         if value != usual:
-            lines.append(
-                f"scene.optics.{key}={value:g} (look: {usual:g}), as values of grid {capture.reader.names[meaning]!r} "
-                f"go to about {usual / value:.2g}"
-            )
+            peak = f"values of grid {capture.reader.names[meaning]!r} go to about {usual / value:.2g}"
+            lines.append(f"scene.optics.{key}={value:g} (look: {usual:g}), as {peak}")
     if lines:
         warn_once(f"{capture.frames[0].path.parent}: {'; '.join(lines)}. Set these to choose others")

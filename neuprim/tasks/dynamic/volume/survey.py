@@ -30,10 +30,10 @@ _PEAK_QUANTILE = 0.999
 
 @dataclass(frozen=True)
 class GridReader:
-    """Reads the grids of files by meaning.
+    """Reads the grids of files by meaning ("density", "temperature", "flames", "color").
 
     Attributes:
-        names: meaning ("density", "temperature", "flames", "color") -> name in the files.
+        names: meaning -> name in the files.
         extinction: meaning of the grid that absorbs.
     """
 
@@ -188,12 +188,7 @@ def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurve
 
 @dataclass(frozen=True)
 class Normalisation:
-    """scene = (world - center) · scale, the same for all frames; axes are not turned.
-
-    Attributes:
-        center: of the sequence's box, world units.
-        scale: scene units per world unit, > 0.
-    """
+    """scene = (world - center) · scale, the same for all frames; axes are not turned."""
 
     center: tuple[float, float, float]
     scale: float
@@ -219,10 +214,6 @@ class Normalisation:
     def to_scene(self, points: np.ndarray) -> np.ndarray:
         """Convert (…, 3) world points to float64 scene points."""
         return (np.asarray(points, np.float64) - self.center) * self.scale
-
-    def to_world(self, points: np.ndarray) -> np.ndarray:
-        """Convert (…, 3) scene points to float64 world points."""
-        return np.asarray(points, np.float64) / self.scale + self.center
 
     def matrix(self) -> np.ndarray:
         """(4, 4) float64, world to scene, acting on column vectors."""

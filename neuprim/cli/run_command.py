@@ -52,9 +52,11 @@ def _help(words: Sequence[str]) -> str:
     """Return the text below the arguments; it lists the installed tasks."""
     if not {"-h", "--help"} & set(words):
         return ""
-    from neuprim.plugins.registry import TASKS, list_tasks
+    from neuprim.plugins.registry import TASKS
 
-    tasks = [f"  {TASKS.shortest_name(info)}  ({info.origin})" for info in list_tasks()] or ["  none is installed"]
+    tasks = [f"  {TASKS.shortest_name(info)}  ({info.origin})" for info in TASKS.list_plugins()] or [
+        "  none is installed"
+    ]
     return "\n\n".join([_COMMON_KEYS, "\n".join(["tasks:", *tasks]), _EXAMPLES])
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from neuprim.cli.command import Command
 from neuprim.core.errors import ConfigError, NeuprimError
-from neuprim.plugins.registry import EXPORTERS, INSPECTORS, LOSSES, SCENES, TASKS, PluginGroup, PluginReport, list_tasks
+from neuprim.plugins.registry import EXPORTERS, INSPECTORS, LOSSES, SCENES, TASKS, PluginGroup, PluginReport
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension, SceneExtension
@@ -34,7 +34,7 @@ def list_plugins() -> list[str]:
             summary, body = "BROKEN", [str(broken)]
         title = f"{report.info.name}  ({report.info.origin})  {summary}{_note(report)}"
         lines += [title, *(f"  {line}" for line in body), ""]
-    tasks = {info.name for info in list_tasks()}
+    tasks = {info.name for info in TASKS.list_plugins()}
     homeless = [report for report in scenes if report.info.name.partition(".")[0] not in tasks]
     if homeless:
         described = (f"  {_describe(report, report.info.name)}" for report in homeless)

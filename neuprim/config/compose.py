@@ -70,7 +70,6 @@ from neuprim.plugins.registry import (
     PluginInfo,
     UnknownPlugin,
     find_scene,
-    load_loss,
     qualified_plugin_name,
     split_plugin_name,
 )
@@ -322,7 +321,7 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
     try:
         loss = _validate_settings(_resolve(base, {})).train.loss
         # while another loss is chosen, a preset may also set what the task's own reads
-        unused = unused_settings(spec, None if loss is None else load_loss(loss))
+        unused = unused_settings(spec, None if loss is None else LOSSES.load(loss))
         refuse_unused([name for name in flatten(preset_node) if name in unused], spec, None)
     except ConfigError as error:
         raise ConfigError(f"{place}: {error}") from error

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from neuprim.config.run_config import RunConfig
 from neuprim.plugins.attribution import RunPlugins
 from neuprim.plugins.provenance import PluginVersion, Provenance, load_recorded_plugin
-from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_scene, load_task, qualified_plugin_name
+from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_scene, load_task
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def scene_of(config: RunConfig, task: TaskSpec, file: Path | None = None) -> Fou
 def made_now(config: RunConfig, task: TaskSpec) -> Provenance:
     """Return the record of a run that starts or goes on now: the same packages, in the versions that are installed."""
     made, scene = config.made_by, scene_of(config, task).added_by
-    task_info = TASKS.find(config.task if made is None else qualified_plugin_name(made.task.package, made.task.name))
+    task_info = TASKS.find(config.task if made is None else made.task.qualified_name)
     loss = None if config.train.loss is None else PluginVersion.of(LOSSES.find(config.train.loss))
     return Provenance(
         __version__,
@@ -91,8 +91,8 @@ def find_run_plugins(config: RunConfig) -> RunPlugins:
     made = config.made_by
     if made is None:
         return RunPlugins(config.task, config.scene_name, config.train.loss)
-    scene = config.scene_name if made.scene is None else qualified_plugin_name(made.scene.package, made.scene.name)
-    return RunPlugins(qualified_plugin_name(made.task.package, made.task.name), scene, config.train.loss)
+    scene = config.scene_name if made.scene is None else made.scene.qualified_name
+    return RunPlugins(made.task.qualified_name, scene, config.train.loss)
 
 
 def refuse_missing_plugins(config: RunConfig) -> None:

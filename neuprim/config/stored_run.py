@@ -15,7 +15,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.notices import warn_once
 from neuprim.core.validation import format_value
 from neuprim.plugins.provenance import PluginVersion
-from neuprim.plugins.registry import BUILT_IN, TASKS, qualified_plugin_name, split_plugin_name
+from neuprim.plugins.registry import BUILT_IN, TASKS, split_plugin_name
 
 Choices = Mapping[str, str | None]
 """Task, scene, preset and effort by what was typed; None where nothing was."""
@@ -86,7 +86,7 @@ def _choices_of(stored: RunConfig) -> dict[str, str | None]:
     made = stored.made_by
 
     def name_of(name: str, maker: PluginVersion | None) -> str:
-        return name if maker is None or maker.package in ("", BUILT_IN) else qualified_plugin_name(maker.package, name)
+        return name if maker is None or maker.package in ("", BUILT_IN) else maker.qualified_name
 
     return {
         "task": name_of(stored.task, None if made is None else made.task),

@@ -35,7 +35,6 @@ from neuprim.conformance.task_checks import (
     check_conditions,
     check_description,
     check_evaluation,
-    check_extremes,
     check_fields,
     check_loss,
     check_parameters,
@@ -67,7 +66,6 @@ CHECKS: dict[str, Callable[[TaskUnderTest], None]] = {
         check_resume,
         check_save_load,
         check_conditions,
-        check_extremes,
     )
 }
 """Every check by name, in reading order."""

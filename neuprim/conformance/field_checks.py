@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,10 @@ from torch import Tensor
 from neuprim.conformance.task_under_test import EXACT, TaskUnderTest
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.data import View
-from neuprim.core.model.fields import ColourField, Conditions, DensityField, Field, LoweredDensity, Shading
+from neuprim.core.model.fields import ColourField, Conditions, Field, Shading
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pairs import Pairs
-from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.primitives import ActiveSet, Primitives
 from neuprim.core.model.reduction import reduce_model
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render import RenderSettings, render
@@ -26,7 +26,7 @@ _STEPS = (1e-5, 1e-6)
 """Steps of the finite differences: a pixel that flips at a silhouette differs only at one of them."""
 
 
-def double_view(view: View) -> View:
+def _double_view(view: View) -> View:
     """Return the view with camera and conditions in float64."""
     conditions = {k: v.double() if v.is_floating_point() else v for k, v in view.conditions.items()}
     return replace(view, camera=replace(view.camera, viewmat=view.camera.viewmat.double()), conditions=conditions)
@@ -52,53 +52,24 @@ def check_forms(t: TaskUnderTest) -> None:
 # ---------------------------------------------------------------- activity and integrals
 
 
-@dataclass(frozen=True)
-class ActiveDensity:
-    """The density of the primitives that are active in a frame.
+def _rows(active: ActiveSet) -> Tensor:
+    """Return the (M,) rows of the model that are active."""
+    return torch.arange(active.geometry.count) if active.rows is None else active.rows
 
-    Attributes:
-        rows: their rows in the model.
-        params: the density's tensors of these rows.
-        stored, moved: their geometry as stored, and where the frame's conditions put it.
-        form: their lowered density.
+
+def _integrate(active: ActiveSet, prim: Tensor, ray: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    """Integrate the field's ``density`` along chords by Gauss-Legendre quadrature on eight panels.
+
+    Returns:
+        the integrals and the greatest |sigma|, both (M,) float64.
     """
-
-    field: DensityField
-    conditions: Conditions
-    rows: Tensor
-    params: dict[str, Tensor]
-    stored: Geometry
-    moved: Geometry
-    form: LoweredDensity
-
-    @classmethod
-    def of(cls, model: Primitives, conditions: Conditions) -> ActiveDensity:
-        """Lower a model's density under some conditions."""
-        rows = model.density.active_rows(model.of(model.density), conditions)
-        rows = torch.arange(model.count) if rows is None else rows
-        params = {name: value[rows] for name, value in model.of(model.density).items()}
-        stored = model.geometry[rows]
-        moved = model.density.move(params, stored, conditions)
-        form = model.density.lower(params, moved, conditions)
-        return cls(model.density, conditions, rows, params, stored, moved, form)
-
-    def quadrature(self, prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor) -> tuple[Tensor, Tensor]:
-        """Integrate the field's ``density`` along chords by Gauss-Legendre quadrature on eight panels.
-
-        Returns:
-            the integrals and the greatest |sigma|, both (M,) float64.
-        """
-        x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(16))
-        nodes = ((x[None] + 1) / 2 + torch.arange(8)[:, None]).reshape(-1) / 8
-        t = t0[:, None] + (t1 - t0)[:, None] * nodes
-        points = (o[:, None] + t[..., None] * d[:, None]).reshape(-1, 3)
-        rows = prim.repeat_interleave(len(nodes))
-        sigma = self.field.density(self.params, self.stored, rows, points, self.conditions).reshape(t.shape)
-        return (sigma * (w / 16).repeat(8)).sum(-1) * (t1 - t0), sigma.abs().amax(-1)
-
-    def optical_depth(self, prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor) -> Tensor:
-        """Integrate the lowered form along chords."""
-        return self.form.optical_depth(Pairs.of(self.moved, prim, o, d, t0, t1))
+    o, d, t0, t1 = ray
+    x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(16))
+    nodes = ((x[None] + 1) / 2 + torch.arange(8)[:, None]).reshape(-1) / 8
+    t = t0[:, None] + (t1 - t0)[:, None] * nodes
+    points = (o[:, None] + t[..., None] * d[:, None]).reshape(-1, 3)
+    sigma = active.sigma(prim.repeat_interleave(len(nodes)), points).reshape(t.shape)
+    return (sigma * (w / 16).repeat(8)).sum(-1) * (t1 - t0), sigma.abs().amax(-1)
 
 
 def points_inside(geometry: Geometry, rows: Tensor, generator: torch.Generator, reach: float = 0.95) -> Tensor:
@@ -134,7 +105,7 @@ def check_activity(t: TaskUnderTest) -> None:
     model = t.perturbed_model()
     generator = torch.Generator().manual_seed(3)
     params = model.of(model.density)
-    for view in map(double_view, t.views):
+    for view in map(_double_view, t.views):
         rows = model.density.active_rows(params, view.conditions)
         if rows is None:
             continue
@@ -154,27 +125,29 @@ def check_integral(t: TaskUnderTest) -> None:
     generator = torch.Generator().manual_seed(4)
     count = 0
     with torch.no_grad():
-        for view in map(double_view, t.views):
-            active = ActiveDensity.of(model, view.conditions)
-            prim = torch.arange(len(active.rows)).repeat(_RAYS)
+        for view in map(_double_view, t.views):
+            active = model.active(view.conditions)
+            geometry, form = model.lower_density(view.conditions)
+            prim = torch.arange(geometry.count).repeat(_RAYS)
             if not len(prim):
                 continue
             count += len(prim)
-            o, d, t0, t1 = random_chords(active.moved, prim, generator)
+            o, d, t0, t1 = random_chords(geometry, prim, generator)
             middle = t0 + 0.4 * (t1 - t0)
-            whole = active.optical_depth(prim, o, d, t0, t1)
+            rays = [(o, d, t0, t1), (o, d, t0, middle), (o, d, middle, t1)]
+            whole, first, second = (form.optical_depth(Pairs.of(geometry, prim, *ray)) for ray in rays)
             shape = tuple(whole.shape)
             t.require(shape == tuple(prim.shape), "density.lower: integral", f"shape {shape}", tuple(prim.shape))
-            parts = [active.optical_depth(prim, o, d, a, b) for a, b in ((t0, middle), (middle, t1))]
-            expected, peak = active.quadrature(prim, o, d, t0, t1)
+            expected, peak = _integrate(active, prim, rays[0])
             for where, found, wanted in (
                 ("chord", whole, expected),
-                ("part of a chord", parts[1], active.quadrature(prim, o, d, middle, t1)[0]),
-                ("chord in two parts", parts[0] + parts[1], whole),
+                ("part of a chord", second, _integrate(active, prim, rays[2])[0]),
+                ("chord in two parts", first + second, whole),
             ):
                 error = (found - wanted).abs() / ((t1 - t0) * peak + 1e-30)
                 i = int(error.argmax())
-                place = f"density.lower: integral of a {where}, primitive {int(active.rows[prim[i]])}, view {view.name}"
+                row = int(_rows(active)[prim[i]])
+                place = f"density.lower: integral of a {where}, primitive {row}, view {view.name}"
                 t.require(bool((error <= 1e-5).all()), place, f"{float(found[i]):.6g}", f"{float(wanted[i]):.6g}")
     t.require(count > 0, "density.active_rows", "no primitive in any view", "some")
 
@@ -203,7 +176,7 @@ class _FixedShading(ColourField):
         return self.colour.lower(params, geometry, camera, conditions)
 
 
-def leaf_parameters(model: Primitives) -> dict[str, Tensor]:
+def _leaf_parameters(model: Primitives) -> dict[str, Tensor]:
     """Replace the model's parameters by leaves that collect gradients, and return them."""
     model.params = {name: value.detach().clone().requires_grad_() for name, value in model.params.items()}
     return model.params
@@ -219,8 +192,8 @@ def _objective(model: Primitives, view: View, seed: int) -> Tensor:
 def check_gradients(t: TaskUnderTest) -> None:
     """Every parameter gets a gradient from some view, and gradients agree with finite differences in float64."""
     model = t.perturbed_model()
-    params = leaf_parameters(model)
-    for i, view in enumerate(map(double_view, t.views)):
+    params = _leaf_parameters(model)
+    for i, view in enumerate(map(_double_view, t.views)):
         _objective(model, view, i).backward()
     for name, value in params.items():
         if value.numel():
@@ -228,9 +201,9 @@ def check_gradients(t: TaskUnderTest) -> None:
             t.require(value.grad is not None, where, "none: the image does not depend on it", "one")
             t.require_finite(where, value.grad)
             t.require(bool(value.grad.any()), where, "zero in all views", "other than zero")  # type: ignore[union-attr]
-    for view in list(map(double_view, t.views))[:2]:
+    for view in list(map(_double_view, t.views))[:2]:
         frozen = Primitives(model.density, _FixedShading(model, view.conditions), model.params)
-        params = leaf_parameters(frozen)
+        params = _leaf_parameters(frozen)
         _objective(frozen, view, 0).backward()
         for name, value in params.items():
             if value.numel():
@@ -283,10 +256,10 @@ def check_scaling(t: TaskUnderTest) -> None:
     twice = {name: torch.cat([value, value]) for name, value in {**model.params, **half}.items()}
     copies = Primitives(model.density, model.colour, twice)
     with torch.no_grad():
-        for i, view in enumerate(map(double_view, t.views)):
-            active = ActiveDensity.of(model, view.conditions)
-            local = torch.arange(len(active.rows)).repeat(4)
-            rows, x = active.rows[local], points_inside(active.moved, local, torch.Generator().manual_seed(i))
+        for i, view in enumerate(map(_double_view, t.views)):
+            active = model.active(view.conditions)
+            local = torch.arange(active.geometry.count).repeat(4)
+            rows, x = _rows(active)[local], points_inside(active.geometry, local, torch.Generator().manual_seed(i))
             one, other = (model.density.density(p, model.geometry, rows, x, view.conditions) for p in (own, scaled))
             _require_close(t, "density.scale_density: density", other, one * factor[rows], rows)
             a, b = (render(m, view.camera, view.conditions, EXACT).rgb for m in (model, copies))
@@ -323,8 +296,8 @@ def check_split(t: TaskUnderTest) -> None:
         _compare_masses(t, model, children)
         return
     generator = torch.Generator().manual_seed(6)
-    for view in map(double_view, t.views):
-        rows = ActiveDensity.of(model, view.conditions).rows.repeat(4)
+    for view in map(_double_view, t.views):
+        rows = _rows(model.active(view.conditions)).repeat(4)
         for child, new in children:
             x = points_inside(model.density.move(child, new, view.conditions), rows, generator)
             found = model.density.density(child, new, rows, x, view.conditions)
@@ -338,7 +311,7 @@ def _compare_masses(t: TaskUnderTest, model: Primitives, children: list[tuple[di
     A density that varies within a primitive continues in the children, whose supports contain other parts of it. So
     one pair may be off, but all of them on average may not.
     """
-    view = double_view(t.views[0])
+    view = _double_view(t.views[0])
     ball = 2 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(8), dtype=torch.float64) - 1
     ball = ball[ball.norm(dim=-1) < 1]
 

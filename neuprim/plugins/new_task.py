@@ -11,7 +11,7 @@ from string import Template
 
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import publish_folder
-from neuprim.plugins.registry import list_tasks
+from neuprim.plugins.registry import TASKS
 from neuprim.version import __version__
 
 _TEMPLATE_SUFFIX = ".in"
@@ -30,7 +30,7 @@ def write_task_package(name: str, out: Path | None = None) -> list[str]:
         raise ConfigError(
             f"new-task {name!r}: expected a name of lower-case letters, digits and _ that starts with a letter"
         )
-    for info in list_tasks():
+    for info in TASKS.list_plugins():
         if info.name == name:
             raise ConfigError(f"new-task {name}: {info.origin} already has a task of this name; choose another")
     variables = {

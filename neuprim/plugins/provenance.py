@@ -71,6 +71,11 @@ class PluginVersion:
         """Package and version, e.g. ``"neuprim-spectral 0.1"``."""
         return f"{self.package} {self.version}".strip()
 
+    @property
+    def qualified_name(self) -> str:
+        """``PACKAGE:NAME``, as a user types it."""
+        return qualified_plugin_name(self.package, self.name)
+
 
 @dataclass(frozen=True)
 class Provenance:
@@ -128,8 +133,8 @@ def load_recorded_plugin(
         info, spec = group.load_with_info(qualified_plugin_name(plugin.package, entry or plugin.name))
     except UnknownPlugin as error:
         raise ConfigError(_in_file(file, missing_plugin_message(group, plugin))) from error
-    if not info.built_in and info.version != plugin.version:
-        _warn_of_version(file, plugin, group.kind, info.origin)
+    if not info.built_in:
+        _warn_of_version(file, plugin, group.kind, PluginVersion.of(info))
     return info, spec
 
 
@@ -171,17 +176,14 @@ def check_resumed_provenance(stored: object, now: Provenance | None, file: Path)
     warn_of_other_neuprim(before, file)
     for kind, old in before.plugins.items():
         new = now.plugins.get(kind)
-        same = new is not None and (canonicalize_name(old.package), old.name) == (
-            canonicalize_name(new.package),
-            new.name,
-        )
-        if new is not None and same and old.version != new.version and canonicalize_name(old.package) != BUILT_IN:
-            _warn_of_version(file, old, kind, new.origin)
+        if new is not None and new.qualified_name == old.qualified_name and canonicalize_name(old.package) != BUILT_IN:
+            _warn_of_version(file, old, kind, new)
 
 
-def _warn_of_version(file: Path | None, plugin: PluginVersion, kind: str, installed: str) -> None:
-    text = f"this run was made by {plugin.origin} ({kind} {plugin.name}); installed is {installed}"
-    warn_once(_in_file(file, text))
+def _warn_of_version(file: Path | None, plugin: PluginVersion, kind: str, installed: PluginVersion) -> None:
+    if installed.version != plugin.version:
+        text = f"this run was made by {plugin.origin} ({kind} {plugin.name}); installed is {installed.origin}"
+        warn_once(_in_file(file, text))
 
 
 def _in_file(file: Path | None, text: str) -> str:

@@ -10,8 +10,6 @@ whoever else registers it.
 from __future__ import annotations
 
 import importlib
-import inspect
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -164,17 +162,6 @@ class PluginGroup(Generic[T]):
         name = self.typed_name(info.name)
         return name if self._name_clash_note(info) is None else qualified_plugin_name(info.distribution, name)
 
-    def owner(self, spec: T) -> PluginInfo | None:
-        """Find who registers a description that is already imported. Built-in plugins come first."""
-        for info in sorted(self.list_plugins(), key=lambda info: not info.built_in):
-            module, _, path = info.target.partition("[")[0].partition(":")
-            found: Any = sys.modules.get(module.strip())
-            for part in path.strip().split("."):
-                found = inspect.getattr_static(found, part, None)
-            if found is spec:
-                return info
-        return None
-
     def warn_of_hidden(self, info: PluginInfo, by: str) -> None:
         """Warn that the name of ``info`` means another plugin, and how to choose it."""
         what = f"{self.kind} {self.typed_name(info.name)!r} of {info.origin}"
@@ -289,29 +276,9 @@ INSPECTORS: PluginGroup[Inspector] = PluginGroup(
 PLUGIN_GROUPS: tuple[PluginGroup[Any], ...] = (TASKS, SCENES, LOSSES, EXPORTERS, INSPECTORS)
 
 
-def list_tasks() -> list[PluginInfo]:
-    """List all registered tasks without importing any."""
-    return TASKS.list_plugins()
-
-
 def load_task(name: str) -> TaskSpec:
     """Load the task that ``NAME`` or ``PACKAGE:NAME`` chooses. Raises as :meth:`PluginGroup.load`."""
     return TASKS.load(name)
-
-
-def load_loss(name: str) -> LossExtension:
-    """Load a loss. Raises as :meth:`PluginGroup.load`."""
-    return LOSSES.load(name)
-
-
-def load_exporter(name: str) -> Exporter:
-    """Load an export format. Raises as :meth:`PluginGroup.load`."""
-    return EXPORTERS.load(name)
-
-
-def load_inspector(name: str) -> Inspector:
-    """Load a way to show a density. Raises as :meth:`PluginGroup.load`."""
-    return INSPECTORS.load(name)
 
 
 @dataclass(frozen=True)
@@ -341,12 +308,11 @@ def find_scene(task: TaskSpec, word: str) -> FoundScene:
     own = {scene.name: scene for scene in task.scenes}
     added = [info for info in SCENES.list_plugins() if info.name.startswith(f"{task.name}.")]
     if name in own:
-        owner = TASKS.owner(task)
         if package is None:
             for info in added:
                 if info.name == f"{task.name}.{name}":
                     SCENES.warn_of_hidden(info, f"one of task {task.name!r} itself")
-        if package is None or (owner is not None and package == canonicalize_name(owner.distribution)):
+        if package is None or _is_of_package(task, package):
             return FoundScene(own[name], task.config_package)
     entry = f"{task.name}.{name}"
     try:
@@ -356,3 +322,8 @@ def find_scene(task: TaskSpec, word: str) -> FoundScene:
         of = f" of {package}" if package else ""
         raise UnknownPlugin(f"scene={word}: task {task.name!r} has no such scene{of}{nearest(name, names)}") from None
     return FoundScene(extension.scene, extension.config_package, info)
+
+
+def _is_of_package(task: TaskSpec, package: str) -> bool:
+    owners = [i for i in TASKS.list_plugins() if i.name == task.name and canonicalize_name(i.distribution) == package]
+    return any(TASKS.load(qualified_plugin_name(info.distribution, info.name)) is task for info in owners)

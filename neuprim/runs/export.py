@@ -22,7 +22,7 @@ from neuprim.core.io.files import StagedOutput, refuse_existing, staged, write_j
 from neuprim.core.io.plain import load_json
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
-from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
+from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin
 from neuprim.runs.open import COMPRESSED, load_run, open_run
 from neuprim.version import __version__
 
@@ -66,7 +66,7 @@ def export_run(
         exporter that crashed.
     """
     try:
-        exporter = load_exporter(name)
+        exporter = EXPORTERS.load(name)
     except UnknownPlugin:
         load_run(run_dir)  # that the run's own package is gone says more
         raise
@@ -260,7 +260,7 @@ def import_run(path: Path, out: Path, name: str | None = None) -> Path:
 def _find_reader(path: Path, name: str | None) -> Exporter:
     name = name or path.suffix.lower().removeprefix(".")
     try:
-        exporter = load_exporter(name)
+        exporter = EXPORTERS.load(name)
     except UnknownPlugin:
         raise ConfigError(
             f"{path}: no format reads .{name} files; expected one of `neuprim compress`, or of --format ply or npz"

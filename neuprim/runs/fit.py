@@ -28,7 +28,7 @@ from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.core.used_settings import build_settings, loss_settings
 from neuprim.plugins.attribution import attribute_errors, guard_loss
-from neuprim.plugins.registry import load_loss
+from neuprim.plugins.registry import LOSSES
 from neuprim.plugins.returns import call_task_clips, call_task_facts, check_fields
 from neuprim.runs.curve import evaluate_curve_point, next_evaluation_progress
 from neuprim.runs.events import Evaluated, Events, Note, Preparing, Step, ignore_event
@@ -189,7 +189,7 @@ def make_loss(config: RunConfig, task: TaskSpec) -> Loss:
         ConfigError: no such loss, or an option that it refuses.
         PluginError: it is another package's and cannot be made.
     """
-    chosen = None if config.train.loss is None else load_loss(config.train.loss)
+    chosen = None if config.train.loss is None else LOSSES.load(config.train.loss)
     source = find_run_plugins(config).loss
     with attribute_errors(source, "loss" if chosen is None else "make"):
         made = (task.loss if chosen is None else chosen.make)(

@@ -27,7 +27,7 @@ from neuprim.inspect.layers import Layer, validate_layers
 from neuprim.inspect.truth_volumes import open_ground_truth, pair_frames, write_density_vdb
 from neuprim.inspect.window import Window, has_display, list_panels, prepare_headless, require_pyvista
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
-from neuprim.plugins.registry import INSPECTORS, PluginError, load_inspector
+from neuprim.plugins.registry import INSPECTORS, PluginError
 from neuprim.runs.events import Events, Note, ignore_event
 from neuprim.runs.kept import PRUNED, describe_kept_shares, kept_shares
 from neuprim.runs.open import open_run
@@ -84,7 +84,7 @@ def inspect_run(request: Request, events: Events = ignore_event) -> list[Path]:
     kind = "" if request.out is None else request.out.suffix.lower()
     if request.out is not None and kind not in OUTPUTS:
         raise ConfigError(f"--out {request.out}: expected a name that ends in {', '.join(OUTPUTS)}")
-    inspectors = [_checked_inspector(load_inspector(name), name) for name in dict.fromkeys(request.show)]
+    inspectors = [_checked_inspector(INSPECTORS.load(name), name) for name in dict.fromkeys(request.show)]
     if request.out is None and not has_display():
         raise BackendUnavailable("there is no display to open a window on; give --out FILE.png, .webp, .html or .vdb")
     if kind not in (".html", ".vdb"):

@@ -301,7 +301,6 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("reductions", "reduce('neurons', 1)", using(less_of((1,), lambda f, p: (f, {**p, "b2": p["b2"] * math.nan})))),
     ("resume", "8 steps against 4 + resume + 4", using(Remembers)),
     ("save_load", "after loading: found a change", using(colour=Progresses)),
-    ("save_load", "SwallowsSettings(no_such_setting=1) of a file", using(SwallowsSettings)),
     ("save_load", "after folding: found a change of", using(FoldsAway)),
     ("save_load", "after folding twice: b1: found different values", using(FoldsOn)),
     ("conditions", "parse('no such value'): found it was accepted", timed(parse=lenient)),
@@ -311,11 +310,6 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("conditions", "condition 'time' = 0.0: found colors of primitive 0 is not finite", timed(BlowsUp)),
     ("conditions", "it was drawn", timed(Untimed)),
     ("conditions", "something is missing", timed(Mute)),
-    (
-        "extremes",
-        "tiny primitives",
-        using(lowers(lambda f, g: replace(f, b2=f.b2 + 1e-30 / g.length_scale[:, None] ** 8))),
-    ),
 ]
 
 

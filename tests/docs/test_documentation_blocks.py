@@ -27,7 +27,7 @@ from neuprim.core.io.images import write_png
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.task import SceneContext
-from neuprim.plugins.registry import TASKS, load_exporter
+from neuprim.plugins.registry import EXPORTERS, TASKS
 from neuprim.runs.run import run
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands, name_of
 
@@ -197,7 +197,7 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         known = {condition: text for condition, text in given.items() if not PLACEHOLDER.search(text)}
         read_conditions(conditions, known, pytest.fail)
     if name == "export":
-        options = load_exporter(args.format).options if not PLACEHOLDER.search(args.format) else {}
+        options = EXPORTERS.load(args.format).options if not PLACEHOLDER.search(args.format) else {}
         rest = [word for word in rest if word.partition("=")[0] not in options]
     assert rest == [], f"{rest} is no argument of neuprim {name}"
 

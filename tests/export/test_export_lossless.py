@@ -99,28 +99,6 @@ def test_the_command_prints_files_and_json_and_replaces_nothing(
     assert "not an empty folder" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("form", "words", "reason"),
-    [
-        ("plx", (), "did you mean 'ply'"),
-        ("ply", ("time=1",), "no such option"),
-        ("ply", ("time",), "KEY=VALUE"),
-        ("mesh", ("gird=3",), "did you mean 'grid'"),
-        ("mesh", ("grid=3", "grid=4"), "twice"),
-        ("mesh", ("grid=many",), "expected a whole number"),
-        ("vdb", ("grid=8.5",), "whole number"),
-        ("vdb", ("half=1",), "true or false"),
-        ("vdb", ("units=metres",), "units=metres: expected auto, source, world or scene"),
-    ],
-)
-def test_wrong_words_are_refused(run_dir: Path, tmp_path: Path, form: str, words: tuple[str, ...], reason: str) -> None:
-    if form == "mesh":
-        pytest.importorskip("pyvista", exc_type=ImportError)
-    with pytest.raises(ConfigError, match=reason):
-        export_run(run_dir, form, None, words)
-    assert not (run_dir / "export").exists()
-
-
 # ---------------------------------------------------------------- untrusted files
 
 

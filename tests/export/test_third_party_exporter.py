@@ -73,6 +73,8 @@ def test_words_that_mean_nothing_are_refused(run_dir: Path, capsys: pytest.Captu
             ["--format", "vdb", "wavelngth_shift=1"],
             "wavelngth_shift: no such option of --format vdb; did you mean 'wavelength_shift'",
         ),
+        (["--format", "npz", "time"], "KEY=VALUE"),
+        (["--format", "mesh", "grid=9", "grid=9"], "twice"),
         (["--format", "npz", "--wavelength-shift", "1"], "--wavelength-shift: --format npz takes no conditions"),
         (["--format", "vdb", "wavelength-shift=1", "--wavelength-shift", "1"], "wavelength-shift: given twice"),
         (["--format", "vdb", "--wavelength-shift"], "--wavelength-shift: expected a value after it"),

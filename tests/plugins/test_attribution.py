@@ -82,26 +82,23 @@ def test_the_plugins_of_a_run(site: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "text"),
+    ("returned", "text"),
     [
-        ("return value, {", "return 3, {", "value: found a int; expected one number as a tensor"),
-        ("return value, {", "return value.expand(2), {", "value: found torch.float32 of shape (2,)"),
-        ("return value, {", "return value.detach(), {", "value: found no gradient"),
-        ('{"mse": value.item()}', "3", "parts: found a int"),
-        ("value.item()", "value", "part 'mse': found torch.float32"),
-        ("return loss\n", "return 3\n", "the loss is a int; expected a function"),
+        (lambda value: (3, {}), "value: found a int; expected one number as a tensor"),
+        (lambda value: (value.expand(2), {}), "value: found torch.float32 of shape (2,)"),
+        (lambda value: (value.detach(), {}), "value: found no gradient"),
+        (lambda value: (value, 3), "parts: found a int"),
+        (lambda value: (value, {"mse": value}), "part 'mse': found torch.float32"),
     ],
 )
-def test_a_loss_that_returns_something_else_ends_the_run_in_a_line(
-    old: str, new: str, text: str, site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert old in LOSS
-    add(site, "loss", LOSS.replace(old, new, 1))
-    add(site, "scene", package="fake_scene", source=None)
-    words = ["task=static", "scene=solids", *QUICK, "train.loss=extra"]
-    assert main(["run", *words, f"output_dir={tmp_path / 'r'}"]) == 2
-    error = capsys.readouterr().err
-    assert "neuprim: error: " in error and "of fake-extra 0.3: " in error and text in error
+def test_a_loss_that_returns_something_else_is_named(returned: Any, text: str) -> None:
+    image = torch.ones(2, 2, 3, requires_grad=True)
+    loss = guard_loss(lambda rendered, truth, frame: returned(rendered.mean()), STRANGER)
+    with pytest.raises(PluginError) as caught:
+        loss(image, image, None)  # type: ignore[arg-type]
+    assert str(caught.value).startswith("loss of task 'glow' of neuprim-glow 0.1: ") and text in str(caught.value)
+    with pytest.raises(PluginError, match="the loss is a int; expected a function"):
+        guard_loss(3, STRANGER)  # type: ignore[arg-type]
 
 
 def test_a_crash_is_one_line_of_the_command_and_does_not_end_a_sweep(
@@ -110,16 +107,15 @@ def test_a_crash_is_one_line_of_the_command_and_does_not_end_a_sweep(
     add(site, "loss", LOSS.replace("        value = ", "        if weight == 2.0: [][1]\n        value = "))
     text = "loss of loss 'extra' of fake-extra 0.3: IndexError: list index out of range (__init__.py line 8, in loss)"
     words = ["task=static", "scene=solids", *QUICK, "train.loss=extra"]
-    assert main(["run", *words, "task.options.weight=2.0", f"output_dir={tmp_path / 'r'}"]) == 2
-    assert [line for line in capsys.readouterr().err.splitlines() if "rror" in line] == [f"neuprim: error: {text}"]
     assert main(["run", "-m", *words, "task.options.weight=2.0,3.0", f"output_dir={tmp_path / 's'}"]) == 2
     error = capsys.readouterr().err
     assert f": {text}" in error and "Traceback" not in error
     rows = (tmp_path / "s" / "sweep.csv").read_text()
     assert rows.count("failed") == 1 and rows.count("done") == 1, rows
     monkeypatch.setenv("NEUPRIM_TRACEBACK", "1")
-    assert main(["run", *words, "task.options.weight=2.0", f"output_dir={tmp_path / 't'}"]) == 2
-    assert "Traceback" in capsys.readouterr().err
+    assert main(["run", *words, "task.options.weight=2.0", f"output_dir={tmp_path / 'r'}"]) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" in error and error.splitlines()[-1] == f"neuprim: error: {text}"
 
 
 @pytest.mark.parametrize(

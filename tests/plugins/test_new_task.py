@@ -36,91 +36,81 @@ def shell(words: list[str], cwd: Path, site: Path) -> str:
 
 
 def pip_install(source: Path, site: Path) -> None:
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "--disable-pip-version-check",
-        "--no-index",
-        "--no-build-isolation",
-        "--no-deps",
-    ]
-    shell([*pip, "--target", str(site), str(source)], source.parent, site)
+    offline = ["--disable-pip-version-check", "--no-index", "--no-build-isolation", "--no-deps"]
+    shell([sys.executable, "-m", "pip", "install", "-q", *offline, "--target", str(site), str(source)], source, site)
 
 
-def neuprim_command(words: list[str], cwd: Path, site: Path) -> str:
-    return shell([sys.executable, "-m", "neuprim", *words], cwd, site)
+def run_commands(commands: list[str], cwd: Path, site: Path) -> list[str]:
+    """Run commands of neuprim in one new process; return what each of them printed."""
+    code = (
+        "import sys; from neuprim.cli import main\n"
+        "for command in sys.argv[1:]:\n"
+        "    assert main(command.split()) == 0; print('@', end='', flush=True)"
+    )
+    return shell([sys.executable, "-c", code, *commands], cwd, site).split("@")[:-1]
 
 
 def passed(output: str) -> int:
     return int(output.split(" passed")[0].split()[-1])
 
 
-@pytest.mark.timeout(900)
-def test_the_example_installs_and_trains(tmp_path: Path) -> None:
-    copy, site = tmp_path / "example", tmp_path / "site"
+def install_example(folder: Path) -> tuple[Path, Path]:
+    """Install the example package; return its folder, without the package itself, and where it is installed."""
+    copy, site = folder / "example", folder / "site"
     shutil.copytree(EXAMPLE, copy, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__"))
     pip_install(copy, site)
     shutil.rmtree(copy / "neuprim_gaussian")  # what runs now is what was installed
-    listed = neuprim_command(["tasks"], tmp_path, site)
-    assert "gaussian  (neuprim-gaussian 0.1.0)  A static scene of true Gaussian densities" in listed
-    assert "BROKEN" not in listed
-    small = [
-        "scene.size=16",
-        "scene.train_views=4",
-        "scene.test_views=1",
-        "scene.supersampling=1",
-        "model.primitives=40",
-    ]
-    neuprim_command(["run", "task=gaussian", *small, "train.iterations=5", "output_dir=r"], tmp_path, site)
-    header = (tmp_path / "r" / "model.safetensors").read_bytes()[:4000]
-    assert b"BellDensity" in header
-    assert json.loads((tmp_path / "r" / "metrics.json").read_text())["psnr"] > 5
-    assert "psnr" in neuprim_command(["eval", "r"], tmp_path, site)
-    assert re.search(r"log_kappa +[0-9]+ +160 ", neuprim_command(["compress", "r", "--steps", "5"], tmp_path, site))
-    assert re.search(
-        r"log_kappa +7 +160 ",
-        neuprim_command(["compress", "r", "--level", "3", "--steps", "5", "--force"], tmp_path, site),
+    return copy, site
+
+
+SMALL = "scene.size=16 scene.train_views=4 scene.test_views=1 train.iterations=5 output_dir=r"
+
+
+@pytest.mark.timeout(900)
+def test_the_example_installs_and_trains(tmp_path: Path) -> None:
+    _, site = install_example(tmp_path)
+    listed, _, evaluated, compressed, coarse = run_commands(
+        [
+            "tasks",
+            f"run task=gaussian scene.supersampling=1 model.primitives=40 {SMALL}",
+            "eval r",
+            "compress r --steps 5",
+            "compress r --level 3 --steps 5 --force",
+        ],
+        tmp_path,
+        site,
     )
+    assert "gaussian  (neuprim-gaussian 0.1.0)  A static scene of true Gaussian densities" in listed
+    assert "BROKEN" not in listed and "psnr" in evaluated
+    assert b"BellDensity" in (tmp_path / "r" / "model.safetensors").read_bytes()[:4000]
+    assert json.loads((tmp_path / "r" / "metrics.json").read_text())["psnr"] > 5
+    assert re.search(r"log_kappa +[0-9]+ +160 ", compressed) and re.search(r"log_kappa +7 +160 ", coarse)
     (tmp_path / "r" / "model.safetensors").unlink()
-    assert "psnr" in neuprim_command(["eval", "r"], tmp_path, site)
+    assert "psnr" in run_commands(["eval r"], tmp_path, site)[0]
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_example_passes_its_own_tests(tmp_path: Path) -> None:
-    copy, site = tmp_path / "example", tmp_path / "site"
-    shutil.copytree(EXAMPLE, copy, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__"))
-    pip_install(copy, site)
-    shutil.rmtree(copy / "neuprim_gaussian")
+    copy, site = install_example(tmp_path)
     assert passed(shell([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"], copy, site)) > 50
 
 
 @pytest.mark.timeout(900)
-def test_a_new_task_installs_trains_and_passes_its_tests(tmp_path: Path) -> None:
+def test_a_new_task_installs_trains_and_passes_its_tests(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     site, folder = tmp_path / "site", tmp_path / "mine"
-    printed = neuprim_command(["new-task", "wave", "--out", str(folder)], tmp_path, site)
-    assert "neuprim run task=wave" in printed
-    assert f"pytest {folder}" in printed
+    assert main(["new-task", "wave", "--out", str(folder)]) == 0
+    printed = capsys.readouterr().out
+    assert "neuprim run task=wave" in printed and f"pytest {folder}" in printed
     lines = [p.read_text().count("\n") for p in folder.rglob("*") if p.is_file()]
     assert len(lines) >= 10 and sum(lines) < 200
     pip_install(folder, site)
     shutil.rmtree(folder / "neuprim_wave")
-    assert "wave  (neuprim-wave 0.1.0)" in neuprim_command(["tasks"], tmp_path, site)
-    small = [
-        "scene.size=16",
-        "scene.train_views=4",
-        "scene.test_views=1",
-        "model.primitives=30",
-        "renderer.backend=reference",
-    ]
-    neuprim_command(["run", "task=wave", *small, "train.iterations=5", "output_dir=r"], tmp_path, site)
+    run = f"run task=wave model.primitives=30 renderer.backend=reference {SMALL}"
+    assert "wave  (neuprim-wave 0.1.0)" in run_commands(["tasks", run], tmp_path, site)[0]
     assert (tmp_path / "r" / "report.html").is_file()
-    assert (
-        passed(shell([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], folder, site)) == len(CHECKS) + 1
-    )
+    output = shell([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], folder, site)
+    assert passed(output) == len(CHECKS) + 1
 
 
 @pytest.mark.parametrize("name", ["", "Wave", "3d", "a-b", "a b", "../x", "class", "wäve", "a" * 41])

@@ -25,7 +25,6 @@ from neuprim.plugins.registry import (
     PluginError,
     PluginGroup,
     find_scene,
-    load_loss,
     load_task,
 )
 from neuprim.runs.measure import evaluate_run
@@ -64,7 +63,7 @@ def test_a_plugin_is_listed_without_import_and_loaded_by_name(kind: str, site: P
 
 def test_listing_does_not_load_torch() -> None:
     code = (
-        "import sys, neuprim.cli; from neuprim.plugins.registry import list_tasks; list_tasks(); "
+        "import sys, neuprim.cli; from neuprim.plugins.registry import TASKS; TASKS.list_plugins(); "
         "assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -283,6 +282,6 @@ def test_of_two_copies_of_a_distribution_the_first_counts(
     install(first, "fake-extra", {"extra": "fake_newer:PLUGIN"}, {"fake_newer.py": LOSS}, version="0.4", group=group)
     monkeypatch.syspath_prepend(str(first))
     assert [info.origin for info in LOSSES.list_plugins() if info.name == "extra"] == ["fake-extra 0.4"]
-    assert load_loss("extra").summary == "mean squared error"
+    assert LOSSES.load("extra").summary == "mean squared error"
     sys.modules.pop("fake_newer", None)
     assert SCENES.typed_name("static.solids") == "solids"

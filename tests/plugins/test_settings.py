@@ -18,7 +18,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.task import Supervision
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.used_settings import build_settings, loss_settings
-from neuprim.plugins.registry import LOSSES, load_loss, load_task
+from neuprim.plugins.registry import LOSSES, load_task
 from neuprim.runs.run import run
 from neuprim.tasks.static import TASK
 from tests.plugins.extras import LOSS, add
@@ -107,7 +107,7 @@ def test_a_losss_options_belong_to_task_options_while_it_is_chosen(
         match=r"task.options.wieght: task 'toy' with loss 'extra' has no such option; did you mean 'weight'",
     ):
         toys("train.loss=extra", "task.options.wieght=5")
-    settings = loss_settings(load_loss("extra"), config.train, config.options)
+    settings = loss_settings(LOSSES.load("extra"), config.train, config.options)
     assert settings["options"] == {"weight": 5.0}, "its own only"
     assert build_settings(load_task("toy"), config.model, config.options)["options"] == {"gain": 1.0}
     assert main(["tasks"]) == 0
@@ -238,7 +238,9 @@ def test_all_built_in_losses_serve_any_task() -> None:
     frame = Supervision(_view(camera(0.0, 0.0)))
     found = {}
     for name in ("compressed", "l1", "relative"):
-        value, parts = load_loss(name).make(loss_settings(load_loss(name), TrainSettings(), {}))(rendered, truth, frame)
+        value, parts = LOSSES.load(name).make(loss_settings(LOSSES.load(name), TrainSettings(), {}))(
+            rendered, truth, frame
+        )
         assert parts == {name: value.item()}
         found[name] = value.item()
         for task in ("static", "dynamic", "relight"):

@@ -50,8 +50,7 @@ def error(
     return float(wrong)
 
 
-@pytest.mark.parametrize("edge", [0, 1, 2])
-@pytest.mark.parametrize("neurons", [0, 2, 5, 8])
+@pytest.mark.parametrize(("neurons", "edge"), [(0, 1), (2, 0), (5, 2), (8, 1)])
 def test_static_models(neurons: int, edge: int, chromium: Any, tmp_path: Path) -> None:
     degree = {0: 0, 2: 1, 5: 2, 8: 3}[neurons]
     model = random_model(CosineDensity(neurons, edge=edge, gain=edge > 0), SphericalHarmonics(degree))
@@ -137,8 +136,10 @@ def test_models_joined_from_chunks(time: str, chromium: Any, tmp_path: Path) -> 
         assert tab.faults == []
 
 
-@pytest.mark.parametrize("visibility", ["none", "primitive", "pixel"])
-@pytest.mark.parametrize(("form", "falloff"), [("additive", False), ("multiplicative", True)])
+@pytest.mark.parametrize(
+    ("visibility", "form", "falloff"),
+    [("none", "multiplicative", True), ("primitive", "additive", False), ("pixel", "multiplicative", True)],
+)
 def test_relit_models(visibility: str, form: str, falloff: bool, chromium: Any, tmp_path: Path) -> None:
     """The depth images out of the light are drawn by the page too. What lies near their shadows' edges amplifies their
     rounding."""
@@ -154,7 +155,7 @@ def test_relit_models(visibility: str, form: str, falloff: bool, chromium: Any, 
         assert tab.faults == []
 
 
-@pytest.mark.parametrize("degree", [0, 2, 5, 8])
+@pytest.mark.parametrize("degree", [0, 5, 8])
 def test_harmonics_of_the_light(degree: int, chromium: Any, tmp_path: Path) -> None:
     model = random_model(CosineDensity(2), LightHarmonics(degree, falloff=True), seed=4)
     page_of(model, tmp_path / "p.html", LIGHT)
@@ -163,7 +164,7 @@ def test_harmonics_of_the_light(degree: int, chromium: Any, tmp_path: Path) -> N
 
 
 def test_networks_of_any_size(chromium: Any, tmp_path: Path) -> None:
-    for hidden in (0, 3, 8, 16):
+    for hidden in (0, 3, 16):
         model = random_model(CosineDensity(1), LightNetwork(hidden, visibility="none"), seed=hidden)
         page_of(model, tmp_path / "p.html", LIGHT)
         with open_tab(chromium, tmp_path / "p.html") as tab:
@@ -240,7 +241,7 @@ def test_what_is_seen_is_the_display_s(chromium: Any, tmp_path: Path) -> None:
             assert wrong.max() <= 1 and (wrong > 0).mean() < 0.01
 
 
-@pytest.mark.parametrize("level", [0, 1, 3, 5])
+@pytest.mark.parametrize("level", [0, 1, 5])
 def test_the_page_has_the_numbers_that_python_says(level: int, chromium: Any, tmp_path: Path) -> None:
     model = random_model(CosineDensity(3, edge=2, gain=True), SphericalHarmonics(2), seed=8)
     page = page_of(model, tmp_path / "p.html", level=level)

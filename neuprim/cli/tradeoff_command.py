@@ -16,7 +16,6 @@ from neuprim.cli.command import (
     plain_console,
     take_render_overrides,
 )
-from neuprim.config.command_settings import parse_duration
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -73,6 +72,7 @@ def _tradeoff(args: argparse.Namespace) -> int:
 
 def _compare_rendering(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
+    from neuprim.config.command_settings import parse_duration
     from neuprim.search.points import TRADEOFF_FOLDER
     from neuprim.search.render_tradeoff import TradeoffRequest, format_render_command, measure_tradeoff
 
@@ -98,7 +98,7 @@ def _compare_rendering(args: argparse.Namespace) -> int:
 
 def _compare_models(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
-    from neuprim.config.command_settings import take_launcher
+    from neuprim.config.command_settings import parse_duration, take_launcher
     from neuprim.config.overrides import parse
     from neuprim.search.ablation import AblationRequest, format_run_command, run_ablation
 

@@ -59,6 +59,7 @@ from neuprim.config.task_files import (
 from neuprim.config.trust import check_stored
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
+from neuprim.core.train.distributed.torchrun import read_torchrun_rank
 from neuprim.core.used_settings import build_settings
 from neuprim.core.validation import coerce, format_value, infer_type, refuse_unknown, validate
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
@@ -134,13 +135,15 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
     earlier = [config for config in (begun, stored) if config is not None]
     for config in earlier:
         check_stored(config, typed)
+    # Where torchrun's ranks get the overrides that describe a run, these say how many views each rank has.
+    new_launch = begun is not None and read_torchrun_rank() is not None and bool(choices["task"] or choices["scene"])
     if begun is not None:
         choices = resumed_choices(begun, choices)
     elif stored is not None:
         choices = stored_choices(stored, choices)
     values = [a for a in assignments if a.key not in CHOICES]
     try:
-        config, paths = _make_config(_select(choices), values, earlier, check_output)
+        config, paths = _make_config(_select(choices), values, earlier, check_output, new_launch)
     except UnknownPlugin:
         if begun is not None:
             refuse_missing_plugins(begun)  # naming the package says more
@@ -234,13 +237,18 @@ def _select(choices: Mapping[str, str | None]) -> _Selection:
 
 
 def _make_config(
-    chosen: _Selection, values: Sequence[Assignment], earlier: Sequence[RunConfig], check_output: bool
+    chosen: _Selection,
+    values: Sequence[Assignment],
+    earlier: Sequence[RunConfig],
+    check_output: bool,
+    new_launch: bool = False,
 ) -> tuple[RunConfig, list[str]]:
     """Return a valid configuration, still without its overrides, and the scene's settings that are paths.
 
     Args:
         values: what was typed for settings.
         earlier: runs whose settings stand below, the first lowest.
+        new_launch: do not take the views per step of each process from the earlier run.
     """
     spec, scene = chosen.spec, chosen.scene
     base = _read_base(spec, scene.spec.name, scene.config_package, chosen.preset, chosen.options)
@@ -253,6 +261,8 @@ def _make_config(
         below |= stored_settings(config, same_scene)
         if same_scene:
             refuse_unknown(config.scene, declared, "scene")
+    if new_launch:
+        below["train"]["views_per_step"] = base.tree["train"]["views_per_step"]
     plain = _resolve(base, {})
     full = _resolve(base, below, chosen.level, values)
     settings = _validate_settings(full)

@@ -52,13 +52,18 @@ def room() -> Room:
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return load_room(SMALL, SceneContext(seed=0, cache_dir=tmp_path_factory.mktemp("cache")))
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
 
 
 @pytest.fixture(scope="module")
-def folder(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return next(next(tmp_path_factory.getbasetemp().glob("cache*")).glob("room-*"))
+def dataset(cache: Path) -> Dataset:
+    return load_room(SMALL, SceneContext(seed=0, cache_dir=cache))
+
+
+@pytest.fixture(scope="module")
+def folder(dataset: Dataset, cache: Path) -> Path:
+    return next(cache.glob("room-*"))
 
 
 def still(count: int, width: float = 0.0) -> np.ndarray:

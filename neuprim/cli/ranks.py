@@ -35,6 +35,8 @@ def run_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
 
     def terminate(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if sys.exc_info()[0] is not None:  # on its way out already, with an error that says more
+            return
         raise group.explain(RankError("ended by SIGTERM"))
 
     # torchrun sends it when another rank ended; a training handles it by itself
@@ -49,6 +51,7 @@ def run_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
             raise
         return 130
     except Exception as error:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # torchrun's signal would add a second message
         line = one_line(error)
         if line is None:
             group.record_failure(f"{type(error).__name__}: {error}")

@@ -93,6 +93,7 @@ def test_two_ranks_of_which_one_is_killed_then_one_process_then_two_ranks_are_on
     killed = time.monotonic()
     _, said = launched.communicate(timeout=60)
     assert launched.returncode != 0 and time.monotonic() - killed < 20
+    assert len(errors(said)) == 1, said
     (line,) = errors(said)
     found = re.match(
         r"neuprim: error: step (\d+): another rank ended without a message, .*; to go on: torchrun --nproc-per-node 2 "

@@ -1,4 +1,4 @@
-"""What commands show while they work: a bar on a terminal, a line now and then elsewhere."""
+"""Show the progress of commands: a bar on a terminal, otherwise a line now and then."""
 
 from __future__ import annotations
 

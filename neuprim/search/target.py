@@ -48,7 +48,7 @@ _FIRST_SHARE = 0.05
 """Share of the squared error at which the search for coarse numbers begins."""
 
 _MAX_TUNING, _MIN_TUNING = 3, 600
-"""Most steps of fine-tuning over those of the full run, and least steps with which pruning is worth it."""
+"""Most steps of fine-tuning over those of the full run, and least steps with which a model is pruned."""
 
 _KEPT = ("model.safetensors", "checkpoint.safetensors", "metrics.jsonl")
 

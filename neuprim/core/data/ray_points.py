@@ -23,7 +23,7 @@ _INFINITY = 1e6  # in camera extents
 _SEEN = 0.1  # share of these pixels that must be seen at a depth, for it to be judged
 _SAME = 1.02  # up to this ratio of differences, infinity agrees with the images as well as the best depth does
 _TRIED = 8  # depths of a ray, of which the one counts at which other views agree best
-_PRIOR = 0.5  # weight of how well a depth fits all rays, beside how well it fits one: some views agree by chance
+_PRIOR = 0.5  # weight of how well a depth fits all rays, relative to how well it fits one: some views agree by chance
 _ROUNDS = 8
 
 

@@ -25,7 +25,7 @@ from neuprim.core.metrics.image import matched
 class _Layer(NamedTuple):
     """A convolution with its rectifier."""
 
-    number: int  # where it stands in torchvision's features
+    number: int  # index in torchvision's features
     inputs: int
     outputs: int
     side: int

@@ -37,10 +37,10 @@ from neuprim.plugins.returns import (
     call_task_clips,
     call_task_diagnose,
     call_task_facts,
-    call_task_judge,
     call_task_mask,
+    call_task_metrics,
     call_task_orbit,
-    call_task_trade,
+    call_task_tunable_settings,
     check_loss_returns,
     draw_task_layer,
 )
@@ -69,7 +69,7 @@ def check_description(t: TaskUnderTest) -> None:
         _require_accepted(t, where, asdict(settings.model), choice.options)
     for scene in t.task.scenes:
         preset_settings(t.task, choice.preset, scene.name)
-    for name, values in call_task_trade(t.task, build_settings(t.task, t.settings.model, t.options)).items():
+    for name, values in call_task_tunable_settings(t.task, build_settings(t.task, t.settings.model, t.options)).items():
         for value in values:
             tree: dict[str, Any] = {"model": asdict(t.settings.model), "task": {"options": dict(t.options)}}
             *path, last = name.split(".")
@@ -77,7 +77,7 @@ def check_description(t: TaskUnderTest) -> None:
             for part in path:
                 node = node.setdefault(part, {})
             node[last] = value
-            _require_accepted(t, f"trade: {name}={value}", tree["model"], tree["task"]["options"])
+            _require_accepted(t, f"tunable_settings: {name}={value}", tree["model"], tree["task"]["options"])
     for group in ("density", "colour"):
         changed: dict[str, Any] = {group: {**getattr(t.settings.model, group), "no_such_setting": 1}}
         where = f"TaskSpec.check with model.{group}.no_such_setting=1"
@@ -165,7 +165,7 @@ def check_evaluation(t: TaskUnderTest) -> None:
         for i in range(len(data.test)):
             truth = data.test.pixels(i).over(data.background)
             call_task_mask(task, data, i)
-            call_task_judge(task, data, i, 0.5 * truth, truth)
+            call_task_metrics(task, data, i, 0.5 * truth, truth)
         call_task_diagnose(task, data, model)
         orbit = call_task_orbit(task, data, 3)
         for spec in task.layers:

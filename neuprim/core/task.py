@@ -135,7 +135,7 @@ class TaskSpec:
             ``loss`` (``train.…``) read. Setting others is an error.
         mask: (data set, index of a test view) -> (H, W) bool, the part of the view whose error is reported on its own,
             or None.
-        judge: (data set, index of a test view, rendered (H, W, C), truth (H, W, C)) -> further metrics by name, for
+        metrics: (data set, index of a test view, rendered (H, W, C), truth (H, W, C)) -> further metrics by name, for
             each view and as means in ``metrics.json``. Images are in the data set's colour space over its background.
             ``mse_NAME`` becomes ``psnr_pooled_NAME``, the PSNR of the mean over views weighted by ``pixels_NAME``;
             ``pixels_NAME`` becomes a sum; all others become plain means over the views that have them.
@@ -145,7 +145,7 @@ class TaskSpec:
         facts: JSON-able facts that drawing a model may need without its data; kept in the model's header under "data",
             with "up" and "center".
         orbit: (data set, number of frames) -> views circling the scene, with every condition of the task.
-        trade: (what ``build`` gets) -> settings that trade quality for speed or size, with the values that are worth
+        tunable_settings: (what ``build`` gets) -> settings that trade quality for speed or size, with the values worth
             training: ``{"model.neurons": (0, 2, 4, 8)}``. ``neuprim tradeoff task=NAME`` varies them, the number of
             primitives and the length of training. Names begin with ``model.`` or ``task.options.``.
     """
@@ -168,12 +168,12 @@ class TaskSpec:
     options: Mapping[str, Option] = field(default_factory=dict)
     uses: tuple[str, ...] = ()
     mask: Callable[[Dataset, int], Tensor | None] = lambda dataset, index: None
-    judge: Callable[[Dataset, int, Tensor, Tensor], Mapping[str, float]] = lambda dataset, index, rendered, truth: {}
+    metrics: Callable[[Dataset, int, Tensor, Tensor], Mapping[str, float]] = lambda dataset, index, rendered, truth: {}
     diagnose: Callable[[Dataset, Primitives], Mapping[str, Any]] = lambda dataset, model: {}
     clips: Callable[[Dataset], Sequence[Clip]] = lambda dataset: ()
     facts: Callable[[Dataset], Mapping[str, Any]] = lambda dataset: {}
     orbit: Callable[[Dataset, int], list[View]] = Dataset.orbit
-    trade: Callable[[Mapping[str, Any]], Mapping[str, Sequence[Any]]] = lambda model: {}
+    tunable_settings: Callable[[Mapping[str, Any]], Mapping[str, Sequence[Any]]] = lambda model: {}
 
     def parameter_names(self) -> set[str]:
         """Return the names of the parameters that the task's fields have at any settings.

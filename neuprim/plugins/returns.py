@@ -71,10 +71,12 @@ def call_task_mask(task: TaskSpec, dataset: Dataset, index: int) -> Tensor | Non
     return mask
 
 
-def call_task_judge(task: TaskSpec, dataset: Dataset, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
+def call_task_metrics(
+    task: TaskSpec, dataset: Dataset, index: int, rendered: Tensor, truth: Tensor
+) -> dict[str, float]:
     """Return the task's own metrics of a test view by name; they may be +inf."""
-    function = f"judge of test view {dataset.test.view(index).name}"
-    metrics = _text_keys(task.judge(dataset, index, rendered, truth), function)
+    function = f"metrics of test view {dataset.test.view(index).name}"
+    metrics = _text_keys(task.metrics(dataset, index, rendered, truth), function)
     for name, value in metrics.items():
         number = isinstance(value, int | float) and not math.isnan(value) and value != -math.inf
         check_returns(number, f"{function}: {name}", repr(value), "a number")
@@ -111,20 +113,24 @@ def call_task_orbit(task: TaskSpec, dataset: Dataset, frames: int) -> list[View]
     return views
 
 
-def call_task_trade(task: TaskSpec, settings: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
+def call_task_tunable_settings(task: TaskSpec, settings: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
     """Return the settings that trade quality for speed or size: name -> values worth training.
 
     Args:
         settings: what the task's ``build`` gets.
     """
-    found = task.trade(settings)
-    check_returns(isinstance(found, Mapping), "trade", _kind(found), "a dictionary of setting names to values")
+    found = task.tunable_settings(settings)
+    check_returns(
+        isinstance(found, Mapping), "tunable_settings", _kind(found), "a dictionary of setting names to values"
+    )
     for name, values in found.items():
         known = isinstance(name, str) and name.startswith(_TUNABLE)
-        check_returns(known, "trade", repr(name), f"the name of a setting that begins with {' or '.join(_TUNABLE)}")
+        check_returns(
+            known, "tunable_settings", repr(name), f"the name of a setting that begins with {' or '.join(_TUNABLE)}"
+        )
         plain = isinstance(values, Sequence) and not isinstance(values, str)
         plain = plain and all(isinstance(value, bool | int | float | str) for value in values)
-        check_returns(plain, f"trade: {name}", repr(values), "a list of numbers, texts, true or false")
+        check_returns(plain, f"tunable_settings: {name}", repr(values), "a list of numbers, texts, true or false")
     return {name: tuple(values) for name, values in found.items()}
 
 

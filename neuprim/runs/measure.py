@@ -37,7 +37,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.notices import warn_once
 from neuprim.core.render import RenderSettings, choose_backend, render
 from neuprim.core.task import TaskSpec
-from neuprim.plugins.returns import call_task_clips, call_task_diagnose, call_task_judge, call_task_mask
+from neuprim.plugins.returns import call_task_clips, call_task_diagnose, call_task_mask, call_task_metrics
 from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.render_config import estimate_file_bytes, parse_render_config
 from neuprim.version import __version__
@@ -59,7 +59,7 @@ class ViewMetrics:
             ``ssim_display`` of what the task's own display shows; ``psnr_gain`` of opaque photographs; ``ssim_3dgs``,
             ``lpips``; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and
             ``psnr_black_image_mask`` of an image without anything on it; what the task's
-            :attr:`~neuprim.core.task.TaskSpec.judge` adds.
+            :attr:`~neuprim.core.task.TaskSpec.metrics` adds.
     """
 
     name: str
@@ -138,7 +138,7 @@ def measure_views(
         )
         if pixels.alpha is None:
             more["psnr_gain"] = psnr_gain(rendered, truth, pixels.mask)
-        more |= call_task_judge(task, dataset, i, rendered, truth)
+        more |= call_task_metrics(task, dataset, i, rendered, truth)
         black = psnr(background.to(truth).expand_as(truth), truth, pixels.mask)
         score = psnr(rendered, truth, pixels.mask)
         result.append(ViewMetrics(view.name, score, ssim(rendered, truth), seconds, black, more, empty))

@@ -16,7 +16,7 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer
 from neuprim.core.used_settings import build_settings
 from neuprim.core.validation import Range
-from neuprim.plugins.returns import call_task_trade
+from neuprim.plugins.returns import call_task_tunable_settings
 from neuprim.runs.fit import prepare_training, use_one_torch_thread
 from neuprim.runs.training import compile_for_run
 from neuprim.search.pareto import Step, combine_steps
@@ -67,7 +67,7 @@ def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]
     counts = dict.fromkeys(max(1, round(part * centre.model.primitives)) for part in _COUNTS)
     knob = "model.primitives"
     variants = {knob: [Variant(knob, (quote_override(knob, n),)) for n in counts if n != centre.model.primitives]}
-    for knob, values in call_task_trade(task, build_settings(task, centre.model, centre.options)).items():
+    for knob, values in call_task_tunable_settings(task, build_settings(task, centre.model, centre.options)).items():
         now = None if knob in centre.unused else get_setting(centre, knob)
         others = [value for value in values if value != now]
         if now in values:

@@ -15,7 +15,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import TaskSpec
 from neuprim.core.used_settings import build_settings
-from neuprim.plugins.returns import call_task_trade
+from neuprim.plugins.returns import call_task_tunable_settings
 from neuprim.search.size_curve import Curve, Proposal, climb, fit_line, propose_size, to_decibels
 from neuprim.search.size_predictor import ALLOWANCE, MIN_MARGIN, SizePredictor, exceeded_limit, format_forecast
 from neuprim.search.target_record import Attempt, SettingChange, SettingValue, TargetRecord
@@ -71,7 +71,7 @@ def smaller_values(config: RunConfig, task: TaskSpec, dataset: Dataset) -> dict[
     whole = count_numbers(config)
     values: dict[str, tuple[SettingValue, ...]] = {}
     least: dict[str, int] = {}
-    for key, offered in call_task_trade(task, build_settings(task, config.model, config.options)).items():
+    for key, offered in call_task_tunable_settings(task, build_settings(task, config.model, config.options)).items():
         now = get_setting(config, key)
         if key in config.unused or now is None:
             continue

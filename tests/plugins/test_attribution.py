@@ -21,10 +21,10 @@ from neuprim.plugins.returns import (
     call_task_clips,
     call_task_diagnose,
     call_task_facts,
-    call_task_judge,
     call_task_mask,
+    call_task_metrics,
     call_task_orbit,
-    call_task_trade,
+    call_task_tunable_settings,
     check_fields,
 )
 from tests.core import tiny
@@ -131,16 +131,31 @@ def test_a_crash_is_one_line_of_the_command_and_does_not_end_a_sweep(
         ("orbit", [], lambda t, d: call_task_orbit(t, d, 3), "orbit: found no views"),
         ("orbit", [3], lambda t, d: call_task_orbit(t, d, 3), "found a int in the list; expected a list of"),
         ("mask", torch.ones(2, 2), lambda t, d: call_task_mask(t, d, 0), "mask"),
-        ("judge", [3], lambda t, d: call_task_judge(t, d, 0, DATA, DATA), "judge of test view .*: found a list"),
-        ("judge", {"x": float("nan")}, lambda t, d: call_task_judge(t, d, 0, DATA, DATA), "x: found nan"),
-        ("judge", {"psnr": 1.0}, lambda t, d: call_task_judge(t, d, 0, DATA, DATA), "found the name psnr, which every"),
-        ("trade", 3, lambda t, d: call_task_trade(t, {}), "trade: found a int; expected a dictionary"),
-        ("trade", {"train.x": (1,)}, lambda t, d: call_task_trade(t, {}), "trade: found 'train.x'; expected the name"),
+        ("metrics", [3], lambda t, d: call_task_metrics(t, d, 0, DATA, DATA), "metrics of test view .*: found a list"),
+        ("metrics", {"x": float("nan")}, lambda t, d: call_task_metrics(t, d, 0, DATA, DATA), "x: found nan"),
         (
-            "trade",
+            "metrics",
+            {"psnr": 1.0},
+            lambda t, d: call_task_metrics(t, d, 0, DATA, DATA),
+            "found the name psnr, which every",
+        ),
+        (
+            "tunable_settings",
+            3,
+            lambda t, d: call_task_tunable_settings(t, {}),
+            "tunable_settings: found a int; expected a dictionary",
+        ),
+        (
+            "tunable_settings",
+            {"train.x": (1,)},
+            lambda t, d: call_task_tunable_settings(t, {}),
+            "tunable_settings: found 'train.x'; expected the name",
+        ),
+        (
+            "tunable_settings",
             {"model.x": "12"},
-            lambda t, d: call_task_trade(t, {}),
-            "trade: model.x: found '12'; expected a list",
+            lambda t, d: call_task_tunable_settings(t, {}),
+            "tunable_settings: model.x: found '12'; expected a list",
         ),
     ],
 )
@@ -151,8 +166,8 @@ def test_what_a_tasks_function_returns_is_checked(member: str, found: Any, call:
 
 
 def test_what_a_task_returns_is_passed_on() -> None:
-    task = replace(load_task("static"), judge=lambda *args: {"x": float("inf")}, facts=lambda data: {"a": [1, "b"]})
-    assert call_task_judge(task, DATA, 0, DATA, DATA) == {"x": float("inf")}  # type: ignore[arg-type]
+    task = replace(load_task("static"), metrics=lambda *args: {"x": float("inf")}, facts=lambda data: {"a": [1, "b"]})
+    assert call_task_metrics(task, DATA, 0, DATA, DATA) == {"x": float("inf")}  # type: ignore[arg-type]
     assert call_task_facts(task, DATA).keys() == {"up", "center", "a"}
     assert all(isinstance(view, View) for view in call_task_orbit(task, DATA, 3))
 

@@ -175,12 +175,12 @@ def test_a_perfect_view_leaves_the_curve_a_number(monkeypatch: pytest.MonkeyPatc
 def test_a_task_may_judge_views_and_make_films_and_tell_facts(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def judge(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
+    def own_metrics(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
         return {"index": float(index), "mse_part": 0.1 if index else 0.2, "pixels_part": 3.0 if index == 0 else 1.0}
 
     mine = replace(
         TASK,
-        judge=judge,
+        metrics=own_metrics,
         mask=lambda dataset, index: dataset.test.pixels(index).alpha > 0.5,
         diagnose=lambda dataset, model: {"counted": [model.count, dataset.channels]},
         clips=lambda dataset: [Clip("round", [2, 0, 1], 10.0, dataset.train)],

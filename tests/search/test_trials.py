@@ -129,7 +129,7 @@ def test_a_task_that_knows_its_test_views_is_not_asked_about_others(
     mine = replace(
         TASK,
         clips=lambda dataset: [Clip("all", [0, 1])],
-        judge=lambda dataset, index, rendered, truth: pytest.fail("asked"),
+        metrics=lambda dataset, index, rendered, truth: pytest.fail("asked"),
     )
     monkeypatch.setattr("neuprim.tasks.static.TASK", mine)
     assert run_trial(Trial(config_of(scene, tmp_path / "t"), hold_out=6)).psnr > 5, (

@@ -145,7 +145,7 @@ def to_json(key: str, value: float) -> dict[str, float | bool | None]:
 
 
 def means(views: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """JSON-able means of numbers by name over the views that have them, by the rules of ``TaskSpec.judge``."""
+    """JSON-able means of numbers by name over the views that have them, by the rules of ``TaskSpec.metrics``."""
     result: dict[str, Any] = {}
     for name in sorted({key for v in views for key in v}):
         having = [v for v in views if name in v]

@@ -40,7 +40,7 @@ def _build_density(model: Mapping[str, Any], components: tuple[str, ...] = ()) -
     return TimeDensity(model["neurons"], **model["density"], components=components)
 
 
-def _trade(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
+def _tunable_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
     parts = ("none", "phase", "window", "window+motion", "phase+window+motion")
     bands: dict[str, tuple[Any, ...]] = {
         "model.sh_degree": (0, 1, 2, 3),
@@ -128,7 +128,7 @@ TASK = TaskSpec(
     build=_build,
     loss=photometric,
     check=_check,
-    trade=_trade,
+    tunable_settings=_tunable_settings,
     conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_time, sweep="0:1"),),
     fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),

@@ -49,7 +49,7 @@ def _check(model: Mapping[str, Any]) -> None:
         raise ConfigError(f"model.colour: {error}") from error
 
 
-def _trade(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
+def _tunable_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
     if model["colour"].get("form") == "harmonics":
         return {**DENSITY_TRADE, "model.colour.degree": (1, 2, 3, 5)}
     return {**DENSITY_TRADE, "model.colour.hidden": (0, 4, 8, 12), "model.colour.visibility": VISIBILITY}
@@ -94,7 +94,7 @@ TASK = TaskSpec(
     build=_build,
     loss=l1,
     check=_check,
-    trade=_trade,
+    tunable_settings=_tunable_settings,
     conditions=(
         ConditionSpec(
             "light",
@@ -112,7 +112,7 @@ TASK = TaskSpec(
     environment=illuminate,
     uses=("model.neurons",),
     mask=evaluation.mask,
-    judge=evaluation.metrics,
+    metrics=evaluation.metrics,
     diagnose=evaluation.diagnose,
     clips=evaluation.clips,
     facts=evaluation.facts,

@@ -36,7 +36,7 @@ def _check(model: Mapping[str, Any]) -> None:
     validate_choices(model["colour"], "model.colour", {})
 
 
-def _trade(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+def _tunable_settings(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
     cosine = model["density"].get("form", "cosine") == "cosine"
     return {**(DENSITY_TRADE if cosine else {}), "model.sh_degree": (0, 1, 2, 3)}
 
@@ -92,7 +92,7 @@ TASK = TaskSpec(
     build=_build,
     loss=photometric,
     check=_check,
-    trade=_trade,
+    tunable_settings=_tunable_settings,
     facts=_facts,
     diagnose=lambda dataset, model: _facts(dataset),
     fields={

@@ -43,8 +43,9 @@ VIEWS, COMPARED, SMALL = 12, 3, 50
 @torch.no_grad()
 def measure_run(folder: Path, near: float) -> str:
     """What float64 is needed for in a finished run's model with this near plane, in one line."""
-    config, task, model, _ = load_run(folder)
-    dataset = load_dataset(config, task)
+    stored = load_run(folder)
+    model = stored.model
+    dataset = load_dataset(stored)
     settings = [
         RenderSettings(backend=backend, near=near, alpha_min=0.0, transmittance_min=0.0)
         for backend in ("cpu", "reference")

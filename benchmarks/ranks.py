@@ -31,8 +31,7 @@ from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.core.train.distributed.torchrun import read_torchrun_rank
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs.fit import fit, prepare_training, use_one_torch_thread
-from neuprim.runs.training import compile_for_run
+from neuprim.runs.fit import compile_kernels, fit, prepare_training, use_one_torch_thread
 
 RECORD = RESULTS / "ranks.json"
 SCENES = {
@@ -56,7 +55,7 @@ def make_trainers(scene: str, group: ProcessGroup) -> dict[str, Trainer]:
         own = replace(own, renderer=replace(config.renderer, device="cpu", threads=threads))
         fitted = prepare_training(own, dataset=dataset, group=group if way == "together" else None)
         dataset = fitted.dataset
-        compile_for_run(fitted.trainer)
+        compile_kernels(fitted.trainer)
         fitted.trainer.step = (fitted.trainer.settings.iterations or 0) // 2
         made[way] = fitted.trainer
     return made

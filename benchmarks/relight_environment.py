@@ -90,8 +90,9 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="environment; truth and model under 64 lights near trained ones")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    config, task, model, header = load_run(args.run_dir)
-    facts, dataset, scene = header["data"], load_dataset(config, task), Scene(build_lit_solids())
+    stored = load_run(args.run_dir)
+    config, model, header = stored.config, stored.model, stored.header
+    facts, dataset, scene = header["data"], load_dataset(stored), Scene(build_lit_solids())
     far = {**facts, "lights": {**facts["lights"], "distance": DISTANT}}
     step = max(len(dataset.test) // args.views, 1)
     views = [dataset.test.view(i) for i in range(0, len(dataset.test), step)][: args.views]

@@ -46,8 +46,9 @@ Scene = tuple[Lowered, Camera, Tensor]
 def open_scene(folder: Path, index: int) -> tuple[str, Scene]:
     """The model of a finished run, as leaves that take gradients, one of its test cameras, and its background;
     named."""
-    config, task, model, _ = load_run(folder)
-    dataset = load_dataset(config, task)
+    stored = load_run(folder)
+    model = stored.model
+    dataset = load_dataset(stored)
     shot = dataset.test.view(index)
     for value in model.params.values():
         value.requires_grad_()

@@ -33,12 +33,12 @@ from shared.arguments import make_parser, require_folders
 from shared.records import RESULTS, read_record, update_record
 from shared.tables import DOCS, Run, Table, between_markers, make_table
 
-from neuprim.config import compose, task_of
+from neuprim.config import Job, compose, task_of
 from neuprim.config.command_settings import Target
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.compute.threads import cpu_name
-from neuprim.runs.events import Event, Note
+from neuprim.runs.fit import Event, Note
 from neuprim.runs.open import load_dataset
 from neuprim.search.target import choose_hold_out, run_target
 from neuprim.search.trial_runner import VIEWS
@@ -149,7 +149,7 @@ def train_grid(name: str, data: Sequence[str], work: Path) -> dict[str, Any]:
             out = work / f"{name}-grid-{size}{'-' if less else ''}{less.rpartition('.')[2]}"
             config = compose([*words_of(name, data, out), f"model.primitives={size}", *([less] if less else [])])
             task = task_of(config)
-            dataset = dataset or load_dataset(config, task)
+            dataset = dataset or load_dataset(Job(config, task))
             every = choose_hold_out(dataset)
             outcome = run_trial(Trial(config, every, VIEWS), dataset)
             model, _ = load_model(out / "model.safetensors", task)

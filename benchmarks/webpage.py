@@ -134,7 +134,7 @@ def measure_preparation(chromium: Any, scene: str, count: int, folder: Path) -> 
     words, sweep = STARTS[scene]
     words = (*words, f"model.primitives={count}", "train.population.grow_from=1")
     fitted = prepare_training(compose(words, check_output=False))
-    fitted.unlock()
+    fitted.unlock_bands()
     model, view, specs = fitted.model, fitted.dataset.test.view(0), fitted.task.conditions
     conditions = [Condition(spec, view.conditions[spec.name]) for spec in specs]
     path = folder / f"{scene}_{count}.html"

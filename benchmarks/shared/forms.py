@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-from neuprim.config import compose, task_of
+from neuprim.config import Job, compose
 from neuprim.core.used_settings import build_settings
 from neuprim.runs.open import load_dataset
 
@@ -107,9 +107,10 @@ _SMALL = {
 def count_parameters(form: Form, task: str) -> int:
     """Of one primitive of the task's preset, colour included."""
     config = compose([f"task={task}", *_SMALL[task], *form.words], check_output=False)
-    spec = task_of(config)
+    job = Job.of(config)
+    spec = job.task
     # without points: some forms learn more from voxels
-    data = replace(load_dataset(config, spec), points=None)
+    data = replace(load_dataset(job), points=None)
     density, colour = spec.build(build_settings(spec, config.model, config.options), data)
     geometry = 3 + 3 + 4
     return geometry + sum(parameter.size for parameter in (*density.parameters(), *colour.parameters()))

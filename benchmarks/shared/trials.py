@@ -14,9 +14,8 @@ from neuprim.config import compose
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import cpu_name
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs.events import Events
-from neuprim.runs.fit import Fitted, compile_kernels, prepare_training, train_to_end
-from neuprim.runs.launch.jobs import Job, Result
+from neuprim.runs.fit import Events, Fitted, compile_kernels, prepare_training, train_to_end
+from neuprim.runs.launch.jobs import JobResult, LaunchJob
 from neuprim.runs.launch.launcher import launch
 from shared.records import read_trials, update_record
 
@@ -94,14 +93,14 @@ def run_all(
     known = {row["trial"] for row in read_trials(path)}
     waiting = [trial for trial in trials if trial.name not in known]
 
-    def keep(number: int, result: Result) -> None:
+    def keep(number: int, result: JobResult) -> None:
         if result.state == "done":
             row = result.value
             rows = sorted([*read_trials(path), row], key=lambda r: r["trial"])
             update_record(path, **{"cpu": cpu_name(), **entries, "trials": rows})
             print(f"{time.strftime('%H:%M')} {row['trial']}: {row.get('psnr', float('nan')):.2f} dB", flush=True)
 
-    work = [Job(trial.name, f"{__name__}:train_job", (trial, wanted)) for trial in waiting]
+    work = [LaunchJob(trial.name, f"{__name__}:train_job", (trial, wanted)) for trial in waiting]
     settings = LauncherSettings("processes", workers=jobs, threads=1)
     results = launch(work, settings, path.parent / f".{path.stem}-launch", on_result=keep)
     failed = [

@@ -114,13 +114,6 @@ def check_run_directory(path: Path) -> None:
 # ---------------------------------------------------------------- words that argparse does not know
 
 
-def load_run_task(run_dir: Path) -> TaskSpec:
-    """Return the task of a run."""
-    from neuprim.config import Job, RunConfig
-
-    return Job.of(RunConfig.from_yaml(run_dir / "config.yaml")).task
-
-
 def take_overrides(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
     """Add the words that are no flags to ``arguments.overrides``: argparse gives up on them after the first flag."""
     arguments.overrides += [word for word in rest if not word.startswith("-")]
@@ -140,16 +133,20 @@ def split_render_overrides(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def take_conditions(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    """Set ``arguments.conditions``, name -> text, from the flags that the run's task defines."""
-    arguments.conditions = {}
+    """Set ``arguments.conditions``, name -> text, from the flags that the run's task defines.
+
+    ``arguments.run`` is the run, opened if there are flags, else its directory.
+    """
+    arguments.conditions, arguments.run = {}, arguments.run_dir
     if not rest:
         return []
     from neuprim.core.conditions import split_words
+    from neuprim.runs.open import load_run
 
-    task = load_run_task(arguments.run_dir)
-    arguments.conditions, unknown = split_words(rest, task.conditions)
+    arguments.run = load_run(arguments.run_dir)
+    arguments.conditions, unknown = split_words(rest, arguments.run.task.conditions)
     if unknown:
-        raise refuse_argument(unknown[0], parser, task)
+        raise refuse_argument(unknown[0], parser, arguments.run.task)
     return []
 
 

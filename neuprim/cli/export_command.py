@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim.cli.command import Command, load_run_task, print_columns, refuse_argument
+from neuprim.cli.command import Command, print_columns, refuse_argument
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import ExportReport
@@ -30,10 +30,13 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _take_rest(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
     """Keep options and conditions for the exporter; refuse flags that are no condition of the run's task."""
+    arguments.run = arguments.run_dir
     if any(word.startswith("-") for word in rest):
         from neuprim.core.conditions import split_words
+        from neuprim.runs.open import load_run
 
-        task = load_run_task(arguments.run_dir)
+        arguments.run = load_run(arguments.run_dir)
+        task = arguments.run.task
         _, others = split_words(rest, task.conditions, bare=False)
         for word in others:
             if word.startswith("-"):
@@ -47,7 +50,7 @@ def _export(arguments: argparse.Namespace) -> int:
     from neuprim.runs.export import export_run
 
     out, options = arguments.out, arguments.options
-    report = export_run(arguments.run_dir, arguments.format, out, options, arguments.force, LineProgress())
+    report = export_run(arguments.run, arguments.format, out, options, arguments.force, LineProgress())
     print_report(report, arguments.json)
     return 0
 

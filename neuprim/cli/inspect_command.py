@@ -41,7 +41,7 @@ def _inspect(arguments: argparse.Namespace) -> int:
     names = [name.strip() for name in arguments.show.split(",") if name.strip()]
     names += ["primitives"] * arguments.primitives + ["primitive"] * (arguments.primitive is not None)
     request = Request(
-        arguments.run_dir,
+        arguments.run,
         names or ["volume"],
         arguments.conditions,
         arguments.grid,

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from neuprim.cli.command import plain_console
-from neuprim.runs.events import Evaluated, Event, Finishing, Note, Preparing, Step
+from neuprim.runs.fit import Evaluated, Event, Finishing, Note, Preparing, Step
 
 
 class _Bar:

@@ -45,7 +45,7 @@ _ROWS = (
 
 
 def _report(made: Pruning, tolerance: float) -> None:
-    from neuprim.runs.kept import describe_kept_shares
+    from neuprim.runs.open import describe_kept_shares
 
     for number, stage in enumerate(made.stages, 1):
         less = f", {', '.join(stage.words)}" if stage.words else ""

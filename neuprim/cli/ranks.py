@@ -113,7 +113,7 @@ def _fit(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> No
     from neuprim.cli.command import describe_interruption
     from neuprim.cli.progress import RunProgress
     from neuprim.config.overrides import CommandLine
-    from neuprim.runs.events import ignore_event
+    from neuprim.runs.fit import ignore_event
     from neuprim.runs.run import run
 
     ranks = f"--nproc-per-node {group.place.local_size}" if group.size == group.place.local_size else "…"

@@ -97,7 +97,7 @@ def _render(arguments: argparse.Namespace) -> int:
         **more,
     )
     with DrawProgress() as progress:
-        paths = render_run(arguments.run_dir, request, notify=progress.note, progress=progress.show)
+        paths = render_run(arguments.run, request, notify=progress.note, progress=progress.show)
     print(*paths, sep="\n")
     return 0
 

@@ -21,9 +21,10 @@ from neuprim.config import RunConfig
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.overrides import CommandLine
 from neuprim.runs.ground_truth import render_ground_truth_of_runs
-from neuprim.runs.launch.jobs import ENDED, JobStatus, Result
+from neuprim.runs.launch.jobs import ENDED, JobResult, JobStatus
 from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch
-from neuprim.runs.sweep import run_job, run_sweep
+from neuprim.runs.launch_record import run_job
+from neuprim.runs.sweep import run_sweep
 
 _LINE_INTERVAL = 0.25
 """Share of a training between two lines, where there is no terminal."""
@@ -172,7 +173,7 @@ def _print_error(directory: Path, line: str) -> None:
     print(f"neuprim: error: {directory}: {line}", file=sys.stderr, flush=True)
 
 
-def _report(configs: Sequence[RunConfig], results: Sequence[Result | None], live: bool, typed: CommandLine) -> int:
+def _report(configs: Sequence[RunConfig], results: Sequence[JobResult | None], live: bool, typed: CommandLine) -> int:
     """Print failures, and raise KeyboardInterrupt with the command that continues; return the exit status: 2 for bad
     input, 1 for a bug."""
     status, left = 0, []

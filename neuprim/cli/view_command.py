@@ -48,7 +48,7 @@ def _view(args: argparse.Namespace) -> int:
 
 def run_viewed(config: RunConfig, events: RunProgress, settings: ViewerSettings) -> Path:
     """Run a training with a live viewer; raise as :func:`neuprim.runs.run.run`."""
-    from neuprim.runs.events import Note
+    from neuprim.runs.fit import Note
     from neuprim.runs.run import run
     from neuprim.viewer.live_training import LiveTraining
 

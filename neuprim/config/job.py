@@ -13,23 +13,15 @@ from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_sce
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
-    from neuprim.core.data import Dataset
-    from neuprim.core.model.primitives import Primitives
     from neuprim.core.task import TaskSpec
 
 
 @dataclass(frozen=True)
 class Job:
-    """A configuration with what its names stand for, looked up once and handed on together.
-
-    Attributes:
-        dataset, model: None until they are loaded or made.
-    """
+    """A configuration with the task that its name stands for, looked up once and handed on together."""
 
     config: RunConfig
     task: TaskSpec
-    dataset: Dataset | None = None
-    model: Primitives | None = None
 
     @classmethod
     def of(cls, config: RunConfig) -> Job:

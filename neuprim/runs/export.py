@@ -6,6 +6,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,39 +24,29 @@ from neuprim.core.io.plain import load_json
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin
-from neuprim.runs.open import COMPRESSED, load_run, open_run
+from neuprim.runs.open import COMPRESSED, Progress, StoredRun, ignore_progress, load_run, open_run
 from neuprim.version import __version__
-
-Progress = Callable[[str, float], None]
 
 EXPORTS_FILE = "exports.json"
 """In a run directory: formats and packages it was exported with, newest last."""
 
-_MAX_ENTRIES = 200
-"""Only the newest are kept."""
-
-_EXPORTS_MAX_FILES = 20
-"""Names kept of one export, which may have a thousand frames."""
-
-_MAX_CHARACTERS = 500
-"""Of one text."""
-
-_MAX_BYTES = 1 << 24
-"""A larger file was written by something else."""
+_MAX_ENTRIES = 200  # only the newest are kept
+_MAX_FILES = 20  # of one export, which may have a thousand frames
+_MAX_CHARACTERS = 500  # of one text
+_MAX_BYTES = 1 << 24  # a larger file was written by something else
 
 # ---------------------------------------------------------------- export
 
 
 def export_run(
-    run_dir: Path,
+    run: Path | StoredRun,
     name: str,
     out: Path | None = None,
     words: Sequence[str] = (),
     overwrite: bool = False,
-    progress: Progress = lambda text, fraction: None,
+    progress: Progress = ignore_progress,
 ) -> ExportReport:
-    """Write a run's model in a format: whole, or not at all, and over files that exist only with ``overwrite``,
-    whoever's format it is.
+    """Write a run's model in a format: whole, or not at all, and over files that exist only with ``overwrite``.
 
     Args:
         words: ``KEY=VALUE`` options of the exporter, and conditions of the task, also as ``--NAME TEXT``.
@@ -65,28 +56,30 @@ def export_run(
         NeuprimError: no such run, format or option, something that the format cannot hold, files in its way, or an
         exporter that crashed.
     """
+    run_dir = run.directory if isinstance(run, StoredRun) else run
     try:
         exporter = EXPORTERS.load(name)
     except UnknownPlugin:
-        load_run(run_dir)  # that the run's own package is gone says more
+        load_run(run)  # that the run's own package is gone says more
         raise
-    final = _destination(run_dir, exporter, out)
+    source = find_plugin_source(EXPORTERS, name)
+    final = _export_destination(run_dir, exporter, out)
     refuse_existing(final, overwrite)
-    run = open_run(run_dir, progress)
-    options, conditions = _parse_options(words, exporter, run.task.conditions)
+    model = open_run(run, progress)
+    options, conditions = _parse_options(words, exporter, model.task.conditions)
     notes: list[str] = []
-    read_conditions(run.task.conditions, conditions, notes.append)
+    read_conditions(model.task.conditions, conditions, notes.append)
     with staged(final, overwrite) as output:
-        job = ExportJob(run, output.out, options, conditions, progress)
-        with attribute_errors(find_plugin_source(EXPORTERS, name)):
+        job = ExportJob(model, output.out, options, conditions, progress)
+        with attribute_errors(source):
             report = exporter.write(job)
-        files = _final_files(report, output, name)
+        files = _check_exported_files(report, output, source.label)
         output.publish()
     report = replace(report, files=files, notes=(*notes, *(output.final_text(note) for note in report.notes)))
     return _record_export(name, job, report)
 
 
-def _destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
+def _export_destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
     """What the user named, or the exporter's own name for it in the run."""
     if out is None:
         return run_dir / "export" / (exporter.default or exporter.name + "".join(exporter.suffixes[:1]))
@@ -96,29 +89,28 @@ def _destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
     return out
 
 
-def _final_files(report: Any, output: StagedOutput, name: str) -> tuple[Path, ...]:
-    """Where the files of a report will be."""
-    who = find_plugin_source(EXPORTERS, name).label
+def _check_exported_files(report: Any, output: StagedOutput, exporter: str) -> tuple[Path, ...]:
+    """Where the files of a report will be. Raises PluginError for a wrong report."""
     if not isinstance(report, ExportReport):
-        raise PluginError(f"{who}: write returned {type(report).__name__}; expected an ExportReport")
+        raise PluginError(f"{exporter}: write returned {type(report).__name__}; expected an ExportReport")
     files = []
     for path in map(Path, report.files):
-        place = output.final_path(path)
-        if place is None:
+        final = output.final_path(path)
+        if final is None:
             raise PluginError(
-                f"{who}: wrote {path} instead of {output.out}, past everything that keeps files from being replaced"
+                f"{exporter}: wrote {path} instead of {output.out}, past everything that keeps files from being "
+                f"replaced"
             )
         if not path.exists():
-            raise PluginError(f"{who}: reports {path}, which it did not write")
-        files.append(place)
+            raise PluginError(f"{exporter}: reports {path}, which it did not write")
+        files.append(final)
     return tuple(files)
 
 
 def _parse_options(
     words: Sequence[str], exporter: Exporter, specs: Sequence[ConditionSpec]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Every option of the exporter, and the texts of the conditions; where both have one name, ``NAME=`` means the
-    option."""
+    """Options of the exporter and texts of conditions; where both have one name, ``NAME=`` means the option."""
     options = {name: default for name, (default, _) in exporter.options.items()}
     conditions, rest = split_words(words, specs, bare=False)
     if conditions and not exporter.conditions:
@@ -138,22 +130,19 @@ def _parse_options(
             options[key] = _parse_scalar(text)
         else:
             known = [*exporter.options, *((spec.name for spec in specs) if exporter.conditions else ())]
-            raise ConfigError(
-                f"{key}: no such option of --format {exporter.name}{nearest(key, known) or '; it has none'}"
-            )
+            hint = nearest(key, known) or "; it has none"
+            raise ConfigError(f"{key}: no such option of --format {exporter.name}{hint}")
     return options, conditions
 
 
 def _parse_scalar(text: str) -> Any:
     """A number, true, false, null, or the text; unlike YAML's, 1e-3 is a number and 1:40 is text."""
-    named = {"true": True, "false": False, "null": None, "": None}
-    if text in named:
-        return named[text]
+    words = {"true": True, "false": False, "null": None, "": None}
+    if text in words:
+        return words[text]
     for kind in (int, float):
-        try:
+        with suppress(ValueError):
             return kind(text)
-        except ValueError:
-            continue
     return text
 
 
@@ -166,41 +155,37 @@ def _record_export(word: str, job: ExportJob, report: ExportReport) -> ExportRep
     Args:
         word: what chose the exporter, ``NAME`` or ``PACKAGE:NAME``.
     """
-    path = job.run.directory / EXPORTS_FILE
-    try:
-        write_json(path, [*_read_record(path), _entry(word, job, report)][-_MAX_ENTRIES:])
-    except OSError as error:
-        return replace(
-            report,
-            notes=(*report.notes, f"{path}: not written ({error.strerror or error}); this export is not recorded"),
-        )
-    except ValueError as error:
-        return replace(report, notes=(*report.notes, f"{path}: {error}; left as it is, this export is not recorded"))
-    return report
-
-
-def _entry(word: str, job: ExportJob, report: ExportReport) -> dict[str, Any]:
-    info, files = EXPORTERS.find(word), [_relative_path(Path(file), job.run.directory) for file in report.files]
-    return {
-        "files": files[:_EXPORTS_MAX_FILES],
-        **({"more_files": len(files) - _EXPORTS_MAX_FILES} if len(files) > _EXPORTS_MAX_FILES else {}),
+    path, info = job.run.directory / EXPORTS_FILE, EXPORTERS.find(word)
+    files = [_name_exported_file(Path(file), job.run.directory) for file in report.files]
+    entry = {
+        "files": files[:_MAX_FILES],
+        **({"more_files": len(files) - _MAX_FILES} if len(files) > _MAX_FILES else {}),
         "format": info.name,
         "package": info.distribution,
         "version": info.version,
         "neuprim": __version__,
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "options": _plain({**job.options, **job.conditions}),
+        "options": _json_options({**job.options, **job.conditions}),
         "lossless": bool(report.lossless),
     }
+    try:
+        write_json(path, [*_read_exports(path), entry][-_MAX_ENTRIES:])
+    except OSError as error:
+        note = f"{path}: not written ({error.strerror or error}); this export is not recorded"
+    except ValueError as error:
+        note = f"{path}: {error}; left as it is, this export is not recorded"
+    else:
+        return report
+    return replace(report, notes=(*report.notes, note))
 
 
-def _relative_path(file: Path, directory: Path) -> str:
+def _name_exported_file(file: Path, directory: Path) -> str:
     """Relative to the run directory if it lies in there, so that a run that was moved still finds it; else absolute."""
     whole, inside = file.absolute(), directory.absolute()
     return str(whole.relative_to(inside) if whole.is_relative_to(inside) else whole)[:_MAX_CHARACTERS]
 
 
-def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
+def _json_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """Options as strict JSON holds them."""
     plain: dict[str, Any] = {}
     for key, value in options.items():
@@ -209,13 +194,8 @@ def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
     return plain
 
 
-def _read_record(path: Path) -> list[Any]:
-    """Earlier entries.
-
-    Raises:
-        ValueError: the file is not a list of exports.
-        OSError: it cannot be read.
-    """
+def _read_exports(path: Path) -> list[Any]:
+    """Earlier entries. Raises ValueError for a file that is not a list of exports."""
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise ValueError(f"larger than {_MAX_BYTES} bytes; expected a list of exports")
@@ -249,61 +229,50 @@ def import_run(path: Path, out: Path, name: str | None = None) -> Path:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"--out {out}: exists and is not an empty folder")
     if name is None and is_compressed(path):
-        return _import_compressed(path, out)
-    reader = _find_reader(path, name)
-    assert reader.read is not None
-    with attribute_errors(find_plugin_source(EXPORTERS, name or reader.name)):
-        stored = reader.read(path)
-    return import_model(stored, path, out)
-
-
-def _find_reader(path: Path, name: str | None) -> Exporter:
+        config = checkpoint.stored_config(path)
+        if config is None:
+            raise DataError(f"{path}: holds no config.yaml; expected a file written by `neuprim compress`")
+        return _write_imported_run(path, out, config, lambda folder: shutil.copyfile(path, folder / COMPRESSED))
     name = name or path.suffix.lower().removeprefix(".")
     try:
-        exporter = EXPORTERS.load(name)
+        reader = EXPORTERS.load(name)
     except UnknownPlugin:
         raise ConfigError(
             f"{path}: no format reads .{name} files; expected one of `neuprim compress`, or of --format ply or npz"
         ) from None
-    if exporter.read is None:
+    if reader.read is None:
         raise ConfigError(f"{path}: --format {name} is lossy and cannot be imported; ply and npz can")
-    return exporter
+    with attribute_errors(find_plugin_source(EXPORTERS, name)):
+        stored = reader.read(path)
+    return import_model(stored, path, out)
 
 
 def import_model(stored: StoredModel, path: Path, out: Path) -> Path:
     """Write a stored model as a run directory and load it once, so that nothing unsound gets the name ``out``."""
     header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
     tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}
-    return _write_run(
-        path,
-        out,
-        stored.config,
-        lambda output: checkpoint.write(output / "model.safetensors", "model", tensors, header),
-    )
+
+    def write(folder: Path) -> None:
+        checkpoint.write(folder / "model.safetensors", "model", tensors, header)
+
+    return _write_imported_run(path, out, stored.config, write)
 
 
-def _import_compressed(path: Path, out: Path) -> Path:
-    config = checkpoint.stored_config(path)
-    if config is None:
-        raise DataError(f"{path}: holds no config.yaml; expected a file written by `neuprim compress`")
-    return _write_run(path, out, config, lambda output: shutil.copyfile(path, output / COMPRESSED))
-
-
-def _write_run(path: Path, out: Path, config: str, write: Callable[[Path], object]) -> Path:
+def _write_imported_run(path: Path, out: Path, config: str, write: Callable[[Path], object]) -> Path:
     """A run directory with this text of ``config.yaml`` and the model that ``write`` puts there."""
     out.parent.mkdir(parents=True, exist_ok=True)
-    output = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    folder = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     try:
-        output.chmod(0o755)
-        (output / "config.yaml").write_text(config, encoding="utf-8", newline="")
+        folder.chmod(0o755)
+        (folder / "config.yaml").write_text(config, encoding="utf-8", newline="")
         try:
-            write(output)
-            load_run(output, named=False)
+            write(folder)
+            load_run(folder, named=False)
         except (NeuprimError, ValueError, TypeError) as error:  # of a file that is not yet there under this name
-            raise DataError(f"{path}: {str(error).replace(str(output), 'its model')}") from error
+            raise DataError(f"{path}: {str(error).replace(str(folder), 'its model')}") from error
         if out.exists():
             out.rmdir()
-        output.rename(out)
+        folder.rename(out)
     finally:
-        shutil.rmtree(output, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
     return out

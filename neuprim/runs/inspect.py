@@ -28,15 +28,14 @@ from neuprim.inspect.truth_volumes import open_ground_truth, pair_frames, write_
 from neuprim.inspect.window import Window, has_display, list_panels, prepare_headless, require_pyvista
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.registry import INSPECTORS, PluginError
-from neuprim.runs.events import Events, Note, ignore_event
-from neuprim.runs.kept import PRUNED, describe_kept_shares, kept_shares
-from neuprim.runs.open import open_run
+from neuprim.runs.fit import Events, Note, ignore_event
+from neuprim.runs.open import PRUNED, StoredRun, describe_kept_shares, kept_shares, open_run
 
 FILMS = (".webp", ".gif", ".mp4")
 OUTPUTS = (".png", *FILMS, ".html", ".vdb")
 """What ``--out`` may end in."""
 
-_COARSE = 48  # points along the box's longest side on which the scale of all frames is found
+_SCALE_POINTS = 48  # points along the box's longest side on which the scale of all frames is found
 _DEPTH = 6.0  # optical depth that a volume is shown with where it is deepest
 
 
@@ -54,7 +53,7 @@ class Request:
         overwrite: whether files that exist may be replaced.
     """
 
-    run_dir: Path
+    run: Path | StoredRun
     show: Sequence[str] = ("volume",)
     conditions: Mapping[str, str] = field(default_factory=dict)
     grid: int = 128
@@ -84,7 +83,7 @@ def inspect_run(request: Request, events: Events = ignore_event) -> list[Path]:
     kind = "" if request.out is None else request.out.suffix.lower()
     if request.out is not None and kind not in OUTPUTS:
         raise ConfigError(f"--out {request.out}: expected a name that ends in {', '.join(OUTPUTS)}")
-    inspectors = [_checked_inspector(INSPECTORS.load(name), name) for name in dict.fromkeys(request.show)]
+    inspectors = [_load_inspector(name) for name in dict.fromkeys(request.show)]
     if request.out is None and not has_display():
         raise BackendUnavailable("there is no display to open a window on; give --out FILE.png, .webp, .html or .vdb")
     if kind not in (".html", ".vdb"):
@@ -96,25 +95,24 @@ def inspect_run(request: Request, events: Events = ignore_event) -> list[Path]:
     film = _FrameSequence(request, events)
     if film.channels.partial and any(i.shows == "model" for i in inspectors):
         events(Note(f"shown: {film.channels.shown}"))
-    if kind == ".html":
-        assert request.out is not None
+    if request.out is not None and kind == ".html":
         write_page(request.out, film, inspectors)
         return [request.out]
-    if kind == ".vdb":
-        return _each(request, film, lambda path, frame: write_density_vdb(path, frame, film.world))
+    if request.out is not None and kind == ".vdb":
+        return _write_frames(request.out, film, lambda path, frame: write_density_vdb(path, frame, film.world))
     window = Window(list_panels(inspectors, request.against is not None), film.up, bool(kind), request.size)
     try:
-        if not kind:
-            window.interact(len(film), film.frame)
-            return []
-        return _pictures(request, film, window, kind)
+        if request.out is not None:
+            return _write_pictures(request.out, film, window)
+        window.interact(len(film), film.frame)
+        return []
     finally:
         window.close()
 
 
-def _checked_inspector(inspector: Inspector, name: str) -> Inspector:
-    """Return the inspector under the name that the user gave it, with errors attributed and layers checked."""
-    source = find_plugin_source(INSPECTORS, name)
+def _load_inspector(name: str) -> Inspector:
+    """Load an inspector under the name that the user gave it, with errors attributed and layers checked."""
+    inspector, source = INSPECTORS.load(name), find_plugin_source(INSPECTORS, name)
     if source.built_in:
         return inspector
 
@@ -129,7 +127,7 @@ def _checked_inspector(inspector: Inspector, name: str) -> Inspector:
     return replace(inspector, name=name, layers=layers)
 
 
-def _paths(out: Path, count: int) -> list[Path]:
+def _output_paths(out: Path, count: int) -> list[Path]:
     """List the files to write: numbered ones for several frames, or one film or page of all."""
     suffix = out.suffix.lower()
     if count == 1 or suffix not in (".png", ".vdb"):
@@ -137,24 +135,21 @@ def _paths(out: Path, count: int) -> list[Path]:
     return [out.with_name(f"{out.stem}_{i:04d}{suffix}") for i in range(count)]
 
 
-def _pictures(request: Request, film: _FrameSequence, window: Window, kind: str) -> list[Path]:
-    assert request.out is not None
-
-    def drawn(frame: FieldFrame) -> Tensor:
+def _write_pictures(out: Path, film: _FrameSequence, window: Window) -> list[Path]:
+    def draw(frame: FieldFrame) -> Tensor:
         window.draw(frame)
         return torch.from_numpy(window.picture().copy()).float() / 255.0
 
-    if kind == ".png":
-        return _each(request, film, lambda path, frame: images.write_png(path, drawn(frame)))
-    request.out.parent.mkdir(parents=True, exist_ok=True)
-    write_animation(request.out, [drawn(film.frame(i)) for i in range(len(film))], min(24.0, max(len(film) / 4.0, 4.0)))
-    return [request.out]
+    if out.suffix.lower() == ".png":
+        return _write_frames(out, film, lambda path, frame: images.write_png(path, draw(frame)))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_animation(out, [draw(film.frame(i)) for i in range(len(film))], min(24.0, max(len(film) / 4.0, 4.0)))
+    return [out]
 
 
-def _each(request: Request, film: _FrameSequence, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
-    assert request.out is not None
-    request.out.parent.mkdir(parents=True, exist_ok=True)
-    paths = _paths(request.out, len(film))
+def _write_frames(out: Path, film: _FrameSequence, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    paths = _output_paths(out, len(film))
     for i, path in enumerate(paths):
         write(path, film.frame(i))
     return paths
@@ -164,13 +159,13 @@ class _FrameSequence:
     """The requested frames, made one at a time, with one box and scale for all."""
 
     def __init__(self, request: Request, events: Events) -> None:
-        run = open_run(request.run_dir)
+        run = open_run(request.run)
         self.model, self.device, self.world = run.model, computing_device(run.settings), run.world
         self.truth: DensityTruth | None = None
         self.channels, self.needed = run.channels, tuple(c.name for c in run.task.conditions)
         self.up = request.up or str(run.scene.get("up", "z"))
         self.up = self.up if self.up in ("x", "y", "z") else "z"
-        self.options, self.name = request.options, request.run_dir.resolve().name
+        self.options, self.name = request.options, run.directory.resolve().name
         wanted = read_condition_frames(run.task.conditions, request.conditions, lambda text: events(Note(text)))
         pairs: list[tuple[Conditions, int]] = [(conditions, -1) for conditions in wanted]
         if request.against is not None:
@@ -178,36 +173,32 @@ class _FrameSequence:
             events(Note(words))
             pairs = pair_frames(wanted, self.truth, bool(request.conditions))
         self.pairs = pairs
-        for path in [] if request.out is None else _paths(request.out, len(pairs)):
+        for path in [] if request.out is None else _output_paths(request.out, len(pairs)):
             refuse_existing(path, request.overwrite)
-        box = self.world.scene_box(request.box) if request.box is not None else self._box()
+        box = self.world.scene_box(request.box) if request.box is not None else self._default_box()
         if request.grid**3 > POINTS_LIMIT:
             raise ConfigError(f"--grid {request.grid}: expected at most {round(POINTS_LIMIT ** (1 / 3))}")
         self.matrix, self.shape = lattice(box, request.grid)
-        self.numbers = [self._compare(i, events) for i in range(len(self))]
-        self.top, self.gain, self.focus = self._scale(box)
+        self.numbers = [self._compare_frame(i, events) for i in range(len(self))]
+        self.top, self.gain, self.focus = self._find_scale(box)
         low, high = ([round(x, 4) for x in corner] for corner in self.world.world_box(np.asarray(box)).tolist())
         units = "scene units" if self.world.identity else "in the coordinates of the run's data"
         on = f"{' x '.join(map(str, self.shape))} points from {low} to {high} {units}"
-        events(
-            Note(
-                f"extinction of {self.model.count} primitives on {on}, in 1/scene unit, each primitive clamped at "
-                "0 from below"
-            )
-        )
-        if (request.run_dir / PRUNED).exists():
+        clamp = "in 1/scene unit, each primitive clamped at 0 from below"
+        events(Note(f"extinction of {self.model.count} primitives on {on}, {clamp}"))
+        if (run.directory / PRUNED).exists():
             for line in describe_kept_shares(kept_shares(self.model)):
                 events(Note(line))
 
     def __len__(self) -> int:
         return len(self.pairs)
 
-    def _box(self) -> np.ndarray:
+    def _default_box(self) -> np.ndarray:
         if self.truth is not None:
             return np.asarray(self.truth.bounds.numpy())
         return find_matter_box(self.model, [conditions for conditions, _ in self.pairs])
 
-    def _compare(self, index: int, events: Events) -> dict[str, float] | None:
+    def _compare_frame(self, index: int, events: Events) -> dict[str, float] | None:
         """Return the frame's errors against the truth, on the truth's own points."""
         if self.truth is None:
             return None
@@ -217,9 +208,9 @@ class _FrameSequence:
         events(Note(f"{self.truth.frames[number].name}  {describe_conditions(conditions)}  {words}"))
         return numbers
 
-    def _scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
+    def _find_scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
         """Return the largest extinction shown, the factor on opacities of volumes, and the middle of the matter."""
-        matrix, shape = lattice(box, _COARSE)
+        matrix, shape = lattice(box, _SCALE_POINTS)
         most, depth, total = 0.0, 0.0, np.zeros(shape)
         for conditions, number in self.pairs:
             grids = [density_grid(self.model, conditions, matrix, shape, where=self.device).numpy()]
@@ -235,7 +226,7 @@ class _FrameSequence:
             float(np.average(np.arange(n), weights=weights.sum(tuple({0, 1, 2} - {a})))) for a, n in enumerate(shape)
         ]
         focus = matrix[:3, :3].numpy() @ np.array(index) + matrix[:3, 3].numpy()
-        return _round_up(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
+        return _round_scale_end(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
 
     def frame(self, index: int) -> FieldFrame:
         """Make a frame; its grids are computed once per frame object."""
@@ -260,7 +251,7 @@ class _FrameSequence:
         )
 
 
-def _round_up(value: float) -> float:
+def _round_scale_end(value: float) -> float:
     """Return the next number of two digits, for the end of a scale; 1 for 0."""
     if not value > 0:
         return 1.0

@@ -1,12 +1,10 @@
-"""The numbers of a fitted model: every held-out view, their means, and what the task adds.
+"""Measure a model: every held-out view, their means, and what the task adds.
 
-PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set also
-gets both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``), if its channels are red, green and blue; a task
-with a display of its own gets both of what that shows instead (``psnr_display``, ``ssim_display``). Where it marks a
-part of a view (the union of all that a camera ever sees of a volume), the error there counts on its own: a black
-background flatters. For comparing with other people's tables
-``ssim_3dgs`` is the SSIM of what is displayed as the tools of 3D Gaussian splatting count it, and ``lpips`` and
-``lpips_3dgs``, where the user has weights, are LPIPS as published and as these tools take it.
+PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set of
+red, green and blue also gets both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``); a task with a display
+of its own gets both of that display (``psnr_display``, ``ssim_display``). Where the task masks a part of a view, the
+error there is also given alone, as a black background flatters. ``ssim_3dgs`` is the SSIM of the displayed image by the
+rule of the tools of 3D Gaussian splatting; ``lpips`` and ``lpips_3dgs`` are LPIPS as published and by that rule.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.config import Job, find_run_plugins
+from neuprim.config import Job
 from neuprim.core.channels import Channels, find_channels
 from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
@@ -38,28 +36,26 @@ from neuprim.core.notices import warn_once
 from neuprim.core.render import RenderSettings, choose_backend, render
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.returns import call_task_clips, call_task_diagnose, call_task_mask, call_task_metrics
-from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device
+from neuprim.runs.open import StoredRun, load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.render_config import estimate_file_bytes, parse_render_config
 from neuprim.version import __version__
 
-_VISIBLE = 20 * math.log10(255)
-"""dB: smaller errors than one of 255 levels are not visible, and an empty frame's black image has no error at all."""
+_VISIBLE_PSNR = 20 * math.log10(255)
+"""dB: errors below one of 255 levels are not visible, and the black image of an empty frame has no error at all."""
 
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """One view's numbers.
+    """Metrics of one view.
 
     Attributes:
         psnr, ssim: in the data set's colour space.
         seconds: of the forward pass alone.
         black: PSNR of an image of the background alone.
+        more: further numbers by name, see the module and :attr:`~neuprim.core.task.TaskSpec.metrics`: ``psnr_gain`` of
+            opaque photographs; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and
+            ``psnr_black_image_mask`` of an image without anything on it.
         empty: the model is not in the view; the image is the background alone.
-        more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``,
-            ``ssim_display`` of what the task's own display shows; ``psnr_gain`` of opaque photographs; ``ssim_3dgs``,
-            ``lpips``; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and
-            ``psnr_black_image_mask`` of an image without anything on it; what the task's
-            :attr:`~neuprim.core.task.TaskSpec.metrics` adds.
     """
 
     name: str
@@ -72,7 +68,7 @@ class ViewMetrics:
 
 
 def render_image(model: Primitives, view: View, settings: RenderSettings, background: Tensor) -> Tensor:
-    """(H, W, C) image of one view, without gradients; on the processor, wherever it was drawn."""
+    """Render one view without gradients: (H, W, C) on the CPU."""
     with torch.no_grad():
         return render(model, view.camera, view.conditions, settings, background).rgb.cpu()
 
@@ -83,23 +79,22 @@ def render_light_sum(
     lights: Sequence[Conditions],
     settings: RenderSettings,
     background: Tensor,
-    drawn: Callable[[Tensor], None] = lambda alpha: None,
+    on_alpha: Callable[[Tensor], None] = lambda alpha: None,
 ) -> Tensor:
-    """(H, W, C) sum of one view's images under conditions that change light alone, over the background once; as
-    :func:`draw`.
+    """Sum a view's images under one or more lights, over the background once: (H, W, C) on the CPU.
 
-    Exact for what is linear in light, as opacity does not depend on it. Sums are float64.
+    Exact for models that are linear in light, as opacity does not depend on it. Sums are float64.
 
     Args:
-        lights: one or more; each replaces the view's conditions of the same names.
-        drawn: called after every image, with its alpha.
+        lights: each replaces the view's conditions of the same names.
+        on_alpha: called after every image, with its alpha.
     """
     total, alpha = torch.zeros(()), torch.zeros(())
     for light in lights:
         with torch.no_grad():
             frame = render(model, view.camera, {**view.conditions, **light}, settings)
         total, alpha = total + frame.rgb.double(), frame.alpha
-        drawn(alpha)
+        on_alpha(alpha)
     return (total + (1.0 - alpha.double())[..., None] * background.double().to(alpha.device)).to(frame.rgb).cpu()
 
 
@@ -108,47 +103,47 @@ def measure_views(
     task: TaskSpec,
     dataset: Dataset,
     settings: RenderSettings,
-    channels: Channels,
-    seen: Callable[[int, View, Tensor, Tensor], None] | None = None,
     lpips: Lpips | None = None,
-    paint: Callable[[Primitives, View, Tensor], Tensor] | None = None,
+    on_view: Callable[[int, View, Tensor, Tensor], None] | None = None,
+    render_view: Callable[[Primitives, View, Tensor], Tensor] | None = None,
 ) -> list[ViewMetrics]:
-    """Every view of the test split, composited over the data set's background.
+    """Measure every view of the test split, composited over the data set's background.
 
     Args:
-        seen: called as ``seen(index, view, rendered, truth)`` for each, e.g. to keep pictures.
-        lpips: measured too, where there are weights for it.
-        paint: draws (model, view, background) in place of :func:`draw` with the settings.
+        lpips: is measured too, if given.
+        on_view: called as ``on_view(index, view, rendered, truth)`` for each, for example to keep pictures.
+        render_view: (model, view, background) -> image, in place of :func:`render_image` with the settings.
     """
-    views, background = dataset.test, dataset.background
+    views, background, channels = dataset.test, dataset.background, find_channels(task, dataset)
     result = []
     for i in range(len(views)):
         view, pixels = views.view(i), views.pixels(i)
         check_pixels("test", view, pixels, dataset.channels)
         truth = pixels.over(background)
         start = time.perf_counter()
-        rendered = render_image(model, view, settings, background) if paint is None else paint(model, view, background)
+        if render_view is None:
+            rendered = render_image(model, view, settings, background)
+        else:
+            rendered = render_view(model, view, background)
         seconds = time.perf_counter() - start
         empty = bool((rendered == background).all())
         if pixels.mask is not None:
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
-        counted = call_task_mask(task, dataset, i)
-        more = _more(rendered, truth, dataset, channels, counted, pixels.mask) | _as_others(
-            rendered, truth, channels, lpips
-        )
+        mask = call_task_mask(task, dataset, i)
+        more = _display_metrics(rendered, truth, dataset, channels, pixels.mask)
+        more |= _mask_metrics(rendered, truth, dataset, mask) | _table_metrics(rendered, truth, channels, lpips)
         if pixels.alpha is None:
             more["psnr_gain"] = psnr_gain(rendered, truth, pixels.mask)
         more |= call_task_metrics(task, dataset, i, rendered, truth)
         black = psnr(background.to(truth).expand_as(truth), truth, pixels.mask)
         score = psnr(rendered, truth, pixels.mask)
         result.append(ViewMetrics(view.name, score, ssim(rendered, truth), seconds, black, more, empty))
-        if seen is not None:
-            seen(i, view, rendered, truth)
+        if on_view is not None:
+            on_view(i, view, rendered, truth)
     if all(view.empty for view in result):
         warn_once(
             f"{dataset.name}: the model is in none of {len(result)} test views, which show the background alone; "
-            f"expected starting points where "
-            f"the cameras look: {GIVE_POINTS}"
+            f"expected starting points where the cameras look: {GIVE_POINTS}"
         )
     return result
 
@@ -156,73 +151,74 @@ def measure_views(
 def measure_quality(
     model: Primitives, task: TaskSpec, dataset: Dataset, settings: RenderSettings
 ) -> tuple[float, float]:
-    """Mean PSNR and SSIM of the held-out views, as ``metrics.json`` has them, drawn where such views are best drawn."""
-    views = measure_views(
-        move_to_render_device(model, settings, dataset.test.view(0)),
-        task,
-        dataset,
-        settings,
-        find_channels(task, dataset),
-    )
+    """Mean PSNR and SSIM of the held-out views, as ``metrics.json`` has them, rendered on the fastest device."""
+    views = measure_views(move_to_render_device(model, settings, dataset.test.view(0)), task, dataset, settings)
     return float(np.mean([v.psnr for v in views])), float(np.mean([v.ssim for v in views]))
 
 
-def _more(
-    rendered: Tensor, truth: Tensor, dataset: Dataset, channels: Channels, part: Tensor | None, valid: Tensor | None
+def _display_metrics(
+    rendered: Tensor, truth: Tensor, dataset: Dataset, channels: Channels, valid: Tensor | None
 ) -> dict[str, float]:
-    more: dict[str, float] = {}
     if channels.own is not None:
-        shown, wanted = channels.display(rendered), channels.display(truth)
-        more |= {"psnr_display": psnr(shown, wanted, valid), "ssim_display": ssim(shown, wanted)}
+        kind, a, b = "display", channels.display(rendered), channels.display(truth)
     elif dataset.color_space == "linear" and channels.plain:
-        shown, wanted = (images.linear_to_srgb(x.clamp_min(0.0)) for x in (rendered, truth))
-        more |= {"psnr_srgb": psnr(shown, wanted, valid), "ssim_srgb": ssim(shown, wanted)}
-    if part is not None and bool(part.any()):
-        black = dataset.background.to(truth).expand_as(truth)
-        more["psnr_mask"] = psnr(rendered, truth, part)
-        more["mse_mask"] = float((rendered - truth)[part].double().square().mean())
-        more["psnr_black_image"], more["psnr_black_image_mask"] = psnr(black, truth), psnr(black, truth, part)
-    return more
+        kind, a, b = "srgb", *(images.linear_to_srgb(x.clamp_min(0.0)) for x in (rendered, truth))
+    else:
+        return {}
+    return {f"psnr_{kind}": psnr(a, b, valid), f"ssim_{kind}": ssim(a, b)}
 
 
-def _as_others(rendered: Tensor, truth: Tensor, channels: Channels, lpips: Lpips | None) -> dict[str, float]:
-    """The numbers of other people's tables, of what is displayed."""
-    shown, wanted = (channels.display(x).clamp(0.0, 1.0) for x in (rendered, truth))
-    found = {"ssim_3dgs": ssim_3dgs(shown, wanted)}
-    if lpips is not None and min(shown.shape[:2]) >= lpips.least:
-        found |= {"lpips": lpips(shown, wanted), "lpips_3dgs": lpips.unmapped(shown, wanted)}
+def _mask_metrics(rendered: Tensor, truth: Tensor, dataset: Dataset, mask: Tensor | None) -> dict[str, float]:
+    if mask is None or not bool(mask.any()):
+        return {}
+    black = dataset.background.to(truth).expand_as(truth)
+    return {
+        "psnr_mask": psnr(rendered, truth, mask),
+        "mse_mask": float((rendered - truth)[mask].double().square().mean()),
+        "psnr_black_image": psnr(black, truth),
+        "psnr_black_image_mask": psnr(black, truth, mask),
+    }
+
+
+def _table_metrics(rendered: Tensor, truth: Tensor, channels: Channels, lpips: Lpips | None) -> dict[str, float]:
+    """The displayed image by the rules of other people's tables."""
+    a, b = (channels.display(x).clamp(0.0, 1.0) for x in (rendered, truth))
+    found = {"ssim_3dgs": ssim_3dgs(a, b)}
+    if lpips is not None and min(a.shape[:2]) >= lpips.least:
+        found |= {"lpips": lpips(a, b), "lpips_3dgs": lpips.unmapped(a, b)}
     return found
 
 
-def evaluate_run(run_dir: Path, lpips: str | Path | None = None, words: Sequence[str] = ()) -> dict[str, Any]:
-    """The metrics of a run's last checkpoint, measured again from disk alone; the same numbers as the run's own.
+def evaluate_run(
+    run: Path | StoredRun, lpips: str | Path | None = None, overrides: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Measure a run's last checkpoint again, from disk alone; the same numbers as the run's own.
 
     Args:
-        lpips: weights for LPIPS; without, those that the run names.
-        words: overrides of a render configuration (:mod:`neuprim.runs.render_config`); ``model_bytes`` is the size of
-            the run's file but for what these change.
+        lpips: weights for LPIPS; None for those that the run names.
+        overrides: of a render configuration (:mod:`neuprim.runs.render_config`); ``model_bytes`` is the size of the
+            run's file with these changes.
     """
-    config, task, model, header = load_run(run_dir)
-    point = parse_render_config(words, config.renderer, model)
-    config = replace(config, renderer=point.settings)
-    weights = lpips or config.metrics.lpips
+    run = load_run(run)
+    config = parse_render_config(overrides, run.config.renderer, run.model)
+    run = replace(run, config=replace(run.config, renderer=config.settings))
+    weights = lpips or run.config.metrics.lpips
     distance = None if weights is None else Lpips.load(weights)
-    with find_run_plugins(config).attribute_errors():
-        dataset = load_dataset(config, task, run_dir=run_dir)
-        check_dataset(dataset, task.conditions)
-        path = model_file(run_dir)
-        training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
-        channels = find_channels(task, dataset)
-        part = point.prepare_model(model)
-        size = estimate_file_bytes(path, model, part, point.storage)
-        model = move_to_render_device(part, config.renderer, dataset.test.view(0))
-        views = measure_views(model, task, dataset, config.renderer, channels, lpips=distance, paint=point.render_view)
-        return summarize_metrics(Job(config, task, dataset, model), channels, views, size, training, distance)
+    with run.plugins.attribute_errors():
+        dataset = load_dataset(run)
+        check_dataset(dataset, run.task.conditions)
+        training = {name: run.header.get(name) for name in ("iterations", "train_seconds")}
+        model = config.prepare_model(run.model)
+        size = estimate_file_bytes(model_file(run.directory), run.model, model, config.storage)
+        model = move_to_render_device(model, config.settings, dataset.test.view(0))
+        views = measure_views(model, run.task, dataset, config.settings, distance, render_view=config.render_view)
+        return summarize_metrics(run, dataset, model, views, size, training, distance)
 
 
 def summarize_metrics(
     job: Job,
-    channels: Channels,
+    dataset: Dataset,
+    model: Primitives,
     views: Sequence[ViewMetrics],
     model_bytes: int,
     training: Mapping[str, Any],
@@ -232,15 +228,12 @@ def summarize_metrics(
     """The content of ``metrics.json``.
 
     Args:
-        job: with its data and its model.
         training: iterations and train_seconds as the run recorded them.
-        split: what the judging views are; those that are not the data set's test views make none of the task's films.
+        split: which views are measured; only the data set's own test views make the task's films.
     """
-    config, task, dataset, model = job.config, job.task, job.dataset, job.model
-    assert dataset is not None and model is not None
-    worst, camera = min(views, key=lambda v: v.psnr), dataset.test.view(0).camera
-    lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions, config.renderer)
-    backend = choose_backend(lowered, config.renderer)
+    config, task, channels = job.config, job.task, find_channels(job.task, dataset)
+    worst, first = min(views, key=lambda v: v.psnr), dataset.test.view(0)
+    backend = choose_backend(model.lower(first.camera, first.conditions, config.renderer), config.renderer)
     seconds = sorted(v.seconds for v in views)
     return {
         "task": config.task,
@@ -251,13 +244,13 @@ def summarize_metrics(
         **to_json("psnr", float(np.mean([v.psnr for v in views]))),
         "ssim": float(np.mean([v.ssim for v in views])),
         **means([v.more for v in views]),
-        **_lpips(views, lpips),
+        **_lpips_entries(views, lpips),
         **to_json("psnr_worst", worst.psnr),
         "view_worst": worst.name,
-        "worse_than_black_image": [v.name for v in views if v.psnr < min(v.black, _VISIBLE)],
-        "per_view": [_entry(v) for v in views],
+        "worse_than_black_image": [v.name for v in views if v.psnr < min(v.black, _VISIBLE_PSNR)],
+        "per_view": [_view_entry(v) for v in views],
         **({"views_empty": sum(v.empty for v in views)} if any(v.empty for v in views) else {}),
-        **_per_frame(call_task_clips(task, dataset) if split == "test" else (), views),
+        **_frame_means(call_task_clips(task, dataset) if split == "test" else (), views),
         "primitives": model.count,
         "parameters": model.count * model.parameters_per_primitive,
         "parameters_per_primitive": model.parameters_per_primitive,
@@ -268,7 +261,7 @@ def summarize_metrics(
         "device": backend.computing_on(config.renderer),
         "checkpoint": "last",
         "downsampling": dataset.downsampling,
-        "image_size": [camera.width, camera.height],
+        "image_size": [first.camera.width, first.camera.height],
         "background": [round(float(x), 6) for x in dataset.background],
         "color_space": dataset.color_space,
         "channels": list(channels.names),
@@ -288,41 +281,35 @@ def summarize_metrics(
     }
 
 
-def _entry(view: ViewMetrics) -> dict[str, Any]:
+def _view_entry(view: ViewMetrics) -> dict[str, Any]:
     entry = {"name": view.name, **to_json("psnr", view.psnr), "ssim": view.ssim, "seconds": view.seconds}
     for name, value in view.more.items():
         entry |= to_json(name, value)
     return entry
 
 
-def _lpips(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dict[str, Any]:
+def _lpips_entries(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dict[str, Any]:
     """Which network measured LPIPS, or why none did: a missing number is not a zero."""
     if lpips is None:
-        return {
-            "lpips": None,
-            "not_measured": {"lpips": "no weights were given (metrics.lpips=FILE, or neuprim eval --lpips FILE)"},
-        }
+        why = "no weights were given (metrics.lpips=FILE, or neuprim eval --lpips FILE)"
+        return {"lpips": None, "not_measured": {"lpips": why}}
     if any("lpips" not in v.more for v in views):
-        return {
-            "lpips": None,
-            "lpips_3dgs": None,
-            "not_measured": {"lpips": f"some view is lower or narrower than {lpips.least} pixels"},
-        }
+        why = f"some view is lower or narrower than {lpips.least} pixels"
+        return {"lpips": None, "lpips_3dgs": None, "not_measured": {"lpips": why}}
     return {"lpips_network": lpips.network}
 
 
-def _per_frame(made: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[str, Any]:
-    """Means over the clips of the test views of each of their frames, where these are of one length."""
-    clips = [[views[i] for i in clip.views] for clip in made if clip.source is None]
-    if not clips or len({len(c) for c in clips}) != 1:
+def _frame_means(clips: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[str, Any]:
+    """Means over the clips of the test views of each of their frames, if all clips have one length."""
+    own = [[views[i] for i in clip.views] for clip in clips if clip.source is None]
+    if not own or len({len(clip) for clip in own}) != 1:
         return {}
     frames = []
-    for same in zip(*clips, strict=True):
-        entry = to_json("psnr", float(np.mean([v.psnr for v in same]))) | {
-            "ssim": float(np.mean([v.ssim for v in same]))
-        }
+    for same in zip(*own, strict=True):
+        entry = to_json("psnr", float(np.mean([v.psnr for v in same])))
+        entry["ssim"] = float(np.mean([v.ssim for v in same]))
         for name in ("psnr_mask", "psnr_black_image"):
-            values = [v.more[name] for v in same if name in v.more]
-            entry |= to_json(name, float(np.mean(values))) if values else {}
+            if values := [v.more[name] for v in same if name in v.more]:
+                entry |= to_json(name, float(np.mean(values)))
         frames.append(entry)
     return {"per_frame": frames}

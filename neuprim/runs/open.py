@@ -1,22 +1,24 @@
-"""A finished run, opened again: its configuration, task, model, data and metrics, from disk alone."""
+"""Open a finished run again: its configuration, task, model, data and metrics, from disk alone."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import RunConfig, find_run_plugins, scene_of, task_of
+from neuprim.config import Job, RunConfig
 from neuprim.config.trust import check_stored, refuse_links
 from neuprim.core.cameras.world import World
-from neuprim.core.checkpoint import load_model, read_header
+from neuprim.core.checkpoint import load_model
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import cache_directory
 from neuprim.core.io.plain import finite, load_json
+from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.prunable import count_numbers, nonzero_rows
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.backends import computing_device, device_of, with_available_device
 from neuprim.core.task import SceneContext, TaskSpec
@@ -28,73 +30,68 @@ from neuprim.plugins.registry import PluginError
 COMPRESSED = "model.neuprim"
 """A run's model in few bits, as ``neuprim compress`` writes it."""
 
+PRUNED = "pruned.json"
+"""In the directory of a pruned model: how it was pruned."""
+
 Progress = Callable[[str, float], None]
+
+
+def ignore_progress(text: str, fraction: float) -> None:
+    """Do nothing."""
+
+
+@dataclass(frozen=True)
+class StoredRun(Job):
+    """A finished run in a directory. ``task`` reads positions in the coordinates of the data's files.
+
+    Attributes:
+        header: of the model file.
+        scene_task: the same task, which reads positions in the coordinates of the model.
+    """
+
+    directory: Path
+    model: Primitives
+    header: dict[str, Any]
+    scene_task: TaskSpec
+
+    @property
+    def world(self) -> World:
+        """The transform between the coordinates of the model and those of the data's files."""
+        return World.of(self.header, str(model_file(self.directory)))
 
 
 def model_file(run_dir: Path) -> Path:
     """The model of a run directory: ``model.safetensors``, or the compressed one where that is the only one."""
-    whole, compressed = run_dir / "model.safetensors", run_dir / COMPRESSED
-    return compressed if compressed.exists() and not whole.exists() else whole
+    full, compressed = run_dir / "model.safetensors", run_dir / COMPRESSED
+    return compressed if compressed.exists() and not full.exists() else full
 
 
-def load_dataset(
-    config: RunConfig,
-    task: TaskSpec,
-    progress: Callable[[str, float], None] = lambda text, fraction: None,
-    run_dir: Path | None = None,
-) -> Dataset:
-    """The data set of a run's configuration.
+def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
+    """Load the configuration, task and model of a run directory; a run that is loaded already is returned as it is.
+
+    Warns if another version of neuprim or of the task's package made the run.
 
     Args:
-        run_dir: the finished run that the configuration was read from: messages name its file. None: a run that is only
-            about to be made.
+        named: whether warnings name the file; not for a directory that the user does not know.
 
     Raises:
-        NeuprimError: what the loader refuses, or that it crashed.
+        CheckpointError, ConfigError: names the file that is missing or damaged.
     """
-    context = make_scene_context(config, progress)
-    if (
-        run_dir is not None and model_file(run_dir).exists()
-    ):  # its cameras and points lie as they did for the model, whatever was added since
-        context = replace(context, world=World.of(read_header(model_file(run_dir), "model"), str(model_file(run_dir))))
-    load = scene_of(config, task, None if run_dir is None else run_dir / "config.yaml").spec.load
-    scene = find_run_plugins(config).scene
-    with attribute_errors(scene, "load"):
-        dataset = load(config.scene, context)
-    if not isinstance(dataset, Dataset):
-        found = f"a {type(dataset).__name__}" if dataset is not None else "None"
-        raise PluginError(f"{scene.label}: its loader returned {found}; expected a neuprim.core.data.Dataset")
-    return dataset
-
-
-def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:
-    """Configuration, task, model and model header of a run directory; the task reads positions in the world of the
-    run's files.
-
-    Warns where another version of neuprim or of the task's package made the run.
-
-    Args:
-        named: whether what is said about these names the file; not for a directory that the user does not know.
-
-    Raises:
-        CheckpointError, ConfigError: naming the file that is missing or damaged.
-    """
-    refuse_links(run_dir)
-    file = run_dir / "config.yaml"
-    config, place = RunConfig.from_yaml(file), file if named else None
-    task = task_of(config, place)
+    if isinstance(run, StoredRun):
+        return run
+    refuse_links(run)
+    config = RunConfig.from_yaml(run / "config.yaml")
+    if not named:
+        config = replace(config, source=None)
+    task = Job.of(config).task
     if config.made_by is not None:
-        warn_of_other_neuprim(config.made_by, place)
-    model, header = load_model(model_file(run_dir), task)
-    world = World.of(header, str(model_file(run_dir)))
-    if any(spec.place for spec in task.conditions) and not world.identity:
-        task = replace(task, conditions=tuple(spec.within(world) for spec in task.conditions))
-    return replace(config, renderer=with_available_device(config.renderer)), task, model, header
-
-
-def move_to_render_device(model: Primitives, settings: RenderSettings, view: View) -> Primitives:
-    """The model where views like this one are best drawn."""
-    return model.to(device_of(model, settings, view.camera, view.conditions))
+        warn_of_other_neuprim(config.made_by, config.source)
+    model, header = load_model(model_file(run), task)
+    config = replace(config, renderer=with_available_device(config.renderer))
+    stored = StoredRun(config, task, run, model, header, task)
+    if any(spec.place for spec in task.conditions) and not stored.world.identity:
+        task = replace(task, conditions=tuple(spec.within(stored.world) for spec in task.conditions))
+    return replace(stored, task=task)
 
 
 def make_scene_context(config: RunConfig, progress: Progress) -> SceneContext:
@@ -108,30 +105,58 @@ def make_scene_context(config: RunConfig, progress: Progress) -> SceneContext:
     return SceneContext(config.seed, cache_directory() / "scenes", progress, computing_device(config.renderer))
 
 
-def open_run(run_dir: Path, progress: Progress = lambda text, fraction: None) -> TrainedModel:
-    """The model of a run directory; its scene is loaded only when asked for.
+def load_dataset(job: Job, progress: Progress = ignore_progress) -> Dataset:
+    """Load the data set of a job. That of a stored run lies as it did for the model, whatever was added to its files.
 
     Raises:
-        CheckpointError, ConfigError: naming the file that is missing or damaged.
+        NeuprimError: the loader refuses its files or settings, or it crashed.
     """
-    config, task, model, header = load_run(run_dir)
-    file = run_dir / "config.yaml"
+    context = make_scene_context(job.config, progress)
+    if isinstance(job, StoredRun):
+        context = replace(context, world=job.world)
+    scene, source = job.scene, job.plugins.scene
+    with attribute_errors(source, "load"):
+        dataset = scene.spec.load(job.config.scene, context)
+    if not isinstance(dataset, Dataset):
+        found = f"a {type(dataset).__name__}" if dataset is not None else "None"
+        raise PluginError(f"{source.label}: its loader returned {found}; expected a neuprim.core.data.Dataset")
+    return dataset
+
+
+def open_run(run: Path | StoredRun, progress: Progress = ignore_progress) -> TrainedModel:
+    """Open the model of a run for exporters and inspectors; its scene is loaded only when asked for.
+
+    Raises as :func:`load_run`.
+    """
+    stored = load_run(run)
+    config = stored.config
 
     def volume() -> VolumeSource | None:
-        load = scene_of(config, task, file).spec.volume
+        load = stored.scene.spec.volume
         if load is None:
             return None
-        with attribute_errors(find_run_plugins(config).scene, "volume"):
+        with attribute_errors(stored.plugins.scene, "volume"):
             return load(config.scene, make_scene_context(config, progress))
 
-    def dataset() -> Dataset:
-        return load_dataset(config, task, progress, run_dir)
+    return TrainedModel(
+        stored.directory,
+        stored.task,
+        stored.model,
+        stored.header,
+        config.scene,
+        config.renderer,
+        lambda: load_dataset(stored, progress),
+        volume,
+    )
 
-    return TrainedModel(run_dir, task, model, header, config.scene, config.renderer, dataset, volume)
+
+def move_to_render_device(model: Primitives, settings: RenderSettings, view: View) -> Primitives:
+    """The model on the device where views like this one are best drawn."""
+    return model.to(device_of(model, settings, view.camera, view.conditions))
 
 
 def read_metrics(run_dir: Path) -> dict[str, Any]:
-    """``metrics.json`` of a run.
+    """Read ``metrics.json`` of a run.
 
     Raises:
         DataError: missing or damaged.
@@ -146,3 +171,19 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
     ):
         raise DataError(f"{path}: expected an object with metrics")
     return data
+
+
+def kept_shares(model: Primitives) -> dict[str, float]:
+    """Group of prunable units -> share of its numbers that pruning kept, 0 to 1, as ``density.neuron 0``."""
+    kept: dict[str, float] = {}
+    sizes: dict[str, int] = {}
+    for name, unit in prunable_units_by_name(model.density, model.colour).items():
+        group, size = f"{name.partition('.')[0]}.{unit.group or unit.name}", count_numbers(unit, model.params)
+        share = float(nonzero_rows(unit, model.params).float().mean()) if model.count else 0.0
+        kept[group], sizes[group] = kept.get(group, 0.0) + size * share, sizes.get(group, 0) + size
+    return {group: value / sizes[group] for group, value in kept.items()}
+
+
+def describe_kept_shares(kept: dict[str, float]) -> list[str]:
+    """A line for every group of prunable units that is not whole."""
+    return [f"{name}: {share:.0%} of its numbers are kept" for name, share in kept.items() if share < 1]

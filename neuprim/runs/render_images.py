@@ -8,7 +8,6 @@ from pathlib import Path
 
 import torch
 
-from neuprim.config import find_run_plugins, task_of
 from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.cameras.world import World
@@ -25,9 +24,9 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.returns import call_task_facts, call_task_orbit
-from neuprim.runs.layers import Layers
+from neuprim.runs.exr_layers import ExrLayers
 from neuprim.runs.measure import render_light_sum
-from neuprim.runs.open import load_dataset, load_run, move_to_render_device
+from neuprim.runs.open import StoredRun, load_dataset, load_run, move_to_render_device
 from neuprim.runs.render_config import parse_render_config
 from neuprim.runs.run_directory import refuse_results
 
@@ -37,10 +36,7 @@ SPACES = WORLD, SCENE = ("world", "scene")
 SETS = ("orbit", "test")
 """Cameras of the run's own."""
 
-_TIME = "time"
-
 ANIMATIONS = ("webp", "gif", "mp4")
-_RAW = ("exr", "npy")
 FORMATS = ("png", "exr", "npy", *ANIMATIONS)
 """What ``neuprim render`` writes: pictures of what the task's channels look like, but all channels as they are in EXR
 and npy."""
@@ -86,7 +82,7 @@ class RenderRequest:
 
 
 def render_run(
-    run_dir: Path,
+    run: Path | StoredRun,
     request: RenderRequest,
     notify: Callable[[str], None] = lambda text: None,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
@@ -102,10 +98,11 @@ def render_run(
         the model.
         BackendUnavailable: a format whose package is missing.
     """
-    session = _RenderSession(run_dir, request, notify, progress)
+    run = load_run(run)
+    session = _RenderSession(run, request, notify, progress)
     targets = session.choose_targets()
     if not request.overwrite:
-        refuse_results(run_dir, targets)
+        refuse_results(run.directory, targets)
     for target in targets:
         target.parent.mkdir(parents=True, exist_ok=True)
     if session.animate:
@@ -120,56 +117,54 @@ class _RenderSession:
 
     def __init__(
         self,
-        run_dir: Path,
+        run: StoredRun,
         request: RenderRequest,
         notify: Callable[[str], None],
         progress: Callable[[str, float], None],
     ) -> None:
-        self.run_dir, self.request, self.notify, self.progress = run_dir, request, notify, progress
-        config, task, model, header = load_run(run_dir)
-        in_world = request.space == WORLD
-        self.config, self.header = config, header
-        self.world = World.of(header, str(run_dir)) if in_world else World()
-        self.task = task if in_world else task_of(config, run_dir / "config.yaml")
-        self.render_config = parse_render_config(request.overrides, config.renderer, model)
-        self.plugins = find_run_plugins(config)
-        self.background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
-        self.channels = read_stored_channels(run_dir, header, self.task, model.colour.channels)
+        self.run, self.request, self.notify, self.progress = run, request, notify, progress
+        channels, in_world = run.model.colour.channels, request.space == WORLD
+        self.world = run.world if in_world else World()
+        self.task = run.task if in_world else run.scene_task
+        self.render_config = parse_render_config(request.overrides, run.config.renderer, run.model)
+        self.background = torch.tensor([float(x) for x in run.header.get("background", [0.0] * channels)])
+        self.channels = read_stored_channels(run.directory, run.header, self.task, channels)
         self.lights = self._load_lights(request.environment)
         self.views, self.fps = self._load_views()
-        with self.plugins.attribute_errors():
+        with run.plugins.attribute_errors():
             self.views, animated = with_conditions(self.views, self.task, request.conditions, notify)
-            model = self.render_config.prepare_model(model)
+            model = self.render_config.prepare_model(run.model)
         self.model = move_to_render_device(model, self.render_config.settings, self.views[0])
-        self.format = request.format or _choose_format(request.out, animated)
+        suffix = "" if request.out is None else request.out.suffix.lower().removeprefix(".")
+        usual = suffix if suffix in FORMATS else "webp" if animated else "png"
+        self.format = request.format or usual
         self.animate = self.format in ANIMATIONS and len(self.views) > 1
         for option, value in (("--layers", request.layers), ("--datatype", request.datatype)):
             if value is not None and self.format != "exr":
                 raise ConfigError(f"{option} {value}: of OpenEXR files; expected --format exr, found {self.format}")
-        self.layers = self._make_layers() if self.format == "exr" else None
-        if self.channels.partial and self.format not in _RAW:
+        self.layers: ExrLayers | None = None
+        if self.format == "exr":
+            self.layers = ExrLayers(
+                run.directory,
+                self.task,
+                self.channels,
+                self.render_config,
+                self.background,
+                request.layers,
+                request.datatype == "half",
+                self.lights,
+                self.world,
+            )
+        if self.channels.partial and self.format not in ("exr", "npy"):
             notify(f"shown: {self.channels.shown}; --format exr and npy hold all channels")
         self._passes = 0  # images rendered so far, one per view and light
         self._visible = [False] * len(self.views)
-
-    def _make_layers(self) -> Layers:
-        return Layers(
-            self.run_dir,
-            self.task,
-            self.channels,
-            self.render_config,
-            self.background,
-            self.request.layers,
-            self.request.datatype == "half",
-            self.lights,
-            self.world,
-        )
 
     def _load_lights(self, environment: EnvironmentFile | None) -> Sequence[Conditions]:
         """Conditions of the lights that stand for an environment; none without one."""
         if environment is None:
             return ()
-        with self.plugins.attribute_errors():
+        with self.run.plugins.attribute_errors():
             illumination = self._illuminate(environment)
         lights = illumination.frames(environment.guesses)
         if not lights:
@@ -187,9 +182,9 @@ class _RenderSession:
             raise ConfigError(
                 f"--environment {environment.path}: task {self.task.name!r} has no light that it could replace"
             )
-        facts = self.header.get("data")
+        facts = self.run.header.get("data")
         if facts is None:  # a model of an imported file has none
-            facts = call_task_facts(self.task, load_dataset(self.config, self.task))
+            facts = call_task_facts(self.task, load_dataset(self.run))
         if not isinstance(facts, dict):
             raise DataError(f"the model's header: data is {type(facts).__name__}; expected an object")
         up = JsonReader(facts, "the model's header: data").array("up", (3,), "3 numbers")
@@ -207,11 +202,11 @@ class _RenderSession:
             file = read_camera_file(Path(request.camera), request.size)
             for note in file.notes:
                 self.notify(f"{request.camera}: {note}")
-            views, fps = _views_of(file, self.task, request.conditions), fps or file.fps
+            views, fps = _camera_file_views(file, self.task, request.conditions), fps or file.fps
             views = [replace(view, camera=self.world.scene_camera(view.camera)) for view in views]
         else:
-            dataset = load_dataset(self.config, self.task, run_dir=self.run_dir)
-            with self.plugins.attribute_errors():
+            dataset = load_dataset(self.run)
+            with self.run.plugins.attribute_errors():
                 if request.camera == "orbit":
                     views = list(call_task_orbit(self.task, dataset, request.frames))
                 else:
@@ -234,11 +229,11 @@ class _RenderSession:
         if single and out is not None:
             return [out]
         # "renders" holds the report's pictures
-        name = _file_name(Path(self.request.camera.partition("#")[0]).resolve().stem)
-        folder = self.run_dir / "frames" / name if out is None else out
+        (name,) = _view_file_names([Path(self.request.camera.partition("#")[0]).resolve().stem])
+        folder = self.run.directory / "frames" / name if out is None else out
         if self.animate:
             return [folder.with_suffix(suffix)]
-        return [folder / f"{name}{suffix}" for name in _file_names(self.views)]
+        return [folder / f"{name}{suffix}" for name in _view_file_names([view.name for view in self.views])]
 
     def write_animation(self, path: Path) -> None:
         stack = [self.channels.display(self._render(view)) for view in self.views]
@@ -248,9 +243,9 @@ class _RenderSession:
     def write_images(self, paths: Sequence[Path]) -> None:
         for view, path in zip(self.views, paths, strict=True):
             if self.layers is None:
-                _write(path, self.format, self._render(view), self.channels, self.fps)
+                _write_image(path, self.format, self._render(view), self.channels, self.fps)
             else:
-                with self.plugins.attribute_errors():
+                with self.run.plugins.attribute_errors():
                     self.layers.write(path, self.model, view, self._count_pass)
         try:
             self._check_visible()
@@ -261,7 +256,7 @@ class _RenderSession:
 
     def _render(self, view: View) -> torch.Tensor:
         config = self.render_config
-        with self.plugins.attribute_errors():
+        with self.run.plugins.attribute_errors():
             if not self.lights:
                 return config.render_view(self.model, view, self.background, self._count_pass)
             small = config.scale_view(view)
@@ -306,17 +301,17 @@ def _describe_position(model: Primitives, view: View, world: World) -> str:
     seen = world.world_camera(view.camera)
     at, towards = seen.position.tolist(), seen.viewmat[2, :3].tolist()
     return (
-        f"the model is within {_point(low)} to {_point(high)}, and {view.name} at {_point(at)} looks towards "
-        f"{_point(towards)}"
+        f"the model is within {_format_point(low)} to {_format_point(high)}, and {view.name} at {_format_point(at)} "
+        f"looks towards {_format_point(towards)}"
     )
 
 
-def _point(numbers: Sequence[float]) -> str:
+def _format_point(numbers: Sequence[float]) -> str:
     return "(" + ", ".join(f"{x:.7g}" for x in numbers) + ")"
 
 
-def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:
-    """One image: all channels as the data set has them in npy, or what its channels look like."""
+def _write_image(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:
+    """Write one image: all channels as the data set has them in npy, or what its channels look like."""
     if format == "npy":
         write_npy(path, pixels.contiguous().numpy())
     elif format == "png":
@@ -327,21 +322,13 @@ def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fp
         write_animation(path, [channels.display(pixels)], fps or 12.0)
 
 
-def _views_of(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
+def _camera_file_views(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
     """A view per camera; each at its own time where the file has times, the task has one, and the user gave no
     other."""
-    timed = (
-        file.times is not None
-        and _TIME not in conditions
-        and any(spec.name == _TIME and not spec.shape for spec in task.conditions)
-    )
-    times = [{_TIME: torch.tensor(time)} for time in file.times or ()] if timed else [{} for _ in file.named]
+    has_time = any(spec.name == "time" and not spec.shape for spec in task.conditions)
+    timed = file.times is not None and "time" not in conditions and has_time
+    times = [{"time": torch.tensor(time)} for time in file.times or ()] if timed else [{} for _ in file.named]
     return [View(name, camera, time) for (name, camera), time in zip(file.named, times, strict=True)]
-
-
-def _choose_format(out: Path | None, animated: bool) -> str:
-    suffix = "" if out is None else out.suffix.lower().removeprefix(".")
-    return suffix if suffix in FORMATS else "webp" if animated else "png"
 
 
 def with_conditions(
@@ -359,33 +346,25 @@ def with_conditions(
     frames = in_step(texts, given)
     if frames > 1:
         count = max(frames, len(views))
-        names = f"{{}}_{{:0{max(3, len(str(count - 1)))}d}}"
-        views = [
-            replace(views[i * len(views) // count], name=names.format(views[i * len(views) // count].name, i))
-            for i in range(count)
-        ]
-    moments = [
-        {name: values[i * len(values) // len(views)] for name, values in given.items()} for i in range(len(views))
-    ]
-    views = [replace(v, conditions={**v.conditions, **moment}) for v, moment in zip(views, moments, strict=True)]
+        digits = max(3, len(str(count - 1)))
+        chosen = [views[i * len(views) // count] for i in range(count)]
+        views = [replace(view, name=f"{view.name}_{i:0{digits}d}") for i, view in enumerate(chosen)]
+    animated = []
+    for i, view in enumerate(views):
+        moment = {name: values[i * len(values) // len(views)] for name, values in given.items()}
+        animated.append(replace(view, conditions={**view.conditions, **moment}))
     for spec in task.conditions:
-        for v in views:
-            if spec.name not in v.conditions:
+        for view in animated:
+            if spec.name not in view.conditions:
                 raise ConfigError(
-                    f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give {flag(spec.name)}"
+                    f"view {view.name} has no {spec.name}, which task {task.name!r} needs; give {flag(spec.name)}"
                 )
-    return views, frames > 1
+    return animated, frames > 1
 
 
-def _file_names(views: Sequence[View]) -> list[str]:
-    """Of each view, with its number where two would share a file."""
-    names = [_file_name(v.name) for v in views]
-    return (
-        names
-        if len({name.lower() for name in names}) == len(names)
-        else [f"{i:03d}_{name}" for i, name in enumerate(names)]
-    )
-
-
-def _file_name(name: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
+def _view_file_names(names: Sequence[str]) -> list[str]:
+    """File names of views, with their numbers where two would share a file."""
+    names = ["".join(c if c.isalnum() or c in "-_." else "_" for c in name) for name in names]
+    if len({name.lower() for name in names}) == len(names):
+        return list(names)
+    return [f"{i:03d}_{name}" for i, name in enumerate(names)]

@@ -1,20 +1,62 @@
-"""One run: fit, measure, draw and report, all in one directory that can be resumed."""
+"""One run in a directory: fit, measure, draw and report, at once or in chunks.
+
+Every chunk of a scene is a run of its own; then all of them are trained together as one model for the last part of the
+budget. ``chunks.json`` records what became of each chunk, so that nothing is done twice.
+"""
 
 from __future__ import annotations
 
+import copy
+from collections import Counter
+from collections.abc import Mapping
 from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from neuprim.config import RunConfig, find_run_plugins
+from neuprim.config import Job, RunConfig, find_run_plugins
 from neuprim.config.command_settings import LauncherSettings
+from neuprim.config.overrides import drop_place, quote_override
+from neuprim.core.checkpoint import load_model
+from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.metrics.image import format_metrics
+from neuprim.core.task import Chunks, Loss
 from neuprim.core.train.distributed.process_group import ProcessGroup
-from neuprim.runs.chunks import train_in_chunks
+from neuprim.core.train.trainer import Trainer
+from neuprim.plugins.attribution import attribute_errors
 from neuprim.runs.evaluate import evaluate_fitted
-from neuprim.runs.events import Events, Finishing, Note, ignore_event
-from neuprim.runs.fit import is_chunked, refuse_chunks
+from neuprim.runs.finetune import fine_tuner, steps_in
+from neuprim.runs.fit import (
+    Events,
+    Finishing,
+    Fitted,
+    Note,
+    Preparing,
+    ignore_event,
+    is_chunked,
+    refuse_chunks,
+)
+from neuprim.runs.ground_truth import render_ground_truth_for_training
+from neuprim.runs.launch.jobs import ENDED, JobStatus
+from neuprim.runs.launch_record import LaunchedRun, LaunchRecord, launch_missing_runs, read_launch_record
+from neuprim.runs.open import make_scene_context, model_file, read_metrics
 from neuprim.runs.run_directory import lock_directory
 from neuprim.runs.training import BetweenSteps, do_nothing_between, train_in_directory
+
+CHUNKS_FILE, CHUNKS_FOLDER = "chunks.json", "chunks"
+"""In a run's directory: the record, and the runs of the chunks."""
+
+JOINT_SHARE = 0.2
+"""Share of the budget in which the joined model is trained as one, so that primitives on both sides of a boundary adapt
+to each other. More of it makes the result worse (docs/dynamic.md)."""
+
+_MIN_PRIMITIVES = 8
+"""Primitives of a chunk, at least: their sizes follow from the distances between them."""
+
+
+class ChunksMissing(NeuprimError):
+    """Some chunks of a run failed; the text says which and why. The others are kept."""
 
 
 def run(
@@ -30,15 +72,14 @@ def run(
     once.
 
     Args:
-        events: told what happens.
         between: called between training steps, see :data:`~neuprim.runs.training.BetweenSteps`.
         group: the processes that train this model, each of which calls this with the same configuration; the first one
             alone writes files. None for one process.
         launcher: where the chunks of a scene are fitted, if it is fitted in chunks.
 
     Raises:
-        NeuprimError: the input's fault, another process that is at work there, or numbers that are not finite;
-            whatever was on disk before is intact.
+        NeuprimError: the input is at fault, another process is at work there, or numbers are not finite; what was on
+            disk before is intact.
         RankError: another rank ended; what was trained is in the checkpoint.
     """
     directory = config.output_dir
@@ -56,3 +97,180 @@ def run(
     if interrupted:
         raise KeyboardInterrupt
     return directory
+
+
+def fit_job(data: Mapping[str, Any], attempt: int, events: Events) -> str:
+    """Do a run as a job; returns its directory. After its worker died it resumes from its checkpoint, if any."""
+    config = RunConfig.from_dict(data)
+    return str(run(replace(config, resume=config.resume or attempt > 0), events))
+
+
+# ---------------------------------------------------------------- chunks
+
+
+@dataclass(frozen=True)
+class ChunkPlan:
+    """How a run is divided.
+
+    Attributes:
+        chunks: how the scene's task divides it and puts it together.
+        configs: of the chunks' runs. runs: their entries in the record.
+        steps: of the joined model's training; None: as many as fit into ``seconds``.
+    """
+
+    chunks: Chunks
+    configs: tuple[RunConfig, ...]
+    runs: tuple[LaunchedRun, ...]
+    steps: int | None
+    seconds: float | None
+
+
+def _load_chunks(config: RunConfig, events: Events) -> Chunks | None:
+    """How the scene of a configuration is fitted in chunks; None for in one. Raises NeuprimError."""
+    job = Job.of(config)
+    load = job.scene.spec.chunks
+    assert load is not None, "the caller asked for chunks"
+    context = make_scene_context(config, lambda text, fraction: events(Preparing(text, fraction)))
+    with attribute_errors(job.plugins.scene, "chunks"):
+        return load(config.to_dict(), context)
+
+
+def _plan_chunks(config: RunConfig, chunks: Chunks) -> ChunkPlan:
+    """The runs of the chunks, with their shares of primitives and budget; each has as many interventions into its
+    population as the whole run.
+
+    Raises:
+        ConfigError: fewer primitives than the chunks need.
+    """
+    least, train = _MIN_PRIMITIVES * len(chunks.parts), config.train
+    if config.model.primitives < least:
+        raise ConfigError(
+            f"model.primitives={config.model.primitives}: expected at least {least} for {len(chunks.parts)} chunks"
+        )
+    counts = _divide_primitives(config.model.primitives - least, [part.primitives for part in chunks.parts])
+    configs, runs = [], []
+    for part, count in zip(chunks.parts, counts, strict=True):
+        share = (1 - JOINT_SHARE) * part.steps
+        settings = {
+            **part.settings,
+            "model.primitives": count + _MIN_PRIMITIVES,
+            "train.population.every": max(round(share * train.population.every), 1),
+        }
+        if train.iterations is not None:
+            settings["train.iterations"] = max(round(share * train.iterations), 1)
+        if train.max_seconds is not None:
+            settings["train.max_seconds"] = share * train.max_seconds
+        words = tuple(quote_override(key, value) for key, value in settings.items())
+        configs.append(_override_config(config, settings, words, config.output_dir / CHUNKS_FOLDER / part.name))
+        runs.append(LaunchedRun(part.name, words))
+    steps = None if train.iterations is None else round(JOINT_SHARE * train.iterations)
+    seconds = None if train.max_seconds is None else JOINT_SHARE * train.max_seconds
+    return ChunkPlan(chunks, tuple(configs), tuple(runs), steps, seconds)
+
+
+def _divide_primitives(total: int, shares: list[float]) -> list[int]:
+    """Whole numbers close to these shares of ``total`` that add up to it."""
+    ends = [round(total * sum(shares[: n + 1]) / sum(shares)) for n in range(len(shares))]
+    return [end - begin for begin, end in zip([0, *ends], ends, strict=False)]
+
+
+def _override_config(
+    config: RunConfig, settings: Mapping[str, Any], words: tuple[str, ...], directory: Path
+) -> RunConfig:
+    """A configuration with other settings, by dotted key, as if these words had been typed."""
+    tree = copy.deepcopy(config.to_dict())
+    for key, value in settings.items():
+        *path, name = key.split(".")
+        node = tree
+        for group in path:
+            node = node[group]
+        tree["non_default"][key] = [node.get(name), value]
+        node[name] = value
+    tree["output_dir"], tree["overrides"] = str(directory), [*drop_place(config.overrides), *words]
+    return RunConfig.from_dict(tree)
+
+
+def read_chunk_record(folder: Path) -> LaunchRecord | None:
+    """What a run directory records of its chunks; None where it has none.
+
+    Raises:
+        DataError: the file is damaged, or of another version.
+    """
+    return read_launch_record(folder / CHUNKS_FILE, "the record of a run in chunks")
+
+
+def train_in_chunks(
+    config: RunConfig,
+    events: Events = ignore_event,
+    launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
+    between: BetweenSteps = do_nothing_between,
+) -> tuple[Fitted, bool]:
+    """Fit the chunks that ``scene.chunks`` asks for, join them and train what they make together; as
+    :func:`~neuprim.runs.training.train_in_directory`, where ``auto`` finds one run better.
+
+    What is done is kept: the command with ``resume=true`` makes what is missing.
+
+    Args:
+        launcher: where chunks are fitted, and their ground truth made. What follows works here.
+
+    Raises:
+        ChunksMissing: some of them failed; the others went on.
+        KeyboardInterrupt: Ctrl-C came before all chunks were there; those at work have their checkpoints.
+        NeuprimError: what a run may raise, a launcher that cannot work here, or chunks other than those that the run
+        was begun with.
+    """
+    render_ground_truth_for_training(config, launcher, lambda text, fraction: events(Preparing(text, fraction)))
+    chunks = _load_chunks(config, events)
+    if chunks is None:
+        events(Note(f"scene.chunks={config.scene['chunks']}: fitted as one run"))
+        return train_in_directory(replace(config, scene={**config.scene, "chunks": None}), events, between=between)
+    plan = _plan_chunks(config, chunks)
+    record = LaunchRecord(config.output_dir / CHUNKS_FILE, (), plan.runs, plan.steps if plan.seconds is None else None)
+    record = record.resume(read_chunk_record(config.output_dir) if config.resume else None, more=False)
+    record = _fit_chunks(plan, record, events, launcher)
+
+    def make(job: Job, dataset: Dataset, loss: Loss) -> Trainer:
+        models = [load_model(model_file(own.output_dir), job.task)[0] for own in plan.configs]
+        with attribute_errors(job.plugins.scene, "join"):
+            model = plan.chunks.join(models)
+        steps = record.joined_steps
+        if steps is None:
+            assert plan.seconds is not None, "a budget is in steps, in seconds or both"
+            steps = min(steps_in(plan.seconds, job, dataset, model), plan.steps or 2**62)
+            replace(record, joined_steps=steps).write()
+        trainer = fine_tuner(job, dataset, model, max(steps, 1), 1 - JOINT_SHARE, config.train.voxels_every)
+        trainer.elapsed = sum(float(read_metrics(own.output_dir)["train_seconds"]) for own in plan.configs)
+        return trainer
+
+    return train_in_directory(config, events, between=between, make=make)
+
+
+def _fit_chunks(plan: ChunkPlan, record: LaunchRecord, events: Events, launcher: LauncherSettings) -> LaunchRecord:
+    """Have every chunk fitted that is not there yet."""
+    folder, count = record.file.parent, len(plan.configs)
+    statuses = [JobStatus()] * count
+
+    def on_status(number: int, status: JobStatus) -> None:
+        """Report all chunks together as one piece of work."""
+        before, statuses[number] = statuses[number], status
+        if status.state == "failed" != before.state:
+            events(Note(f"{plan.configs[number].output_dir}: {status.text}"))
+        states = Counter(s.state if s.state in (*ENDED, "waiting") else "at work" for s in statuses)
+        order = ("done", "at work", "waiting", "failed", "interrupted")
+        text = ", ".join(f"{states[state]} {state}" for state in order if states[state])
+        progress = sum(1.0 if s.state in ENDED else s.progress for s in statuses) / count
+        events(Preparing(f"fitting {count} chunks ({text})", progress))
+
+    record, results = launch_missing_runs(record, plan.configs, launcher, on_status)
+    for result in results:
+        if result is not None and result.trace:
+            raise RuntimeError(f"in a chunk's run:\n{result.trace}")
+    if any(result is None or result.state == "interrupted" for result in results):
+        raise KeyboardInterrupt
+    failed = [f"{own.output_dir}: {r.line}" for own, r in zip(plan.configs, results, strict=True) if r and r.line]
+    if failed:
+        raise ChunksMissing(
+            f"{'; '.join(failed)}; {count - len(failed)} of {count} chunks are done, and resume=true with "
+            f"output_dir={folder} makes the others"
+        )
+    return record

@@ -17,7 +17,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import RunConfig, compose, find_run_plugins, task_of
+from neuprim.config import Job, RunConfig, compose, find_run_plugins, task_of
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.outputs import ROOT
 from neuprim.config.overrides import parse, quote_override
@@ -131,7 +131,7 @@ def run_ablation(
         stack.enter_context(lock_directory(folder, "set"))
         plan = None if before is None else _parse_plan(file, before)
         render_ground_truth_for_training(centre, request.launcher, progress)
-        dataset = load_dataset(centre, task, progress)
+        dataset = load_dataset(Job(centre, task), progress)
         check_dataset(dataset, task.conditions)
         views = eval_views(dataset, request.views)
         if not views:

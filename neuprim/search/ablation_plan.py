@@ -17,8 +17,7 @@ from neuprim.core.train.trainer import Trainer
 from neuprim.core.used_settings import build_settings
 from neuprim.core.validation import Range
 from neuprim.plugins.returns import call_task_tunable_settings
-from neuprim.runs.fit import prepare_training, use_one_torch_thread
-from neuprim.runs.training import compile_for_run
+from neuprim.runs.fit import compile_kernels, prepare_training, use_one_torch_thread
 from neuprim.search.pareto import Step, combine_steps
 from neuprim.search.points import COMBINED, Point, name_variant
 from neuprim.search.trial_runner import get_setting
@@ -160,7 +159,7 @@ class StepTimes:
         config = replace(config, train=replace(config.train, population=population))
         trainer = prepare_training(config, dataset=self.dataset).trainer
         begun = time.perf_counter()
-        compile_for_run(trainer)
+        compile_kernels(trainer)
         self.compiling += time.perf_counter() - begun
         settings = trainer.settings
         trainer.step, trainer.elapsed = (settings.iterations or 0) // 2, (settings.max_seconds or 0.0) / 2

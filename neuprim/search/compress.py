@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from neuprim.config import find_run_plugins
+from neuprim.config import Job
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, BitTable, Quantizers, bit_table
 from neuprim.core.data.dataset_check import check_dataset
@@ -111,16 +111,16 @@ def compress_run(request: CompressRequest, progress: Progress = lambda text, fra
     if final.is_dir():
         raise ConfigError(f"--out {final}: is a folder; expected the name of a file")
     refuse_existing(final, request.overwrite)
-    config, task, model, header = load_run(run_dir)
-    config = replace(config, output_dir=run_dir)
+    run = load_run(run_dir)
+    config, task, model, header = replace(run.config, output_dir=run_dir), run.task, run.model, run.header
     table = bit_table(DEFAULT_LEVEL if request.level is None else request.level, request.bits, model.specs)
-    notes, plugins = ["its primitives are in another order than the run's"], find_run_plugins(config)
+    notes, plugins = ["its primitives are in another order than the run's"], run.plugins
     stored, steps, dataset = model, 0, None
     coding: BitTable | Quantizers = table
     with plugins.attribute_errors():
         progress("reading the run's data", 0.0)
         try:
-            dataset = load_dataset(config, task, run_dir=run_dir)
+            dataset = load_dataset(run)
             check_dataset(dataset, task.conditions)
         except NeuprimError as error:
             dataset = None
@@ -157,7 +157,7 @@ def _quantize(
 ) -> QuantizedModel:
     steps = request.steps
     if steps is None:
-        steps = steps_in(request.seconds, data.config, data.task, data.dataset, model)
+        steps = steps_in(request.seconds, Job(data.config, data.task), data.dataset, model)
     if request.by_level:
         return finetune_for_table(data, model, table, steps, progress)
     tolerance = DEFAULT_TOLERANCE if request.tolerance is None else request.tolerance

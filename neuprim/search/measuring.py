@@ -125,12 +125,13 @@ def load_setup(
     Raises:
         NeuprimError: no such run, no test views, or invalid overrides.
     """
-    config, task, model, _ = load_run(run_dir)
+    run = load_run(run_dir)
+    config, task, model = run.config, run.task, run.model
     reference = parse_render_config(overrides, config.renderer, model)
     weights = lpips or config.metrics.lpips
     distance = None if weights is None else Lpips.load(weights)
     if loaded is None:
-        dataset = load_dataset(config, task, run_dir=run_dir)
+        dataset = load_dataset(run)
         loaded = dataset, eval_views(dataset, views)
     dataset, chosen = loaded
     if not chosen:

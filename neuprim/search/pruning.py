@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import RunConfig, find_run_plugins
+from neuprim.config import Job, RunConfig
 from neuprim.core.channels import find_channels
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
@@ -23,9 +23,16 @@ from neuprim.core.train.trainer import Trainer
 from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.finetune import fine_tuner, steps_in
 from neuprim.runs.fit import Fitted, keep_model_settings, make_loss, use_one_torch_thread
-from neuprim.runs.kept import PRUNED, kept_shares
 from neuprim.runs.measure import measure_quality
-from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device, read_metrics
+from neuprim.runs.open import (
+    PRUNED,
+    kept_shares,
+    load_dataset,
+    load_run,
+    model_file,
+    move_to_render_device,
+    read_metrics,
+)
 from neuprim.runs.training import save_training
 from neuprim.search.eval_views import eval_views, measure_eval_views
 from neuprim.search.pruning_cuts import count_stored_numbers, cut_to_loss, list_reductions, price_cuts, zero_masks
@@ -216,7 +223,7 @@ class ModelShrinker:
         """Return the state after a round of fine-tuning."""
         model, steps = state.model, self.steps * (number + 1) // rounds - self.steps * number // rounds
         if steps and model.count:
-            trainer = fine_tuner(self.config, self.task, self.dataset, model, steps)
+            trainer = fine_tuner(Job(self.config, self.task), self.dataset, model, steps)
             trainer.zero_masks, left = zero_masks(trainer.model), state.numbers
             for done in range(steps):
                 trainer.train_step()
@@ -305,18 +312,17 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
     if final.exists() and final.resolve() == request.run_dir.resolve():
         raise ConfigError(f"--out {final}: is the run itself; expected a new folder")
     refuse_existing(final, request.overwrite)
-    config, task, model, header = load_run(request.run_dir)
-    config = replace(config, output_dir=request.run_dir)
-    plugins = find_run_plugins(config)
-    with plugins.attribute_errors(), use_one_torch_thread():
+    run = load_run(request.run_dir)
+    config, task, model, header = replace(run.config, output_dir=request.run_dir), run.task, run.model, run.header
+    with run.plugins.attribute_errors(), use_one_torch_thread():
         progress("reading the run's data", 0.0)
-        dataset = load_dataset(config, task, run_dir=request.run_dir)
+        dataset = load_dataset(run)
         check_dataset(dataset, task.conditions)
         if request.hold_out:
             dataset = replace(dataset, train=hold_out_views(dataset, request.hold_out).train)
         begun, steps = time.monotonic(), request.steps
         if steps is None:
-            steps = steps_in(request.seconds, config, task, dataset, model)
+            steps = steps_in(request.seconds, Job(config, task), dataset, model)
         shrinker = ModelShrinker(config, task, dataset, request.tolerance, steps, progress)
         small, words = shrinker.shrink(model)
         seconds = time.monotonic() - begun
@@ -366,6 +372,6 @@ def _fit_pruned(
         overrides=[*(word for word in config.overrides if not word.startswith(replaced)), *own],
     )
     settings = keep_model_settings(config.train, task, model)
-    trainer = Trainer(model, dataset, make_loss(config, task), settings, config.renderer, config.seed)
+    trainer = Trainer(model, dataset, make_loss(Job(config, task)), settings, config.renderer, config.seed)
     trainer.zero_masks = zero_masks(trainer.model)
     return Fitted(config, task, dataset, find_channels(task, dataset), trainer)

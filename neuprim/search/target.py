@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from neuprim.config import RunConfig, find_run_plugins, task_of
+from neuprim.config import Job, RunConfig, find_run_plugins, task_of
 from neuprim.config.command_settings import LauncherSettings, Target
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
 from neuprim.core.compression import Quantizers
@@ -27,14 +27,13 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.files import atomic_path, write_text
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.evaluate import evaluate_fitted
-from neuprim.runs.events import Events, Finishing, Preparing, ignore_event
-from neuprim.runs.fit import prepare_training
+from neuprim.runs.fit import Events, Finishing, Preparing, compile_kernels, ignore_event, prepare_training
 from neuprim.runs.ground_truth import render_ground_truth_for_training
 from neuprim.runs.launch.launcher import use_launcher_threads
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import COMPRESSED, load_dataset, move_to_render_device, read_metrics
 from neuprim.runs.run_directory import lock_directory
-from neuprim.runs.training import compile_for_run, train_in_directory
+from neuprim.runs.training import train_in_directory
 from neuprim.search.eval_views import eval_views, measure_eval_views
 from neuprim.search.pruning import PruneRequest, prune_run
 from neuprim.search.quantized_finetune import QuantizationSearch, dequantize
@@ -86,11 +85,11 @@ def run_target(
             events(Preparing(text, fraction))
 
         render_ground_truth_for_training(config, launcher, progress)
-        dataset = load_dataset(config, task, progress)
+        dataset = load_dataset(Job(config, task), progress)
         check_dataset(dataset, task.conditions)
         record.hold_out = choose_hold_out(dataset)
         loaded = clock()
-        compile_for_run(prepare_training(config, dataset=dataset).trainer, events)
+        compile_kernels(prepare_training(config, dataset=dataset).trainer, events)
         begun += clock() - loaded
         runner = TrialRunner(config, dataset, record, events, clock, launcher, begun - record.spent)
         try:

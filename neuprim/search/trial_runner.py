@@ -16,7 +16,7 @@ from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.settings import PopulationSettings
-from neuprim.runs.events import Events, Note, Preparing
+from neuprim.runs.fit import Events, Note, Preparing
 from neuprim.runs.launch.executors import count_parallel_jobs
 from neuprim.search.size_curve import fit_line
 from neuprim.search.target_record import Attempt, TargetRecord

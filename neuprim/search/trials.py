@@ -14,14 +14,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import RunConfig, find_run_plugins, made_now, task_of
+from neuprim.config import Job, RunConfig, find_run_plugins, made_now, task_of
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError, NeuprimError
 from neuprim.core.io.files import read_json, write_json
 from neuprim.core.validation import validate
-from neuprim.runs.events import Event, Events, Finishing, Note, Preparing, Step, ignore_event
-from neuprim.runs.launch.jobs import ENDED, Job, JobStatus, Result
+from neuprim.runs.fit import Event, Events, Finishing, Note, Preparing, Step, ignore_event
+from neuprim.runs.launch.jobs import ENDED, JobResult, JobStatus, LaunchJob
 from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch
 from neuprim.runs.open import load_dataset
 from neuprim.runs.run_directory import lock_directory
@@ -135,7 +135,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
             if interrupted:
                 raise KeyboardInterrupt
             events(Finishing("measuring evaluation views"))
-            fitted.unlock()
+            fitted.unlock_bands()
             views = eval_views(fitted.dataset, trial.views)
             quality = measure_eval_views(fitted.model, views, config.renderer, fitted.dataset.background)
         steps, seconds = fitted.trainer.step, fitted.trainer.elapsed
@@ -214,13 +214,13 @@ def run_trial_job(data: Mapping[str, Any], attempt: int, events: Events) -> Outc
     key = json.dumps([config.task, config.scene_name, config.scene, config.seed], sort_keys=True)
     if key not in _datasets:
         _datasets.clear()
-        _datasets[key] = load_dataset(config, task_of(config), lambda text, part: events(Preparing(text, part)))
+        _datasets[key] = load_dataset(Job.of(config), lambda text, part: events(Preparing(text, part)))
     return run_trial(Trial(config, data["hold_out"], data["views"]), _datasets[key], events)
 
 
 def launch_trials(
     trials: Sequence[Trial], settings: LauncherSettings, folder: Path, progress: Progress
-) -> list[Result]:
+) -> list[JobResult]:
     """Run trials as jobs in the folder of a search; returns results with outcomes, or why one failed, in their order.
 
     Args:
@@ -234,7 +234,7 @@ def launch_trials(
     jobs = []
     for number, one in enumerate(trials):
         data = {"config": one.config.to_dict(), "hold_out": one.hold_out, "views": one.views}
-        jobs.append(Job(f"{number}-{one.config.output_dir.name}", call, data))
+        jobs.append(LaunchJob(f"{number}-{one.config.output_dir.name}", call, data))
     done = [0.0] * len(jobs)
 
     def hear(number: int, status: JobStatus) -> None:

@@ -18,8 +18,7 @@ import numpy as np
 
 from neuprim.config import RunConfig
 from neuprim.config.command_settings import ViewerSettings
-from neuprim.runs.events import Evaluated, Event, Events, Finishing, Note, Preparing, Step
-from neuprim.runs.fit import Fitted
+from neuprim.runs.fit import Evaluated, Event, Events, Finishing, Fitted, Note, Preparing, Step
 from neuprim.runs.training import save_training
 from neuprim.viewer.render_queue import RenderQueue
 from neuprim.viewer.server import PageServer

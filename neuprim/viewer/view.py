@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuprim.config import find_run_plugins
 from neuprim.config.command_settings import ViewerSettings
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import read_stored_channels
@@ -103,11 +102,12 @@ def open_scene(
     Raises:
         CheckpointError, ConfigError: naming the file that is missing or damaged.
     """
-    config, task, model, header = load_run(run_dir)
+    run = load_run(run_dir)
+    config, task, model, header = run.config, run.task, run.model, run.header
     dataset: Dataset | None = None
     try:
-        with find_run_plugins(config).attribute_errors():
-            dataset = load_dataset(config, task, progress, run_dir)
+        with run.plugins.attribute_errors():
+            dataset = load_dataset(run, progress)
     except NeuprimError as error:
         warn(f"no held-out views: {error}")
     means = model.params["means"].detach().double().cpu()

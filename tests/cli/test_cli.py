@@ -16,7 +16,7 @@ from neuprim.config import RunConfig
 from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.extensions import ExportReport
-from neuprim.runs.events import Events
+from neuprim.runs.fit import Events
 from neuprim.runs.render_images import RenderRequest
 from tests.plugins.fakes import install, site, toy
 

@@ -14,7 +14,7 @@ import neuprim
 from neuprim.cli.command import plain_console
 from neuprim.cli.progress import DrawProgress, RunProgress
 from neuprim.core.train.trainer import StepReport
-from neuprim.runs.events import Finishing, Note, Preparing, Step
+from neuprim.runs.fit import Finishing, Note, Preparing, Step
 
 ODD = "pip install 'neuprim[video]' [bold]loud[/bold] [/] :smile: C:dir:x"
 """Markup that would vanish, a closing tag that would raise, an emoji's name."""

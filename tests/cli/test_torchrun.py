@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 
 import neuprim
 from neuprim.config import compose
-from neuprim.runs.events import Event, Step
+from neuprim.runs.fit import Event, Step
 from neuprim.runs.run import run
 from tests.core import tiny
 from tests.short_runs import fit, words

@@ -62,7 +62,8 @@ def test_what_was_imported_renders_without_the_data(run_dir: Path, tmp_path: Pat
 
 def test_the_ply_names_every_number(run_dir: Path, tmp_path: Path) -> None:
     found = read_ply(export_run(run_dir, "ply", tmp_path / "m.ply").files[0])
-    _, _, model, header = load_run(run_dir)
+    stored = load_run(run_dir)
+    model, header = stored.model, stored.header
     corner = found.rows[4]  # the marked corner
     assert [float(corner[n]) for n in ("x", "y", "z")] == pytest.approx([0.5, 0.7, 0.9])
     assert [float(corner[f"means_{i}"]) for i in range(3)] == pytest.approx([0.5, 0.7, 0.9])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -342,10 +342,8 @@ def _read_run(folder: Path) -> None:
 
 def _records(folder: Path) -> None:
     """What runs, sweeps, chunks, searches and launches keep."""
-    from neuprim.runs.chunks import ChunkRecord
-    from neuprim.runs.chunks import ChunkRow as Chunk
     from neuprim.runs.launch.jobs import JobStatus, write_status
-    from neuprim.runs.sweep import SweepRecord, SweepRow
+    from neuprim.runs.launch_record import LaunchedRun, LaunchRecord
     from neuprim.search.points import LeftOut, Point, Record
     from neuprim.search.target_record import SettingChange, TargetRecord
     from neuprim.search.trials import Outcome
@@ -361,10 +359,9 @@ def _records(folder: Path) -> None:
     (folder / "run/renders/worst_0.png").touch()
     region = [{"file": "worst_0.png", "name": "a", "psnr": 10.0, "x": 1, "y": 2, "side": 3}]
     (folder / "run/renders/worst.json").write_text(json.dumps(region))
-    SweepRecord(
-        ("a=1,2",), (SweepRow("0", ("a=1",), {"a": "1"}), SweepRow("1", ("a=2",), {"a": "2"}, "failed", "why", 2.5, 1))
-    ).write(folder)
-    ChunkRecord((Chunk("chunk_0", 20, 30, None), Chunk("chunk_1", 20, 30, 1.5)), 100).write(folder)
+    runs = (LaunchedRun("0", ("a=1",), {"a": "1"}), LaunchedRun("1", ("a=2",), {"a": "2"}, "failed", "why", 2.5, 1))
+    LaunchRecord(folder / "sweep.json", ("a=1,2",), runs).write()
+    LaunchRecord(folder / "chunks.json", (), runs, 100).write()
     turned = [SettingChange("model.neurons", 4, 2, {"psnr": 0.1}, 0.8, True)]
     TargetRecord({"psnr": 30.0}, {}, length=200, attempts=[attempt(100, 50, 30.0)], turns=turned).write(
         folder / "target"
@@ -383,9 +380,9 @@ def _records(folder: Path) -> None:
 
 
 def _read_records(folder: Path) -> None:
-    from neuprim.runs.chunks import read_chunk_record as read_chunks
     from neuprim.runs.launch.jobs import read_status
-    from neuprim.runs.sweep import read_sweep, read_sweep_runs, write_csv
+    from neuprim.runs.run import read_chunk_record
+    from neuprim.runs.sweep import read_sweep, read_sweep_runs, write_sweep_csv
     from neuprim.search import trials
     from neuprim.search.points import read_record
     from neuprim.search.points import write_csv as write_points
@@ -394,10 +391,10 @@ def _read_records(folder: Path) -> None:
 
     _read_run(folder)
     if (sweep := read_sweep(folder)) is not None:
-        write_csv(folder / "out.csv", read_sweep_runs(folder, sweep))
-        sweep.write(folder / "again")
-    if (chunks := read_chunks(folder)) is not None:
-        chunks.write(folder / "again")
+        write_sweep_csv(folder / "out.csv", read_sweep_runs(sweep))
+        replace(sweep, file=folder / "again/sweep.json").write()
+    if (chunks := read_chunk_record(folder)) is not None:
+        replace(chunks, file=folder / "again/chunks.json").write()
     if (target := read_target(folder / "target")) is not None:
         target.write(folder / "again")
         repr((target.words, target.finished("size"), [one.count for one in target.attempts if one.outcome]))
@@ -448,7 +445,7 @@ def _checkpoint(folder: Path) -> None:
 
 
 def _read_checkpoint(folder: Path) -> None:
-    from neuprim.runs.events import ignore_event
+    from neuprim.runs.fit import ignore_event
     from neuprim.runs.training import _resume
 
     _resume(_fitted(folder), ignore_event)

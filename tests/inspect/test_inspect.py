@@ -22,7 +22,7 @@ from neuprim.inspect.field import FieldFrame, describe_conditions, find_matter_b
 from neuprim.inspect.html_page import encode_values
 from neuprim.inspect.layers import Scale
 from neuprim.plugins.registry import load_task
-from neuprim.runs.events import Event, Note
+from neuprim.runs.fit import Event, Note
 from neuprim.runs.inspect import Request, inspect_run
 from neuprim.runs.open import load_dataset, load_run
 from tests.inspect.pages import array, layers_of
@@ -153,8 +153,8 @@ def test_its_own_volume_agrees_with_the_model(run_dir: Path, tmp_path: Path) -> 
 
 
 def test_the_numbers_are_those_of_the_data_set(run_dir: Path, tmp_path: Path) -> None:
-    config, task, model, _ = load_run(run_dir)
-    expected = {f["frame"]: f for f in task.diagnose(load_dataset(config, task), model)["sigma_frames"]}
+    stored = load_run(run_dir)
+    expected = {f["frame"]: f for f in stored.task.diagnose(load_dataset(stored), stored.model)["sigma_frames"]}
     for against in (str(run_dir.parent / "files"), "scene"):
         _, said = look(
             run_dir, conditions={"time": "0:1:20"}, grid=8, against=against, out=tmp_path / "x.vdb", overwrite=True

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from neuprim.config import compose
-from neuprim.runs.events import Events, ignore_event
+from neuprim.runs.fit import Events, ignore_event
 from neuprim.runs.run import run
 from tests.plugins.fakes import install_groups
 

@@ -238,7 +238,8 @@ def test_a_run_without_a_record_is_read_by_names(made: Path, site: Path) -> None
     text = file.read_text()
     for without in (text[: text.index("made_by:")], text[: text.index("made_by:")] + "made_by: null\n"):
         file.write_text(without)
-        config, task, _, _ = load_run(made)
+        stored = load_run(made)
+        config, task = stored.config, stored.task
         assert config.made_by is None and task.name == "glow"
     assert "made_by" not in evaluate_run(made)
     header, tensors = checkpoint.read(made / "checkpoint.safetensors", "checkpoint")

@@ -74,8 +74,9 @@ def changed(site: Path, tmp_path: Path, *words: str, **changes: str) -> tuple[Pa
 
 def first_view(run_dir: Path) -> tuple[Any, Tensor, Tensor]:
     """Channels of the model, rendered and true image of the first test view."""
-    config, task, model, header = load_run(run_dir)
-    dataset = load_dataset(config, task)
+    stored = load_run(run_dir)
+    config, task, model, header = stored.config, stored.task, stored.model, stored.header
+    dataset = load_dataset(stored)
     view = dataset.test.view(0)
     with torch.no_grad():
         drawn = render(model, view.camera, view.conditions, config.renderer, dataset.background).rgb
@@ -144,7 +145,8 @@ def test_the_inspectors_page_has_the_displays_colours(trained: Path, tmp_path: P
     (frame,) = layers_of(tmp_path / "page.html")["frames"]
     (shown,) = (layer for layer in frame["layers"]["primitives"]["model"] if layer["kind"] == "ellipsoids")
     found = array(frame, shown["rows"], "<f4").reshape(-1, 15)[:, 12:]
-    _, task, model, _ = load_run(trained)
+    stored = load_run(trained)
+    task, model = stored.task, stored.model
     assert task.display is not None
     values = model.params["logit"].sigmoid()
     raw = (values[:, :-1] + values[:, 1:]) / 2  # as a shift of 0.5 has it

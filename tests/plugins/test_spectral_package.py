@@ -125,7 +125,7 @@ def test_its_exporter_and_inspector(package: Path, tmp_path: Path, capsys: pytes
     advice = line.rsplit("for example ", 1)[1].split()
     assert call(*table, *advice, "digits=5") == 0
     rows = list(csv.DictReader((out / "export" / "spectra.csv").open()))
-    values = load_run(out)[2].params["logit"].detach().sigmoid()
+    values = load_run(out).model.params["logit"].detach().sigmoid()
     expected = ((values[:, :-1] + values[:, 1:]) / 2).numpy()
     assert np.allclose([[float(row[name]) for name in NAMES] for row in rows], expected, atol=1e-5)
     assert call(*table, *advice, "most=3", "--out", tmp_path / "a.json") == 0

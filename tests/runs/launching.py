@@ -13,16 +13,16 @@ import neuprim.runs.evaluate
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import DataError
-from neuprim.runs.events import Event, Events, Preparing, Step
-from neuprim.runs.launch.jobs import Job
-from neuprim.runs.sweep import fit_job
+from neuprim.runs.fit import Event, Events, Preparing, Step
+from neuprim.runs.launch.jobs import LaunchJob
+from neuprim.runs.run import fit_job
 
 PHASES = ("loading", "training")
 """Without a checkpoint, and with one; tests/runs/test_resume.py kills at any moment."""
 
 
-def job(name: str, function: Any, data: Any = None) -> Job:
-    return Job(name, f"{__name__}:{function.__name__}", data)
+def job(name: str, function: Any, data: Any = None) -> LaunchJob:
+    return LaunchJob(name, f"{__name__}:{function.__name__}", data)
 
 
 def processes(workers: int = 1, **more: Any) -> LauncherSettings:

@@ -17,12 +17,10 @@ from neuprim.core import checkpoint
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.train.distributed.process_group import ProcessGroup
-from neuprim.runs import chunks
-from neuprim.runs.chunks import ChunksMissing, read_chunk_record
-from neuprim.runs.events import Event, Note, Preparing, Step, ignore_event
-from neuprim.runs.fit import fit
+from neuprim.runs import launch_record
+from neuprim.runs.fit import Event, Note, Preparing, Step, fit, ignore_event
 from neuprim.runs.open import load_run, read_metrics
-from neuprim.runs.run import run
+from neuprim.runs.run import ChunksMissing, read_chunk_record, run
 from neuprim.tasks.dynamic.density import TimeDensity
 from tests.tasks.dynamic.sequences import blob
 
@@ -66,17 +64,16 @@ def model_of(folder: Path) -> dict[str, torch.Tensor]:
 
 
 def test_one_model_of_two_chunks_with_the_whole_number_of_primitives(finished: Path) -> None:
-    config, _, model, header = load_run(finished)
+    stored = load_run(finished)
+    config, model, header = stored.config, stored.model, stored.header
     assert config.scene["chunks"] == 2 and model.count == 80
     assert isinstance(model.density, TimeDensity) and len(model.density.seams) == 1
     assert model.density.seams[0] == pytest.approx((0.4, 0.6))
     own = [load_run(finished / "chunks" / name) for name in NAMES]
     counts = [int((model.params["chunk"] == number).sum()) for number in range(2)]
-    assert counts == [chunk.count for _, _, chunk, _ in own]
+    assert counts == [chunk.model.count for chunk in own]
     assert header["iterations"] == STEPS
-    assert [chunk.train.iterations for chunk, *_ in own] == [40, 40] and [
-        chunk.train.population.every for chunk, *_ in own
-    ] == [4, 4]
+    assert [(chunk.config.train.iterations, chunk.config.train.population.every) for chunk in own] == [(40, 4)] * 2
 
 
 def test_it_is_judged_on_all_frames_and_has_learned(finished: Path) -> None:
@@ -96,7 +93,7 @@ def test_progress_is_that_of_all_chunks_and_then_of_the_joined_model(finished: P
 
 
 def test_a_chunk_is_a_run_that_can_be_made_by_hand(finished: Path, tmp_path: Path) -> None:
-    config, *_ = load_run(finished / "chunks" / NAMES[1])
+    config = load_run(finished / "chunks" / NAMES[1]).config
     assert config.scene["span"] == "3:6" and config.scene["chunks"] is None
     again = run(compose([*config.overrides, f"output_dir='{tmp_path / 'again'}'"]))
     first, second = model_of(finished / "chunks" / NAMES[1]), model_of(again)
@@ -115,7 +112,7 @@ def test_every_command_reads_it(finished: Path, tmp_path: Path, capsys: pytest.C
         ["compress", str(finished), "--out", str(tmp_path / "small.neuprim")],
     ):
         assert main(command) == 0, (command, capsys.readouterr().err)
-    back = load_run(tmp_path / "imported")[2]
+    back = load_run(tmp_path / "imported").model
     assert isinstance(back.density, TimeDensity) and len(back.density.seams) == 1
 
 
@@ -137,7 +134,7 @@ def test_what_is_done_is_kept(finished: Path, files: Path, tmp_path: Path) -> No
 def test_one_that_fails_does_not_stop_the_others_and_is_all_that_is_made_again(
     files: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chunks, "_FIT_JOB", f"{__name__}:{_fail_first.__name__}")
+    monkeypatch.setattr(launch_record, "FIT_JOB", f"{__name__}:{_fail_first.__name__}")
     out, told = tmp_path / "run", list[Event]()
     with pytest.raises(
         ChunksMissing,
@@ -146,7 +143,7 @@ def test_one_that_fails_does_not_stop_the_others_and_is_all_that_is_made_again(
         run(compose(words(files, out)), told.append)
     assert [event.text.partition("chunks/")[2] for event in told if isinstance(event, Note)] == ["frames_1-4: no luck"]
     record = read_chunk_record(out)
-    assert record is not None and [(row.state, row.line) for row in record.rows] == [
+    assert record is not None and [(row.state, row.line) for row in record.runs] == [
         ("failed", "no luck"),
         ("done", ""),
     ]
@@ -158,7 +155,7 @@ def test_one_that_fails_does_not_stop_the_others_and_is_all_that_is_made_again(
 
 
 def _fail_first(data: Any, attempt: int, events: Any) -> str:
-    from neuprim.runs.sweep import fit_job
+    from neuprim.runs.run import fit_job
 
     if str(data["output_dir"]).endswith(NAMES[0]):
         raise DataError("no luck")
@@ -169,7 +166,7 @@ def test_other_chunks_than_it_was_begun_with_are_refused(finished: Path, files: 
     shutil.copytree(finished, tmp_path / "copy")
     with pytest.raises(
         ConfigError,
-        match=r"chunks.json: begun with frames_1-4 \(\d+ primitives, 40 steps\), .* expected the same words",
+        match=r"chunks.json: begun with frames_1-4, .* ask for frames_1-3, .*; expected the same words",
     ):
         run(compose(words(files, tmp_path / "copy", "scene.chunks=3", "resume=true")))
     (tmp_path / "copy" / "chunks.json").write_text("{}")
@@ -180,7 +177,8 @@ def test_other_chunks_than_it_was_begun_with_are_refused(finished: Path, files: 
 def test_a_budget_in_seconds_is_shared_out_and_the_joined_steps_are_kept(files: Path, tmp_path: Path) -> None:
     out = run(compose(words(files, tmp_path / "run", "train.iterations=null", "train.max_seconds=0.5")))
     record = json.loads((out / "chunks.json").read_text())
-    assert [row["max_seconds"] for row in record["chunks"]] == [0.2, 0.2] and record["joined_steps"] >= 1
+    assert ["train.max_seconds=0.2" in run["words"] for run in record["runs"]] == [True] * 2
+    assert record["joined_steps"] >= 1
     assert read_metrics(out)["iterations"] == round(record["joined_steps"] / 0.2)
 
 

@@ -8,8 +8,7 @@ import pytest
 
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError
-from neuprim.runs.events import Event, Note
-from neuprim.runs.fit import prepare_training, train_to_end
+from neuprim.runs.fit import Event, Note, prepare_training, train_to_end
 from tests.core import tiny
 from tests.short_runs import words
 

@@ -21,7 +21,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io import store as stores
 from neuprim.core.io.vdb import write_vdb
 from neuprim.runs import ground_truth
-from neuprim.runs.events import Event, Note, Preparing
+from neuprim.runs.fit import Event, Note, Preparing
 from neuprim.runs.ground_truth import load_ground_truth, render_ground_truth, render_ground_truth_of_runs, split_frames
 from neuprim.runs.launch.jobs import JobStatus
 from neuprim.tasks.dynamic.volume import capture
@@ -84,7 +84,7 @@ def test_a_killed_worker_loses_the_frame_it_was_at_and_a_slow_one_holds_up_nobod
     files: Path, tmp_path: Path, alone: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
-    monkeypatch.setattr(ground_truth, "Job", truth_jobs.troubled(FRAMES))
+    monkeypatch.setattr(ground_truth, "LaunchJob", truth_jobs.troubled(FRAMES))
     monkeypatch.setattr(ground_truth, "split_frames", lambda missing, workers: iter([[0], [1, 2, 3, 4], [5], [6], [7]]))
     heard: list[Event] = []
     made(config(files, tmp_path), LauncherSettings("processes", 2), heard)
@@ -129,7 +129,6 @@ def test_two_makers_at_once_and_a_job_that_is_done_twice(files: Path, tmp_path: 
     assert first is not None
     first.begin()
     data = {"config": there.to_dict(), "known": dict(first.known), "key": first.key, "frames": list(range(FRAMES))}
-    data["stop"] = str(tmp_path / "failed")
 
     def work() -> None:
         try:
@@ -142,7 +141,7 @@ def test_two_makers_at_once_and_a_job_that_is_done_twice(files: Path, tmp_path: 
         thread.start()
     for thread in threads:
         thread.join()
-    ground_truth._kept.clear()
+    ground_truth._loaded.clear()
     first.write(0, lambda text: None)  # type: ignore[attr-defined]  # as one that has not seen that it is there
     assert errors == []
     first.complete()
@@ -228,7 +227,7 @@ def test_other_files_where_a_worker_is_are_refused(files: Path, tmp_path: Path) 
         ground_truth.render_frames_job(
             {"config": there.to_dict(), "known": truth.known, "key": "0" * 16, "frames": [0]}, 0, lambda event: None
         )
-    ground_truth._kept.clear()
+    ground_truth._loaded.clear()
 
 
 def test_runs_that_share_a_scene_wait_for_it_together_and_a_broken_one_holds_up_none(

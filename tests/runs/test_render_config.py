@@ -37,7 +37,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def model(run_dir: Path) -> Primitives:
-    return load_run(run_dir)[2]
+    return load_run(run_dir).model
 
 
 CONFIGS = st.builds(
@@ -129,8 +129,9 @@ def test_reductions_of_a_file_without_zeros_count_as_tensors(model: Primitives, 
 
 def test_render_and_eval_apply_the_overrides(run_dir: Path, model: Primitives, tmp_path: Path) -> None:
     """Images from the command line equal those of the configuration, to the bit."""
-    run_config, task, _, _ = load_run(run_dir)
-    dataset = load_dataset(run_config, task)
+    stored = load_run(run_dir)
+    run_config = stored.config
+    dataset = load_dataset(stored)
     view = dataset.test.view(1)
     words = ["renderer.alpha_min=0.25", "resolution=0.5", "colour.degree=0", "store.all=float16"]
     config = parse_render_config(words, run_config.renderer, model)
@@ -143,4 +144,4 @@ def test_render_and_eval_apply_the_overrides(run_dir: Path, model: Primitives, t
     plain = render_image(model, small, run_config.renderer, dataset.background).permute(2, 0, 1)[None]
     expected = torch.nn.functional.interpolate(plain, (24, 24), mode="bilinear")[0].permute(1, 2, 0)
     assert torch.equal(half, expected)
-    assert evaluate_run(run_dir, words=words)["psnr"] != evaluate_run(run_dir)["psnr"]
+    assert evaluate_run(run_dir, overrides=words)["psnr"] != evaluate_run(run_dir)["psnr"]

@@ -11,7 +11,7 @@ from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.runs.render_images import _file_names, _views_of, with_conditions
+from neuprim.runs.render_images import _camera_file_views, _view_file_names, with_conditions
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
 from tests import scenes
@@ -64,21 +64,21 @@ def test_ten_thousand_frames_have_names_in_order() -> None:
 
 def test_a_files_times_are_the_frames_where_the_task_has_a_time() -> None:
     file = CameraViews(tuple((v.name, v.camera) for v in VIEWS), times=(0.0, 0.25, 0.5, 1.0))
-    assert [float(v.conditions["time"]) for v in _views_of(file, DYNAMIC, {})] == [0.0, 0.25, 0.5, 1.0]
-    assert [v.conditions for v in _views_of(file, DYNAMIC, {"time": "0.5"})] == [{}] * 4, (
+    assert [float(v.conditions["time"]) for v in _camera_file_views(file, DYNAMIC, {})] == [0.0, 0.25, 0.5, 1.0]
+    assert [v.conditions for v in _camera_file_views(file, DYNAMIC, {"time": "0.5"})] == [{}] * 4, (
         "what the user says comes first"
     )
-    assert [v.conditions for v in _views_of(file, RELIGHT, {})] == [{}] * 4
-    assert [v.conditions for v in _views_of(replace(file, times=None), DYNAMIC, {})] == [{}] * 4
+    assert [v.conditions for v in _camera_file_views(file, RELIGHT, {})] == [{}] * 4
+    assert [v.conditions for v in _camera_file_views(replace(file, times=None), DYNAMIC, {})] == [{}] * 4
     views, animated = with_conditions(
-        _views_of(file, BOTH, {}), BOTH, {"light": "orbit:4:40:4", "light_intensity": "2"}
+        _camera_file_views(file, BOTH, {}), BOTH, {"light": "orbit:4:40:4", "light_intensity": "2"}
     )
     assert animated and [float(v.conditions["time"]) for v in views] == [0.0, 0.25, 0.5, 1.0]
 
 
 def test_no_two_views_share_a_file() -> None:
-    assert _file_names([replace(VIEWS[0], name=name) for name in ("a/b", "c d")]) == ["a_b", "c_d"]
-    assert _file_names([replace(VIEWS[0], name=name) for name in ("a/b", "a_b", "A_B")]) == [
+    assert _view_file_names(("a/b", "c d")) == ["a_b", "c_d"]
+    assert _view_file_names(("a/b", "a_b", "A_B")) == [
         "000_a_b",
         "001_a_b",
         "002_A_B",

@@ -15,10 +15,10 @@ from neuprim.core import checkpoint, notices
 from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import write_text
 from neuprim.core.notices import NeuprimWarning
-from neuprim.runs.curve import open_curve
 from neuprim.runs.open import read_metrics
 from neuprim.runs.run import run
 from neuprim.runs.run_directory import result_files
+from neuprim.runs.training import add_curve_line, cut_curve
 from tests.core import tiny
 from tests.short_runs import fit, words
 
@@ -101,9 +101,9 @@ def test_a_full_disk_names_the_file_and_keeps_lines_whole(tmp_path: Path, monkey
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    with open_curve(tmp_path / "metrics.jsonl", 0) as curve:
-        curve.add('{"step": 1}\n')
-        assert (tmp_path / "metrics.jsonl").read_text() == '{"step": 1}\n', "at once"
+    cut_curve(tmp_path / "metrics.jsonl", 0)
+    add_curve_line(tmp_path / "metrics.jsonl", '{"step": 1}\n')
+    assert (tmp_path / "metrics.jsonl").read_text() == '{"step": 1}\n', "at once"
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left") as refused:
         write_text(tmp_path / "report.html", "x")

@@ -19,12 +19,10 @@ from torch import Tensor
 
 from neuprim.config import RunConfig, compose
 from neuprim.core import checkpoint
-from neuprim.core.channels import Channels
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.notices import NeuprimWarning
-from neuprim.runs.curve import evaluate_curve_point
-from neuprim.runs.events import Event, Note
+from neuprim.runs.fit import Event, Note, measure_curve_point
 from neuprim.runs.measure import evaluate_run, measure_views
 from neuprim.runs.open import read_metrics
 from neuprim.runs.render_images import RenderRequest, render_run
@@ -142,17 +140,17 @@ def test_masked_pixels_do_not_count_on_the_curve() -> None:
         for p in dataset.test.images  # type: ignore[attr-defined]
     ]
     trainer = tiny.trainer(dataset, 3)
-    views = measure_views(trainer.model, TASK, dataset, trainer.renderer, Channels())
-    assert evaluate_curve_point(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
+    views = measure_views(trainer.model, TASK, dataset, trainer.renderer)
+    assert measure_curve_point(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
 
 
 def test_a_model_that_no_view_shows_says_so() -> None:
     dataset = tiny.two_primitives()
     trainer = tiny.trainer(dataset, 3)
-    assert not any(v.empty for v in measure_views(trainer.model, TASK, dataset, trainer.renderer, Channels()))
+    assert not any(v.empty for v in measure_views(trainer.model, TASK, dataset, trainer.renderer))
     trainer.model.params["means"] = trainer.model.params["means"].detach() + 1000.0
     with pytest.warns(NeuprimWarning, match=r"two: the model is in none of 2 test views.*ply_file_path"):
-        views = measure_views(trainer.model, TASK, dataset, trainer.renderer, Channels())
+        views = measure_views(trainer.model, TASK, dataset, trainer.renderer)
     assert all(v.empty for v in views)
 
 
@@ -165,11 +163,11 @@ def test_the_near_plane_of_a_run_is_recorded_once(scene: Path, tmp_path: Path) -
 def test_a_perfect_view_leaves_the_curve_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = tiny.two_primitives()
     monkeypatch.setattr(
-        "neuprim.runs.curve.render_image",
+        "neuprim.runs.fit.render_image",
         lambda model, view, settings, background: dataset.test.pixels(0).over(background),
     )
     dataset.test.images = [dataset.test.images[0]] * 2  # type: ignore[attr-defined]
-    assert evaluate_curve_point(tiny.trainer(dataset, 3)) == 200.0
+    assert measure_curve_point(tiny.trainer(dataset, 3)) == 200.0
 
 
 def test_a_task_may_judge_views_and_make_films_and_tell_facts(

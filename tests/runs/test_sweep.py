@@ -106,7 +106,7 @@ def test_a_duplicated_run_is_refused_and_the_sweep_goes_on(
     out = tmp_path / "sweep"
     with lock_directory(out / "seed-2"):
         assert main(typed(scene, out, "train.iterations=1", "resume=true")) == 2
-    assert [(row.state, "is at work on this run" in row.line) for row in read_sweep(out).rows] == [("done", False),
+    assert [(row.state, "is at work on this run" in row.line) for row in read_sweep(out).runs] == [("done", False),
         ("failed", True), ("done", False)]  # type: ignore[union-attr]  # fmt: skip
     assert "neuprim: error:" in capsys.readouterr().err
 

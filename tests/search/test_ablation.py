@@ -14,9 +14,8 @@ from neuprim.config import compose
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError, NonFiniteError
-from neuprim.runs.events import Events
-from neuprim.runs.fit import fit
-from neuprim.runs.launch.jobs import Result
+from neuprim.runs.fit import Events, fit
+from neuprim.runs.launch.jobs import JobResult
 from neuprim.runs.open import load_run
 from neuprim.search import ablation, ablation_plan, trials
 from neuprim.search.ablation import TRIALS, AblationRequest, run_ablation
@@ -69,7 +68,8 @@ def test_the_centre_every_knob_alone_and_some_together(measured: tuple[Path, Rec
     assert any(point.knob == COMBINED and len(point.turned) > 1 for point in record.points)
     plan = Plan(**record.facts["plan"])
     for point in record.points:
-        config, _, model, _ = load_run(folder / point.run_dir)
+        stored = load_run(folder / point.run_dir)
+        config, model = stored.config, stored.model
         assert config.train.iterations == point.steps and model.count == point.primitives
         assert point.steps == max(1, round(STEPS * point.length / plan.paces[point.name]))
         assert point.bytes == (folder / point.run_dir / "model.safetensors").stat().st_size
@@ -129,11 +129,11 @@ def test_an_interrupted_set_continues_with_trainings_launched_together(
 ) -> None:
     batches: list[int] = []
 
-    def launch(wanted: list[Trial], settings: LauncherSettings, *args: Any) -> list[Result]:
+    def launch(wanted: list[Trial], settings: LauncherSettings, *args: Any) -> list[JobResult]:
         if len(batches) == 1:
             raise KeyboardInterrupt
         batches.append(len(wanted))
-        return [Result("done", run_trial(trial)) for trial in wanted]
+        return [JobResult("done", run_trial(trial)) for trial in wanted]
 
     monkeypatch.setattr(ablation, "launch_trials", launch)
     monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)

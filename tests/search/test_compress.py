@@ -60,7 +60,7 @@ def test_the_command_says_what_became_of_every_parameter(
     command = ["compress", str(whole), "--seconds", "0", "--level", "2", "--out", str(out)]
     assert main([*command, "--bits", "W1=12", "means=20", "sh_rest=9,7"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    _, _, model, _ = load_run(whole)
+    model = load_run(whole).model
     rows = {line.split()[0]: line.split()[1:] for line in lines[2 : 2 + len(model.specs)]}
     assert lines[0] == str(out) and rows.keys() == model.params.keys()
     assert all(int(rows[s.name][-3].replace(",", "")) == 4 * model.count * s.size for s in model.specs)
@@ -122,9 +122,9 @@ def test_the_best_of_both_is_read(whole: Path, tmp_path: Path) -> None:
     shutil.copytree(whole, run)
     compress_run(run, level=5)
     exact = checkpoint.read(whole / "model.safetensors", "model")[1]
-    assert model_file(run) == run / "model.safetensors" and torch.equal(load_run(run)[2].params["b1"], exact["b1"])
+    assert model_file(run) == run / "model.safetensors" and torch.equal(load_run(run).model.params["b1"], exact["b1"])
     (run / "model.safetensors").unlink()
-    assert model_file(run) == run / "model.neuprim" and not torch.equal(load_run(run)[2].params["b1"], exact["b1"])
+    assert model_file(run) == run / "model.neuprim" and not torch.equal(load_run(run).model.params["b1"], exact["b1"])
     (run / "model.neuprim").unlink()
     with pytest.raises(CheckpointError, match=r"model\.safetensors: no such model"):
         load_run(run)
@@ -135,8 +135,9 @@ def test_the_best_of_both_is_read(whole: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("steps", [0, 80])
 def test_training_views_decide_how_coarse_numbers_are(whole: Path, tmp_path: Path, steps: int) -> None:
-    config, task, model, _ = load_run(whole)
-    quality = TrainingQuality.of_run(config, load_dataset(config, task, run_dir=whole))
+    stored = load_run(whole)
+    config, task, model = stored.config, stored.task, stored.model
+    quality = TrainingQuality.of_run(config, load_dataset(stored))
     base, sizes = quality(model), []
     for tolerance in (0.05, 0.3, 1.5):
         made = compress_run(whole, tolerance=tolerance, steps=steps, out=tmp_path / f"{tolerance}")
@@ -182,8 +183,8 @@ def test_export(small: Path, tmp_path: Path, form: str) -> None:
     (file,) = export_run(small, form, tmp_path / f"m.{form.rpartition('-')[2]}").files
     if form != "gaussian-ply":
         back = import_run(file, tmp_path / "back")
-        wanted = load_run(small)[2].params
-        assert all(torch.equal(value, wanted[name]) for name, value in load_run(back)[2].params.items())
+        wanted = load_run(small).model.params
+        assert all(torch.equal(value, wanted[name]) for name, value in load_run(back).model.params.items())
 
 
 def test_import_makes_a_run_directory_of_the_file_alone(
@@ -200,7 +201,7 @@ def test_import_makes_a_run_directory_of_the_file_alone(
 
 def test_files_that_import_refuses(small: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.neuprim").write_bytes((small / "model.neuprim").read_bytes()[:-1])
-    checkpoint.save_compressed(tmp_path / "bare.neuprim", load_run(small)[2], "static", {}, LEVELS[3])
+    checkpoint.save_compressed(tmp_path / "bare.neuprim", load_run(small).model, "static", {}, LEVELS[3])
     (tmp_path / "wrong.neuprim").write_bytes(b"something else")
     for name, error, message in (
         ("cut", CheckpointError, r"cut\.neuprim: the sections take"),

@@ -57,7 +57,8 @@ def test_less_is_left_and_training_views_lose_no_more_than_the_tolerance(made: P
 
 def test_the_run_of_what_is_left_is_a_run(whole: Path, left: Path, made: Pruning) -> None:
     config = RunConfig.from_yaml(left / "config.yaml")
-    _, _, model, header = load_run(left)
+    stored = load_run(left)
+    model, header = stored.model, stored.header
     assert (
         model.count == made.after["primitives"] == config.model.primitives
         and count_stored_numbers(model) == made.after["numbers"]
@@ -82,8 +83,8 @@ def test_every_command_reads_it(left: Path, tmp_path: Path) -> None:
     again = import_run(tmp_path / "model.npz", tmp_path / "again")
     assert evaluate_run(again)["psnr"] == pytest.approx(evaluate_run(left)["psnr"], abs=1e-5)
     small = compress_run(CompressRequest(left, level=1, out=tmp_path / "small.neuprim"))
-    back, _ = checkpoint.load_model(small.file, load_run(left)[1])
-    model = load_run(left)[2]
+    back, _ = checkpoint.load_model(small.file, load_run(left).task)
+    model = load_run(left).model
     assert count_stored_numbers(back) <= count_stored_numbers(model)  # what is zero comes back as zero
     assert small.measured["psnr"][0] - small.measured["psnr"][1] < 0.2
 
@@ -92,9 +93,9 @@ def test_training_goes_on_where_it_was_left_and_what_is_gone_stays_gone(left: Pa
     copy = copied(left, tmp_path / "on")
     config = RunConfig.from_yaml(copy / "config.yaml")
     typed = [word for word in config.overrides if not word.startswith(("train.iterations=", "output_dir=", "resume="))]
-    before = load_run(copy)[2]
+    before = load_run(copy).model
     fit([*typed, f"output_dir={copy}", "resume=true", "train.iterations=300", "train.population.strategy=fixed"])
-    after = load_run(copy)[2]
+    after = load_run(copy).model
     assert checkpoint.read_header(copy / "checkpoint.safetensors", "checkpoint")["step"] == 300
     assert after.count == before.count and count_stored_numbers(after) <= count_stored_numbers(before)
     assert not torch.equal(after.params["means"], before.params["means"])
@@ -105,7 +106,7 @@ def test_with_steps_more_may_go_and_the_result_is_the_same_again(whole: Path, ma
     assert runs[0].steps == 100 and runs[0].judged[0] - runs[0].judged[1] <= TOLERANCE + 1e-6
     assert runs[0].after["numbers"] < made.before["numbers"] and runs[0].stages[0].cut < runs[0].stages[0].trained
     assert [s.numbers for s in runs[0].stages] == [s.numbers for s in runs[1].stages]
-    a, b = (load_run(r.run_dir)[2] for r in runs if r.run_dir is not None)
+    a, b = (load_run(r.run_dir).model for r in runs if r.run_dir is not None)
     assert all(torch.equal(a.params[name], b.params[name]) for name in a.params)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from neuprim.config import Job
 from neuprim.core.compression import Quantizers, bit_table, canonicalize, fit_quantizers
 from neuprim.core.compression.quantizers import Columns
 from neuprim.core.data import Dataset
@@ -34,14 +35,14 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def dataset(run_dir: Path) -> Dataset:
-    config, task, _, _ = load_run(run_dir)
-    return load_dataset(config, task, run_dir=run_dir)
+    return load_dataset(load_run(run_dir))
 
 
 def test_rates_begin_above_those_of_the_run_s_end_and_fall_to_next_to_nothing(run_dir: Path, dataset: Dataset) -> None:
-    config, task, model, _ = load_run(run_dir)
+    stored = load_run(run_dir)
+    config, task, model = stored.config, stored.task, stored.model
     assert 40 / LONG * START < LEAST_START
-    trainer = fine_tuner(config, task, dataset, model, 40)
+    trainer = fine_tuner(Job(config, task), dataset, model, 40)
     spec = next(s for s in model.specs if s.name == "b2")
     usual = config.train.rates.get("b2", spec.lr) * config.train.final_rate
     assert trainer.rates()["b2"] == pytest.approx(LEAST_START * usual, rel=1e-6)
@@ -55,16 +56,19 @@ def test_rates_begin_above_those_of_the_run_s_end_and_fall_to_next_to_nothing(ru
         (3 * LONG, START),
         (2 * LONG // 3, 2 * START / 3),
     ):  # of many steps they begin higher
-        assert fine_tuner(config, task, dataset, model, steps).rates()["b2"] == pytest.approx(start * usual, rel=1e-3)
+        assert fine_tuner(Job(config, task), dataset, model, steps).rates()["b2"] == pytest.approx(
+            start * usual, rel=1e-3
+        )
 
 
 def test_the_model_itself_stays_as_it_is_and_no_primitive_is_born_or_moved(run_dir: Path, dataset: Dataset) -> None:
-    config, task, model, _ = load_run(run_dir)
+    stored = load_run(run_dir)
+    config, task, model = stored.config, stored.task, stored.model
     before = {name: value.clone() for name, value in model.params.items()}
     eager = replace(
         config, train=replace(config.train, population=replace(config.train.population, every=1, start=0.0, stop=1.0))
     )
-    trainer = fine_tuner(eager, task, dataset, model, 30)
+    trainer = fine_tuner(Job(eager, task), dataset, model, 30)
     changes = [trainer.train_step().change for _ in range(30)]
     assert set(changes) == {None} and trainer.model.count == model.count
     assert all(torch.equal(model.params[name], value) for name, value in before.items())
@@ -72,20 +76,21 @@ def test_the_model_itself_stays_as_it_is_and_no_primitive_is_born_or_moved(run_d
 
 
 def test_what_is_to_stay_zero_does_and_nothing_else(run_dir: Path, dataset: Dataset) -> None:
-    config, task, model, _ = load_run(run_dir)
+    stored = load_run(run_dir)
+    config, task, model = stored.config, stored.task, stored.model
     zero = torch.zeros_like(model.params["sh_rest"], dtype=torch.bool)
     zero[::2, 3:] = True
     pruned = Primitives(
         model.density, model.colour, {**model.params, "sh_rest": model.params["sh_rest"].masked_fill(zero, 0.0)}
     )
-    trainer = fine_tuner(config, task, dataset, pruned, 20)
+    trainer = fine_tuner(Job(config, task), dataset, pruned, 20)
     trainer.zero_masks = {"sh_rest": zero}
     for _ in range(20):
         trainer.train_step()
     after = trainer.model.params["sh_rest"].detach()
     assert bool((after[zero] == 0).all()) and not torch.equal(after[~zero], pruned.params["sh_rest"][~zero])
     tensors, header = trainer.state()
-    again = fine_tuner(config, task, dataset, pruned, 20)
+    again = fine_tuner(Job(config, task), dataset, pruned, 20)
     again.load_state(tensors, header, "state")
     assert torch.equal(again.zero_masks["sh_rest"], zero)
 
@@ -95,7 +100,8 @@ def test_what_is_to_stay_zero_does_and_nothing_else(run_dir: Path, dataset: Data
 
 @pytest.fixture
 def data(run_dir: Path, dataset: Dataset) -> TrainingData:
-    config, task, _, _ = load_run(run_dir)
+    stored = load_run(run_dir)
+    config, task = stored.config, stored.task
     return TrainingData(config, task, dataset)
 
 
@@ -108,7 +114,7 @@ def equal(a: Primitives, b: Primitives) -> bool:
 
 
 def test_training_for_few_bits_wins_back_what_they_cost(run_dir: Path, data: TrainingData) -> None:
-    model, quality = load_run(run_dir)[2], TrainingQuality(data.dataset, data.config.renderer)
+    model, quality = load_run(run_dir).model, TrainingQuality(data.dataset, data.config.renderer)
     table, plain = bit_table(5, [], model.specs), canonicalize(model)
     at_once = quality(dequantize(plain, fit_quantizers(plain, table)))
     fewer, again = (finetune_for_table(data, model, table, 150, ignore) for _ in range(2))
@@ -118,7 +124,7 @@ def test_training_for_few_bits_wins_back_what_they_cost(run_dir: Path, data: Tra
 
 @pytest.mark.parametrize("steps", [0, 200])
 def test_a_tolerance_is_kept(run_dir: Path, data: TrainingData, steps: int) -> None:
-    model, quality = load_run(run_dir)[2], TrainingQuality(data.dataset, data.config.renderer)
+    model, quality = load_run(run_dir).model, TrainingQuality(data.dataset, data.config.renderer)
     base = quality(model)
     for allowed in (0.1, 0.5):
         fewer = quantize_within(data, model, allowed, steps, ignore)
@@ -129,7 +135,7 @@ def test_a_tolerance_is_kept(run_dir: Path, data: TrainingData, steps: int) -> N
 def test_training_that_spoils_the_model_is_not_stored(
     run_dir: Path, data: TrainingData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = load_run(run_dir)[2]
+    model = load_run(run_dir).model
     plain = quantize_within(data, model, 0.2, 0, ignore)
     monkeypatch.setattr("neuprim.runs.finetune.LEAST_START", 300.0)
     found = quantize_within(data, model, 0.2, 20, ignore)
@@ -142,7 +148,7 @@ def test_training_that_spoils_the_model_is_not_stored(
 @pytest.mark.parametrize("start", [1e-3, 0.1, 20.0])
 def test_the_coarsest_numbers_that_are_enough_are_found(run_dir: Path, data: TrainingData, start: float) -> None:
     quality = TrainingQuality(data.dataset, data.config.renderer)
-    rounding = QuantizationSearch(load_run(run_dir)[2], data.dataset, quality)
+    rounding = QuantizationSearch(load_run(run_dir).model, data.dataset, quality)
 
     def width(made: Quantizers) -> float:
         scheme = made["sh_dc"]

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 
-from neuprim.config import RunConfig, compose
+from neuprim.config import Job, RunConfig, compose
 from neuprim.config.command_settings import LauncherSettings, Target
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.runs.events import Event, Note, Step
-from neuprim.runs.launch.jobs import Result
+from neuprim.runs.fit import Event, Note, Step
+from neuprim.runs.launch.jobs import JobResult
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, read_metrics
 from neuprim.search import pruning, size_search, target, trial_runner
@@ -147,15 +147,15 @@ def test_an_interrupted_search_ends_like_one_that_was_not_and_test_views_decide_
 
 def test_launched_it_trains_two_lengths_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, clock = list[int](), Clock()
-    dataset = load_dataset(config(tmp_path / "run"), TASK)
+    dataset = load_dataset(Job(config(tmp_path / "run"), TASK))
 
-    def launch(trials: list[Trial], settings: LauncherSettings, folder: Path, progress: Any) -> list[Result]:
+    def launch(trials: list[Trial], settings: LauncherSettings, folder: Path, progress: Any) -> list[JobResult]:
         asked.append(len(trials))
         assert settings.threads == 1 and folder == tmp_path / "run" / "target"
         outcomes = [timed(trial, dataset) for trial in trials]
         seconds = [outcome.pace * outcome.steps for outcome in outcomes]
         clock.now += max(seconds)
-        return [Result("done", one, seconds=each) for one, each in zip(outcomes, seconds, strict=True)]
+        return [JobResult("done", one, seconds=each) for one, each in zip(outcomes, seconds, strict=True)]
 
     monkeypatch.setattr(trial_runner, "launch_trials", launch)
     monkeypatch.setattr(target, "_publish", lambda runner, predictor: None)

@@ -11,13 +11,12 @@ from pathlib import Path
 import pytest
 
 import neuprim.runs.fit as fitting
-from neuprim.config import RunConfig, compose
+from neuprim.config import Job, RunConfig, compose
 from neuprim.core import checkpoint
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import write_json
 from neuprim.core.train.trainer import StepReport, Trainer
-from neuprim.runs.events import Event, Note, Step
-from neuprim.runs.fit import fit
+from neuprim.runs.fit import Event, Note, Step, fit
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.render_images import RenderRequest, render_run
@@ -62,7 +61,7 @@ def test_a_trial_is_a_run_without_report_and_pictures(done: tuple[Path, Outcome]
     assert sorted(p.name for p in folder.iterdir()) == sorted(
         ["checkpoint.safetensors", "config.yaml", "metrics.jsonl", "model.safetensors", TRIAL_FILE]
     )
-    assert load_run(folder)[2].count == 40
+    assert load_run(folder).model.count == 40
     assert len(render_run(folder, RenderRequest("test", size=(12, 12), format="png", out=tmp_path / "drawn"))) == 2
 
 
@@ -106,7 +105,7 @@ def test_other_views_are_measured_and_not_trained_for(scene: Path, tmp_path: Pat
 
 def test_views_that_judge_are_not_learned_from(scene: Path, tmp_path: Path) -> None:
     config = config_of(scene, tmp_path / "t")
-    whole = load_dataset(config, TASK)
+    whole = load_dataset(Job(config, TASK))
     learned = set[str]()
 
     def hear(event: Event) -> None:

@@ -13,8 +13,8 @@ import pytest
 
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.runs import ground_truth
-from neuprim.runs.events import Events
-from neuprim.runs.launch.jobs import Job
+from neuprim.runs.fit import Events
+from neuprim.runs.launch.jobs import LaunchJob
 from neuprim.tasks.dynamic.volume import capture
 
 SLOW, FATAL = 1, 4
@@ -49,7 +49,7 @@ def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
 def troubled(wait: int) -> Any:
     """In place of the class of jobs: theirs with this module's function."""
 
-    def job(name: str, call: str, data: Any) -> Job:
-        return Job(name, f"{__name__}:{make_frames.__name__}", {**data, "wait": wait})
+    def job(name: str, call: str, data: Any) -> LaunchJob:
+        return LaunchJob(name, f"{__name__}:{make_frames.__name__}", {**data, "wait": wait})
 
     return job

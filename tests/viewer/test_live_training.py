@@ -19,8 +19,7 @@ import neuprim.viewer.session as sessions
 from neuprim.config import RunConfig, compose
 from neuprim.config.command_settings import ViewerSettings
 from neuprim.core import checkpoint
-from neuprim.runs.events import Event, Note, Step
-from neuprim.runs.fit import Fitted
+from neuprim.runs.fit import Event, Fitted, Note, Step
 from neuprim.runs.run import run
 from neuprim.viewer.live_training import LiveTraining
 from tests.core import tiny

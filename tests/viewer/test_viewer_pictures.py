@@ -305,7 +305,8 @@ def test_a_run_whose_data_are_gone_is_shown_without_held_out_views(run_dir: Path
 def test_a_damaged_header_is_named(run_dir: Path, tmp_path: Path) -> None:
     copy = tmp_path / "run"
     shutil.copytree(run_dir, copy)
-    _, _, model, header = load_run(copy)
+    stored = load_run(copy)
+    model, header = stored.model, stored.header
     more = {k: v for k, v in header.items() if k in ("background", "color_space", "channels", "data_source")}
     save_model(copy / "model.safetensors", model, "static", {**more, "data": {"up": [0, "x", 1], "center": [0, 0, 0]}})
     with pytest.raises(DataError, match=r"the model's header: data: up\[1\] is .*expected a finite number"):

@@ -54,8 +54,6 @@ class Backend:
     device_name: Callable[[], str] = _processor_name
     missing: Callable[[], str | None] = _no_reason
     """Why this machine lacks what it needs, such as a package; None if it has it. Cheap."""
-    compiles: bool = False
-    """Whether it compiles something once per installation, which a run then does during its other preparations."""
     checks: bool = False
     """Whether it refuses numbers that are not finite while it prepares a frame."""
     differentiates_intrinsics: bool = False
@@ -128,9 +126,7 @@ TABLE: tuple[Backend, ...] = (
         devices=(hardware.CUDA, hardware.CPU),
         slabs=_loader("cuda", "render_slabs"),
     ),
-    Backend(
-        "cpu", _loader("cpu"), unsupported_by_kernels, compiles=True, checks=True, slabs=_loader("cpu", "render_slabs")
-    ),
+    Backend("cpu", _loader("cpu"), unsupported_by_kernels, checks=True, slabs=_loader("cpu", "render_slabs")),
     Backend(REFERENCE, _loader("reference"), differentiates_intrinsics=True),
 )
 """Fastest first."""
@@ -224,12 +220,6 @@ def with_available_device(settings: RenderSettings) -> RenderSettings:
     """Return the settings for drawing a finished run, perhaps on a machine without the run's GPU."""
     gone = settings.device == hardware.CUDA and gpu_unavailable() is not None and settings.backend == AUTO
     return replace(settings, device="auto") if gone else settings
-
-
-def precompiled_backend(settings: RenderSettings) -> Backend | None:
-    """Return the backend that a run may want to compile during its other preparations, whatever it will draw."""
-    kind = hardware.CUDA if gpu_unavailable() is None else hardware.CPU
-    return next((backend for backend in candidate_backends(settings, kind) if backend.compiles), None)
 
 
 def device_of(model: Primitives, settings: RenderSettings, camera: AnyCamera, conditions: Conditions) -> torch.device:

@@ -11,14 +11,10 @@ import multiprocessing
 import os
 import shutil
 import socket
-import sys
 import tempfile
-import threading
-import time
-from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -27,11 +23,8 @@ from urllib.parse import urlsplit
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import machine_cores
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.runs.launch.jobs import Result
-from neuprim.runs.launch.worker import CACHE_VARIABLES, Task, interrupt, is_working, worker_environment
-
-_GRACE = 60.0
-"""Seconds that a worker has to write its checkpoint when its launcher is gone."""
+from neuprim.runs.launch.jobs import JobResult
+from neuprim.runs.launch.worker import WorkerTask, cache_variables, start_worker_process, worker_environment
 
 _RAY_TIMEOUT = 5.0
 """Seconds for a Ray cluster to answer; Ray itself would wait for minutes."""
@@ -44,7 +37,7 @@ class WorkerDied(Exception):
     """The process that had a task is gone; the text says what is known."""
 
 
-class Executor(Protocol):
+class LaunchExecutor(Protocol):
     """Runs tasks in other processes.
 
     Attributes:
@@ -54,13 +47,13 @@ class Executor(Protocol):
     workers: int
     threads: int
 
-    def submit(self, task: Task) -> Any:
+    def submit(self, task: WorkerTask) -> Any:
         """Start a task; returns its handle."""
 
     def done(self, handle: Any) -> bool:
         """Whether the task is over."""
 
-    def result(self, handle: Any) -> Result:
+    def result(self, handle: Any) -> JobResult:
         """The result of a task that is over. Raises WorkerDied."""
 
     def cancel(self, handle: Any) -> None:
@@ -109,14 +102,17 @@ def count_parallel_jobs(settings: LauncherSettings, jobs: int) -> tuple[int, int
 
 
 @dataclass
-class _Worker:
+class _WorkerProcess:
     """A pool of one process: when the system kills a process, its pool breaks and no other. ``log`` has its output."""
 
     pool: ProcessPoolExecutor
     log: Path
 
 
-class Processes:
+_ProcessHandle = tuple[Future[JobResult], _WorkerProcess]
+
+
+class ProcessExecutor:
     """``launcher=processes``: workers that stay alive from one task to the next.
 
     Args:
@@ -125,27 +121,25 @@ class Processes:
 
     def __init__(self, settings: LauncherSettings, jobs: int, folder: Path) -> None:
         self.workers, self.threads = divide_cores(settings, jobs)
-        self._folder = folder.absolute()
-        self._idle: list[_Worker] = []
-        self._busy: list[_Worker] = []
-        self._numbers = itertools.count()
+        self._folder, self._numbers = folder.absolute(), itertools.count()
+        self._idle: list[_WorkerProcess] = []
+        self._busy: list[_WorkerProcess] = []
 
-    def submit(self, task: Task) -> tuple[Future[Result], _Worker]:
+    def submit(self, task: WorkerTask) -> _ProcessHandle:
         worker = self._idle.pop() if self._idle else self._new_worker()
-        with _environment(worker_environment(self.threads)):  # a process starts with its first task
-            try:
-                future = worker.pool.submit(task)
-            except BrokenProcessPool:  # it was killed while it was idle
-                worker.pool.shutdown(wait=False)
-                worker = self._new_worker()
-                future = worker.pool.submit(task)
+        try:
+            future = worker.pool.submit(task)
+        except BrokenProcessPool:  # it was killed while it was idle
+            worker.pool.shutdown(wait=False)
+            worker = self._new_worker()
+            future = worker.pool.submit(task)
         self._busy.append(worker)
         return future, worker
 
-    def done(self, handle: tuple[Future[Result], _Worker]) -> bool:
+    def done(self, handle: _ProcessHandle) -> bool:
         return handle[0].done()
 
-    def result(self, handle: tuple[Future[Result], _Worker]) -> Result:
+    def result(self, handle: _ProcessHandle) -> JobResult:
         future, worker = handle
         self._busy.remove(worker)
         try:
@@ -159,67 +153,27 @@ class Processes:
         self._idle.append(worker)
         return result
 
-    def cancel(self, handle: tuple[Future[Result], _Worker]) -> None:
+    def cancel(self, handle: _ProcessHandle) -> None:
         """Every task has begun; it stops by itself."""
 
     def close(self, now: bool) -> None:
         for worker in self._busy if now else []:
             for process in list((worker.pool._processes or {}).values()):
                 process.kill()
-        pools = [worker.pool for worker in (*self._idle, *self._busy)]
-        if pools:
+        if pools := [worker.pool for worker in (*self._idle, *self._busy)]:
             with ThreadPoolExecutor(len(pools)) as closing:  # a worker takes a second to end
-                list(closing.map(lambda pool: pool.shutdown(wait=True), pools))
+                list(closing.map(ProcessPoolExecutor.shutdown, pools))
 
-    def _new_worker(self) -> _Worker:
-        log = self._folder / f"worker-{next(self._numbers)}.log"
-        context = multiprocessing.get_context("spawn")
-        return _Worker(ProcessPoolExecutor(1, context, initializer=_start_worker, initargs=(log,)), log)
-
-
-@contextmanager
-def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _start_worker(log: Path) -> None:
-    """In a new process: ignore the terminal's Ctrl-C, which the launcher passes on, write output to a file, and end
-    when the launcher is gone."""
-    if hasattr(os, "setsid"):
-        os.setsid()
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
-    with open(log, "ab") as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-    threading.Thread(target=_end_without_launcher, name="neuprim-orphaned", daemon=True).start()
-
-
-def _end_without_launcher() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None, "a worker has a launcher"
-    parent.join()
-    if is_working():
-        interrupt()
-    until = time.monotonic() + _GRACE
-    while is_working() and time.monotonic() < until:
-        time.sleep(0.1)
-    os._exit(1)
+    def _new_worker(self) -> _WorkerProcess:
+        log, context = self._folder / f"worker-{next(self._numbers)}.log", multiprocessing.get_context("spawn")
+        started = log, worker_environment(self.threads)
+        return _WorkerProcess(ProcessPoolExecutor(1, context, start_worker_process, started), log)
 
 
 # ------------------------------------------------------------ Ray
 
 
-class Ray:
+class RayExecutor:
     """``launcher=ray``: tasks of Ray, on this machine or on a cluster.
 
     Raises:
@@ -234,10 +188,11 @@ class Ray:
         self._refs: list[Any] = []
         self._connected = not ray.is_initialized()
         if self._connected:
-            _connect(ray, settings.address or os.environ.get("RAY_ADDRESS") or "local")
+            _connect_to_ray(ray, settings.address or os.environ.get("RAY_ADDRESS") or "local")
         try:
-            self.workers, self.threads = _divide_cluster(ray, settings, jobs)
-            self._call = ray.remote(_call).options(**{"num_cpus": self.threads, **settings.options}, max_retries=0)
+            self.workers, self.threads = _divide_ray_cluster(ray, settings, jobs)
+            options = {"num_cpus": self.threads, **settings.options}
+            self._call = ray.remote(WorkerTask.__call__).options(**options, max_retries=0)
         except (ValueError, TypeError) as error:
             self.close(True)
             raise ConfigError(f"launcher.options: Ray refuses them: {_join_lines(error)}") from None
@@ -245,23 +200,20 @@ class Ray:
             self.close(True)
             raise
 
-    def submit(self, task: Task) -> Any:
-        ref = self._call.remote(task)
-        self._refs.append(ref)
-        return ref
+    def submit(self, task: WorkerTask) -> Any:
+        self._refs.append(self._call.remote(task))
+        return self._refs[-1]
 
     def done(self, handle: Any) -> bool:
         return bool(self._ray.wait([handle], timeout=0)[0])
 
-    def result(self, handle: Any) -> Result:
+    def result(self, handle: Any) -> JobResult:
         self._refs.remove(handle)
         try:
-            result: Result = self._ray.get(handle)
+            result: JobResult = self._ray.get(handle)
             return result
-        except (
-            self._ray.exceptions.RayTaskError
-        ) as error:  # the worker lacks a package; a job's errors are in its result
-            return Result("failed", line=f"the worker cannot do it: {_join_lines(error.cause)}", trace=str(error))
+        except self._ray.exceptions.RayTaskError as error:  # the worker lacks a package; a job's errors are results
+            return JobResult("failed", line=f"the worker cannot do it: {_join_lines(error.cause)}", trace=str(error))
         except self._ray.exceptions.RayError as error:
             raise WorkerDied(_join_lines(error)) from None
 
@@ -275,24 +227,19 @@ class Ray:
             self._ray.shutdown()
 
 
-def _call(task: Task) -> Result:
-    return task()
-
-
-def _connect(ray: Any, address: str) -> None:
+def _connect_to_ray(ray: Any, address: str) -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     options: dict[str, Any] = {"num_cpus": machine_cores(), "include_dashboard": False}
     if address != "local":
-        _check_reachable(address)
-        passed = {name: os.environ[name] for name in CACHE_VARIABLES if name in os.environ}
-        options = {"runtime_env": {"env_vars": passed}}
+        _check_ray_address(address)
+        options = {"runtime_env": {"env_vars": cache_variables()}}
     try:
         ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, **options)
     except (ValueError, ConnectionError, RuntimeError, SystemExit) as error:
         raise BackendUnavailable(f"launcher.address={address}: no Ray there ({_join_lines(error)})") from None
 
 
-def _check_reachable(address: str) -> None:
+def _check_ray_address(address: str) -> None:
     """Raise BackendUnavailable where nothing listens at ``HOST:PORT`` or ``ray://HOST:PORT``."""
     if address == "auto":
         return
@@ -312,7 +259,7 @@ def _check_reachable(address: str) -> None:
         ) from None
 
 
-def _divide_cluster(ray: Any, settings: LauncherSettings, jobs: int) -> tuple[int, int]:
+def _divide_ray_cluster(ray: Any, settings: LauncherSettings, jobs: int) -> tuple[int, int]:
     """(jobs at once, threads of each); jobs that the cluster has no cores for wait in Ray's queue."""
     machines = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
     if len(machines) == 1 and settings.address is None:
@@ -334,9 +281,9 @@ def _divide_cluster(ray: Any, settings: LauncherSettings, jobs: int) -> tuple[in
 class RequeuedTask:
     """A task that submitit may stop and queue again, when Slurm takes the machine away or its time is up."""
 
-    task: Task
+    task: WorkerTask
 
-    def __call__(self) -> Result:
+    def __call__(self) -> JobResult:
         return self.task()
 
     def checkpoint(self) -> Any:
@@ -346,7 +293,7 @@ class RequeuedTask:
         return DelayedSubmission(RequeuedTask(self.task.retry()))
 
 
-class Slurm:
+class SlurmExecutor:
     """``launcher=slurm``: jobs of a Slurm cluster; submitit's local executor uses processes of this machine.
 
     Args:
@@ -370,40 +317,37 @@ class Slurm:
         # results are pickles, which run code when they are read: only this user can write into the new folder
         self._folder, self._died = Path(tempfile.mkdtemp(prefix="submitit-", dir=folder.absolute())), False
         self._jobs: list[Any] = []
+        defaults = {"name": "neuprim", "cpus_per_task": self.threads, "timeout_min": _SLURM_MINUTES}
         try:
             self._executor = submitit.AutoExecutor(self._folder, cluster=address)
-        except RuntimeError as error:
+            self._executor.update_parameters(**{**defaults, **settings.options})
+        except (RuntimeError, NameError, TypeError, ValueError, AssertionError) as error:
             self.close(False)
             with suppress(OSError):  # it has other files
                 folder.rmdir()
+            if not isinstance(error, RuntimeError):
+                raise ConfigError(f"launcher.options: submitit refuses them: {_join_lines(error)}") from None
             raise BackendUnavailable(
                 f"launcher=slurm: {_join_lines(error)}; launcher.address=local does without a cluster"
             ) from None
-        defaults = {"name": "neuprim", "cpus_per_task": self.threads, "timeout_min": _SLURM_MINUTES}
-        try:
-            self._executor.update_parameters(**{**defaults, **settings.options})
-        except (NameError, TypeError, ValueError, AssertionError) as error:
-            self.close(False)
-            raise ConfigError(f"launcher.options: submitit refuses them: {_join_lines(error)}") from None
 
-    def submit(self, task: Task) -> Any:
-        job = self._executor.submit(RequeuedTask(task))
-        self._jobs.append(job)
-        return job
+    def submit(self, task: WorkerTask) -> Any:
+        self._jobs.append(self._executor.submit(RequeuedTask(task)))
+        return self._jobs[-1]
 
     def done(self, handle: Any) -> bool:
         return bool(handle.done())
 
-    def result(self, handle: Any) -> Result:
+    def result(self, handle: Any) -> JobResult:
         from submitit.core.utils import FailedJobError, UncompletedJobError
 
         self._jobs.remove(handle)
         try:
-            result: Result = handle.result()
+            result: JobResult = handle.result()
             return result
-        except FailedJobError as error:  # the worker lacks a package; a job's errors are in its result
+        except FailedJobError as error:  # the worker lacks a package; a job's errors are results
             last = str(error).strip().splitlines()[-1]
-            return Result("failed", line=f"the worker cannot do it: {last}", trace=str(error))
+            return JobResult("failed", line=f"the worker cannot do it: {last}", trace=str(error))
         except UncompletedJobError:
             self._died = True
             raise WorkerDied(

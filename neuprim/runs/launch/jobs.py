@@ -21,15 +21,14 @@ from neuprim.core.io.plain import load_json
 from neuprim.core.validation import validate
 
 if TYPE_CHECKING:
-    from neuprim.runs.events import Event, Events
-
+    from neuprim.runs.fit import Event, Events
 
 ENDED = ("done", "failed", "interrupted")
 """States of a job that is over."""
 
 
 @dataclass(frozen=True)
-class Job:
+class LaunchJob:
     """One piece of work.
 
     Attributes:
@@ -45,7 +44,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Result:
+class JobResult:
     """How a job ended.
 
     Attributes:
@@ -84,17 +83,17 @@ class JobStatus:
     psnr: float | None = None
     attempt: int = 0
 
-    def end(self, result: Result) -> JobStatus:
+    def end(self, result: JobResult) -> JobStatus:
         """The last status of a job with this result."""
         return replace(self, state=result.state, text=result.line, attempt=result.attempts - 1)
 
 
-def perform(job: Job, attempt: int, events: Events) -> Result:
+def perform_job(job: LaunchJob, attempt: int, events: Events) -> JobResult:
     """Do a job in this process. Nothing is raised: errors are in the result."""
     start = time.monotonic()
 
-    def result(state: str, value: Any = None, line: str = "", trace: str = "") -> Result:
-        return Result(state, value, line, trace, time.monotonic() - start, attempt + 1)
+    def result(state: str, value: Any = None, line: str = "", trace: str = "") -> JobResult:
+        return JobResult(state, value, line, trace, time.monotonic() - start, attempt + 1)
 
     try:
         module, _, name = job.call.partition(":")
@@ -118,7 +117,7 @@ class StatusListener:
         self.status = JobStatus("starting", attempt=attempt)
 
     def __call__(self, event: Event) -> None:
-        from neuprim.runs.events import Evaluated, Finishing, Preparing, Step  # torch, see above
+        from neuprim.runs.fit import Evaluated, Finishing, Preparing, Step  # torch, see above
 
         status = self.status
         match event:

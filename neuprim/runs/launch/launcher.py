@@ -8,16 +8,24 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.errors import BackendUnavailable, NeuprimError
-from neuprim.runs.events import Event
-from neuprim.runs.interrupt import interruptible
-from neuprim.runs.launch.executors import Executor, Processes, Ray, Slurm, WorkerDied, divide_cores
-from neuprim.runs.launch.jobs import Job, JobStatus, Result, StatusListener, perform, read_status
-from neuprim.runs.launch.worker import Task, worker_environment
+from neuprim.runs.launch.executors import (
+    LaunchExecutor,
+    ProcessExecutor,
+    RayExecutor,
+    SlurmExecutor,
+    WorkerDied,
+    divide_cores,
+)
+from neuprim.runs.launch.jobs import JobResult, JobStatus, LaunchJob, StatusListener, perform_job, read_status
+from neuprim.runs.launch.worker import WorkerTask, interruptible, worker_environment
+
+if TYPE_CHECKING:
+    from neuprim.runs.fit import Event
 
 LAUNCH_FOLDER = "launch"
 """In a sweep's directory: statuses while it works, and the logs of workers that printed something."""
@@ -25,13 +33,13 @@ LAUNCH_FOLDER = "launch"
 OnStatus = Callable[[int, JobStatus], None]
 """Called with the number of a job and its status, whenever it is new."""
 
-OnResult = Callable[[int, Result], None]
+OnResult = Callable[[int, JobResult], None]
 """Called with the number of a job and its result, before its last status."""
 
-_EXECUTORS: dict[str, Callable[[LauncherSettings, int, Path], Executor]] = {
-    "processes": Processes,
-    "ray": Ray,
-    "slurm": Slurm,
+_EXECUTORS: dict[str, Callable[[LauncherSettings, int, Path], LaunchExecutor]] = {
+    "processes": ProcessExecutor,
+    "ray": RayExecutor,
+    "slurm": SlurmExecutor,
 }
 _PACKAGES = {"ray": "ray", "slurm": "submitit"}
 """Launcher -> the package that it needs."""
@@ -44,7 +52,7 @@ def ignore_status(number: int, status: JobStatus) -> None:
     """Do nothing."""
 
 
-def ignore_result(number: int, result: Result) -> None:
+def ignore_result(number: int, result: JobResult) -> None:
     """Do nothing."""
 
 
@@ -57,8 +65,7 @@ def check_launcher(settings: LauncherSettings, jobs: int) -> None:
     """
     if settings.name == "processes":
         divide_cores(settings, jobs)
-    package = _PACKAGES.get(settings.name)
-    if package is None:
+    if (package := _PACKAGES.get(settings.name)) is None:
         return
     try:
         importlib.import_module(package)
@@ -70,20 +77,18 @@ def check_launcher(settings: LauncherSettings, jobs: int) -> None:
 
 def use_launcher_threads(settings: LauncherSettings) -> AbstractContextManager[None]:
     """Give this process the threads of ``launcher.threads`` where runs work in it; otherwise it keeps its own."""
-    return (
-        limit_process_threads(settings.threads)
-        if settings.name == "inline" and settings.threads is not None
-        else nullcontext()
-    )
+    own = settings.name == "inline" and settings.threads is not None
+    return limit_process_threads(settings.threads or 1) if own else nullcontext()
 
 
 def launch(
-    jobs: Sequence[Job],
+    jobs: Sequence[LaunchJob],
     settings: LauncherSettings,
     folder: Path,
     on_status: OnStatus = ignore_status,
     on_result: OnResult = ignore_result,
-) -> list[Result | None]:
+    stop_at_failure: bool = False,
+) -> list[JobResult | None]:
     """Do all jobs.
 
     The first Ctrl-C stops every job as it stops a run, which finishes its step and writes a checkpoint; the second ends
@@ -92,9 +97,10 @@ def launch(
     Args:
         folder: where launcher and workers meet; every worker sees it under this path. It is removed afterwards, unless
             workers printed something.
+        stop_at_failure: whether the first job that fails stops the others as Ctrl-C does.
 
     Returns:
-        results in the order of the jobs; None for those that Ctrl-C kept from starting.
+        results in the order of the jobs; None for those that did not start.
 
     Raises:
         BackendUnavailable: the launcher needs a package that is not installed, or cannot be reached.
@@ -102,7 +108,7 @@ def launch(
     """
     check_launcher(settings, len(jobs))
     if settings.name == "inline":
-        return _run_inline(jobs, settings, on_status, on_result)
+        return _launch_inline(jobs, settings, on_status, on_result, stop_at_failure)
     if not jobs:
         return []
     try:
@@ -111,14 +117,18 @@ def launch(
         with suppress(OSError):  # there may be none
             folder.rmdir()
         raise
-    return _JobLoop(executor, jobs, folder, settings.retries, on_status, on_result).run()
+    return _JobLoop(executor, jobs, folder, settings.retries, on_status, on_result, stop_at_failure).run()
 
 
-def _run_inline(
-    jobs: Sequence[Job], settings: LauncherSettings, on_status: OnStatus, on_result: OnResult
-) -> list[Result | None]:
-    """Do one job after the other in this process, up to the one that Ctrl-C ends."""
-    results = list[Result | None]([None] * len(jobs))
+def _launch_inline(
+    jobs: Sequence[LaunchJob],
+    settings: LauncherSettings,
+    on_status: OnStatus,
+    on_result: OnResult,
+    stop_at_failure: bool,
+) -> list[JobResult | None]:
+    """Do one job after the other in this process, up to the one that Ctrl-C or a failure ends."""
+    results = list[JobResult | None]([None] * len(jobs))
     with use_launcher_threads(settings):
         for number, job in enumerate(jobs):
             listener = StatusListener()
@@ -128,10 +138,10 @@ def _run_inline(
                 on_status(number, listener.status)
 
             on_status(number, JobStatus("starting"))
-            result = results[number] = perform(job, 0, notify)
+            result = results[number] = perform_job(job, 0, notify)
             on_result(number, result)
             on_status(number, listener.status.end(result))
-            if result.state == "interrupted":
+            if result.state == "interrupted" or (stop_at_failure and result.state == "failed"):
                 break
     return results
 
@@ -141,27 +151,29 @@ class _JobLoop:
 
     def __init__(
         self,
-        executor: Executor,
-        jobs: Sequence[Job],
+        executor: LaunchExecutor,
+        jobs: Sequence[LaunchJob],
         folder: Path,
         retries: int,
         on_status: OnStatus,
         on_result: OnResult,
+        stop_at_failure: bool,
     ) -> None:
         self._executor, self._retries, self._on_status, self._on_result = executor, retries, on_status, on_result
+        self._stop_at_failure = stop_at_failure
         self._folder = folder.absolute()
         self._stop = self._folder / "stop"
         variables, threads = worker_environment(executor.threads), executor.threads
         self._tasks = [
-            Task(job, threads, self._folder / f"{number}.json", self._stop, Path.cwd(), variables)
+            WorkerTask(job, threads, self._folder / f"{number}.json", self._stop, Path.cwd(), variables)
             for number, job in enumerate(jobs)
         ]
         self._waiting = deque(enumerate(self._tasks))
-        self._running: dict[int, tuple[Any, Task]] = {}
-        self._results = list[Result | None]([None] * len(jobs))
+        self._running: dict[int, tuple[Any, WorkerTask]] = {}
+        self._results = list[JobResult | None]([None] * len(jobs))
         self._statuses: dict[int, JobStatus] = {}
 
-    def run(self) -> list[Result | None]:
+    def run(self) -> list[JobResult | None]:
         self._folder.mkdir(parents=True, exist_ok=True)
         self._stop.unlink(missing_ok=True)
         finished = False
@@ -170,26 +182,31 @@ class _JobLoop:
                 while self._waiting or self._running:
                     if stopped.is_set() and not self._stop.exists():
                         self._stop_all()
-                    self._fill()
+                    while self._waiting and len(self._running) < self._executor.workers:
+                        number, task = self._waiting.popleft()
+                        task.status.unlink(missing_ok=True)
+                        self._running[number] = self._executor.submit(task), task
+                        self._notify(number, JobStatus("starting", attempt=task.attempt))
                     for number, (handle, task) in list(self._running.items()):
                         if self._executor.done(handle):
                             del self._running[number]
                             self._finish(number, handle, task)
-                        else:
-                            self._follow(number, task)
+                            continue
+                        status = read_status(task.status)
+                        if status and status.attempt >= task.attempt and status != self._statuses[number]:
+                            self._notify(number, status)
                     time.sleep(_INTERVAL)
             finished = True
         finally:
             self._executor.close(not finished)
-            self._clean_up()
+            for file in (*(task.status for task in self._tasks), self._stop):
+                file.unlink(missing_ok=True)
+            for log in self._folder.glob("*.log"):
+                if not log.stat().st_size:
+                    log.unlink()
+            with suppress(OSError):  # logs with something in them
+                self._folder.rmdir()
         return self._results
-
-    def _fill(self) -> None:
-        while self._waiting and len(self._running) < self._executor.workers:
-            number, task = self._waiting.popleft()
-            task.status.unlink(missing_ok=True)
-            self._running[number] = self._executor.submit(task), task
-            self._notify(number, JobStatus("starting", attempt=task.attempt))
 
     def _stop_all(self) -> None:
         self._stop.touch()
@@ -198,39 +215,26 @@ class _JobLoop:
             if not task.status.exists():  # it waits in the executor's queue
                 self._executor.cancel(handle)
 
-    def _finish(self, number: int, handle: Any, task: Task) -> None:
+    def _finish(self, number: int, handle: Any, task: WorkerTask) -> None:
         try:
             result = self._executor.result(handle)
         except WorkerDied as death:
             attempts = task.attempt + 1
             if self._stop.exists():
-                result = Result("interrupted", attempts=attempts)
+                result = JobResult("interrupted", attempts=attempts)
             elif task.attempt < self._retries:
                 self._notify(number, JobStatus("waiting", "its worker died", attempt=attempts))
                 self._waiting.appendleft((number, task.retry()))
                 return
             else:
                 times = f", {attempts} times" if attempts > 1 else ""
-                result = Result("failed", line=f"its worker died{times}: {death}", attempts=attempts)
+                result = JobResult("failed", line=f"its worker died{times}: {death}", attempts=attempts)
         self._results[number] = result
+        if self._stop_at_failure and result.state == "failed" and not self._stop.exists():
+            self._stop_all()
         self._on_result(number, result)
         self._notify(number, (read_status(task.status) or JobStatus()).end(result))
-
-    def _follow(self, number: int, task: Task) -> None:
-        status = read_status(task.status)
-        if status is not None and status.attempt >= task.attempt and status != self._statuses[number]:
-            self._notify(number, status)
 
     def _notify(self, number: int, status: JobStatus) -> None:
         self._statuses[number] = status
         self._on_status(number, status)
-
-    def _clean_up(self) -> None:
-        """Remove all but the logs that have something in them."""
-        for file in (*(task.status for task in self._tasks), self._stop):
-            file.unlink(missing_ok=True)
-        for log in self._folder.glob("*.log"):
-            if not log.stat().st_size:
-                log.unlink()
-        with suppress(OSError):  # logs
-            self._folder.rmdir()

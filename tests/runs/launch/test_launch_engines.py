@@ -121,10 +121,10 @@ def test_submitit_does_jobs(tmp_path: Path) -> None:
 @posix
 def test_submitits_results_come_from_a_folder_of_this_launch_alone(tmp_path: Path) -> None:
     pytest.importorskip("submitit")
-    from neuprim.runs.launch.executors import Slurm
+    from neuprim.runs.launch.executors import SlurmExecutor
 
     (tmp_path / "submitit").mkdir(mode=0o777)  # where somebody may have put pickles of theirs
-    executors = [Slurm(LauncherSettings("slurm", workers=1, address="local"), 1, tmp_path) for _ in range(2)]
+    executors = [SlurmExecutor(LauncherSettings("slurm", workers=1, address="local"), 1, tmp_path) for _ in range(2)]
     folders = [Path(executor._executor.folder) for executor in executors]
     assert len({*folders, tmp_path / "submitit"}) == 3
     assert all(
@@ -146,10 +146,10 @@ def test_submitit_queues_again_with_what_goes_on(tmp_path: Path) -> None:
     """What submitit asks for before a machine is taken away: a task that knows that it was begun."""
     pytest.importorskip("submitit")
     from neuprim.runs.launch.executors import RequeuedTask
-    from neuprim.runs.launch.worker import Task
+    from neuprim.runs.launch.worker import WorkerTask
 
     again = RequeuedTask(
-        Task(job("once", launching.die, 1), 1, tmp_path / "0.json", tmp_path / "stop", tmp_path)
+        WorkerTask(job("once", launching.die, 1), 1, tmp_path / "0.json", tmp_path / "stop", tmp_path)
     ).checkpoint()
     assert again.function.task.attempt == 1
 

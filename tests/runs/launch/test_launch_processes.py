@@ -17,7 +17,7 @@ from neuprim.core import checkpoint
 from neuprim.core.compute.threads import core_count, limit_process_threads
 from neuprim.core.errors import ConfigError
 from neuprim.runs.launch.executors import divide_cores
-from neuprim.runs.launch.jobs import JobStatus, Result
+from neuprim.runs.launch.jobs import JobResult, JobStatus
 from neuprim.runs.launch.launcher import launch, use_launcher_threads
 from tests.core import tiny
 from tests.runs import launching
@@ -32,7 +32,7 @@ def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
 
 
-def states(results: list[Result | None]) -> list[str | None]:
+def states(results: list[JobResult | None]) -> list[str | None]:
     return [None if result is None else result.state for result in results]
 
 

@@ -96,7 +96,7 @@ def test_an_animation_over_time(finished: Path, tmp_path: Path, suffix: str) -> 
 
 
 def test_cameras_of_a_file_need_a_time(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    _, task, _, _ = load_run(finished)
+    task = load_run(finished).task
     assert task is TASK
     matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.7], [0, 0, 0, 1]]
     cameras = {"w": 24, "h": 24, "camera_angle_x": 0.5, "frames": [{"name": "a", "transform_matrix": matrix}]}
@@ -144,7 +144,7 @@ def test_resuming_equals_going_on(files: Path, tmp_path: Path) -> None:
         with pytest.raises(KeyboardInterrupt):
             fit(files, part, *words, "train.checkpoint_every_seconds=0.0")
     fit(files, part, *words, "resume=true")
-    first, second = (load_run(folder)[2].params for folder in (whole, part))
+    first, second = (load_run(folder).model.params for folder in (whole, part))
     assert all(torch.equal(first[k], second[k]) for k in first)
 
 
@@ -164,7 +164,7 @@ def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(fi
         "train.population.start=0",
         "model.neurons=8",
     ]
-    model = load_run(fit(files, tmp_path / "run", *words))[2]
+    model = load_run(fit(files, tmp_path / "run", *words)).model
     assert (
         model.parameters_per_primitive == 143 + 1
         and bool(model.params["W_t"].any())

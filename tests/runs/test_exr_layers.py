@@ -23,7 +23,7 @@ from neuprim.core.model.fields import Constant
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.plugins.returns import ReturnError
-from neuprim.runs.layers import Layers
+from neuprim.runs.exr_layers import ExrLayers
 from neuprim.runs.measure import render_light_sum
 from neuprim.runs.render_config import RenderConfig
 from neuprim.tasks.dynamic import TASK as DYNAMIC
@@ -47,11 +47,11 @@ def volume() -> Primitives:
 VIEW = View("a view", CAMERA, {"time": torch.tensor(0.4)})
 
 
-def layers(space: str = "linear", **changes: Any) -> Layers:
-    return replace(Layers(Path("runs/fire"), DYNAMIC, Channels(color_space=space), RenderConfig(), BLUE), **changes)
+def layers(space: str = "linear", **changes: Any) -> ExrLayers:
+    return replace(ExrLayers(Path("runs/fire"), DYNAMIC, Channels(color_space=space), RenderConfig(), BLUE), **changes)
 
 
-def written(path: Path, how: Layers, model: Primitives, view: View) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def written(path: Path, how: ExrLayers, model: Primitives, view: View) -> tuple[dict[str, Tensor], dict[str, Any]]:
     how.write(path, model, view)
     with OpenEXR.File(str(path), separate_channels=True) as file:
         return {name: torch.from_numpy(np.array(c.pixels)) for name, c in file.channels().items()}, dict(file.header())

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ import torch
 import neuprim
 from neuprim.cli import main
 from neuprim.cli.export_command import print_report
-from neuprim.config import RunConfig
+from neuprim.config import Job, RunConfig
 from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.extensions import ExportReport
@@ -38,9 +39,15 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         made.append((run_dir, *words) if words else run_dir)
         return {"psnr": 31.23456, "views": 20, "worst": {"name": "r_3", "psnr": 27.0}}
 
-    def render_run(run_dir: Path, request: Any, **callbacks: Any) -> list[Path]:
-        made.append((run_dir, request))
+    def load_run(run_dir: Path) -> Any:
+        """A run without a model."""
+        return SimpleNamespace(directory=run_dir, task=Job.of(RunConfig.from_yaml(run_dir)).task)
+
+    def render_run(run: Any, request: Any, **callbacks: Any) -> list[Path]:
+        made.append((getattr(run, "directory", run), request))
         return [Path("a.png"), Path("b.png")]
+
+    monkeypatch.setattr("neuprim.runs.open.load_run", load_run)
 
     monkeypatch.setattr("neuprim.runs.run.run", run)
     monkeypatch.setattr("neuprim.runs.measure.evaluate_run", evaluate_run)

@@ -41,9 +41,9 @@ from neuprim.core.metrics import psnr
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import render_image
-from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.density import TimeDensity
-from neuprim.tasks.dynamic.evaluation import recording_of
+from neuprim.tasks.dynamic import recording_of
+from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
 
 RECORD = RESULTS / "dynamic_quality.json"
 PARTS = ("main", "control", "between", "equations")

@@ -40,7 +40,7 @@ from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.layout import Form
 from neuprim.core.render.cuda.projection import PER_BLOCK
 from neuprim.core.train import adam_warp, ssim_warp
-from neuprim.core.volumes import grid_warp
+from neuprim.core.volumes import density_grid_warp
 from neuprim.tasks.dynamic.volume import raymarch_warp
 
 RECORD = RESULTS / "gpu_kernels.json"
@@ -73,8 +73,8 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
             ("harmonics", sh_warp._kernels(3)),
             ("Adam", adam_warp._kernels()),
             ("SSIM", ssim_warp._kernels()),
-            ("grid", (grid_warp._kernel(),)),
-            ("rays of volumes", (raymarch_warp._radiances(), raymarch_warp._depths(), raymarch_warp._extinctions())),
+            ("grid", (density_grid_warp._add_kernel(),)),
+            ("rays of volumes", (raymarch_warp._image_kernel(), raymarch_warp._depth_kernel())),
         ):
             for number, kernel in enumerate(made, 1):
                 yield f"{title} {number}" if len(made) > 1 else title, kernel, BLOCK

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from neuprim.core.model.primitives import Primitives
-from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
 from tests import scenes
 
 COUNT = 30

@@ -22,7 +22,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
 from neuprim.core.task import Loss, SceneSpec, TaskSpec
 from neuprim.core.validation import Option, Range, coerce
-from neuprim.core.volumes.source import VolumeSource
+from neuprim.core.volumes.density_truth import VolumeSource
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.render import render
 from neuprim.core.render.backends import computing_device
 from neuprim.core.task import API_VERSION
-from neuprim.core.volumes.grid import density_grid
+from neuprim.core.volumes.density_grid import density_grid
 from neuprim.export.shared import Harmonics, choose_comparison_views, ellipsoid_box, find_rgb_channels, fit_harmonics
 
 OPTIONS = {

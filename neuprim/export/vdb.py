@@ -33,9 +33,15 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.backends import computing_device
 from neuprim.core.task import API_VERSION
-from neuprim.core.volumes.density_errors import Comparison, measure_frame_errors, split_planes
-from neuprim.core.volumes.grid import density_grid
-from neuprim.core.volumes.source import Extent, Placement, VolumeSource
+from neuprim.core.volumes.density_grid import density_grid
+from neuprim.core.volumes.density_truth import (
+    DensityComparison,
+    GridExtent,
+    Placement,
+    VolumeSource,
+    measure_frame_errors,
+    split_grid_planes,
+)
 from neuprim.export.shared import ellipsoid_box
 
 OPTIONS = {
@@ -89,7 +95,9 @@ def _write(job: ExportJob) -> ExportReport:
     errors: dict[str, float] = {}
     for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
         job.progress("writing frames", i / len(frames))
-        transform = source.transform(frame.source) if own and source is not None and frame.source is not None else None
+        transform = (
+            source.grid_transform(frame.source) if own and source is not None and frame.source is not None else None
+        )
         transform = fallback if transform is None else transform
         grid = sampler.sample_grid(frame.conditions, transform)
         if placement is not None and placement.extents:
@@ -156,12 +164,12 @@ def _component(job: ExportJob, placement: Placement | None) -> Primitives:
     return model.component(placement.component)
 
 
-def _extent(placement: Placement, frame: _GridFrame) -> Extent:
+def _extent(placement: Placement, frame: _GridFrame) -> GridExtent:
     """Return the extent of the source's frame, or of all frames for a time between them."""
-    return Extent.around(placement.extents) if frame.source is None else placement.extents[frame.source]
+    return GridExtent.around(placement.extents) if frame.source is None else placement.extents[frame.source]
 
 
-def _clamp_to_extent(grid: Grid, extent: Extent, per_unit: float) -> tuple[Grid, _Cut]:
+def _clamp_to_extent(grid: Grid, extent: GridExtent, per_unit: float) -> tuple[Grid, _Cut]:
     """Clamp a grid to an extent: no value above its largest, none outside its box; and count what that changed.
 
     Args:
@@ -200,7 +208,7 @@ def _find_source(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Pla
     kept = None
     if isinstance(record, dict) and "grid" in record:
         kept = Placement.from_json(record, str(job.run.directory / "model.safetensors"))
-    if source is not None and kept is not None and not kept.same(source.placement):
+    if source is not None and kept is not None and not kept.matches(source.placement):
         notes.append(
             "the source's files are not those that the model was fitted to, so neither their voxels nor errors "
             "against them"
@@ -344,16 +352,16 @@ def _errors(
         return {}
     name = f"frame_{source.placement.numbers[frame.source]:04d}"
     result = {f"{name}.{key}": value for key, value in found.items()}
-    grid, written = read_grid(path, str(job.options["name"])), Comparison()
+    grid, written = read_grid(path, str(job.options["name"])), DensityComparison()
     if grid.bounds is None:
         return result
     dense = grid.to_dense()
-    for matrix, shape in split_planes(*place):
+    for matrix, shape in split_grid_planes(*place):
         chain = np.linalg.inv(scene_from_world @ grid.transform) @ matrix.numpy()
         offset = chain[:3, 3] - np.array(grid.bounds[0])
         values = ndimage.affine_transform(dense, chain[:3, :3], offset, shape, order=1, mode="grid-constant") / factor
-        written.add(source.grid(frame.source, matrix, shape, **part).numpy(), values)
-    numbers = written.numbers()
+        written.add_block(source.grid(frame.source, matrix, shape, **part).numpy(), values)
+    numbers = written.errors()
     assert numbers is not None
     return result | {f"{name}.file_{key}": value for key, value in numbers.items()}
 

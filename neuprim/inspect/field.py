@@ -19,7 +19,7 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.model.fields import Conditions, ConditionSpec
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import ActiveSet, Primitives
-from neuprim.core.volumes.grid import density_grid
+from neuprim.core.volumes.density_grid import density_grid
 from neuprim.inspect.layers import Scale
 
 _OUTSIDE = 0.002

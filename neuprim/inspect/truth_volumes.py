@@ -15,9 +15,8 @@ from neuprim.core.cameras.world import World
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import Grid, VdbFrame, read_grid, read_header, sequence, write_vdb
 from neuprim.core.model.fields import Conditions
-from neuprim.core.volumes.density_errors import DensityTruth, TruthFrame
-from neuprim.core.volumes.grid import voxels_within
-from neuprim.core.volumes.source import VolumeSource
+from neuprim.core.volumes.density_grid import voxels_in_box
+from neuprim.core.volumes.density_truth import DensityTruth, TruthFrame, VolumeSource
 from neuprim.inspect.field import FieldFrame
 
 _GRID, _MARK, _CONDITION = "extinction", "neuprim_units", "neuprim_condition_"
@@ -48,7 +47,7 @@ def open_ground_truth(path: str, volume: Callable[[], VolumeSource | None], worl
         return VdbGroundTruth(frames, world), f"ground truth: {path}, written by neuprim in scene units"
     scene = volume()
     if scene is not None:
-        return scene.of(place), f"ground truth: {path}, placed and scaled by the rules of the run's scene"
+        return scene.open_files(place), f"ground truth: {path}, placed and scaled by the rules of the run's scene"
     per_world = (
         f", its world as that of the run's data, of {world.scale:g} scene units"
         if not world.identity
@@ -125,7 +124,7 @@ class VdbGroundTruth(DensityTruth):
 
     def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
         source = self._read(self._files[frame])
-        return None if source.bounds is None else voxels_within(self.bounds, self._scene_from_index(source))
+        return None if source.bounds is None else voxels_in_box(self.bounds, self._scene_from_index(source))
 
     def grid(
         self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None

@@ -19,8 +19,8 @@ from neuprim.core.io.animation import write_animation
 from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.fields import Conditions
 from neuprim.core.render.backends import computing_device
-from neuprim.core.volumes.density_errors import DensityTruth, measure_frame_errors
-from neuprim.core.volumes.grid import POINTS_LIMIT, density_grid, lattice
+from neuprim.core.volumes.density_grid import POINTS_LIMIT, box_lattice, density_grid
+from neuprim.core.volumes.density_truth import DensityTruth, measure_frame_errors
 from neuprim.inspect.field import FieldFrame, ViewOptions, describe_conditions, find_matter_box, read_condition_frames
 from neuprim.inspect.html_page import write_page
 from neuprim.inspect.layers import Layer, validate_layers
@@ -178,7 +178,7 @@ class _FrameSequence:
         box = self.world.scene_box(request.box) if request.box is not None else self._default_box()
         if request.grid**3 > POINTS_LIMIT:
             raise ConfigError(f"--grid {request.grid}: expected at most {round(POINTS_LIMIT ** (1 / 3))}")
-        self.matrix, self.shape = lattice(box, request.grid)
+        self.matrix, self.shape = box_lattice(box, request.grid)
         self.numbers = [self._compare_frame(i, events) for i in range(len(self))]
         self.top, self.gain, self.focus = self._find_scale(box)
         low, high = ([round(x, 4) for x in corner] for corner in self.world.world_box(np.asarray(box)).tolist())
@@ -210,7 +210,7 @@ class _FrameSequence:
 
     def _find_scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
         """Return the largest extinction shown, the factor on opacities of volumes, and the middle of the matter."""
-        matrix, shape = lattice(box, _SCALE_POINTS)
+        matrix, shape = box_lattice(box, _SCALE_POINTS)
         most, depth, total = 0.0, 0.0, np.zeros(shape)
         for conditions, number in self.pairs:
             grids = [density_grid(self.model, conditions, matrix, shape, where=self.device).numpy()]

@@ -22,7 +22,7 @@ from neuprim.core.model.prunable import count_numbers, nonzero_rows
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.backends import computing_device, device_of, with_available_device
 from neuprim.core.task import SceneContext, TaskSpec
-from neuprim.core.volumes.source import VolumeSource
+from neuprim.core.volumes.density_truth import VolumeSource
 from neuprim.plugins.attribution import attribute_errors
 from neuprim.plugins.provenance import warn_of_other_neuprim
 from neuprim.plugins.registry import PluginError

@@ -12,7 +12,7 @@ from neuprim.core.data import Dataset, PointSamples, PointSupervision
 from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
-from neuprim.core.volumes.points import values_at
+from neuprim.core.volumes.points import volume_values_at
 from neuprim.runs.measure import render_image
 
 _VIEWS, _QUICK_VIEWS = 24, 8
@@ -84,7 +84,9 @@ class TrainingQuality:
         values = []
         with torch.no_grad():
             for samples in self.draws[:: max(len(self.draws) // _QUICK_FRAMES, 1) if quick else 1]:
-                sigma = values_at(model, samples.conditions, samples.points, False, self.settings.threads).sigma.cpu()
+                sigma = volume_values_at(
+                    model, samples.conditions, samples.points, False, self.settings.threads
+                ).sigma.cpu()
                 error = float(((sigma - samples.sigma) / samples.sigma_scale).square().mean())
                 values.append(-10 * math.log10(max(error, 1e-20)))
         return float(np.mean(values))

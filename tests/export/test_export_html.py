@@ -17,8 +17,8 @@ from neuprim.report import Viewer, write_report
 from neuprim.report.run_report import LIMIT
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
-from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.webpage.scene import held_out
 from tests.core import tiny
 from tests.page_models import random_model

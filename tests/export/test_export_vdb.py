@@ -12,8 +12,8 @@ import torch
 from neuprim.core.compute import device
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import Grid, read_grid
-from neuprim.core.volumes.density_errors import NUMBERS
-from neuprim.core.volumes.grid import density_grid
+from neuprim.core.volumes.density_grid import density_grid
+from neuprim.core.volumes.density_truth import DENSITY_ERRORS
 from neuprim.export import vdb as exporter
 from neuprim.runs.export import export_run
 from neuprim.runs.inspect import Request, inspect_run
@@ -92,7 +92,7 @@ def test_a_sequence_lies_on_the_voxels_of_its_files_and_in_their_units(moving: P
 
 
 def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Path) -> None:
-    from neuprim.tasks.dynamic.volume.ground_truth import compare_extinction
+    from neuprim.tasks.dynamic.volume.capture_density import compare_extinction
 
     report = export_run(moving, "vdb", tmp_path / "frames")
     run = open_run(moving)
@@ -100,7 +100,9 @@ def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Pat
     assert len(expected) == 3
     for entry in expected:
         name = f"frame_{entry['frame']:04d}"
-        assert {key: report.errors[f"{name}.{key}"] for key in NUMBERS} == {key: entry[key] for key in NUMBERS}
+        assert {key: report.errors[f"{name}.{key}"] for key in DENSITY_ERRORS} == {
+            key: entry[key] for key in DENSITY_ERRORS
+        }
         # on the very voxels of the file: missing in it is what is faint, above the source's peak or outside its bounds
         assert report.errors[f"{name}.file_relative_l2"] <= entry["relative_l2"] + 1e-3
         assert report.errors[f"{name}.file_max_error"] <= entry["max_error"] + 1e-3

@@ -236,15 +236,15 @@ def _read_vdb(folder: Path) -> None:
 
 
 def _voxels(folder: Path) -> None:
-    from neuprim.tasks.dynamic.volume.dataset import Voxels
+    from neuprim.tasks.dynamic.volume.capture_dataset import MediumVoxels
 
-    Voxels(np.array([1, 5]), np.ones((2, 4), np.float32), (2, 3, 4), np.eye(4)).write(folder / "a.npz")
+    MediumVoxels(np.array([1, 5]), np.ones((2, 4), np.float32), (2, 3, 4), np.eye(4)).write(folder / "a.npz")
 
 
 def _read_voxels(folder: Path) -> None:
-    from neuprim.tasks.dynamic.volume.dataset import Voxels
+    from neuprim.tasks.dynamic.volume.capture_dataset import MediumVoxels
 
-    Voxels.read(folder / "a.npz").at(np.zeros((1, 3), np.int64))
+    MediumVoxels.read(folder / "a.npz").values_at_cells(np.zeros((1, 3), np.int64))
 
 
 # ---------------------------------------------------------------- cameras
@@ -468,7 +468,7 @@ FORMATS: dict[str, Format] = {
         _loader(_DATASETS, "load_nerfstudio"),
         {"transforms.json": m.json_of, "points.ply": m.text_of, "mask.png": m.png},
     ),
-    "multiview": Format(_multiview, _loader("neuprim.tasks.dynamic.multiview"), _SPLITS, slow=True),
+    "multiview": Format(_multiview, _loader("neuprim.tasks.dynamic.multiview", "load_multiview"), _SPLITS, slow=True),
     "olat": Format(_olat, _loader("neuprim.tasks.relight.olat"), _SPLITS),
     "colmap": Format(
         _colmap(False), _loader(_DATASETS, "load_colmap"), {f"sparse/0/{part}.bin": m.lies(0, 400) for part in _PARTS}

@@ -15,8 +15,8 @@ import torch
 from neuprim.cli import main
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.io.vdb import read_grid
-from neuprim.core.volumes.density_errors import NUMBERS
-from neuprim.core.volumes.grid import density_at, density_grid, lattice
+from neuprim.core.volumes.density_grid import box_lattice, density_at, density_grid
+from neuprim.core.volumes.density_truth import DENSITY_ERRORS
 from neuprim.inspect import ViewOptions, window
 from neuprim.inspect.field import FieldFrame, describe_conditions, find_matter_box, read_condition_frames
 from neuprim.inspect.html_page import encode_values
@@ -87,7 +87,7 @@ def test_the_box_holds_the_matter_and_forgets_a_stray() -> None:
 
 
 def frame_of(time: float = 1.0, **options: Any) -> FieldFrame:
-    matrix, shape = lattice(np.array([[-0.5, -0.5, -0.4], [0.6, 0.5, 0.7]]), 24)
+    matrix, shape = box_lattice(np.array([[-0.5, -0.5, -0.4], [0.6, 0.5, 0.7]]), 24)
     return FieldFrame(
         runs.model(), {"time": torch.tensor(time)}, "", matrix, shape, 8.0, 1.0, options=ViewOptions(**options)
     )
@@ -161,7 +161,7 @@ def test_the_numbers_are_those_of_the_data_set(run_dir: Path, tmp_path: Path) ->
         )
         assert len(expected) == 3 and len(said) == 5
         for number, line in zip(runs.NUMBERS, said[1:], strict=False):
-            wanted = "  ".join(f"{key} {expected[number][key]:.4f}" for key in NUMBERS)
+            wanted = "  ".join(f"{key} {expected[number][key]:.4f}" for key in DENSITY_ERRORS)
             assert line.endswith(wanted) and line.startswith(f"ball_{number}.vdb  time {(number - 4) / 2:g} ")
 
 

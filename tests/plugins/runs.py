@@ -12,8 +12,8 @@ from neuprim.core.checkpoint import save_model
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
 
 NUMBERS = (4, 5, 6)
 VOXEL = 0.5

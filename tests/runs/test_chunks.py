@@ -21,7 +21,7 @@ from neuprim.runs import launch_record
 from neuprim.runs.fit import Event, Note, Preparing, Step, fit, ignore_event
 from neuprim.runs.open import load_run, read_metrics
 from neuprim.runs.run import ChunksMissing, read_chunk_record, run
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time_density import TimeDensity
 from tests.tasks.dynamic.sequences import blob
 
 NAMES = ["frames_1-4", "frames_3-6"]

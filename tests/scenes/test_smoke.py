@@ -10,8 +10,14 @@ import pytest
 import torch
 
 from neuprim.core.io.vdb import read_grids, read_header
-from neuprim.scenes.smoke.generate import THRESHOLD, simulate_smoke, simulation_box, simulation_key
-from neuprim.scenes.smoke.scenes import SCENES, Stage
+from neuprim.scenes.smoke.smoke_scenes import (
+    SMOKE_SCENES,
+    THRESHOLD,
+    SmokeStage,
+    simulate_smoke,
+    simulation_key,
+    smoke_box,
+)
 from neuprim.scenes.smoke.solver import GasState, advance_gas
 
 TINY, FEW = 24, 8
@@ -20,17 +26,17 @@ TINY, FEW = 24, 8
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     cache = tmp_path_factory.mktemp("cache")
-    return {name: simulate_smoke(name, FEW, TINY, 0, cache) for name in SCENES}
+    return {name: simulate_smoke(name, FEW, TINY, 0, cache) for name in SMOKE_SCENES}
 
 
 def dense(path: Path) -> dict[str, np.ndarray]:
-    x, y, z = simulation_box(TINY).shape
+    x, y, z = smoke_box(TINY).shape
     return {name: grid.to_dense(((0, 0, 0), (x, y, z))) for name, grid in ((g.name, g) for g in read_grids(path))}
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", SMOKE_SCENES)
 def test_files_hold_what_the_scene_promises(name: str, folders: dict[str, Path]) -> None:
-    scene, folder = SCENES[name], folders[name]
+    scene, folder = SMOKE_SCENES[name], folders[name]
     assert sorted(p.name for p in folder.iterdir()) == sorted(f"{name}_{i}.vdb" for i in range(FEW))
     header = read_header(folder / f"{name}_0.vdb")
     assert header.metadata["creator"] == "neuprim simulation" and "simulated" in header.metadata["comment"]
@@ -51,10 +57,10 @@ def test_files_hold_what_the_scene_promises(name: str, folders: dict[str, Path])
         assert np.ptp(grids["color"].values[grids["color"].masks], axis=1).max() > 0.3  # not grey
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", SMOKE_SCENES)
 def test_files_read_back_as_the_state(name: str, folders: dict[str, Path]) -> None:
-    scene, box = SCENES[name], simulation_box(TINY)
-    stage, state = Stage(box, 0), GasState.empty(box, scene.coloured)
+    scene, box = SMOKE_SCENES[name], smoke_box(TINY)
+    stage, state = SmokeStage(box, 0), GasState.clear_air(box, scene.coloured)
     for _ in range(FEW):
         state = advance_gas(state, scene.solver, box, scene.forcing(stage, state.time), scene.frame_time)
     read = dense(folders[name] / f"{name}_{FEW - 1}.vdb")
@@ -83,8 +89,11 @@ def test_equal_seeds_give_equal_bits_for_any_number_of_threads(
 
 
 def test_every_setting_is_in_the_key() -> None:
-    scene = SCENES["smoke_fire"]
-    changed = [dataclasses.replace(scene, frame_time=0.5), *(other for other in SCENES.values() if other is not scene)]
+    scene = SMOKE_SCENES["smoke_fire"]
+    changed = [
+        dataclasses.replace(scene, frame_time=0.5),
+        *(other for other in SMOKE_SCENES.values() if other is not scene),
+    ]
     for field in dataclasses.fields(scene.solver):
         solver = dataclasses.replace(scene.solver, **{field.name: getattr(scene.solver, field.name) + 1})
         changed.append(dataclasses.replace(scene, solver=solver))

@@ -7,42 +7,42 @@ import math
 import pytest
 import torch
 
-from neuprim.scenes.smoke.scenes import Noise
+from neuprim.scenes.smoke.smoke_scenes import TurbulenceNoise
 from neuprim.scenes.smoke.solver import (
-    Box,
     Faces,
-    Forcing,
+    GasForcing,
+    GasSettings,
     GasState,
-    SolverSettings,
+    SmokeBox,
     advance_gas,
     advect_field,
-    divergence,
     expansion_flow,
+    flow_divergence,
     project_velocity,
     step_gas,
 )
 
-BOX = Box((17, 12, 23), 1 / 17)
+BOX = SmokeBox((17, 12, 23), 1 / 17)
 
 
-def random_flow(box: Box, seed: int) -> Faces:
+def random_flow(box: SmokeBox, seed: int) -> Faces:
     generator = torch.Generator().manual_seed(seed)
-    u, v, w = (torch.randn(component.shape, generator=generator) for component in box.still())
+    u, v, w = (torch.randn(component.shape, generator=generator) for component in box.air_at_rest())
     return u, v, w
 
 
-def leak(velocity: Faces, box: Box) -> float:
-    """Greatest divergence, relative to the greatest speed per cell."""
+def leak(velocity: Faces, box: SmokeBox) -> float:
+    """Greatest flow_divergence, relative to the greatest speed per cell."""
     fastest = max(float(component.abs().max()) for component in velocity)
-    return float(divergence(velocity, box).abs().max()) * box.cell / max(fastest, 1e-30)
+    return float(flow_divergence(velocity, box).abs().max()) * box.cell / max(fastest, 1e-30)
 
 
-def blob(box: Box, at: tuple[float, float, float], radius: float) -> torch.Tensor:
+def blob(box: SmokeBox, at: tuple[float, float, float], radius: float) -> torch.Tensor:
     x, y, z = box.axes()
     return torch.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2) / radius**2)
 
 
-def centroid(field: torch.Tensor, box: Box) -> list[float]:
+def centroid(field: torch.Tensor, box: SmokeBox) -> list[float]:
     return [float((field * axis).sum() / field.sum()) for axis in box.axes()]
 
 
@@ -90,7 +90,7 @@ def test_advection_by_whole_cells_is_exact() -> None:
 
 def test_rotation_brings_a_blob_back() -> None:
     """One turn in 60 steps of up to 2.5 cells; the correction keeps what plain interpolation would lose."""
-    box = Box((40, 40, 16), 1 / 40)
+    box = SmokeBox((40, 40, 16), 1 / 40)
     x, y, z = box.axes()
     wind = torch.stack(torch.broadcast_tensors(-2 * math.pi * y, 2 * math.pi * x, 0 * z + 0 * x))
     start = blob(box, (0.22, 0.0, 0.2), 0.1)[None]
@@ -108,14 +108,14 @@ def test_rotation_brings_a_blob_back() -> None:
 
 
 def test_hot_gas_rises_and_soot_falls() -> None:
-    box = Box((20, 20, 30), 1 / 20)
+    box = SmokeBox((20, 20, 30), 1 / 20)
     hot = blob(box, (0.0, 0.0, 0.7), 0.15)
     nothing = torch.zeros(box.shape)
-    settings = SolverSettings(buoyancy=3.0, weight=3.0, confinement=0.0, cooling=0.0, dissipation=0.0)
+    settings = GasSettings(buoyancy=3.0, weight=3.0, confinement=0.0, cooling=0.0, dissipation=0.0)
     for density, temperature, sign in ((nothing, hot, 1), (hot, nothing, -1)):
-        state = GasState(box.still(), density, temperature, nothing)
+        state = GasState(box.air_at_rest(), density, temperature, nothing)
         for _ in range(8):
-            state = advance_gas(state, settings, box, Forcing(), 1 / 30)
+            state = advance_gas(state, settings, box, GasForcing(), 1 / 30)
         centre = centroid(state.temperature + state.density, box)
         assert sign * (centre[2] - 0.7) > 0.02
         assert centre[:2] == pytest.approx([0, 0], abs=1e-3)
@@ -124,29 +124,29 @@ def test_hot_gas_rises_and_soot_falls() -> None:
 def test_fuel_burns_to_heat_and_soot() -> None:
     box = BOX
     full, nothing = torch.ones(box.shape), torch.zeros(box.shape)
-    settings = SolverSettings(
+    settings = GasSettings(
         buoyancy=0.0, weight=0.0, confinement=0.0, cooling=0.0, dissipation=0.0, burn=2.0, heat=0.8, soot=0.5
     )
-    state = GasState(box.still(), nothing, nothing, full)
+    state = GasState(box.air_at_rest(), nothing, nothing, full)
     for _ in range(50):
-        state = step_gas(state, settings, box, Forcing(), 0.01)
+        state = step_gas(state, settings, box, GasForcing(), 0.01)
     assert float(state.fuel.max()) < 1e-5  # 1 / burn = 0.5 s
     assert torch.allclose(state.temperature, 0.8 * full, atol=1e-4)
     assert torch.allclose(state.density, 0.5 * full, atol=0.02)
 
 
 def test_noise_is_a_function_of_seed_place_and_time() -> None:
-    axes = Box((20, 20, 20), 1 / 20).axes()
-    first = Noise(1).field(0, axes, 7.0, 3.0, 0.4)
-    assert torch.equal(first, Noise(1).field(0, axes, 7.0, 3.0, 0.4))
+    axes = SmokeBox((20, 20, 20), 1 / 20).axes()
+    first = TurbulenceNoise(1).field(0, axes, 7.0, 3.0, 0.4)
+    assert torch.equal(first, TurbulenceNoise(1).field(0, axes, 7.0, 3.0, 0.4))
     for other in (
-        Noise(2).field(0, axes, 7.0, 3.0, 0.4),
-        Noise(1).field(1, axes, 7.0, 3.0, 0.4),
-        Noise(1).field(0, axes, 7.0, 3.0, 0.9),
+        TurbulenceNoise(2).field(0, axes, 7.0, 3.0, 0.4),
+        TurbulenceNoise(1).field(1, axes, 7.0, 3.0, 0.4),
+        TurbulenceNoise(1).field(0, axes, 7.0, 3.0, 0.9),
     ):
         assert float((first - other).abs().mean()) > 0.1
-    near = Noise(1).field(0, axes, 7.0, 3.0, 0.4001)
+    near = TurbulenceNoise(1).field(0, axes, 7.0, 3.0, 0.4001)
     assert float((first - near).abs().max()) < 0.01
-    part = Noise(1).field(0, (axes[0][3:9], axes[1], axes[2][:, :, 5:]), 7.0, 3.0, 0.4)
+    part = TurbulenceNoise(1).field(0, (axes[0][3:9], axes[1], axes[2][:, :, 5:]), 7.0, 3.0, 0.4)
     assert torch.allclose(part, first[3:9, :, 5:], atol=1e-5)
     assert 0.2 < float(first.std()) < 1.0

@@ -12,7 +12,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
-from neuprim.core.volumes.points import values_at
+from neuprim.core.volumes.points import volume_values_at
 from neuprim.search.pruning_cuts import cut_to_loss, price_cuts
 from neuprim.search.training_quality import TrainingQuality
 from neuprim.tasks.static.fields import SphericalHarmonics
@@ -49,7 +49,7 @@ class Known(PointSupervision):
         name = self.names[int(torch.randint(len(self.names), (), generator=generator))]
         points = 0.5 * (torch.rand(count, 3, generator=generator) - 0.5)
         with torch.no_grad():
-            sigma = values_at(self.model, {}, points, False, 1).sigma
+            sigma = volume_values_at(self.model, {}, points, False, 1).sigma
         return PointSamples(name, {}, points, sigma, None, float(sigma.max()))
 
 
@@ -91,7 +91,7 @@ def test_inside_the_signs_find_each_primitive_s_share() -> None:
         true = 0.0
         for samples in draws:
             with torch.no_grad():
-                both = [values_at(m, {}, samples.points, False, 1).sigma for m in (model, without(model, [row]))]
+                both = [volume_values_at(m, {}, samples.points, False, 1).sigma for m in (model, without(model, [row]))]
             true += float(((both[0] - both[1]) / samples.sigma_scale).square().mean()) / len(draws)
         assert math.isclose(float(found[row]), true, rel_tol=0.5)
 

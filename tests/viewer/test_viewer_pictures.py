@@ -26,8 +26,8 @@ from neuprim.runs.measure import render_image
 from neuprim.runs.open import load_run
 from neuprim.runs.render_config import RenderConfig, parse_render_config
 from neuprim.search.points import Point, Record
-from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.static import TASK as STATIC
 from neuprim.tasks.static.fields import SphericalHarmonics
 from neuprim.viewer.ellipsoids import describe_primitive, list_ellipsoids, make_ellipsoid, pick_primitive

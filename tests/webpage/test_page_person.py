@@ -14,8 +14,8 @@ from PIL import Image
 
 from neuprim.core.io.images import webp_data_uri
 from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.static.fields import SphericalHarmonics
 from neuprim.webpage import PageView

@@ -25,7 +25,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions
 
 if TYPE_CHECKING:
-    from neuprim.core.volumes.source import Placement
+    from neuprim.core.volumes.density_truth import Placement
 
 DataSource = Literal["real", "generated", "simulated"]
 """Photographs or captures ("real"), our own ray-cast scenes ("generated"), stand-ins for data not given

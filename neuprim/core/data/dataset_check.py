@@ -18,7 +18,7 @@ from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, PointSamples, PointSupervision, View, ViewSet
 from neuprim.core.errors import DataError
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.core.volumes.source import Placement
+from neuprim.core.volumes.density_truth import Placement
 
 Extra = TypeVar("Extra")
 

@@ -13,7 +13,7 @@ from neuprim.core.data.dataset_check import check_samples
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Contributions
 from neuprim.core.train.settings import TrainSettings
-from neuprim.core.volumes.points import Shares, values_at
+from neuprim.core.volumes.points import PointShares, volume_values_at
 
 _COMPONENT = 0.1
 """Weight of an extinction's components: it teaches the primitives' shares, whose rate does not depend on it, and hardly
@@ -28,7 +28,8 @@ class PointResult:
         loss: with gradient. parts: its named parts, for the log.
         psnr: of the extinction at the points, against the largest true one.
         name: of the frame.
-        rows, shares: of the primitives that live in the frame, see :func:`~neuprim.core.volumes.points.values_at`.
+        rows, shares: of the primitives that are active in the frame, see
+            :func:`~neuprim.core.volumes.points.volume_values_at`.
     """
 
     loss: Tensor
@@ -36,7 +37,7 @@ class PointResult:
     psnr: float
     name: str
     rows: Tensor | None
-    shares: Shares
+    shares: PointShares
 
     def contributions(self) -> Contributions:
         """Contributions of the primitives to the points; call it after the backward pass."""
@@ -58,7 +59,7 @@ def point_loss(
     """
     check_samples(samples, dataset)
     colour = samples.source is not None and settings.voxel_colour > 0
-    found = values_at(model, samples.conditions, samples.points, colour, threads)
+    found = volume_values_at(model, samples.conditions, samples.points, colour, threads)
     where = found.sigma.device
     wrong = (found.sigma - device.copy_from_host(samples.sigma, where)) / samples.sigma_scale
     loss = wrong.square().mean()

@@ -22,7 +22,7 @@ from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import removal_effect
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.volumes.points import values_at
+from neuprim.core.volumes.points import volume_values_at
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: in
     whole, there, sums = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64), _Sums(model)
     for samples in draws:
         params = {name: value.detach().requires_grad_() for name, value in model.params.items()}
-        values = values_at(
+        values = volume_values_at(
             Primitives(model.density, model.colour, params), samples.conditions, samples.points, False, threads
         )
         signs = (2 * torch.randint(0, 2, (len(samples.points),), generator=generator) - 1).float()

@@ -1,4 +1,1 @@
-"""Built-in fluid simulations, for those who have no OpenVDB export at hand.
-
-``scenes`` says what happens, ``solver`` how gas moves, ``generate`` writes a sequence of OpenVDB files.
-"""
+"""Built-in fluid simulations of smoke and fire, written as OpenVDB files."""

@@ -15,18 +15,15 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from neuprim.core.validation import Range, validate_fields
-
 Faces = tuple[Tensor, Tensor, Tensor]
 """Velocity in world units per second, float32: components (X+1, Y, Z), (X, Y+1, Z) and (X, Y, Z+1)."""
 
-NotNegative = Annotated[float, Range(at_least=0)]
 Job = TypeVar("Job")
 
 _ENDS = ((True, True), (True, True), (False, True))
@@ -34,11 +31,11 @@ _ENDS = ((True, True), (True, True), (False, True))
 
 
 @dataclass(frozen=True)
-class Box:
+class SmokeBox:
     """X x Y x Z cubic cells over a solid ground; z is up.
 
-    The box is centred at x = y = 0 and stands on z = 0. At its sides and its top the pressure beyond is zero, and air
-    goes in and out; nothing flows through the ground. ``cell`` is the edge of a cell in world units.
+    It is centred at x = y = 0 and stands on z = 0. Beyond its sides and its top the pressure is zero, and air goes in
+    and out; nothing flows through the ground. ``cell`` is the edge of a cell in world units.
     """
 
     shape: tuple[int, int, int]
@@ -50,8 +47,7 @@ class Box:
         x, y = x - self.shape[0] / 2, y - self.shape[1] / 2
         return (x * self.cell).reshape(-1, 1, 1), (y * self.cell).reshape(1, -1, 1), (z * self.cell).reshape(1, 1, -1)
 
-    def still(self) -> Faces:
-        """Air at rest."""
+    def air_at_rest(self) -> Faces:
         x, y, z = self.shape
         return torch.zeros(x + 1, y, z), torch.zeros(x, y + 1, z), torch.zeros(x, y, z + 1)
 
@@ -71,41 +67,40 @@ class Box:
             total += values.reshape([-1 if a == axis else 1 for a in range(3)]) / self.cell**2
         return tuple(vectors), 1 / total
 
-    def solve(self, right: Tensor) -> Tensor:
+    def solve_pressure(self, right: Tensor) -> Tensor:
         """(X, Y, Z) float64: the pressure whose Laplacian is ``right``."""
         (x, y, z), inverse = self._modes
         return _apply_along_axes(_apply_along_axes(right.double(), x.T, y.T, z.T) * inverse, x, y, z)
 
 
 def _apply_along_axes(field: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """A matrix applied along each axis of a field (X, Y, Z)."""
     field = torch.matmul(y, torch.matmul(field, z.T))
     return torch.matmul(x, field.reshape(field.shape[0], -1)).reshape(field.shape)
 
 
-def divergence(velocity: Faces, box: Box) -> Tensor:
+def flow_divergence(velocity: Faces, box: SmokeBox) -> Tensor:
     """(X, Y, Z) float64, in 1/s: what flows out of each cell per volume."""
     u, v, w = (component.double() for component in velocity)
     return ((u[1:] - u[:-1]) + (v[:, 1:] - v[:, :-1]) + (w[:, :, 1:] - w[:, :, :-1])) / box.cell
 
 
-def project_velocity(velocity: Faces, box: Box) -> Faces:
+def project_velocity(velocity: Faces, box: SmokeBox) -> Faces:
     """The divergence-free part of a flow: u - grad p with laplace p = div u, and nothing through the ground."""
     u, v, w = velocity
     w = w.clone()
     w[:, :, 0] = 0
-    return _subtract_gradient((u, v, w), box.solve(divergence((u, v, w), box)), box)
+    return _subtract_gradient((u, v, w), box.solve_pressure(flow_divergence((u, v, w), box)), box)
 
 
-def expansion_flow(source: Tensor, box: Box) -> Faces:
+def expansion_flow(source: Tensor, box: SmokeBox) -> Faces:
     """The irrotational flow with divergence ``source`` (X, Y, Z) in 1/s: how gas that is heated pushes the rest away.
 
     Kept apart from the divergence-free flow: added for transport alone, it does not outlast its cause.
     """
-    return _subtract_gradient(box.still(), -box.solve(source), box)
+    return _subtract_gradient(box.air_at_rest(), -box.solve_pressure(source), box)
 
 
-def _subtract_gradient(velocity: Faces, pressure: Tensor, box: Box) -> Faces:
+def _subtract_gradient(velocity: Faces, pressure: Tensor, box: SmokeBox) -> Faces:
     """velocity - grad pressure, in float32; faces of the ground keep their values."""
     parts = []
     for axis, (component, (low, high)) in enumerate(zip(velocity, _ENDS, strict=True)):
@@ -135,7 +130,7 @@ def _to_faces(centred: Tensor) -> Faces:
 
 
 @dataclass(frozen=True)
-class SolverSettings:
+class GasSettings:
     """What the gas is like.
 
     Attributes:
@@ -151,23 +146,20 @@ class SolverSettings:
         most_steps: steps per frame at most.
     """
 
-    buoyancy: NotNegative = 2.0
-    weight: NotNegative = 0.1
-    confinement: NotNegative = 0.3
-    cooling: NotNegative = 0.3
-    radiation: NotNegative = 0.0
-    dissipation: NotNegative = 0.1
-    drag: NotNegative = 0.0
-    burn: NotNegative = 2.0
-    heat: NotNegative = 0.0
-    soot: NotNegative = 0.0
-    expansion: NotNegative = 0.0
-    smoothing: NotNegative = 0.1
-    cfl: Annotated[float, Range(above=0)] = 3.0
-    most_steps: Annotated[int, Range(at_least=1)] = 2
-
-    def __post_init__(self) -> None:
-        validate_fields(self, "solver")
+    buoyancy: float = 2.0
+    weight: float = 0.1
+    confinement: float = 0.3
+    cooling: float = 0.3
+    radiation: float = 0.0
+    dissipation: float = 0.1
+    drag: float = 0.0
+    burn: float = 2.0
+    heat: float = 0.0
+    soot: float = 0.0
+    expansion: float = 0.0
+    smoothing: float = 0.1
+    cfl: float = 3.0
+    most_steps: int = 2
 
 
 @dataclass(frozen=True)
@@ -189,13 +181,13 @@ class GasState:
     time: float = 0.0
 
     @staticmethod
-    def empty(box: Box, coloured: bool = False) -> GasState:
+    def clear_air(box: SmokeBox, coloured: bool = False) -> GasState:
         """Clear, cold air at rest."""
-        nothing = torch.zeros(box.shape)
-        return GasState(box.still(), nothing, nothing, nothing, torch.zeros(3, *box.shape) if coloured else None)
+        zeros = torch.zeros(box.shape)
+        return GasState(box.air_at_rest(), zeros, zeros, zeros, torch.zeros(3, *box.shape) if coloured else None)
 
 
-class Source(NamedTuple):
+class GasSource(NamedTuple):
     """A place where gas takes given values. What is None is left alone.
 
     Attributes:
@@ -215,7 +207,7 @@ class Source(NamedTuple):
     velocity: Tensor | None = None
 
 
-class Forcing(NamedTuple):
+class GasForcing(NamedTuple):
     """What a scene does to the gas at one time.
 
     Attributes:
@@ -225,13 +217,13 @@ class Forcing(NamedTuple):
         fade: (X, Y, Z) per second: how fast smoke, heat and fuel vanish near open ends.
     """
 
-    sources: Sequence[Source] = ()
+    sources: Sequence[GasSource] = ()
     gusts: Tensor | None = None
     expansion: Tensor | None = None
     fade: Tensor | None = None
 
 
-def advance_gas(state: GasState, settings: SolverSettings, box: Box, forcing: Forcing, time: float) -> GasState:
+def advance_gas(state: GasState, settings: GasSettings, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
     """As many equal steps over ``time`` seconds as the fastest gas needs."""
     fastest = max(float(component.abs().max()) for component in state.velocity)
     count = min(max(math.ceil(fastest * time / box.cell / settings.cfl), 1), settings.most_steps)
@@ -240,7 +232,7 @@ def advance_gas(state: GasState, settings: SolverSettings, box: Box, forcing: Fo
     return state
 
 
-def step_gas(state: GasState, settings: SolverSettings, box: Box, forcing: Forcing, time: float) -> GasState:
+def step_gas(state: GasState, settings: GasSettings, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
     """The gas ``time`` seconds later; its velocity is free of divergence, to rounding."""
     before = _to_centres(state.velocity)
     wind = before
@@ -255,18 +247,18 @@ def step_gas(state: GasState, settings: SolverSettings, box: Box, forcing: Forci
     # The velocity stays blurred: sharp, it gathers motion of the finest scale, which shows as streaks along the axes.
     moved = advect_field(torch.cat(fields), wind, time, box.cell, blurred=3)
     after = moved[:3]
-    density, temperature, fuel = _react(moved[3], moved[4], moved[5], settings, time)
+    density, temperature, fuel = _burn_fuel(moved[3], moved[4], moved[5], settings, time)
     faded = math.exp(-settings.dissipation * time)
     density = density * faded
     colour = None if state.colour is None else moved[6:9] * faded
 
-    after = after + time * _forces(after, density, temperature, settings, box)
+    after = after + time * _gas_acceleration(after, density, temperature, settings, box)
     if forcing.gusts is not None:
         after = after + (2 * time * (density + temperature + fuel)).clamp_max(time) * forcing.gusts
     after = after * math.exp(-settings.drag * time)
     state = GasState(state.velocity, density, temperature, fuel, colour, state.time + time)
     for source in forcing.sources:
-        state, after = _emit(state, after, source, time)
+        state, after = _apply_source(state, after, source, time)
     if forcing.fade is not None:
         keep = torch.exp(-time * forcing.fade)
         density, temperature, fuel = (x * keep for x in (state.density, state.temperature, state.fuel))
@@ -281,8 +273,8 @@ def step_gas(state: GasState, settings: SolverSettings, box: Box, forcing: Forci
     return replace(state, velocity=project_velocity((u, v, w), box))
 
 
-def _react(
-    density: Tensor, temperature: Tensor, fuel: Tensor, settings: SolverSettings, time: float
+def _burn_fuel(
+    density: Tensor, temperature: Tensor, fuel: Tensor, settings: GasSettings, time: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fuel burns at a constant rate (Nguyen, Fedkiw and Jensen 2002), so flames end sharply; then the gas cools."""
     burnt = fuel.clamp_max(settings.burn * time)
@@ -293,13 +285,15 @@ def _react(
     return density, temperature * math.exp(-settings.cooling * time), fuel - burnt
 
 
-def _forces(velocity: Tensor, density: Tensor, temperature: Tensor, settings: SolverSettings, box: Box) -> Tensor:
+def _gas_acceleration(
+    velocity: Tensor, density: Tensor, temperature: Tensor, settings: GasSettings, box: SmokeBox
+) -> Tensor:
     """(3, X, Y, Z) acceleration: buoyancy, weight, and vorticity confinement e h (N x w) with w = curl u and N =
     grad |w| / |grad |w|| (Fedkiw, Stam and Jensen 2001), which gives small eddies back what interpolation takes."""
     if settings.confinement:
-        w = _curl(velocity, box.cell)
+        w = _vorticity(velocity, box.cell)
         size = (w * w).sum(0).sqrt()
-        n = torch.stack([_slope(size, axis, box.cell) for axis in range(3)])
+        n = torch.stack([_central_difference(size, axis, box.cell) for axis in range(3)])
         n = n / ((n * n).sum(0).sqrt() + 1e-3 / box.cell)  # no direction where nothing turns
         force = torch.stack([n[1] * w[2] - n[2] * w[1], n[2] * w[0] - n[0] * w[2], n[0] * w[1] - n[1] * w[0]])
         force *= settings.confinement * box.cell
@@ -309,7 +303,7 @@ def _forces(velocity: Tensor, density: Tensor, temperature: Tensor, settings: So
     return force
 
 
-def _slope(field: Tensor, axis: int, cell: float) -> Tensor:
+def _central_difference(field: Tensor, axis: int, cell: float) -> Tensor:
     """Central difference along one axis, zero in the first and last cell."""
     result = torch.zeros_like(field)
     count = field.shape[axis] - 2
@@ -317,12 +311,13 @@ def _slope(field: Tensor, axis: int, cell: float) -> Tensor:
     return result
 
 
-def _curl(velocity: Tensor, cell: float) -> Tensor:
+def _vorticity(velocity: Tensor, cell: float) -> Tensor:
     pairs = ((2, 1), (0, 2), (1, 0))  # (component, axis); each curl component is the slope of one pair less its mirror
-    return torch.stack([_slope(velocity[a], b, cell) - _slope(velocity[b], a, cell) for a, b in pairs])
+    slopes = ((_central_difference(velocity[a], b, cell), _central_difference(velocity[b], a, cell)) for a, b in pairs)
+    return torch.stack([own - mirrored for own, mirrored in slopes])
 
 
-def _emit(state: GasState, velocity: Tensor, source: Source, time: float) -> tuple[GasState, Tensor]:
+def _apply_source(state: GasState, velocity: Tensor, source: GasSource, time: float) -> tuple[GasState, Tensor]:
     """State and velocity at the centres after a source has worked for ``time`` seconds."""
     share = 1 - torch.exp(-source.rate * time)
 
@@ -345,19 +340,13 @@ def _emit(state: GasState, velocity: Tensor, source: Source, time: float) -> tup
 
 # ---------------------------------------------------------------- transport
 
-_SLAB = 1 << 15
-"""Cells worked on at once: their stencils stay in a CPU's cache, which is twice as fast."""
-
-_NOTHING = 1e-4
-"""Invisible values; most of a box holds no more, and need not be corrected."""
+_SLAB = 1 << 15  # cells worked on at once: their stencils stay in a CPU's cache, which is twice as fast
+_INVISIBLE = 1e-4  # most of a box holds no more, and need not be corrected
 
 
 class _Stencil(NamedTuple):
-    """Where N points read: rows of a table (X * Y * Z, C) that holds all channels of a cell in one row.
-
-    A point is a weighted sum of eight rows, for which torch has a fast kernel under the name ``embedding_bag``: several
-    times faster than ``grid_sample`` in three dimensions, and the same for any number of threads.
-    """
+    """Rows of a table (X * Y * Z, C) around N points. ``embedding_bag`` sums them several times faster than
+    ``grid_sample`` in three dimensions, with the same result for any number of threads."""
 
     rows: Tensor  # (N, 8) int32, the cells around each point; the first is the lowest corner
     weights: Tensor  # (N, 8) float32, trilinear
@@ -430,16 +419,13 @@ def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blu
             low, high = torch.minimum(low, values), torch.maximum(high, values)
         carried[at, blurred:] = torch.minimum(torch.maximum(better, low), high)
 
-    _run_in_threads(correct, (blurry.abs() > _NOTHING).any(1).nonzero().squeeze(1).split(_SLAB))
+    _run_in_threads(correct, (blurry.abs() > _INVISIBLE).any(1).nonzero().squeeze(1).split(_SLAB))
     return carried.T.reshape(fields.shape)
 
 
 def _run_in_threads(work: Callable[[Job], None], jobs: Iterable[Job]) -> None:
-    """Calls that write to different places, in threads of our own.
-
-    torch's threads wait for each other in a busy loop after every operation, which on a machine with other things to do
-    takes many times longer than the work. The jobs, and so the result, are the same for any number of threads.
-    """
+    """Calls that write to different places, in threads of our own: torch's threads wait for each other in a busy loop
+    after every operation, which on a busy machine takes many times longer than the work."""
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
         list(pool.map(work, jobs))
 

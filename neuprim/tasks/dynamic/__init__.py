@@ -3,31 +3,39 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from neuprim.core.data import Dataset
-from neuprim.core.data.dataset import GroundTruth
+from neuprim.core.data import Clip, Dataset
+from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.errors import ConfigError
+from neuprim.core.layers import LayerFrame, LayerSpec
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE
-from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
-from neuprim.core.task import API_VERSION, Chunks, SceneContext, SceneSpec, TaskSpec
+from neuprim.core.model.edge import NORMS, profile
+from neuprim.core.model.fields import ColourField, ConditionSpec, Cosine, DensityField
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.task import API_VERSION, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.core.validation import validate_choices
-from neuprim.core.volumes.source import VolumeSource
-from neuprim.tasks.dynamic import evaluation
-from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time_colour import FREQUENCIES, TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
+
+if TYPE_CHECKING:
+    from neuprim.tasks.dynamic.volume.capture_dataset import Recording
+
+_MIN_OPACITY = 1.0 / 255.0  # of a visible primitive
 
 
-def _check(model: Mapping[str, Any]) -> None:
+def _check_model(model: Mapping[str, Any]) -> None:
     validate_choices(model["density"], "model.density", {"time": str, "divide_above": float, **DENSITY_OPTIONS})
     validate_choices(model["colour"], "model.colour", {"frequencies": tuple(FREQUENCIES), "powers": int, "waves": int})
     try:
-        _build_density(model)
+        TimeDensity(model["neurons"], **model["density"])
     except ValueError as error:
         raise ConfigError(f"model.density.time: {error}") from error
     try:
@@ -36,60 +44,20 @@ def _check(model: Mapping[str, Any]) -> None:
         raise ConfigError(f"model.colour: {error}") from error
 
 
-def _build_density(model: Mapping[str, Any], components: tuple[str, ...] = ()) -> TimeDensity:
-    return TimeDensity(model["neurons"], **model["density"], components=components)
-
-
 def _tunable_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
-    parts = ("none", "phase", "window", "window+motion", "phase+window+motion")
-    bands: dict[str, tuple[Any, ...]] = {
+    return {
+        **DENSITY_TRADE,
+        "model.density.time": ("none", "phase", "window", "window+motion", "phase+window+motion"),
         "model.sh_degree": (0, 1, 2, 3),
         "model.colour.powers": (0, 2, 4),
         "model.colour.waves": (0, 2, 4),
     }
-    return {**DENSITY_TRADE, "model.density.time": parts, **bands}
 
 
-def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
+def _build_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     components = () if dataset.points is None else dataset.points.components
-    return _build_density(model, components), TimeHarmonics(
-        model["sh_degree"], dataset.channels, model["sh_every"], **model["colour"]
-    )
-
-
-# Loaders are imported when used: each pulls in modules of its own.
-
-
-def _load_volume_scene(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.dynamic.volume.scene import load_dataset
-
-    return load_dataset(settings, context)
-
-
-def _open_volumes(settings: Mapping[str, Any], context: SceneContext) -> VolumeSource:
-    from neuprim.tasks.dynamic.volume.scene import open_volumes
-
-    return open_volumes(settings, context)
-
-
-def _open_ground_truth(
-    settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None
-) -> GroundTruth:
-    from neuprim.tasks.dynamic.volume.scene import open_ground_truth
-
-    return open_ground_truth(settings, context, known)
-
-
-def _split_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
-    from neuprim.tasks.dynamic.volume.scene import split_chunks
-
-    return split_chunks(config, context)
-
-
-def _load_multiview(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.dynamic.multiview import load
-
-    return load(settings, context)
+    density = TimeDensity(model["neurons"], **model["density"], components=components)
+    return density, TimeHarmonics(model["sh_degree"], dataset.channels, model["sh_every"], **model["colour"])
 
 
 def parse_time(text: str) -> list[Tensor]:
@@ -105,6 +73,110 @@ def parse_time(text: str) -> list[Tensor]:
     return [torch.tensor(time)]
 
 
+# ---------------------------------------------------------------- evaluation
+
+
+def recording_of(dataset: Dataset) -> Recording | None:
+    """The volume sequence that the images were rendered from; None if there is none.
+
+    Raises:
+        DatasetFault: the dataset's ``extra`` is something else.
+    """
+    if dataset.extra is None:
+        return None
+    from neuprim.tasks.dynamic.volume.capture_dataset import Recording
+
+    return get_extra(dataset, Recording)
+
+
+def matter_mask(dataset: Dataset, index: int) -> Tensor | None:
+    """Pixels that show matter in some frame of the view's camera."""
+    recording = recording_of(dataset)
+    return None if recording is None else recording.matter_mask(index)
+
+
+def held_out_clips(dataset: Dataset) -> Sequence[Clip]:
+    """One film of all frames per test camera."""
+    recording = recording_of(dataset)
+    if recording is None:
+        return ()
+    n = len(recording.capture.frames)
+    return [Clip(f"cam_{c:02d}", range(i * n, (i + 1) * n), 24.0) for i, c in enumerate(recording.test.cameras)]
+
+
+def compare_with_volume(dataset: Dataset, model: Primitives) -> dict[str, Any]:
+    """Compare the model's extinction and size with those of the files."""
+    recording = recording_of(dataset)
+    if recording is None:
+        return {}
+    from neuprim.tasks.dynamic.volume.capture_density import compare_extinction
+
+    capture, times = recording.capture, recording.test.times
+    return {
+        "exposure": dataset.exposure,
+        "vdb_bytes": sum(frame.path.stat().st_size for frame in capture.frames),
+        "normalisation": vars(capture.normalisation),
+        "invisible_fraction": invisible_fraction(model, times),
+        **compare_extinction(model, capture, [float(t) for t in times]),
+    }
+
+
+def invisible_fraction(model: Primitives, times: Sequence[Tensor]) -> float:
+    """Share of primitives whose opacity along each of their axes stays below 1/255 at all of these times.
+
+    The chord along axis j through the centre has half length s_j, so that I = (N_p s_j/m) (b2 + sum_k w2_k cos(omega0
+    b1_k) B_p(omega0 W1_k . r_j s_j/m)) with r_j the axis' direction (:mod:`neuprim.core.model.edge`).
+    """
+    most_opaque = torch.zeros(model.count, dtype=torch.float64)
+    density, params = model.density, {k: v.detach() for k, v in model.of(model.density).items()}
+    geometry = Geometry(*(model.params[n].detach() for n in ("means", "log_scales", "quats")))
+    reach = geometry.scales.double() / geometry.length_scale.double()[:, None]
+    axes = geometry.rotations.double() * reach[:, None, :]  # (N, 3, 3), columns r_j s_j/m
+    for time in times:
+        form = density.lower(params, geometry, {"time": time})
+        assert isinstance(form, Cosine)
+        rate = form.omega0 * (form.W1.double() @ axes)  # (N, K, 3)
+        waves = (form.w2.double() * torch.cos(form.omega0 * form.b1.double()))[:, :, None] * profile(rate, form.edge)
+        depth = NORMS[form.edge] * reach * (form.b2.double().reshape(-1, 1) + waves.sum(1))
+        most_opaque = torch.maximum(most_opaque, 1.0 - torch.exp(-depth.clamp_min(0.0).amax(1)))
+    return float((most_opaque < _MIN_OPACITY).double().mean())
+
+
+def _draw_emission(frame: LayerFrame) -> Tensor | None:
+    return frame.emitted
+
+
+def _draw_absorption(frame: LayerFrame) -> Tensor | None:
+    return None if frame.emitted is None else frame.emitted - frame.drawn.rgb
+
+
+# The two terms of the equation of transfer, dL/ds = sigma c - sigma L (Max, "Optical models for direct volume
+# rendering", 1995); the image over black is emission - absorption.
+_LAYERS = (
+    LayerSpec(
+        "emission",
+        "all light that is emitted along the ray, as if nothing absorbed any: the integral of sigma c, linear light",
+        _draw_emission,
+    ),
+    LayerSpec(
+        "absorption",
+        "the part of the emission that is absorbed before it arrives, linear light: beauty = emission - absorption",
+        _draw_absorption,
+    ),
+)
+
+# ---------------------------------------------------------------- the task
+
+
+def _import_when_called(module: str, function: str) -> Callable[..., Any]:
+    """A function of a module of this task; loaders pull in many modules that other commands do not need."""
+
+    def call(*arguments: Any) -> Any:
+        return getattr(import_module(f"{__package__}.{module}"), function)(*arguments)
+
+    return call
+
+
 _VOLUME_SCENES = {
     "smoke_fire": "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR",
     "colorful_smoke": "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR",
@@ -112,6 +184,11 @@ _VOLUME_SCENES = {
     "dust_tornado": "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR",
     "vdb": "any sequence of .vdb files: scene.vdb=DIR",
 }
+_VOLUME_FUNCTIONS = tuple(
+    _import_when_called("volume.volume_scene", function)
+    for function in ("load_dataset", "open_volumes", "open_ground_truth", "split_chunks")
+)
+_MULTIVIEW = "images with a time per frame (D-NeRF layout): scene.path=DIR"
 
 TASK = TaskSpec(
     api=API_VERSION,
@@ -119,21 +196,18 @@ TASK = TaskSpec(
     summary="Smoke and fire over time, from OpenVDB sequences or images with a time each (time inside the density)",
     config_package="neuprim.tasks.dynamic.conf",
     scenes=(
-        *(
-            SceneSpec(name, summary, _load_volume_scene, _open_volumes, _open_ground_truth, _split_chunks)
-            for name, summary in _VOLUME_SCENES.items()
-        ),
-        SceneSpec("multiview", "images with a time per frame (D-NeRF layout): scene.path=DIR", _load_multiview),
+        *(SceneSpec(name, summary, *_VOLUME_FUNCTIONS) for name, summary in _VOLUME_SCENES.items()),
+        SceneSpec("multiview", _MULTIVIEW, _import_when_called("multiview", "load_multiview")),
     ),
-    build=_build,
+    build=_build_fields,
     loss=photometric,
-    check=_check,
+    check=_check_model,
     tunable_settings=_tunable_settings,
     conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_time, sweep="0:1"),),
     fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
-    mask=evaluation.mask,
-    diagnose=evaluation.diagnose,
-    clips=evaluation.clips,
-    layers=evaluation.LAYERS,
+    mask=matter_mask,
+    diagnose=compare_with_volume,
+    clips=held_out_clips,
+    layers=_LAYERS,
 )

@@ -47,12 +47,10 @@ from neuprim.core.task import SceneContext
 from neuprim.core.validation import Accepts, validate
 
 _AUTO = "auto"
-_NAMES = ("train", "val", "test")
-
 _TimeRange = tuple[float, float]
 
 
-def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def load_multiview(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load the scene in the folder ``settings["path"]``; sRGB from PNG and JPEG, linear light from OpenEXR.
 
     Raises:
@@ -68,9 +66,10 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         document = JsonReader.open(single)
         records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
         time_range = _time_range(records, [], options.time_range)
-        records, frames = _frames(options, document, records, time_range)
+        records, frames = _read_timed_frames(options, document, records, time_range)
         train, test = split_named_frames(document, records, frames, options.test_every)
-        return assemble_dataset(str(single), name, train, test, options, context, SceneDetails(start=moving_points))
+        details = SceneDetails(start=sample_moving_points)
+        return assemble_dataset(str(single), name, train, test, options, context, details)
     if not any(path.is_file() for path in files.values()):
         raise DataError(
             f"{folder}: has neither {files[options.train_split].name} nor transforms.json; expected one of them"
@@ -83,16 +82,16 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         )
     documents = {split: JsonReader.open(path) for split, path in files.items()}
     splits = {split: list(document.objects("frames")) for split, document in documents.items()}
-    time_range = _time_range(
-        [r for s in splits.values() for r in s], _unused_splits(folder, splits), options.time_range
-    )
-    read = {split: _frames(options, documents[split], splits[split], time_range)[1] for split in splits}
-    details = SceneDetails(up=torch.tensor([0.0, 0.0, 1.0]), start=moving_points)
-    train, test = read[options.train_split], read[options.test_split]
+    names = (name for name in ("train", "val", "test") if name not in splits)
+    others = [path for name in names if (path := folder / f"transforms_{name}.json").is_file()]
+    time_range = _time_range([r for s in splits.values() for r in s], others, options.time_range)
+    frames_of = {split: _read_timed_frames(options, documents[split], splits[split], time_range)[1] for split in splits}
+    details = SceneDetails(up=torch.tensor([0.0, 0.0, 1.0]), start=sample_moving_points)
+    train, test = frames_of[options.train_split], frames_of[options.test_split]
     return assemble_dataset(str(folder), name, train, test, options, context, details)
 
 
-def _frames(
+def _read_timed_frames(
     options: MultiviewSettings, document: JsonReader, records: list[JsonReader], time_range: _TimeRange
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
     """The frames with their times 0..1, and their records."""
@@ -123,18 +122,17 @@ def _time_range(records: Sequence[JsonReader], others: Sequence[Path], setting: 
             f"{where}: no frame has a time, so this is a static scene; expected a time in every frame, or task=static"
         )
     if setting != _AUTO:
-        low, high = _parse_range(setting)
+        low, high = _parse_time_range(setting)
         for record in records:
-            time = _time(record)
+            time = _read_time(record)
             if not low <= time <= high:
-                expected = (
-                    f"a number from {low:g} to {high:g} for {record.text('file_path')} (scene.time_range is {setting!r}"
-                )
-                raise record.fail("time", f"{expected}; LOW:HIGH or auto maps other times to 0..1)")
+                expected = f"a number from {low:g} to {high:g} for {record.text('file_path')}"
+                why = f"scene.time_range is {setting!r}; LOW:HIGH or auto maps other times to 0..1"
+                raise record.fail("time", f"{expected} ({why})")
         return low, high
-    times = [_time(r) for r in records]
+    times = [_read_time(r) for r in records]
     for path in others:
-        times += [_time(r) for r in JsonReader.open(path).objects("frames")]
+        times += [_read_time(r) for r in JsonReader.open(path).objects("frames")]
     low, high = min(times), max(times)
     if low == high:
         where = records[0].where.rsplit(": ", 1)[0]
@@ -145,19 +143,14 @@ def _time_range(records: Sequence[JsonReader], others: Sequence[Path], setting: 
     return low, high
 
 
-def _time(record: JsonReader) -> float:
+def _read_time(record: JsonReader) -> float:
     name = record.text("file_path")
     if "time" not in record.values:
         raise record.fail("time", f"a number for {name}, as other frames have one")
     return record.number("time", f"a finite number for {name}")
 
 
-def _unused_splits(folder: Path, used: Mapping[str, Any]) -> list[Path]:
-    """Existing files of the usual splits that are not in use."""
-    return [path for name in _NAMES if name not in used and (path := folder / f"transforms_{name}.json").is_file()]
-
-
-def _parse_range(value: str) -> _TimeRange:
+def _parse_time_range(value: str) -> _TimeRange:
     """The two numbers of "LOW:HIGH"; ValueError where it is something else."""
     low, high = (float(part) for part in value.split(":"))
     if not (math.isfinite(low) and math.isfinite(high) and low < high and math.isfinite(high - low)):
@@ -165,9 +158,9 @@ def _parse_range(value: str) -> _TimeRange:
     return low, high
 
 
-def _is_range(value: str) -> bool:
+def _is_time_range(value: str) -> bool:
     try:
-        return value == _AUTO or bool(_parse_range(value))
+        return value == _AUTO or bool(_parse_time_range(value))
     except ValueError:
         return False
 
@@ -185,22 +178,22 @@ class MultiviewSettings(FolderSettings):
     train_split: SplitName = "train"
     test_split: SplitName = "test"
     test_every: EveryNth = 8
-    time_range: Annotated[str, Accepts(_is_range, 'auto, or "LOW:HIGH" in quotes with LOW below HIGH, e.g. "0:1"')] = (
-        "0:1"
-    )
+    time_range: Annotated[
+        str, Accepts(_is_time_range, 'auto, or "LOW:HIGH" in quotes with LOW below HIGH, e.g. "0:1"')
+    ] = "0:1"
 
 
 # ---------------------------------------------------------------- starting points
 
 _MIN_SHARED = 2  # cameras per time for a hull of a single time; with fewer, neighbours in time are added
-_RUN = 4  # neighbours in time
-_MOMENTS = 64
+_RUN_LENGTH = 4  # neighbours in time
+_MAX_MOMENTS = 64
 _RESOLUTION = 64
-_SEEN = 0.75  # share of the cameras that must see a place; half of them often take empty space for matter
-_MATTER = 0.1  # least opacity of matter; the edges of smoke are seldom more opaque
+_MIN_SEEN_SHARE = 0.75  # share of the cameras that must see a place; half of them often take empty space for matter
+_MIN_OPACITY = 0.1  # least opacity of matter; the edges of smoke are seldom more opaque
 
 
-def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
+def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
     """At most ``count`` distinct starting points of a moving scene, in scene units and the images' colour space.
 
     Visual hulls of single moments are united over time; one hull of all masks would carve away whatever moves. If
@@ -219,7 +212,7 @@ def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> Poi
     check_point_count(count)
     times = torch.stack([views.view(i).conditions["time"] for i in range(len(views))]).float()
     if not optical_axes_meet([views.view(i).camera for i in range(len(views))]):
-        rays, owner = ray_points(views, count, generator, _MATTER)
+        rays, owner = ray_points(views, count, generator, _MIN_OPACITY)
         return drop_repeated_points(PointCloud(rays.means, rays.colors, {"time": times[owner]}))
     if views_have_alpha(views):
         points = _hull_points(views, times, count, generator)
@@ -232,17 +225,19 @@ def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> Poi
 
 def _hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Generator) -> PointCloud | None:
     """Points on the hulls; None if every image has its own time and all hulls are empty."""
-    moments, shared = _moments(times)
+    moments, shared = _choose_moments(times)
     surfaces, owners, sides = [], [], []
     empty: EmptyHull | None = None
     for number, (indices, _) in enumerate(moments):
         try:
-            found, side = hull_surface(ViewSubset(views, indices), _RESOLUTION, seen_views=_SEEN, matter=_MATTER)
+            surface, side = hull_surface(
+                ViewSubset(views, indices), _RESOLUTION, seen_views=_MIN_SEEN_SHARE, matter=_MIN_OPACITY
+            )
         except EmptyHull as error:
             empty = error
             continue
-        surfaces.append(found)
-        owners.append(torch.full((len(found),), number))
+        surfaces.append(surface)
+        owners.append(torch.full((len(surface),), number))
         sides.append(side)
     if not surfaces:
         if shared and empty is not None:
@@ -250,7 +245,7 @@ def _hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Gen
         return None
     centers, owner = torch.cat(surfaces), torch.cat(owners)
     voxel = torch.cat([torch.full((len(s),), side) for s, side in zip(surfaces, sides, strict=True)])
-    rows = _one_per_cell(centers, float(np.median(sides)), generator)
+    rows = _draw_one_per_cell(centers, float(np.median(sides)), generator)
     if count <= len(rows):
         rows = rows[farthest_points(centers[rows], count, generator)]
     else:
@@ -260,13 +255,13 @@ def _hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Gen
     colors = torch.empty_like(means)
     for number in owner.unique().tolist():
         mine = owner == number
-        colors[mine] = median_colors(ViewSubset(views, moments[number][0]), means[mine], _MATTER)
+        colors[mine] = median_colors(ViewSubset(views, moments[number][0]), means[mine], _MIN_OPACITY)
     when = torch.tensor([time for _, time in moments], dtype=torch.float32)
     return drop_repeated_points(PointCloud(means, colors, {"time": when[owner]}))
 
 
-def _moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:
-    """(views, time) of at most _MOMENTS moments in order of time; and whether moments are single times."""
+def _choose_moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:
+    """(views, time) of at most _MAX_MOMENTS moments in order of time; and whether moments are single times."""
     values = times.tolist()
     sharing = Counter(values)
     shared = float(np.median(list(sharing.values()))) >= _MIN_SHARED
@@ -274,14 +269,14 @@ def _moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:
     if shared:
         moments = [([i for i in order if values[i] == t], t) for t in sorted(sharing) if sharing[t] >= _MIN_SHARED]
     else:
-        last = max(0, len(order) - _RUN)
-        runs = [order[start : start + _RUN] for start in sorted({*range(0, last + 1, _RUN // 2), last})]
+        last = max(0, len(order) - _RUN_LENGTH)
+        runs = [order[start : start + _RUN_LENGTH] for start in sorted({*range(0, last + 1, _RUN_LENGTH // 2), last})]
         moments = [(run, values[run[len(run) // 2]]) for run in runs]
-    kept = sorted({round(i) for i in np.linspace(0, len(moments) - 1, min(len(moments), _MOMENTS))})
+    kept = sorted({round(i) for i in np.linspace(0, len(moments) - 1, min(len(moments), _MAX_MOMENTS))})
     return [moments[i] for i in kept], shared
 
 
-def _one_per_cell(points: Tensor, side: float, generator: torch.Generator) -> Tensor:
+def _draw_one_per_cell(points: Tensor, side: float, generator: torch.Generator) -> Tensor:
     """Rows of one random point in every cubic cell with points: things at rest are found in all moments."""
     shuffled = torch.randperm(len(points), generator=generator)
     cells = ((points[shuffled] - points.min(0).values) / side).floor().long().numpy()

@@ -18,8 +18,8 @@ from neuprim.core.model.prunable import count_numbers, nonzero_rows, removal_eff
 from neuprim.core.model.sparse_storage import load_sparse, store_sparse
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.registry import load_task
-from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core.model.shaken import CONDITIONS, COUNT, camera, made

@@ -16,8 +16,8 @@ from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Field
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
-from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core.model.shaken import CONDITIONS, COUNT, camera, made

@@ -12,7 +12,7 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.core.volumes.grid import density_at, density_grid
+from neuprim.core.volumes.density_grid import density_at, density_grid
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import timed_models
 from tests.cosine_models import model
@@ -73,7 +73,7 @@ def test_any_other_density_is_evaluated_in_torch_code(monkeypatch: pytest.Monkey
     m = Primitives.initialise(GaussianDensity(), SphericalHarmonics(0), context)
     expected, whole = reference(m, spaced(0.1)), density_grid(m, {}, spaced(0.1), SHAPE)
     assert float(expected.max()) > 0.1 and torch.allclose(whole.double(), expected, rtol=1e-5, atol=1e-6)
-    monkeypatch.setattr("neuprim.core.volumes.grid._PAIRS", 20)  # blocks of single planes
+    monkeypatch.setattr("neuprim.core.volumes.density_grid._PAIRS", 20)  # blocks of single planes
     assert torch.equal(density_grid(m, {}, spaced(0.1), SHAPE, threads=2), whole)
 
 

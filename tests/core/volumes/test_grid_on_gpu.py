@@ -13,8 +13,8 @@ pytest.importorskip("warp", reason="GPU kernels are written in Warp: pip install
 
 from neuprim.core.compute import device
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.volumes import grid_warp
-from neuprim.core.volumes.grid import density_grid
+from neuprim.core.volumes import density_grid_warp
+from neuprim.core.volumes.density_grid import density_grid
 from tests.cosine_models import model as cosine_model
 
 SHAPE = (21, 18, 25)
@@ -55,22 +55,22 @@ def test_it_is_the_cpus(edge: int, neurons: int, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(("name", "most"), [("_PAIRS", 1), ("_PAIRS", 40), ("_POINTS", 1), ("_POINTS", 8 * 18 * 25)])
 def test_any_part_at_a_time_gives_the_same_bits(name: str, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = filled()
-    monkeypatch.setattr(grid_warp, name, most)
+    monkeypatch.setattr(density_grid_warp, name, most)
     assert bool(whole.any()) and torch.equal(filled(), whole)
 
 
 def test_blocks_may_come_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last first, each as if it were alone."""
-    whole, genuine, blocks = filled(), grid_warp.launch, []
+    whole, genuine, blocks = filled(), density_grid_warp.launch, []
 
     def one_by_one(kernel: Any, dim: Any, inputs: Sequence[Any], where: torch.device, block: int) -> None:
         starts = inputs[0].tensor
         for tile in reversed(range(dim[0])):
             alone = torch.where(torch.arange(len(starts)) <= tile, starts[tile], starts[tile + 1])
-            genuine(kernel, dim, (grid_warp.array(alone, inputs[0].dtype), *inputs[1:]), where, block)
+            genuine(kernel, dim, (density_grid_warp.array(alone, inputs[0].dtype), *inputs[1:]), where, block)
             blocks.append(tile)
 
-    monkeypatch.setattr(grid_warp, "launch", one_by_one)
+    monkeypatch.setattr(density_grid_warp, "launch", one_by_one)
     assert torch.equal(filled(), whole) and len(blocks) == 6 * 3 * 4
 
 

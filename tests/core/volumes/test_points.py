@@ -13,10 +13,11 @@ from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.core.volumes.grid import density_at
-from neuprim.core.volumes.points import find_pairs, sort_into_cells, values_at
-from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.core.volumes.density_grid import density_at
+from neuprim.core.volumes.points import find_point_pairs, volume_values_at
+from neuprim.core.volumes.points_cpu import sort_points_into_cells
+from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.cosine_models import model as cosine_model
 
@@ -81,7 +82,7 @@ def agree(
     model: Primitives, conditions: Conditions, x: Tensor, tolerance: float = 2e-6, exact: Primitives | None = None
 ) -> None:
     exact = exact or model
-    found, (sigma, source) = values_at(model, conditions, x), reference(exact, conditions, x)
+    found, (sigma, source) = volume_values_at(model, conditions, x), reference(exact, conditions, x)
     assert found.source is not None and float(sigma.detach().max()) > 0 and found.sigma.dtype == torch.float32
     for fast, slow in ((found.sigma, sigma), (found.source, source)):
         assert torch.allclose(fast.double(), slow, rtol=tolerance, atol=tolerance * float(slow.detach().abs().max()))
@@ -101,7 +102,7 @@ def cloud(count: int = 300, size: float = 2.0) -> Tensor:
 def test_it_equals_all_pairs_forward_and_backward(neurons: int, edge: int) -> None:
     model, x = static(neurons, edge), cloud()
     agree(model, {}, x)
-    assert torch.allclose(values_at(model, {}, x).sigma.double(), density_at(model, {}, x), rtol=1e-6, atol=1e-6)
+    assert torch.allclose(volume_values_at(model, {}, x).sigma.double(), density_at(model, {}, x), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.37, 1.0])
@@ -145,21 +146,21 @@ def test_nothing_is_active_or_no_point_is_given() -> None:
     with torch.no_grad():
         model.params["window_center"].fill_(0.1)
         model.params["log_window"].fill_(-4.0)
-    nothing = values_at(model, {"time": torch.tensor(0.9)}, cloud())
+    nothing = volume_values_at(model, {"time": torch.tensor(0.9)}, cloud())
     assert nothing.source is not None and not bool(nothing.sigma.any()) and not bool(nothing.source.any())
-    none = values_at(static(2, 1), {}, torch.zeros(0, 3))
+    none = volume_values_at(static(2, 1), {}, torch.zeros(0, 3))
     assert none.sigma.shape == (0,) and none.source is not None and none.source.shape == (0, 3)
 
 
 @pytest.mark.parametrize("model", [static(3, 1, count=150), gaussians()], ids=["compiled", "torch"])
 def test_shares_are_sums_over_points(model: Primitives) -> None:
     x, error = cloud(), torch.rand(300, generator=torch.Generator().manual_seed(3))
-    found = values_at(model, {}, x)
+    found = volume_values_at(model, {}, x)
     shares = found.request_shares(error)
     assert not bool(shares.weight.any())
     found.sigma.sum().backward()
-    cells = sort_into_cells(x.numpy())
-    row, prim = find_pairs(model.geometry, cells)
+    cells = sort_points_into_cells(x.numpy())
+    row, prim = find_point_pairs(model.geometry, cells)
     point = torch.from_numpy(cells.order)[row]
     own = model.active({}).sigma(prim, x[point]).clamp_min(0).detach()
     for sums, value in ((shares.weight, own), (shares.error_weight, own * error[point])):
@@ -169,7 +170,7 @@ def test_shares_are_sums_over_points(model: Primitives) -> None:
 
 def test_it_does_not_depend_on_the_number_of_threads() -> None:
     model, x = static(3, 1, count=150), cloud()
-    found = [values_at(model, {}, x, threads=n) for n in (1, 2, 5)]
+    found = [volume_values_at(model, {}, x, threads=n) for n in (1, 2, 5)]
     made = [gradients(model, f.sigma, f.sigma[:, None]) for f in found]
     for other, grads in zip(found[1:], made[1:], strict=True):
         assert torch.equal(found[0].sigma, other.sigma)
@@ -194,8 +195,8 @@ def test_parameters_in_float32_lose_nothing_on_the_way() -> None:
 
 def test_pairs_are_all_and_once() -> None:
     model, x = static(0, 0), cloud()
-    cells, g = sort_into_cells(x.numpy()), model.geometry
-    row, prim = find_pairs(g, cells)
+    cells, g = sort_points_into_cells(x.numpy()), model.geometry
+    row, prim = find_point_pairs(g, cells)
     y = torch.einsum("mna,nab->mnb", x[:, None] - g.means, g.rotations) / g.scales
     expected = {tuple(pair) for pair in (y.square().sum(-1) < 1).nonzero().tolist()}
     found = list(zip(cells.order[row.numpy()].tolist(), prim.tolist(), strict=True))
@@ -204,7 +205,7 @@ def test_pairs_are_all_and_once() -> None:
 
 def test_cells_hold_every_point() -> None:
     x = cloud().numpy()
-    cells = sort_into_cells(x)
+    cells = sort_points_into_cells(x)
     count = int(cells.counts.prod())
     assert sorted(cells.order) == list(range(300)) and cells.starts[-1] == 300 and len(cells.starts) == count + 1
     owner = np.repeat(np.arange(count), np.diff(cells.starts))
@@ -223,14 +224,14 @@ def test_what_is_not_finite_is_named(name: str, value: float, message: str) -> N
     with torch.no_grad():
         model.params[name][7] = value
     with pytest.raises(NonFiniteError, match=message):
-        values_at(model, {}, cloud())
+        volume_values_at(model, {}, cloud())
 
 
 def test_colour_is_left_out_where_it_is_not_requested_or_depends_on_direction(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     model, x = static(2, 1), cloud()
-    sigma, source = values_at(model, {}, x, colour=False)[:2]
+    sigma, source = volume_values_at(model, {}, x, colour=False)[:2]
     monkeypatch.setattr(SphericalHarmonics, "harmonics", lambda self, params, conditions: None)
-    found = values_at(model, {}, x)
+    found = volume_values_at(model, {}, x)
     assert source is None and found.source is None and torch.equal(found.sigma, sigma)

@@ -7,16 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.volumes import density_errors
-from neuprim.core.volumes.density_errors import (
-    NUMBERS,
-    Comparison,
+from neuprim.core.volumes import density_truth
+from neuprim.core.volumes.density_grid import density_grid, voxels_in_box
+from neuprim.core.volumes.density_truth import (
+    DENSITY_ERRORS,
+    DensityComparison,
     DensityTruth,
     TruthFrame,
     measure_frame_errors,
-    split_planes,
+    split_grid_planes,
 )
-from neuprim.core.volumes.grid import density_grid, voxels_within
 from tests.cosine_models import model
 
 SHAPE = (20, 14, 17)
@@ -48,19 +48,19 @@ def ball() -> np.ndarray:
 
 
 def numbers(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
-    compared = Comparison()
-    compared.add(a, b)
-    found = compared.numbers()
+    compared = DensityComparison()
+    compared.add_block(a, b)
+    found = compared.errors()
     assert found is not None
     return found
 
 
 @pytest.mark.parametrize(("block", "blocks"), [(1, 20), (14 * 17 * 3, 7), (1 << 22, 1)])
 def test_numbers_are_those_of_the_whole_grids(monkeypatch: pytest.MonkeyPatch, block: int, blocks: int) -> None:
-    monkeypatch.setattr(density_errors, "_BLOCK", block)
+    monkeypatch.setattr(density_truth, "_BLOCK_POINTS", block)
     truth, m = Known(ball()), model()
     found = measure_frame_errors(m, {}, truth, 0)
-    assert found is not None and tuple(found) == NUMBERS and truth.blocks == blocks
+    assert found is not None and tuple(found) == DENSITY_ERRORS and truth.blocks == blocks
     a, b = truth.values.astype(float), density_grid(m, {}, truth.matrix, SHAPE).numpy().astype(float)
     active = (b - a)[a > 0]
     assert 0 < len(active) < a.size
@@ -94,7 +94,7 @@ def test_nothing_to_compare_with() -> None:
 def test_blocks_are_the_points_in_their_order() -> None:
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = torch.tensor([[0.1, 0.02, 0], [0, 0.2, 0], [0.05, 0, 0.1]])
-    parts = split_planes(matrix, (5000, 60, 50))
+    parts = split_grid_planes(matrix, (5000, 60, 50))
     assert sum(shape[0] for _, shape in parts) == 5000 and len(parts) > 2
     assert all(shape[1:] == (60, 50) for _, shape in parts)
     point = torch.tensor([parts[0][1][0], 1, 2, 1.0], dtype=torch.float64)
@@ -104,6 +104,6 @@ def test_blocks_are_the_points_in_their_order() -> None:
 def test_voxels_of_a_box_are_those_whose_centres_lie_in_it() -> None:
     place = np.diag([0.25, 0.5, 1.0, 1.0])
     place[:3, 3] = (0.1, -3.0, 7.0)
-    matrix, shape = voxels_within(np.array([[0.1, -4.0, 5.5], [1.1, -2.0, 8.4]]), place)
+    matrix, shape = voxels_in_box(np.array([[0.1, -4.0, 5.5], [1.1, -2.0, 8.4]]), place)
     assert shape == (5, 5, 3)
     assert matrix[:3, 3].tolist() == pytest.approx([0.1, -4.0, 6.0]) and np.allclose(matrix[:3, :3], place[:3, :3])

@@ -10,10 +10,10 @@ import numpy as np
 from neuprim.core.data import Dataset
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.task import SceneContext
-from neuprim.tasks.dynamic.evaluation import recording_of
+from neuprim.tasks.dynamic import recording_of
 from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.dataset import Recording
-from neuprim.tasks.dynamic.volume.scene import load_dataset
+from neuprim.tasks.dynamic.volume.capture_dataset import Recording
+from neuprim.tasks.dynamic.volume.volume_scene import load_dataset
 
 VOXEL = 0.5
 MIDDLE = (8, 15)  # along y and z, in voxels

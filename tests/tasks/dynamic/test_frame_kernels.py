@@ -10,7 +10,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.dynamic.time_kernels import apply_window, move_means, rows_in_window
 
 pytestmark = pytest.mark.usefixtures("either_way")

@@ -13,7 +13,7 @@ import torch
 from neuprim.core.data import Dataset
 from neuprim.core.errors import DataError
 from neuprim.tasks.dynamic.volume import capture as capturing
-from neuprim.tasks.dynamic.volume.dataset import FrameViews, FrameVoxels, Voxels
+from neuprim.tasks.dynamic.volume.capture_dataset import FrameViews, FrameVoxels, MediumVoxels
 from tests.tasks.dynamic.sequences import dataset, recorded, write_blobs
 
 
@@ -74,7 +74,7 @@ def test_damage_and_strange_files_are_refused_by_name(files: Path, tmp_path: Pat
         "scene_from_index": np.eye(4),
     }
     np.savez(tmp_path / "voxels.npz", **good)
-    assert len(Voxels.read(tmp_path / "voxels.npz").index) == 2
+    assert len(MediumVoxels.read(tmp_path / "voxels.npz").index) == 2
     for change in (
         {"index": np.array([1, 8])},
         {"index": np.array([5, 1])},
@@ -85,7 +85,7 @@ def test_damage_and_strange_files_are_refused_by_name(files: Path, tmp_path: Pat
     ):
         np.savez(tmp_path / "voxels.npz", **{**good, **change})
         with pytest.raises(DataError, match=r"voxels\.npz: damaged .*ascending places in it, and finite values"):
-            Voxels.read(tmp_path / "voxels.npz")
+            MediumVoxels.read(tmp_path / "voxels.npz")
 
 
 def test_memory_is_bounded_by_the_setting_whatever_the_length(files: Path, tmp_path: Path) -> None:

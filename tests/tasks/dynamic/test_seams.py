@@ -14,10 +14,10 @@ from neuprim.core.compression.codec import canonicalize, fake_quantize, fit_quan
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.volumes.points import values_at
+from neuprim.core.volumes.points import volume_values_at
 from neuprim.tasks.dynamic import TASK
-from neuprim.tasks.dynamic.density import TimeDensity, chunk_weights, validate_overlaps
-from neuprim.tasks.dynamic.volume.chunks import join_chunks
+from neuprim.tasks.dynamic.time_density import TimeDensity, chunk_weights, validate_overlaps
+from neuprim.tasks.dynamic.volume.volume_scene import join_chunks
 from tests import scenes
 from tests.timed_models import model
 
@@ -92,7 +92,7 @@ def test_a_joined_field_is_the_sum_of_the_chunks_by_their_shares(time: str) -> N
 
 def _sums(m: Primitives, points: Tensor, time: float) -> Tensor:
     """(4, M) extinction and source of all primitives at some points."""
-    values = values_at(m, at(time), points, True, 1)
+    values = volume_values_at(m, at(time), points, True, 1)
     return torch.cat([values.sigma[None], values.source.T]).detach()
 
 

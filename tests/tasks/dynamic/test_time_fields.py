@@ -19,14 +19,17 @@ from neuprim.core.render.output import Contributions
 from neuprim.core.train.population import Relocate
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.core.train.splitting import split_primitives
-from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.density import PARTS, TimeDensity
-from neuprim.tasks.dynamic.evaluation import invisible_fraction
+from neuprim.tasks.dynamic import invisible_fraction
+from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TIME_PARTS, TimeDensity
 from tests import scenes
 from tests.backends import BACKENDS, by
 from tests.timed_models import COUNT, model
 
-VARIANTS = ["none", *("+".join(c) for n in range(1, len(PARTS) + 1) for c in itertools.combinations(PARTS, n))]
+VARIANTS = [
+    "none",
+    *("+".join(c) for n in range(1, len(TIME_PARTS) + 1) for c in itertools.combinations(TIME_PARTS, n)),
+]
 
 
 def at(time: float) -> dict[str, Tensor]:

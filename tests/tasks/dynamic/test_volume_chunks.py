@@ -14,9 +14,8 @@ from neuprim.config import compose
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.task import Chunks, SceneContext
-from neuprim.tasks.dynamic import evaluation
-from neuprim.tasks.dynamic.volume.chunks import MAX_FRAMES, MIN_FRAMES, count_chunks
-from neuprim.tasks.dynamic.volume.scene import open_volumes, split_chunks
+from neuprim.tasks.dynamic import TASK
+from neuprim.tasks.dynamic.volume.volume_scene import MAX_FRAMES, MIN_FRAMES, count_chunks, open_volumes, split_chunks
 from tests.tasks.dynamic.sequences import dataset, empty_frame, recorded, write_blobs
 
 NUMBERS = (2, 3, 5, 6, 7, 8, 10, 11, 12)
@@ -138,7 +137,7 @@ def test_a_span_has_the_whole_sequences_times_box_light_and_images(folder: Path,
     assert part.points is not None
     drawn = part.points.draw(50, torch.Generator().manual_seed(1))
     assert 0.3 - 1e-6 <= float(drawn.conditions["time"]) <= 0.8 + 1e-6
-    assert [clip.views for clip in evaluation.clips(part)] == [range(5), range(5, 10)]
+    assert [clip.views for clip in TASK.clips(part)] == [range(5), range(5, 10)]
 
 
 def test_files_of_a_span_are_its_frames_in_the_sequences_time(folder: Path, tmp_path: Path) -> None:

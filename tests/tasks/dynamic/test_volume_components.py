@@ -13,13 +13,13 @@ from neuprim.config import compose
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import Grid, read_grid, scale_transform, write_vdb
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.volumes.grid import density_grid
+from neuprim.core.volumes.density_grid import density_grid
 from neuprim.runs.export import export_run
 from neuprim.runs.fit import prepare_training
 from neuprim.runs.open import open_run
 from neuprim.runs.run import run
-from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.dynamic.volume.capture import Capture
 from tests.tasks.dynamic.sequences import dataset, recorded
 

@@ -11,7 +11,7 @@ import torch
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
-from neuprim.tasks.dynamic.volume.dataset import FrameViews
+from neuprim.tasks.dynamic.volume.capture_dataset import FrameViews
 from neuprim.tasks.dynamic.volume.medium import build_medium
 from neuprim.tasks.dynamic.volume.optics import optics_preset, override_optics
 from neuprim.tasks.dynamic.volume.survey import Normalisation
@@ -90,7 +90,7 @@ def test_grids_far_from_the_worlds_origin_are_still_told_apart() -> None:
         fine = Grid.from_dense("density", ball, transform=scale_transform(1e-3, (offset, 0, 0)))
         box = fine.world_bounds()
         assert box is not None
-        media.append(build_medium({"density": fine, "flames": coarse}, look, Normalisation.from_bounds(box), 1))
+        media.append(build_medium({"density": fine, "flames": coarse}, look, Normalisation.from_bounds(box).matrix()))
     near, far = (m.values for m in media)
     assert near.shape == far.shape and np.allclose(near, far, atol=0.02 * float(near.max()))
 

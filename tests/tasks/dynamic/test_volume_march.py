@@ -128,7 +128,7 @@ def test_nothing() -> None:
     view = camera((2.0, 1.0, 1.5), 7)
     zeros = np.zeros((5, 6, 7, 4), np.float32)
     for medium in (
-        Medium.nothing(),
+        Medium.without_voxels(),
         Medium.padded(zeros, np.eye(4)),
         Medium.padded(zeros[:0], np.eye(4)),
         Medium(zeros[:1], np.eye(4)),

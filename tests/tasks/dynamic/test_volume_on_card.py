@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -17,14 +16,13 @@ from neuprim.core.data.dataset import SceneContext
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.core.volumes.grid import lattice
-from neuprim.tasks.dynamic.density import TimeDensity
-from neuprim.tasks.dynamic.volume.ground_truth import compare_extinction, sample_extinction
-from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
-from neuprim.tasks.dynamic.volume.scene import open_volumes
+from neuprim.tasks.dynamic.time_density import TimeDensity
+from neuprim.tasks.dynamic.volume.capture_density import compare_extinction
+from neuprim.tasks.dynamic.volume.raymarch import render_medium
+from neuprim.tasks.dynamic.volume.volume_scene import open_volumes
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.tasks.dynamic.sequences import blob, dataset, recorded
-from tests.tasks.dynamic.volumes import camera, ragged, rotation
+from tests.tasks.dynamic.volumes import camera, ragged
 
 
 @pytest.fixture
@@ -76,22 +74,6 @@ def test_pixels_do_not_depend_on_those_beside_them(monkeypatch: pytest.MonkeyPat
     assert bool(whole[9:16].any()) and torch.equal(render_medium(medium, part, 2), whole[9:16])
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_extinction_on_a_lattice_is_the_processors(turned: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    medium = ragged(1)
-    if turned:
-        medium = Medium(medium.values, rotation(2) @ medium.scene_from_index)
-    matrix, shape = lattice(np.array([[-0.7, -0.6, -0.65], [0.7, 0.75, 0.6]]), 30)
-    places = [(matrix, shape), (torch.from_numpy(medium.scene_from_index), medium.values.shape[:3])]
-    wanted = [sample_extinction(medium, *place) for place in places]
-    on_blocks(monkeypatch)
-    found = [sample_extinction(medium, *place) for place in places]
-    for a, b in zip(wanted, found, strict=True):
-        assert a.max() > 3 and np.allclose(a, b, rtol=1e-5, atol=1e-5)
-    assert np.allclose(found[1], medium.values[..., 0], rtol=1e-5, atol=1e-5)
-    assert not sample_extinction(Medium(np.zeros((1, 4, 4, 4), np.float32), np.eye(4)), *places[0]).any()
-
-
 def test_errors_of_a_model_are_the_processors(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = open_volumes(
         {"vdb": str(folder), "size": 24, "cameras": 4, "look": "smoke_fire"}, SceneContext(0, tmp_path)
@@ -106,9 +88,9 @@ def test_errors_of_a_model_are_the_processors(folder: Path, tmp_path: Path, monk
         conditions={"time": torch.rand(30, generator=generator)},
     )
     model = Primitives.initialise(TimeDensity(2, "window+motion"), SphericalHarmonics(0), made)
-    wanted = compare_extinction(model, capture, [0.0, 0.5, 1.0], per_third=1)
+    wanted = compare_extinction(model, capture, [0.0, 0.5, 1.0])
     on_blocks(monkeypatch)
-    found = compare_extinction(model, replace(capture), [0.0, 0.5, 1.0], per_third=1)
+    found = compare_extinction(model, replace(capture), [0.0, 0.5, 1.0])
     assert len(wanted["sigma_frames"]) == 3 and abs(wanted["sigma_correlation_middle"]) > 0.05
     assert {k: v for k, v in found.items() if k != "sigma_frames"} == pytest.approx(
         {k: v for k, v in wanted.items() if k != "sigma_frames"}, rel=1e-5

@@ -11,11 +11,11 @@ import torch
 
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import write_vdb
-from neuprim.core.volumes.grid import lattice
-from neuprim.tasks.dynamic import evaluation
+from neuprim.core.volumes.density_grid import box_lattice
+from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.volume import capture as capturing
-from neuprim.tasks.dynamic.volume.ground_truth import sample_extinction
-from neuprim.tasks.dynamic.volume.scene import choose_frames
+from neuprim.tasks.dynamic.volume.capture_density import sample_extinction
+from neuprim.tasks.dynamic.volume.volume_scene import choose_frames
 from tests.tasks.dynamic.sequences import (
     MIDDLE,
     ORIGIN,
@@ -46,7 +46,7 @@ def test_frames_in_numerical_order_cameras_and_times(folder: Path, tmp_path: Pat
     times = [round(float(data.test.view(i).conditions["time"]), 4) for i in range(4)]
     assert times == [0, 0.7778, 0.8889, 1]  # by number
     assert data.data_source == "real" and data.color_space == "linear"
-    assert evaluation.clips(data)[1].views == range(4, 8)
+    assert TASK.clips(data)[1].views == range(4, 8)
     trained, held_out = (
         {tuple(v.view(i).camera.position.tolist()) for i in range(len(v))} for v in (data.train, data.test)
     )
@@ -68,13 +68,13 @@ def test_images_are_radiance_over_the_exposures_peak_with_alpha(folder: Path, tm
 
 def test_the_ball_moves_in_the_images_and_the_mask_is_its_track(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
-    mask = evaluation.mask(data, 0)
+    mask = TASK.mask(data, 0)
     assert mask is not None
     for i in range(1, 4):
         alpha = data.test.pixels(i).alpha
         assert alpha is not None and bool(((alpha > 1 / 255) <= mask).all())
         assert int((alpha > 1 / 255).sum()) < int(mask.sum())
-    assert torch.equal(evaluation.mask(data, 3), mask)
+    assert torch.equal(TASK.mask(data, 3), mask)
 
 
 def test_starting_points_lie_where_and_when_there_is_matter(folder: Path, tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_every_nth_frame_may_be_left_out_of_training(folder: Path, tmp_path: Pat
 def test_the_files_extinction_on_a_lattice(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
     recording = recorded(data)
-    matrix, shape = lattice(recording.capture.bounds, 48)
+    matrix, shape = box_lattice(recording.capture.bounds, 48)
     medium = recording.capture.medium(recording.capture.frames[1])
     found = sample_extinction(medium, matrix, shape)
     peak = np.array(np.unravel_index(found.argmax(), shape))

@@ -15,7 +15,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import fit, prepare_training
-from neuprim.tasks.dynamic.volume.dataset import FrameVoxels, Voxels
+from neuprim.tasks.dynamic.volume.capture_dataset import FrameVoxels, MediumVoxels
 from tests.tasks.dynamic.sequences import VOXEL, dataset, empty_frame, recorded, write_blobs
 
 SMALL = (
@@ -36,6 +36,10 @@ def supervision(folder: Path, tmp_path: Path, **changes: Any) -> FrameVoxels:
     found = dataset(folder, tmp_path, **changes).points
     assert isinstance(found, FrameVoxels)
     return found
+
+
+def size_of(voxels: MediumVoxels) -> int:
+    return voxels.index.nbytes + voxels.values.nbytes
 
 
 def frames_of(points: FrameVoxels, draws: int, count: int = 400) -> dict[str, list[PointSamples]]:
@@ -125,11 +129,11 @@ def test_voxels_are_read_once_kept_beside_the_images_and_bounded(
     reads: list[int] = []
     monkeypatch.setattr(type(first.capture), "medium", lambda self, frame: reads.append(frame.number))
     again = supervision(files, tmp_path)
-    again._voxels._memory = read[0].bytes + read[1].bytes
+    again._voxels._memory = sum(size_of(voxels) for voxels in read[:2])
     for t, expected in enumerate(read):
         found = again._voxels[t]
         assert np.array_equal(found.index, expected.index) and np.array_equal(found.values, expected.values)
-        assert sum(v.bytes for v in again._voxels._items.values()) <= again._voxels._memory
+        assert sum(map(size_of, again._voxels._items.values())) <= again._voxels._memory
     assert not reads
     path = again.capture.fetch_points(again.folder, again.frames[0]).with_name("voxels.npz")
     path.write_bytes(path.read_bytes()[:200])
@@ -141,10 +145,10 @@ def test_values_at_indices_are_those_of_the_grid() -> None:
     rng = np.random.default_rng(0)
     values = np.where(rng.random((5, 4, 6, 1)) > 0.6, rng.random((5, 4, 6, 4)), 0).astype(np.float32)
     index = np.flatnonzero(values.reshape(-1, 4).any(1))
-    voxels = Voxels(index, values.reshape(-1, 4)[index], (5, 4, 6), np.eye(4))
+    voxels = MediumVoxels(index, values.reshape(-1, 4)[index], (5, 4, 6), np.eye(4))
     cells = np.stack(np.meshgrid(*(np.arange(-2, n + 2) for n in (5, 4, 6)), indexing="ij"), -1).reshape(-1, 3)
     padded = np.pad(values, ((2, 2), (2, 2), (2, 2), (0, 0)))
-    assert np.array_equal(voxels.at(cells), padded.reshape(-1, 4))
+    assert np.array_equal(voxels.values_at_cells(cells), padded.reshape(-1, 4))
 
 
 # ---------------------------------------------------------------- what is learned

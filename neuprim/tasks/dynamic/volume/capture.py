@@ -23,13 +23,13 @@ import torch
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.compute import device as hardware
 from neuprim.core.data.dataset import GroundTruth
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import DataError
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.files import write_json
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.notices import warn_once
-from neuprim.core.volumes.source import Extent
+from neuprim.core.volumes.density_truth import GridExtent, Placement
 from neuprim.tasks.dynamic.volume.medium import build_medium
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
@@ -44,6 +44,7 @@ POINTS = 8192
 LAST_FILE = "points.npz"
 """The file of a frame that is written last."""
 
+_SCENE_FILE = "scene.json"
 _POINTS_BYTES = 2 * POINTS * 3 * 4 + 2**16
 
 
@@ -69,7 +70,7 @@ class Capture:
     bounds: np.ndarray
     device: torch.device = hardware.HOST
     ends: tuple[int, int] | None = None
-    measured: Mapping[int, Extent] = field(default_factory=dict)
+    measured: Mapping[int, GridExtent] = field(default_factory=dict)
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -86,7 +87,7 @@ class Capture:
         first, last = self.clock
         return (frame.number - first) / max(last - first, 1)
 
-    def within(self, first: int, last: int) -> Capture:
+    def select_frames(self, first: int, last: int) -> Capture:
         """The frames from one number to another; times and image folder stay those of all frames."""
         return replace(self, frames=[frame for frame in self.frames if first <= frame.number <= last], ends=self.clock)
 
@@ -94,7 +95,7 @@ class Capture:
         """A short hash of everything; files count by name, size and modification time."""
         stats = [(f.number, str(f.path), f.path.stat().st_size, f.path.stat().st_mtime_ns) for f in self.frames]
         cameras = [(c.viewmat.tolist(), c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in self.cameras]
-        optics, names, normalisation = asdict(self.optics), dict(self.reader.names), self.normalisation.to_json()
+        optics, names, normalisation = asdict(self.optics), dict(self.reader.names), asdict(self.normalisation)
         parts = [RENDERER_VERSION, stats, optics, names, cameras, self.samples, normalisation]
         parts += [self.device.type] * hardware.has_warp(self.device)
         return hashlib.sha256(json.dumps(parts, default=_to_plain).encode()).hexdigest()[:16]
@@ -103,12 +104,27 @@ class Capture:
         """The medium of a frame's file; empty if the file lacks the grids that absorb in others."""
         grids = self.reader.read(frame.path)
         if self.reader.extinction not in grids and not (self.components and self.optics.flame_grid in grids):
-            return Medium.nothing()
+            return Medium.without_voxels()
         optics = replace(self.optics, extinction_grids=(self.reader.extinction,))
         try:
-            return build_medium(grids, optics, self.normalisation, where=self.device)
+            return build_medium(grids, optics, self.normalisation.matrix(), self.device)
         except DataError as error:
             raise DataError(f"{frame.path}: {error}") from error
+
+    def placement(self) -> Placement:
+        """How the scene lies in the world of its files; times as in the dataset."""
+        optics, names = self.optics, self.reader.names
+        flames_absorb = optics.flame_extinction > 0 and optics.flame_grid in names
+        return Placement(
+            self.normalisation.matrix(),
+            [frame.number for frame in self.frames],
+            {"time": [self.time(frame) for frame in self.frames]},
+            optics.extinction or 1.0,
+            names[self.reader.extinction],
+            exact=not flames_absorb and optics.extinction > 0,
+            component=self.reader.extinction,
+            extents=[self.measured[frame.number] for frame in self.frames] if self.measured else (),
+        )
 
     def frame_folder(self, frame: VdbFrame) -> str:
         """Name of the folder of a frame's files."""
@@ -134,7 +150,7 @@ class Capture:
             "cameras": len(self.cameras),
             "size": [self.cameras[0].width, self.cameras[0].height],
             "samples": self.samples,
-            "normalisation": self.normalisation.to_json(),
+            "normalisation": asdict(self.normalisation),
         }
 
     def render(self, frame: VdbFrame, folder: Path) -> None:
@@ -147,7 +163,7 @@ class Capture:
         medium = self.medium(frame)
         brightest = 0.0
         for c, camera in enumerate(self.cameras):
-            rgba = render_medium(medium, camera, samples=self.samples, where=self.device)
+            rgba = render_medium(medium, camera, self.samples, where=self.device)
             peak = float(rgba[..., :3].max().half())  # as stored: values that half floats round to 0 are no light
             if not np.isfinite(peak):
                 raise DataError(
@@ -185,8 +201,6 @@ def _to_plain(value: Any) -> Any:
 
 # ---------------------------------------------------------------- rendering all frames
 
-_SCENE = "scene.json"
-
 
 class RenderedFrames(GroundTruth):
     """Ground truth of a volume sequence: every frame from every camera, rendered when missing.
@@ -202,7 +216,7 @@ class RenderedFrames(GroundTruth):
         self.capture = capture
         self.frames = [capture.frame_folder(frame) for frame in capture.frames]
         self.known = {
-            "normalisation": capture.normalisation.to_json(),
+            "normalisation": asdict(capture.normalisation),
             "bounds": capture.bounds.tolist(),
             "look": {key: getattr(capture.optics, key) for key in DATA_DEPENDENT},
             "grids": dict(capture.reader.names),
@@ -244,8 +258,8 @@ class RenderedFrames(GroundTruth):
 
     def complete(self) -> None:
         with _describe_write_errors(self.store):
-            if not self.store.has_file(_SCENE):
-                self.store.write_file(_SCENE, lambda path: write_json(path, self.capture.describe()))
+            if not self.store.has_file(_SCENE_FILE):
+                self.store.write_file(_SCENE_FILE, lambda path: write_json(path, self.capture.describe()))
 
     def render_missing(self, progress: Callable[[str, float], None]) -> Store:
         """Render missing frames in this process; returns the store of the images.
@@ -284,15 +298,12 @@ def _describe_write_errors(store: Store) -> Iterator[None]:
 _TEST_CAMERAS = (0.4, 0.75)
 """Positions of the test cameras in the sequence from rim to pole: neighbours on all sides, 90 degrees apart."""
 
+_DISTANCE = 2.7  # of cameras from the origin, the centre of the box, scene units (box sides)
+_ELEVATIONS = (3.0, 80.0)  # degrees above the horizon of the lowest and the highest camera
+
 
 def hemisphere_cameras(
-    size: int,
-    cameras: int = 40,
-    *,
-    up: str = "z",
-    distance: float = 2.7,
-    field_of_view: float = 27.0,
-    elevations: tuple[float, float] = (3.0, 80.0),
+    size: int, cameras: int = 40, *, up: str = "z", field_of_view: float = 27.0
 ) -> tuple[list[Camera], list[Camera]]:
     """Training cameras and two test cameras on a Fibonacci lattice over the upper hemisphere around the unit box.
 
@@ -300,20 +311,9 @@ def hemisphere_cameras(
         size: edge of the square images in pixels.
         cameras: of both kinds, at least 4.
         up: 'y' or 'z'.
-        distance: from the origin, the centre of the box, in scene units (box sides).
         field_of_view: whole angle, degrees.
-        elevations: of the lowest and the highest camera, degrees above the horizon.
     """
-    low, high = (math.sin(math.radians(e)) for e in elevations)
-    if up not in UP_AXES:
-        raise ConfigError(f"up {up!r}; expected 'y' or 'z'")
-    sound = size >= 1 and cameras >= 4 and distance > 0.0 and 0.0 < field_of_view < 180.0
-    if not sound or not -90 <= elevations[0] < elevations[1] <= 90:
-        raise ConfigError(
-            f"size {size}, cameras {cameras}, distance {distance}, field_of_view {field_of_view}, "
-            f"elevations {elevations}; "
-            "expected positive sizes, at least 4 cameras, an angle below 180 and rising elevations"
-        )
+    low, high = (math.sin(math.radians(e)) for e in _ELEVATIONS)
     focal = 0.5 * size / math.tan(math.radians(field_of_view) / 2)
     axis = torch.tensor(UP_AXES[up], dtype=torch.float64)
     views = []
@@ -322,8 +322,8 @@ def hemisphere_cameras(
         angle = n * math.pi * (3.0 - math.sqrt(5.0))
         around = math.sqrt(1.0 - height * height)
         a, b = around * math.cos(angle), around * math.sin(angle)
-        eye = torch.tensor([a, b, height] if up == "z" else [b, height, a], dtype=torch.float64) * distance
+        eye = torch.tensor([a, b, height] if up == "z" else [b, height, a], dtype=torch.float64) * _DISTANCE
         viewmat = look_at(eye, torch.zeros(3, dtype=torch.float64), axis)
         views.append(Camera(viewmat, focal, focal, size / 2, size / 2, size, size))
-    chosen = {int(cameras * part) for part in _TEST_CAMERAS}
-    return [v for n, v in enumerate(views) if n not in chosen], [v for n, v in enumerate(views) if n in chosen]
+    held_out = {int(cameras * part) for part in _TEST_CAMERAS}
+    return [v for n, v in enumerate(views) if n not in held_out], [v for n, v in enumerate(views) if n in held_out]

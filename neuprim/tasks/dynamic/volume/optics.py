@@ -103,18 +103,13 @@ class Optics:
     def __post_init__(self) -> None:
         validate_fields(self, "scene.optics")
 
-    @property
-    def grids(self) -> tuple[str, ...]:
-        """Meanings of all grids that are used if a file has them."""
-        return tuple(dict.fromkeys(n for n in (*self.extinction_grids, self.flame_grid, self.color_grid) if n))
-
     def mixes(self, names: Container[str]) -> bool:
         """Whether flames add to the extinction of the extinction grid, given the grids ``names``."""
         return self.extinction > 0 and self.flame_extinction > 0 and self.flame_grid in names
 
-    def turned(self, up: Axis) -> Optics:
+    def turn_to_axis(self, up: Axis) -> Optics:
         """The same optics for sequences whose up axis is ``up``; the light turns along."""
-        if up == self.up or up not in UP_AXES or self.light is None:
+        if up == self.up or self.light is None:
             return replace(self, up=up)
         x, y, z = self.light.direction
         return replace(self, up=up, light=replace(self.light, direction=(y, z, x) if up == "y" else (z, x, y)))
@@ -182,10 +177,10 @@ OPTICS_PRESETS = {
 
 
 def optics_preset(name: str, up: Axis = "z") -> Optics:
-    """The preset ``scene.look`` of that name, for sequences with this up axis."""
+    """The preset ``scene.look`` of that name, for sequences with this up axis; ConfigError if there is none."""
     if name not in OPTICS_PRESETS:
         raise ConfigError(f"scene.look={name}: no such look{nearest(name, OPTICS_PRESETS)}")
-    return OPTICS_PRESETS[name].turned(up)
+    return OPTICS_PRESETS[name].turn_to_axis(up)
 
 
 def override_optics(optics: Optics, changes: Mapping[str, Any]) -> Optics:

@@ -1,10 +1,9 @@
-"""A voxel medium, and rays through the cells between voxel centres: ground-truth images, and a light's transmittance.
+"""A voxel medium, and rays through the cells between its voxel centres: images, and a light's transmittance.
 
 A cell is the cube between eight voxel centres. Along a straight line through it a trilinear field is a cubic
 polynomial, which two Gauss points integrate exactly, so a ray's optical depth has no discretisation error. For the
-radiance, each point's source is weighted by the transmittance up to it; the weights are scaled so that a constant
-source is integrated exactly, which makes the error of fourth order in the step. Steps of an optical depth above 0.5 are
-shortened automatically.
+radiance, each point's source is weighted by the transmittance up to it, scaled so that a constant source is integrated
+exactly: an error of fourth order in the step. Steps of an optical depth above 0.5 are shortened.
 """
 
 from __future__ import annotations
@@ -27,22 +26,19 @@ from neuprim.core.cameras import Camera
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import DataError
 
 _ROWS_PER_JOB, _SLICES_PER_JOB = 4, 2
-_GAUSS = 0.5 - math.sqrt(3.0) / 6.0
-_FAR = 1e30
+_GAUSS, _FAR = 0.5 - math.sqrt(3.0) / 6.0, 1e30
 _OPAQUE = np.float32(1e-4)
 _SHORTEST = 1.0 / 64.0
 _LESS, _MORE = np.float32(math.sqrt(1.0 / 3.0) - 0.5), np.float32(math.sqrt(1.0 / 3.0) + 0.5)
-_TINY = np.float32(1e-30)
-_DARK = 16.0
+_TINY, _DARK = np.float32(1e-30), 16.0
 _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 _C2, _C3, _C4, _C5, _C6, _C7 = (np.float32(1.0 / n) for n in range(2, 8))
 
 
-_NEGLIGIBLE = 1e-7
-"""Below this optical depth across a cell, and this fraction of the strongest source, a voxel counts as empty."""
+_NEGLIGIBLE = 1e-7  # optical depth across a cell, and share of the strongest source, below which a voxel is empty
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,51 +51,30 @@ class Medium:
         values: (X, Y, Z, 4) float32, C-contiguous: σ in 1/scene unit, and σ times the source radiance in linear RGB.
             The outermost voxels are zero, so that the field is continuous; :meth:`padded` adds that layer.
         scene_from_index: (4, 4) float64, affine and invertible: the centre of voxel (i, j, k) is at it @ (i, j, k, 1).
-        non_finite: number of source voxels that were NaN or infinite and count as 0.
         scattering: (X, Y, Z) float32, the extinction grid's part of σ if flames add to it; None if it is all of σ.
     """
 
     values: np.ndarray
     scene_from_index: np.ndarray
-    non_finite: int = 0
     scattering: np.ndarray | None = None
     _on_device: dict[torch.device, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        v, m = self.values, self.scene_from_index
-        if v.ndim != 4 or v.shape[3] != 4 or v.dtype != np.float32 or not v.flags.c_contiguous:
-            raise DataError(
-                f"medium: values are {v.dtype} of shape {v.shape}; expected contiguous float32 (X, Y, Z, 4)"
-            )
-        if m.shape != (4, 4) or m.dtype != np.float64 or not np.isfinite(m).all() or (m[3] != (0, 0, 0, 1)).any():
-            raise DataError(
-                f"medium: scene_from_index is {m.dtype} of shape {m.shape}; expected a finite affine float64 (4, 4)"
-            )
-        if self.empty:
-            return
-        edges = np.linalg.norm(m[:3, :3], axis=0)
-        if (edges == 0).any() or abs(np.linalg.det(m[:3, :3] / edges)) < 1e-9:
-            raise DataError("medium: scene_from_index is singular; expected voxels with a volume")
-        if not np.isfinite(v).all() or float(v[..., 0].min()) < 0:
-            raise DataError("medium: values are NaN, infinite or of negative extinction; expected finite ones")
-        if any(face.any() for face in (v[0], v[-1], v[:, 0], v[:, -1], v[:, :, 0], v[:, :, -1])):
-            raise DataError("medium: the outermost voxels are not zero; Medium.padded adds a layer that is")
-
     @staticmethod
-    def padded(
-        values: np.ndarray, scene_from_index: np.ndarray, non_finite: int = 0, scattering: np.ndarray | None = None
-    ) -> Medium:
-        """The medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels."""
+    def padded(values: np.ndarray, scene_from_index: np.ndarray, scattering: np.ndarray | None = None) -> Medium:
+        """The medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels.
+
+        Raises:
+            DataError: a value is not finite.
+        """
+        if not np.isfinite(values).all():
+            raise DataError("medium: values are NaN or infinite; expected finite ones (scene.optics)")
         shift = np.eye(4)
         shift[:3, 3] = -1.0
-        around = np.zeros((*(n + 2 for n in values.shape[:3]), 4), np.float32)
-        around[1:-1, 1:-1, 1:-1] = values
-        padded = None if scattering is None else np.pad(scattering, 1)
-        return Medium(around, np.asarray(scene_from_index, np.float64) @ shift, non_finite, padded)
+        around = np.pad(values, ((1, 1), (1, 1), (1, 1), (0, 0)))
+        return Medium(around, scene_from_index @ shift, None if scattering is None else np.pad(scattering, 1))
 
     @staticmethod
-    def nothing() -> Medium:
-        """An empty medium."""
+    def without_voxels() -> Medium:
         return Medium(np.zeros((0, 0, 0, 4), np.float32), np.eye(4))
 
     @property
@@ -138,69 +113,52 @@ class Medium:
 
 
 def render_medium(
-    medium: Medium,
-    camera: Camera,
-    samples: int = 2,
-    subdivisions: int = 1,
-    threads: int = 0,
-    where: torch.device = device.HOST,
+    medium: Medium, camera: Camera, samples: int = 2, subdivisions: int = 1, where: torch.device = device.HOST
 ) -> Tensor:
     """Render a medium: (H, W, 4) float32 linear premultiplied RGBA without a background, on the CPU.
 
-    Alpha is exact up to rounding, radiance of fourth order. A ray ends where T < 1e-4. The result does not depend on
-    ``threads``; devices differ by rounding.
+    Alpha is exact up to rounding, radiance of fourth order. A ray ends where T < 1e-4. Devices differ by rounding.
 
     Args:
         camera: pinhole, scene units.
         samples: rays per pixel side, on a regular grid.
         subdivisions: sub-intervals per cell; more than 1 only to verify the error.
-        threads: 0 for all cores.
         where: the device that computes.
     """
-    if samples < 1 or subdivisions < 1:
-        raise ConfigError(f"samples {samples}, subdivisions {subdivisions}; expected at least 1")
     if medium.empty or medium.skips.min() > 0:
         return torch.zeros(camera.height, camera.width, 4)
-    camera.validate("camera")
     pose = (medium.index_from_scene @ np.linalg.inv(camera.viewmat.detach().double().cpu().numpy()))[:3]
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
     if device.has_warp(where):
         from neuprim.tasks.dynamic.volume import raymarch_warp
 
-        values, skips = medium.to_device(where)
         place, lenses = (device.copy_from_host(torch.from_numpy(np.ascontiguousarray(x)), where) for x in (pose, lens))
-        return raymarch_warp.radiances(
-            values, skips, place, lenses, camera.width, camera.height, samples, subdivisions
-        ).cpu()
+        size = (camera.width, camera.height)
+        return raymarch_warp.march_images(*medium.to_device(where), place, lenses, size, samples, subdivisions).cpu()
     image = np.zeros((camera.height, camera.width, 4), np.float32)
     rays = (np.ascontiguousarray(pose), lens, camera.width, samples, subdivisions)
-    parallel_for(radiances, camera.height, _ROWS_PER_JOB, threads, medium.values, medium.skips, *rays, image)
+    parallel_for(_march_image_rows, camera.height, _ROWS_PER_JOB, 0, medium.values, medium.skips, *rays, image)
     return torch.from_numpy(image)
 
 
-def light_transmittance(
-    medium: Medium, direction: Sequence[float], threads: int = 0, where: torch.device = device.HOST
-) -> np.ndarray:
+def light_transmittance(medium: Medium, direction: Sequence[float], where: torch.device = device.HOST) -> np.ndarray:
     """(X, Y, Z) float32 exp(-∫ σ ds) from each voxel centre towards a directional light, exact up to rounding.
 
     ``direction`` points to the light, scene axes, any length > 0. Voxels without extinction get 1 without a ray:
     nothing there scatters.
     """
-    towards = np.array(direction, np.float64)
-    length = float(np.linalg.norm(towards)) if towards.shape == (3,) else 0.0
-    if not 0.0 < length < np.inf:
-        raise ConfigError(f"direction {tuple(direction)}; expected three finite numbers that are not all 0")
     result = np.zeros(medium.values.shape[:3], np.float32)
     if not medium.empty:
-        way = medium.index_from_scene[:3, :3] @ (towards / length)
+        towards = np.array(direction, np.float64)
+        way = medium.index_from_scene[:3, :3] @ (towards / float(np.linalg.norm(towards)))
         sigma = np.ascontiguousarray(medium.values[..., 0])
         if device.has_warp(where):
             from neuprim.tasks.dynamic.volume import raymarch_warp
 
             inputs = (device.copy_from_host(torch.from_numpy(x), where) for x in (sigma, medium.skips, way))
-            return np.exp(-raymarch_warp.depths(*inputs).cpu().numpy())
+            return np.exp(-raymarch_warp.march_depths(*inputs).cpu().numpy())
         rx, ry, rz = way.tolist()
-        parallel_for(depths, len(sigma), _SLICES_PER_JOB, threads, sigma, medium.skips, rx, ry, rz, result)
+        parallel_for(_march_depths, len(sigma), _SLICES_PER_JOB, 0, sigma, medium.skips, rx, ry, rz, result)
     return np.exp(-result)
 
 
@@ -208,7 +166,7 @@ def light_transmittance(
 
 
 @inline
-def _slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
+def _clip_to_slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
     """The part of [near, far] in which ``o + t d`` is within 0..size."""
     if abs(d) < 1e-12:
         return (near, far) if 0.0 <= o <= size else (_FAR, -_FAR)
@@ -217,19 +175,19 @@ def _slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _first(o, d, t, cells):  # type: ignore[no-untyped-def]
+def _first_cell(o, d, t, cells):  # type: ignore[no-untyped-def]
     """The cell of a point, per axis."""
     return min(max(math.floor(o + t * d), 0), cells - 1)
 
 
 @inline
-def _inverse(d):  # type: ignore[no-untyped-def]
+def _inverse_direction(d):  # type: ignore[no-untyped-def]
     """1 / d; 0 where the ray runs along the cells."""
     return 1.0 / d if abs(d) > 1e-12 else 0.0
 
 
 @inline
-def _leave(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
+def _cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
     """Where the ray leaves the cells ``cell - reach … cell + reach`` of one axis."""
     if inverse > 0.0:
         return (cell + reach + 1 - o) * inverse
@@ -239,7 +197,7 @@ def _leave(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _next(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
+def _next_cell(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
     """The cell beyond ``t``, per axis: exact on the axis that is crossed, so that rounding never holds a ray up."""
     if crossed:
         return cell + reach + 1 if d > 0.0 else cell - reach - 1
@@ -249,7 +207,7 @@ def _next(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _fading(depth):  # type: ignore[no-untyped-def]
+def _absorbed(depth):  # type: ignore[no-untyped-def]
     """(1 - exp(-depth)) / depth and exp(-depth), float32; without cancellation and mostly without an exponential."""
     if depth < _HALF:
         mean = _ONE - depth * _C7
@@ -264,7 +222,7 @@ def _fading(depth):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _transmittance(depth):  # type: ignore[no-untyped-def]
+def _short_transmittance(depth):  # type: ignore[no-untyped-def]
     """exp(-depth) for depths of -0.05 to 0.55, to 3e-6; float32."""
     rest = _ONE - depth * _C6
     rest = _ONE - depth * _C5 * rest
@@ -275,7 +233,7 @@ def _transmittance(depth):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _gains(a, b):  # type: ignore[no-untyped-def]
+def _step_gains(a, b):  # type: ignore[no-untyped-def]
     """How much of the sources of two Gauss points leaves a step, and its transmittance, float32.
 
     Args:
@@ -283,75 +241,74 @@ def _gains(a, b):  # type: ignore[no-untyped-def]
     """
     depth = a + b
     if depth > _HALF:  # the shortest steps of something all but solid: one point behind the other, never out of range
-        p, rest = _fading(a)
-        q, last = _fading(b)
+        p, rest = _absorbed(a)
+        q, last = _absorbed(b)
         return p, rest * q, rest * last
-    mean, rest = _fading(depth)
+    mean, rest = _absorbed(depth)
     # depths up to the points if extinction is linear; the first may come out slightly below zero
-    p, q = _transmittance(_HALF * a - _LESS * b), _transmittance(_MORE * a + _HALF * b)
+    p, q = _short_transmittance(_HALF * a - _LESS * b), _short_transmittance(_MORE * a + _HALF * b)
     whole = a * p + b * q
     scale = mean * depth / whole if whole > _TINY else _ONE
     return p * scale, q * scale, rest
 
 
-_FREE = ("nsz", "contract", "reassoc")
-"""What LLVM may do with the arithmetic of ``_two_points``."""
+_FREE = ("nsz", "contract", "reassoc")  # what LLVM may do with the arithmetic of _two_points
 
 
-def _generator(context, flat, o, dy, dx, x1, y1, z1, x2, y2, z2):  # type: ignore[no-untyped-def]
+@intrinsic
+def _two_points(context: Any, flat: Any, corner: Any, first: Any, second: Any) -> Any:
     """Trilinear values of the four channels at two points of one cell, eight numbers: one vector of four per corner.
 
-    Written in LLVM's vectors because its optimiser does not find them in scalar code, which takes 1.4 times as long.
+    Written in LLVM's vectors, as its optimiser does not find them in scalar code, which takes 1.4 times as long.
 
     Args:
         flat: float32 array of the interleaved voxels.
-        o, dy, dx: uint64, offsets of the cell's lowest corner and between neighbours in y and x; those in z are 4
-            apart.
-        x1 … z2: float32 fractions within the cell.
+        corner: (o, dy, dx) uint64, offsets of the cell's lowest corner and between neighbours in y and x; those in z
+            are 4 apart.
+        first, second: (x, y, z) float32 fractions within the cell, of each point.
     """
-    signature = types.UniTuple(types.float32, 8)(flat, o, dy, dx, *(types.float32,) * 6)
+    signature = types.UniTuple(types.float32, 8)(flat, corner, first, second)
     number, vector = ir.IntType(32), ir.VectorType(ir.FloatType(), 4)
-    nothing, first = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(number, 4), [0] * 4)
+    nothing, lanes = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(number, 4), [0] * 4)
 
-    def generate(target, builder, signature, args):  # type: ignore[no-untyped-def]
+    def generate(target: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = target.make_array(signature.args[0])(target, builder, args[0]).data
-        low, to_y, to_x = args[1], args[2], args[3]
+        low, to_y, to_x = (builder.extract_value(args[1], n) for n in range(3))
         to_z = ir.Constant(ir.IntType(64), 4)
 
-        def corner(*steps):  # type: ignore[no-untyped-def]
+        def load_corner(*steps: Any) -> Any:
             at = low
             for step in steps:
                 at = builder.add(at, step)
             return builder.load(builder.bitcast(builder.gep(data, [at]), vector.as_pointer()), align=4)
 
-        def spread(value):  # type: ignore[no-untyped-def]
-            return builder.shuffle_vector(builder.insert_element(nothing, value, number(0)), nothing, first)
+        def spread(point: Any, axis: int) -> Any:
+            value = builder.insert_element(nothing, builder.extract_value(point, axis), number(0))
+            return builder.shuffle_vector(value, nothing, lanes)
 
-        def along(a, change, part):  # type: ignore[no-untyped-def]
+        def along(a: Any, change: Any, part: Any) -> Any:
             return builder.fadd(a, builder.fmul(part, change, _FREE), _FREE)
 
-        def between(a, b, part):  # type: ignore[no-untyped-def]
+        def between(a: Any, b: Any, part: Any) -> Any:
             return along(a, builder.fsub(b, a, _FREE), part)
 
         edges = []
         for steps in ((), (to_y,), (to_x,), (to_x, to_y)):
-            below = corner(*steps)
-            edges.append((below, builder.fsub(corner(*steps, to_z), below, _FREE)))
-        found = []
-        for x, y, z in (map(spread, args[4:7]), map(spread, args[7:10])):
+            below = load_corner(*steps)
+            edges.append((below, builder.fsub(load_corner(*steps, to_z), below, _FREE)))
+        channels = []
+        for point in args[2:]:
+            x, y, z = (spread(point, axis) for axis in range(3))
             a, b, c, d = (along(below, change, z) for below, change in edges)
             value = between(between(a, b, y), between(c, d, y), x)
-            found += [builder.extract_element(value, number(n)) for n in range(4)]
-        return target.make_tuple(builder, signature.return_type, found)
+            channels += [builder.extract_element(value, number(n)) for n in range(4)]
+        return target.make_tuple(builder, signature.return_type, channels)
 
     return signature, generate
 
 
-_two_points: Any = intrinsic(_generator)
-
-
 @kernel
-def radiances(start, stop, values, skips, pose, lens, width, samples, parts, image):  # type: ignore[no-untyped-def]
+def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, parts, image):  # type: ignore[no-untyped-def]
     """Image rows start … stop.
 
     Args:
@@ -378,19 +335,23 @@ def radiances(start, stop, values, skips, pose, lens, width, samples, parts, ima
                 rx = (pose[0, 0] * cx + pose[0, 1] * cy + pose[0, 2]) * unit
                 ry = (pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2]) * unit
                 rz = (pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2]) * unit
-                t, end = _slab(ox, rx, float(nx), 0.0, _FAR)
-                t, end = _slab(oy, ry, float(ny), t, end)
-                t, end = _slab(oz, rz, float(nz), t, end)
+                t, end = _clip_to_slab(ox, rx, float(nx), 0.0, _FAR)
+                t, end = _clip_to_slab(oy, ry, float(ny), t, end)
+                t, end = _clip_to_slab(oz, rz, float(nz), t, end)
                 if t >= end:
                     continue
-                ix, iy, iz = _inverse(rx), _inverse(ry), _inverse(rz)
-                i, j, k = _first(ox, rx, t, nx), _first(oy, ry, t, ny), _first(oz, rz, t, nz)
+                ix, iy, iz = _inverse_direction(rx), _inverse_direction(ry), _inverse_direction(rz)
+                i, j, k = _first_cell(ox, rx, t, nx), _first_cell(oy, ry, t, ny), _first_cell(oz, rz, t, nz)
                 through = _ONE
                 r, g, b = _ZERO, _ZERO, _ZERO
                 while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
                     skip = int(skips[i, j, k])
                     reach = max(skip - 1, 0)
-                    tx, ty, tz = _leave(ox, ix, i, reach), _leave(oy, iy, j, reach), _leave(oz, iz, k, reach)
+                    tx, ty, tz = (
+                        _cell_exit(ox, ix, i, reach),
+                        _cell_exit(oy, iy, j, reach),
+                        _cell_exit(oz, iz, k, reach),
+                    )
                     out = min(tx, min(ty, tz))
                     if skip == 0 and out > t:
                         o = np.uint64(i) * dx + np.uint64(j) * dy + np.uint64(4 * k)
@@ -404,14 +365,14 @@ def radiances(start, stop, values, skips, pose, lens, width, samples, parts, ima
                             s = begin + part * (1.0 - _GAUSS)
                             x2, y2 = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j)
                             z2 = np.float32(oz + s * rz - k)
-                            s1, r1, g1, b1, s2, r2, g2, b2 = _two_points(flat, o, dy, dx, x1, y1, z1, x2, y2, z2)
+                            s1, r1, g1, b1, s2, r2, g2, b2 = _two_points(flat, (o, dy, dx), (x1, y1, z1), (x2, y2, z2))
                             half = np.float32(0.5 * part)
                             s1 *= half
                             s2 *= half
                             if s1 + s2 > _HALF and part > _SHORTEST * step:
                                 part *= 0.5 if s1 + s2 < _ONE else 0.25
                                 continue
-                            p, q, rest = _gains(s1, s2)
+                            p, q, rest = _step_gains(s1, s2)
                             p *= through * half
                             q *= through * half
                             r += p * r1 + q * r2
@@ -422,9 +383,9 @@ def radiances(start, stop, values, skips, pose, lens, width, samples, parts, ima
                             part = min(step, out - begin)
                         if through < _OPAQUE:
                             break
-                    i = _next(ox, rx, i, reach, out, tx == out)
-                    j = _next(oy, ry, j, reach, out, ty == out)
-                    k = _next(oz, rz, k, reach, out, tz == out)
+                    i = _next_cell(ox, rx, i, reach, out, tx == out)
+                    j = _next_cell(oy, ry, j, reach, out, ty == out)
+                    k = _next_cell(oz, rz, k, reach, out, tz == out)
                     t = max(t, out)
                 sum_r += r
                 sum_g += g
@@ -437,7 +398,7 @@ def radiances(start, stop, values, skips, pose, lens, width, samples, parts, ima
 
 
 @inline
-def _between(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
+def _trilinear(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
     """Trilinear value of an (X, Y, Z) array at fractions of cell (i, j, k)."""
     a = v[i, j, k] + z * (v[i, j, k + 1] - v[i, j, k])
     b = v[i, j + 1, k] + z * (v[i, j + 1, k + 1] - v[i, j + 1, k])
@@ -449,16 +410,16 @@ def _between(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignore[no-untyped-def]
+def _march_depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignore[no-untyped-def]
     """Optical depth from the voxels of slices start … stop in one direction to the end of the grid.
 
     Args:
-        sigma: (X, Y, Z) float32. skips: as in :func:`radiances`.
+        sigma: (X, Y, Z) float32. skips: of a :class:`Medium`.
         rx, ry, rz: the direction, indices per scene unit.
         result: (X, Y, Z) float32, written where sigma > 0; a ray stops at a depth of 16.
     """
     nx, ny, nz = skips.shape
-    ix, iy, iz = _inverse(rx), _inverse(ry), _inverse(rz)
+    ix, iy, iz = _inverse_direction(rx), _inverse_direction(ry), _inverse_direction(rz)
     for a in range(start, stop):
         for b in range(ny + 1):
             for c in range(nz + 1):
@@ -470,16 +431,20 @@ def depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignore[no-un
                 while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and depth < _DARK:
                     skip = int(skips[i, j, k])
                     reach = max(skip - 1, 0)
-                    tx, ty, tz = _leave(ox, ix, i, reach), _leave(oy, iy, j, reach), _leave(oz, iz, k, reach)
+                    tx, ty, tz = (
+                        _cell_exit(ox, ix, i, reach),
+                        _cell_exit(oy, iy, j, reach),
+                        _cell_exit(oz, iz, k, reach),
+                    )
                     out = min(tx, min(ty, tz))
                     if skip == 0 and out > t:
                         for point in range(2):
                             s = t + (out - t) * (_GAUSS if point == 0 else 1.0 - _GAUSS)
                             x, y = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j)
                             z = np.float32(oz + s * rz - k)
-                            depth += 0.5 * (out - t) * _between(sigma, i, j, k, x, y, z)
-                    i = _next(ox, rx, i, reach, out, tx == out)
-                    j = _next(oy, ry, j, reach, out, ty == out)
-                    k = _next(oz, rz, k, reach, out, tz == out)
+                            depth += 0.5 * (out - t) * _trilinear(sigma, i, j, k, x, y, z)
+                    i = _next_cell(ox, rx, i, reach, out, tx == out)
+                    j = _next_cell(oy, ry, j, reach, out, ty == out)
+                    k = _next_cell(oz, rz, k, reach, out, tz == out)
                     t = max(t, out)
                 result[a, b, c] = depth

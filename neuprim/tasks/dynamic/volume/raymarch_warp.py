@@ -22,7 +22,7 @@ _FAR, _OPAQUE, _SHORTEST, _DARK = 1e30, 1e-4, 1.0 / 64.0, 16.0
 
 
 @wp.func
-def _slab(o: wp.float64, way: wp.float64, size: wp.float64, range: wp.vec2d):
+def _clip_to_slab(o: wp.float64, way: wp.float64, size: wp.float64, range: wp.vec2d):
     """The part of ``range`` in which ``o + t way`` is within 0..size."""
     if wp.abs(way) < d(1e-12):
         if o >= d(0.0) and o <= size:
@@ -34,7 +34,7 @@ def _slab(o: wp.float64, way: wp.float64, size: wp.float64, range: wp.vec2d):
 
 
 @wp.func
-def _inverse(way: wp.float64):
+def _inverse_direction(way: wp.float64):
     """1 / way; 0 where the ray runs along the cells."""
     if wp.abs(way) > d(1e-12):
         return d(1.0) / way
@@ -42,13 +42,13 @@ def _inverse(way: wp.float64):
 
 
 @wp.func
-def _first(o: wp.float64, way: wp.float64, t: wp.float64, cells: int):
+def _first_cell(o: wp.float64, way: wp.float64, t: wp.float64, cells: int):
     """The cell of a point, per axis."""
     return wp.min(wp.max(int(wp.floor(o + t * way)), 0), cells - 1)
 
 
 @wp.func
-def _leave(o: wp.float64, inverse: wp.float64, cell: int, reach: int):
+def _cell_exit(o: wp.float64, inverse: wp.float64, cell: int, reach: int):
     """Where the ray leaves the cells ``cell - reach … cell + reach`` of one axis."""
     if inverse > d(0.0):
         return (d(cell + reach + 1) - o) * inverse
@@ -58,7 +58,7 @@ def _leave(o: wp.float64, inverse: wp.float64, cell: int, reach: int):
 
 
 @wp.func
-def _next(o: wp.float64, way: wp.float64, cell: int, reach: int, t: wp.float64, crossed: bool):
+def _next_cell(o: wp.float64, way: wp.float64, cell: int, reach: int, t: wp.float64, crossed: bool):
     """The cell beyond ``t``, per axis: exact on the axis that is crossed, so that rounding never holds a ray up."""
     if crossed:
         if way > d(0.0):
@@ -70,7 +70,7 @@ def _next(o: wp.float64, way: wp.float64, cell: int, reach: int, t: wp.float64, 
 
 
 @wp.func
-def _fading(depth: float):
+def _absorbed(depth: float):
     """((1 - exp(-depth)) / depth, exp(-depth)), without cancellation and mostly without an exponential."""
     if depth < 0.5:
         mean = 1.0 - depth / 7.0
@@ -85,15 +85,15 @@ def _fading(depth: float):
 
 
 @wp.func
-def _gains(a: float, b: float):
+def _step_gains(a: float, b: float):
     """How much of the sources of two Gauss points leaves a step, and its transmittance; a, b: optical depth that each
     point stands for."""
     depth = a + b
     if depth > 0.5:
-        one = _fading(a)
-        two = _fading(b)
+        one = _absorbed(a)
+        two = _absorbed(b)
         return wp.vec3(one[0], one[1] * two[0], one[1] * two[1])
-    mean = _fading(depth)
+    mean = _absorbed(depth)
     p = wp.exp(_LESS * b - 0.5 * a)
     q = wp.exp(-_MORE * a - 0.5 * b)
     whole = a * p + b * q
@@ -104,7 +104,7 @@ def _gains(a: float, b: float):
 
 
 @wp.func
-def _between(v: Any, i: int, j: int, k: int, x: float, y: float, z: float):
+def _trilinear(v: Any, i: int, j: int, k: int, x: float, y: float, z: float):
     """Trilinear value of an (X, Y, Z) array at fractions of cell (i, j, k)."""
     a = v[i, j, k] + z * (v[i, j, k + 1] - v[i, j, k])
     b = v[i, j + 1, k] + z * (v[i, j + 1, k + 1] - v[i, j + 1, k])
@@ -116,7 +116,7 @@ def _between(v: Any, i: int, j: int, k: int, x: float, y: float, z: float):
 
 
 @functools.cache
-def _radiances() -> Any:
+def _image_kernel() -> Any:
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def radiances(
         values: wp.array3d(dtype=wp.vec4), skips: wp.array3d(dtype=wp.uint8), pose: wp.array2d(dtype=wp.float64),
@@ -134,23 +134,23 @@ def _radiances() -> Any:
             rx = (pose[0, 0] * cx + pose[0, 1] * cy + pose[0, 2]) * unit
             ry = (pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2]) * unit
             rz = (pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2]) * unit
-            inside = _slab(origin[0], rx, d(nx), wp.vec2d(d(0.0), d(_FAR)))
-            inside = _slab(origin[1], ry, d(ny), inside)
-            inside = _slab(origin[2], rz, d(nz), inside)
+            inside = _clip_to_slab(origin[0], rx, d(nx), wp.vec2d(d(0.0), d(_FAR)))
+            inside = _clip_to_slab(origin[1], ry, d(ny), inside)
+            inside = _clip_to_slab(origin[2], rz, d(nz), inside)
             t = d(inside[0])
             if t < inside[1]:
-                ix, iy, iz = _inverse(rx), _inverse(ry), _inverse(rz)
-                i = int(_first(origin[0], rx, t, nx))
-                j = int(_first(origin[1], ry, t, ny))
-                k = int(_first(origin[2], rz, t, nz))
+                ix, iy, iz = _inverse_direction(rx), _inverse_direction(ry), _inverse_direction(rz)
+                i = int(_first_cell(origin[0], rx, t, nx))
+                j = int(_first_cell(origin[1], ry, t, ny))
+                k = int(_first_cell(origin[2], rz, t, nz))
                 through = float(1.0)
                 light = wp.vec3()
                 while through >= _OPAQUE and i >= 0 and i < nx and j >= 0 and j < ny and k >= 0 and k < nz:
                     skip = int(skips[i, j, k])
                     reach = wp.max(skip - 1, 0)
-                    tx = _leave(origin[0], ix, i, reach)
-                    ty = _leave(origin[1], iy, j, reach)
-                    tz = _leave(origin[2], iz, k, reach)
+                    tx = _cell_exit(origin[0], ix, i, reach)
+                    ty = _cell_exit(origin[1], iy, j, reach)
+                    tz = _cell_exit(origin[2], iz, k, reach)
                     out = wp.min(tx, wp.min(ty, tz))
                     if skip == 0 and out > t:
                         step = (out - t) / d(parts)
@@ -163,8 +163,8 @@ def _radiances() -> Any:
                             s = begin + part * d(_HIGH)
                             x2, y2 = f(origin[0] + s * rx - d(i)), f(origin[1] + s * ry - d(j))
                             z2 = f(origin[2] + s * rz - d(k))
-                            one = _between(values, i, j, k, x1, y1, z1)
-                            two = _between(values, i, j, k, x2, y2, z2)
+                            one = _trilinear(values, i, j, k, x1, y1, z1)
+                            two = _trilinear(values, i, j, k, x2, y2, z2)
                             half = f(d(0.5) * part)
                             s1 = one[0] * half
                             s2 = two[0] * half
@@ -174,16 +174,16 @@ def _radiances() -> Any:
                                 else:
                                     part = d(0.25) * part
                             else:
-                                gains = _gains(s1, s2)
+                                gains = _step_gains(s1, s2)
                                 p = gains[0] * through * half
                                 q = gains[1] * through * half
                                 light += p * wp.vec3(one[1], one[2], one[3]) + q * wp.vec3(two[1], two[2], two[3])
                                 through *= gains[2]
                                 begin += part
                                 part = wp.min(step, out - begin)
-                    i = _next(origin[0], rx, i, reach, out, tx == out)
-                    j = _next(origin[1], ry, j, reach, out, ty == out)
-                    k = _next(origin[2], rz, k, reach, out, tz == out)
+                    i = _next_cell(origin[0], rx, i, reach, out, tx == out)
+                    j = _next_cell(origin[1], ry, j, reach, out, ty == out)
+                    k = _next_cell(origin[2], rz, k, reach, out, tz == out)
                     t = wp.max(t, out)
                 total += wp.vec4(light[0], light[1], light[2], 1.0 - through)
         image[pixel] = total * (1.0 / float(samples * samples))
@@ -192,7 +192,7 @@ def _radiances() -> Any:
 
 
 @functools.cache
-def _depths() -> Any:
+def _depth_kernel() -> Any:
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def depths(
         sigma: wp.array3d(dtype=float), skips: wp.array3d(dtype=wp.uint8), way: wp.array(dtype=wp.float64),
@@ -201,7 +201,7 @@ def _depths() -> Any:
         a, b, c = wp.tid()
         if sigma[a, b, c] > 0.0:
             nx, ny, nz = skips.shape[0], skips.shape[1], skips.shape[2]
-            ix, iy, iz = _inverse(way[0]), _inverse(way[1]), _inverse(way[2])
+            ix, iy, iz = _inverse_direction(way[0]), _inverse_direction(way[1]), _inverse_direction(way[2])
             ox, oy, oz = d(a), d(b), d(c)
             i = int(wp.min(a, nx - 1))
             j = int(wp.min(b, ny - 1))
@@ -211,78 +211,43 @@ def _depths() -> Any:
             while i >= 0 and i < nx and j >= 0 and j < ny and k >= 0 and k < nz and depth < d(_DARK):
                 skip = int(skips[i, j, k])
                 reach = wp.max(skip - 1, 0)
-                tx = _leave(ox, ix, i, reach)
-                ty = _leave(oy, iy, j, reach)
-                tz = _leave(oz, iz, k, reach)
+                tx = _cell_exit(ox, ix, i, reach)
+                ty = _cell_exit(oy, iy, j, reach)
+                tz = _cell_exit(oz, iz, k, reach)
                 out = wp.min(tx, wp.min(ty, tz))
                 if skip == 0 and out > t:
                     for point in range(2):
                         s = t + (out - t) * wp.where(point == 0, d(_LOW), d(_HIGH))
                         x, y, z = f(ox + s * way[0] - d(i)), f(oy + s * way[1] - d(j)), f(oz + s * way[2] - d(k))
-                        depth += d(0.5) * (out - t) * d(_between(sigma, i, j, k, x, y, z))
-                i = _next(ox, way[0], i, reach, out, tx == out)
-                j = _next(oy, way[1], j, reach, out, ty == out)
-                k = _next(oz, way[2], k, reach, out, tz == out)
+                        depth += d(0.5) * (out - t) * d(_trilinear(sigma, i, j, k, x, y, z))
+                i = _next_cell(ox, way[0], i, reach, out, tx == out)
+                j = _next_cell(oy, way[1], j, reach, out, ty == out)
+                k = _next_cell(oz, way[2], k, reach, out, tz == out)
                 t = wp.max(t, out)
             result[a, b, c] = f(depth)
 
     return depths
 
 
-@functools.cache
-def _extinctions() -> Any:
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
-    def extinctions(values: wp.array3d(dtype=wp.vec4), way: wp.array(dtype=wp.vec4d), result: wp.array3d(dtype=float)):
-        a, b, c = wp.tid()
-        at = wp.vec4d(d(a), d(b), d(c), d(1.0))
-        x, y, z = wp.dot(way[0], at), wp.dot(way[1], at), wp.dot(way[2], at)
-        nx, ny, nz = values.shape[0] - 1, values.shape[1] - 1, values.shape[2] - 1
-        found = float(0.0)
-        if x >= d(0.0) and y >= d(0.0) and z >= d(0.0) and x <= d(nx) and y <= d(ny) and z <= d(nz):
-            i = wp.max(wp.min(int(x), nx - 1), 0)
-            j = wp.max(wp.min(int(y), ny - 1), 0)
-            k = wp.max(wp.min(int(z), nz - 1), 0)
-            corners = _between(values, i, j, k, f(x - d(i)), f(y - d(j)), f(z - d(k)))
-            found = corners[0]
-        result[a, b, c] = found
-
-    return extinctions
-
-
-def radiances(
-    values: Tensor, skips: Tensor, pose: Tensor, lens: Tensor, width: int, height: int, samples: int, subdivisions: int
+def march_images(
+    values: Tensor, skips: Tensor, pose: Tensor, lens: Tensor, size: tuple[int, int], samples: int, subdivisions: int
 ) -> Tensor:
-    """(H, W, 4) float32 premultiplied RGBA, on the device of the voxels; arguments as of the kernel of the CPU."""
-    image = torch.empty(height * width, 4, dtype=torch.float32, device=values.device)
-    launch(
-        _radiances(), height * width,
-        (
-            array(values, wp.vec4), array(skips, wp.uint8), array(pose, d), array(lens, d), wp.vec2i(width, height),
-            samples, subdivisions, array(image, wp.vec4),
-        ), values.device,
-    )  # fmt: skip
-    return image.view(height, width, 4)
+    """(H, W, 4) float32 premultiplied RGBA, on the device of the voxels; arguments as of the kernel of the CPU, and
+    ``size`` = (W, H)."""
+    image = torch.empty(size[1] * size[0], 4, dtype=torch.float32, device=values.device)
+    arrays = (array(values, wp.vec4), array(skips, wp.uint8), array(pose, d), array(lens, d))
+    inputs = (*arrays, wp.vec2i(*size), samples, subdivisions, array(image, wp.vec4))
+    launch(_image_kernel(), size[1] * size[0], inputs, values.device)
+    return image.view(size[1], size[0], 4)
 
 
-def depths(sigma: Tensor, skips: Tensor, way: Tensor) -> Tensor:
+def march_depths(sigma: Tensor, skips: Tensor, way: Tensor) -> Tensor:
     """(X, Y, Z) float32 optical depth from every voxel with extinction to the end of the grid, 0 from the others.
 
     Args:
         way: (3,) float64, the direction, indices per scene unit.
     """
     result = torch.zeros_like(sigma)
-    launch(
-        _depths(), sigma.shape, (array(sigma, f), array(skips, wp.uint8), array(way, d), array(result, f)), sigma.device
-    )
-    return result
-
-
-def extinctions(values: Tensor, way: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """(X, Y, Z) float32 extinction at a lattice's points, trilinear; 0 outside the voxels.
-
-    Args:
-        values: of a medium that is not empty. way: (3, 4) float64, the lattice's indices to the voxels'.
-    """
-    result = torch.empty(shape, dtype=torch.float32, device=values.device)
-    launch(_extinctions(), shape, (array(values, wp.vec4), array(way, wp.vec4d), array(result, f)), values.device)
+    inputs = (array(sigma, f), array(skips, wp.uint8), array(way, d), array(result, f))
+    launch(_depth_kernel(), sigma.shape, inputs, sigma.device)
     return result

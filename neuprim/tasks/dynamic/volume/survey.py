@@ -13,7 +13,7 @@ import numpy as np
 
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.vdb import Grid, VdbFrame, read_grids, read_header
-from neuprim.core.volumes.source import Extent
+from neuprim.core.volumes.density_truth import GridExtent
 from neuprim.tasks.dynamic.volume.optics import Optics
 
 USUAL_NAMES = {
@@ -24,8 +24,7 @@ USUAL_NAMES = {
 }
 """Grid names of exporters (EmberGen, Mantaflow, Houdini) by meaning."""
 
-_PEAK_QUANTILE = 0.999
-"""Quantile of a grid's voxels that counts as its peak, so that single outliers do not change the optics."""
+_PEAK_QUANTILE = 0.999  # of a grid's voxels, so that single outliers do not change the optics
 
 
 @dataclass(frozen=True)
@@ -46,14 +45,14 @@ class GridReader:
         Raises:
             DataError: it has none of them.
         """
-        available = [meaning for meaning in wanted if meaning in self.names]
-        if not available:
-            listed = ", ".join(f"{meaning} ({name!r})" for meaning, name in self.names.items())
-            raise DataError(
-                f"{folder}: this look absorbs by {' or '.join(wanted)}, and the files have {listed}; "
-                f"choose another scene.look, or name the grid: scene.grids.{wanted[0]}=NAME"
-            )
-        return replace(self, extinction=available[0])
+        for meaning in wanted:
+            if meaning in self.names:
+                return replace(self, extinction=meaning)
+        listed = ", ".join(f"{meaning} ({name!r})" for meaning, name in self.names.items())
+        raise DataError(
+            f"{folder}: this look absorbs by {' or '.join(wanted)}, and the files have {listed}; "
+            f"choose another scene.look, or name the grid: scene.grids.{wanted[0]}=NAME"
+        )
 
     def read(self, path: Path) -> dict[str, Grid]:
         """Read the grids of one file by meaning; grids that the file lacks are left out (exporters drop empty ones)."""
@@ -62,8 +61,8 @@ class GridReader:
         return dict(zip(wanted, read_grids(path, list(wanted.values())), strict=True))
 
 
-def find_grids(frames: Sequence[VdbFrame], given: Mapping[str, str]) -> GridReader:
-    """Find the grids that some frame has: those the user named, then those with a usual name.
+def find_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> GridReader:
+    """Find the grids that some frame has: those the user chose by name, then those with a usual name.
 
     Raises:
         DataError: a named grid is in no file or cannot be read (level sets, points), or no grid absorbs.
@@ -77,17 +76,16 @@ def find_grids(frames: Sequence[VdbFrame], given: Mapping[str, str]) -> GridRead
     folder = frames[0].path.parent
     names: dict[str, str] = {}
     for meaning, usual in USUAL_NAMES.items():
-        if meaning in given:
-            name = given[meaning]
+        if meaning in chosen:
+            name = chosen[meaning]
             where = f"{folder}: scene.grids.{meaning}={name}"
             if name not in refusals:
                 raise DataError(f"{where}: no frame has such a grid{nearest(name, refusals)}")
             if refusals[name]:
                 raise DataError(f"{where}: the grid {refusals[name]}")
             names[meaning] = name
-        else:
-            usable = [name for name in usual if name in refusals and refusals[name] is None]
-            names |= {meaning: usable[0]} if usable else {}
+        elif usable := [name for name in usual if name in refusals and refusals[name] is None]:
+            names[meaning] = usable[0]
     if not {"density", "temperature"} & names.keys():
         listed = ", ".join(f"{name} ({why or 'readable'})" for name, why in sorted(refusals.items())) or "none"
         raise DataError(
@@ -111,27 +109,9 @@ class SequenceSurvey:
     """
 
     box: np.ndarray
-    extents: dict[int, Extent]
+    extents: dict[int, GridExtent]
     hottest: float
     peaks: dict[str, float]
-
-
-class _Histogram:
-    """Counts of positive values with a relative resolution of about 1 %, for quantiles of a whole sequence."""
-
-    def __init__(self) -> None:
-        self.counts = np.zeros(1 << 15, np.int64)
-
-    def add(self, values: np.ndarray) -> None:
-        positive = values[np.isfinite(values) & (values > 0)]
-        # the upper half of a positive float32's bits rises with its value
-        self.counts += np.bincount(positive.astype(np.float32).view(np.uint32) >> 16, minlength=len(self.counts))
-
-    def quantile(self, share: float) -> float:
-        """0 without any value."""
-        cumulative = np.cumsum(self.counts)
-        place = int(np.searchsorted(cumulative, share * cumulative[-1]))
-        return float(np.uint32(place << 16 | 1 << 15).view(np.float32)) if cumulative[-1] else 0.0
 
 
 def survey_frames(
@@ -142,29 +122,42 @@ def survey_frames(
     Raises:
         DataError: no frame has an active voxel.
     """
-    matter, extents, hottest = list[Extent](), dict[int, Extent](), 0.0
-    histograms = {meaning: _Histogram() for meaning in (reader.extinction, "flames")}
+    matter, extents, hottest = list[GridExtent](), dict[int, GridExtent](), 0.0
+    histograms = {meaning: np.zeros(1 << 15, np.int64) for meaning in (reader.extinction, "flames")}
     for i, frame in enumerate(frames):
         progress("looking through the frames", i / len(frames))
-        extents[frame.number] = Extent(0.0, None)
+        extents[frame.number] = GridExtent(0.0, None)
         for meaning, grid in reader.read(frame.path).items():
             box = grid.world_bounds()
             if box is None or meaning not in histograms or grid.channels != 1:
                 continue
-            extent = Extent(max(grid.range[1], 0.0) if grid.range else 0.0, box)
-            histograms[meaning].add(grid.active_values())
+            extent = GridExtent(max(grid.range[1], 0.0) if grid.range else 0.0, box)
+            histograms[meaning] += _count_values(grid.active_values())
             if meaning == reader.extinction:
                 extents[frame.number] = extent
             if meaning == "flames":
                 hottest = max(hottest, extent.largest)
             if meaning == reader.extinction or optics.mixes(reader.names):
                 matter.append(extent)
-    box = Extent.around(matter).box
+    box = GridExtent.around(matter).box
     if box is None:
         where = os.path.commonpath([f.path for f in frames])
         name = reader.names[reader.extinction]
         raise DataError(f"{where}: no frame has an active voxel of {name!r}; expected matter in at least one")
-    return SequenceSurvey(box, extents, hottest, {m: h.quantile(_PEAK_QUANTILE) for m, h in histograms.items()})
+    return SequenceSurvey(box, extents, hottest, {m: _peak_value(counts) for m, counts in histograms.items()})
+
+
+def _count_values(values: np.ndarray) -> np.ndarray:
+    """(2^15,) numbers of positive values by the upper half of a float32's bits, which rises with its value."""
+    positive = values[np.isfinite(values) & (values > 0)]
+    return np.bincount(positive.astype(np.float32).view(np.uint32) >> 16, minlength=1 << 15)
+
+
+def _peak_value(counts: np.ndarray) -> float:
+    """A quantile close to the largest value, to about 1 %; 0 without any value."""
+    cumulative = np.cumsum(counts)
+    place = int(np.searchsorted(cumulative, _PEAK_QUANTILE * cumulative[-1]))
+    return float(np.uint32(place << 16 | 1 << 15).view(np.float32)) if cumulative[-1] else 0.0
 
 
 def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurvey) -> dict[str, Any]:
@@ -178,12 +171,7 @@ def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurve
         for key, meaning in grids.items()
         if survey.peaks[meaning] > 0
     }
-    if survey.hottest > 0:
-        settings["flame_range"] = (0.0, survey.hottest)
-    return settings
-
-
-# ---------------------------------------------------------------- placement
+    return settings | ({"flame_range": (0.0, survey.hottest)} if survey.hottest > 0 else {})
 
 
 @dataclass(frozen=True)
@@ -193,18 +181,16 @@ class Normalisation:
     center: tuple[float, float, float]
     scale: float
 
-    def __post_init__(self) -> None:
-        if len(self.center) != 3 or not all(math.isfinite(c) for c in self.center) or not 0.0 < self.scale < math.inf:
-            raise DataError(
-                f"normalisation: center {self.center}, scale {self.scale}; expected three finite numbers and one > 0"
-            )
-
     @staticmethod
     def from_bounds(bounds: np.ndarray) -> Normalisation:
-        """Map the (2, 3) box ``bounds``, world units, to one around the origin with longest side 1."""
+        """Map the (2, 3) box ``bounds``, world units, to one around the origin with longest side 1.
+
+        Raises:
+            DataError: the box is not finite, or has no volume.
+        """
         low, high = np.asarray(bounds, np.float64)
         longest = float((high - low).max())
-        if not np.isfinite(high - low).all() or longest <= 0.0 or (high < low).any():
+        if not np.isfinite(high - low).all() or longest <= 0.0 or not math.isfinite(1.0 / longest):
             raise DataError(
                 f"normalisation: box from {low.tolist()} to {high.tolist()}; expected a finite one with a volume"
             )
@@ -220,22 +206,3 @@ class Normalisation:
         matrix = np.diag([self.scale, self.scale, self.scale, 1.0])
         matrix[:3, 3] = -np.asarray(self.center) * self.scale
         return matrix
-
-    def to_json(self) -> dict[str, Any]:
-        """Numbers that :meth:`from_json` reads back exactly."""
-        return {"center": list(self.center), "scale": self.scale}
-
-    @staticmethod
-    def from_json(record: Mapping[str, Any], where: str = "normalisation") -> Normalisation:
-        """Read what :meth:`to_json` gave; ``where`` names the file in errors.
-
-        Raises:
-            DataError: a missing key, or anything but numbers.
-        """
-        try:
-            x, y, z = (float(c) for c in record["center"])
-            return Normalisation((x, y, z), float(record["scale"]))
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(
-                f"{where}: {dict(record)!r} ({error!r}); expected 'center' (three numbers) and 'scale'"
-            ) from None

@@ -15,7 +15,7 @@ from neuprim.core.model.fields import ColourField, Conditions, Constant, read_sc
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
-from neuprim.tasks.dynamic.density import get_time
+from neuprim.tasks.dynamic.time_density import get_time
 
 FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
 """Angle of the first Fourier term at xi = 1. The paper prints i xi, whose basis is nearly rank-deficient on [0, 1]

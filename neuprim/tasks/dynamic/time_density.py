@@ -1,6 +1,4 @@
-"""Cosine density that changes in time; the density of one frame is a static one, so time costs nothing per pixel.
-
-Parts that vary are chosen by name and joined by "+":
+"""Cosine density that changes in time. The density of one frame is a static one. Parts that vary, joined by "+":
 
     phase    b1 + xi W_t                                        equation 13 of the paper; K parameters
     offset   b2 + sum_j p_j cos(pi j xi) + q_j sin(pi j xi)     j = 1..4; 8 parameters
@@ -8,13 +6,10 @@ Parts that vary are chosen by name and joined by "+":
     motion   mu + v (xi - c) + a (xi - c)^2                     c of the window, else 1/2; 6 parameters
 
 xi is time over the sequence, 0..1. Primitives outside their window are dropped from a frame before anything is
-computed.
-
-A model joined from chunks of a sequence stores the chunk of every primitive. Neighbouring chunks overlap in time: over
-an overlap the earlier chunk's weight falls linearly from 1 to 0 and the later one's rises from 0 to 1.
-
-Where several grids make the extinction (smoke and flames), each of ``components`` adds one parameter, share_NAME: the
-primitive's share of that grid, as a logit.
+computed. A model joined from chunks of a sequence stores the chunk of every primitive; over an overlap in time the
+earlier chunk's weight falls linearly from 1 to 0 and the later one's rises from 0 to 1. Where several grids make the
+extinction (smoke and flames), each of ``components`` adds one parameter, share_NAME: the primitive's share of that
+grid, as a logit.
 """
 
 from __future__ import annotations
@@ -42,14 +37,14 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.train.splitting import SPLIT_LONG, SPLIT_SHIFT
+from neuprim.tasks.dynamic.time_kernels import apply_window, move_means, rows_in_window
 
-PARTS = ("phase", "offset", "window", "motion")
+TIME_PARTS = ("phase", "offset", "window", "motion")
 """What may vary in time."""
 
 OFFSET_TERMS = 4
 _OFFSETS, _MOTION = ("offset_cos", "offset_sin"), ("velocity", "acceleration")
 _SHARE = "share_"
-
 
 ChunkOverlaps = tuple[tuple[float, float], ...]
 """(from, to) time of each overlap of chunks, ascending; chunk k ends with overlap k."""
@@ -117,11 +112,11 @@ class TimeDensity(DensityField):
         components: Sequence[str] = (),
     ) -> None:
         parts = time.split("+") if isinstance(time, str) and time != "none" else []
-        if not isinstance(time, str) or any(p not in PARTS for p in parts) or len(set(parts)) != len(parts):
-            raise ValueError(f"{time!r}: expected none or some of {', '.join(PARTS)} joined by +")
+        if not isinstance(time, str) or any(p not in TIME_PARTS for p in parts) or len(set(parts)) != len(parts):
+            raise ValueError(f"{time!r}: expected none or some of {', '.join(TIME_PARTS)} joined by +")
         self.static, self.divide_above = CosineDensity(neurons, omega0, edge, gain), divide_above
         self.exact_split = self.static.exact_split
-        self.time, self.parts = "+".join(p for p in PARTS if p in parts) or "none", frozenset(parts)
+        self.time, self.parts = "+".join(p for p in TIME_PARTS if p in parts) or "none", frozenset(parts)
         self.seams = validate_overlaps(seams)
         if isinstance(components, str) or not all(isinstance(name, str) and name.isidentifier() for name in components):
             raise ValueError(f"components {components!r}; expected a list of names")
@@ -137,7 +132,7 @@ class TimeDensity(DensityField):
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
-        every = cls(time="+".join(PARTS), gain=True, seams=[(0.0, 1.0)], components=("density", "temperature"))
+        every = cls(time="+".join(TIME_PARTS), gain=True, seams=[(0.0, 1.0)], components=("density", "temperature"))
         return every.parameters()
 
     def parameters(self) -> list[ParameterSpec]:
@@ -172,8 +167,6 @@ class TimeDensity(DensityField):
             return None
         xi, rows = get_time(conditions), None
         if "window" in self.parts:
-            from neuprim.tasks.dynamic.time_kernels import rows_in_window  # numba, loaded when first needed
-
             rows = rows_in_window(params["window_center"], params["log_window"], xi)
         if self.seams:
             counts = chunk_weights(params["chunk"], self.seams, xi)[:, 0] > 0
@@ -183,8 +176,6 @@ class TimeDensity(DensityField):
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
         if "motion" not in self.parts:
             return geometry
-        from neuprim.tasks.dynamic.time_kernels import move_means  # numba, loaded when first needed
-
         center = params["window_center"] if "window" in self.parts else torch.full_like(geometry.means[:, :1], 0.5)
         means = move_means(geometry.means, params["velocity"], params["acceleration"], center, get_time(conditions))
         return Geometry(means, geometry.log_scales, geometry.quats)
@@ -193,7 +184,7 @@ class TimeDensity(DensityField):
         xi = get_time(conditions)
         b1 = params["b1"]
         if "phase" in self.parts:
-            b1 = _advance(b1, params["W_t"], xi, 2 * math.pi / self.static.omega0)
+            b1 = _advance_phase(b1, params["W_t"], xi, 2 * math.pi / self.static.omega0)
         changed = dict(params)
         if "offset" in self.parts:
             angle = math.pi * xi * torch.arange(1, OFFSET_TERMS + 1, dtype=torch.float64, device=xi.device)
@@ -203,8 +194,6 @@ class TimeDensity(DensityField):
             changed["b2"] = b2 + (cosines + sines)[:, None]
         w2, b2 = amplified(changed["w2"], changed["b2"], changed.get("log_gain"))
         if "window" in self.parts:
-            from neuprim.tasks.dynamic.time_kernels import apply_window  # numba, loaded when first needed
-
             w2, b2 = apply_window(w2, b2, params["window_center"], params["log_window"], xi)
         if self.seams:
             weight = chunk_weights(params["chunk"], self.seams, xi).to(b2)
@@ -212,9 +201,8 @@ class TimeDensity(DensityField):
         return Cosine(params["W1"], b1, w2, b2, self.static.omega0, self.static.edge)
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
-        return cosine_density(
-            self.lower(params, geometry, conditions), self.move(params, geometry, conditions), prim, x
-        )
+        form = self.lower(params, geometry, conditions)
+        return cosine_density(form, self.move(params, geometry, conditions), prim, x)
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
         children = split_cosine(params, old, new, self.static.omega0, self.static.edge)
@@ -255,7 +243,7 @@ class TimeDensity(DensityField):
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
         """Fewer neurons, and each part of time, which is either there or not."""
-        return {**self.static.reductions(), **{part: (0,) for part in PARTS if part in self.parts}}
+        return self.static.reductions() | {part: (0,) for part in TIME_PARTS if part in self.parts}
 
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
@@ -264,7 +252,7 @@ class TimeDensity(DensityField):
             field = TimeDensity(**{**self.settings(), "neurons": value})
             return field, prune_neurons(params, geometry, value, self.static.omega0)
         remaining = drop_time_terms(params, geometry, name, self.static.omega0)
-        left = "+".join(part for part in PARTS if part in self.parts and part != name) or "none"
+        left = "+".join(part for part in TIME_PARTS if part in self.parts and part != name) or "none"
         field = TimeDensity(**{**self.settings(), "time": left})
         kept = {"means", *(spec.name for spec in field.parameters())}
         return field, {key: value for key, value in remaining.items() if key in kept}
@@ -277,7 +265,7 @@ class TimeDensity(DensityField):
             for unit in self.static.prunable_units()
         ]
         if "offset" in self.parts:
-            units.append(PrunableUnit("offset", {"offset_cos": (), "offset_sin": ()}))
+            units.append(PrunableUnit("offset", dict.fromkeys(_OFFSETS, ())))
         if "motion" in self.parts:
             units += [PrunableUnit(f"{name} {'xyz'[k]}", {name: (k,)}, name) for name in _MOTION for k in range(3)]
         return tuple(units)
@@ -293,7 +281,7 @@ class TimeDensity(DensityField):
         return scaled
 
 
-def _advance(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:
+def _advance_phase(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:
     """b1 + xi W_t without whole turns of 2 pi/omega0; float32-exact also for times far outside 0..1."""
     phase = b1.double() + xi * W_t.double()
     return (phase - turn * torch.round(phase.detach() / turn)).to(b1)
@@ -325,12 +313,11 @@ _MIDDLE = 0.5  # reference time of motion without a window
 
 
 def drop_time_terms(params: Params, geometry: Geometry, part: str, omega0: float) -> dict[str, Tensor]:
-    """The tensors of a :class:`TimeDensity` with one part replaced by its mean over the sequence.
+    """The tensors of a :class:`TimeDensity` with one part replaced by its mean over the sequence, and "means" if moved.
 
     Means are over xi in 0..1, weighted by the window if there is one. A phase that advances by a over the sequence,
     cos(phi + xi a), has the mean R cos(phi + psi) with R e^(i psi) the mean of e^(i xi a). A window leaves its mean
-    factor, a motion its mean position. The dropped part's own tensors are still in the result. With "motion", and with
-    "window" where there is a motion (then relative to xi = 1/2), "means" is there as well.
+    factor, a motion its mean position. The dropped part's own tensors are still in the result.
     """
     changes = {"phase": _mean_phase, "offset": _mean_offset, "window": _mean_window, "motion": _mean_motion}
     return {**params, **changes[part](params, geometry, omega0)}
@@ -382,21 +369,15 @@ def _mean_offset(params: Params, geometry: Geometry, omega0: float) -> dict[str,
 
 def _mean_window(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
     mean = torch.stack([_window_factor(params, xi) for xi in _mean_times(params["b1"])]).mean(0)
-    faded = {
-        name: (params[name].double() * mean).to(params[name])
-        for name in ("w2", "b2", "offset_cos", "offset_sin")
-        if name in params
-    }
+    names = [name for name in ("w2", "b2", *_OFFSETS) if name in params]
+    faded = {name: (params[name].double() * mean).to(params[name]) for name in names}
     if "velocity" not in params:
         return faded
     later = _MIDDLE - params["window_center"].double()
     velocity, acceleration = params["velocity"].double(), params["acceleration"].double()
     means = geometry.means.double() + (velocity + acceleration * later) * later
-    return {
-        **faded,
-        "means": means.to(geometry.means),
-        "velocity": (velocity + 2 * acceleration * later).to(params["velocity"]),
-    }
+    moved = (velocity + 2 * acceleration * later).to(params["velocity"])
+    return {**faded, "means": means.to(geometry.means), "velocity": moved}
 
 
 def _mean_motion(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:

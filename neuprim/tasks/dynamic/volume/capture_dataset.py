@@ -25,7 +25,6 @@ from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.notices import warn_once
 from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.ground_truth import placement_of
 from neuprim.tasks.dynamic.volume.raymarch import Medium
 
 TRAINING_MEMORY, _TEST_MEMORY, _VOXEL_MEMORY = 6 / 11, 1 / 11, 4 / 11
@@ -36,7 +35,7 @@ _MIN_ALPHA = 1.0 / 255.0  # of a pixel that shows matter
 T = TypeVar("T")
 
 
-class _RecentlyUsed(Generic[T]):
+class _RecentFrames(Generic[T]):
     """Items by index, read when first used; the least recently used are dropped beyond ``memory`` bytes."""
 
     def __init__(self, read: Callable[[int], T], size: Callable[[T], int], memory: float) -> None:
@@ -48,11 +47,11 @@ class _RecentlyUsed(Generic[T]):
         if index in self._items:
             self._items.move_to_end(index)
             return self._items[index]
-        self._items[index] = found = self._read(index)
-        self._bytes += self._size(found)
+        self._items[index] = item = self._read(index)
+        self._bytes += self._size(item)
         while len(self._items) > 1 and self._bytes > self._memory:
             self._bytes -= self._size(self._items.popitem(last=False)[1])
-        return found
+        return item
 
 
 class FrameViews(ViewSet):
@@ -75,20 +74,20 @@ class FrameViews(ViewSet):
         memory: float = math.inf,
     ) -> None:
         self.capture, self.folder, self.cameras, self.exposure = capture, folder, list(cameras), exposure
-        self._images = _RecentlyUsed(self._decode, lambda rgba: rgba.numel() * 2, memory)
+        self._images = _RecentFrames(self._decode, lambda rgba: rgba.numel() * 2, memory)
         self.frames = capture.frames[::every]
         self.times = [torch.tensor(capture.time(frame)) for frame in self.frames]
 
     def __len__(self) -> int:
         return len(self.cameras) * len(self.times)
 
-    def _split(self, index: int) -> tuple[int, int]:
+    def _split_index(self, index: int) -> tuple[int, int]:
         """The number of a view's camera, and the position of its frame."""
         camera, frame = divmod(index, len(self.times))
         return self.cameras[camera], frame
 
     def view(self, index: int) -> View:
-        camera, t = self._split(index)
+        camera, t = self._split_index(index)
         name = f"cam_{camera:02d}_frame_{self.frames[t].number:04d}"
         return View(name, self.capture.cameras[camera], {"time": self.times[t]})
 
@@ -97,15 +96,13 @@ class FrameViews(ViewSet):
         return Pixels(rgba[..., :3] / self.exposure, rgba[..., 3])
 
     def _decode(self, index: int) -> Tensor:
-        number, t = self._split(index)
+        number, t = self._split_index(index)
         camera, frame = self.capture.cameras[number], self.frames[t]
-
-        def read() -> Tensor:
-            path = self.capture.fetch_image(self.folder, frame, number)
-            return images.read_image(path, (camera.width, camera.height))
-
+        size = (camera.width, camera.height)
         try:
-            return self.folder.retry(read, warn_once).half()
+            return self.folder.retry(
+                lambda: images.read_image(self.capture.fetch_image(self.folder, frame, number), size), warn_once
+            ).half()
         except DataError as error:
             address = self.folder.at(self.capture.frame_folder(frame)).address
             raise DataError(f"{error}; delete the folder {address} to render the frame again") from error
@@ -144,9 +141,7 @@ class Recording:
         frames = torch.multinomial(torch.from_numpy(weights), count, replacement=True, generator=generator)
         per_frame = torch.bincount(frames, minlength=len(weights)).tolist()
         means, colors, times = [], [], []
-        for t, wanted in enumerate(per_frame):
-            if not wanted:
-                continue
+        for t, wanted in ((t, wanted) for t, wanted in enumerate(per_frame) if wanted):
             stored = read_points_file(self.capture.fetch_points(self.folder, self.capture.frames[t]), "means", "colors")
             points = torch.from_numpy(stored["means"])
             rows = torch.randperm(len(points), generator=generator)[torch.arange(wanted) % len(points)]
@@ -208,7 +203,7 @@ def volume_dataset(
             f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)"
         )
     if used.span is not None:
-        capture = capture.within(*used.span)
+        capture = capture.select_frames(*used.span)
     training = [c for c in range(len(capture.cameras)) if c not in held_out]
     train = FrameViews(capture, folder, training, exposure, used.every, used.memory * TRAINING_MEMORY)
     test = FrameViews(capture, folder, held_out, exposure, memory=used.memory * _TEST_MEMORY)
@@ -232,7 +227,7 @@ def volume_dataset(
         bounds=torch.from_numpy(capture.bounds),
         exposure=exposure,
         world=World(torch.from_numpy(capture.normalisation.matrix())),
-        placement=placement_of(capture),
+        placement=capture.placement(),
         largest=max(float(frame["largest"]) for frame in stored),
         points=voxels,
         extra=recording,
@@ -279,7 +274,7 @@ _MAX_VOXEL_BYTES = 4 * 2**30  # of a frame; more than the largest grid that is r
 
 
 @dataclass(frozen=True)
-class Voxels:
+class MediumVoxels:
     """A frame's voxels that hold matter or light.
 
     Attributes:
@@ -294,14 +289,16 @@ class Voxels:
     scene_from_index: np.ndarray
 
     @staticmethod
-    def of(medium: Medium) -> Voxels:
+    def of(medium: Medium) -> MediumVoxels:
         """The voxels of a medium that are not all zero."""
         flat = medium.values.reshape(-1, 4)
         if medium.scattering is not None:
             flat = np.concatenate([flat, medium.scattering.reshape(-1, 1)], 1)
         index = np.flatnonzero(flat.any(1))
         x, y, z = medium.values.shape[:3]
-        return Voxels(index.astype(np.int64), np.ascontiguousarray(flat[index]), (x, y, z), medium.scene_from_index)
+        return MediumVoxels(
+            index.astype(np.int64), np.ascontiguousarray(flat[index]), (x, y, z), medium.scene_from_index
+        )
 
     @cached_property
     def rms(self) -> tuple[float, float, float]:
@@ -311,18 +308,13 @@ class Voxels:
         squares = np.square(self.values, dtype=np.float64).mean(0)
         return tuple(float(np.sqrt(x)) for x in (squares[0], squares[1:4].mean(), squares[4:].sum()))  # type: ignore[return-value]
 
-    @property
-    def bytes(self) -> int:
-        return self.index.nbytes + self.values.nbytes
-
     def write(self, path: Path) -> None:
         """Write a file of arrays. Raises OSError."""
-        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _VOXEL_ARRAYS}
         with open(path, "wb") as file:
-            np.savez(file, **arrays)
+            np.savez(file, **{name: np.asarray(getattr(self, name)) for name in _VOXEL_ARRAYS})
 
     @staticmethod
-    def read(path: Path) -> Voxels:
+    def read(path: Path) -> MediumVoxels:
         """Read what :meth:`write` wrote.
 
         Raises:
@@ -339,18 +331,17 @@ class Voxels:
                 f"{path}: damaged ({len(index)} voxels of a grid of {x}x{y}x{z}; "
                 "expected ascending places in it, and finite values)"
             )
-        return Voxels(index, values, (x, y, z), matrix)
+        return MediumVoxels(index, values, (x, y, z), matrix)
 
-    def at(self, cells: np.ndarray) -> np.ndarray:
+    def values_at_cells(self, cells: np.ndarray) -> np.ndarray:
         """(M, C) values at (M, 3) integer indices; 0 outside."""
-        found = np.zeros((len(cells), self.values.shape[1]), np.float32)
+        values = np.zeros((len(cells), self.values.shape[1]), np.float32)
         inside = ((cells >= 0) & (cells < np.array(self.shape))).all(1)
-        flat = np.ravel_multi_index(tuple(cells[inside].T), self.shape) if len(self.index) else np.zeros(0, np.int64)
-        if not len(flat):
-            return found
-        place = np.searchsorted(self.index, flat).clip(max=len(self.index) - 1)
-        found[inside] = np.where((self.index[place] == flat)[:, None], self.values[place], np.float32(0))
-        return found
+        if len(self.index) and inside.any():
+            flat = np.ravel_multi_index(tuple(cells[inside].T), self.shape)
+            place = np.searchsorted(self.index, flat).clip(max=len(self.index) - 1)
+            values[inside] = np.where((self.index[place] == flat)[:, None], self.values[place], np.float32(0))
+        return values
 
 
 class FrameVoxels(PointSupervision):
@@ -374,7 +365,7 @@ class FrameVoxels(PointSupervision):
         self.exposure, self.components = views.exposure, capture.components
         shares = torch.tensor(weights, dtype=torch.float64)
         self.chances = (1 - _ANY_FRAME) * shares / shares.sum().clamp_min(1e-300) + _ANY_FRAME / len(self.frames)
-        self._voxels = _RecentlyUsed(self._read, lambda voxels: voxels.bytes, memory)
+        self._voxels = _RecentFrames(self._read_voxels, lambda v: v.index.nbytes + v.values.nbytes, memory)
 
     def draw(self, count: int, generator: torch.Generator) -> PointSamples:
         t = int(torch.multinomial(self.chances, 1, generator=generator))
@@ -394,7 +385,7 @@ class FrameVoxels(PointSupervision):
             chosen = np.stack(np.unravel_index(voxels.index[rows], voxels.shape), -1)
             chosen[:near] += torch.randint(-_MAX_OFFSET, _MAX_OFFSET + 1, (near, 3), generator=generator).numpy()
             cells, known = np.concatenate([cells, chosen]), voxels.values[rows[near:]]
-        values = np.concatenate([voxels.at(cells[: count - len(known)]), known])
+        values = np.concatenate([voxels.values_at_cells(cells[: count - len(known)]), known])
         points = cells @ voxels.scene_from_index[:3, :3].T + voxels.scene_from_index[:3, 3]
         sigma, light, part = voxels.rms
         fallback = self.capture.optics.extinction or 1.0  # for empty frames
@@ -411,21 +402,20 @@ class FrameVoxels(PointSupervision):
             components=dict.fromkeys(self.components, (parts, part or sigma or fallback)),
         )
 
-    def _read(self, t: int) -> Voxels:
-        return self.folder.retry(lambda: self._read_or_make(self.frames[t]), warn_once)
+    def _read_voxels(self, t: int) -> MediumVoxels:
+        return self.folder.retry(lambda: self._read_or_make_voxels(self.frames[t]), warn_once)
 
-    def _read_or_make(self, frame: VdbFrame) -> Voxels:
-        """The voxels of a frame from the store, or from the frame's file."""
+    def _read_or_make_voxels(self, frame: VdbFrame) -> MediumVoxels:
         name = f"{self.capture.frame_folder(frame)}/voxels.npz"
         path = self.folder.fetch_file(name, _MAX_VOXEL_BYTES)
         if not path.is_file():
-            made = Voxels.of(self.capture.medium(frame))
+            made = MediumVoxels.of(self.capture.medium(frame))
             try:
                 self.folder.write_file(name, made.write)
             except OSError as error:
                 raise DataError(f"cannot write the voxels of {frame.path} to {path}: {error}") from error
             return made
         try:
-            return Voxels.read(path)
+            return MediumVoxels.read(path)
         except DataError as error:
             raise DataError(f"{error}; delete it to read the frame again") from error

@@ -1,11 +1,9 @@
-"""The model's extinction on a regular grid: sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m, inside
-their ellipsoids.
+"""The model's extinction on a regular grid: sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m inside
+their ellipsoids. A primitive's negative f is clamped here point by point; a renderer clamps its integral along a ray.
 
-A primitive's f may be negative in places, where it is clamped at 0; a renderer clamps the integral along a ray instead.
-
-Along an axis of the grid a neuron's phase is linear in the index, so its cosine at a grid point is a product of one
-complex number per axis: a primitive that spans n^3 points costs 3 n sines and cosines per neuron, and two
-multiplications per neuron and point.
+A neuron's phase is linear in the index along each axis, so its cosine at a grid point is a product of one complex
+number per axis: a primitive that spans n^3 points costs 3 n sines and cosines per neuron, and two multiplications per
+neuron and point.
 """
 
 from __future__ import annotations
@@ -23,26 +21,25 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions, Cosine
 from neuprim.core.model.primitives import Primitives
 
-_SLAB = 8  # planes per unit of work; fixed, and the result does not depend on it
+_PLANES_PER_JOB = 8
 _PAIRS = 1 << 17  # of points and primitives that torch code evaluates at once
 
 POINTS_LIMIT = 2**30
 """Most points of a grid, 4 GiB of float32."""
 
 
-def lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, tuple[int, int, int]]:
+def box_lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, tuple[int, int, int]]:
     """(4, 4) scene_from_index and shape of a regular grid of cell centres that fills a (2, 3) box, ``resolution`` along
     its longest side."""
     low, high = np.asarray(bounds, np.float64)
     step = float((high - low).max()) / resolution
     x, y, z = (max(1, round(float(side) / step)) for side in high - low)
-    matrix = torch.eye(4, dtype=torch.float64) * step
-    matrix[3, 3] = 1.0
+    matrix = torch.diag(torch.tensor([step, step, step, 1.0], dtype=torch.float64))
     matrix[:3, 3] = torch.from_numpy(low + step / 2)
     return matrix, (x, y, z)
 
 
-def voxels_within(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> tuple[Tensor, tuple[int, int, int]]:
+def voxels_in_box(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> tuple[Tensor, tuple[int, int, int]]:
     """(4, 4) scene_from_index and shape of the voxels whose centres lie in a (2, 3) box of the scene, or in a box of
     voxels around it if they are turned."""
     corners = np.stack(np.meshgrid(*np.asarray(bounds, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
@@ -65,7 +62,7 @@ def density_grid(
 ) -> Tensor:
     """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``; on the CPU.
 
-    A density that lowers to a :class:`~neuprim.core.model.forms.Cosine` runs in compiled code on all cores, or on a
+    A density that lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on all cores, or on a
     GPU; any other density is evaluated in blocks on the CPU. It takes a few MB besides the grid; up to 500 MB of a GPU.
 
     Args:
@@ -78,8 +75,7 @@ def density_grid(
         ConfigError: more than :data:`POINTS_LIMIT` points, or a map that is singular or not finite.
     """
     forward = scene_from_index.detach().double().numpy()
-    count = int(np.prod(np.array(shape, np.float64)))
-    if count > POINTS_LIMIT:
+    if np.prod(np.array(shape, np.float64)) > POINTS_LIMIT:
         raise ConfigError(f"a grid of {' x '.join(map(str, shape))} points: expected at most {POINTS_LIMIT}")
     if not np.isfinite(forward).all() or abs(np.linalg.det(forward[:3, :3])) == 0:
         raise ConfigError(f"scene_from_index {forward.tolist()}: expected a finite, invertible affine map")
@@ -94,15 +90,16 @@ def density_grid(
             return torch.from_numpy(grid)
         neurons = (form.W1.double(), form.b1.double(), form.w2.double(), form.b2.reshape(-1).double())
         if device.has_warp(where):
-            from neuprim.core.volumes import grid_warp
+            from neuprim.core.volumes import density_grid_warp
 
             maps = torch.from_numpy(forward[:3]), torch.from_numpy(back[:3])
-            return torch.from_numpy(
-                grid_warp.fill_grid(ellipsoids, neurons, form.omega0, form.edge, *maps, shape, where)
+            values = density_grid_warp.fill_density_grid(
+                ellipsoids, neurons, form.omega0, form.edge, *maps, shape, where
             )
+            return torch.from_numpy(values)
         tensors = [x.detach().numpy() for x in (*ellipsoids, *neurons)]
     arguments = [np.ascontiguousarray(x) for x in (*tensors, forward[:3], back[:3])]
-    parallel_for(_fill, shape[0], _SLAB, threads, *arguments, form.omega0, form.edge, grid)
+    parallel_for(_fill_planes, shape[0], _PLANES_PER_JOB, threads, *arguments, form.omega0, form.edge, grid)
     return torch.from_numpy(grid)
 
 
@@ -126,29 +123,26 @@ def _add_any_density(
 ) -> None:
     """Add a density in torch code, primitive by primitive in a fixed order, so that sums are the same every time."""
     active = model.active(conditions, torch.float64)
-    means, scales, R = (x.detach().numpy() for x in ellipsoids)
-    limit = np.array(grid.shape)
-    for n in range(len(means)):
-        center = Q[:3, :3] @ means[n] + Q[:3, 3]
-        reach = np.linalg.norm((Q[:3, :3] @ R[n]) * scales[n], axis=1)
-        low = np.clip(np.ceil(np.clip(center - reach, -1e9, 1e9)), 0, limit).astype(int)
-        high = np.clip(np.floor(np.clip(center + reach, -1e9, 1e9)) + 1, 0, limit).astype(int)
-        size = high - low
-        if (size <= 0).any():
+    for n, (mean, scale, R) in enumerate(zip(*(x.detach().numpy() for x in ellipsoids), strict=True)):
+        center = Q[:3, :3] @ mean + Q[:3, 3]
+        reach = np.linalg.norm((Q[:3, :3] @ R) * scale, axis=1)
+        low = np.clip(np.ceil(np.clip(center - reach, -1e9, 1e9)), 0, grid.shape).astype(int)
+        high = np.clip(np.floor(np.clip(center + reach, -1e9, 1e9)) + 1, 0, grid.shape).astype(int)
+        if (high <= low).any():
             continue
-        planes = max(1, _PAIRS // int(size[1] * size[2]))
+        planes = max(1, _PAIRS // int((high - low)[1:].prod()))
         for start in range(low[0], high[0], planes):
             block = (slice(start, min(start + planes, high[0])), slice(low[1], high[1]), slice(low[2], high[2]))
             index = np.stack(np.meshgrid(*(np.arange(s.start, s.stop) for s in block), indexing="ij"), -1)
             x = index @ P[:3, :3].T + P[:3, 3]
-            inside = (np.square(((x - means[n]) @ R[n]) / scales[n]).sum(-1) < 1.0).nonzero()
+            inside = (np.square(((x - mean) @ R) / scale).sum(-1) < 1.0).nonzero()
             points = torch.from_numpy(x[inside])
-            found = active.sigma(torch.full((len(points),), n), points).clamp_min(0).numpy()
-            grid[block][inside] += found.astype(np.float32)
+            sigma = active.sigma(torch.full((len(points),), n), points).clamp_min(0).numpy()
+            grid[block][inside] += sigma.astype(np.float32)
 
 
 @exact_kernel
-def _fill(
+def _fill_planes(
     start: int, stop: int, means: Any, scales: Any, R: Any, W1: Any, b1: Any, w2: Any, b2: Any, P: Any, Q: Any,
     omega0: float, edge: int,
     grid: Any,

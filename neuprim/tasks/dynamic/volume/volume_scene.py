@@ -1,12 +1,17 @@
-"""Load volume scenes (``scene=smoke_fire`` and others): OpenVDB files, given or simulated, as a dataset."""
+"""Load volume scenes (``scene=smoke_fire`` and others): OpenVDB files, given or simulated, as a dataset, or in chunks.
+
+Chunks of time divide the training frames evenly, in order, and are trained separately. Each also sees a few frames
+beyond its ends, over which neighbouring chunks are blended (:mod:`neuprim.tasks.dynamic.time_density`). Times, box,
+cameras and exposure are those of the whole sequence, so that nothing has to be converted.
+"""
 
 from __future__ import annotations
 
-import dataclasses
+import itertools
+import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,16 +21,22 @@ import torch
 from neuprim.core.data import Dataset, DataSource
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.store import Store, open_store
-from neuprim.core.io.vdb import sequence
+from neuprim.core.io.vdb import VdbFrame, sequence
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.notices import warn_once
-from neuprim.core.task import Chunks, SceneContext
+from neuprim.core.task import Chunk, Chunks, SceneContext
 from neuprim.core.validation import Accepts, Range, coerce, nonempty_text, validate, validate_fields
-from neuprim.core.volumes.source import Extent
-from neuprim.scenes.smoke.generate import TIMESTEPS, Resolution, simulate_smoke
+from neuprim.core.volumes.density_truth import GridExtent
+from neuprim.scenes.smoke.smoke_scenes import MAX_TIMESTEPS, Resolution, simulate_smoke
+from neuprim.tasks.dynamic.time_density import ChunkOverlaps, TimeDensity
 from neuprim.tasks.dynamic.volume.capture import Capture, RenderedFrames, hemisphere_cameras
-from neuprim.tasks.dynamic.volume.chunks import count_chunks, plan_chunks
-from neuprim.tasks.dynamic.volume.dataset import TRAINING_MEMORY, TrainingFrames, total_extinction, volume_dataset
-from neuprim.tasks.dynamic.volume.ground_truth import CaptureSource
+from neuprim.tasks.dynamic.volume.capture_dataset import (
+    TRAINING_MEMORY,
+    TrainingFrames,
+    total_extinction,
+    volume_dataset,
+)
+from neuprim.tasks.dynamic.volume.capture_density import CaptureDensity
 from neuprim.tasks.dynamic.volume.optics import (
     DATA_DEPENDENT,
     UP_AXES,
@@ -41,7 +52,7 @@ from neuprim.tasks.dynamic.volume.survey import Normalisation, data_dependent_op
 
 
 def _frame_range(frames: str) -> range | None:
-    """The numbers of "FIRST:LAST" or "FIRST:LAST:STEP", LAST included; None for text of another form."""
+    """The numbers of "FIRST:LAST" or "FIRST:LAST:STEP", LAST included; None for other text."""
     match = re.fullmatch(r"(\d{1,9}):(\d{1,9})(?::(\d{1,9}))?", frames)
     if match is None or (step := int(match[3] or 1)) < 1 or int(match[1]) > int(match[2]):
         return None
@@ -65,7 +76,7 @@ class VolumeSettings:
         span: "FIRST:LAST" by number, the frames for training and evaluation; times, box, exposure and images stay those
             of all ``frames``. None: all.
         chunks: number of chunks of time, each trained in its own run; "auto": see
-            :func:`~neuprim.tasks.dynamic.volume.chunks.count_chunks`; None or 1: one run.
+            :func:`count_chunks`; None or 1: one run.
         grids: meaning -> name in the files.
         look: name of a preset of the optics, or "auto"; ``optics``: changes to the preset's settings.
         size: width and height of the images in pixels; ``samples``: rays per pixel side.
@@ -79,7 +90,7 @@ class VolumeSettings:
     vdb: Annotated[Path, nonempty_text("a folder of .vdb files")] | None = None
     simulation: str | None = None
     resolution: Resolution = 64
-    timesteps: Annotated[int, Range(2, TIMESTEPS[1])] | None = None
+    timesteps: Annotated[int, Range(2, MAX_TIMESTEPS)] | None = None
     frames: Frames = "all"
     span: Span | None = None
     chunks: Annotated[int, Range(1, 1000)] | Literal["auto"] | None = None
@@ -149,7 +160,7 @@ class _PreparedScene:
     capture: Capture
     held_out: range
 
-    def span(self) -> tuple[int, int] | None:
+    def span_ends(self) -> tuple[int, int] | None:
         """First and last number of the chosen frames within ``scene.span``; None for all of them."""
         wanted = None if self.settings.span is None else _frame_range(self.settings.span)
         if wanted is None:
@@ -175,9 +186,9 @@ def load_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown setting or impossible value.
         DataError: files that are missing, damaged, or without a usable grid; a cache that cannot be written.
     """
-    scene = _prepare(settings, context)
+    scene = _prepare_scene(settings, context)
     _report_chosen_extinctions(scene)
-    span = scene.span()
+    span = scene.span_ends()
     images = scene.rendered_frames(context).render_missing(context.progress)
     up = torch.tensor(UP_AXES[scene.settings.up], dtype=torch.float64)
     used = TrainingFrames(scene.settings.train_every, span, scene.settings.memory_bytes)
@@ -192,41 +203,21 @@ def open_ground_truth(
     Args:
         known: of the same scene's ground truth in another process, which has surveyed the files.
     """
-    return _prepare(settings, context, known).rendered_frames(context)
+    return _prepare_scene(settings, context, known).rendered_frames(context)
 
 
-def open_volumes(settings: Mapping[str, Any], context: SceneContext) -> CaptureSource:
+def open_volumes(settings: Mapping[str, Any], context: SceneContext) -> CaptureDensity:
     """The scene's files without any image; raises as :func:`load_dataset`."""
-    scene = _prepare(settings, context)
-    span = scene.span()
-    return CaptureSource(scene.capture if span is None else scene.capture.within(*span))
+    scene = _prepare_scene(settings, context)
+    span = scene.span_ends()
+    return CaptureDensity(scene.capture if span is None else scene.capture.select_frames(*span))
 
 
-def split_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
-    """The chunks of ``scene.chunks``; None for one run. Renders all frames, as the chunks share one exposure.
-
-    Raises:
-        ConfigError: more chunks than the frames allow; and as :func:`load_dataset`.
-    """
-    scene = _prepare({name: value for name, value in config["scene"].items() if name != "name"}, context)
-    options, capture = scene.settings, scene.capture
-    frames, camera = len(capture.frames[:: options.train_every]), capture.cameras[0]
-    views = frames * (len(capture.cameras) - len(scene.held_out))
-    image_bytes = views * camera.width * camera.height * 4 * 2  # RGBA in half floats
-    count = count_chunks(options.chunks, frames, image_bytes, options.memory_bytes * TRAINING_MEMORY)
-    if count == 1:
-        return None
-    store = scene.rendered_frames(context).render_missing(context.progress)
-    weight = partial(total_extinction, capture, store)
-    return plan_chunks(capture, options.train_every, count, weight, config)
-
-
-def _prepare(
+def _prepare_scene(
     settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
 ) -> _PreparedScene:
     options = validate(VolumeSettings, settings, "scene")
     options.resolve_optics()  # report typing errors before anything is simulated
-    source: DataSource = "simulated" if options.vdb is None else "real"
     if options.vdb is not None:
         folder, name = options.vdb, options.vdb.name
     else:
@@ -240,28 +231,26 @@ def _prepare(
     reader = find_grids(frames, {str(meaning): name for meaning, name in options.grids.items()})
     optics = options.resolve_optics("density" in reader.names)
     reader = reader.with_extinction(optics.extinction_grids, folder)
-    measured: Mapping[int, Extent] = {}
+    measured: Mapping[int, GridExtent] = {}
     if known is None:
         survey = survey_frames(frames, reader, optics, context.progress)
         if not survey.hottest > 0:  # no flames in any frame: leave out everything that only flames need
-            reader = dataclasses.replace(reader, names={m: n for m, n in reader.names.items() if m != "flames"})
-        if source == "real":
+            reader = replace(reader, names={m: n for m, n in reader.names.items() if m != "flames"})
+        if options.vdb is not None:
             derived = data_dependent_optics(optics, reader.extinction, survey)
-            changes = {key: value for key, value in derived.items() if key not in options.optics}
-            optics = dataclasses.replace(optics, **changes)
+            optics = replace(optics, **{key: value for key, value in derived.items() if key not in options.optics})
         normalisation, measured = Normalisation.from_bounds(survey.box), survey.extents
         bounds = normalisation.to_scene(survey.box)
     else:
         derived = {key: known["look"][key] for key in DATA_DEPENDENT}
-        low, high = derived["flame_range"]
-        optics = dataclasses.replace(optics, **{**derived, "flame_range": (low, high)})
-        reader = dataclasses.replace(reader, names=known["grids"])
-        normalisation, bounds = Normalisation.from_json(known["normalisation"]), np.array(known["bounds"])
+        optics = replace(optics, **{**derived, "flame_range": tuple(derived["flame_range"])})
+        reader = replace(reader, names=known["grids"])
+        center, bounds = tuple(known["normalisation"]["center"]), np.array(known["bounds"])
+        normalisation = Normalisation(center, known["normalisation"]["scale"])
     train, test = hemisphere_cameras(options.size, options.cameras, up=options.up, field_of_view=options.field_of_view)
-    cameras, device = [*train, *test], context.device
-    capture = Capture(
-        frames, reader, optics, cameras, options.samples, normalisation, bounds, device, measured=measured
-    )
+    views = ([*train, *test], options.samples)
+    capture = Capture(frames, reader, optics, *views, normalisation, bounds, context.device, measured=measured)
+    source: DataSource = "simulated" if options.vdb is None else "real"
     return _PreparedScene(options, name, source, capture, range(len(train), len(train) + len(test)))
 
 
@@ -269,12 +258,128 @@ def _report_chosen_extinctions(scene: _PreparedScene) -> None:
     """Print one line with the extinctions that were chosen instead of the preset's."""
     capture = scene.capture
     preset = scene.settings.resolve_optics("density" in capture.reader.names)
-    grids = {"extinction": capture.reader.extinction, "flame_extinction": "flames"}
     lines = []
-    for key, meaning in grids.items():
+    for key, meaning in {"extinction": capture.reader.extinction, "flame_extinction": "flames"}.items():
         value, usual = getattr(capture.optics, key), getattr(preset, key)
         if value != usual:
             peak = f"values of grid {capture.reader.names[meaning]!r} go to about {usual / value:.2g}"
             lines.append(f"scene.optics.{key}={value:g} (look: {usual:g}), as {peak}")
     if lines:
         warn_once(f"{capture.frames[0].path.parent}: {'; '.join(lines)}. Set these to choose others")
+
+
+# ---------------------------------------------------------------- chunks of time
+
+MAX_FRAMES, MIN_FRAMES = 100, 25
+"""Frames of an automatic chunk: primitives are active for much of a sequence, and short chunks cut that short."""
+
+_TIME_POWERS = {"window_center": 1, "velocity": -1, "acceleration": -2, "W_t": -1}
+"""Parameters in units of the sequence's time -> power of time in them."""
+
+_FRAMES_PER_OVERLAP, _MAX_OVERLAP = 8, 3
+"""A chunk sees one frame beyond each end per eight of its own, from one to three. An abrupt change of models is visible
+where little moves; frames in two chunks cost both of them."""
+
+
+def split_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
+    """The chunks of ``scene.chunks``; None for one run. Renders all frames, as the chunks share one exposure.
+
+    Raises:
+        ConfigError: more chunks than the frames allow; and as :func:`load_dataset`.
+    """
+    scene = _prepare_scene({name: value for name, value in config["scene"].items() if name != "name"}, context)
+    options, capture = scene.settings, scene.capture
+    frames, camera = capture.frames[:: options.train_every], capture.cameras[0]
+    views = len(frames) * (len(capture.cameras) - len(scene.held_out))
+    image_bytes = views * camera.width * camera.height * 4 * 2  # RGBA in half floats
+    count = count_chunks(options.chunks, len(frames), image_bytes, options.memory_bytes * TRAINING_MEMORY)
+    if count == 1:
+        return None
+    store = scene.rendered_frames(context).render_missing(context.progress)
+    begins = [number * len(frames) // count for number in range(count + 1)]
+    times = [float(torch.tensor(capture.time(frame))) for frame in frames]  # float32 as in views
+    extra = min(max(len(frames) // count // _FRAMES_PER_OVERLAP, 1), _MAX_OVERLAP)
+    overlaps = tuple((times[begin - extra], times[begin + extra - 1]) for begin in begins[1:-1])
+    parts = [frames[max(begin - extra, 0) : end + extra] for begin, end in itertools.pairwise(begins)]
+    # primitives are divided by extinction, like the starting points of one run
+    weights = [sum(total_extinction(capture, store, frame) for frame in part) for part in parts]
+    used = [number for number in range(count) if weights[number] > 0]  # a chunk without matter cannot be trained
+    if not used:
+        return None
+    total_frames = sum(len(parts[number]) for number in used)
+    width = max(len(str(frame.number)) for frame in frames)
+    chunks = []
+    for number in used:
+        part = parts[number]
+        first, last = part[0].number, part[-1].number
+        changes = {"scene.chunks": None, "scene.span": f"{first}:{last}", **_rescale_time(capture, part, config)}
+        name = f"frames_{first:0{width}}-{last:0{width}}"
+        chunks.append(Chunk(name, changes, weights[number] / sum(weights), len(part) / total_frames))
+    return Chunks(tuple(chunks), lambda models: join_chunks(models, used, overlaps))
+
+
+def count_chunks(requested: int | str | None, frames: int, image_bytes: int, memory: float) -> int:
+    """Number of chunks: the requested one, or for "auto" enough that none has more than :data:`MAX_FRAMES` frames and
+    the images of each fit in memory, but not so many that one has fewer than :data:`MIN_FRAMES`.
+
+    Args:
+        frames: for training.
+        image_bytes, memory: bytes of all decoded training images, and of those that a run keeps in memory.
+
+    Raises:
+        ConfigError: fewer than two frames per chunk.
+    """
+    if requested == "auto":
+        wanted = max(math.ceil(frames / MAX_FRAMES), math.ceil(image_bytes / memory))
+        return max(min(wanted, frames // MIN_FRAMES), 1)
+    count = int(requested or 1)
+    if count > 1 and 2 * count > frames:
+        reason = "a chunk has at least two of its own"
+        expected = f"at most {frames // 2}, as {reason}" if frames >= 4 else f"null: {reason}"
+        available = "is 1 frame" if frames == 1 else f"are {frames} frames"
+        raise ConfigError(f"scene.chunks={count}: there {available} to learn from; expected {expected}")
+    return count
+
+
+def _rescale_time(capture: Capture, frames: Sequence[VdbFrame], config: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a chunk's training: learning rates as for a sequence of the chunk's length, windows at most that."""
+    length = capture.time(frames[-1]) - capture.time(frames[0])
+    density = TimeDensity(config["model"]["neurons"], **config["model"]["density"])
+    rates = {spec.name: config["train"]["rates"].get(spec.name, spec.lr) for spec in density.parameters()}
+    settings: dict[str, Any] = {
+        f"train.rates.{name}": rates[name] * length**power for name, power in _TIME_POWERS.items() if name in rates
+    }
+    window = config["model"]["init"].get("window")
+    if isinstance(window, int | float) and window > length:
+        settings["model.init.window"] = length
+    return settings
+
+
+def join_chunks(models: Sequence[Primitives], numbers: Sequence[int], overlaps: ChunkOverlaps) -> Primitives:
+    """Join the models of chunks: at every time their extinctions and sources, weighted by their chunks' weights.
+
+    Args:
+        models: all of one form, in the whole sequence's time.
+        numbers: of their chunks, 0 to len(overlaps); missing chunks are empty.
+        overlaps: of neighbouring chunks.
+
+    Raises:
+        ConfigError: forms differ, or are joined models already.
+    """
+    first = models[0]
+    for model in models:
+        if not isinstance(model.density, TimeDensity) or model.density.seams:
+            raise ConfigError(
+                f"a chunk's density is {type(model.density).__name__} {model.density.settings()}; "
+                "expected a TimeDensity without seams"
+            )
+        if any(getattr(model, kind).settings() != getattr(first, kind).settings() for kind in ("density", "colour")):
+            raise ConfigError(
+                f"chunks have models of different forms: {first.density.settings()} and {model.density.settings()}"
+            )
+    density = TimeDensity(**{**first.density.settings(), "seams": overlaps})
+    params = {name: torch.cat([model.params[name].detach().cpu() for model in models]) for name in first.params}
+    labels = zip(models, numbers, strict=True)
+    params["chunk"] = torch.cat([torch.full((model.count, 1), float(number)) for model, number in labels])
+    specs = Primitives(density, first.colour, params).specs
+    return Primitives(density, first.colour, {spec.name: params[spec.name] for spec in specs})

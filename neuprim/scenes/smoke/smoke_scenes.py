@@ -1,17 +1,48 @@
-"""The built-in scenes: sources and forces over time, with smooth random turbulence."""
+"""The built-in smoke scenes, simulated as sequences of OpenVDB files.
+
+    NAME_0.vdb ... NAME_{T-1}.vdb     fog volumes of half floats, Blosc, numbers not padded, as EmberGen writes them
+
+    density        amount of smoke
+    temperature    0 is the air's
+    flames         fuel that is burning (scenes with fire)
+    color          albedo of the smoke, vec3s, not multiplied by density (scenes with colours)
+
+Values are about 0 to 1. Voxels are cubes; the box is one world unit wide and deep, centred at x = y = 0, its ground at
+z = 0, z up. A scene gives sources and forces over time, with smooth random turbulence.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from functools import lru_cache
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.scenes.smoke.solver import Box, Forcing, SolverSettings, Source
+from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.validation import Range
+from neuprim.scenes.image_set import Progress, write_cached_folder
+from neuprim.scenes.smoke.solver import GasForcing, GasSettings, GasSource, GasState, SmokeBox, advance_gas
+
+SOLVER_VERSION = 1
+"""Part of the cache's key: raise it with every change to the solver, the scenes' sources or the files' layout."""
+
+THRESHOLD = 2e-3
+"""Values below are background: they are invisible, and files stay small."""
+
+Resolution = Annotated[int, Range(16, 192)]
+"""Cells across the box; advection counts cells in float32, which is exact up to 2^24."""
+
+MAX_TIMESTEPS = 1000
 
 Axes = tuple[Tensor, Tensor, Tensor]
 """World coordinates (X, 1, 1), (1, Y, 1), (1, 1, Z), which broadcast against fields."""
@@ -19,20 +50,18 @@ Axes = tuple[Tensor, Tensor, Tensor]
 _PERIOD = 16  # lattice nodes per axis before the noise repeats
 
 
-class Noise:
-    """Value noise (random numbers on a lattice, smoothly interpolated) with mean 0 and about unit variance at the
-    nodes.
+class TurbulenceNoise:
+    """Value noise (random numbers on a lattice, smoothly interpolated) with mean 0 and unit variance at the nodes.
 
-    A pure function of seed, channel, place and time, so that it is the same however a frame is divided into steps, and
-    at any resolution the same pattern. Different channels are independent. ``cells`` are lattice cells per world unit;
-    ``tempo`` is how often per second the field is another one, and in between one turns into the next.
+    A pure function of seed, channel, place and time, whatever the steps and the resolution. Channels are independent.
+    ``cells`` are lattice cells per world unit; ``tempo`` is how often per second one field has turned into the next.
     """
 
     def __init__(self, seed: int) -> None:
-        self._lattice = lru_cache(maxsize=64)(self._draw)
+        self._lattice = lru_cache(maxsize=64)(self._draw_nodes)
         self._seed = seed
 
-    def _draw(self, channel: int, key: int) -> Tensor:
+    def _draw_nodes(self, channel: int, key: int) -> Tensor:
         numbers = np.random.default_rng([self._seed, channel, key]).standard_normal((_PERIOD,) * 3)
         return torch.from_numpy(numbers.astype(np.float32))
 
@@ -42,7 +71,7 @@ class Noise:
         key = math.floor(phase)
         angle = (phase - key) * math.pi / 2
         lattice = math.cos(angle) * self._lattice(channel, key) + math.sin(angle) * self._lattice(channel, key + 1)
-        x, y, z = (_weights(axis.reshape(-1) * cells) for axis in axes)
+        x, y, z = (_lattice_weights(axis.reshape(-1) * cells) for axis in axes)
         planes = torch.matmul(y, torch.matmul(lattice, z.T)).reshape(_PERIOD, -1)
         return torch.matmul(x, planes).reshape(len(x), len(y), len(z))
 
@@ -57,7 +86,7 @@ class Noise:
         return torch.stack([self.fractal(c, axes, cells, tempo, time, octaves) for c in channels])
 
 
-def _weights(places: Tensor) -> Tensor:
+def _lattice_weights(places: Tensor) -> Tensor:
     """(n, _PERIOD) what each lattice node counts at each place; cubic fade, so that slopes are continuous."""
     lower = places.floor()
     part = places - lower
@@ -70,12 +99,12 @@ def _weights(places: Tensor) -> Tensor:
     return weights
 
 
-class Stage:
+class SmokeStage:
     """A box, the coordinates of its cells' centres, the noise, and (X, Y, Z) ``fade`` per second: near the sides and
     the top gas vanishes, so that nothing is cut off there."""
 
-    def __init__(self, box: Box, seed: int) -> None:
-        self.box, self.noise, self.axes = box, Noise(seed), box.axes()
+    def __init__(self, box: SmokeBox, seed: int) -> None:
+        self.box, self.noise, self.axes = box, TurbulenceNoise(seed), box.axes()
         x, y, z = self.axes
         half_x, half_y, top = (n * box.cell * s for n, s in zip(box.shape, (0.5, 0.5, 1.0), strict=True))
         inside = torch.minimum(torch.minimum(half_x - x.abs(), half_y - y.abs()) / 0.14, (top - z) / 0.25)
@@ -99,14 +128,14 @@ class Stage:
 @dataclass(frozen=True)
 class SmokeScene:
     """A simulation: frames of the whole sequence, seconds between two of them, the grids that are written
-    (:mod:`neuprim.scenes.smoke.generate`), what the gas is like, and sources and forces at a time in seconds."""
+    (see the module), what the gas is like, and sources and forces at a time in seconds."""
 
     name: str
     timesteps: int
     frame_time: float
     grids: tuple[str, ...]
-    solver: SolverSettings
-    forcing: Callable[[Stage, float], Forcing]
+    solver: GasSettings
+    forcing: Callable[[SmokeStage, float], GasForcing]
 
     @property
     def coloured(self) -> bool:
@@ -114,7 +143,7 @@ class SmokeScene:
         return "color" in self.grids
 
 
-def _soft(distance: Tensor, width: float) -> Tensor:
+def _soft_edge(distance: Tensor, width: float) -> Tensor:
     """1 well inside (negative distance), 0 outside, smooth over ``width``."""
     t = (0.5 - distance / width).clamp(0, 1)
     return t * t * (3 - 2 * t)
@@ -123,19 +152,19 @@ def _soft(distance: Tensor, width: float) -> Tensor:
 # ---------------------------------------------------------------- a fire on the ground
 
 
-def _smoke_fire(stage: Stage, time: float) -> Forcing:
+def _force_smoke_fire(stage: SmokeStage, time: float) -> GasForcing:
     where, axes = stage.region((-0.3, -0.3, 0.0), (0.3, 0.3, 0.1))
     x, y, z = axes
     noise = stage.noise
     radius = torch.sqrt(x * x + y * y) - 0.05 * noise.fractal(1, axes, 5.0, 3.0, time)
     flicker = torch.sigmoid(3.0 * noise.fractal(2, axes, 8.0, 6.0, time, octaves=2) + 0.6)
-    rate = 50.0 * min(1.0, 0.2 + time / 0.25) * _soft(radius - 0.11, 0.06) * _soft(z - 0.05, 0.05) * flicker
+    rate = 50.0 * min(1.0, 0.2 + time / 0.25) * _soft_edge(radius - 0.11, 0.06) * _soft_edge(z - 0.05, 0.05) * flicker
     push = noise.vector(3, axes, 7.0, 7.0, time) * 0.5
     push[2] += 0.8
-    fire = Source(where, rate, density=0.0, temperature=0.7, fuel=1.0, velocity=push)
+    fire = GasSource(where, rate, density=0.0, temperature=0.7, fuel=1.0, velocity=push)
     gusts = 3.0 * noise.vector(20, stage.axes, 7.0, 3.0, time)
     gusts[2] *= 0.5
-    return Forcing((fire,), gusts, fade=stage.fade)
+    return GasForcing((fire,), gusts, fade=stage.fade)
 
 
 SMOKE_FIRE = SmokeScene(
@@ -143,11 +172,11 @@ SMOKE_FIRE = SmokeScene(
     100,
     1 / 25,
     ("density", "temperature", "flames"),
-    SolverSettings(
+    GasSettings(
         buoyancy=4.0, weight=0.2, confinement=0.5, cooling=0.7, dissipation=0.35, burn=1.9, heat=0.7, soot=0.8,
         expansion=1.5, drag=0.1,
     ),
-    _smoke_fire,
+    _force_smoke_fire,
 )  # fmt: skip
 
 # ---------------------------------------------------------------- coloured jets
@@ -155,7 +184,7 @@ SMOKE_FIRE = SmokeScene(
 _PALETTE = ((0.95, 0.10, 0.20), (1.0, 0.62, 0.05), (0.10, 0.72, 0.30), (0.08, 0.40, 1.0), (0.72, 0.12, 0.90))
 
 
-def _colorful_smoke(stage: Stage, time: float) -> Forcing:
+def _force_colorful_smoke(stage: SmokeStage, time: float) -> GasForcing:
     sources = []
     for k, albedo in enumerate(_PALETTE):
         angle = 2 * math.pi * (k / len(_PALETTE)) + 0.3
@@ -165,7 +194,7 @@ def _colorful_smoke(stage: Stage, time: float) -> Forcing:
         x, y, z = axes
         lumps = stage.noise.fractal(10 * k, axes, 12.0, 4.0, time, octaves=2)
         distance = torch.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2) - 0.012 * lumps
-        rate = 60.0 * _soft(distance - 0.045, 0.035) * min(1.0, 0.2 + strength)
+        rate = 60.0 * _soft_edge(distance - 0.045, 0.035) * min(1.0, 0.2 + strength)
         push = 0.25 * stage.noise.vector(10 * k + 3, axes, 11.0, 6.0, time, octaves=1)
         speed = 0.5 + 0.75 * strength
         inward, around = 0.45, 0.35 if k % 2 else -0.2
@@ -173,9 +202,9 @@ def _colorful_smoke(stage: Stage, time: float) -> Forcing:
         push[1] += speed * (-inward * math.sin(angle) + around * math.cos(angle))
         push[2] += speed * 0.9
         amount = 0.25 + 0.75 * strength
-        sources.append(Source(where, rate, density=amount, temperature=0.35, colour=albedo, velocity=push))
+        sources.append(GasSource(where, rate, density=amount, temperature=0.35, colour=albedo, velocity=push))
     gusts = 1.2 * stage.noise.vector(200, stage.axes, 6.0, 2.0, time)
-    return Forcing(sources, gusts, fade=stage.fade)
+    return GasForcing(sources, gusts, fade=stage.fade)
 
 
 COLORFUL_SMOKE = SmokeScene(
@@ -183,47 +212,49 @@ COLORFUL_SMOKE = SmokeScene(
     128,
     1 / 30,
     ("density", "temperature", "color"),
-    SolverSettings(buoyancy=1.6, weight=0.05, confinement=0.4, cooling=0.4, dissipation=0.22, drag=0.15),
-    _colorful_smoke,
+    GasSettings(buoyancy=1.6, weight=0.05, confinement=0.4, cooling=0.4, dissipation=0.22, drag=0.15),
+    _force_colorful_smoke,
 )
 
 # ---------------------------------------------------------------- a blast
 
 
-def _ground_explosion(stage: Stage, time: float) -> Forcing:
+def _force_ground_explosion(stage: SmokeStage, time: float) -> GasForcing:
     noise, sources = stage.noise, []
     expansion = None
-    blast = _fade(time, 0.13, 0.06)
+    blast = _fade_out(time, 0.13, 0.06)
     if blast > 0:
         where, axes = stage.region((-0.25, -0.25, 0.0), (0.25, 0.25, 0.25))
         x, y, z = axes
         distance = torch.sqrt(x * x + y * y + (z - 0.03) ** 2) + 1e-6
         lumps = noise.fractal(1, axes, 9.0, 5.0, time)
-        inside = _soft(distance - 0.1 - 0.02 * lumps, 0.05) * blast
+        inside = _soft_edge(distance - 0.1 - 0.02 * lumps, 0.05) * blast
         push = torch.stack([x.expand_as(distance), y.expand_as(distance), (z * 1.2).expand_as(distance)]) / distance
         push = 1.0 * push * (1 + 0.3 * lumps) + 0.3 * noise.vector(2, axes, 10.0, 8.0, time)
         push[2] += 0.7
-        sources.append(Source(where, 60.0 * inside, density=0.05, temperature=1.0, fuel=1.0, velocity=push))
+        sources.append(GasSource(where, 60.0 * inside, density=0.05, temperature=1.0, fuel=1.0, velocity=push))
         expansion = torch.zeros(stage.box.shape)
         expansion[where] = 22.0 * inside
-    sweep = _fade(time, 0.55, 0.35)
+    sweep = _fade_out(time, 0.55, 0.35)
     if sweep > 0:  # the pressure wave runs outward and lifts a ring of dust
         front = 0.08 + 0.26 * (1 - math.exp(-time / 0.22))
         where, axes = stage.region((-0.5, -0.5, 0.0), (0.5, 0.5, 0.09))
         x, y, z = axes
         distance = torch.sqrt(x * x + y * y) + 1e-6
         lumps = noise.fractal(5, axes, 11.0, 3.0, time)
-        ring = _soft((distance - front).abs() - 0.035 - 0.02 * lumps, 0.05) * _soft(z - 0.03 - 0.015 * lumps, 0.03)
+        ring = _soft_edge((distance - front).abs() - 0.035 - 0.02 * lumps, 0.05) * _soft_edge(
+            z - 0.03 - 0.015 * lumps, 0.03
+        )
         speed = 1.1 * math.exp(-time / 0.3)
         push = torch.stack([x.expand_as(ring), y.expand_as(ring), torch.zeros_like(ring)]) / distance * speed
         push[2] += 0.35 * speed
         amount = (0.3 + 0.3 * lumps).clamp(0.05, 0.7)
-        sources.append(Source(where, 18.0 * ring * sweep, density=amount, temperature=0.02, velocity=push))
+        sources.append(GasSource(where, 18.0 * ring * sweep, density=amount, temperature=0.02, velocity=push))
     gusts = 1.2 * noise.vector(40, stage.axes, 10.0, 2.0, time)
-    return Forcing(sources, gusts, expansion, stage.fade)
+    return GasForcing(sources, gusts, expansion, stage.fade)
 
 
-def _fade(time: float, end: float, length: float) -> float:
+def _fade_out(time: float, end: float, length: float) -> float:
     """1, then down to 0 at ``end`` over ``length`` seconds."""
     return min(1.0, max(0.0, (end - time) / length))
 
@@ -233,27 +264,27 @@ GROUND_EXPLOSION = SmokeScene(
     130,
     1 / 36,
     ("density", "temperature", "flames"),
-    SolverSettings(
+    GasSettings(
         buoyancy=3.6, weight=0.35, confinement=0.35, cooling=0.7, radiation=0.3, dissipation=0.25, burn=0.75, heat=0.3,
         soot=0.8, expansion=2.0, drag=0.25,
     ),
-    _ground_explosion,
+    _force_ground_explosion,
 )  # fmt: skip
 
 # ---------------------------------------------------------------- a whirlwind
 
 
-def _axis(height: Tensor, time: float) -> tuple[Tensor, Tensor]:
+def _whirl_axis(height: Tensor, time: float) -> tuple[Tensor, Tensor]:
     """Where the whirl's axis passes at each height: the ground leads, the top follows later and wanders less."""
     late = time - 0.55 * height
     reach = 0.13 * torch.exp(-0.35 * height)
     return reach * torch.sin(1.5 * late + 0.4), reach * torch.sin(1.05 * late + 2.0)
 
 
-def _dust_tornado(stage: Stage, time: float) -> Forcing:
+def _force_dust_tornado(stage: SmokeStage, time: float) -> GasForcing:
     x, y, z = stage.axes
     noise = stage.noise
-    centre_x, centre_y = _axis(z, time)
+    centre_x, centre_y = _whirl_axis(z, time)
     dx, dy = x - centre_x, y - centre_y
     r2 = dx * dx + dy * dy + 1e-8
     r = torch.sqrt(r2)
@@ -268,16 +299,20 @@ def _dust_tornado(stage: Stage, time: float) -> Forcing:
         [(dx * outward - dy * turn) / r, (dy * outward + dx * turn) / r, updraft * (1 - torch.exp(-z / 0.03))]
     )
     whole = (slice(None), slice(None), slice(None))
-    whirl = Source(whole, 4.5 * torch.exp(-r2 / (3.0 * core) ** 2), velocity=push)
+    whirl = GasSource(whole, 4.5 * torch.exp(-r2 / (3.0 * core) ** 2), velocity=push)
 
     where, axes = stage.region((-0.45, -0.45, 0.0), (0.45, 0.45, 0.12))
-    fx, fy = _axis(axes[2], time)
+    fx, fy = _whirl_axis(axes[2], time)
     ground = torch.sqrt((axes[0] - fx) ** 2 + (axes[1] - fy) ** 2)
     lumps = noise.fractal(1, axes, 13.0, 7.0, time)
-    ring = _soft((ground - 0.085).abs() - 0.04 - 0.035 * lumps, 0.05) * _soft(axes[2] - 0.03 - 0.025 * lumps, 0.04)
-    dust = Source(where, 22.0 * ring, density=(0.4 + 0.6 * lumps).clamp(0.0, 1.2), temperature=0.05)
+    ring = _soft_edge((ground - 0.085).abs() - 0.04 - 0.035 * lumps, 0.05) * _soft_edge(
+        axes[2] - 0.03 - 0.025 * lumps, 0.04
+    )
+    dust = GasSource(where, 22.0 * ring, density=(0.4 + 0.6 * lumps).clamp(0.0, 1.2), temperature=0.05)
     gusts = (2.0 + 3.5 * z) * noise.vector(40, stage.axes, 8.0, 5.0, time)
-    return Forcing((whirl, dust), gusts, fade=stage.fade + 2.5 * (z - 0.6).clamp_min(0))  # dust thins out on its way up
+    return GasForcing(
+        (whirl, dust), gusts, fade=stage.fade + 2.5 * (z - 0.6).clamp_min(0)
+    )  # dust thins out on its way up
 
 
 DUST_TORNADO = SmokeScene(
@@ -285,9 +320,108 @@ DUST_TORNADO = SmokeScene(
     100,
     1 / 24,
     ("density", "temperature"),
-    SolverSettings(buoyancy=0.3, weight=0.15, confinement=0.45, cooling=0.3, dissipation=0.3, drag=0.1),
-    _dust_tornado,
+    GasSettings(buoyancy=0.3, weight=0.15, confinement=0.45, cooling=0.3, dissipation=0.3, drag=0.1),
+    _force_dust_tornado,
 )
 
-SCENES = {scene.name: scene for scene in (SMOKE_FIRE, COLORFUL_SMOKE, GROUND_EXPLOSION, DUST_TORNADO)}
+SMOKE_SCENES = {scene.name: scene for scene in (SMOKE_FIRE, COLORFUL_SMOKE, GROUND_EXPLOSION, DUST_TORNADO)}
 """The built-in scenes by name."""
+
+
+# ---------------------------------------------------------------- simulation
+
+
+def simulate_smoke(
+    name: str,
+    frames: int | None,
+    resolution: int,
+    seed: int,
+    cache_dir: Path,
+    progress: Progress = lambda text, fraction: None,
+) -> Path:
+    """Run a simulation unless its sequence is complete; return the folder ``cache_dir/sim-NAME-KEY``.
+
+    Equal arguments give equal grids on one machine for any number of threads.
+
+    Args:
+        name: one of :data:`SMOKE_SCENES`.
+        frames: number of frames from the start, at most :data:`MAX_TIMESTEPS`; None for all.
+        resolution: cells across the box, which is half as high again as it is wide.
+        seed: of the turbulence; not negative.
+
+    Raises:
+        ConfigError: unknown scene.
+        DataError: the cache directory cannot be written.
+    """
+    if name not in SMOKE_SCENES:
+        raise ConfigError(f"scene {name!r} is not simulated{nearest(str(name), SMOKE_SCENES)}")
+    scene = SMOKE_SCENES[name]
+    count = scene.timesteps if frames is None else frames
+    files = [f"{name}_{i}.vdb" for i in range(count)]
+
+    def write(folder: Path) -> None:
+        text = f"{name}: simulating {count} frames"
+        progress(text, 0.0)
+        box = smoke_box(resolution)
+        stage, state = SmokeStage(box, seed), GasState.clear_air(box, scene.coloured)
+        metadata = {"creator": "neuprim simulation", "comment": f"simulated by neuprim: {name}, seed {seed}"}
+        for frame, file in enumerate(files, start=1):
+            with _one_torch_thread():
+                state = advance_gas(state, scene.solver, box, scene.forcing(stage, state.time), scene.frame_time)
+            write_vdb(folder / file, make_smoke_grids(state, scene, box), metadata=metadata)
+            progress(text, frame / count)
+
+    final = Path(cache_dir) / f"sim-{name}-{simulation_key(scene, count, resolution, seed)}"
+    return write_cached_folder(final, files, write, f"scene {name}: cannot write the simulated frames")
+
+
+def simulation_key(scene: SmokeScene, frames: int, resolution: int, seed: int) -> str:
+    """Hash everything that the files depend on."""
+    settings = {
+        "version": SOLVER_VERSION,
+        "scene": scene.name,
+        "frame_time": scene.frame_time,
+        "grids": scene.grids,
+        "solver": asdict(scene.solver),
+        "threshold": THRESHOLD,
+        "frames": frames,
+        "resolution": resolution,
+        "seed": seed,
+    }
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def smoke_box(resolution: int) -> SmokeBox:
+    """The box: one world unit wide and deep, 1.5 high, rounded up to blocks of 8 voxels."""
+    return SmokeBox((resolution, resolution, -(-3 * resolution // 16) * 8), 1.0 / resolution)
+
+
+def make_smoke_grids(state: GasState, scene: SmokeScene, box: SmokeBox) -> list[Grid]:
+    """Convert a state to the grids of the scene, in half floats, with faint values set to the background."""
+    half = box.cell * 0.5
+    corner = (half - box.shape[0] * half, half - box.shape[1] * half, half)  # the centre of voxel 0
+    transform = scale_transform(box.cell, corner)
+    fields = {"density": state.density, "temperature": state.temperature, "flames": state.fuel}
+    grids = []
+    for name in scene.grids:
+        if name == "color":
+            assert state.colour is not None
+            straight = (state.colour / state.density.clamp_min(THRESHOLD)).clamp(0, 1)
+            straight = torch.where(state.density < THRESHOLD, 0.0, straight)
+            values = np.ascontiguousarray(straight.permute(1, 2, 3, 0).numpy())
+        else:
+            values = fields[name].numpy()
+            values = np.where(values < THRESHOLD, np.float32(0), values)
+        grids.append(Grid.from_dense(name, values, transform=transform, half=True))
+    return grids
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Run torch on one thread: the solver divides its work itself, and results must not depend on threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Extinction on a regular grid on a GPU: the twin of the kernel in :mod:`neuprim.core.volumes.grid`.
+"""Extinction on a regular grid on a GPU: the twin of the kernel in :mod:`neuprim.core.volumes.density_grid`.
 
 A block adds up a tile of the grid, a thread a point, primitive by primitive in their order, float64 inside and float32
 sums, as the CPU does it. Primitives of each tile are listed by sorting integers, so that no bit depends on the order of
@@ -29,7 +29,7 @@ _PAIRS = 1 << 22  # most pairs of tiles and primitives that are listed at a time
 
 
 @functools.cache
-def _kernel() -> Any:
+def _add_kernel() -> Any:
     across, deep = _TILE[1], _TILE[2]
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
@@ -113,7 +113,7 @@ def _parts(counts: Tensor) -> Iterator[tuple[int, int]]:
         begin = end
 
 
-def fill_grid(
+def fill_density_grid(
     ellipsoids: tuple[Tensor, Tensor, Tensor], neurons: tuple[Tensor, Tensor, Tensor, Tensor], omega0: float, edge: int,
     P: Tensor, Q: Tensor,
     shape: tuple[int, int, int], where: torch.device,
@@ -152,7 +152,7 @@ def fill_grid(
             starts, ids = _list_primitives(low, wide, counts, own, *some)
             lists = array(starts, wp.int32), array(ids, wp.int32)
             launch(
-                _kernel(), (len(starts) - 1, _THREADS),
+                _add_kernel(), (len(starts) - 1, _THREADS),
                 (*lists, wp.vec2i(own[1], own[2]), first, rows, *prims, edge, array(part, f)), where,
                 _THREADS,
             )  # fmt: skip

@@ -1,0 +1,259 @@
+"""Ground truth of a model's extinction: the voxel files of a scene, their placement, and errors against them."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core.compute import device
+from neuprim.core.errors import DataError
+from neuprim.core.model.fields import Conditions
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.volumes.density_grid import density_grid
+
+DENSITY_ERRORS = ("correlation", "relative_l2", "psnr_active", "max_error")
+"""Names of the numbers of :meth:`DensityComparison.errors`."""
+
+_BLOCK_POINTS = 1 << 22  # 16 MiB of each grid
+_MIN_SQUARED_ERROR = 1e-20  # as a share of the peak's square: 200 dB, as no number may be infinite
+
+
+class GridExtent(NamedTuple):
+    """Largest value of a frame's absorbing grid, and (2, 3) box around its active voxels, world units, or None."""
+
+    largest: float
+    box: np.ndarray | None
+
+    @staticmethod
+    def around(extents: Sequence[GridExtent]) -> GridExtent:
+        """That of several frames together."""
+        boxes = [extent.box for extent in extents if extent.box is not None]
+        box = np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)]) if boxes else None
+        return GridExtent(max((extent.largest for extent in extents), default=0.0), box)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How scene units follow from the world of the files.
+
+    Attributes:
+        scene_from_world: (4, 4) float64.
+        numbers: of the frames.
+        times: name -> value per frame of the condition that tells frames apart, e.g. ``{"time": [0.0, 0.5, 1.0]}``.
+        sigma_per_unit: extinction, 1/scene unit, of a grid value of 1.
+        grid: name of the grid that absorbs.
+        exact: whether that grid alone makes the extinction; if not, other grids add to it.
+        component: the name of that grid's part of the extinction in models.
+        extents: of that grid in every frame; empty if unknown.
+    """
+
+    scene_from_world: np.ndarray
+    numbers: Sequence[int]
+    times: Mapping[str, Sequence[float]]
+    sigma_per_unit: float
+    grid: str
+    exact: bool = True
+    component: str = "density"
+    extents: Sequence[GridExtent] = ()
+
+    def matches(self, other: Placement) -> bool:
+        """Whether both mean the same frames, places and values."""
+        keys = ("scene_from_world", "numbers", "sigma_per_unit", "grid", "exact")
+        mine, theirs = self.to_json(), other.to_json()
+        return all(mine[key] == theirs[key] for key in keys)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers, exact when read back."""
+        return {
+            "scene_from_world": self.scene_from_world.tolist(),
+            "numbers": list(self.numbers),
+            "times": {name: list(values) for name, values in self.times.items()},
+            "sigma_per_unit": self.sigma_per_unit,
+            "grid": self.grid,
+            "exact": self.exact,
+            "component": self.component,
+            "extents": [[one.largest, None if one.box is None else one.box.tolist()] for one in self.extents],
+        }
+
+    @staticmethod
+    def from_json(record: Mapping[str, Any], where: str) -> Placement:
+        """Read what :meth:`to_json` gave; ``where`` names the file in errors.
+
+        Raises:
+            DataError: anything else.
+        """
+        try:
+            placement = Placement(
+                np.array(record["scene_from_world"], np.float64).reshape(4, 4),
+                [int(n) for n in record["numbers"]],
+                {str(name): [float(v) for v in values] for name, values in record["times"].items()},
+                float(record["sigma_per_unit"]),
+                str(record["grid"]),
+                bool(record["exact"]),
+                str(record.get("component", "density")),
+                [
+                    GridExtent(float(largest), None if box is None else np.array(box, np.float64).reshape(2, 3))
+                    for largest, box in record.get("extents", ())
+                ],
+            )
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise DataError(f"{where}: header field 'world' is damaged ({error!r})") from None
+        matrix, count, extents = placement.scene_from_world, len(placement.numbers), placement.extents
+        sound = (
+            np.isfinite(matrix).all()
+            and (matrix[3] == (0, 0, 0, 1)).all()
+            and abs(np.linalg.det(matrix)) > 0
+            and 0 < placement.sigma_per_unit < np.inf
+            and all(0 <= one.largest < np.inf and (one.box is None or np.isfinite(one.box).all()) for one in extents)
+            and all(len(values) == count for values in placement.times.values())
+            and len(extents) in (0, count)
+        )
+        if not sound:
+            raise DataError(
+                f"{where}: header field 'world' is damaged; expected an invertible affine matrix, and a time per frame"
+            )
+        return placement
+
+
+@dataclass(frozen=True)
+class TruthFrame:
+    """One frame of the ground truth: a name to show, and the conditions of the same frame of a model; empty if
+    unknown."""
+
+    name: str
+    conditions: Conditions
+
+
+class DensityTruth(ABC):
+    """The extinction sigma that a data set was made from, on any regular grid, 1/scene unit.
+
+    Attributes:
+        frames: in order, one or more.
+        bounds: (2, 3) float64 box around all of it, scene units.
+    """
+
+    frames: Sequence[TruthFrame]
+    bounds: Tensor
+
+    @abstractmethod
+    def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
+        """(4, 4) float64 scene_from_index and shape of the grid on which models are compared with a frame: all voxels
+        of a file in the box. None where the frame holds nothing."""
+
+    @abstractmethod
+    def grid(
+        self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
+    ) -> Tensor:
+        """(X, Y, Z) float32 extinction of a frame at the points ``scene_from_index @ (i, j, k, 1)``.
+
+        Args:
+            component: only the part from the source grid of this name.
+        """
+
+
+class VolumeSource(DensityTruth):
+    """The files themselves, one frame at a time; ``frames`` are those of the placement."""
+
+    placement: Placement
+
+    @abstractmethod
+    def grid_transform(self, frame: int) -> np.ndarray | None:
+        """(4, 4) float64, index to world, of the absorbing grid of a frame; None where the frame lacks it."""
+
+    @abstractmethod
+    def open_files(self, path: Path) -> DensityTruth:
+        """Another file, or folder of frames, read by the same rules and placed as these are.
+
+        Raises:
+            DataError: nothing in ``path`` fits.
+        """
+
+
+# ---------------------------------------------------------------- errors
+
+
+class DensityComparison:
+    """Sums over the points of a grid, block by block, from which all errors follow; float64."""
+
+    def __init__(self) -> None:
+        self.points = self.active = 0
+        self.sums = np.zeros(5)  # a, b, aa, bb, ab
+        self.error = self.error_active = self.peak = self.worst = 0.0
+
+    def add_block(self, truth: np.ndarray, values: np.ndarray) -> None:
+        """Add two blocks of one shape."""
+        a, b = truth.reshape(-1).astype(np.float64), values.reshape(-1).astype(np.float64)
+        wrong = b - a
+        inside = wrong[a != 0]
+        self.points += a.size
+        self.active += int(np.count_nonzero(a))
+        self.sums += (a.sum(), b.sum(), a @ a, b @ b, a @ b)
+        self.error += float(wrong @ wrong)
+        self.error_active += float(inside @ inside)
+        self.peak = max(self.peak, float(a.max(initial=0.0)))
+        self.worst = max(self.worst, float(np.abs(wrong).max(initial=0.0)))
+
+    def errors(self) -> dict[str, float] | None:
+        """Name -> number of each of :data:`DENSITY_ERRORS`; None where the truth is the same everywhere.
+
+        ``correlation`` is Pearson's, ``relative_l2`` |values - truth| / |truth|, both over all points; ``psnr_active``
+        is over those where the truth is not 0, against its largest value; ``max_error`` is the largest error anywhere,
+        as a share of that value.
+        """
+        n = max(self.points, 1)
+        a, b, aa, bb, ab = (float(x) for x in self.sums)
+        spread_a, spread_b = aa - a * a / n, bb - b * b / n
+        if not self.active or spread_a <= 1e-12 * aa:
+            return None
+        correlation = (ab - a * b / n) / math.sqrt(spread_a * spread_b) if spread_b > 1e-12 * bb else 0.0
+        share = self.error_active / self.active / self.peak**2
+        psnr = -10 * math.log10(max(share, _MIN_SQUARED_ERROR))
+        values = (correlation, math.sqrt(self.error / aa), psnr, self.worst / self.peak)
+        return dict(zip(DENSITY_ERRORS, values, strict=True))
+
+
+def measure_frame_errors(
+    model: Primitives,
+    conditions: Conditions,
+    truth: DensityTruth,
+    frame: int,
+    threads: int = 0,
+    where: torch.device = device.HOST,
+    component: str | None = None,
+) -> dict[str, float] | None:
+    """Compare the model under ``conditions`` with a frame of the truth, see :meth:`DensityComparison.errors`.
+
+    Args:
+        where: the device that computes the model's extinction.
+        component: compare this part of both extinctions.
+    """
+    place = truth.points(frame)
+    if place is None:
+        return None
+    model = model if component is None else model.component(component)
+    comparison = DensityComparison()
+    for matrix, shape in split_grid_planes(*place):
+        sigma = truth.grid(frame, matrix, shape, component).numpy()
+        comparison.add_block(sigma, density_grid(model, conditions, matrix, shape, threads, where).numpy())
+    return comparison.errors()
+
+
+def split_grid_planes(
+    scene_from_index: Tensor, shape: tuple[int, int, int]
+) -> list[tuple[Tensor, tuple[int, int, int]]]:
+    """The same points in parts of whole planes."""
+    planes = max(1, _BLOCK_POINTS // max(1, shape[1] * shape[2]))
+    parts = []
+    for x in range(0, shape[0], planes):
+        matrix = scene_from_index.clone()
+        matrix[:3, 3] += matrix[:3, 0] * x
+        parts.append((matrix, (min(planes, shape[0] - x), shape[1], shape[2])))
+    return parts

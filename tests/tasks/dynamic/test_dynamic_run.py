@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from PIL import Image
 
 from neuprim.cli import main
@@ -22,14 +21,9 @@ from tests.reports import offered
 from tests.tasks.dynamic import sequences
 from tests.tasks.dynamic.sequences import blob
 
-SMALL = [
-    "scene.size=24",
-    "scene.cameras=6",
-    "scene.samples=1",
-    "model.primitives=60",
-    "model.neurons=2",
-    "train.max_seconds=null",
-]
+SMALL = (
+    "scene.size=24 scene.cameras=6 scene.samples=1 model.primitives=60 model.neurons=2 train.max_seconds=null".split()
+)
 
 
 @pytest.fixture(scope="module")
@@ -58,9 +52,8 @@ def test_a_run_learns_and_reports_every_number(finished: Path) -> None:
     m = metrics(finished)
     assert m["psnr_mask"] > m["psnr_black_image_mask"] + 4
     assert m["psnr"] > m["psnr_mask"] and m["psnr_pooled_mask"] <= m["psnr_mask"] + 1e-9
-    assert len(m["per_frame"]) == 4 and all(
-        {"psnr", "psnr_mask", "psnr_black_image"} <= f.keys() for f in m["per_frame"]
-    )
+    assert len(m["per_frame"]) == 4
+    assert all({"psnr", "psnr_mask", "psnr_black_image"} <= f.keys() for f in m["per_frame"])
     assert m["psnr_srgb"] > 0 and m["ssim_srgb"] > 0 and m["color_space"] == "linear"
     assert m["sigma_correlation_middle"] > 0.5 and 0 < m["sigma_relative_l2_middle"] < 1
     assert m["sigma_psnr_active_middle"] > 5 and 0 < m["sigma_max_error_middle"] < 2
@@ -80,10 +73,8 @@ def test_an_animation_over_time(finished: Path, tmp_path: Path, suffix: str) -> 
     if suffix == "mp4":
         pytest.importorskip("av", reason="MP4 needs neuprim[video]")
     target = tmp_path / f"film.{suffix}"
-    assert (
-        main(["render", str(finished), "--camera", "orbit", "--time", "0:1:7", "--frames", "7", "--out", str(target)])
-        == 0
-    )
+    words = ["render", str(finished), "--camera", "orbit", "--time", "0:1:7", "--frames", "7", "--out", str(target)]
+    assert main(words) == 0
     if suffix == "mp4":
         import av
 
@@ -116,44 +107,11 @@ def test_impossible_times(text: str) -> None:
         parse_time(text)
 
 
-def test_resuming_equals_going_on(files: Path, tmp_path: Path) -> None:
-    words = [
-        "model.density.time=phase+window+motion",
-        "train.population.every=5",
-        "train.population.start=0",
-        "train.iterations=40",
-    ]
-    whole = fit(files, tmp_path / "whole", *words)
-    part = tmp_path / "part"
-
-    class Stop(Exception):
-        pass
-
-    from neuprim.core.train.trainer import Trainer
-
-    original, steps = Trainer.train_step, []
-
-    def stopping(self: Trainer) -> Any:
-        if self.step == 20 and len(self.model.params["means"]) == 60 and not steps:
-            steps.append(self.step)
-            raise KeyboardInterrupt
-        return original(self)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "train_step", stopping)
-        with pytest.raises(KeyboardInterrupt):
-            fit(files, part, *words, "train.checkpoint_every_seconds=0.0")
-    fit(files, part, *words, "resume=true")
-    first, second = (load_run(folder).model.params for folder in (whole, part))
-    assert all(torch.equal(first[k], second[k]) for k in first)
-
-
 def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(files: Path, tmp_path: Path) -> None:
     quick, equations, paper = (compose(["task=dynamic", f"preset={name}"]) for name in ("quick", "equations", "paper"))
     assert equations.model.density == paper.model.density == {"time": "phase"}
-    assert (
-        equations.model.colour == {"powers": 4, "waves": 4, "frequencies": "printed"} and equations.model.sh_degree == 3
-    )
+    assert equations.model.colour == {"powers": 4, "waves": 4, "frequencies": "printed"}
+    assert equations.model.sh_degree == 3
     assert (equations.train.voxels_every, quick.train.voxels_every) == (4, 16), "about the same share of a step's time"
     train = dataclasses.replace(equations.train, voxels_every=quick.train.voxels_every)
     assert (train, equations.renderer) == (quick.train, quick.renderer), "the budget and the rates are those of quick"
@@ -179,15 +137,8 @@ def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(fi
 
 
 def test_a_simulated_scene_says_so(tmp_path: Path) -> None:
-    words = [
-        "task=dynamic",
-        "scene=smoke_fire",
-        "scene.resolution=16",
-        "scene.timesteps=4",
-        *SMALL,
-        "train.iterations=5",
-    ]
-    folder = run(compose([*words, f"output_dir='{tmp_path / 'run'}'"]))
+    words = "task=dynamic scene=smoke_fire scene.resolution=16 scene.timesteps=4 train.iterations=5".split()
+    folder = run(compose([*words, *SMALL, f"output_dir='{tmp_path / 'run'}'"]))
     m = metrics(folder)
     assert m["data_source"] == "simulated" and "simulated" in m["dataset"]
     assert "simulated data" in (folder / "report.html").read_text()

@@ -125,14 +125,11 @@ def test_the_field_uses_them_with_every_part(parts: str) -> None:
     """The whole field in float64 against the formulas of its module's description, parameter by parameter."""
     generator = torch.Generator().manual_seed(1)
     field = TimeDensity(2, parts, edge=2, gain=True)
-    context = InitContext(
-        torch.rand(6, 3, generator=generator), torch.full((6,), 0.3), torch.rand(6, 3, generator=generator), generator
-    )
-    params = {
-        s.name: (s.init(context) + 0.1 * torch.randn(6, *s.shape, generator=generator)).double()
-        for s in field.parameters()
-    }
-    params = {name: value.requires_grad_() for name, value in params.items()}
+    places, colours = (torch.rand(6, 3, generator=generator) for _ in range(2))
+    context, params = InitContext(places, torch.full((6,), 0.3), colours, generator), {}
+    for s in field.parameters():
+        value = s.init(context) + 0.1 * torch.randn(6, *s.shape, generator=generator)
+        params[s.name] = value.double().requires_grad_()
     means = torch.rand(6, 3, generator=generator, dtype=torch.float64).requires_grad_()
     place = Geometry(means, torch.zeros(6, 3, dtype=torch.float64), torch.ones(6, 4, dtype=torch.float64))
     conditions = {"time": torch.tensor(0.45)}

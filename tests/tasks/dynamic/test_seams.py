@@ -37,9 +37,8 @@ def three(time: str = "phase+window+motion") -> list[Primitives]:
     for seed in range(3):
         one = model(time, neurons=2, dtype=torch.float32)
         generator = torch.Generator().manual_seed(seed)
-        one.params["means"] = one.params["means"].detach() + 0.2 * torch.rand(
-            one.params["means"].shape, generator=generator
-        )
+        means = one.params["means"].detach()
+        one.params["means"] = means + 0.2 * torch.rand(means.shape, generator=generator)
         if "window" in time:
             one.params["log_window"] = torch.full_like(one.params["log_window"], 1.0)
         models.append(one)
@@ -58,9 +57,8 @@ def test_shares_add_up_to_one_at_every_time_and_at_most_two_count() -> None:
 def test_a_chunk_is_all_or_nothing_at_the_frames_beside_a_seam() -> None:
     for (begin, end), chunk in zip(SEAMS, range(2), strict=True):
         for time, expected in ((begin, chunk), (end, chunk + 1)):
-            assert chunk_weights(CHUNKS, SEAMS, torch.tensor(time))[:, 0].tolist() == [
-                float(c == expected) for c in range(3)
-            ]
+            weights = chunk_weights(CHUNKS, SEAMS, torch.tensor(time))[:, 0].tolist()
+            assert weights == [float(c == expected) for c in range(3)]
     assert chunk_weights(CHUNKS, SEAMS, torch.tensor(0.3125))[:, 0].tolist() == [0.5, 0.5, 0.0]
 
 
@@ -85,9 +83,8 @@ def test_a_joined_field_is_the_sum_of_the_chunks_by_their_shares(time: str) -> N
         parts = [_sums(m, points, moment) for m in models]
         found = _sums(whole, points, moment)
         assert float(found.abs().max()) > 0
-        assert torch.allclose(
-            found, sum(share * part for share, part in zip(own, parts, strict=True)), rtol=1e-5, atol=1e-5
-        )
+        wanted = sum(share * part for share, part in zip(own, parts, strict=True))
+        assert torch.allclose(found, wanted, rtol=1e-5, atol=1e-5)
 
 
 def _sums(m: Primitives, points: Tensor, time: float) -> Tensor:
@@ -149,25 +146,22 @@ def test_the_reference_agrees_and_labels_have_no_gradient() -> None:
 def test_a_part_of_time_can_be_taken_away() -> None:
     whole = join_chunks(three(), [0, 1, 2], SEAMS)
     field, fewer = whole.density.reduce(whole.of(whole.density), whole.geometry, "phase", 0)
-    assert (
-        isinstance(field, TimeDensity) and field.seams == SEAMS and torch.equal(fewer["chunk"], whole.params["chunk"])
-    )
+    assert isinstance(field, TimeDensity) and field.seams == SEAMS
+    assert torch.equal(fewer["chunk"], whole.params["chunk"])
 
 
 def test_files_keep_seams_and_labels(tmp_path: Path) -> None:
     whole = join_chunks(three(), [0, 1, 2], SEAMS)
     checkpoint.save_model(tmp_path / "model.safetensors", whole, "dynamic", {})
     again, _ = checkpoint.load_model(tmp_path / "model.safetensors", TASK)
-    assert again.density.settings() == whole.density.settings() and torch.equal(
-        again.params["chunk"], whole.params["chunk"]
-    )
+    assert again.density.settings() == whole.density.settings()
+    assert torch.equal(again.params["chunk"], whole.params["chunk"])
 
 
 def test_labels_survive_every_level_of_compression() -> None:
     count = 40
-    whole = join_chunks(
-        [three()[0]] * count, range(count), tuple((n / count, (n + 0.5) / count) for n in range(1, count))
-    )
+    seams = tuple((n / count, (n + 0.5) / count) for n in range(1, count))
+    whole = join_chunks([three()[0]] * count, range(count), seams)
     small = canonicalize(whole)
     for table in LEVELS.values():
         back = fake_quantize(small.params, fit_quantizers(small, table))["chunk"]

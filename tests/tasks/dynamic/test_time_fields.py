@@ -15,15 +15,17 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
+from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.render.output import Contributions
 from neuprim.core.train.population import Relocate
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.core.train.splitting import split_primitives
-from neuprim.tasks.dynamic import invisible_fraction
+from neuprim.tasks.dynamic import TASK, invisible_fraction
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TIME_PARTS, TimeDensity
 from tests import scenes
 from tests.backends import BACKENDS, by
+from tests.chords import chords
 from tests.timed_models import COUNT, model
 
 VARIANTS = [
@@ -204,9 +206,8 @@ def test_a_window_divides_into_halves_that_stay_on_its_path() -> None:
         assert torch.allclose(children["log_scales"][rows][long], m.params["log_scales"].detach()[long])
         assert not torch.allclose(children["log_scales"][rows][~long], m.params["log_scales"].detach()[~long])
         own = {s.name: children[s.name][rows] for s in m.density.parameters()}
-        place = m.density.move(
-            own, Geometry(*(children[n][rows] for n in ("means", "log_scales", "quats"))), at(0.6)
-        ).means
+        shape = Geometry(*(children[n][rows] for n in ("means", "log_scales", "quats")))
+        place = m.density.move(own, shape, at(0.6)).means
         whole = m.density.move({k: v.detach() for k, v in m.of(m.density).items()}, m.geometry, at(0.6)).means
         assert torch.allclose(place[long], whole[long], atol=1e-6)  # children move as their parent did
 
@@ -260,3 +261,23 @@ def test_a_fresh_window_is_so_many_frames_at_most(
     spec = next(spec for spec in TimeDensity(0, "window").parameters() if spec.name == "log_window")
     made = spec.init(replace(_context(7, **settings), steps={} if step is None else {"time": step}))
     assert made.shape == (7, 1) and torch.allclose(made.exp(), torch.tensor(expected), rtol=1e-5)
+
+
+# ---------------------------------------------------------------- layers
+
+
+def test_beauty_is_what_is_emitted_less_what_is_absorbed() -> None:
+    settings = RenderSettings(alpha_min=0.0, transmittance_min=0.0, alpha_max=0.9999)
+    camera = scenes.camera(20, 16, distance=2.6)
+    frame = LayerFrame(model("window+motion", count=16, dtype=torch.float32), camera, at(0.4), settings)
+    found = chords(frame.lowered, camera)
+    colours = frame.lowered.colour.flat
+    assert colours is not None and colours.min() >= 0
+    emitted = torch.einsum("nhw,nc->hwc", found.tau, colours.double())
+    arrived = torch.einsum("nhw,nc->hwc", found.weight, colours.double())
+    layers = {spec.name: spec.draw(frame) for spec in TASK.layers}
+    assert list(layers) == ["emission", "absorption"] and all(spec.light for spec in TASK.layers)
+    assert (layers["emission"] - emitted).abs().max() < 1e-5 * emitted.max()
+    assert (layers["absorption"] - (emitted - arrived)).abs().max() < 1e-5 * emitted.max()
+    assert (layers["emission"] - layers["absorption"] - arrived).abs().max() < 1e-5 * emitted.max()
+    assert (emitted - arrived).max() > 0.05 * emitted.max(), "something is absorbed"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuprim.config import compose
+from neuprim.config import RunConfig, compose
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import Grid, read_grid, scale_transform, write_vdb
 from neuprim.core.model.primitives import Primitives
@@ -33,13 +33,12 @@ def ball(centre: tuple[float, float, float], radius: float, peak: float, size: i
     return np.clip(peak * (1 - np.linalg.norm(index - centre, axis=-1) / radius), 0, None).astype(np.float32)
 
 
-def fire(frame: int, half: bool = True) -> list[Grid]:
+def fire(frame: int) -> list[Grid]:
     """Faint smoke, and flames of 1 that reach beyond it."""
     transform = scale_transform(0.5, SHIFT)
     smoke, flame = ball((6 + frame, 8, 9), 5, PEAK), ball((6 + frame, 8, 5), 5, 1.0)
-    return [
-        Grid.from_dense(name, v, transform=transform, half=half) for name, v in (("density", smoke), ("flame", flame))
-    ]
+    named = (("density", smoke), ("flame", flame))
+    return [Grid.from_dense(name, values, transform=transform, half=True) for name, values in named]
 
 
 @pytest.fixture(scope="module")
@@ -124,11 +123,8 @@ def test_a_component_is_every_primitives_share() -> None:
     field = TimeDensity(0, "window", gain=True, components=("density",))
     generator = torch.Generator().manual_seed(0)
     params = {s.name: torch.randn((6, *s.shape), generator=generator) * 0.3 for s in field.parameters()}
-    params |= {
-        "means": torch.zeros(6, 3),
-        "log_scales": torch.full((6, 3), -1.0),
-        "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1),
-    }
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1)
+    params |= {"means": torch.zeros(6, 3), "log_scales": torch.full((6, 3), -1.0), "quats": quats}
     params["b2"] = params["b2"].abs() + 1
     params["window_center"], params["log_window"] = torch.full((6, 1), 0.5), torch.zeros(6, 1)
     params["sh_dc"] = torch.zeros(6, 3)
@@ -143,15 +139,13 @@ def test_a_component_is_every_primitives_share() -> None:
 SMALL = ["scene.size=24", "scene.cameras=6", "scene.samples=1", "model.primitives=120", "train.max_seconds=null"]
 
 
-def words(files: Path, out: Path, *more: str) -> list[str]:
+def composed(files: Path, out: Path, *more: str) -> RunConfig:
     scene = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", f"output_dir='{out}'", "renderer.threads=1"]
-    return [*scene, *SMALL, *more]
+    return compose([*scene, *SMALL, *more], check_output=False)
 
 
 def test_no_primitive_goes_beyond_the_largest_extinction(files: Path, tmp_path: Path) -> None:
-    trainer = prepare_training(
-        compose(words(files, tmp_path / "run", "train.iterations=3"), check_output=False)
-    ).trainer
+    trainer = prepare_training(composed(files, tmp_path / "run", "train.iterations=3")).trainer
     model, largest = trainer.model, trainer.dataset.largest
     assert largest is not None
     with torch.no_grad():
@@ -164,9 +158,7 @@ def test_no_primitive_goes_beyond_the_largest_extinction(files: Path, tmp_path: 
 
 @pytest.mark.filterwarnings("ignore::neuprim.core.notices.NeuprimWarning")
 def test_exported_density_is_the_files_own(files: Path, tmp_path: Path) -> None:
-    out = run(
-        compose(words(files, tmp_path / "run", "train.iterations=240", "train.voxels_every=2"), check_output=False)
-    )
+    out = run(composed(files, tmp_path / "run", "train.iterations=240", "train.voxels_every=2"))
     report = export_run(out, "vdb", tmp_path / "frames")
     again = export_run(out, "vdb", tmp_path / "again", ["source=false", "grid=32"])
     for number in range(3):
@@ -188,9 +180,7 @@ def test_exported_density_is_the_files_own(files: Path, tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::neuprim.core.notices.NeuprimWarning")
 def test_a_density_that_nothing_taught_is_refused(files: Path, tmp_path: Path) -> None:
-    out = run(
-        compose(words(files, tmp_path / "run", "train.iterations=3", "train.supervision=images"), check_output=False)
-    )
+    out = run(composed(files, tmp_path / "run", "train.iterations=3", "train.supervision=images"))
     assert open_run(out).model.density.components(open_run(out).model.params) == {}
     with pytest.raises(ConfigError, match=r"flames absorb beside grid 'density'.*train\.supervision=both"):
         export_run(out, "vdb", tmp_path / "frames")

@@ -75,18 +75,11 @@ def test_voxels_from_thick_to_solid(strength: float) -> None:
     """Steps become shorter by themselves; sources stay between the least and the greatest one."""
     rng = np.random.default_rng(1)
     sigma = rng.random((9, 9, 9)) * strength
-    medium = Medium.padded(
-        np.concatenate([sigma[..., None], sigma[..., None] * rng.uniform(0.5, 1.0, (9, 9, 9, 3))], -1).astype(
-            np.float32
-        ),
-        box((9, 9, 9)),
-    )
+    values = np.concatenate([sigma[..., None], sigma[..., None] * rng.uniform(0.5, 1.0, (9, 9, 9, 3))], -1)
+    medium = Medium.padded(values.astype(np.float32), box((9, 9, 9)))
     image, fine = (render_medium(medium, camera((1.6, -1.5, 1.5), 64), 1, subdivisions=n) for n in (1, 8))
-    assert (
-        torch.isfinite(image).all()
-        and (image[..., :3] <= image[..., 3:] * (1 + 1e-5)).all()
-        and (image[..., :3] >= 0.499 * image[..., 3:]).all()
-    )
+    rgb, alpha = image[..., :3], image[..., 3:]
+    assert torch.isfinite(image).all() and (rgb <= alpha * (1 + 1e-5)).all() and (rgb >= 0.499 * alpha).all()
     if strength < 1e4:
         assert (image - fine).abs().max() < 2e-3
 
@@ -98,10 +91,9 @@ def test_anisotropic_and_sheared_voxels() -> None:
     shear[0, 1] = 0.3
     for shape, extra in (((40, 40, 40), np.eye(4)), ((60, 30, 45), np.eye(4)), ((56, 40, 40), shear)):
         matrix = np.eye(4)
-        matrix[range(3), range(3)] = np.array([1.4, 1.0, 1.0] if extra is shear else [1.0, 1.0, 1.0]) / shape
-        matrix[:3, 3] = (
-            -0.5 * np.array([1.4, 1.0, 1.0] if extra is shear else [1.0, 1.0, 1.0]) + np.diag(matrix)[:3] / 2
-        )
+        sides = np.array([1.4, 1.0, 1.0] if extra is shear else [1.0, 1.0, 1.0])
+        matrix[range(3), range(3)] = sides / shape
+        matrix[:3, 3] = -0.5 * sides + np.diag(matrix)[:3] / 2
         matrix = extra @ matrix
         index = np.stack(np.meshgrid(*[np.arange(s) for s in shape], indexing="ij"), -1)
         where = index @ matrix[:3, :3].T + matrix[:3, 3]
@@ -127,10 +119,6 @@ def test_empty_space_is_skipped_without_a_trace() -> None:
 def test_nothing() -> None:
     view = camera((2.0, 1.0, 1.5), 7)
     zeros = np.zeros((5, 6, 7, 4), np.float32)
-    for medium in (
-        Medium.without_voxels(),
-        Medium.padded(zeros, np.eye(4)),
-        Medium.padded(zeros[:0], np.eye(4)),
-        Medium(zeros[:1], np.eye(4)),
-    ):
+    padded = (Medium.padded(voxels, np.eye(4)) for voxels in (zeros, zeros[:0]))
+    for medium in (Medium.without_voxels(), *padded, Medium(zeros[:1], np.eye(4))):
         assert torch.equal(render_medium(medium, view), torch.zeros(7, 7, 4))

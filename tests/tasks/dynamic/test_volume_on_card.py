@@ -13,7 +13,6 @@ pytest.importorskip("warp", reason="the kernels of a card are written in Warp: p
 from neuprim.core.cameras import Camera
 from neuprim.core.compute import device
 from neuprim.core.data.dataset import SceneContext
-from neuprim.core.io.vdb import write_vdb
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.tasks.dynamic.time_density import TimeDensity
@@ -21,17 +20,13 @@ from neuprim.tasks.dynamic.volume.capture_density import compare_extinction
 from neuprim.tasks.dynamic.volume.raymarch import render_medium
 from neuprim.tasks.dynamic.volume.volume_scene import open_volumes
 from neuprim.tasks.static.fields import SphericalHarmonics
-from tests.tasks.dynamic.sequences import blob, dataset, recorded
+from tests.tasks.dynamic.sequences import dataset, recorded, write_blobs
 from tests.tasks.dynamic.volumes import camera, ragged
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    made = tmp_path / "files"
-    made.mkdir()
-    for number in (1, 2, 3):
-        write_vdb(made / f"ball_{number}.vdb", blob(6.0 + 3 * number))
-    return made
+    return write_blobs(tmp_path / "files", {number: 6.0 + 3 * number for number in (1, 2, 3)})
 
 
 def on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,11 +37,8 @@ def test_a_sequence_is_the_processors_and_lies_in_a_folder_of_its_own(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With a light, glow and shadows; within the half floats that images are stored in."""
-    changes = {
-        "size": 32,
-        "samples": 2,
-        "optics": {"light": {"direction": [0.3, -0.5, 0.8], "irradiance": [3.0, 3.0, 3.0]}},
-    }
+    light = {"direction": [0.3, -0.5, 0.8], "irradiance": [3.0, 3.0, 3.0]}
+    changes = {"size": 32, "samples": 2, "optics": {"light": light}}
     own = dataset(folder, tmp_path, **changes)
     with monkeypatch.context() as patch:
         on_blocks(patch)
@@ -59,9 +51,8 @@ def test_a_sequence_is_the_processors_and_lies_in_a_folder_of_its_own(
         mine, theirs, rerun = (data.test.pixels(i) for data in (own, other, again))
         assert mine.alpha is not None and theirs.alpha is not None
         assert float(mine.alpha.max()) > 0.3
-        assert torch.allclose(mine.rgb, theirs.rgb, rtol=2e-3, atol=1e-4) and torch.allclose(
-            mine.alpha, theirs.alpha, rtol=2e-3, atol=1e-4
-        )
+        assert torch.allclose(mine.rgb, theirs.rgb, rtol=2e-3, atol=1e-4)
+        assert torch.allclose(mine.alpha, theirs.alpha, rtol=2e-3, atol=1e-4)
         assert torch.equal(theirs.rgb, rerun.rgb) and torch.equal(theirs.alpha, rerun.alpha)  # type: ignore[arg-type]
 
 
@@ -75,23 +66,16 @@ def test_pixels_do_not_depend_on_those_beside_them(monkeypatch: pytest.MonkeyPat
 
 
 def test_errors_of_a_model_are_the_processors(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    capture = open_volumes(
-        {"vdb": str(folder), "size": 24, "cameras": 4, "look": "smoke_fire"}, SceneContext(0, tmp_path)
-    ).capture
+    settings = {"vdb": str(folder), "size": 24, "cameras": 4, "look": "smoke_fire"}
+    capture = open_volumes(settings, SceneContext(0, tmp_path)).capture
     generator = torch.Generator().manual_seed(0)
     means = 0.4 * torch.rand(30, 3, generator=generator) - 0.2
-    made = InitContext(
-        means,
-        torch.full((30,), 0.15),
-        torch.zeros(30, 3),
-        generator,
-        conditions={"time": torch.rand(30, generator=generator)},
-    )
+    times = {"time": torch.rand(30, generator=generator)}
+    made = InitContext(means, torch.full((30,), 0.15), torch.zeros(30, 3), generator, conditions=times)
     model = Primitives.initialise(TimeDensity(2, "window+motion"), SphericalHarmonics(0), made)
     wanted = compare_extinction(model, capture, [0.0, 0.5, 1.0])
     on_blocks(monkeypatch)
     found = compare_extinction(model, replace(capture), [0.0, 0.5, 1.0])
     assert len(wanted["sigma_frames"]) == 3 and abs(wanted["sigma_correlation_middle"]) > 0.05
-    assert {k: v for k, v in found.items() if k != "sigma_frames"} == pytest.approx(
-        {k: v for k, v in wanted.items() if k != "sigma_frames"}, rel=1e-5
-    )
+    del wanted["sigma_frames"], found["sigma_frames"]
+    assert found == pytest.approx(wanted, rel=1e-5)

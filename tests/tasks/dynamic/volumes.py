@@ -59,9 +59,8 @@ def sheet(seed: int, size: int = 32) -> Medium:
     gas = 10.0 * inside
     flame = np.maximum(1.0 - np.abs(where @ normal), 0.0) * inside
     color = 0.05 + flame[..., None] * np.array([1.0, 0.3, 0.03])
-    return Medium.padded(
-        np.concatenate([gas[..., None], gas[..., None] * color], -1).astype(np.float32), box((size,) * 3)
-    )
+    values = np.concatenate([gas[..., None], gas[..., None] * color], -1)
+    return Medium.padded(values.astype(np.float32), box((size,) * 3))
 
 
 def rays(view: Camera, samples: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -87,11 +86,9 @@ def march_slowly(
     for first in range(0, steps, 400):
         t = near + step * (np.arange(first, first + 400) + 0.5)
         points = (origin + flat[:, None] * t[:, None]) @ inverse[:3, :3].T + inverse[:3, 3]
-        found = [
-            ndimage.map_coordinates(medium.values[..., c].astype(float), points.reshape(-1, 3).T, order=1)
-            for c in range(4)
-        ]
-        sigma, *source = (f.reshape(len(flat), -1) for f in found)
+        channels = np.moveaxis(medium.values, -1, 0).astype(float)
+        values = (ndimage.map_coordinates(channel, points.reshape(-1, 3).T, order=1) for channel in channels)
+        sigma, *source = (v.reshape(len(flat), -1) for v in values)
         depth = sigma * step
         before = np.cumsum(depth, 1) - depth
         gain = through[:, None] * np.exp(-before) * -np.expm1(-depth) / np.where(sigma > 0, sigma, 1.0)

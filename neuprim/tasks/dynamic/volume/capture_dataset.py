@@ -310,8 +310,9 @@ class MediumVoxels:
 
     def write(self, path: Path) -> None:
         """Write a file of arrays. Raises OSError."""
+        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _VOXEL_ARRAYS}
         with open(path, "wb") as file:
-            np.savez(file, **{name: np.asarray(getattr(self, name)) for name in _VOXEL_ARRAYS})
+            np.savez(file, **arrays)
 
     @staticmethod
     def read(path: Path) -> MediumVoxels:

@@ -144,8 +144,7 @@ def render_medium(
 def light_transmittance(medium: Medium, direction: Sequence[float], where: torch.device = device.HOST) -> np.ndarray:
     """(X, Y, Z) float32 exp(-∫ σ ds) from each voxel centre towards a directional light, exact up to rounding.
 
-    ``direction`` points to the light, scene axes, any length > 0. Voxels without extinction get 1 without a ray:
-    nothing there scatters.
+    ``direction`` points to the light, scene axes, any length > 0. Voxels without extinction get 1 without a ray.
     """
     result = np.zeros(medium.values.shape[:3], np.float32)
     if not medium.empty:
@@ -255,11 +254,9 @@ def _step_gains(a, b):  # type: ignore[no-untyped-def]
 _FREE = ("nsz", "contract", "reassoc")  # what LLVM may do with the arithmetic of _two_points
 
 
-@intrinsic
-def _two_points(context: Any, flat: Any, corner: Any, first: Any, second: Any) -> Any:
-    """Trilinear values of the four channels at two points of one cell, eight numbers: one vector of four per corner.
-
-    Written in LLVM's vectors, as its optimiser does not find them in scalar code, which takes 1.4 times as long.
+def _generate_two_points(context: Any, flat: Any, corner: Any, first: Any, second: Any) -> Any:
+    """Trilinear values of the four channels at two points of one cell, as vectors of four: LLVM does not find them
+    in scalar code, which takes 1.4 times as long.
 
     Args:
         flat: float32 array of the interleaved voxels.
@@ -305,6 +302,9 @@ def _two_points(context: Any, flat: Any, corner: Any, first: Any, second: Any) -
         return target.make_tuple(builder, signature.return_type, channels)
 
     return signature, generate
+
+
+_two_points: Any = intrinsic(_generate_two_points)
 
 
 @kernel

@@ -115,22 +115,12 @@ def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(fi
     assert (equations.train.voxels_every, quick.train.voxels_every) == (4, 16), "about the same share of a step's time"
     train = dataclasses.replace(equations.train, voxels_every=quick.train.voxels_every)
     assert (train, equations.renderer) == (quick.train, quick.renderer), "the budget and the rates are those of quick"
-    words = [
-        "preset=equations",
-        "train.iterations=20",
-        "train.population.every=5",
-        "train.population.start=0",
-        "model.neurons=8",
-    ]
-    model = load_run(fit(files, tmp_path / "run", *words)).model
-    assert (
-        model.parameters_per_primitive == 143 + 1
-        and bool(model.params["W_t"].any())
-        and bool(model.params["time_sin"].any())
-    )
-    data = dataclasses.replace(
-        sequences.dataset(files, tmp_path), points=None
-    )  # the form alone, without shares of components
+    words = "preset=equations train.iterations=20 train.population.every=5 train.population.start=0 model.neurons=8"
+    model = load_run(fit(files, tmp_path / "run", *words.split())).model
+    assert model.parameters_per_primitive == 143 + 1
+    assert bool(model.params["W_t"].any()) and bool(model.params["time_sin"].any())
+    # the form alone, without shares of components
+    data = dataclasses.replace(sequences.dataset(files, tmp_path), points=None)
     fields = TASK.build(vars(quick.model), data)
     numbers = 10 + sum(spec.size for field in fields for spec in field.parameters())
     assert abs(143 * equations.model.primitives - numbers * quick.model.primitives) <= 143 / 2

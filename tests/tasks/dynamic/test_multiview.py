@@ -40,21 +40,12 @@ def ball(pose: np.ndarray, time: float) -> np.ndarray:
     return (gap < RADIUS).reshape(SIZE, 3, SIZE, 3).mean((1, 3))
 
 
-def views(scenes: Any, monocular: bool, steps: int = 12) -> list[tuple[np.ndarray, float]]:
-    """Poses and times: 12 times of 4 cameras, or as many of one camera that jumps."""
-    poses = scenes.ring(4, 3.5)
-    if not monocular:
-        return [(poses[c], t) for t in TIMES for c in range(4)]
-    rng = np.random.default_rng(0)
-    octants = rng.choice([[-1, -1, 1], [1, 1, 1], [1, -1, 1]], steps)
-    directions = np.abs(rng.normal(size=(steps, 3))) * octants
-    eyes = 3.5 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return [(scenes.opengl_pose(tuple(eye)), i / (steps - 1)) for i, eye in enumerate(eyes)]
+def views(scenes: Any) -> list[tuple[np.ndarray, float]]:
+    """Poses and times: 12 times of 4 cameras."""
+    return [(pose, t) for t in TIMES for pose in scenes.ring(4, 3.5)]
 
 
-def write(
-    folder: Path, split: str, shots: list[tuple[np.ndarray, float]], scenes: Any, exr: bool = False, scale: float = 1.0
-) -> None:
+def write(folder: Path, split: str, shots: list[tuple[np.ndarray, float]], scenes: Any, exr: bool = False) -> None:
     """One ``transforms_SPLIT.json`` (``transforms.json`` for "") and its images."""
     frames = []
     for i, (pose, time) in enumerate(shots):
@@ -66,7 +57,7 @@ def write(
             write_exr((folder / name).with_suffix(".exr"), torch.from_numpy(premultiplied))
         else:
             scenes.save((folder / name).with_suffix(".png"), image)
-        frames.append({"file_path": f"./{name}", "time": time * scale, "transform_matrix": pose.tolist()})
+        frames.append({"file_path": f"./{name}", "time": time, "transform_matrix": pose.tolist()})
     name = f"transforms_{split}.json" if split else "transforms.json"
     scenes.write_json(folder / name, {"camera_angle_x": ANGLE, "frames": frames})
 
@@ -76,7 +67,7 @@ def folder(tmp_path: Path, scenes: Any) -> Path:
     """12 times of 4 cameras to train on, 5 views to test."""
     path = tmp_path / "ball"
     path.mkdir()
-    write(path, "train", views(scenes, False), scenes)
+    write(path, "train", views(scenes), scenes)
     write(path, "test", [(scenes.opengl_pose((2.0, 2.0, 2.0)), t) for t in (0.0, 0.3, 0.5, 0.77, 1.0)], scenes)
     return path
 
@@ -115,7 +106,7 @@ def test_views_and_times(folder: Path, scenes: Any, context: Any) -> None:
 
 
 def test_one_file_of_frames(tmp_path: Path, scenes: Any, context: Any) -> None:
-    write(tmp_path, "", views(scenes, False), scenes)
+    write(tmp_path, "", views(scenes), scenes)
     data = load_multiview({"path": tmp_path, "test_every": 4}, context)
     assert (len(data.train), len(data.test)) == (36, 12)
     assert times_of(data.test) == [np.float32(t) for t in TIMES]
@@ -132,7 +123,7 @@ def test_one_file_of_frames(tmp_path: Path, scenes: Any, context: Any) -> None:
 
 def test_exr_is_linear_and_premultiplied(tmp_path: Path, scenes: Any, context: Any) -> None:
     for split in ("train", "test"):
-        write(tmp_path, split, views(scenes, False)[:8], scenes, exr=True)
+        write(tmp_path, split, views(scenes)[:8], scenes, exr=True)
     data = load_multiview({"path": tmp_path}, context)
     pixels = data.train.pixels(3)
     assert data.color_space == "linear" and pixels.alpha is not None
@@ -248,6 +239,18 @@ def test_starting_points_cover_the_ball_at_all_times(folder: Path, context: Any)
     assert sorted(set(times.tolist())) == [np.float32(t) for t in TIMES]
     where = torch.from_numpy(np.stack([middle(t) for t in times.tolist()])).float()
     assert (points.means - where).norm(dim=-1).max() < 1.7 * RADIUS, "a point lies where the ball was at its time"
+
+
+def test_a_camera_that_jumps_gives_points_where_the_ball_passes(tmp_path: Path, scenes: Any, context: Any) -> None:
+    """Every image has its own time, as in D-NeRF."""
+    octants = np.array([[-1, -1, 1], [1, 1, 1], [1, -1, 1]] * 20)
+    directions = np.abs(np.random.default_rng(0).normal(size=(60, 3))) * octants
+    eyes = 3.5 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    write(tmp_path, "train", [(scenes.opengl_pose(tuple(eye)), i / 59) for i, eye in enumerate(eyes)], scenes)
+    write(tmp_path, "test", [(scenes.opengl_pose((2.0, 2.0, 2.0)), 0.5)], scenes)
+    points = load_multiview({"path": tmp_path}, context).initial_points(1000, rng())
+    assert min(covered(points.means, RADIUS)) > 0.98 and beside(points.means) < 0.25
+    assert len(points.conditions["time"].unique()) == 29, "runs of four images, half overlapping"
 
 
 def test_what_rests_is_covered_evenly(tmp_path: Path, scenes: Any, context: Any) -> None:

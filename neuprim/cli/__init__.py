@@ -11,24 +11,9 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from importlib import import_module
 
-from neuprim.cli import (
-    bench_command,
-    compress_command,
-    doctor_command,
-    eval_command,
-    export_command,
-    inspect_command,
-    prune_command,
-    render_command,
-    run_command,
-    tasks_command,
-    tradeoff_command,
-    truth_command,
-    vdb_command,
-    view_command,
-)
-from neuprim.cli.command import Parser
+from neuprim.cli.command import Command, Parser
 from neuprim.core.errors import ConfigError, NeuprimError, nearest, one_line
 from neuprim.core.io.trust import trusting
 from neuprim.core.notices import warnings_as_lines
@@ -36,25 +21,17 @@ from neuprim.version import __version__
 
 __all__ = ["COMMANDS", "main"]
 
-_LISTED = (
-    run_command.COMMAND,
-    truth_command.COMMAND,
-    eval_command.COMMAND,
-    render_command.COMMAND,
-    tradeoff_command.COMMAND,
-    export_command.COMMAND,
-    compress_command.COMMAND,
-    prune_command.COMMAND,
-    export_command.IMPORT_COMMAND,
-    inspect_command.COMMAND,
-    view_command.COMMAND,
-    vdb_command.COMMAND,
-    tasks_command.COMMAND,
-    tasks_command.NEW_TASK_COMMAND,
-    bench_command.COMMAND,
-    doctor_command.COMMAND,
+_MODULES = ("run", "measure", "model", "view", "install")
+_ORDER = (
+    "run truth eval render tradeoff export compress prune import inspect view vdb tasks new-task bench doctor".split()
 )
-COMMANDS = {command.name: command for command in _LISTED}
+_FOUND = {
+    value.name: value
+    for module in _MODULES
+    for value in vars(import_module(f"neuprim.cli.{module}_commands")).values()
+    if isinstance(value, Command)
+}
+COMMANDS = {name: _FOUND[name] for name in _ORDER}
 """Every command by its name, in the order of ``neuprim --help``."""
 
 
@@ -86,7 +63,7 @@ def _dispatch(words: list[str]) -> int:
     parser = Parser(prog="neuprim", description="Radiance fields made of splattable neural primitives.")
     parser.add_argument("--version", action="version", version=f"neuprim {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for command in _LISTED:
+    for command in COMMANDS.values():
         commands.add_parser(command.name, help=command.summary, add_help=False)
     if not words:
         parser.print_help()

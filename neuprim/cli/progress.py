@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 import time
-from types import TracebackType
+from collections import Counter
+from collections.abc import Sequence
 from typing import Self
 
-from rich.console import Console
+from rich import box
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.live import Live
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
 
 from neuprim.cli.command import plain_console
+from neuprim.config import RunConfig
 from neuprim.runs.fit import Evaluated, Event, Finishing, Note, Preparing, Step
+from neuprim.runs.launch.jobs import ENDED, JobStatus
 
 
-class _Bar:
+class _ProgressBar:
     """Context manager: the bar is there inside."""
 
     def __init__(self, console: Console | None, columns: tuple[ProgressColumn, ...], transient: bool) -> None:
@@ -27,13 +35,11 @@ class _Bar:
         self.bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.bar.stop()
 
 
-class RunProgress(_Bar):
+class RunProgress(_ProgressBar):
     """Context manager around one run, which calls it with its events.
 
     Args:
@@ -89,7 +95,7 @@ class RunProgress(_Bar):
             self._print(f"{progress:4.0%}  {report.seconds:6.1f} s  {info}")
 
 
-class DrawProgress(_Bar):
+class DrawProgress(_ProgressBar):
     """Context manager around the drawing of images; the bar is gone afterwards."""
 
     def __init__(self, console: Console | None = None) -> None:
@@ -119,8 +125,117 @@ class LineProgress:
             self.last = (text, fraction)
             self.console.print(f"{text}, {fraction:.0%}" if fraction > 0 else text)
 
+    def note(self, text: str) -> None:
+        """Print a line that stays."""
+        self.console.print(f"neuprim: {text}")
+
 
 def print_notes(event: Event) -> None:
     """Print notes on standard output, for commands whose notes are what they were asked for."""
     if isinstance(event, Note):
         print(event.text)
+
+
+# ---------------------------------------------------------------- several jobs
+
+_LINE_INTERVAL = 0.25
+"""Share of a training between two lines, where there is no terminal."""
+
+_STATE_ORDER = ("training", "finishing", "preparing", "starting", "failed", "interrupted", "done", "waiting")
+"""Jobs that go first where not all rows fit the screen."""
+
+_STYLES = {"failed": "red", "done": "green", "waiting": "dim"}
+
+
+class RunLaunchProgress:
+    """Show several runs: one table on a terminal, a line now and then elsewhere. Call it with their statuses."""
+
+    def __init__(self, configs: Sequence[RunConfig]) -> None:
+        self.console = plain_console(stderr=True)
+        self.live = self.console.is_terminal
+        self._directories = [config.output_dir for config in configs]
+        self._statuses = [JobStatus()] * len(configs)
+        self._seconds: dict[int, float] = {}
+        self._printed: dict[int, tuple[object, ...]] = {}
+        self._display = Live(self, console=self.console, redirect_stdout=True)
+
+    def __enter__(self) -> Self:
+        if self.live:
+            self._display.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._display.stop()
+
+    def __call__(self, number: int, status: JobStatus) -> None:
+        """Show a run's status."""
+        before, self._statuses[number] = self._statuses[number], status
+        if status.state != "waiting":
+            self._seconds.setdefault(number, time.monotonic())
+        if status.state in ENDED and before.state not in ENDED:
+            self._seconds[number] = time.monotonic() - self._seconds[number]  # a time, from now on a duration
+        if not self.live:
+            self._print_line(number, status)
+            self._print_change(number, before, status)
+
+    def _print_line(self, number: int, status: JobStatus) -> None:
+        shown = (
+            status.state,
+            int(status.progress / _LINE_INTERVAL) if status.state in ("training", "waiting") else 0,
+            status.text.rpartition(", ")[0] or status.text if status.state == "waiting" else "",
+            status.attempt,
+        )
+        if self._printed.get(number) == shown or status.state in ("starting", "failed", "interrupted"):
+            return  # the command reports these states
+        self._printed[number] = shown
+        if status.state == "done" and not status.step:
+            return  # it was done before
+        cells = (_format_state(status), _format_steps(status), _format_psnr(status, " dB held out"), status.text)
+        self.console.print(f"{self._directories[number].name}: {' '.join(filter(None, cells))}")
+
+    def _print_change(self, number: int, before: JobStatus, status: JobStatus) -> None:
+        """Print started and finished runs on standard output."""
+        directory, many = self._directories[number], len(self._directories)
+        if many > 1 and before.state == "waiting" and status.state == "starting" and not status.attempt:
+            print(f"[{number + 1}/{many}] {directory}", flush=True)
+        elif status.state == "done":
+            print(directory, flush=True)
+        elif status.state == "failed":
+            print(f"neuprim: error: {directory}: {status.text}", file=sys.stderr, flush=True)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        table.add_column("run", overflow="fold")
+        table.add_column("state", no_wrap=True)
+        for name in ("steps", "held-out dB", "seconds"):
+            table.add_column(name, justify="right", no_wrap=True)
+        table.add_column("", overflow="ellipsis", no_wrap=True)
+        room = max(console.size.height - 6, 4)
+        order = sorted(range(len(self._statuses)), key=lambda n: (_STATE_ORDER.index(self._statuses[n].state), n))
+        for number in sorted(order[:room]):
+            status, name = self._statuses[number], self._directories[number].name
+            numbers = (_format_steps(status), _format_psnr(status), self._format_seconds(number))
+            cells = (name, _format_state(status), *numbers, status.text)
+            table.add_row(*(Text(cell, style=_STYLES.get(status.state, "")) for cell in cells))
+        yield table
+        counts = Counter(status.state for status in self._statuses)
+        more = f"; {len(order) - room} not shown" if len(order) > room else ""
+        yield Text("  ".join(f"{counts[state]} {state}" for state in _STATE_ORDER if counts[state]) + more)
+
+    def _format_seconds(self, number: int) -> str:
+        if number not in self._seconds:
+            return ""
+        seconds = self._seconds[number]
+        return f"{seconds if self._statuses[number].state in ENDED else time.monotonic() - seconds:.0f}"
+
+
+def _format_state(status: JobStatus) -> str:
+    return status.state + (f", try {status.attempt + 1}" if status.attempt else "")
+
+
+def _format_steps(status: JobStatus) -> str:
+    return f"step {status.step:,} ({status.progress:.0%})" if status.step else ""
+
+
+def _format_psnr(status: JobStatus, unit: str = "") -> str:
+    return "" if status.psnr is None else f"{status.psnr:.2f}{unit}"

@@ -18,12 +18,12 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from neuprim.conformance.field_checks import (
     check_activity,
-    check_forms,
     check_gradients,
     check_integral,
     check_reductions,
@@ -55,7 +55,6 @@ CHECKS: dict[str, Callable[[TaskUnderTest], None]] = {
         check_parameters,
         check_evaluation,
         check_loss,
-        check_forms,
         check_channels,
         check_activity,
         check_integral,
@@ -84,26 +83,22 @@ def named_checks(
         model: changes to its model settings, e.g. ``{"neurons": 2, "density": {"form": "gaussian"}}``.
     """
     subject = TaskUnderTest(task, preset=preset, model=model)
+    return {name: partial(_run_check, subject, name) for name in CHECKS}
 
-    def bind(name: str, check: Callable[[TaskUnderTest], None]) -> Callable[[], None]:
-        def run() -> None:
-            with suppress(Exception):  # a task whose files are broken fails only the checks that need them
-                _ = subject.settings, subject.options  # read once for all checks
-            try:
-                check(subject.named(name))
-            except ConformanceError:
-                raise
-            except FormError as error:  # it names field, method and tensor
-                raise ConformanceError(f"task {task.name!r}: {name}: {error}") from error
-            except (Exception, SystemExit) as error:  # whatever a task's code does, the message must name the task
-                text = " ".join(str(error).split())
-                stopped = f"stopped by {type(error).__name__}: {text}{_task_line(error)}"
-                raise ConformanceError(f"task {task.name!r}: {name}: {stopped}") from error
 
-        run.__doc__ = check.__doc__
-        return run
-
-    return {name: bind(name, check) for name, check in CHECKS.items()}
+def _run_check(subject: TaskUnderTest, name: str) -> None:
+    with suppress(Exception):  # a task whose files are broken fails only the checks that need them
+        _ = subject.settings, subject.options  # read once for all checks
+    where = f"task {subject.task.name!r}: {name}"
+    try:
+        CHECKS[name](subject.named(name))
+    except ConformanceError:
+        raise
+    except FormError as error:  # it names field, method and tensor
+        raise ConformanceError(f"{where}: {error}") from error
+    except (Exception, SystemExit) as error:  # whatever a task's code does, the message must name the task
+        text = f"stopped by {type(error).__name__}: {' '.join(str(error).split())}{_find_task_line(error)}"
+        raise ConformanceError(f"{where}: {text}") from error
 
 
 def check_task(task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] | None = None) -> None:
@@ -130,7 +125,7 @@ def checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] |
     return pytest.mark.parametrize("check", [pytest.param(run, id=name) for name, run in found.items()])
 
 
-def _task_line(error: BaseException) -> str:
+def _find_task_line(error: BaseException) -> str:
     """Return e.g. ``" in Waves.on_split (fields.py, line 12)"``, the innermost line of the task's own code, or ""."""
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         module = str(frame.f_globals.get("__name__", ""))

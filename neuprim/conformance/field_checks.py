@@ -1,4 +1,4 @@
-"""Check fields: lowered forms, integrals, gradients, and what changes a population."""
+"""Check fields: integrals, gradients, and what changes a population."""
 
 from __future__ import annotations
 
@@ -32,37 +32,15 @@ def _double_view(view: View) -> View:
     return replace(view, camera=replace(view.camera, viewmat=view.camera.viewmat.double()), conditions=conditions)
 
 
-def check_forms(t: TaskUnderTest) -> None:
-    """Lowered tensors have the shapes of their form, the data set's channels, the parameters' dtype, finite numbers."""
-    for dtype in (torch.float32, torch.float64):
-        model = t.perturbed_model(dtype)
-        t.require(
-            model.colour.channels == t.dataset.channels, "colour.channels", model.colour.channels, t.dataset.channels
-        )
-        for view in t.views[:3]:
-            lowered = model.lower(view.camera, view.conditions)  # which refuses wrong shapes by name
-            for where, form in (("density.lower", lowered.density), ("colour.lower", lowered.colour)):
-                for name, value in vars(form).items():
-                    if isinstance(value, Tensor):
-                        expected = f"{dtype}, as the parameters"
-                        t.require(value.dtype == dtype, f"{where}: {name}", value.dtype, expected)
-                        t.require_finite(f"{where}: {name}", value)
-
-
 # ---------------------------------------------------------------- activity and integrals
 
 
-def _rows(active: ActiveSet) -> Tensor:
-    """Return the (M,) rows of the model that are active."""
+def _active_rows(active: ActiveSet) -> Tensor:
     return torch.arange(active.geometry.count) if active.rows is None else active.rows
 
 
 def _integrate(active: ActiveSet, prim: Tensor, ray: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """Integrate the field's ``density`` along chords by Gauss-Legendre quadrature on eight panels.
-
-    Returns:
-        the integrals and the greatest |sigma|, both (M,) float64.
-    """
+    """Integrate along chords by Gauss-Legendre quadrature on eight panels; also return the greatest |sigma|."""
     o, d, t0, t1 = ray
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(16))
     nodes = ((x[None] + 1) / 2 + torch.arange(8)[:, None]).reshape(-1) / 8
@@ -74,24 +52,24 @@ def _integrate(active: ActiveSet, prim: Tensor, ray: tuple[Tensor, ...]) -> tupl
 
 def points_inside(geometry: Geometry, rows: Tensor, generator: torch.Generator, reach: float = 0.95) -> Tensor:
     """Draw (M, 3) float64 points, one uniform in ``reach`` of the ellipsoid of each of ``rows`` (M,)."""
-    direction = torch.nn.functional.normalize(
-        torch.randn(len(rows), 3, generator=generator, dtype=torch.float64), dim=-1
-    )
+    direction = _random_directions(len(rows), generator)
     radius = reach * torch.rand(len(rows), 1, generator=generator, dtype=torch.float64) ** (1 / 3)
     local = geometry.scales.double()[rows] * direction * radius
     return geometry.means.double()[rows] + (geometry.rotations.double()[rows] @ local[:, :, None])[..., 0]
 
 
-def random_chords(
-    geometry: Geometry, rows: Tensor, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _random_directions(count: int, generator: torch.Generator) -> Tensor:
+    return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
+
+
+def random_chords(geometry: Geometry, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
     """Draw a ray from outside through the ellipsoid of each of ``rows`` (M,).
 
     Returns:
         origins, directions, and both ends of the chord along the ray, float64.
     """
     point = points_inside(geometry, rows, generator)
-    d = torch.nn.functional.normalize(torch.randn(len(rows), 3, generator=generator, dtype=torch.float64), dim=-1)
+    d = _random_directions(len(rows), generator)
     whiten = geometry.rotations.double()[rows].transpose(1, 2) / geometry.scales.double()[rows][:, :, None]
     y, v = ((whiten @ x[:, :, None])[..., 0] for x in (point - geometry.means.double()[rows], d))
     a, b = (v * v).sum(-1), (y * v).sum(-1)
@@ -106,7 +84,7 @@ def check_activity(t: TaskUnderTest) -> None:
     generator = torch.Generator().manual_seed(3)
     params = model.of(model.density)
     for view in map(_double_view, t.views):
-        rows = model.density.active_rows(params, view.conditions)
+        rows = model.density.active_active_rows(params, view.conditions)
         if rows is None:
             continue
         fine = rows.dtype == torch.int64 and bool((rows[1:] > rows[:-1]).all())
@@ -146,7 +124,7 @@ def check_integral(t: TaskUnderTest) -> None:
             ):
                 error = (found - wanted).abs() / ((t1 - t0) * peak + 1e-30)
                 i = int(error.argmax())
-                row = int(_rows(active)[prim[i]])
+                row = int(_active_rows(active)[prim[i]])
                 place = f"density.lower: integral of a {where}, primitive {row}, view {view.name}"
                 t.require(bool((error <= 1e-5).all()), place, f"{float(found[i]):.6g}", f"{float(wanted[i]):.6g}")
     t.require(count > 0, "density.active_rows", "no primitive in any view", "some")
@@ -249,9 +227,8 @@ def check_scaling(t: TaskUnderTest) -> None:
     scaled = model.density.scale_density(own, factor)
     _require_same_layout(t, "density.scale_density", scaled, before)
     for name, value in own.items():
-        t.require(
-            torch.equal(value, before[name]), f"density.scale_density: {name}", "changed in place", "a new tensor"
-        )
+        same = torch.equal(value, before[name])
+        t.require(same, f"density.scale_density: {name}", "changed in place", "a new tensor")
     half = model.density.scale_density(own, torch.full((model.count,), 0.5, dtype=torch.float64))
     twice = {name: torch.cat([value, value]) for name, value in {**model.params, **half}.items()}
     copies = Primitives(model.density, model.colour, twice)
@@ -259,15 +236,17 @@ def check_scaling(t: TaskUnderTest) -> None:
         for i, view in enumerate(map(_double_view, t.views)):
             active = model.active(view.conditions)
             local = torch.arange(active.geometry.count).repeat(4)
-            rows, x = _rows(active)[local], points_inside(active.geometry, local, torch.Generator().manual_seed(i))
+            rows, x = (
+                _active_rows(active)[local],
+                points_inside(active.geometry, local, torch.Generator().manual_seed(i)),
+            )
             one, other = (model.density.density(p, model.geometry, rows, x, view.conditions) for p in (own, scaled))
             _require_close(t, "density.scale_density: density", other, one * factor[rows], rows)
             a, b = (render(m, view.camera, view.conditions, EXACT).rgb for m in (model, copies))
             change = float((a - b).abs().max())
             ok = change <= 2e-4 * max(1.0, float(a.abs().max()))  # two clamps at 0.9999 let less through than one
-            t.require(
-                ok, f"density.scale_density by a half, twice over: view {view.name}", f"a change of {change:.3g}", 0
-            )
+            where = f"density.scale_density by a half, twice over: view {view.name}"
+            t.require(ok, where, f"a change of {change:.3g}", 0)
 
 
 def check_split(t: TaskUnderTest) -> None:
@@ -287,9 +266,8 @@ def check_split(t: TaskUnderTest) -> None:
     divided = model.density.divide(parents, old)
     if divided is not None:
         mask, halves, place = divided
-        t.require(
-            mask.dtype == torch.bool and mask.shape == (model.count,), "density.divide: mask", mask.dtype, "bool (N,)"
-        )
+        fine = mask.dtype == torch.bool and mask.shape == (model.count,)
+        t.require(fine, "density.divide: mask", mask.dtype, "bool (N,)")
         t.require(place.count == 2 * model.count, "density.divide: geometry", f"{place.count} rows", 2 * model.count)
         _require_same_layout(t, "density.divide", halves, {k: torch.cat([v, v]) for k, v in parents.items()})
     if not model.density.exact_split:
@@ -297,7 +275,7 @@ def check_split(t: TaskUnderTest) -> None:
         return
     generator = torch.Generator().manual_seed(6)
     for view in map(_double_view, t.views):
-        rows = _rows(model.active(view.conditions)).repeat(4)
+        rows = _active_rows(model.active(view.conditions)).repeat(4)
         for child, new in children:
             x = points_inside(model.density.move(child, new, view.conditions), rows, generator)
             found = model.density.density(child, new, rows, x, view.conditions)
@@ -306,11 +284,7 @@ def check_split(t: TaskUnderTest) -> None:
 
 
 def _compare_masses(t: TaskUnderTest, model: Primitives, children: list[tuple[dict[str, Tensor], Geometry]]) -> None:
-    """Compare integrals of |sigma| over the ellipsoids of parents and children, on the same points in each.
-
-    A density that varies within a primitive continues in the children, whose supports contain other parts of it. So
-    one pair may be off, but all of them on average may not.
-    """
+    """Compare integrals of |sigma| over parents and children: where sigma varies, one pair may be off, the mean not."""
     view = _double_view(t.views[0])
     ball = 2 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(8), dtype=torch.float64) - 1
     ball = ball[ball.norm(dim=-1) < 1]

@@ -63,9 +63,8 @@ def check_description(t: TaskUnderTest) -> None:
         settings = preset_settings(t.task, preset, choice.scene, level)
         for group, given in (("rates", settings.train.rates), ("rate_units", settings.train.rate_units)):
             for name in given:
-                t.require(
-                    name in known, f"{where}: train.{group}.{name}", "no such parameter", ", ".join(sorted(known))
-                )
+                expected = ", ".join(sorted(known))
+                t.require(name in known, f"{where}: train.{group}.{name}", "no such parameter", expected)
         _require_accepted(t, where, asdict(settings.model), choice.options)
     for scene in t.task.scenes:
         preset_settings(t.task, choice.preset, scene.name)
@@ -87,7 +86,7 @@ def check_description(t: TaskUnderTest) -> None:
             t.require("no_such_setting" in str(error), where, repr(str(error)), "a message that names the setting")
         else:
             t.require(
-                False, where, "it was accepted", "ConfigError (neuprim.core.validation.validate_choices raises it)"
+                False, where, "it was accepted", "ConfigError, as neuprim.core.validation.validate_choices raises"
             )
 
 
@@ -117,9 +116,7 @@ def check_fields(t: TaskUnderTest) -> None:
             type(field)(**{**settings, "no_such_setting": 1})
         except (TypeError, ValueError):
             continue
-        t.require(
-            False, f"{name}(no_such_setting=1)", "it was accepted", "TypeError, so that damaged files are noticed"
-        )
+        t.require(False, f"{name}(no_such_setting=1)", "it was accepted", "TypeError, so that damage is noticed")
 
 
 def check_parameters(t: TaskUnderTest) -> None:
@@ -155,9 +152,7 @@ def check_evaluation(t: TaskUnderTest) -> None:
     image = data.test.pixels(0).over(data.background)
     shown, rows = channels.display(image.clone()), [channels.display(row[None]) for row in image.clone()]
     off = float((shown - torch.cat(rows)).abs().max())
-    t.require(
-        off < 1e-4, "display of an image", f"{off:.3g} off its rows one by one", "the same for each pixel by itself"
-    )
+    t.require(off < 1e-4, "display of an image", f"{off:.3g} off its rows one by one", "each pixel by itself")
     before = {name: value.clone() for name, value in model.params.items()}
     try:
         call_task_clips(task, data)
@@ -329,9 +324,8 @@ def check_save_load(t: TaskUnderTest) -> None:
             image = t.draw("saved", model, view)
             for where, other, tolerance in (("loading", loaded, 0.0), ("folding", canonical, 1e-4)):
                 change = float((t.draw(where, other, view) - image).abs().max())
-                t.require(
-                    change <= tolerance, f"view {view.name} after {where}", f"a change of {change:.3g}", tolerance
-                )
+                found = f"a change of {change:.3g}"
+                t.require(change <= tolerance, f"view {view.name} after {where}", found, tolerance)
         stored = [canonical.params]
         for _ in range(2):
             again = Primitives(model.density, model.colour, stored[-1])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from neuprim.cli import main
-from neuprim.cli.bench_command import parse_table_numbers
+from neuprim.cli.measure_commands import parse_table_numbers
 from neuprim.config import presets
 from neuprim.core.errors import ConfigError
 from neuprim.plugins.registry import load_task

@@ -11,7 +11,7 @@ import torch
 
 import neuprim
 from neuprim.cli import main
-from neuprim.cli.export_command import print_report
+from neuprim.cli.model_commands import print_export_report
 from neuprim.config import Job, RunConfig
 from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import NonFiniteError
@@ -266,11 +266,11 @@ def test_a_target_prints_what_came_of_it(
 def test_export_reports_numbers_in_lines_or_columns(
     errors: dict[str, float], rows: list[list[str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    print_report(ExportReport((Path("a.vdb"),), False, errors, ("a note",)), False)
+    print_export_report(ExportReport((Path("a.vdb"),), False, errors, ("a note",)), False)
     lines = capsys.readouterr().out.splitlines()
     assert (lines[:2], lines[-1]) == (["a.vdb", "lossy"], "note: a note")
     assert [line.split() for line in lines[2:-1]] == rows
-    print_report(ExportReport((Path("a.vdb"),), False, {"psnr": float("inf")}), True)
+    print_export_report(ExportReport((Path("a.vdb"),), False, {"psnr": float("inf")}), True)
     assert json.loads(capsys.readouterr().out)["errors"] == {"psnr": None}
 
 

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 import neuprim.core.render as rendering
-from neuprim.cli import doctor_command as doctor
+from neuprim.cli import install_commands as doctor
 from neuprim.core.compute import device
 from neuprim.core.render import backends
 from neuprim.core.render.backends import Backend
@@ -15,12 +15,12 @@ from neuprim.core.render.backends import Backend
 
 def report() -> tuple[int, str]:
     console = Console(file=io.StringIO(), width=200)
-    status = doctor.print_report(console)
+    status = doctor.print_doctor_report(console)
     return status, console.file.getvalue()  # type: ignore[attr-defined]
 
 
 def test_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_probe", lambda name: None if name == "reference" else "no such luck")
+    monkeypatch.setattr(doctor, "_probe_backend", lambda name: None if name == "reference" else "no such luck")
     status, text = report()
     assert status == 0
     for word in (
@@ -40,7 +40,7 @@ def test_report(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_status_1_when_nothing_works(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_probe", lambda name: "broken")
+    monkeypatch.setattr(doctor, "_probe_backend", lambda name: "broken")
     status, text = report()
     assert status == 1
     assert "no renderer backend works" in text
@@ -64,7 +64,7 @@ def test_what_is_missing_or_too_old_says_how_to_install(monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("backend", [backend.name for backend in backends.available_backends()])
 def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert doctor._probe(backend) is None
+    assert doctor._probe_backend(backend) is None
     genuine = rendering.render_lowered
 
     def dimmer(*args: Any) -> Any:
@@ -72,12 +72,12 @@ def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypa
         return replace(output, rgb=0.999 * output.rgb)
 
     monkeypatch.setattr(rendering, "render_lowered", dimmer)
-    reason = doctor._probe(backend)
+    reason = doctor._probe_backend(backend)
     assert reason is not None and reason.startswith("drew 0.86")
 
 
 def test_it_says_whether_runs_use_a_card_and_why_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_probe", lambda name: None)
+    monkeypatch.setattr(doctor, "_probe_backend", lambda name: None)
     monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
     assert (
         dict(doctor._list_devices())["used by runs"] == "no: torch finds no CUDA device"

@@ -15,7 +15,7 @@ import torch
 
 from neuprim.cli import COMMANDS
 from neuprim.cli.command import split_render_overrides
-from neuprim.cli.tradeoff_command import is_override
+from neuprim.cli.measure_commands import is_override
 from neuprim.config import compose, compose_all
 from neuprim.config.command_settings import take_launcher, take_target, take_viewer
 from neuprim.config.overrides import drop_place

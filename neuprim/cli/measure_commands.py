@@ -1,0 +1,397 @@
+"""``neuprim eval``, ``bench`` and ``tradeoff``: measure runs."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuprim.cli.command import (
+    RENDER_OVERRIDES_HELP,
+    Command,
+    add_trust_flag,
+    check_run_directory,
+    parse_count,
+    plain_console,
+    take_overrides,
+    take_render_overrides,
+)
+from neuprim.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from neuprim.runs.paper import Planned as PlannedRun
+    from neuprim.runs.paper import Table as PaperTable
+    from neuprim.search.points import Point, Record
+
+
+# ---------------------------------------------------------------- eval
+
+
+def _add_eval_arguments(parser: argparse.ArgumentParser) -> None:
+    text = "measure LPIPS with these weights of your own, a file or a folder"
+    parser.add_argument("--lpips", type=Path, metavar="FILE", help=text)
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from neuprim.core.metrics.image import format_metrics
+    from neuprim.runs.measure import evaluate_run
+
+    metrics = evaluate_run(arguments.run_dir, arguments.lpips, arguments.words)
+    rows = _flatten_metrics(metrics)
+    width = max((len(name) for name, _ in rows), default=0)
+    for name, value in rows:
+        print(f"{name:{width}}  {value}")
+    if "worse_than_black_image" in metrics:
+        print(format_metrics(metrics))
+    return 0
+
+
+def _flatten_metrics(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for key, value in metrics.items():
+        name = f"{where}{key}"
+        if isinstance(value, Mapping):
+            rows += _flatten_metrics(value, f"{name}.")
+        elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
+            rows.append((name, f"{len(value)} entries, in the run's metrics.json"))
+        else:
+            rows.append((name, f"{value:.4f}" if isinstance(value, float) else str(value)))
+    return rows
+
+
+EVAL_COMMAND = Command(
+    "eval",
+    "measure a run on its test views",
+    _evaluate,
+    _add_eval_arguments,
+    RENDER_OVERRIDES_HELP,
+    take_render_overrides,
+    opens_run=True,
+)
+
+
+# ---------------------------------------------------------------- bench paper
+
+
+_PAPER_RULES = """\
+PSNR of floats; SSIM and LPIPS by the rule of 3DGS's tools (ssim_3dgs, lpips_3dgs; metrics.lpips=FILE has your weights
+of VGG)"""
+
+_PAPER_MEASURES = ("PSNR", "SSIM", "LPIPS")
+
+
+def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("what", choices=["paper"], help="which tables")
+    settings = "settings over the protocol's, e.g. scene.downsample=4"
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help=settings)
+    numbers = "numbers of the paper's tables, e.g. 3-5 or 6,7 (default: 3-7)"
+    parser.add_argument("--tables", default="3-7", metavar="N", help=numbers)
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a folder per scene; without it the tables are listed")
+    scenes = "some of them, e.g. chair,lego; chair=FOLDER where the folder has another name"
+    parser.add_argument("--scenes", metavar="NAME", help=scenes)
+    parser.add_argument("--rows", metavar="NAME", help="some of the rows: 200, 5k, nolimit, real")
+    budget = "training time of a run, e.g. 10m; full: 100,000 steps (default)"
+    parser.add_argument("--budget", default="full", metavar="TIME", help=budget)
+    seeds = "runs of each, with seeds from 0 (default: 1)"
+    parser.add_argument("--seeds", type=parse_count, default=1, metavar="N", help=seeds)
+    out = "gets a run directory each"
+    parser.add_argument("--out", type=Path, default=Path("outputs/paper"), metavar="DIR", help=out)
+    parser.add_argument("--estimate", action="store_true", help="only say what would run, and for how long")
+
+
+def _bench(args: argparse.Namespace) -> int:
+    """List the tables, or run what stands for their rows."""
+    from neuprim.cli.run_commands import run_one
+    from neuprim.config.overrides import CommandLine
+    from neuprim.runs.open import read_metrics
+    from neuprim.runs.paper import plan, tables
+
+    wanted = parse_table_numbers(args.tables)
+    chosen = [table for table in tables() if wanted & set(table.numbers)]
+    if args.data is None:
+        print(*_list_paper_tables(chosen), sep="\n")
+        return 0
+    scenes: dict[str, str] = {}
+    for text in args.scenes.split(",") if args.scenes else []:
+        name, _, folder = text.partition("=")
+        scenes[name.strip().lower()] = (folder or name).strip()
+    rows = args.rows.split(",") if args.rows else []
+    planned = plan(args.data, chosen, scenes, rows, args.budget, args.seeds, args.out, args.overrides)
+    print(*_describe_bench_plan(planned), sep="\n", flush=True)
+    if args.estimate:
+        return 0
+    results = []
+    for number, one in enumerate(planned, 1):
+        print(f"[{number}/{len(planned)}] {one.config.output_dir}", flush=True)
+        results.append((one, read_metrics(run_one(one.config, CommandLine(one.config.overrides)))))
+        print(*_describe_paper_result(*results[-1]), sep="\n", flush=True)
+    print(*_describe_paper_averages(results), _PAPER_RULES, sep="\n")
+    return 0
+
+
+def parse_table_numbers(text: str) -> set[int]:
+    """Return the numbers of the tables that ``3-5,7`` names; raises ConfigError for others than 3 to 7."""
+    found: set[int] = set()
+    for part in text.split(","):
+        match = re.fullmatch(r"([3-7])(?:-([3-7]))?", part.strip())
+        numbers = range(int(match[1]), int(match[2] or match[1]) + 1) if match else ()
+        if not numbers:
+            raise ConfigError(f"--tables {text}: expected numbers from 3 to 7, such as 3-5 or 6,7")
+        found |= set(numbers)
+    return found
+
+
+def _list_paper_tables(chosen: Sequence[PaperTable]) -> Iterator[str]:
+    for table in chosen:
+        numbers = ", ".join(map(str, table.numbers))
+        plural = "s" * (len(table.numbers) > 1)
+        yield f"table{plural} {numbers}: {table.title} (task=static scene={table.loader})"
+        for row in table.rows:
+            yield f"  {row.name}: preset={row.preset}{f'; beside {row.beside[0]}' if row.beside[0] else ''}"
+            for scene, found in row.figures.items():
+                line = "  ".join(
+                    f"{kind} {_format_measure(getattr(found, kind.lower()), kind):>7}" for kind in _PAPER_MEASURES
+                )
+                yield f"    {scene:10} {line}{f'  {found.primitives:,} primitives' if found.primitives else ''}"
+    yield "neuprim bench paper --data DIR runs those whose data are folders of DIR; --estimate says first for how long"
+
+
+def _describe_bench_plan(planned: Sequence[PlannedRun]) -> Iterator[str]:
+    """What would run, and for how long: seconds of a budget, else steps at the pace of a row's first scene."""
+    from neuprim.runs.paper import pace
+
+    total, paces, longer = 0.0, dict[tuple[str, str], float](), ""
+    for one in planned:
+        train, key = one.config.train, (one.table.title, one.row.name)
+        if train.max_seconds is not None:
+            total += train.max_seconds
+            continue
+        assert train.iterations is not None, "a run without seconds has steps"
+        if key not in paces:
+            paces[key] = pace(one)
+            start = f"{1e3 * paces[key]:.0f} ms a step at the start"
+            yield f"{one.row.name}, {one.scene}: {start}, {train.iterations:,} steps"
+        total += paces[key] * train.iterations
+        if train.population.strategy == "gradient":
+            longer = "; longer where the population grows"
+    yield f"{len(planned)} runs, about {_format_seconds(total)} of training on this machine{longer}, and measuring"
+
+
+def _describe_paper_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Iterator[str]:
+    from neuprim.runs.paper import compared
+
+    steps, seconds = metrics["iterations"], _format_seconds(metrics["train_seconds"])
+    yield (
+        f"{one.scene}, {one.row.name}: preset={one.row.preset}, seed {one.config.seed}, "
+        f"{metrics['checkpoint']} checkpoint after {steps:,} steps in {seconds}"
+    )
+    protocol = ("scene=", "scene.path=", "preset=", "seed=", "output_dir=", "task=")
+    own = " ".join(text for text in one.config.overrides if not text.startswith(protocol))
+    width, height = metrics["image_size"]
+    yield f"  images of {width}x{height}, down-sampling {metrics['downsampling']}{f', {own}' if own else ''}"
+    for kind, ours, theirs, other in compared(one, metrics):
+        beside = (
+            f"   {one.row.beside[0]} {_format_measure(other, kind)}"
+            if one.row.beside[0] and kind in _PAPER_MEASURES
+            else ""
+        )
+        yield f"  {kind:10} {_format_measure(ours, kind):>9}   paper {_format_measure(theirs, kind)}{beside}"
+
+
+def _describe_paper_averages(results: Sequence[tuple[PlannedRun, Mapping[str, Any]]]) -> Iterator[str]:
+    """Per row, over scenes and seeds that have both numbers."""
+    from neuprim.runs.paper import compared
+
+    rows: dict[tuple[str, str], list[tuple[PlannedRun, Mapping[str, Any]]]] = {}
+    for one, metrics in results:
+        rows.setdefault((one.table.title, one.row.name), []).append((one, metrics))
+    for (title, name), own in rows.items():
+        scenes, seeds = len({one.scene for one, _ in own}), len({one.config.seed for one, _ in own})
+        count = f"{scenes} scenes, {seeds} seed{'s' * (seeds > 1)}"
+        yield f"{title}, {name}: means over {count}; ours of the last checkpoint, the paper's of the best"
+        pairs = [pair for one, metrics in own for pair in compared(one, metrics)]
+        for kind in _PAPER_MEASURES:
+            both = [(a, b) for what, a, b, _ in pairs if what == kind and a is not None and b is not None]
+            if both:
+                ours, theirs = (statistics.mean(column) for column in zip(*both, strict=True))
+                yield f"  {kind:10} {_format_measure(ours, kind):>9}   paper {_format_measure(theirs, kind)}"
+
+
+def _format_measure(value: float | None, kind: str) -> str:
+    if value is None:
+        return "–"
+    return f"{value:,.0f}" if kind == "primitives" else f"{value:.{2 if kind == 'PSNR' else 4}f}"
+
+
+def _format_seconds(seconds: float) -> str:
+    for unit, length in (("h", 3600), ("min", 60)):
+        if seconds >= length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+BENCH_COMMAND = Command(
+    "bench",
+    "the paper's tables, and runs of their protocol on data that you have",
+    _bench,
+    _add_bench_arguments,
+    take_rest=take_overrides,
+)
+
+
+# ---------------------------------------------------------------- tradeoff
+
+
+_TRADEOFF_USAGE = """\
+neuprim tradeoff RUN_DIR | KEY=VALUE ... [KEY=VALUE ...] [--views N] [--repeats N] [--knobs NAME ...] [--budget TIME]
+                       [--seeds N] [--lpips FILE]"""
+_TRADEOFF_FORMS = """\
+neuprim tradeoff RUN_DIR measures the settings of rendering on a finished run.
+neuprim tradeoff task=NAME scene=NAME budget=20m [KEY=VALUE ...] [output_dir=DIR]
+  trains a designed set of models around the one of these overrides of `neuprim run`, and measures them together.
+
+After RUN_DIR, """
+
+_TRADEOFF_FILES = ("tradeoff.json", "tradeoff.csv", "tradeoff.html", "front.png")
+
+
+def is_override(first: str) -> bool:
+    """Return whether the first argument is an override of ``neuprim run`` and not a run directory."""
+    return "=" in first and not Path(first).exists()
+
+
+def _add_tradeoff_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.usage = _TRADEOFF_USAGE
+    add_trust_flag(parser)
+    parser.add_argument("run_dir", metavar="RUN_DIR|KEY=VALUE", help="a finished run, or overrides of `neuprim run`")
+    views = "test views, evenly spread (default: 5)"
+    parser.add_argument("--views", type=parse_count, default=5, metavar="N", help=views)
+    parser.add_argument("--repeats", type=parse_count, default=15, metavar="N", help="rounds of timing (default: 15)")
+    knobs = "some of them, e.g. alpha_min sort (default: all)"
+    parser.add_argument("--knobs", nargs="+", default=[], metavar="NAME", help=knobs)
+    budget = "about how long, e.g. 90s or 10m; what does not fit is left out (default: 5m, 20m of trainings)"
+    parser.add_argument("--budget", metavar="TIME", help=budget)
+    parser.add_argument("--seeds", type=parse_count, metavar="N", help="trainings of every model (default: 1)")
+    lpips = "measure LPIPS with these weights of your own, a file or a folder"
+    parser.add_argument("--lpips", type=Path, metavar="FILE", help=lpips)
+
+
+def _take_tradeoff_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
+    if is_override(arguments.run_dir):
+        arguments.words = [word for word in rest if not word.startswith("-")]
+        return [word for word in rest if word.startswith("-") and word != "--"]
+    return take_render_overrides(arguments, rest, parser)
+
+
+def _tradeoff(args: argparse.Namespace) -> int:
+    args.words += [word for word in args.knobs if "=" in word]  # overrides after --knobs look like names
+    args.knobs = [word for word in args.knobs if "=" not in word]
+    return _train_tradeoff(args) if is_override(args.run_dir) else _render_tradeoff(args)
+
+
+def _render_tradeoff(args: argparse.Namespace) -> int:
+    from neuprim.cli.progress import DrawProgress
+    from neuprim.config.command_settings import parse_duration
+    from neuprim.search.points import TRADEOFF_FOLDER
+    from neuprim.search.render_tradeoff import TradeoffRequest, format_render_command, measure_tradeoff
+
+    run_dir, views, repeats = Path(args.run_dir), args.views, args.repeats
+    check_run_directory(run_dir)
+    if args.seeds is not None:
+        raise ConfigError("--seeds: of models that are trained (neuprim tradeoff task=NAME ...); a run has one")
+    budget = parse_duration(args.budget or "5m", f"--budget {args.budget}")
+    request = TradeoffRequest(run_dir, views, repeats, args.knobs, budget, args.words, args.lpips)
+    folder = run_dir / TRADEOFF_FOLDER
+    try:
+        with DrawProgress() as progress:
+            record = measure_tradeoff(request, progress.note, progress.show)
+    except KeyboardInterrupt:
+        if not (folder / "tradeoff.json").exists():
+            raise
+        kept = f"; {folder / 'tradeoff.json'} has the points up to here; the same command goes on"
+        raise KeyboardInterrupt(kept) from None
+    commands = [format_render_command(str(run_dir), point.words) for point in record.points]
+    _print_fronts(folder, record, commands)
+    return 0
+
+
+def _train_tradeoff(args: argparse.Namespace) -> int:
+    from neuprim.cli.progress import DrawProgress
+    from neuprim.config.command_settings import parse_duration, take_launcher
+    from neuprim.config.overrides import parse
+    from neuprim.search.ablation import AblationRequest, format_run_command, run_ablation
+
+    launcher, words = take_launcher([args.run_dir, *args.words])
+    said = [str(a.value) for a in parse(words) if a.key == "budget"]
+    if said and args.budget is not None:
+        raise ConfigError(f"budget={said[-1]} and --budget {args.budget}: expected one of them")
+    asked = f"budget={said[-1]}" if said else f"--budget {args.budget}"
+    budget = parse_duration(said[-1] if said else args.budget or "20m", asked)
+    seeds = args.seeds or 1
+    request = AblationRequest(words, budget, args.views, args.repeats, args.knobs, seeds, args.lpips, launcher)
+    try:
+        with DrawProgress() as progress:
+            folder, record = run_ablation(request, progress.note, progress.show)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("; what is trained is kept, and the same command goes on") from None
+    _print_fronts(folder, record, [format_run_command(point.words) for point in record.points])
+    return 0
+
+
+def _print_fronts(folder: Path, record: Record, commands: Sequence[str]) -> None:
+    console = plain_console()
+    if "length" in record.facts:
+        console.print(record.facts["length"])
+    for title, numbers in (("front of speed", record.speed), ("front of size", record.size)):
+        console.print(_build_front_table(title, record, numbers))
+        for place, number in enumerate(numbers, 1):
+            console.print(f"{commands[number]}  # {place}")
+        console.print()
+    if record.points[0].run_dir:
+        for one in record.left_out:
+            console.print(f"left out: {' '.join(one.words) or one.knob}: {one.reason}")
+    for name in _TRADEOFF_FILES:
+        console.print(folder / name)
+
+
+def _build_front_table(title: str, record: Record, numbers: Sequence[int]) -> Table:
+    """Build the table of the reference and a front; the numbers are those of the commands."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    trained = bool(record.points[0].run_dir)
+    table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
+    names = ["#", "time", "ms", "frames/s", "PSNR", "SSIM", "exact", "bytes", *(["ms/step"] if trained else [])]
+    for name in names:
+        table.add_column(name, justify="right", no_wrap=True)
+    first = "centre" if trained else "ref."
+    for place, number in ((first, 0), *((str(k), number) for k, number in enumerate(numbers, 1))):
+        table.add_row(*(Text(cell) for cell in (place, *_format_point(record.points[number]))))
+    return table
+
+
+def _format_point(point: Point) -> tuple[str, ...]:
+    q = point.quality
+    about = "" if point.spread is None else f" ± {point.spread:.3f}"
+    seeds = "" if point.seed_spread is None else f" ± {point.seed_spread:.2f}"
+    times = ("–", "–", "–")
+    if point.ms:
+        times = (f"{point.ratio:.3f}{about}", f"{point.time:.2f}", f"{1e3 / point.time:.1f}")
+    quality = (f"{q['psnr']:.2f}{seeds}", f"{q['ssim']:.4f}", f"{q['psnr_exact']:.1f}")
+    return (*times, *quality, f"{point.bytes:,}", *([f"{point.ms_per_step:.1f}"] if point.run_dir else []))
+
+
+TRADEOFF_COMMAND = Command(
+    "tradeoff",
+    "measure what speed and size cost in accuracy: how a run is drawn, or what is trained",
+    _tradeoff,
+    _add_tradeoff_arguments,
+    _TRADEOFF_FORMS + RENDER_OVERRIDES_HELP,
+    _take_tradeoff_words,
+)

@@ -1,0 +1,292 @@
+"""``neuprim export``, ``import``, ``compress`` and ``prune``: write a run's model in another form."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuprim.cli.command import (
+    Command,
+    parse_count,
+    parse_decibels,
+    parse_seconds,
+    parse_whole,
+    print_columns,
+    refuse_argument,
+)
+
+if TYPE_CHECKING:
+    from neuprim.core.extensions import ExportReport
+    from neuprim.search.compress import Compression
+    from neuprim.search.pruning import Pruning
+
+
+# ---------------------------------------------------------------- export and import
+
+
+_EXPORT_USAGE = (
+    "neuprim export RUN_DIR --format NAME [KEY=VALUE ...] [--CONDITION TEXT ...] [--out PATH] [--force] [--json]"
+)
+_HELP_WIDTH = 100
+
+
+def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.usage = _EXPORT_USAGE
+    formats = "which format; all of them, those of plugins too, are listed below"
+    parser.add_argument("--format", required=True, metavar="NAME", help=formats)
+    parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR/export)")
+    parser.add_argument("--force", action="store_true", help="replace files that exist")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _take_export_options(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
+    """Keep options and conditions for the exporter; refuse flags that are no condition of the run's task."""
+    arguments.run = arguments.run_dir
+    if any(word.startswith("-") for word in rest):
+        from neuprim.core.conditions import split_words
+        from neuprim.runs.open import load_run
+
+        arguments.run = load_run(arguments.run_dir)
+        task = arguments.run.task
+        _, others = split_words(rest, task.conditions, bare=False)
+        for word in others:
+            if word.startswith("-"):
+                raise refuse_argument(word, parser, task)
+    arguments.options = rest
+    return []
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from neuprim.cli.progress import LineProgress
+    from neuprim.runs.export import export_run
+
+    out, options = arguments.out, arguments.options
+    report = export_run(arguments.run, arguments.format, out, options, arguments.force, LineProgress())
+    print_export_report(report, arguments.json)
+    return 0
+
+
+def _export_help(words: Sequence[str]) -> str:
+    """Without a format only package metadata is read; with one, that exporter is imported."""
+    if not {"-h", "--help"} & set(words):
+        return ""
+    name = None
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        key, equals, value = word.partition("=")
+        if name is None and key == "--format":
+            name = value if equals else following * (not following.startswith("-")) or None
+    return "\n".join(_list_export_formats() if name is None else _describe_export_format(name))
+
+
+def _list_export_formats() -> Iterator[str]:
+    from neuprim.plugins.registry import EXPORTERS
+
+    yield "formats:"
+    for info in EXPORTERS.list_plugins():
+        yield f"  {info.name}  ({info.origin})"
+    yield ""
+    yield "KEY=VALUE is an option of the format: `neuprim export --format NAME --help` lists them with their defaults."
+
+
+def _describe_export_format(name: str) -> Iterator[str]:
+    from neuprim.plugins.registry import EXPORTERS
+
+    info, exporter = EXPORTERS.load_with_info(name)
+    yield f"--format {name}  ({info.origin}): {exporter.summary}"
+    rows = [
+        (f"{option}={_format_option_default(default)}", help_) for option, (default, help_) in exporter.options.items()
+    ]
+    yield f"options of --format {name}, with their defaults:" if rows else f"--format {name} has no options"
+    indent = 4 + max((len(first) for first, _ in rows), default=0)
+    for first, second in rows:
+        yield textwrap.fill(f"  {first:{indent - 4}}  {second}", _HELP_WIDTH, subsequent_indent=" " * indent)
+    if exporter.conditions:
+        yield "conditions of the run's task: --NAME TEXT or NAME=TEXT, as --time 0.5 or light=1,2,3"
+
+
+def _format_option_default(value: Any) -> str:
+    return "" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def print_export_report(report: ExportReport, as_json: bool) -> None:
+    """Print what an export wrote, for people or for programs."""
+    if as_json:
+        errors = {name: value if math.isfinite(value) else None for name, value in report.errors.items()}
+        files, notes = [str(path) for path in report.files], list(report.notes)
+        record = {"files": files, "lossless": report.lossless, "errors": errors, "notes": notes}
+        print(json.dumps(record, indent=1, allow_nan=False))
+        return
+    print(*report.files, sep="\n")
+    print("lossless" if report.lossless else "lossy")
+    _print_export_errors(report.errors)
+    for note in report.notes:
+        print(f"note: {note}")
+
+
+def _print_export_errors(errors: Mapping[str, float]) -> None:
+    """Print a line per number; numbers of several things, as ``frame_0007.relative_l2``, in a line per thing."""
+    rows: dict[str, dict[str, str]] = {}
+    for name, value in errors.items():
+        thing, _, key = name.rpartition(".")
+        rows.setdefault(thing, {})[key] = f"{value:.4f}"
+    if "" in rows or len(rows) < 2:
+        width = max((len(name) for name in errors), default=0)
+        for name, value in errors.items():
+            print(f"{name:{width}}  {value:.4f}")
+    else:
+        columns = list(dict.fromkeys(key for row in rows.values() for key in row))
+        print_columns([("", *columns), *((t, *(row.get(key, "") for key in columns)) for t, row in rows.items())])
+
+
+def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, metavar="FILE")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="new directory")
+
+
+def _import_model(arguments: argparse.Namespace) -> int:
+    from neuprim.runs.export import import_run
+
+    print(import_run(arguments.file, arguments.out))
+    return 0
+
+
+EXPORT_COMMAND = Command(
+    "export",
+    "write a run's model in another format",
+    _export,
+    _add_export_arguments,
+    _export_help,
+    _take_export_options,
+    opens_run=True,
+)
+IMPORT_COMMAND = Command(
+    "import", "make a run directory of an exported .ply or .npz, or of a .neuprim", _import_model, _add_import_arguments
+)
+
+
+# ---------------------------------------------------------------- compress
+
+
+def _add_compress_arguments(parser: argparse.ArgumentParser) -> None:
+    tolerance = "how much worse it may get (default: 0.1dB)"
+    parser.add_argument("--tolerance", type=parse_decibels, metavar="DB", help=tolerance)
+    level = "so many bits instead, whatever that costs: 1 keeps nearly everything, 5 very little"
+    parser.add_argument("--level", type=parse_count, metavar="1-5", help=level)
+    bits = "bits of a parameter, or of all others, over a level's (3 unless given): means=16 sh_rest=6,5 others=8"
+    parser.add_argument("--bits", nargs="+", default=[], metavar="NAME=BITS", help=bits)
+    seconds = "of training for few bits; 0 for none (default: 30)"
+    parser.add_argument("--seconds", type=parse_seconds, default=30.0, metavar="S", help=seconds)
+    steps = "of training instead, for the same file on every machine"
+    parser.add_argument("--steps", type=parse_whole, metavar="N", help=steps)
+    out = "where to write (default: RUN_DIR/model.neuprim)"
+    parser.add_argument("--out", "--output", type=Path, metavar="FILE", help=out)
+    parser.add_argument("--force", action="store_true", help="replace a file that exists")
+
+
+def _compress(args: argparse.Namespace) -> int:
+    from neuprim.cli.progress import LineProgress
+    from neuprim.search.compress import CompressRequest, compress_run
+
+    request = CompressRequest(
+        args.run_dir, args.level, args.bits, args.out, args.force, args.seconds, args.steps, args.tolerance
+    )
+    _print_compression(compress_run(request, LineProgress()))
+    return 0
+
+
+def _print_compression(made: Compression) -> None:
+    """Print file, bytes of every parameter, and what was lost."""
+    print(made.file)
+    sizes = [(p.name, p.bits, p.before, p.after) for p in made.parameters]
+    sizes.append(("all, and the header", "", made.before, made.after))
+    rows = [("", "bits", "bytes before", "after", "times")]
+    for name, bits, before, after in sizes:
+        rows.append((name, bits, f"{before:,}", f"{after:,}", f"{before / after:.2f}" if before and after else "-"))
+    print_columns(rows)
+    for name, (loss_before, loss_after) in made.measured.items():
+        unit, digits = (" dB", 3) if name == "psnr" else ("", 4)
+        change = f"{loss_before:.{digits}f} -> {loss_after:.{digits}f}{unit} ({loss_after - loss_before:+.{digits}f})"
+        print(f"{name:5} {change}, mean of the held-out views")
+    for note in made.notes:
+        print(f"note: {note}")
+    trained = f", with {made.steps:,} steps of training" if made.steps else ""
+    print(f"compressed in {made.seconds:.2f} s{trained}")
+
+
+COMPRESS_COMMAND = Command(
+    "compress",
+    "write a run's model in few bits, as one file that every command reads",
+    _compress,
+    _add_compress_arguments,
+    opens_run=True,
+)
+
+
+# ---------------------------------------------------------------- prune
+
+
+def _add_prune_arguments(parser: argparse.ArgumentParser) -> None:
+    tolerance = "how much worse it may get (default: 0.1dB)"
+    parser.add_argument("--tolerance", type=parse_decibels, default=0.1, metavar="DB", help=tolerance)
+    seconds = "of fine-tuning; 0 for none (default: 60)"
+    parser.add_argument("--seconds", type=parse_seconds, default=60.0, metavar="S", help=seconds)
+    steps = "of fine-tuning instead, for the same model on every machine"
+    parser.add_argument("--steps", type=parse_whole, metavar="N", help=steps)
+    parser.add_argument("--out", type=Path, metavar="DIR", help="the new run's directory (default: RUN_DIR-pruned)")
+    parser.add_argument("--force", action="store_true", help="replace files that exist")
+
+
+def _prune(args: argparse.Namespace) -> int:
+    from neuprim.cli.progress import DrawProgress
+    from neuprim.search.pruning import PruneRequest, prune_run
+
+    request = PruneRequest(args.run_dir, args.tolerance, args.seconds, args.steps, args.out, args.force)
+    with DrawProgress() as progress:
+        made = prune_run(request, progress.show)
+    _print_pruning(made, args.tolerance)
+    return 0
+
+
+_PRUNING_ROWS = (
+    ("primitives", "primitives", "{:,.0f}"),
+    ("numbers", "numbers", "{:,.0f}"),
+    ("bytes", "bytes", "{:,.0f}"),
+    ("psnr", "PSNR, held-out views", "{:.3f} dB"),
+    ("ssim", "SSIM, held-out views", "{:.4f}"),
+    ("frames_per_second", "frames/s", "{:.1f}"),
+)
+
+
+def _print_pruning(made: Pruning, tolerance: float) -> None:
+    from neuprim.runs.open import describe_kept_shares
+
+    for number, stage in enumerate(made.stages, 1):
+        less = f", {', '.join(stage.words)}" if stage.words else ""
+        what = f"cut {number}: {stage.primitives:,} primitives, {stage.numbers:,} numbers{less}"
+        loss = f"{stage.cut - made.judged[0]:+.3f} dB at once, {stage.trained - made.judged[0]:+.3f} dB after training"
+        print(f"{what}; training views {loss}; {'kept' if stage.kept else 'taken back'}")
+    if made.run_dir is None:
+        print(f"nothing can go within {tolerance:g} dB; nothing was written")
+        return
+    print(made.run_dir)
+    rows = [(name, form.format(made.before[key]), form.format(made.after[key])) for key, name, form in _PRUNING_ROWS]
+    print_columns([("", "before", "after"), *rows])
+    for word in made.words:
+        print(f"all primitives: {word}")
+    for line in describe_kept_shares(made.kept):
+        print(line)
+    print(f"fine-tuned for {made.steps:,} steps, {made.seconds:.0f} s in all")
+
+
+PRUNE_COMMAND = Command(
+    "prune",
+    "remove what a run's scene does not require, and write the rest as a run",
+    _prune,
+    _add_prune_arguments,
+    opens_run=True,
+)

@@ -1,0 +1,419 @@
+"""``neuprim run`` and ``truth``: fit a scene, a sweep of scenes, by several processes, or until a target is reached."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import signal
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from neuprim.cli.command import Command, add_trust_flag, describe_interruption, take_overrides
+from neuprim.core.errors import BackendUnavailable, ConfigError, RankError, one_line
+
+if TYPE_CHECKING:
+    from neuprim.config import RunConfig
+    from neuprim.config.command_settings import LauncherSettings, Target, ViewerSettings
+    from neuprim.config.overrides import CommandLine
+    from neuprim.core.train.distributed.process_group import ProcessGroup
+    from neuprim.core.train.distributed.torchrun import TorchrunRank
+    from neuprim.runs.launch.jobs import JobResult
+    from neuprim.search.target_record import TargetRecord
+
+
+_COMMON_KEYS = """\
+commonest keys:
+  task=NAME scene=NAME preset=NAME     what to fit, and how (`neuprim tasks` lists them)
+  effort=N                             1 (fast) to 9 (good): a size and length that the task has measured
+  scene.path=DIR                       data of a scene that reads files
+  output_dir=DIR resume=true           where to write; continue an interrupted run
+  train.iterations=N train.max_seconds=S
+  model.primitives=N model.neurons=K model.sh_degree=D
+  train.rates.NAME=R                   learning rate of one parameter; train.rate_units.NAME=absolute|extent
+  renderer.backend=auto|NAME           `neuprim doctor` lists them
+  renderer.sort=center|entry           renderer.samples=N (rays per pixel side) renderer.threads=N
+  seed=N
+  viewer=true viewer.port=N            look at the model in the browser while it is trained; pause, step, save, stop
+  target.psnr=DB budget=10m            the smallest model that reaches it, found in that time; also target.ssim=S,
+                                       target.megabytes=M and target.fps=F as limits, or these alone
+  launcher=inline|processes|ray|slurm  where runs work; launcher.workers=N launcher.threads=N launcher.retries=N
+                                       launcher.address=... launcher.options.KEY=VALUE (docs/launching.md)
+  scene.cache=DIR|URL                  volumes: where their ground truth is kept (`neuprim truth` makes it before)
+`neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted
+twice, for the shell and for the grammar: "scene.path='a=b, c'"."""
+
+_EXAMPLES = """\
+examples:
+  neuprim run task=dynamic scene=smoke_fire
+  neuprim run task=dynamic scene=vdb scene.vdb=DIR scene.frames=0:100:2
+  neuprim run task=static scene=solids
+  neuprim run task=static scene=blender scene.path=DIR preset=paper
+  neuprim run -m model.primitives=200,1000 train.max_seconds=60 launcher=processes
+  neuprim run --config RUN_DIR/config.yaml seed=1
+  torchrun --nproc-per-node 2 -m neuprim run task=static scene=solids      (one scene by two processes)"""
+
+
+def _run_help(words: Sequence[str]) -> str:
+    """Return the text below the arguments, with the installed tasks."""
+    if not {"-h", "--help"} & set(words):
+        return ""
+    from neuprim.plugins.registry import TASKS
+
+    tasks = [f"  {TASKS.shortest_name(info)}  ({info.origin})" for info in TASKS.list_plugins()]
+    return "\n\n".join([_COMMON_KEYS, "\n".join(["tasks:", *tasks]), _EXAMPLES])
+
+
+def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings, in Hydra's grammar")
+    sweep = "run every combination of values separated by commas"
+    parser.add_argument("-m", "--multirun", action="store_true", help=sweep)
+    stored = "start with the settings of RUN_DIR/config.yaml; words beside it come first"
+    parser.add_argument("--config", type=Path, metavar="FILE", help=stored)
+    parser.add_argument("--cfg", action="store_true", help="print the resolved configuration and stop")
+    add_trust_flag(parser)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from neuprim.config import compose, compose_all, read_stored_config
+    from neuprim.config.command_settings import LauncherSettings, take_launcher, take_target, take_viewer
+    from neuprim.config.overrides import CommandLine, drop_place
+    from neuprim.core.train.distributed.torchrun import read_torchrun_rank
+    from neuprim.runs.fit import is_chunked, refuse_chunks
+
+    place = read_torchrun_rank()
+    if place is not None:
+        return run_as_rank(place, args.overrides, args.multirun or args.cfg or args.config is not None)
+    typed = CommandLine(args.overrides, args.config)
+    viewer, overrides = take_viewer(args.overrides)
+    launcher, overrides = take_launcher(overrides)
+    wanted, overrides = take_target(overrides)
+    launched = launcher != LauncherSettings()
+    for name, given in (("-m", args.multirun), ("target", wanted is not None), ("launcher", launched)):
+        if viewer is not None and given:
+            raise ConfigError(f"viewer=true: shows one run; expected no {name} beside it")
+    if wanted is not None and args.multirun:
+        raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
+    if args.multirun and not drop_place(overrides):
+        from neuprim.runs.sweep import read_sweep_overrides
+
+        overrides = read_sweep_overrides(overrides)
+        typed = CommandLine([*overrides, *args.overrides], args.config)  # what goes on with it says all of it
+    stored = None if args.config is None else read_stored_config(args.config)
+    check = not args.cfg
+    configs = compose_all(overrides, check, stored) if args.multirun else [compose(overrides, check, stored)]
+    if args.cfg:
+        if wanted is not None:
+            print(f"# {wanted[0]} budget={wanted[1]:g}s; the search starts from")
+        print("---\n".join(config.to_yaml() for config in configs), end="")
+        return 0
+    if wanted is not None:
+        return _fit_target(configs[0], *wanted, launcher, typed)
+    if viewer is not None:
+        refuse_chunks(configs[0], "viewer=true shows one training")
+    if len(configs) > 1 or (launched and not is_chunked(configs[0])):  # the chunks of a scene are launched themselves
+        return launch_runs(configs, overrides, launcher, typed)
+    print(run_one(configs[0], typed, viewer, launcher))
+    return 0
+
+
+def run_one(
+    config: RunConfig,
+    typed: CommandLine,
+    viewer: ViewerSettings | None = None,
+    launcher: LauncherSettings | None = None,
+) -> Path:
+    """Run one configuration in this process and return its directory.
+
+    An interruption says where the run is and the command that continues it.
+
+    Args:
+        launcher: where the chunks of a scene that is fitted in chunks work; None: here.
+    """
+    from neuprim.cli.progress import RunProgress
+    from neuprim.cli.view_commands import run_viewed
+    from neuprim.config.command_settings import LauncherSettings
+    from neuprim.runs.run import run
+
+    try:
+        with RunProgress(f"{config.task}/{config.scene_name}") as events:
+            if viewer is not None:
+                return run_viewed(config, events, viewer)
+            return run(config, events, launcher=launcher or LauncherSettings())
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(describe_interruption(config.output_dir, typed)) from None
+
+
+def _fit_target(
+    config: RunConfig, target: Target, budget: float, launcher: LauncherSettings, typed: CommandLine
+) -> int:
+    """Search for a model that reaches a target; print what was achieved and the run's directory."""
+    from neuprim.cli.progress import RunProgress
+    from neuprim.search.target import run_target
+
+    try:
+        with RunProgress(f"{config.task}/{config.scene_name}", search=True) as events:
+            record = run_target(config, target, budget, events, launcher=launcher)
+    except KeyboardInterrupt:
+        command = typed.resume_command(config.output_dir)
+        raise KeyboardInterrupt(f"; {config.output_dir} has the trials up to here; to go on:\n  {command}") from None
+    for line in _describe_target(record):
+        events.console.print(line)
+    print(record.achieved["run_dir"])
+    return 0
+
+
+def _describe_target(record: TargetRecord) -> list[str]:
+    """What was predicted and achieved, and why the search ended."""
+    from neuprim.search.size_predictor import format_forecast
+    from neuprim.search.target_record import TARGET_FILE
+
+    found = record.achieved
+    lines = [
+        f"predicted {format_forecast(name, value, doubt)}; held out {found['held_out'][name]:.4g}; "
+        f"test views {found['test'][name]:.4g}, {found['test_before_storing'][name]:.4g} before storing"
+        for name, (value, doubt) in found["predicted"].items()
+    ]
+    files = f"{found['file']} {found['packed_bytes']:,} bytes, model.safetensors {found['model_bytes']:,} bytes"
+    lines.append(f"{found['primitives']:,} primitives: {files}")
+    used = f"{found['seconds']:.0f} s of {record.asked['budget']:g} s used"
+    lines.append(f"{used}; {found['fps']:.1f} frames per second")
+    lines += [f"ended: {why}" for why in record.why]
+    if record.warning:
+        lines.append(f"neuprim: warning: {record.warning}")
+    return [*lines, f"everything that was tried: {TARGET_FILE}"]
+
+
+RUN_COMMAND = Command("run", "fit a scene", _run, _add_run_arguments, _run_help, take_overrides)
+
+
+# ---------------------------------------------------------------- sweeps and launchers
+
+
+def launch_runs(
+    configs: Sequence[RunConfig], overrides: list[str], settings: LauncherSettings, typed: CommandLine
+) -> int:
+    """Launch the runs of a sweep, or a single run in another process; return the exit status.
+
+    Args:
+        overrides: what the sweep was asked for.
+        typed: all that was typed, for the command that continues.
+    """
+    from neuprim.cli.progress import RunLaunchProgress
+    from neuprim.runs.ground_truth import render_ground_truth_of_runs
+    from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch
+    from neuprim.runs.launch_record import run_job
+    from neuprim.runs.sweep import run_sweep
+
+    with RunLaunchProgress(configs) as progress:
+        if len(configs) > 1:
+            _, results = run_sweep(configs, overrides, settings, progress)
+        else:
+            render_ground_truth_of_runs(configs, settings, progress)
+            results = launch([run_job(configs[0])], settings, configs[0].output_dir / LAUNCH_FOLDER, progress)
+    status = _report_launched_runs(configs, results, progress.live, typed)
+    if len(configs) > 1:
+        print(configs[0].output_dir.parent / "sweep.html")
+    return status
+
+
+def _report_launched_runs(
+    configs: Sequence[RunConfig], results: Sequence[JobResult | None], live: bool, typed: CommandLine
+) -> int:
+    """Print failures, and raise KeyboardInterrupt with the command that continues; return the exit status: 2 for bad
+    input, 1 for a bug."""
+    status, left = 0, []
+    for config, result in zip(configs, results, strict=True):
+        if result is None or result.state == "interrupted":
+            left.append(config.output_dir)
+        elif result.state == "done":
+            if live:
+                print(config.output_dir)
+        else:
+            if result.trace:
+                print(result.trace, end="", file=sys.stderr)
+            if live:
+                print(f"neuprim: error: {config.output_dir}: {result.line}", file=sys.stderr)
+            status = 1 if result.trace or status == 1 else 2
+    if left and len(configs) == 1:
+        raise KeyboardInterrupt(describe_interruption(left[0], typed))
+    if left:
+        over = f"{left[0].parent} has {len(configs) - len(left)} of {len(configs)} runs"
+        begun = sum((directory / "checkpoint.safetensors").exists() for directory in left)
+        command = typed.resume_command(left[0])
+        raise KeyboardInterrupt(f"; {over}, and {begun} of the others up to here; to go on:\n  {command}")
+    return status
+
+
+# ---------------------------------------------------------------- truth
+
+
+_TRUTH_HELP = """\
+Frames that are there are not made again; a run with the same scene reads them. With a launcher they are made side by
+side:
+  neuprim truth task=dynamic scene=vdb scene.vdb=DIR launcher=processes
+  neuprim truth task=dynamic scene=vdb scene.vdb=DIR scene.cache=DIR launcher=slurm
+Prints where they are."""
+
+
+def _add_truth_arguments(parser: argparse.ArgumentParser) -> None:
+    settings = "settings of the scene and of the launcher, as of neuprim run"
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help=settings)
+    every = "of every combination of values separated by commas"
+    parser.add_argument("-m", "--multirun", action="store_true", help=every)
+
+
+def _truth(args: argparse.Namespace) -> int:
+    from neuprim.cli.progress import RunProgress
+    from neuprim.config import compose, compose_all
+    from neuprim.config.command_settings import take_launcher
+    from neuprim.runs.ground_truth import render_ground_truth
+
+    launcher, rest = take_launcher(args.overrides)
+    try:
+        for config in compose_all(rest) if args.multirun else [compose(rest)]:
+            with RunProgress(f"{config.task}/{config.scene_name}") as events:
+                made = render_ground_truth(config, launcher, events)
+            if made is None:
+                raise ConfigError(
+                    f"scene={config.scene_name}: its images are not rendered frame by frame; expected "
+                    "a scene of volumes, as task=dynamic scene=vdb"
+                )
+            print(made.place, flush=True)
+    except KeyboardInterrupt:
+        command = shlex.join(["neuprim", "truth", *(["-m"] if args.multirun else []), *args.overrides])
+        raise KeyboardInterrupt(f"; frames made so far are kept; to go on:\n  {command}") from None
+    return 0
+
+
+TRUTH_COMMAND = Command(
+    "truth",
+    "render the ground truth of a scene before runs need it",
+    _truth,
+    _add_truth_arguments,
+    _TRUTH_HELP,
+    take_overrides,
+)
+
+
+# ---------------------------------------------------------------- torchrun
+
+
+def run_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
+    """Fit one scene as one of several ranks; returns the exit status.
+
+    An error is printed once, in one line, by the first rank that fails.
+
+    Args:
+        words: the overrides.
+        more: whether anything but one run was asked for.
+    """
+    from neuprim.core.compute.threads import limit_process_threads, machine_cores
+    from neuprim.core.train.distributed.process_group import ProcessGroup
+
+    group = ProcessGroup(place, os.environ)
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if sys.exc_info()[0] is not None:  # on its way out already, with an error that says more
+            return
+        raise group.explain(RankError("ended by SIGTERM"))
+
+    # torchrun sends it when another rank ended; a training handles it by itself
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        with limit_process_threads(max(machine_cores() // place.local_size, 1)):
+            _fit_as_rank(_compose_for_rank(words, more, group), words, group)
+        return 0
+    except KeyboardInterrupt:
+        group.record_failure("interrupted")
+        if group.is_first:
+            raise
+        return 130
+    except Exception as error:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # torchrun's signal would add a second message
+        line = one_line(error)
+        if line is None:
+            group.record_failure(f"{type(error).__name__}: {error}")
+            print(f"neuprim: rank {group.rank} failed:", file=sys.stderr)
+            raise
+        reported = isinstance(error, RankError) and error.reported
+        if not reported and group.record_failure(line):
+            where = "" if group.is_first or isinstance(error, RankError) else f"rank {group.rank}: "
+            print(f"neuprim: error: {where}{line}", file=sys.stderr, flush=True)
+        return 2
+    finally:
+        group.close()
+        signal.signal(signal.SIGTERM, before)
+
+
+def _compose_for_rank(words: list[str], more: bool, group: ProcessGroup) -> RunConfig:
+    """Compose the configuration; all ranks take the output directory of rank 0, which writes there."""
+    from neuprim.config import compose
+    from neuprim.config.command_settings import take_launcher, take_target, take_viewer
+
+    more = more or any(len(take(words)[1]) < len(words) for take in (take_target, take_launcher, take_viewer))
+    if group.is_first and more:
+        raise ConfigError(
+            f"{group.size} processes of torchrun fit one scene together; expected neither -m, --config, --cfg, "
+            "a target, a launcher, nor a viewer"
+        )
+    config = compose(words) if group.is_first else None
+    directory = group.gather(None if config is None else str(config.output_dir))[0]
+    if config is None:
+        config = compose(words, check_output=False)
+        config.output_dir = Path(directory)
+    _select_rank_gpu(config, group.place)
+    return config
+
+
+def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
+    """Use GPU i for the i-th rank of a machine.
+
+    Raises:
+        BackendUnavailable: there are GPUs, but fewer than ranks.
+    """
+    import torch
+
+    from neuprim.core.compute.device import CPU
+
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if gpus == 0 or config.renderer.device == CPU:
+        return
+    if gpus < place.local_size:
+        raise BackendUnavailable(
+            f"renderer.device={config.renderer.device}: {gpus} GPUs for {place.local_size} ranks of this machine; "
+            f"expected one for each, or renderer.device={CPU}"
+        )
+    torch.cuda.set_device(place.local_rank)
+
+
+def _fit_as_rank(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> None:
+    """Train, and show it on rank 0."""
+    from neuprim.cli.progress import RunProgress
+    from neuprim.config.overrides import CommandLine
+    from neuprim.runs.fit import ignore_event
+    from neuprim.runs.run import run
+
+    ranks = f"--nproc-per-node {group.place.local_size}" if group.size == group.place.local_size else "…"
+    typed = CommandLine(overrides)
+    try:
+        if not group.is_first:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # rank 0 warns
+                run(config, ignore_event, group=group)
+            return
+        with RunProgress(f"{config.task}/{config.scene_name}, {group.size} ranks") as events:
+            print(run(config, events, group=group))
+    except RankError as error:
+        command = f"torchrun {ranks} -m {typed.resume_command(config.output_dir)}"
+        raise RankError(f"{error}; to go on: {command}", error.reported) from error
+    except KeyboardInterrupt:
+        # torchrun takes any other status than 0 for a failure, and ends rank 0, which still has to write
+        if group.is_first:
+            text = describe_interruption(config.output_dir, typed)
+            raise KeyboardInterrupt(text.replace("  neuprim run", f"  torchrun {ranks} -m neuprim run")) from None

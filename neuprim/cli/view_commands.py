@@ -1,0 +1,429 @@
+"""``neuprim render``, ``inspect``, ``view`` and ``vdb info``: look at runs and at volumes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuprim.cli.command import (
+    RENDER_OVERRIDES_HELP,
+    Command,
+    parse_count,
+    parse_number,
+    parse_numbers,
+    parse_rate,
+    parse_size,
+    parse_whole,
+    plain_console,
+    take_conditions,
+    take_render_overrides,
+)
+from neuprim.core.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from neuprim.cli.progress import RunProgress
+    from neuprim.config import RunConfig
+    from neuprim.config.command_settings import ViewerSettings
+    from neuprim.core.environment import EnvironmentFile
+    from neuprim.core.io.vdb import Grid, GridHeader
+
+
+# ---------------------------------------------------------------- render
+
+
+_RENDER_CONDITIONS = """\
+Each condition of the run's task (time, light, ...) is a flag, given after RUN_DIR: --time 0.5; a number may also be a
+list or a range, --time 0.2,0.8 or --time 0:1:20, one frame each.
+
+"""
+
+
+def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
+    cameras = "a file is JSON (frames, or a path of nerfstudio's viewer), USD (FILE#/PRIM) or a COLMAP model's folder"
+    parser.add_argument("--camera", required=True, metavar="orbit|test|FILE", help=cameras)
+    space = "coordinates of cameras, lights and .exr files: the run's data (default), or the model (volumes: unit box)"
+    parser.add_argument("--space", choices=("world", "scene"), help=space)
+    parser.add_argument("--size", type=parse_size, metavar="WxH", help="pixels (default: the data set's)")
+    formats = ("png", "exr", "npy", "webp", "gif", "mp4")
+    parser.add_argument("--format", choices=formats, help="default: png, or webp for an animation")
+    layers = "of an .exr: beauty, alpha, depth, density, and the task's own (an unknown name lists them); default: all"
+    parser.add_argument("--layers", metavar="NAME,...", help=layers)
+    datatype = "light and alpha of an .exr in 16 or 32 bits (default: float); other numbers are always float"
+    parser.add_argument("--datatype", choices=("half", "float"), help=datatype)
+    rate = "frames per second of an animation (default: about four seconds in all)"
+    parser.add_argument("--fps", type=parse_rate, metavar="F", help=rate)
+    parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
+    parser.add_argument("--frames", type=parse_count, default=60, metavar="N", help="frames of an orbit (default: 60)")
+    parser.add_argument("--force", action="store_true", help="replace pictures of the run's report")
+    group = parser.add_argument_group("light from all around, for tasks with a light")
+    image = "radiance by latitude and longitude, twice as wide as high"
+    group.add_argument("--environment", type=Path, metavar="FILE.exr", help=image)
+    lights = "lights that stand for it (default: 64)"
+    group.add_argument("--environment-samples", type=_parse_light_count, metavar="N", help=lights)
+    rotation = "anticlockwise about up, seen from above (default: 0)"
+    group.add_argument("--environment-rotation", type=_parse_degrees, metavar="DEG", help=rotation)
+    scale = "multiplies its radiance (default: 1)"
+    group.add_argument("--environment-scale", type=_parse_factor, metavar="X", help=scale)
+    unseen = "light from where the model never saw any: draw what it guesses, or leave it out (default: keep)"
+    group.add_argument("--environment-unseen", choices=("keep", "drop"), help=unseen)
+
+
+def _take_render_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
+    return take_conditions(arguments, take_render_overrides(arguments, rest, parser), parser)
+
+
+def _render(arguments: argparse.Namespace) -> int:
+    camera = arguments.camera
+    if camera not in ("orbit", "test") and not any(Path(n).exists() for n in (camera, camera.partition("#")[0])):
+        raise ConfigError(f"--camera {camera}: no such file; expected orbit, test, or a file or folder of cameras")
+    environment = _read_environment(arguments)
+    from neuprim.cli.progress import DrawProgress
+    from neuprim.runs.render_images import RenderRequest, render_run
+
+    names = ("size", "format", "out", "frames", "conditions", "fps", "space", "layers", "datatype")
+    given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
+    request = RenderRequest(
+        camera, environment=environment, overrides=arguments.words, overwrite=arguments.force, **given
+    )
+    with DrawProgress() as progress:
+        paths = render_run(arguments.run, request, notify=progress.note, progress=progress.show)
+    print(*paths, sep="\n")
+    return 0
+
+
+def _read_environment(arguments: argparse.Namespace) -> EnvironmentFile | None:
+    given = {name: getattr(arguments, f"environment_{name}") for name in ("samples", "rotation", "scale", "unseen")}
+    settings = {name: value for name, value in given.items() if value is not None}
+    if arguments.environment is None:
+        for name in settings:
+            raise ConfigError(f"--environment-{name} is given without --environment FILE.exr")
+        return None
+    from neuprim.core.environment import EnvironmentFile
+
+    guesses = settings.pop("unseen", "keep") == "keep"
+    return EnvironmentFile(arguments.environment, **settings, guesses=guesses)
+
+
+def _parse_light_count(text: str) -> int:
+    return int(parse_number(text, 1, 4096, "a whole number from 1 to 4096", whole=True))
+
+
+def _parse_degrees(text: str) -> float:
+    return parse_number(text, -1e6, 1e6, "an angle in degrees")
+
+
+def _parse_factor(text: str) -> float:
+    return parse_number(text, 0.0, 1e6, "a factor from 0 to 1e6")
+
+
+RENDER_COMMAND = Command(
+    "render",
+    "draw images of a run",
+    _render,
+    _add_render_arguments,
+    _RENDER_CONDITIONS + RENDER_OVERRIDES_HELP,
+    _take_render_words,
+    opens_run=True,
+)
+
+
+# ---------------------------------------------------------------- inspect
+
+
+_INSPECT_CONDITIONS = """\
+Each condition of the run's task is a flag, given after RUN_DIR: --time 0.5, or several frames: --time 0:1:20,
+--time 0.2,0.8."""
+
+
+def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
+    shown = "volume, isosurface, slices, primitives, primitive, difference, ..."
+    parser.add_argument("--show", default="", metavar="NAME,...", help=shown)
+    ellipsoids = "the ellipsoids in their own colours; as --show primitives"
+    parser.add_argument("--primitives", action="store_true", help=ellipsoids)
+    one = "look into this one; as --show primitive"
+    parser.add_argument("--primitive", type=parse_whole, metavar="INDEX", help=one)
+    parser.add_argument("--against", metavar="FILE.vdb|DIR|scene", help="ground truth to compare with")
+    grid = "points along the box's longest side (default: 128)"
+    parser.add_argument("--grid", type=parse_count, default=128, metavar="N", help=grid)
+    box = "two corners, in the coordinates of the run's data, as --box=-1,-1,-1,1,1,1 (default: around all matter)"
+    parser.add_argument("--box", type=parse_numbers, metavar="X,Y,Z,X,Y,Z", help=box)
+    levels = "extinctions of isosurfaces, 1/scene unit"
+    parser.add_argument("--level", type=parse_numbers, default=[], metavar="S,...", help=levels)
+    parser.add_argument("--up", choices=("x", "y", "z"), help="the upward axis (default: the scene's, or z)")
+    parser.add_argument("--size", type=parse_size, metavar="WxH", help="pixels of the picture or window")
+    out = ".png, .webp, .gif, .mp4, .html or .vdb (default: a window)"
+    parser.add_argument("--out", type=Path, metavar="FILE", help=out)
+    parser.add_argument("--force", action="store_true", help="replace files that exist")
+
+
+def _inspect(arguments: argparse.Namespace) -> int:
+    from neuprim.cli.progress import print_notes
+    from neuprim.inspect import ViewOptions, parse_box
+    from neuprim.runs.inspect import Request, inspect_run
+
+    names = [name.strip() for name in arguments.show.split(",") if name.strip()]
+    names += ["primitives"] * arguments.primitives + ["primitive"] * (arguments.primitive is not None)
+    request = Request(
+        arguments.run,
+        names or ["volume"],
+        arguments.conditions,
+        arguments.grid,
+        None if arguments.box is None else parse_box(arguments.box),
+        options=ViewOptions(tuple(arguments.level), arguments.primitive),
+        against=arguments.against,
+        out=arguments.out,
+        size=arguments.size,
+        up=arguments.up,
+        overwrite=arguments.force,
+    )
+    print(*inspect_run(request, print_notes), sep="\n")
+    return 0
+
+
+INSPECT_COMMAND = Command(
+    "inspect",
+    "look inside a run's density",
+    _inspect,
+    _add_inspect_arguments,
+    _INSPECT_CONDITIONS,
+    take_conditions,
+    opens_run=True,
+)
+
+
+# ---------------------------------------------------------------- view
+
+
+def _add_view_arguments(parser: argparse.ArgumentParser) -> None:
+    port = "of the page's address; 0 for any (default: 8080)"
+    parser.add_argument("--port", type=_parse_port, default=8080, metavar="N", help=port)
+    host = "to listen on (default: 127.0.0.1, which this machine alone reaches)"
+    parser.add_argument("--host", metavar="ADDRESS", help=host)
+
+
+def _view(args: argparse.Namespace) -> int:
+    """Show the run until Ctrl-C."""
+    from neuprim.cli.progress import LineProgress
+    from neuprim.config.command_settings import LOOPBACK, ViewerSettings
+    from neuprim.viewer.view import view_run
+
+    settings = ViewerSettings(args.host or LOOPBACK, args.port)
+    _warn_of_open_host(settings)
+    progress = LineProgress()
+
+    def print_address(address: str) -> None:
+        print(f"{address}\nopen it in a browser; Ctrl-C ends the viewer", flush=True)
+
+    try:
+        view_run(args.run_dir, settings, print_address, progress.note, progress)
+    except KeyboardInterrupt:
+        print("neuprim: the viewer is closed", file=sys.stderr)
+    return 0
+
+
+def run_viewed(config: RunConfig, events: RunProgress, settings: ViewerSettings) -> Path:
+    """Run a training with a live viewer; raise as :func:`neuprim.runs.run.run`."""
+    from neuprim.runs.fit import Note
+    from neuprim.runs.run import run
+    from neuprim.viewer.live_training import LiveTraining
+
+    _warn_of_open_host(settings)
+    with LiveTraining(settings, config, lambda address: events(Note(f"the viewer is at {address}")), events) as live:
+        return run(config, live, live.between)
+
+
+def _warn_of_open_host(settings: ViewerSettings) -> None:
+    from neuprim.config.command_settings import LOOPBACK
+    from neuprim.viewer.server import is_loopback
+
+    if not is_loopback(settings.host):
+        port = settings.port or 8080
+        print(
+            f"neuprim: warning: other machines can reach the viewer at {settings.host}, without encryption: whoever "
+            "can read the network can read its token. Safer: leave the host out, and type on the other machine "
+            f"`ssh -L {port}:{LOOPBACK}:{port} THIS_MACHINE`",
+            file=sys.stderr,
+        )
+
+
+def _parse_port(text: str) -> int:
+    if not (text.isascii() and text.isdigit()) or int(text) > 65535:
+        raise ConfigError(f"--port {text}: expected a port, 1 to 65535, or 0 for any")
+    return int(text)
+
+
+VIEW_COMMAND = Command(
+    "view",
+    "look at a run in the browser: turn it, play it, move its light, edit a camera path",
+    _view,
+    _add_view_arguments,
+    opens_run=True,
+)
+
+
+# ---------------------------------------------------------------- vdb info
+
+
+_GRID_COLUMNS = ("grid", "type", "compression", "voxel size", "bounds", "active", "range", "dense")
+
+
+def _add_vdb_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("action", choices=("info",), metavar="info", help="what to do")
+    parser.add_argument("path", type=Path, metavar="FILE|DIR", help="a .vdb file, or a folder of frames")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _vdb_info(arguments: argparse.Namespace) -> int:
+    """Print a report on a file, or on every file of a folder."""
+    files, notes = _find_vdb_files(arguments.path)
+    if arguments.json:
+        record = {"files": [_describe_vdb_file(file) for file in files], "notes": notes}
+        print(json.dumps(record, indent=1, allow_nan=False))
+        return 0
+    console = plain_console()
+    for file in files:
+        _print_vdb_table(console, _describe_vdb_file(file))
+    for note in notes:
+        console.print(note)
+    return 0
+
+
+def _find_vdb_files(path: Path) -> tuple[list[Path], list[str]]:
+    """Return files, frames in their order, and notes on the folder."""
+    if not path.is_dir():
+        return [path], []
+    from neuprim.core.io.vdb import sequence
+
+    try:
+        frames = sequence(path)
+    except DataError as error:
+        files = sorted(p for p in path.iterdir() if p.suffix.lower() == ".vdb" and p.is_file())
+        if not files:
+            raise
+        return files, [f"not one sequence: {error}"]
+    missing = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in frames.gaps)
+    numbers = f"{frames.frames[0].number} to {frames.frames[-1].number}"
+    note = f"{len(frames)} frames, {numbers}; missing: {missing or 'none'}"
+    return [frame.path for frame in frames.frames], [note]
+
+
+def _describe_vdb_file(path: Path) -> dict[str, Any]:
+    """Return JSON-ready values: lengths in world units, bounds in voxel indices (upper ones excluded)."""
+    from neuprim.core.io.vdb import read_grids, read_header
+
+    header = read_header(path)
+    grids = read_grids(path, level_sets=True)  # in the same order, one in memory at a time
+    return {
+        "path": str(path),
+        "version": header.version,
+        "library": list(header.library),
+        "metadata": _grid_to_json(header.metadata),
+        "grids": [_describe_grid(entry, None if entry.undecodable() else next(grids)) for entry in header.grids],
+    }
+
+
+def _describe_grid(header: GridHeader, grid: Grid | None) -> dict[str, Any]:
+    """Grids that cannot be decoded have a ``reason`` and no numbers from voxels."""
+    entry: dict[str, Any] = {
+        "name": header.name,
+        "class": header.kind,
+        "type": header.type,
+        "half": header.half,
+        "compression": header.compression,
+        "map": header.map,
+        "transform": None if header.transform is None else header.transform.tolist(),
+        "voxel_size": header.voxel_size,
+        "metadata": _grid_to_json(header.metadata),
+        "reason": header.refusal(),
+    }
+    if grid is None:
+        return entry
+    box = grid.world_bounds()
+    return entry | {
+        "background": _grid_to_json(grid.background.ravel().tolist()),
+        "bounds": grid.bounds,
+        "world_bounds": None if box is None else box.tolist(),
+        "leaves": len(grid.values),
+        "tiles": len(grid.tiles),
+        "active_voxels": grid.active_voxels,
+        "range": grid.range,
+        "non_finite": grid.non_finite,
+        "sparse_bytes": grid.sparse_bytes,
+        "dense_bytes": grid.dense_bytes,
+    }
+
+
+def _grid_to_json(value: Any) -> Any:
+    """Plain values: JSON knows no bytes, tuples or NaN."""
+    if isinstance(value, Mapping):
+        return {name: _grid_to_json(item) for name, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_grid_to_json(item) for item in value]
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _print_vdb_table(console: Console, file: dict[str, Any]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+    from rich.text import Text
+
+    grids = file["grids"]
+    title = f"{file['path']}  (version {file['version']}, {len(grids)} {'grid' if len(grids) == 1 else 'grids'})"
+    table = Table(title=Text(_printable(title)), title_justify="left", box=SIMPLE_HEAD)
+    for name in _GRID_COLUMNS:
+        table.add_column(name, overflow="fold", no_wrap=name in ("bounds", "active", "range", "dense"))
+    for grid in grids:
+        table.add_row(*(Text(_printable(cell)) for cell in _format_grid_cells(grid)))
+    console.print(table)
+    for grid in grids:
+        if grid["reason"]:
+            console.print(_printable(f"  {grid['name']}: {grid['reason']}"))
+        if grid.get("non_finite"):
+            console.print(_printable(f"  {grid['name']}: {grid['non_finite']} active values are NaN or infinite"))
+
+
+def _format_grid_cells(grid: dict[str, Any]) -> Iterator[str]:
+    size = grid["voxel_size"]
+    kind = grid["type"].removeprefix("Tree_").removesuffix("_5_4_3") + " as half" * grid["half"]
+    yield from (grid["name"], f"{kind}\n{grid['class']}", grid["compression"].replace(" + ", "\n"))
+    yield grid["map"] if size is None else "\n".join(f"{v:.4g}" for v in (size[:1] if len(set(size)) == 1 else size))
+    if "bounds" not in grid:
+        yield from ("not read", "", "", "")
+        return
+    box, span = grid["bounds"], grid["range"]
+    yield "empty" if box is None else "\n".join(f"{a}:{b}" for a, b in zip(*box, strict=True))
+    yield f"{grid['active_voxels']:,}"
+    yield "–" if span is None else f"{span[0]:.4g}\n{span[1]:.4g}"
+    yield _format_bytes(grid["dense_bytes"])
+
+
+def _format_bytes(count: int) -> str:
+    size = float(count)
+    for unit in ("B", "KiB", "MiB", "GiB"):
+        if size < 1024:
+            return f"{size:.3g} {unit}" if unit != "B" else f"{count} B"
+        size /= 1024
+    return f"{size:,.3g} TiB"
+
+
+def _printable(text: str) -> str:
+    """Replace control characters in names of files; a terminal must not act on them."""
+    return "".join(c if c.isprintable() or c == "\n" else "�" for c in text)
+
+
+VDB_COMMAND = Command(
+    "vdb",
+    "look into OpenVDB files",
+    _vdb_info,
+    _add_vdb_arguments,
+    "`info` lists grids: type, transform, bounds, active voxels, values, memory.",
+)

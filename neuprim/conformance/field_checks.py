@@ -84,7 +84,7 @@ def check_activity(t: TaskUnderTest) -> None:
     generator = torch.Generator().manual_seed(3)
     params = model.of(model.density)
     for view in map(_double_view, t.views):
-        rows = model.density.active_active_rows(params, view.conditions)
+        rows = model.density.active_rows(params, view.conditions)
         if rows is None:
             continue
         fine = rows.dtype == torch.int64 and bool((rows[1:] > rows[:-1]).all())

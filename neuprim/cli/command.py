@@ -98,7 +98,7 @@ class Command:
 
 
 def add_trust_flag(parser: argparse.ArgumentParser) -> None:
-    """Add ``--trust``, which lets a stored configuration reach outside its run (:mod:`neuprim.config.trust`)."""
+    """Add ``--trust``, which lets a stored configuration reach outside its run (:mod:`neuprim.config.stored_run`)."""
     text = "use addresses, and write to folders outside of it, that a stored config.yaml names"
     parser.add_argument(FLAG, action="store_true", help=text)
 

@@ -13,15 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim.config.checks import (
-    CHOICES,
-    check_key,
-    check_names,
-    complete_options,
-    options_of,
-    refuse_unused,
-    unused_settings,
-)
 from neuprim.config.job import refuse_missing_plugins
 from neuprim.config.outputs import DEFAULT_TASK, output_directory, run_name
 from neuprim.config.overrides import (
@@ -35,7 +26,17 @@ from neuprim.config.overrides import (
     swept_keys,
 )
 from neuprim.config.run_config import RunConfig, RunSettings, flatten
+from neuprim.config.setting_checks import (
+    CHOICES,
+    check_key,
+    check_names,
+    complete_options,
+    options_of,
+    refuse_unused,
+    unused_settings,
+)
 from neuprim.config.stored_run import (
+    check_stored,
     find_resumed_run,
     refuse_contradictions,
     resumed_choices,
@@ -56,14 +57,13 @@ from neuprim.config.task_files import (
     task_choices,
     to_plain,
 )
-from neuprim.config.trust import check_stored
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
 from neuprim.core.train.distributed.torchrun import read_torchrun_rank
 from neuprim.core.used_settings import build_settings
 from neuprim.core.validation import coerce, format_value, infer_type, refuse_unknown, validate
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
-from neuprim.plugins.provenance import PluginVersion, Provenance
+from neuprim.plugins.provenance import Provenance
 from neuprim.plugins.registry import (
     LOSSES,
     TASKS,
@@ -74,7 +74,6 @@ from neuprim.plugins.registry import (
     qualified_plugin_name,
     split_plugin_name,
 )
-from neuprim.version import __version__
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
@@ -88,12 +87,7 @@ _REQUIRED = "???"
 
 @dataclass(frozen=True)
 class _Selection:
-    """Task, scene, preset and level of a configuration, loaded.
-
-    Attributes:
-        name: of the run's directory, where users choose none.
-        options: the task's own options without the user's.
-    """
+    """Task, scene, preset and level of a configuration, loaded, and the default name of its directory."""
 
     task_info: PluginInfo
     spec: TaskSpec
@@ -107,11 +101,7 @@ class _Selection:
 
 @dataclass(frozen=True)
 class _Base:
-    """Everything below a user's settings: defaults, preset, scene and options, with ``${...}`` as it is.
-
-    Attributes:
-        paths: the scene's settings that are paths.
-    """
+    """Everything below a user's settings, with ``${...}`` as it is, and the scene's settings that are paths."""
 
     tree: dict[str, Any]
     paths: list[str]
@@ -157,10 +147,7 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
 def compose_all(
     overrides: Sequence[str], check_output: bool = True, stored: RunConfig | None = None
 ) -> list[RunConfig]:
-    """Return the configurations of a sweep, each in its own folder of one output directory, all valid.
-
-    Arguments and errors are those of :func:`compose`.
-    """
+    """As :func:`compose`: return the configurations of a sweep, each in its own folder of one output directory."""
     swept = set(swept_keys(overrides))
     if not swept:
         return [compose(overrides, check_output, stored)]
@@ -243,13 +230,7 @@ def _make_config(
     check_output: bool,
     new_launch: bool = False,
 ) -> tuple[RunConfig, list[str]]:
-    """Return a valid configuration, still without its overrides, and the scene's settings that are paths.
-
-    Args:
-        values: what was typed for settings.
-        earlier: runs whose settings stand below, the first lowest.
-        new_launch: do not take the views per step of each process from the earlier run.
-    """
+    """Return a valid configuration without its overrides, over ``earlier`` runs, and the scene's settings of paths."""
     spec, scene = chosen.spec, chosen.scene
     base = _read_base(spec, scene.spec.name, scene.config_package, chosen.preset, chosen.options)
     declared = base.tree["scene"]
@@ -281,13 +262,6 @@ def _make_config(
     if settings.metrics.lpips is not None:
         settings.metrics = MetricsSettings(str(Path(settings.metrics.lpips).expanduser().absolute()))
     preset = {"preset": (chosen.default_preset, chosen.preset)} if chosen.preset != chosen.default_preset else {}
-    added = scene.added_by
-    made_by = Provenance(
-        __version__,
-        PluginVersion.of(chosen.task_info),
-        None if added is None else PluginVersion.of(added, scene.spec.name),
-        None if loss_info is None else PluginVersion.of(loss_info),
-    )
     config = RunConfig(
         task=spec.name,
         scene_name=scene.spec.name,
@@ -297,7 +271,7 @@ def _make_config(
         options=options,
         unused=unused_settings(spec, loss),
         non_default=preset | _find_differences(_flatten(plain, _validate_settings(plain)), _flatten(full, settings)),
-        made_by=made_by,
+        made_by=Provenance.of_installed(chosen.task_info, scene, loss_info),
         **{name: getattr(settings, name) for name in ("model", "train", "renderer", "metrics", "seed", "resume")},
     )
     return config, base.paths
@@ -341,11 +315,7 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
 def _resolve(
     base: _Base, earlier: Mapping[str, Any], level: Level | None = None, values: Sequence[Assignment] = ()
 ) -> dict[str, Any]:
-    """Return the configuration with everything in it that stands over its base, resolved.
-
-    Args:
-        earlier: keys and values of earlier runs, which replace what was there.
-    """
+    """Return the resolved configuration; values of ``earlier`` runs replace those of the base."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
@@ -367,9 +337,7 @@ def _resolve(
     if steps is not None and seconds is None and earlier:
         OmegaConf.update(tree, "train.max_seconds", None)  # the other budget was the earlier run's
     if other_strategy and _typed_value(values, "train.population", "grow_from") is None:
-        OmegaConf.update(
-            tree, "train.population.grow_from", 1.0
-        )  # what was there is for populations that grow that way
+        OmegaConf.update(tree, "train.population.grow_from", 1.0)  # the preset's value is for its own strategy
     plain: dict[str, Any] = show_references(to_plain(tree))
     return plain
 
@@ -416,10 +384,6 @@ def _flatten(tree: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
 
 def _find_differences(default: Mapping[str, Any], actual: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Return key -> (default, value) of the flat settings that differ."""
-    found: dict[str, tuple[Any, Any]] = {}
-    for key in {**default, **actual}:
-        before, after = default.get(key), actual.get(key)
-        before = None if before == _REQUIRED else before
-        if before != after:
-            found[key] = (before, after)
-    return found
+    before = {key: None if value == _REQUIRED else value for key, value in default.items()}
+    pairs = {key: (before.get(key), actual.get(key)) for key in {**default, **actual}}
+    return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 from neuprim.config.run_config import RunConfig
 from neuprim.plugins.attribution import RunPlugins
-from neuprim.plugins.provenance import PluginVersion, Provenance, load_recorded_plugin
-from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_scene, load_task
-from neuprim.version import __version__
+from neuprim.plugins.provenance import Provenance, load_recorded_plugin
+from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_scene
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
@@ -46,8 +45,6 @@ def task_of(config: RunConfig, file: Path | None = None) -> TaskSpec:
         ConfigError: the package is not installed; names it and ``file``, where the configuration was read from.
         PluginError: the task is broken.
     """
-    if config.made_by is None:
-        return load_task(config.task)
     return load_recorded_plugin(TASKS, config.made_by.task, file)[1]
 
 
@@ -56,8 +53,6 @@ def scene_of(config: RunConfig, task: TaskSpec, file: Path | None = None) -> Fou
 
     Raises as :func:`task_of`.
     """
-    if config.made_by is None:
-        return find_scene(task, config.scene_name)
     if config.made_by.scene is None:
         own = [scene for scene in task.scenes if scene.name == config.scene_name]
         return FoundScene(own[0], task.config_package) if own else find_scene(task, config.scene_name)
@@ -67,22 +62,14 @@ def scene_of(config: RunConfig, task: TaskSpec, file: Path | None = None) -> Fou
 
 def made_now(config: RunConfig, task: TaskSpec) -> Provenance:
     """Return the record of a run that starts or goes on now: the same packages, in the versions that are installed."""
-    made, scene = config.made_by, scene_of(config, task).added_by
-    task_info = TASKS.find(config.task if made is None else made.task.qualified_name)
-    loss = None if config.train.loss is None else PluginVersion.of(LOSSES.find(config.train.loss))
-    return Provenance(
-        __version__,
-        PluginVersion.of(task_info),
-        None if scene is None else PluginVersion.of(scene, config.scene_name),
-        loss,
-    )
+    task_info = TASKS.find(config.made_by.task.qualified_name)
+    loss = None if config.train.loss is None else LOSSES.find(config.train.loss)
+    return Provenance.of_installed(task_info, scene_of(config, task), loss)
 
 
 def find_run_plugins(config: RunConfig) -> RunPlugins:
     """Find the plugins of a run, which errors in their code name."""
     made = config.made_by
-    if made is None:
-        return RunPlugins(config.task, config.scene_name, config.train.loss)
     scene = config.scene_name if made.scene is None else made.scene.qualified_name
     return RunPlugins(made.task.qualified_name, scene, config.train.loss)
 
@@ -90,5 +77,5 @@ def find_run_plugins(config: RunConfig) -> RunPlugins:
 def refuse_missing_plugins(config: RunConfig) -> None:
     """Raise ConfigError for a package that made a stored run and is not installed."""
     scene_of(config, task_of(config, config.source), config.source)
-    if config.made_by is not None and config.made_by.loss is not None:
+    if config.made_by.loss is not None:
         load_recorded_plugin(LOSSES, config.made_by.loss, config.source)

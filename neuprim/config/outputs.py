@@ -14,13 +14,12 @@ DEFAULT_TASK = "static"
 
 
 def run_name(task: str, scene: str) -> str:
-    """The name of a run's directory in the output root, where users chose none; ``PACKAGE:NAME`` becomes a part of
-    it."""
+    """Return the name of a run's directory where users chose none; ``PACKAGE:NAME`` becomes a part of it."""
     return "-".join(part for word in (task, scene) for part in split_plugin_name(word) if part)
 
 
 def output_directory(asked: str | None, name: str, resume: bool, check: bool = True) -> Path:
-    """The directory of a run or sweep; nothing is created.
+    """Return the directory of a run or sweep; nothing is created.
 
     Args:
         asked: the user's ``output_dir``, or None for ``outputs/NAME``, ``outputs/NAME-2``, ...
@@ -29,8 +28,7 @@ def output_directory(asked: str | None, name: str, resume: bool, check: bool = T
         check: whether an ``asked`` directory that holds files is refused (unless ``resume``).
     """
     if asked is None:
-        taken = _numbers(name)
-        number = max(taken, default=0) if resume else max(taken, default=0) + 1
+        number = max(_numbers_in_use(name), default=0) + (not resume)
         return ROOT / (name if number <= 1 else f"{name}-{number}")
     if not asked.strip():
         raise ConfigError("output_dir='': expected a directory")
@@ -38,28 +36,21 @@ def output_directory(asked: str | None, name: str, resume: bool, check: bool = T
     if not check:
         return path
     try:
-        if path.exists() and not path.is_dir():
-            raise ConfigError(f"output_dir={path}: is a file; expected a directory")
         if not resume and path.is_dir() and any(path.iterdir()):
             raise ConfigError(
                 f"output_dir={path}: exists and is not empty; choose another, or continue its run with resume=true"
             )
-        _check_place(path)
+        there = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
+        if not there.is_dir():
+            raise ConfigError(f"output_dir={path}: {there} is a file; expected a directory")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise ConfigError(f"output_dir={path}: {there} cannot be written to")
     except (OSError, ValueError) as error:
         raise ConfigError(f"output_dir={path}: {error}") from error
     return path
 
 
-def _check_place(path: Path) -> None:
-    """Refuses a directory that cannot be made or written, before a run has prepared its data for it."""
-    there = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
-    if not there.is_dir():
-        raise ConfigError(f"output_dir={path}: {there} is a file; expected a directory")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(f"output_dir={path}: {there} cannot be written to")
-
-
-def _numbers(name: str) -> list[int]:
+def _numbers_in_use(name: str) -> list[int]:
     """Numbers of the existing ``NAME`` (1) and ``NAME-n`` under the output root."""
     if not ROOT.is_dir():
         return []

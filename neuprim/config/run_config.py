@@ -58,8 +58,8 @@ class RunConfig:
         resume: continue from the checkpoint in ``output_dir``, if there is one.
         overrides: what the user typed.
         non_default: dotted key -> (value with the same task, scene and preset and nothing typed, value of this run).
-        source: the file that it was read from; None for one that the user composed. See :mod:`neuprim.config.trust`.
-        made_by: the packages that task, scene and loss come from; None where nobody said, and their names alone decide.
+        source: the file that it was read from; None for one that the user composed.
+        made_by: the packages that task, scene and loss come from.
     """
 
     task: str
@@ -70,6 +70,7 @@ class RunConfig:
     train: TrainSettings
     renderer: RenderSettings
     output_dir: Path
+    made_by: Provenance
     metrics: MetricsSettings = field(default_factory=MetricsSettings)
     seed: int = 0
     resume: bool = False
@@ -77,11 +78,10 @@ class RunConfig:
     unused: tuple[str, ...] = ()
     overrides: list[str] = field(default_factory=list)
     non_default: dict[str, tuple[Any, Any]] = field(default_factory=dict)
-    made_by: Provenance | None = None
     source: Path | None = field(default=None, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain nested values, in the layout of the command line's keys."""
+        """Return plain nested values, in the layout of the command line's keys."""
         tree: dict[str, Any] = {
             "task": {"name": self.task, "options": self.options},
             "scene": {"name": self.scene_name, **self.scene},
@@ -95,7 +95,7 @@ class RunConfig:
             "resume": self.resume,
             "overrides": list(self.overrides),
             "non_default": {key: list(pair) for key, pair in self.non_default.items()},
-            **({} if self.made_by is None else {"made_by": self.made_by.to_dict()}),
+            "made_by": self.made_by.to_dict(),
         }
         for name in self.unused:
             group, _, key = name.partition(".")
@@ -103,7 +103,7 @@ class RunConfig:
         return tree
 
     def to_yaml(self) -> str:
-        """The resolved configuration as YAML; :meth:`from_yaml` reads it back unchanged."""
+        """Return the resolved configuration as YAML, which :meth:`from_yaml` reads back unchanged."""
         return yaml.dump(self.to_dict(), Dumper=_PlainDumper, sort_keys=False, allow_unicode=True, width=120)
 
     @classmethod
@@ -132,7 +132,8 @@ class RunConfig:
         Raises:
             ConfigError: a setting in it does not exist or has an impossible value.
         """
-        unused = tuple(name for name in OPTIONAL if _lacks(data, name))
+        stored_keys = flatten(data)
+        unused = tuple(name for name in OPTIONAL if name not in stored_keys)
         stored = validate(_StoredConfig, data)
         if stored.output_dir is None:
             raise ConfigError("output_dir: missing; expected a directory")
@@ -146,22 +147,11 @@ class RunConfig:
             "scene": ("scene.name", scene_name),
             "loss": ("train.loss", loss),
         }
-        for kind, plugin in ({} if stored.made_by is None else stored.made_by.plugins).items():
+        for kind, plugin in stored.made_by.plugins.items():
             key, name = names[kind]
             if plugin.name != name:
                 raise ConfigError(f"made_by.{kind}.name: found {plugin.name!r}; expected {name!r}, as {key} says")
-        same = (
-            "preset",
-            "model",
-            "train",
-            "renderer",
-            "metrics",
-            "seed",
-            "resume",
-            "overrides",
-            "non_default",
-            "made_by",
-        )
+        same = "preset model train renderer metrics seed resume overrides non_default made_by".split()
         return cls(
             task=stored.task.name,
             scene_name=scene_name,
@@ -188,9 +178,9 @@ class _StoredConfig(RunSettings):
     task: _StoredTask
     scene: dict[str, Any]
     preset: str
+    made_by: Provenance
     overrides: list[str] = field(default_factory=list)
     non_default: dict[str, tuple[Any, Any]] = field(default_factory=dict)
-    made_by: Provenance | None = None
 
 
 class _PlainDumper(yaml.SafeDumper):
@@ -219,19 +209,10 @@ def _read_mapping(file: Path) -> Mapping[str, Any]:
     return data
 
 
-def _lacks(data: Mapping[str, Any], name: str) -> bool:
-    group, _, key = name.partition(".")
-    found = data.get(group)
-    return not isinstance(found, Mapping) or key not in found
-
-
 def flatten(node: Mapping[str, Any], where: str = "") -> dict[str, Any]:
     """Return dotted names and values of nested settings."""
     found: dict[str, Any] = {}
     for key, value in node.items():
         name = join_key(where, str(key))
-        if isinstance(value, Mapping):
-            found |= flatten(value, name)
-        else:
-            found[name] = value
+        found |= flatten(value, name) if isinstance(value, Mapping) else {name: value}
     return found

@@ -1,17 +1,23 @@
-"""Settings of an earlier run, for ``neuprim run --config FILE`` and for a run that ``resume=true`` continues."""
+"""Settings of an earlier run, for ``neuprim run --config FILE`` and ``resume=true``, and what they may reach.
+
+A stored configuration is text of somebody else. What it names is read from this machine's own folders, as any user's
+run does. An address of another machine, and a place outside of the run that would be written to, are used only where
+the user typed them or said ``--trust``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from neuprim.config.checks import CHOICES
 from neuprim.config.outputs import DEFAULT_TASK, output_directory, run_name
 from neuprim.config.run_config import RunConfig, flatten
+from neuprim.config.setting_checks import CHOICES
 from neuprim.config.task_files import task_choices
-from neuprim.config.trust import refuse_links
-from neuprim.core.errors import ConfigError
+from neuprim.core.errors import ConfigError, cut
+from neuprim.core.io.trust import ENVIRONMENT, FLAG, trusted
 from neuprim.core.notices import warn_once
 from neuprim.core.validation import format_value
 from neuprim.plugins.provenance import PluginVersion
@@ -28,23 +34,14 @@ _SEARCH, _SWEEP = "target.json", "sweep.json"
 
 
 def read_stored_config(path: Path) -> RunConfig:
-    """Return the configuration of a run, from its ``config.yaml`` or its directory.
-
-    Raises:
-        ConfigError: there is no such file, or a setting in it does not exist or has an impossible value.
-        CheckpointError: it is no run's configuration.
-    """
+    """Return the configuration of a run, from its ``config.yaml`` or its directory."""
     if not path.exists():
         raise ConfigError(f"--config {path}: no such file; expected RUN_DIR/config.yaml of an earlier run")
     return RunConfig.from_yaml(path)
 
 
 def stored_choices(stored: RunConfig, typed: Choices) -> dict[str, str | None]:
-    """Return task, scene and preset: what was typed, else what the run of ``--config`` had.
-
-    Raises:
-        ConfigError: another task, preset or level was typed, although the file has every setting of the run's own.
-    """
+    """Return task, scene and preset: the typed scene, else what the run of ``--config`` had."""
     own = _choices_of(stored)
     for key in ("task", "preset", "effort"):
         if _differs(typed[key], own[key]):
@@ -82,15 +79,14 @@ def _replace_text(value: Any, old: str, new: str) -> Any:
 
 
 def _choices_of(stored: RunConfig) -> dict[str, str | None]:
-    """Task, scene and preset of a stored run; ``PACKAGE:NAME`` for those of another package."""
     made = stored.made_by
 
     def name_of(name: str, maker: PluginVersion | None) -> str:
         return name if maker is None or maker.package in ("", BUILT_IN) else maker.qualified_name
 
     return {
-        "task": name_of(stored.task, None if made is None else made.task),
-        "scene": name_of(stored.scene_name, None if made is None else made.scene),
+        "task": name_of(stored.task, made.task),
+        "scene": name_of(stored.scene_name, made.scene),
         "preset": stored.preset,
         "effort": None,
     }
@@ -144,11 +140,7 @@ def find_resumed_run(typed: Mapping[str, Any], choices: Choices, has_file: bool)
 
 
 def resumed_choices(begun: RunConfig, typed: Choices) -> dict[str, str | None]:
-    """Return task, scene and preset of a run that goes on, and the level that was typed.
-
-    Raises:
-        ConfigError: another task, scene or preset was typed.
-    """
+    """Return task, scene and preset of a run that goes on, which may not change, and the level that was typed."""
     own = _choices_of(begun)
     for key in ("task", "scene", "preset"):
         if _differs(typed[key], own[key]):
@@ -159,16 +151,9 @@ def resumed_choices(begun: RunConfig, typed: Choices) -> dict[str, str | None]:
 
 
 def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]) -> None:
-    """Refuse settings that a run cannot change on its way.
+    """Refuse settings that a run cannot change on its way: what the model is, and what it is trained on and for.
 
-    What the model is, and what it is trained on and for, stays. Budgets, rates, renderers, where data lie and how much
-    memory they take may change.
-
-    Args:
-        paths: the scene's settings that are paths.
-
-    Raises:
-        ConfigError: names the setting, and what the run was begun with.
+    Budgets, rates, renderers, memory, and the scene's ``paths`` (its settings that say where data lie) may change.
     """
     free = {f"scene.{name}" for name in (*paths, *_FREE)}
     before, after = _fixed_settings(begun), _fixed_settings(now)
@@ -190,3 +175,62 @@ def _fixed_settings(config: RunConfig) -> dict[str, Any]:
     found = flatten({"model": tree["model"], "scene": config.scene, "task": options, "seed": config.seed})
     found["train.loss"] = config.train.loss
     return {key: list(value) if isinstance(value, tuple) else value for key, value in found.items()}
+
+
+# ---------------------------------------------------------------- what a file may reach
+
+
+def check_stored(config: RunConfig, typed: Mapping[str, Any] | None = None) -> None:
+    """Raise ConfigError for what a configuration from a file would reach outside of its run, unless it is trusted.
+
+    Args:
+        config: passes if it has no ``source``.
+        typed: dotted keys that the user gave values for beside the file; None: there is no way to give any.
+    """
+    if config.source is None or trusted():
+        return
+    tree = {
+        "scene": config.scene,
+        "task.options": config.options,
+        "model.init": config.model.init,
+        "metrics.lpips": config.metrics.lpips,
+    }
+    run_dir = config.source.parent.resolve()
+    for key, value in _list_texts("", tree):
+        if typed is not None and any(key == name or key.startswith(f"{name}.") for name in typed):
+            continue
+        share = value.startswith("\\\\" if os.name != "nt" else ("\\\\", "//"))
+        if share or "://" in value or "::" in value:  # a URL, a chain of them, or a Windows share
+            what = "an address, which would be contacted"
+        elif key == "scene.cache" and not Path(value).expanduser().resolve().is_relative_to(run_dir):
+            what = "a folder outside of the run, which would be written to"
+        else:
+            continue
+        allow = f"type {key}=... to use it" if typed is not None else f"{FLAG} allows it"
+        raise ConfigError(
+            f"{config.source}: {key} is {cut(value)!r}, {what}; {allow}, {ENVIRONMENT}=1 in the "
+            "environment does so for all runs"
+        )
+
+
+def refuse_links(run_dir: Path) -> None:
+    """Raise ConfigError for a folder in a run directory that is a link out of it, unless the user trusts it."""
+    if trusted() or not run_dir.is_dir():
+        return
+    whole = run_dir.resolve()
+    for entry in os.scandir(run_dir):
+        if entry.is_symlink() and entry.is_dir() and whole not in (there := Path(entry.path).resolve()).parents:
+            raise ConfigError(
+                f"{entry.path}: is a link to {there}, outside of the run; expected a folder, or {FLAG} to write there"
+            )
+
+
+def _list_texts(key: str, value: Any) -> Iterator[tuple[str, str]]:
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            yield from _list_texts(f"{key}.{name}" if key else str(name), item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _list_texts(key, item)
+    elif isinstance(value, str | Path):
+        yield key, str(value)

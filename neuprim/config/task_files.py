@@ -21,8 +21,8 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import TYPE_CHECKING, Any
 
-from neuprim.config.checks import complete_options
 from neuprim.config.overrides import Assignment, quote_override
+from neuprim.config.setting_checks import complete_options
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.validation import format_value, refuse_unknown
 
@@ -38,8 +38,7 @@ PRESET_GROUPS = ("model", "train", "renderer")
 
 @dataclass(frozen=True)
 class TaskChoices:
-    """What ``task/NAME.yaml`` says: scene and preset of a run that names none, and values of all of the task's own
-    options."""
+    """What ``task/NAME.yaml`` says: default scene and preset, and values of all of the task's own options."""
 
     scene: str
     preset: str
@@ -55,11 +54,7 @@ class Level:
 
 
 def task_choices(spec: TaskSpec) -> TaskChoices:
-    """Read ``task/NAME.yaml``.
-
-    Raises:
-        ConfigError: it is not YAML, or names a key, scene, preset or option that the task does not have.
-    """
+    """Read ``task/NAME.yaml``, which names only what the task has."""
     place = f"task/{spec.name}.yaml"
     who = f"task {spec.name!r}: {place}"
     node = read_yaml(package_root(spec) / place, who)
@@ -77,7 +72,9 @@ def task_choices(spec: TaskSpec) -> TaskChoices:
 
 def presets(spec: TaskSpec) -> list[str]:
     """Return the names of a task's presets."""
-    return _list_files(spec, "preset")
+    folder = package_root(spec) / "preset" / spec.name
+    entries = folder.iterdir() if folder.is_dir() else ()
+    return sorted(entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
 
 
 def check_groups(spec: TaskSpec) -> None:
@@ -108,14 +105,10 @@ def package_root(spec: TaskSpec) -> Traversable:
 
 
 def read_group(spec: TaskSpec, group: str, name: str, package: str | None = None) -> dict[str, Any]:
-    """Return the settings of a scene or preset, with those of its ``defaults`` under its own; ``${...}`` stays as it
-    is.
+    """Return the settings of a scene or preset over those of its ``defaults``; ``${...}`` stays as it is.
 
     Args:
         package: that holds the file; None for the task's own.
-
-    Raises:
-        ConfigError: a file is missing, cannot be read, or starts from itself.
     """
     root = package_root(spec) if package is None else _open_package(package, f"scene {name!r}")
     return _read_with_defaults(root, f"{group}/{spec.name}", name, f"task {spec.name!r}: ", ())
@@ -139,11 +132,7 @@ def _read_with_defaults(
 
 
 def read_yaml(file: Traversable, who: str) -> dict[str, Any]:
-    """Return a YAML file of a task's package as a mapping; an empty file has no entries.
-
-    Raises:
-        ConfigError: there is no such file, or it is none; the message begins with ``who``.
-    """
+    """Return a YAML file of a task's package as a mapping; an error begins with ``who``."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
@@ -156,11 +145,7 @@ def read_yaml(file: Traversable, who: str) -> dict[str, Any]:
 
 
 def to_plain(node: Any, resolve: bool = True, who: str = "configuration") -> dict[str, Any]:
-    """Return an OmegaConf mapping as plain values.
-
-    Raises:
-        ConfigError: it is no mapping, or something that it refers to does not exist.
-    """
+    """Return an OmegaConf mapping as plain values; an error begins with ``who``."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
@@ -182,50 +167,29 @@ def _open_package(name: str, who: str) -> Traversable:
         raise ConfigError(f"{who}: cannot open its config_package {name!r} ({text})") from error
 
 
-def _list_files(spec: TaskSpec, group: str) -> list[str]:
-    folder = package_root(spec) / group / spec.name
-    entries = folder.iterdir() if folder.is_dir() else ()
-    return sorted(entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
-
-
 # ---------------------------------------------------------------- levels of effort
 
 
 def choose_level(spec: TaskSpec, chosen: str | None, preset: str | None, presets: Sequence[str]) -> Level | None:
-    """Return the level that ``effort=N`` names; None where that was not typed.
-
-    Args:
-        chosen, preset: what was typed for them.
-        presets: names of the task's.
-
-    Raises:
-        ConfigError: no such level, the task has none, or they are not of the preset that was typed.
-    """
+    """Return the level that ``effort=N`` names, which must be of the ``preset`` that was typed, if any."""
     if chosen is None:
         return None
     if chosen not in map(str, LEVELS):
         raise ConfigError(f"{EFFORT}={chosen}: expected a level from {LEVELS[0]} (fast) to {LEVELS[-1]} (good)")
     levels = read_levels(spec, presets)
+    typed = f"{EFFORT}={chosen}"
     if levels is None:
-        raise ConfigError(
-            f"{EFFORT}={chosen}: task {spec.name!r} has no levels; set model.primitives=N and "
-            "train.iterations=N instead"
-        )
+        instead = "set model.primitives=N and train.iterations=N instead"
+        raise ConfigError(f"{typed}: task {spec.name!r} has no levels; {instead}")
     level = levels[int(chosen)]
     if preset not in (None, level.preset):
-        raise ConfigError(
-            f"{EFFORT}={chosen}: levels of task {spec.name!r} are of preset={level.preset}, found "
-            f"preset={preset}; expected one of the two"
-        )
+        found = f"levels of task {spec.name!r} are of preset={level.preset}, found preset={preset}"
+        raise ConfigError(f"{typed}: {found}; expected one of the two")
     return level
 
 
 def read_levels(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, Level] | None:
-    """Return a task's levels by their numbers; None where it has none.
-
-    Raises:
-        ConfigError: its file is no such list.
-    """
+    """Return a task's levels by their numbers; None where it has none."""
     place = f"effort/{spec.name}.yaml"
     file = package_root(spec) / place
     if not file.is_file():

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from neuprim.config import check_groups, preset_settings, presets, task_choices
-from neuprim.config.checks import complete_options
+from neuprim.config.setting_checks import complete_options
 from neuprim.config.task_files import Level, read_levels
 from neuprim.conformance.task_under_test import ConformanceError, TaskUnderTest, drawn_range, random_condition
 from neuprim.core import checkpoint
@@ -22,12 +22,12 @@ from neuprim.core.compression import LEVELS, canonicalize
 from neuprim.core.conditions import read_conditions
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, FormError, NeuprimError
-from neuprim.core.layers import LayerFrame
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import ParameterSpec
 from neuprim.core.render import render
+from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.task import API_VERSION, Supervision
 from neuprim.core.train.settings import ModelSettings
 from neuprim.core.used_settings import build_settings, loss_settings

@@ -11,9 +11,9 @@ from torch import Tensor
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.dataset import GroundTruth, SceneContext
 from neuprim.core.environment import Environment, Illumination
-from neuprim.core.layers import LayerSpec
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField, Field
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.core.validation import Option
 from neuprim.core.volumes.density_truth import VolumeSource
 

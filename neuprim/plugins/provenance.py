@@ -18,6 +18,7 @@ from neuprim.core.notices import warn_once
 from neuprim.core.validation import Accepts, validate
 from neuprim.plugins.registry import (
     BUILT_IN,
+    FoundScene,
     PluginGroup,
     PluginInfo,
     UnknownPlugin,
@@ -92,6 +93,12 @@ class Provenance:
     scene: PluginVersion | None = None
     loss: PluginVersion | None = None
 
+    @classmethod
+    def of_installed(cls, task: PluginInfo, scene: FoundScene, loss: PluginInfo | None) -> Provenance:
+        """Record the installed plugins of a run; ``loss`` is that of ``train.loss``."""
+        added = None if scene.added_by is None else PluginVersion.of(scene.added_by, scene.spec.name)
+        return cls(__version__, PluginVersion.of(task), added, None if loss is None else PluginVersion.of(loss))
+
     @property
     def plugins(self) -> dict[str, PluginVersion]:
         """Kind -> plugin, without those that the run has not."""
@@ -153,7 +160,7 @@ def warn_of_other_neuprim(made_by: Provenance, file: Path | None = None) -> None
         warn_once(_in_file(file, f"this run was made by neuprim {made_by.neuprim}; this is neuprim {__version__}"))
 
 
-def check_resumed_provenance(stored: object, now: Provenance | None, file: Path) -> None:
+def check_resumed_provenance(stored: object, now: Provenance, file: Path) -> None:
     """Check whether a run may go on from a checkpoint, and warn of other versions.
 
     Args:
@@ -162,8 +169,6 @@ def check_resumed_provenance(stored: object, now: Provenance | None, file: Path)
     Raises:
         CheckpointError: its task comes from another package, or the record is damaged.
     """
-    if stored is None or now is None:
-        return
     try:
         before = Provenance.from_dict(stored)
     except ConfigError as error:

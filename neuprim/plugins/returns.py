@@ -12,9 +12,9 @@ from torch import Tensor
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.dataset_check import DatasetError, check_mask
 from neuprim.core.errors import NeuprimError
-from neuprim.core.layers import LayerFrame, LayerSpec
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
 from neuprim.core.task import TaskSpec
 
 Kind = TypeVar("Kind")

@@ -11,8 +11,8 @@ from typing import Any
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Exporter, Inspector, LossExtension
 from neuprim.core.io.exr import channel_name_error
-from neuprim.core.layers import COMMON, LIGHTS, LayerSpec
 from neuprim.core.model.fields import ConditionSpec, Field
+from neuprim.core.render.layer_frame import COMMON, LIGHTS, LayerSpec
 from neuprim.core.task import SceneSpec, TaskSpec
 from neuprim.core.used_settings import OPTIONAL
 from neuprim.core.validation import coerce, option_type

@@ -19,9 +19,9 @@ from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.exr import ExrChannel, write_exr_layers
 from neuprim.core.io.images import srgb_to_linear
-from neuprim.core.layers import LIGHTS, LayerFrame, LayerSpec, select_layers
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.layer_frame import LIGHTS, LayerFrame, LayerSpec, select_layers
 from neuprim.core.render.near_plane import resolve_near
 from neuprim.core.render.output import mean_depth
 from neuprim.core.task import TaskSpec

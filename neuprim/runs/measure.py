@@ -277,7 +277,7 @@ def summarize_metrics(
             "torch": torch.__version__,
             "numpy": np.__version__,
         },
-        **({} if config.made_by is None else {"made_by": config.made_by.origins()}),
+        "made_by": config.made_by.origins(),
     }
 
 

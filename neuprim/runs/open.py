@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import Job, RunConfig
-from neuprim.config.trust import check_stored, refuse_links
+from neuprim.config.stored_run import check_stored, refuse_links
 from neuprim.core.cameras.world import World
 from neuprim.core.checkpoint import load_model
 from neuprim.core.data import Dataset, View
@@ -84,8 +84,7 @@ def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
     if not named:
         config = replace(config, source=None)
     task = Job.of(config).task
-    if config.made_by is not None:
-        warn_of_other_neuprim(config.made_by, config.source)
+    warn_of_other_neuprim(config.made_by, config.source)
     model, header = load_model(model_file(run), task)
     config = replace(config, renderer=with_available_device(config.renderer))
     stored = StoredRun(config, task, run, model, header, task)
@@ -99,7 +98,7 @@ def make_scene_context(config: RunConfig, progress: Progress) -> SceneContext:
 
     Raises:
         ConfigError: a stored configuration has the scene contact an address, or write outside of the run
-        (:mod:`neuprim.config.trust`).
+        (:mod:`neuprim.config.stored_run`).
     """
     check_stored(config)
     return SceneContext(config.seed, cache_directory() / "scenes", progress, computing_device(config.renderer))

@@ -58,8 +58,8 @@ class RenderRequest:
             frames per second.
         environment: light from all around instead of the task's light.
         overrides: of a render configuration (:mod:`neuprim.runs.render_config`).
-        layers: of an OpenEXR file, names separated by commas (:mod:`neuprim.core.layers`); None for all but a layer per
-            light.
+        layers: of an OpenEXR file, names separated by commas (:mod:`neuprim.core.render.layer_frame`); None for all but
+            a layer per light.
         datatype: of light and alpha in an OpenEXR file, "half" or "float" (16 or 32 bits, the default).
         space: "world": cameras of a file, lights, and what is written of cameras and depths are in the coordinates of
             the data's files; "scene": in those of the model, for volumes their unit box.

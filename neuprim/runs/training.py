@@ -193,11 +193,10 @@ def save_training(fitted: Fitted) -> None:
     """Write checkpoint and model into the run's directory."""
     trainer, config, dataset = fitted.trainer, fitted.config, fitted.dataset
     tensors, header = trainer.state()
-    made_by = {} if config.made_by is None else {"made_by": config.made_by.to_dict()}
     placement = {} if dataset.placement is None else dataset.placement.to_json()
     moved = not dataset.world.identity or dataset.placement is not None
     world = {"world": {**placement, **dataset.world.to_json()}} if moved else {}
-    header = {"task": config.task, **made_by, **world, **header}
+    header = {"task": config.task, "made_by": config.made_by.to_dict(), **world, **header}
     checkpoint.write(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, header)
     extra: dict[str, Any] = {
         "background": [float(x) for x in dataset.background],

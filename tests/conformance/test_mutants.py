@@ -16,12 +16,12 @@ from neuprim.conformance.task_under_test import synthetic_dataset
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.core.layers import LayerSpec
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Conditions, ConditionSpec, Constant, Cosine, Field
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import ParameterSpec, Params
+from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.core.task import SceneSpec, Supervision, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.tasks.static import TASK

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import pytest
 
 from neuprim.core.extensions import Exporter, ExportReport, Inspector, SceneExtension
-from neuprim.core.layers import LayerSpec
 from neuprim.core.model.fields import ConditionSpec, DensityField
+from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.core.task import SceneSpec
 from neuprim.core.used_settings import OPTIONAL
 from neuprim.core.validation import Range

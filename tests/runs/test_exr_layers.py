@@ -18,10 +18,10 @@ from neuprim.core.channels import Channels
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.images import srgb_to_linear
-from neuprim.core.layers import LayerSpec
 from neuprim.core.model.fields import Constant
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
+from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.plugins.returns import ReturnError
 from neuprim.runs.exr_layers import ExrLayers
 from neuprim.runs.measure import render_light_sum

@@ -1,6 +1,6 @@
 """The user's word that a run of somebody else may be used as one of their own: ``--trust``, or an environment variable.
 
-What it is asked for: :mod:`neuprim.config.trust`.
+What it is asked for: :mod:`neuprim.config.stored_run`.
 """
 
 from __future__ import annotations

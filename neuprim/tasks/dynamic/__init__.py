@@ -13,12 +13,12 @@ from torch import Tensor
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.errors import ConfigError
-from neuprim.core.layers import LayerFrame, LayerSpec
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE
 from neuprim.core.model.edge import NORMS, profile
 from neuprim.core.model.fields import ColourField, ConditionSpec, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
 from neuprim.core.task import API_VERSION, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.core.validation import validate_choices

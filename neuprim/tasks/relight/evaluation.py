@@ -17,11 +17,11 @@ from torch import Tensor
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import linear_to_srgb
-from neuprim.core.layers import LayerFrame, LayerSpec
 from neuprim.core.metrics import means as mean_metrics
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.metrics.flip import flip, flip_available
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
 from neuprim.scenes import PIXEL_CLASSES
 from neuprim.tasks.relight.lighting import lighting_of, summarize_lights
 

@@ -9,7 +9,7 @@ import pytest
 
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose, read_stored_config
-from neuprim.config.trust import check_stored, refuse_links
+from neuprim.config.stored_run import check_stored, refuse_links
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.io.trust import ENVIRONMENT, trusting
 from neuprim.runs.open import make_scene_context

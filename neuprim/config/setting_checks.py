@@ -1,5 +1,4 @@
-"""Checks of names that a settings dataclass alone cannot make: keys of a scene, options of a task and loss, and shared
-settings that nothing reads."""
+"""Checks that a settings dataclass cannot make: keys of a scene, options of a task and loss, unused shared settings."""
 
 from __future__ import annotations
 
@@ -48,7 +47,6 @@ def check_key(assignment: Assignment, scene: Mapping[str, Any], scene_name: str)
 
 
 def _setting_names(cls: type, where: str = "") -> Iterator[str]:
-    """Dotted names of all settings of a dataclass, nested ones included; free dictionaries by their own name."""
     for own, hint in field_types(cls).items():
         name = join_key(where, own)
         if dataclasses.is_dataclass(hint) and isinstance(hint, type):
@@ -73,11 +71,7 @@ def _is_setting(path: list[str]) -> bool:
 
 
 def options_of(spec: TaskSpec, loss: LossExtension | None) -> Mapping[str, Option]:
-    """Return the options that may stand under ``task.options``: the task's own and those of the loss chosen.
-
-    Raises:
-        ConfigError: both have one of the same name.
-    """
+    """Return the options that may stand under ``task.options``: the task's own and those of the loss chosen."""
     if loss is None:
         return spec.options
     for name in sorted(spec.options.keys() & loss.options.keys()):
@@ -91,15 +85,7 @@ def options_of(spec: TaskSpec, loss: LossExtension | None) -> Mapping[str, Optio
 def complete_options(
     declared: Mapping[str, Option], given: Any, owner: str, where: str = "task.options"
 ) -> dict[str, Any]:
-    """Return every declared option: as given, converted to its type, else the default.
-
-    Args:
-        owner: whose options they are, for messages.
-        where: dotted name of the group, for messages.
-
-    Raises:
-        ConfigError: no such option, or a value that it does not take.
-    """
+    """Return every declared option, as given or its default; ``owner`` and ``where`` are for messages."""
     if not isinstance(given, Mapping):
         raise ConfigError(f"{where}={format_value(given)}: expected entries, each as {where}.KEY=VALUE")
     for key in given:
@@ -137,15 +123,15 @@ def refuse_unused(names: Iterable[str], spec: TaskSpec, loss: LossExtension | No
 def check_names(spec: TaskSpec, settings: RunSettings) -> None:
     """Refuse names under ``model.init``, ``train.rates`` and ``train.rate_units`` that no field of the task has, as far
     as the task lists its fields. The model itself may have fewer; what it lacks is refused when it is made."""
-    classes = list((spec.fields or {}).values())
-    if not classes:
+    if not spec.fields:
         return
-    init = {"scale", "points", "surroundings", *(name for cls in classes for name in cls.init_settings)}
+    init = {"scale", "points", "surroundings", *(name for cls in spec.fields.values() for name in cls.init_settings)}
     refuse_unknown(settings.model.init, init, "model.init")
     try:
-        parameters = {s.name for s in (*GEOMETRY_SPECS, *(s for cls in classes for s in cls.every_parameter()))}
+        own = [parameter for cls in spec.fields.values() for parameter in cls.every_parameter()]
     except TypeError:  # a field that cannot be made without settings
         return
+    parameters = {parameter.name for parameter in (*GEOMETRY_SPECS, *own)}
     for group, given in (("rates", settings.train.rates), ("rate_units", settings.train.rate_units)):
         for key in given:
             if key not in parameters:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.layers import COMMON, LayerSpec, select_layers
+from neuprim.core.render.layer_frame import COMMON, LayerSpec, select_layers
 
 HEAT = LayerSpec("heat", "temperature, kelvin", lambda frame: None, ("K",))
 GLOW = LayerSpec("glow", "light of the glow", lambda frame: None)

@@ -49,32 +49,22 @@ def find_plugin_source(group: PluginGroup[Any], word: str, entry: str | None = N
         entry: name of the entry point, if it is not the plugin's.
     """
     package, name = split_plugin_name(word)
-    info = _find_info(group, package, entry or name)
+    info = _find_plugin_info(group, package, entry or name)
     if info is None:
         return PluginSource(f"{group.kind} {name!r} of an unregistered package", "?")
     module = "" if info.built_in else info.target.partition(":")[0].partition(".")[0]
     return PluginSource(f"{group.kind} {name!r} of {info.origin}", module)
 
 
-def _find_info(group: PluginGroup[Any], package: str | None, entry: str) -> PluginInfo | None:
-    found = [
-        info
-        for info in group.list_plugins()
-        if info.name == entry and package in (None, canonicalize_name(info.distribution))
-    ]
+def _find_plugin_info(group: PluginGroup[Any], package: str | None, entry: str) -> PluginInfo | None:
+    named = [info for info in group.list_plugins() if info.name == entry]
+    found = [info for info in named if package in (None, canonicalize_name(info.distribution))]
     return min(found, key=lambda info: not info.built_in, default=None)
 
 
 @contextmanager
 def attribute_errors(source: PluginSource, function: str = "") -> Iterator[None]:
-    """Name the plugin in errors of one call of its code.
-
-    Args:
-        function: what is called, e.g. ``"build"``.
-
-    Raises:
-        PluginError: the call returned something unusable (:class:`~neuprim.plugins.returns.ReturnError`).
-    """
+    """Name the plugin in errors of a call of its ``function``, e.g. ``"build"``."""
     where = f"{function} of {source.label}" if function else source.label
     try:
         yield
@@ -85,30 +75,25 @@ def attribute_errors(source: PluginSource, function: str = "") -> Iterator[None]
     except (Exception, SystemExit) as error:
         if source.built_in or (isinstance(error, OSError) and error.errno in DISK):
             raise
-        raise PluginError(f"{where}: {_describe(error, source)}") from error
+        raise PluginError(f"{where}: {_describe_plugin_error(error, source)}") from error
 
 
-def _describe(error: BaseException, source: PluginSource) -> str:
-    """Return type and text of an error, and the innermost place in the plugin's code."""
+def _describe_plugin_error(error: BaseException, source: PluginSource) -> str:
     text = ": ".join(part for part in (type(error).__name__, " ".join(str(error).split())) if part)
     places = [
         f" ({Path(frame.f_code.co_filename).name} line {line}, in {frame.f_code.co_name})"
         for frame, line in traceback.walk_tb(error.__traceback__)
-        if _is_in(frame.f_globals, source)
+        if _is_plugin_code(frame.f_globals, source)
     ]
     return text + (places[-1] if places else "")
 
 
-def _is_in(variables: dict[str, Any], source: PluginSource) -> bool:
+def _is_plugin_code(variables: dict[str, Any], source: PluginSource) -> bool:
     return bool(source.module) and str(variables.get("__name__", "")).partition(".")[0] == source.module
 
 
 def guard_loss(loss: Loss, source: PluginSource) -> Loss:
-    """Return the loss of a plugin with its results checked and its errors attributed.
-
-    Raises:
-        PluginError: it is no function; or, when it is called, it returned something unusable.
-    """
+    """Return the loss of a plugin with its results checked and its errors attributed."""
     if not callable(loss):
         raise PluginError(f"{source.label}: the loss is a {type(loss).__name__}; expected a function")
 
@@ -133,7 +118,7 @@ class RunPlugins:
         self.task = find_plugin_source(TASKS, task)
         package, name = split_plugin_name(scene)
         entry = f"{split_plugin_name(task)[1]}.{name}"
-        if _find_info(SCENES, package, entry) is not None:
+        if _find_plugin_info(SCENES, package, entry) is not None:
             self.scene = find_plugin_source(SCENES, scene, entry)
         else:  # one of the task's own
             self.scene = PluginSource(f"scene {name!r} of {self.task.label.rpartition(' of ')[2]}", self.task.module)
@@ -141,12 +126,7 @@ class RunPlugins:
 
     @contextmanager
     def attribute_errors(self) -> Iterator[None]:
-        """Name the plugin in errors of code that calls several of them; the traceback says which one is at fault.
-
-        Raises:
-            DataError: the scene's loader broke a promise of its data set.
-            PluginError: a plugin's code failed, or a function of the task returned something unusable.
-        """
+        """Name the plugin in errors of code that calls several of them, by their tracebacks."""
         try:
             yield
         except DatasetError as error:
@@ -159,6 +139,6 @@ class RunPlugins:
             frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
             for frame in reversed(frames):
                 for source in (self.task, self.scene, self.loss):
-                    if _is_in(frame.f_globals, source):
-                        raise PluginError(f"{source.label}: {_describe(error, source)}") from error
+                    if _is_plugin_code(frame.f_globals, source):
+                        raise PluginError(f"{source.label}: {_describe_plugin_error(error, source)}") from error
             raise

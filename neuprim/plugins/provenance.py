@@ -36,7 +36,11 @@ def _is_version(value: Any) -> bool:
     return isinstance(value, str) and len(value) <= _LONGEST and value.isprintable()
 
 
-_Name = Annotated[str, Accepts(lambda value: _is_version(value) and bool(value.strip()) and ":" not in value, f"a name of at most {_LONGEST} characters")]
+def _is_name(value: Any) -> bool:
+    return _is_version(value) and bool(value.strip()) and ":" not in value
+
+
+_Name = Annotated[str, Accepts(_is_name, f"a name of at most {_LONGEST} characters")]
 _Version = Annotated[str, Accepts(_is_version, f"a version of at most {_LONGEST} characters")]
 
 

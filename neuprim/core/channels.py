@@ -122,25 +122,15 @@ class Channels:
 
 
 def find_channels(task: TaskSpec, dataset: Dataset) -> Channels:
-    """Return the channels of a task's data set.
-
-    Raises:
-        DataError: the task names another number of channels, or the background does not have one number for each.
-    """
+    """Return the channels of a task's data set, whose background must have one number for each."""
     if task.channels and len(task.channels) != dataset.channels:
-        raise DataError(
-            f"{dataset.name}: {dataset.channels} channels; expected {len(task.channels)}, which task "
-            f"{task.name!r} names: "
-            f"{', '.join(task.channels)}"
-        )
-    if tuple(dataset.background.shape) != (dataset.channels,):
-        raise DataError(
-            f"{dataset.name}: the background has shape {tuple(dataset.background.shape)}; "
-            f"expected ({dataset.channels},), a number per channel"
-        )
-    return Channels(
-        tuple(task.channels) or default_channel_names(dataset.channels), dataset.color_space, task.display, task.name
-    )
+        named = f"{len(task.channels)}, which task {task.name!r} names: {', '.join(task.channels)}"
+        raise DataError(f"{dataset.name}: {dataset.channels} channels; expected {named}")
+    if (shape := tuple(dataset.background.shape)) != (dataset.channels,):
+        expected = f"({dataset.channels},), a number per channel"
+        raise DataError(f"{dataset.name}: the background has shape {shape}; expected {expected}")
+    names = tuple(task.channels) or default_channel_names(dataset.channels)
+    return Channels(names, dataset.color_space, task.display, task.name)
 
 
 def read_stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec, count: int) -> Channels:
@@ -154,7 +144,7 @@ def read_stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec,
         CheckpointError: the header's names are damaged or do not fit the model.
     """
     names = header.get("channels")
-    if names is None:  # written before models kept them
+    if names is None:  # of a model that no run wrote
         names = task.channels if len(task.channels) == count else default_channel_names(count)
     elif not isinstance(names, list) or len(names) != count or channel_name_error(names):
         raise CheckpointError(

@@ -33,30 +33,25 @@ _NUMBERS = ("step", "elapsed", "views", "iterations", "train_seconds", "primitiv
 
 
 def write(path: Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Write tensors and a JSON header atomically; a full disk or a kill leaves the previous file untouched.
-
-    Raises:
-        CheckpointError: the file could not be written; names it and the reason.
-    """
+    """Write tensors and a JSON header atomically; a full disk or a kill leaves the previous file untouched."""
     text = json.dumps({"format": FORMAT, "kind": kind, **header}, allow_nan=False)
     compact = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     try:
         with atomic_path(path) as temporary:
             save_file(compact, str(temporary), metadata={_KEY: text})
     except (OSError, SafetensorError) as error:
-        raise CheckpointError(
-            f"{path}: could not write the {kind}: {error}; the previous one, if any, is untouched"
-        ) from error
+        left = "the previous one, if any, is untouched"
+        raise CheckpointError(f"{path}: could not write the {kind}: {error}; {left}") from error
 
 
 def read_header(path: Path, kind: str) -> dict[str, Any]:
-    """The JSON header of a file of this kind; reads no tensor.
+    """Return the JSON header of a file of this kind; reads no tensor.
 
     Raises:
         CheckpointError: missing, truncated, foreign or of another format version.
     """
     if compression.is_compressed(path):
-        return _checked(path, compression.read_head(path), kind)
+        return _check_model_header(path, compression.read_head(path), kind)
     try:
         with safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}
@@ -72,10 +67,10 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
         header = load_json(metadata[_KEY])
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: the {_KEY!r} header is not valid JSON ({error})") from error
-    return _checked(path, header, kind)
+    return _check_model_header(path, header, kind)
 
 
-def _checked(path: Path, header: Any, kind: str) -> dict[str, Any]:
+def _check_model_header(path: Path, header: Any, kind: str) -> dict[str, Any]:
     if not isinstance(header, dict) or header.get("kind") != kind:
         found = header.get("kind") if isinstance(header, dict) else type(header).__name__
         raise CheckpointError(f"{path}: kind is {cut(repr(found))}; expected {kind!r}")
@@ -94,11 +89,7 @@ def _checked(path: Path, header: Any, kind: str) -> dict[str, Any]:
 
 
 def shapes(path: Path, kind: str) -> dict[str, tuple[int, ...]]:
-    """Shapes of all tensors of a file that is not compressed; reads none of them.
-
-    Raises:
-        CheckpointError: see :func:`read_header`.
-    """
+    """Return the shapes of all tensors of a file that is not compressed; reads none of them."""
     read_header(path, kind)
     with safe_open(str(path), framework="pt") as file:
         return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}
@@ -107,17 +98,14 @@ def shapes(path: Path, kind: str) -> dict[str, tuple[int, ...]]:
 def read(
     path: Path, kind: str, rows: Callable[[str, tuple[int, ...]], slice | None] = lambda name, shape: None
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Header and tensors. Memory is bounded by the file's true size: a header that claims more is refused.
+    """Return header and tensors. Memory is bounded by the file's true size: a header that claims more is refused.
 
     Args:
         rows: of a tensor's name and shape, those to read; None for all.
-
-    Raises:
-        CheckpointError: see :func:`read_header`.
     """
     if compression.is_compressed(path):
         header, tensors, _ = compression.read_compressed(path)
-        return _checked(path, header, kind), tensors
+        return _check_model_header(path, header, kind), tensors
     header = read_header(path, kind)
     try:
         with safe_open(str(path), framework="pt") as file:
@@ -138,9 +126,7 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
     """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source.
 
     Args:
-        without_zeros: whether zeros of the fields are left out (:mod:`neuprim.core.model.sparse_storage`), as in models
-            that
-        were pruned.
+        without_zeros: leave out zeros of the fields, as in pruned models (:mod:`neuprim.core.model.sparse_storage`).
     """
     specs = (*model.density.parameters(), *model.colour.parameters()) if without_zeros else ()
     tensors, sparse = store_sparse(model.params, specs)
@@ -160,9 +146,6 @@ def save_compressed(
     Args:
         bits: how many, or how the numbers of a model that is folded are coded.
         config: text of the run's ``config.yaml``, so that a run directory can be made of the file.
-
-    Raises:
-        CheckpointError: numbers that cannot be stored, or the file could not be written; names it and the reason.
     """
     if isinstance(bits, compression.BitTable):
         model = compression.canonicalize(model)
@@ -178,11 +161,7 @@ def save_compressed(
 
 
 def stored_config(path: Path) -> str | None:
-    """Text of the ``config.yaml`` in a compressed model; None where it has none.
-
-    Raises:
-        CheckpointError: see :func:`read_header`.
-    """
+    """Return the text of the ``config.yaml`` in a compressed model; None where it has none."""
     return compression.read_compressed(path)[2]
 
 
@@ -197,30 +176,24 @@ def model_header(model: Primitives, task: str, extra: Mapping[str, Any]) -> dict
 
 def extra_of(header: Mapping[str, Any]) -> dict[str, Any]:
     """Of a model's header, what :func:`save_model` was given beside the model itself."""
-    return {
-        key: value
-        for key, value in header.items()
-        if key not in ("format", "kind", "task", "primitives", "density", "colour")
-    }
+    own = ("format", "kind", "task", "primitives", "density", "colour")
+    return {key: value for key, value in header.items() if key not in own}
 
 
 def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
-    """The model in ``path`` and its header.
+    """Return the model in ``path`` and its header.
 
     Raises:
-        CheckpointError: damaged, written for another task, with fields this task does not have, or tensors that do not
-        fit them.
+        CheckpointError: damaged, of another task, with fields that it does not have, or tensors that do not fit them.
     """
     header = read_header(path, "model")
     if header.get("task") != task.name:
         raise CheckpointError(f"{path}: written for task {cut(repr(header.get('task')))}; expected {task.name!r}")
-    density, colour = (_field(path, header, task, kind) for kind in ("density", "colour"))
+    density, colour = (_read_field(path, header, task, kind) for kind in ("density", "colour"))
     _, tensors = read(path, "model")
     if not isinstance(density, DensityField) or not isinstance(colour, ColourField):
-        raise CheckpointError(
-            f"{path}: density and colour fields are {type(density).__name__} and "
-            f"{type(colour).__name__}; expected one of each"
-        )
+        found = f"{type(density).__name__} and {type(colour).__name__}"
+        raise CheckpointError(f"{path}: density and colour fields are {found}; expected one of each")
     own = (*density.parameters(), *colour.parameters())
     if "sparse" in header:
         tensors = load_sparse(tensors, header.pop("sparse"), own, str(path))
@@ -236,30 +209,21 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
     return model, header
 
 
-def _field(path: Path, header: Mapping[str, Any], task: TaskSpec, kind: str) -> Any:
-    entry = header.get(kind)
-    if (
-        not isinstance(entry, dict)
-        or not isinstance(entry.get("class"), str)
-        or not isinstance(entry.get("settings"), dict)
-    ):
-        raise CheckpointError(
-            f"{path}: header field {kind!r} is {cut(repr(entry))}; expected {{'class': ..., 'settings': {{...}}}}"
-        )
-    known = task.fields or {}
-    if entry["class"] not in known:
-        raise CheckpointError(
-            f"{path}: unknown {kind} field {cut(entry['class'])!r} for task "
-            f"{task.name!r}{nearest(entry['class'], known)}"
-        )
-    for name, value in entry["settings"].items():
-        if not isinstance(value, (int, float, str, bool, type(None), list)) or (
-            isinstance(value, int) and abs(value) > 10_000
-        ):
-            raise CheckpointError(f"{path}: {kind} setting {cut(name)}={cut(repr(value))} is not plausible")
+def _read_field(path: Path, header: Mapping[str, Any], task: TaskSpec, kind: str) -> Any:
+    entry, known = header.get(kind), task.fields or {}
+    name, settings = (entry.get("class"), entry.get("settings")) if isinstance(entry, dict) else (None, None)
+    if not isinstance(name, str) or not isinstance(settings, dict):
+        expected = "{'class': ..., 'settings': {...}}"
+        raise CheckpointError(f"{path}: header field {kind!r} is {cut(repr(entry))}; expected {expected}")
+    if name not in known:
+        who = f"unknown {kind} field {cut(name)!r} for task {task.name!r}"
+        raise CheckpointError(f"{path}: {who}{nearest(name, known)}")
+    for key, value in settings.items():
+        plain = isinstance(value, int | float | str | list | None)
+        if not plain or (isinstance(value, int) and abs(value) > 10_000):
+            raise CheckpointError(f"{path}: {kind} setting {cut(key)}={cut(repr(value))} is not plausible")
     try:
-        return known[entry["class"]](**entry["settings"])
+        return known[name](**settings)
     except (TypeError, ValueError) as error:
-        raise CheckpointError(
-            f"{path}: {kind} field {entry['class']!r} refused its settings {cut(str(entry['settings']))}: {error}"
-        ) from error
+        refused = f"{kind} field {name!r} refused its settings {cut(str(settings))}"
+        raise CheckpointError(f"{path}: {refused}: {error}") from error

@@ -1,11 +1,9 @@
-"""What a user may write for a condition of a task: one grammar for every command, and for exporters of anybody's.
+"""Read the conditions of a task from text: one grammar for every command and exporter, and the check of their ranges.
 
 A condition is given as ``--NAME TEXT``, ``--NAME=TEXT`` or ``NAME=TEXT``, with ``-`` or ``_`` inside its name. For a
 condition that is one number the text may be a number, a list ``A,B,C`` of them, ``FIRST:LAST`` or ``FIRST:LAST:COUNT``,
-one frame each; what one number is, the task's own :attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>`
-says. The text of any other condition is the task's altogether, as ``x,y,z`` or ``orbit`` for a light.
-
-Values are held against the condition's range here, so that no command and no exporter can forget to.
+one frame each; :attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>` reads one number. The text of any
+other condition is the task's altogether, as ``x,y,z`` or ``orbit`` for a light.
 """
 
 from __future__ import annotations
@@ -51,14 +49,10 @@ def named(word: str, specs: Sequence[ConditionSpec]) -> str | None:
 def split_words(
     words: Sequence[str], specs: Sequence[ConditionSpec], bare: bool = True
 ) -> tuple[dict[str, str], list[str]]:
-    """Condition name -> text out of the words of a command, and the words that are about something else, in their
-    order.
+    """Return condition name -> text out of the words of a command, and the other words in their order.
 
     Args:
         bare: whether ``NAME=TEXT`` counts too, beside ``--NAME TEXT`` and ``--NAME=TEXT``.
-
-    Raises:
-        ConfigError: a condition without a text, or given twice.
     """
     found: dict[str, str] = {}
     rest: list[str] = []
@@ -87,37 +81,29 @@ def split_words(
 def read_conditions(
     specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = _silent
 ) -> dict[str, list[Tensor]]:
-    """Name -> values, one per frame, of the conditions that were given, in the task's order.
+    """Return name -> values, one per frame, of the conditions that were given, in the task's order.
 
     An animation that does not say how many frames it has, ``0:1`` or ``orbit``, takes the number of those that do.
 
     Args:
         warn: called with one line for each condition that leaves its range; those of strict ones are refused.
-
-    Raises:
-        ConfigError: a text that the condition does not take, values that are not finite, or beyond the range of a
-        strict condition.
     """
     given = [spec for spec in specs if spec.name in texts]
     said = {}
     for spec in given:
-        found = _read(spec, texts[spec.name], _silent)
-        if len(found) > 1 and _in_frames(spec, texts[spec.name], len(found)) is None:
+        found = _read_condition(spec, texts[spec.name], _silent)
+        if len(found) > 1 and _with_frame_count(spec, texts[spec.name], len(found)) is None:
             said[spec.name] = len(found)
     count = max(said.values(), default=0)
     lengths = {
-        spec.name: None if spec.name in said or not count else _in_frames(spec, texts[spec.name], count)
+        spec.name: None if spec.name in said or not count else _with_frame_count(spec, texts[spec.name], count)
         for spec in given
     }
-    return {spec.name: _read(spec, lengths[spec.name] or texts[spec.name], warn) for spec in given}
+    return {spec.name: _read_condition(spec, lengths[spec.name] or texts[spec.name], warn) for spec in given}
 
 
 def in_step(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> int:
-    """How many frames conditions of :func:`read_conditions` have together; those of one value hold it in all of them.
-
-    Raises:
-        ConfigError: two have several values each, and not as many.
-    """
+    """Return how many frames conditions have together; those of one value hold it in all frames, others must agree."""
     counts = {name: len(values) for name, values in found.items() if len(values) > 1}
     if len(set(counts.values())) > 1:
         each = " and ".join(f"{flag(name)} {texts[name]} has {count} frames" for name, count in counts.items())
@@ -125,7 +111,7 @@ def in_step(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> 
     return max(counts.values(), default=1)
 
 
-def _in_frames(spec: ConditionSpec, text: str, count: int) -> str | None:
+def _with_frame_count(spec: ConditionSpec, text: str, count: int) -> str | None:
     """The text in so many frames; None where it says its number, or is a single value or a list."""
     if spec.shape:
         return spec.in_frames(text, count)
@@ -133,46 +119,43 @@ def _in_frames(spec: ConditionSpec, text: str, count: int) -> str | None:
     return f"{text.strip()}:{count}" if found is not None and found[3] is None else None
 
 
-def _read(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
+def _read_condition(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
     parts = [part.strip() for part in text.split(",")] if not spec.shape else [text]
     values: list[Tensor] = []
     for part in parts:
-        values += _values(spec, part)
+        values += _read_number_or_range(spec, part)
         if len(values) > _MOST:  # before the next part takes more memory
-            raise ConfigError(
-                f"{flag(spec.name)} {text[:40]}...: {len(values)} values and more; expected at most {_MOST}"
-            )
-    _check_range(spec, text, values, warn)
+            shown = f"{flag(spec.name)} {text[:40]}..."
+            raise ConfigError(f"{shown}: {len(values)} values and more; expected at most {_MOST}")
+    _check_condition_range(spec, text, values, warn)
     return values
 
 
-def _values(spec: ConditionSpec, text: str) -> list[Tensor]:
-    """One number or one range, as the task reads it; a range that the task does not read is made of numbers that it
-    does."""
+def _read_number_or_range(spec: ConditionSpec, text: str) -> list[Tensor]:
+    """Read one number or range; a range that the task does not read is made of numbers that it does."""
     try:
-        return _parsed(spec, text)
+        return _parse_condition(spec, text)
     except NeuprimError:
         found = None if spec.shape else _RANGE.fullmatch(text)
         if found is None:
             raise
         first, last = float(found[1]), float(found[2])
         try:
-            ends = [value for end in (first, last) for value in _parsed(spec, _plain(end))]
+            ends = [value for end in (first, last) for value in _parse_condition(spec, _format_number(end))]
         except NeuprimError:
             pass  # the task's message about the whole text says more than one about an end
         else:
             count = FRAMES if found[3] is None else int(found[3])
             if not 2 <= count <= _MOST:
-                raise ConfigError(
-                    f"{flag(spec.name)} {text}: expected FIRST:LAST or FIRST:LAST:COUNT, 2 to {_MOST} frames"
-                ) from None
+                expected = f"FIRST:LAST or FIRST:LAST:COUNT, 2 to {_MOST} frames"
+                raise ConfigError(f"{flag(spec.name)} {text}: expected {expected}") from None
             dtype = ends[0].dtype if ends[0].is_floating_point() else torch.float64
             numbers = torch.linspace(first, last, count, dtype=dtype).tolist()
-            return [value for x in numbers for value in _parsed(spec, _plain(x))]
+            return [value for x in numbers for value in _parse_condition(spec, _format_number(x))]
         raise
 
 
-def _parsed(spec: ConditionSpec, text: str) -> list[Tensor]:
+def _parse_condition(spec: ConditionSpec, text: str) -> list[Tensor]:
     try:
         values = spec.parse(text)
     except ValueError as error:  # as float("x") raises it; the text is the user's
@@ -182,30 +165,30 @@ def _parsed(spec: ConditionSpec, text: str) -> list[Tensor]:
     return list(values)
 
 
-def _plain(number: float) -> str:
+def _format_number(number: float) -> str:
     """As a user would write it: whole numbers without a point, others exact."""
     return repr(number).removesuffix(".0")
 
 
-def _check_range(spec: ConditionSpec, text: str, values: Sequence[Tensor], warn: Warn) -> None:
+def _check_condition_range(spec: ConditionSpec, text: str, values: Sequence[Tensor], warn: Warn) -> None:
     """Elementwise; the range's ends are rounded as the values are, so that 0.3 lies within 0 to 0.3."""
     low, high = spec.range
     shown = f"{flag(spec.name)} {text}"
     for value in values:
         if not bool(torch.isfinite(value).all()):
-            raise ConfigError(f"{shown}: {_first(value, ~torch.isfinite(value)):g}; expected finite numbers")
+            raise ConfigError(f"{shown}: {_first_where(value, ~torch.isfinite(value)):g}; expected finite numbers")
     for value in values:
         ends = torch.tensor([low, high], dtype=value.dtype if value.is_floating_point() else torch.float64)
         outside = (value < ends[0]) | (value > ends[1])
         if bool(outside.any()):
-            line = f"{shown}: {_first(value, outside):g} is outside its range, {low:g} to {high:g} ({spec.unit})"
+            line = f"{shown}: {_first_where(value, outside):g} is outside its range, {low:g} to {high:g} ({spec.unit})"
             if spec.strict:
                 raise ConfigError(f"{line}; expected values within it")
             warn(f"warning: {line}")
             return
 
 
-def _first(value: Tensor, where: Tensor) -> float:
+def _first_where(value: Tensor, where: Tensor) -> float:
     return float(value[where].flatten()[0])
 
 
@@ -215,15 +198,11 @@ def _first(value: Tensor, where: Tensor) -> float:
 def export_frames(
     specs: Sequence[ConditionSpec], texts: Mapping[str, str], several: bool = False
 ) -> list[dict[str, Tensor]]:
-    """One mapping of every condition of the task per frame that was asked for; only one frame unless ``several``.
-
-    Raises:
-        ConfigError: a condition is missing, has several values where one is wanted, or as :func:`read_conditions`.
-    """
+    """Return a mapping of every condition of the task per frame; all must be given, of one frame unless ``several``."""
     for spec in specs:
         if spec.name not in texts:
             what = f"{flag(spec.name)}: required, as the model depends on it ({spec.unit})"
-            raise ConfigError(f"{what}; for example {flag(spec.name)} {_example(spec)}")
+            raise ConfigError(f"{what}; for example {flag(spec.name)} {_example_condition(spec)}")
     found = read_conditions(specs, texts)
     counts = {name: len(values) for name, values in found.items() if len(values) > 1}
     if counts and not several:
@@ -233,9 +212,9 @@ def export_frames(
     return [{name: values[i if len(values) > 1 else 0] for name, values in found.items()} for i in range(frames)]
 
 
-def _example(spec: ConditionSpec) -> str:
+def _example_condition(spec: ConditionSpec) -> str:
     """A text that is within the range."""
     low, high = spec.range
     usual = 1.0 if spec.shape else 0.5
     value = usual if low <= usual <= high else (low + high) / 2
-    return ",".join([_plain(value)] * math.prod(spec.shape))
+    return ",".join([_format_number(value)] * math.prod(spec.shape))

@@ -89,8 +89,8 @@ class Environment:
         if radiance.dim() != 3 or radiance.shape[1:] != (2 * len(radiance), 3) or not len(radiance):
             shape = tuple(radiance.shape)
             raise DataError(f"{where}: image has shape {shape}; expected (H, 2 H, 3), latitude and longitude, RGB")
-        axes = _axes(torch.tensor([0.0, 0.0, 1.0]) if up is None else up)
-        self._flux, self._moment = _cells(radiance, axes, math.radians(rotation), where)
+        axes = _environment_axes(torch.tensor([0.0, 0.0, 1.0]) if up is None else up)
+        self._flux, self._moment = _sum_texel_blocks(radiance, axes, math.radians(rotation), where)
 
     @property
     def irradiance(self) -> Tensor:
@@ -160,7 +160,7 @@ def read_environment(path: Path, up: Tensor | None = None, rotation: float = 0.0
     return Environment(radiance if scale == 1.0 else radiance.float() * scale, up, rotation, str(path))
 
 
-def _axes(up: Tensor) -> Array:
+def _environment_axes(up: Tensor) -> Array:
     """(3, 3) rows: first horizontal axis, second, up."""
     top = up.detach().double().numpy()
     length = np.linalg.norm(top)
@@ -173,7 +173,7 @@ def _axes(up: Tensor) -> Array:
     return np.stack([first, np.cross(top, first), top])
 
 
-def _cells(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Array, Array]:
+def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Array, Array]:
     """(R, C, 3) radiance times solid angle, and (R, C, 3) its luminance times direction, summed over blocks of
     texels."""
     height, width = radiance.shape[:2]
@@ -214,41 +214,41 @@ def _rectangles(moment: Array, weight: Array, count: int) -> list[tuple[int, int
     if total == 0.0:
         return []
     whole: tuple[int, int, int, int] = (0, rows, 0, columns)
-    queue = [(-float(_spread(table[-1, -1])), whole)]
+    queue = [(-float(_direction_spread(table[-1, -1])), whole)]
     done: list[tuple[int, int, int, int]] = []
     while queue and len(queue) + len(done) < count:
         _, box = heapq.heappop(queue)
-        parts = _cut(table, box, 1e-12 * total)
+        parts = _cut_rectangle(table, box, 1e-12 * total)
         if not parts:
             done.append(box)
         for part in parts:
-            heapq.heappush(queue, (-float(_spread(_sum(table, part))), part))
+            heapq.heappush(queue, (-float(_direction_spread(_sum_rectangle(table, part))), part))
     return sorted(done + [box for _, box in queue])
 
 
-def _sum(table: Array, box: tuple[int, int, int, int]) -> Array:
+def _sum_rectangle(table: Array, box: tuple[int, int, int, int]) -> Array:
     r0, r1, c0, c1 = box
     return np.asarray(table[r1, c1] - table[r0, c1] - table[r1, c0] + table[r0, c0])
 
 
-def _spread(sums: Array) -> Array:
+def _direction_spread(sums: Array) -> Array:
     """Energy times variance of direction, W - |M|^2/W, of (..., 4) sums (M, W)."""
     weight = sums[..., 3]
     return np.asarray(np.maximum(weight - (sums[..., :3] ** 2).sum(-1) / np.maximum(weight, 1e-300), 0.0))
 
 
-def _cut(table: Array, box: tuple[int, int, int, int], least: float) -> list[tuple[int, int, int, int]]:
+def _cut_rectangle(table: Array, box: tuple[int, int, int, int], least: float) -> list[tuple[int, int, int, int]]:
     """The two parts of the best cut; none if no cut lowers the spread by ``least``."""
     r0, r1, c0, c1 = box
-    whole = _sum(table, box)
-    best, parts = float(_spread(whole)) - least, []
+    whole = _sum_rectangle(table, box)
+    best, parts = float(_direction_spread(whole)) - least, []
     rows = table[r0 + 1 : r1, c1] - table[r0, c1] - table[r0 + 1 : r1, c0] + table[r0, c0]
     columns = table[r1, c0 + 1 : c1] - table[r1, c0] - table[r0, c0 + 1 : c1] + table[r0, c0]
     for along_rows, first in ((True, rows), (False, columns)):
         if not len(first):
             continue
         second = whole - first
-        cost = _spread(first) + _spread(second)
+        cost = _direction_spread(first) + _direction_spread(second)
         cost[np.minimum(first[:, 3], second[:, 3]) <= 0.1 * least] = np.inf  # a part without energy is no light
         at = int(cost.argmin())
         if cost[at] < best:

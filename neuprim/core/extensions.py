@@ -49,20 +49,12 @@ class TrainedModel:
 
     @property
     def world(self) -> World:
-        """The transform between the scene and the user's files, in whose coordinates everything is exported.
-
-        Raises:
-            DataError: the header says something else.
-        """
+        """The transform between the scene and the user's files, in whose coordinates everything is exported."""
         return World.of(self.header, str(self.directory))
 
     @property
     def channels(self) -> Channels:
-        """The channels of its colours.
-
-        Raises:
-            CheckpointError: the header names other channels than the model has.
-        """
+        """The channels of its colours."""
         return read_stored_channels(self.directory, self.header, self.task, self.model.colour.channels)
 
 
@@ -86,11 +78,7 @@ class ExportJob:
     progress: Callable[[str, float], None] = lambda text, fraction: None
 
     def frames(self, several: bool = False) -> list[dict[str, Tensor]]:
-        """Return the task's conditions of each frame that the user named; one frame unless ``several``.
-
-        Raises:
-            ConfigError: a condition is missing, or has several values where one is wanted.
-        """
+        """Return the task's conditions of each frame that the user named; one frame unless ``several``."""
         return export_frames(self.run.task.conditions, self.conditions, several)
 
     def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:

@@ -1,9 +1,7 @@
-"""Which settings a task or loss reads: its own options, and those of the shared settings that only some of them use.
+"""Which settings a task or loss reads: its own options, and the shared settings that only some of them use.
 
-Most of ``model`` and ``train`` concerns every run, because the trainer reads it. The settings in :data:`OPTIONAL` are
-read by a task's
-``build`` or by a loss, if at all. Whoever reads one says so in ``uses``; setting one that nobody reads is refused, and
-a function that reads one which it did not declare does not get it.
+The settings in :data:`OPTIONAL` are read by a task's ``build`` or by a loss, if at all. Whoever reads one says so in
+``uses``; setting one that nobody reads is refused, and a function gets only those that it declared.
 """
 
 from __future__ import annotations
@@ -13,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from neuprim.core.errors import ConfigError
 from neuprim.core.train.settings import ModelSettings, TrainSettings
-from neuprim.core.validation import Option
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension
@@ -43,37 +40,26 @@ class TrackedMapping(dict[str, Any]):
 
 
 def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What a task's ``build`` and ``check`` get: the model's settings that it uses, and its options as "options".
+    """Return what a task's ``build`` and ``check`` get: the model settings that it uses, and its options as "options".
 
     Args:
         options: values by name; what is missing takes its default, others are left out.
     """
-    return _group("model", vars(model), task.uses, task.options, options, f"task {task.name!r}")
+    return _track_settings("model", vars(model), task, options, f"task {task.name!r}")
 
 
 def loss_settings(
     owner: TaskSpec | LossExtension, train: TrainSettings, options: Mapping[str, Any]
 ) -> Mapping[str, Any]:
-    """What makes a loss: the training settings that it uses, and its options as "options".
-
-    Args:
-        owner: of the loss: the task, or what ``train.loss`` names.
-        options: as of :func:`build_settings`.
-    """
+    """As :func:`build_settings`: return what makes a loss of the task or of the ``train.loss`` that owns it."""
     who = f"the loss of task {owner.name!r}" if hasattr(owner, "build") else f"loss {owner.name!r}"
-    return _group("train", vars(train), owner.uses, owner.options, options, who)
+    return _track_settings("train", vars(train), owner, options, who)
 
 
-def _group(
-    name: str,
-    values: Mapping[str, Any],
-    uses: tuple[str, ...],
-    declared: Mapping[str, Option],
-    options: Mapping[str, Any],
-    owner: str,
+def _track_settings(
+    group: str, values: Mapping[str, Any], spec: TaskSpec | LossExtension, options: Mapping[str, Any], owner: str
 ) -> TrackedMapping:
-    used = {k: v for k, v in values.items() if f"{name}.{k}" not in OPTIONAL or f"{name}.{k}" in uses}
-    own = {key: options.get(key, option[0]) for key, option in declared.items()}
-    return TrackedMapping(
-        {**used, "options": TrackedMapping(own, owner, "task.options", "options")}, owner, name, "uses"
-    )
+    used = {k: v for k, v in values.items() if f"{group}.{k}" not in OPTIONAL or f"{group}.{k}" in spec.uses}
+    declared = {key: options.get(key, option[0]) for key, option in spec.options.items()}
+    own = TrackedMapping(declared, owner, "task.options", "options")
+    return TrackedMapping({**used, "options": own}, owner, group, "uses")

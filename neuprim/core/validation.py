@@ -1,14 +1,12 @@
-"""Settings, declared once: their types, bounds and choices stand on the fields of a dataclass, and one function refuses
-what does not fit.
+"""Settings, declared once on the fields of a dataclass with types, bounds and choices, and checked by one function.
 
     @dataclass(frozen=True)
     class Waves:
         count: Annotated[int, Range(1, 16)] = 3
         form: Literal["sine", "cosine"] = "sine"
 
-    validate(Waves, {"cuont": 4}, "model.density")  # model.density.cuont: no such setting; did you mean
-    'model.density.count'? validate(Waves, {"count": 99}, "model.density")  # model.density.count=99: expected a whole
-    number from 1 to 16
+    validate(Waves, {"cuont": 4}, "model.density")
+    # ConfigError: model.density.cuont: no such setting; did you mean 'model.density.count'?
 
 Types are ``bool``, ``int``, ``float``, ``str``, ``Path``, ``list``, ``Literal``, ``tuple``, ``dict``, other settings
 dataclasses, unions of these, and ``Any``. Conversions lose nothing: 1e5 is a whole number, true is not one, and no
@@ -18,6 +16,7 @@ number is NaN or infinite.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import types
 from collections.abc import Callable, Iterable, Mapping
@@ -70,10 +69,8 @@ class Range:
 
     def words(self, kind: str) -> str:
         """E.g. "0, or a whole number of at least 2"."""
-        low, high = (
-            _number(self.at_least if self.above is None else self.above),
-            _number(self.at_most if self.below is None else self.below),
-        )
+        low = _format_bound(self.at_least if self.above is None else self.above)
+        high = _format_bound(self.at_most if self.below is None else self.below)
         if low and high and self.above is self.below is None:
             limits = f"from {low} to {high}"
         else:
@@ -84,10 +81,10 @@ class Range:
                 if lower and upper
                 else lower or (upper and f"of {upper}" if self.below is None else upper)
             )
-        return "".join(f"{_number(value)}, or " for value in self.also) + f"{kind} {limits}".rstrip()
+        return "".join(f"{_format_bound(value)}, or " for value in self.also) + f"{kind} {limits}".rstrip()
 
 
-def _number(value: float | None) -> str:
+def _format_bound(value: float | None) -> str:
     """As a bound is written; empty for none."""
     return "" if value is None or math.isinf(value) else str(value) if isinstance(value, int) else f"{value:g}"
 
@@ -115,11 +112,7 @@ class Unbounded:
 
 def nonempty_text(says: str) -> Accepts:
     """Text or a path that is not empty, without the character that no file name can hold."""
-    return Accepts(_is_text, says)
-
-
-def _is_text(value: Any) -> bool:
-    return bool(str(value)) and "\0" not in str(value)
+    return Accepts(lambda value: bool(str(value)) and "\0" not in str(value), says)
 
 
 # ---------------------------------------------------------------- settings from plain values
@@ -133,8 +126,7 @@ def validate(cls: type[T], values: object, where: str = "") -> T:
         where: dotted key of this group, for messages; empty at the root.
 
     Raises:
-        ConfigError: one line for an unknown or missing key, or a value of the wrong type, beyond its bounds, or none of
-        its choices.
+        ConfigError: one line for an unknown or missing key, or a value that its field does not take.
     """
     if isinstance(values, cls):
         return values
@@ -157,30 +149,19 @@ def validate_choices(found: Mapping[str, Any], where: str, offered: Mapping[str,
     Args:
         found: what the user and the preset set.
         where: dotted name of the group, for messages.
-        offered: name -> type, as on a settings dataclass: ``int``, ``Annotated[float, Range(above=0)]``, ``Literal["a",
-        "b"]``; or a tuple
-            of the values to choose from.
-
-    Raises:
-        ConfigError: naming the key, what was found and what is expected.
+        offered: name -> type, as on a settings dataclass; or a tuple of the values to choose from.
     """
     refuse_unknown(found, offered, where)
     for key, value in found.items():
         hint = _offered(offered[key])
         made = coerce(value, hint, join_key(where, key))
         if made != value or (isinstance(made, int) and isinstance(value, float)):
-            # "1e-3" for a number, 3 for text, 4.0 for a whole number: a field that gets the value itself would not read
-            # them so
+            # "1e-3" for a number, 3 for text, 4.0 for a whole number: the field gets the value itself
             raise _Unfit(join_key(where, key), value, _words(hint, join_key(where, key)))
 
 
 def validate_fields(settings: Any, where: str) -> None:
-    """For ``__post_init__`` of a settings dataclass: what Python code passes is checked, and converted, as what users
-    type.
-
-    Raises:
-        ConfigError: as :func:`validate`.
-    """
+    """Check and convert the fields of a settings dataclass in its ``__post_init__``, as :func:`validate` does."""
     for name, hint in field_types(type(settings)).items():
         value = getattr(settings, name)
         made = coerce(value, hint, join_key(where, name))
@@ -189,11 +170,7 @@ def validate_fields(settings: Any, where: str) -> None:
 
 
 def coerce(value: Any, hint: Any, where: str) -> Any:
-    """``value`` as the annotated type ``hint``, within its bounds.
-
-    Raises:
-        ConfigError: one line with ``where``, the value and what is expected.
-    """
+    """Return ``value`` as the annotated type ``hint``, within its bounds; a ConfigError names ``where``."""
     plain, notes = _unwrapped(hint)
     if get_origin(plain) in (Union, types.UnionType):
         return _one_of(value, get_args(plain), where)
@@ -250,19 +227,13 @@ def join_key(where: str, name: str) -> str:
 
 
 def format_value(value: object) -> str:
-    """A value as users type it, cut where it is long; text that reads as something else is quoted, and so is what would
-    break the line."""
-    return cut(_whole(value))
-
-
-def _whole(value: object) -> str:
+    """Return a value as users type it, cut where it is long; text that reads as something else is quoted."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, str) and (
-        not value.isprintable() or value.lower() in ("", "null", "true", "false") or _reads_as_number(value)
-    ):
-        return repr(value)
-    return " ".join(str(value).split()) if not isinstance(value, str) else value
+    if not isinstance(value, str):
+        return cut(" ".join(str(value).split()))
+    special = value.lower() in ("", "null", "true", "false") or _reads_as_number(value)
+    return cut(repr(value) if special or not value.isprintable() else value)
 
 
 def _reads_as_number(value: str) -> bool:
@@ -307,15 +278,11 @@ def _either(values: tuple[object, ...]) -> str:
 # ---------------------------------------------------------------- types
 
 
+@functools.cache
 def field_types(cls: type) -> Mapping[str, Any]:
     """Field name -> annotated type, of a settings dataclass."""
-    if cls not in _HINTS:
-        hints = get_type_hints(cls, include_extras=True)
-        _HINTS[cls] = {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
-    return _HINTS[cls]
-
-
-_HINTS: dict[type, Mapping[str, Any]] = {}
+    hints = get_type_hints(cls, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
 
 
 def _unwrapped(hint: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -393,8 +360,6 @@ def _scalar(value: Any, kind: Any) -> Any:
         return number if math.isfinite(number) else None
     if kind is str and isinstance(value, str | int) and not truth:
         return str(value)  # a directory may be called 123
-    if (
-        kind is Path and isinstance(value, str | int | Path) and not truth and str(value)
-    ):  # Path("") would be the working directory
-        return Path(str(value))
+    if kind is Path and isinstance(value, str | int | Path) and not truth and str(value):
+        return Path(str(value))  # Path("") would be the working directory
     return value if kind is list and isinstance(value, list) else None

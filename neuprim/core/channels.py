@@ -51,37 +51,37 @@ class Channels:
         return {1: (0, 0, 0), 3: (0, 1, 2)}.get(self.count)
 
     @property
-    def plain(self) -> bool:
+    def is_rgb(self) -> bool:
         """Whether an image is red, green and blue and nothing else, so that the sRGB curve applies to all of it."""
         return self.own is None and sorted(self.names) == ["B", "G", "R"]
 
     @property
-    def partial(self) -> bool:
+    def hides_channels(self) -> bool:
         """Whether pictures leave channels out or have too few, because the task has no display."""
         return self.own is None and self.count not in (1, 3)
 
     @property
-    def shown(self) -> str:
+    def display_text(self) -> str:
         """What pictures show, in words; empty for plain red, green and blue or grey."""
         if self.own is not None:
-            return f"{self.listed} through the display of task {self.task!r}"
-        if self.names == default_channel_names(self.count) and not self.partial:
+            return f"{self.name_list} through the display of task {self.task!r}"
+        if self.names == default_channel_names(self.count) and not self.hides_channels:
             return ""
         if self.count == 1:
             return f"{self.names[0]} as grey"
-        chosen = [self.names[i] for i in self._chosen]
+        chosen = [self.names[i] for i in self._shown_indices]
         part = f" of {self.count} channels" if self.count > 3 else ""
         return f"{', '.join(chosen)}{part} as {', '.join(('red', 'green', 'blue')[: len(chosen)])}"
 
     @property
-    def listed(self) -> str:
+    def name_list(self) -> str:
         """The names in a line; of many, the first and the last ones."""
         if self.count <= _LISTED:
             return ", ".join(self.names)
         return f"{', '.join(self.names[:3])}, … {self.names[-1]} ({self.count} channels)"
 
     @property
-    def _chosen(self) -> tuple[int, ...]:
+    def _shown_indices(self) -> tuple[int, ...]:
         return self.rgb or tuple(range(min(self.count, 3)))
 
     def display(self, image: Tensor) -> Tensor:
@@ -93,13 +93,13 @@ class Channels:
             ConfigError: the task's display returned something else.
         """
         if image.shape[-1] != self.count:
-            raise ValueError(f"an image of shape {tuple(image.shape)} for {self.count} channels, {self.listed}")
+            raise ValueError(f"an image of shape {tuple(image.shape)} for {self.count} channels, {self.name_list}")
         if self.own is not None:
             return self._check_display(self.own(image), image)
         if self.count == 1:
             image = image.expand(-1, -1, 3)
-        elif self.count != 3 or self._chosen != (0, 1, 2):
-            image = torch.nn.functional.pad(image[..., list(self._chosen)], (0, max(0, 3 - self.count)))
+        elif self.count != 3 or self._shown_indices != (0, 1, 2):
+            image = torch.nn.functional.pad(image[..., list(self._shown_indices)], (0, max(0, 3 - self.count)))
         return linear_to_srgb(image.clamp_min(0.0)) if self.color_space == "linear" else image
 
     def display_rows(self, colours: Tensor) -> Tensor:

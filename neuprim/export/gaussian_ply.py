@@ -114,11 +114,11 @@ def _write(job: ExportJob) -> ExportReport:
         )
     if channels.own is not None:
         notes.append(
-            f"red, green and blue are the channels {channels.listed}, not what the display of task "
+            f"red, green and blue are the channels {channels.name_list}, not what the display of task "
             f"{job.run.task.name!r} shows"
         )
-    elif channels.shown:
-        notes.append(f"colours: {channels.shown}")
+    elif channels.display_text:
+        notes.append(f"colours: {channels.display_text}")
     if space == "linear":
         notes.append("colours are linear, viewers take them for sRGB: they look darker there")
     return ExportReport((job.out,), False, errors, tuple(notes))

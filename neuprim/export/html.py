@@ -46,7 +46,9 @@ _MEASURED = 4
 def _write(job: ExportJob) -> ExportReport:
     run = job.run
     if run.channels.own is not None:
-        raise ConfigError(f"{run.directory}: pictures show {run.channels.shown}; a page shows red, green and blue")
+        raise ConfigError(
+            f"{run.directory}: pictures show {run.channels.display_text}; a page shows red, green and blue"
+        )
     find_rgb_channels(run)
     level, most = job.count("level", 0, 5) or 0, job.count("views", 0, 100) or 0
     views, notes = _views(job, most)

@@ -115,8 +115,8 @@ def _write(job: ExportJob) -> ExportReport:
     notes.append(
         "colours: of the primitives around each vertex, weighted by density, seen along the normal from outside"
     )
-    if channels.shown:
-        notes.append(f"colours: {channels.shown}")
+    if channels.display_text:
+        notes.append(f"colours: {channels.display_text}")
     if path.suffix.lower() == ".glb" and up == "z":
         notes.append("turned from z up to glTF's y up; Blender and others turn it back")
     return ExportReport((path,), False, {"silhouette_iou": iou}, tuple(notes))

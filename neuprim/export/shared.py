@@ -67,7 +67,7 @@ def find_rgb_channels(run: TrainedModel, hint: str = "") -> tuple[int, int, int]
     channels = run.channels
     if channels.rgb is None:
         raise ConfigError(
-            f"{run.directory}: {channels.count} channels, {channels.listed}; this format has red, green and "
+            f"{run.directory}: {channels.count} channels, {channels.name_list}; this format has red, green and "
             f"blue{hint}; "
             "--format ply and npz hold all channels"
         )

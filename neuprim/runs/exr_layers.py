@@ -173,7 +173,7 @@ class ExrLayers:
             "neuprim:colorSpace": f"linear light{origin}",
             "neuprim:background": _linear_light(self.background[None, None], space)[0, 0].tolist(),
         }
-        if self.channels.plain:
+        if self.channels.is_rgb:
             found["chromaticities"] = _REC709
         replaced = {name for light in self.lights for name in light}
         for name, value in self._condition_values(view.conditions):

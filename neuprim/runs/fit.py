@@ -188,8 +188,8 @@ def prepare_training(
     call_task_clips(task, dataset)
     call_task_facts(task, dataset)
     channels = find_channels(task, dataset)
-    if channels.partial:
-        events(Note(f"shown: {channels.shown}; task {task.name!r} has no display that shows them all"))
+    if channels.hides_channels:
+        events(Note(f"shown: {channels.display_text}; task {task.name!r} has no display that shows them all"))
     if hold_out:
         dataset = hold_out_views(dataset, hold_out)
     if make is not None:

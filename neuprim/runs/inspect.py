@@ -93,8 +93,8 @@ def inspect_run(request: Request, events: Events = ignore_event) -> list[Path]:
     if request.against is None and any(i.shows == "both" for i in inspectors):
         raise ConfigError("--show difference: there is no ground truth; give --against FILE.vdb, DIR or scene")
     film = _FrameSequence(request, events)
-    if film.channels.partial and any(i.shows == "model" for i in inspectors):
-        events(Note(f"shown: {film.channels.shown}"))
+    if film.channels.hides_channels and any(i.shows == "model" for i in inspectors):
+        events(Note(f"shown: {film.channels.display_text}"))
     if request.out is not None and kind == ".html":
         write_page(request.out, film, inspectors)
         return [request.out]

@@ -161,7 +161,7 @@ def _display_metrics(
 ) -> dict[str, float]:
     if channels.own is not None:
         kind, a, b = "display", channels.display(rendered), channels.display(truth)
-    elif dataset.color_space == "linear" and channels.plain:
+    elif dataset.color_space == "linear" and channels.is_rgb:
         kind, a, b = "srgb", *(images.linear_to_srgb(x.clamp_min(0.0)) for x in (rendered, truth))
     else:
         return {}
@@ -265,7 +265,7 @@ def summarize_metrics(
         "background": [round(float(x), 6) for x in dataset.background],
         "color_space": dataset.color_space,
         "channels": list(channels.names),
-        **({"shown": channels.shown} if channels.shown else {}),
+        **({"shown": channels.display_text} if channels.display_text else {}),
         "data_source": dataset.data_source,
         "train_views": len(dataset.train),
         "seed": config.seed,

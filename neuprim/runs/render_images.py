@@ -155,8 +155,8 @@ class _RenderSession:
                 self.lights,
                 self.world,
             )
-        if self.channels.partial and self.format not in ("exr", "npy"):
-            notify(f"shown: {self.channels.shown}; --format exr and npy hold all channels")
+        if self.channels.hides_channels and self.format not in ("exr", "npy"):
+            notify(f"shown: {self.channels.display_text}; --format exr and npy hold all channels")
         self._passes = 0  # images rendered so far, one per view and light
         self._visible = [False] * len(self.views)
 

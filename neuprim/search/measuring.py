@@ -164,7 +164,7 @@ def describe_setup(setup: EvaluationSetup) -> dict[str, Any]:
         "dataset": setup.dataset.name,
         "data_source": setup.dataset.data_source,
         "backend": setup.backend(setup.reference).name,
-        "shown": setup.channels.shown,
+        "shown": setup.channels.display_text,
         "not_measured": {} if setup.lpips is not None else {"lpips": "no weights were given (--lpips FILE)"},
     }
 

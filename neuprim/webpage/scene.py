@@ -83,7 +83,9 @@ def scene_page(
         CheckpointError: numbers that cannot be stored.
     """
     if channels.own is not None or channels.rgb is None:
-        raise ConfigError(f"a page shows red, green and blue; this model has {channels.shown or channels.listed}")
+        raise ConfigError(
+            f"a page shows red, green and blue; this model has {channels.display_text or channels.name_list}"
+        )
     still = ""
     if views:
         image = draw(model, views[0].camera, views[0].conditions or start)

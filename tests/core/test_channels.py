@@ -41,8 +41,8 @@ def image(channels: int, height: int = 4, width: int = 6) -> Tensor:
 )
 def test_without_a_display_it_is_said_what_is_shown(names: tuple[str, ...], shown: str, indices: Sequence[int]) -> None:
     channels, values = Channels(names), image(len(names))
-    assert channels.shown == shown
-    assert channels.partial == (len(names) != 3) and not channels.plain
+    assert channels.display_text == shown
+    assert channels.hides_channels == (len(names) != 3) and not channels.is_rgb
     found = channels.display(values)
     assert found.shape == (4, 6, 3) and torch.equal(found[..., : len(indices)], values[..., list(indices)])
     assert not found[..., len(indices) :].any()
@@ -53,8 +53,12 @@ def test_the_tasks_own_display_is_what_is_shown() -> None:
     values = image(5)
     assert torch.equal(channels.display(values), values[..., [4, 3, 2]].clamp(0, 1))
     assert torch.equal(channels.display_rows(values[0]), channels.display(values)[0])
-    assert "through the display of task 'bands'" in channels.shown and not channels.partial and not channels.plain
-    assert not Channels(own=lambda x: x).plain
+    assert (
+        "through the display of task 'bands'" in channels.display_text
+        and not channels.hides_channels
+        and not channels.is_rgb
+    )
+    assert not Channels(own=lambda x: x).is_rgb
 
 
 @pytest.mark.parametrize(

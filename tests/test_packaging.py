@@ -57,11 +57,7 @@ def test_the_wheel_holds_the_whole_package(tmp_path: Path) -> None:
     ("file", "old", "new", "message"),
     [
         pytest.param(
-            "pyproject.toml",
-            ', "**/*.html"',
-            "",
-            "none-any.whl lacks neuprim/report/page.html",
-            marks=pytest.mark.slow,
+            "pyproject.toml", ', "**/*.html"', "", "none-any.whl lacks neuprim/report/page.html", marks=pytest.mark.slow
         ),
         ("pyproject.toml", 'include = ["neuprim*"]', 'include = ["neuprim*", "tests"]', "which is not the package's"),
         ("MANIFEST.in", "graft tests\n", "", ".tar.gz lacks tests/conftest.py"),

@@ -70,11 +70,7 @@ def test_a_group_is_taken_out_of_the_overrides(take: Take, words: list[str], exp
         (take_target, ["target.psnr=28,30", BUDGET], "target.psnr: several values; expected one"),
         (take_target, ["target.psnr=30", "budget=600"], "budget=600: expected a time such as 90s"),
         (take_target, ["target.psnr=30", "budget=0m"], "budget=0m: expected a time such as 90s"),
-        (
-            take_target,
-            ["target.psnr=30", "budget.minutes=3"],
-            "budget.minutes: no such setting",
-        ),
+        (take_target, ["target.psnr=30", "budget.minutes=3"], "budget.minutes: no such setting"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(take: Take, words: list[str], message: str) -> None:

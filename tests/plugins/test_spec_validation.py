@@ -42,12 +42,7 @@ def test_all_built_in_plugins_are_valid() -> None:
         (TASK, "scenes", (SCENE, SCENE), "scenes has two of one name among ball, ball"),
         (TASK, "conditions", 3, "conditions is of type int; expected a tuple of ConditionSpec"),
         (TASK, "conditions", (replace(TIME, parse=None),), "conditions[0].parse is of type NoneType; expected a func"),
-        (
-            TASK,
-            "conditions",
-            (replace(TIME, range=None),),
-            "conditions[0].range is of type NoneType; expected a tuple",
-        ),
+        (TASK, "conditions", (replace(TIME, range=None),), "conditions[0].range is of type NoneType; expected a tuple"),
         (TASK, "conditions", (replace(TIME, range=(1.0, 1.0)),), "range is (1.0, 1.0); expected a lower and a higher"),
         (TASK, "fields", 3, "fields is of type int; expected a mapping"),
         (TASK, "fields", {"X": int}, "fields['X'] is <class 'int'>; expected a subclass"),

@@ -28,12 +28,7 @@ RUNS: dict[str, tuple[str, int, tuple[str, ...], tuple[str, ...]]] = {
     "chair_2000": ("chair", 2500, ("model.primitives=2800",), ("psnr", "psnr_worst")),
     "chair_5000": ("chair", 4000, ("model.primitives=7000",), ("psnr", "psnr_worst")),
     "fire": ("fire", 4000, (), ("psnr_mask", "sigma_relative_l2_early", "sigma_relative_l2_late")),
-    "lit_solids": (
-        "lit_solids",
-        2600,
-        (),
-        ("psnr_linear_clamped", "psnr_pooled_cast_shadow", "psnr_pooled_highlight"),
-    ),
+    "lit_solids": ("lit_solids", 2600, (), ("psnr_linear_clamped", "psnr_pooled_cast_shadow", "psnr_pooled_highlight")),
 }
 """Scene, steps, further words and the measures. `chair_*` have the bytes of 2,000 or 5,000 of the paper's
 primitives."""

@@ -33,10 +33,8 @@ from neuprim.report.charts import LARGE, Chart, Points, write_png_charts
 
 RECORD = RESULTS / "budget.json"
 PICTURE = DOCS / "pictures" / "budgets.png"
-FIRST = {"chair": 640, "smoke_fire": 500, "fire": 500, "lit_solids": 360}
-"""Steps of the smallest budget."""
-SEVERAL = 4
-"""Budgets with all seeds."""
+FIRST = {"chair": 640, "smoke_fire": 500, "fire": 500, "lit_solids": 360}  # steps of the smallest budget
+SEVERAL = 4  # budgets with all seeds
 FALL = 0.1
 TITLES = {
     "chair": "NeRF-synthetic chair, 200×200",

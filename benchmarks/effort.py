@@ -37,16 +37,14 @@ TITLES = {
 }
 """One scene of each task."""
 JUDGED = {"chair": "all pixels", "smoke_fire": "inside the mask", "lit_solids": "clamped"}
-TIMES = dict(zip(LEVELS, (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 1.5, 2, 3, 4), strict=True))
-"""Of the preset's own time."""
+TIMES = dict(zip(LEVELS, (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 1.5, 2, 3, 4), strict=True))  # of the preset's own time
 FIRST = 0.5
 """Of the preset's own number of primitives, where the first level begins, and half of which it tries as well."""
 DOUBLED = {1: 4, 2: 4, 3: 4, 4: 4, 5: 4, 7: 1}
 """Levels that try twice as many, and so many times twice as many again while that is better; the others take what the
 one before found."""
 TIE = 0.05
-PACED = 320
-"""Steps of the short runs that tell the paces; a whole one each, as primitives are born on the way."""
+PACED = 320  # steps of the short runs that tell the paces; a whole one each, as primitives are born on the way
 HOLD_OUT = 8
 KEYS = ("psnr", "psnr_mask", "psnr_linear_clamped", "ssim", "primitives", "model_bytes")
 

@@ -53,8 +53,7 @@ STEPS = {
     "lit_solids": {2000: 2000},
 }
 """Of the paper's form; the others train as long in seconds."""
-SMALL = 100
-"""Primitives of the part ``gaussian``."""
+SMALL = 100  # primitives of the part ``gaussian``
 SMALL_STEPS = 400
 SMALL_IMAGES = {"solids": "scene.size=64", "chair": "scene.downsample=4"}
 

@@ -26,8 +26,7 @@ from neuprim.core.compute.threads import cpu_name
 from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
 from neuprim.search.ablation import AblationRequest, run_ablation
 
-VIEWS = 25
-"""Held-out views, evenly spread: as many as the chair has."""
+VIEWS = 25  # held-out views, evenly spread: as many as the chair has
 
 RECORD = RESULTS / "fronts.json"
 PICTURE = DOCS / "pictures" / "fronts.png"
@@ -130,10 +129,7 @@ def report(name: str, result: Mapping[str, Any]) -> str:
 
 def make_chart(name: str, result: Mapping[str, Any], front: str) -> Chart:
     """The front of a scene; its points are marked with their primitives."""
-    cost, unit, label = {
-        "speed": ("ms_per_frame", 1.0, "ms a frame, one thread"),
-        "size": ("bytes", 1e-6, "MB"),
-    }[front]
+    cost, unit, label = {"speed": ("ms_per_frame", 1.0, "ms a frame, one thread"), "size": ("bytes", 1e-6, "MB")}[front]
     dots = []
     for i, model in enumerate(result["models"]):
         mark = f"{model['primitives']:,}" + (", no shadows" if "visibility=none" in model["name"] else "")

@@ -36,8 +36,7 @@ from neuprim.core.render.backends import REFERENCE
 from neuprim.runs.open import load_dataset, load_run
 from tests.numerics.extremes.sweep import Result, sweep
 
-VIEWS, COMPARED, SMALL = 12, 3, 50
-"""Of a run: views to count in, how many of them to compare, and those images' sides."""
+VIEWS, COMPARED, SMALL = 12, 3, 50  # of a run: views to count in, how many of them to compare, and those images' sides
 
 
 @torch.no_grad()

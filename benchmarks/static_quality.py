@@ -24,8 +24,7 @@ from shared.trials import Trial, run_all
 
 RECORD = RESULTS / "static_quality.json"
 ROWS = ("2800x2500", "7000x4000", "2000x2500x8:0", "5000x4000x8:0")
-DEFAULT = "2:2"
-"""The preset's form."""
+DEFAULT = "2:2"  # the preset's form
 KEYS = ("psnr", "psnr_worst", "ssim", "train_seconds", "model_bytes", "parameters_per_primitive", "primitives")
 
 

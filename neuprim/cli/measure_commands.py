@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from neuprim.runs.paper import Planned as PlannedRun
     from neuprim.runs.paper import Table as PaperTable
-    from neuprim.search.points import Point, Record
+    from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord
 
 
 # ---------------------------------------------------------------- eval
@@ -297,8 +297,8 @@ def _tradeoff(args: argparse.Namespace) -> int:
 def _render_tradeoff(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.config.command_settings import parse_duration
-    from neuprim.search.points import TRADEOFF_FOLDER
     from neuprim.search.render_tradeoff import TradeoffRequest, format_render_command, measure_tradeoff
+    from neuprim.search.tradeoff_record import TRADEOFF_FOLDER
 
     run_dir, views, repeats = Path(args.run_dir), args.views, args.repeats
     check_run_directory(run_dir)
@@ -343,7 +343,7 @@ def _train_tradeoff(args: argparse.Namespace) -> int:
     return 0
 
 
-def _print_fronts(folder: Path, record: Record, commands: Sequence[str]) -> None:
+def _print_fronts(folder: Path, record: TradeoffRecord, commands: Sequence[str]) -> None:
     console = plain_console()
     if "length" in record.facts:
         console.print(record.facts["length"])
@@ -359,7 +359,7 @@ def _print_fronts(folder: Path, record: Record, commands: Sequence[str]) -> None
         console.print(folder / name)
 
 
-def _build_front_table(title: str, record: Record, numbers: Sequence[int]) -> Table:
+def _build_front_table(title: str, record: TradeoffRecord, numbers: Sequence[int]) -> Table:
     """Build the table of the reference and a front; the numbers are those of the commands."""
     from rich import box
     from rich.table import Table
@@ -376,7 +376,7 @@ def _build_front_table(title: str, record: Record, numbers: Sequence[int]) -> Ta
     return table
 
 
-def _format_point(point: Point) -> tuple[str, ...]:
+def _format_point(point: TradeoffPoint) -> tuple[str, ...]:
     q = point.quality
     about = "" if point.spread is None else f" ± {point.spread:.3f}"
     seeds = "" if point.seed_spread is None else f" ± {point.seed_spread:.2f}"

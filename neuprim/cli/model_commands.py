@@ -265,10 +265,11 @@ _PRUNING_ROWS = (
 def _print_pruning(made: Pruning, tolerance: float) -> None:
     from neuprim.runs.open import describe_kept_shares
 
+    before = made.judged_psnr[0]
     for number, stage in enumerate(made.stages, 1):
         less = f", {', '.join(stage.words)}" if stage.words else ""
         what = f"cut {number}: {stage.primitives:,} primitives, {stage.numbers:,} numbers{less}"
-        loss = f"{stage.cut - made.judged[0]:+.3f} dB at once, {stage.trained - made.judged[0]:+.3f} dB after training"
+        loss = f"{stage.cut - before:+.3f} dB at once, {stage.trained - before:+.3f} dB after training"
         print(f"{what}; training views {loss}; {'kept' if stage.kept else 'taken back'}")
     if made.run_dir is None:
         print(f"nothing can go within {tolerance:g} dB; nothing was written")
@@ -276,7 +277,7 @@ def _print_pruning(made: Pruning, tolerance: float) -> None:
     print(made.run_dir)
     rows = [(name, form.format(made.before[key]), form.format(made.after[key])) for key, name, form in _PRUNING_ROWS]
     print_columns([("", "before", "after"), *rows])
-    for word in made.words:
+    for word in made.reduced:
         print(f"all primitives: {word}")
     for line in describe_kept_shares(made.kept):
         print(line)

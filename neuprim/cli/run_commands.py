@@ -169,7 +169,7 @@ def _fit_target(
 
 def _describe_target(record: TargetRecord) -> list[str]:
     """What was predicted and achieved, and why the search ended."""
-    from neuprim.search.size_predictor import format_forecast
+    from neuprim.search.size_forecast import format_forecast
     from neuprim.search.target_record import TARGET_FILE
 
     found = record.achieved

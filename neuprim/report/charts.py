@@ -36,14 +36,12 @@ SMALL, LARGE = (360, 210), (540, 300)
 _BUCKETS = 120
 """A band is drawn where there are more than twice so many points: medians, and the range of each of so many groups."""
 
-_FEW = 40
-"""Points of a line up to which each is marked."""
+_FEW = 40  # points of a line up to which each is marked
 
 _LOG_RATIO, _FRONT_LOG_RATIO = 4.0, 1.5
 """An axis is logarithmic where its positive values, or the costs of a front, span at least this factor."""
 
-_LEAST_DECIBELS = 0.4
-"""Least range of the y axis of a front: smaller differences are invisible."""
+_LEAST_DECIBELS = 0.4  # least range of the y axis of a front: smaller differences are invisible
 
 
 @dataclass(frozen=True)
@@ -186,10 +184,7 @@ def front_chart(
         labels = [dot.mark or "" for dot in dots]
         return Points(x, y, colour, joined, size=size, opacity=opacity, spread=spread, labels=labels)
 
-    both = [
-        points(others, TRAINING, False, 4.5, 0.75),
-        points(marked, HELD_OUT, joined and len(marked) > 1, 6.0, 1.0),
-    ]
+    both = [points(others, TRAINING, False, 4.5, 0.75), points(marked, HELD_OUT, joined and len(marked) > 1, 6.0, 1.0)]
     costs = [dot.cost for dot in drawn]
     log = bool(costs) and max(costs) / min(costs) >= _FRONT_LOG_RATIO
     ring = next(((dot.cost, dot.good) for dot in drawn if dot.reference), None)

@@ -20,11 +20,9 @@ from neuprim.report.run_record import as_number
 
 MISSING = "–"
 
-_PIXELATED_BELOW = 256
-"""Pictures narrower than this many pixels are enlarged with hard pixel edges."""
+_PIXELATED_BELOW = 256  # pictures narrower than this many pixels are enlarged with hard pixel edges
 
-Tile = tuple[str, str, str, str]
-"""Label, value, unit and note of a number in large type, as HTML."""
+Tile = tuple[str, str, str, str]  # label, value, unit and note of a number in large type, as HTML
 
 
 def render_page(title: str, sections: Iterable[str], kind: str = "", policy: str = "", script: str = "") -> str:

@@ -15,8 +15,7 @@ from torch import Tensor
 from neuprim.core.errors import ConfigError
 from neuprim.core.metrics import matched
 
-ERROR_SCALE = 0.2
-"""Error at the bright end of :func:`error_map` and of the report's colour bar."""
+ERROR_SCALE = 0.2  # error at the bright end of :func:`error_map` and of the report's colour bar
 
 _INLINE_LIMIT = 400_000
 """Bytes up to which a picture enters the page unchanged; larger ones are compressed as WebP of quality 90."""

@@ -18,17 +18,10 @@ from neuprim.core.io.files import read_json, write_json
 from neuprim.core.io.plain import finite
 from neuprim.report.pictures import error_map
 
-FILE = "worst.json"
-"""Beside the pictures in ``renders/``."""
-
-SHARE, LEAST = 0.25, 16
-"""Side of a region over the shorter side of its image, and in pixels."""
-
-MOST = 60
-"""Views whose regions are kept: the worst of them."""
-
-_STEPS = 8
-"""Places along a region's side at which regions are compared."""
+FILE = "worst.json"  # beside the pictures in ``renders/``
+SHARE, LEAST = 0.25, 16  # side of a region over the shorter side of its image, and in pixels
+MOST = 60  # views whose regions are kept: the worst of them
+_STEPS = 8  # places along a region's side at which regions are compared
 
 
 @dataclass(frozen=True)

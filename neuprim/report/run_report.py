@@ -28,11 +28,8 @@ from neuprim.report.page import (
 from neuprim.report.pictures import ERROR_SCALE, color_bar, inline
 from neuprim.report.run_record import RunRecord, ViewFiles, as_number, per_view, read_run
 
-LIMIT = 4_000_000
-"""Bytes of a report with a viewer in it; the viewer of a larger one becomes a page beside it."""
-
-_WORST_SHOWN = 12
-"""Worst regions that are shown unfolded."""
+LIMIT = 4_000_000  # bytes of a report with a viewer in it; the viewer of a larger one becomes a page beside it
+_WORST_SHOWN = 12  # worst regions that are shown unfolded
 
 _SOURCES = {
     "generated": ("generated data", "ray-cast scenes of our own, not photographs"),

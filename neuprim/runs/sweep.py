@@ -17,7 +17,7 @@ from neuprim.config.overrides import drop_place, parse, swept_keys
 from neuprim.core.errors import ConfigError, DataError, cut
 from neuprim.core.io.files import write_text
 from neuprim.report.run_record import RunRecord, read_run
-from neuprim.report.sweep import SweepRun, write_sweep_page
+from neuprim.report.sweep_page import SweepRun, write_sweep_page
 from neuprim.runs.launch.jobs import JobResult
 from neuprim.runs.launch.launcher import OnStatus, ignore_status
 from neuprim.runs.launch_record import LaunchedRun, LaunchRecord, launch_missing_runs, read_launch_record

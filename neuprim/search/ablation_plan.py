@@ -18,15 +18,12 @@ from neuprim.core.used_settings import build_settings
 from neuprim.core.validation import Range
 from neuprim.plugins.returns import call_task_tunable_settings
 from neuprim.runs.fit import compile_kernels, prepare_training, use_one_torch_thread
-from neuprim.search.pareto import Step, combine_steps
-from neuprim.search.points import COMBINED, Point, name_variant
-from neuprim.search.trial_runner import get_setting
+from neuprim.search.pareto import FrontStep, combine_front_steps
+from neuprim.search.tradeoff_record import COMBINED, TradeoffPoint, name_variant
+from neuprim.search.trials import get_setting
 
-CENTRE = "centre"
-"""Name of the model that others are compared with."""
-
-LENGTH = "train.iterations"
-"""The knob whose values are shares of the full length."""
+CENTRE = "centre"  # name of the model that others are compared with
+LENGTH = "train.iterations"  # the knob whose values are shares of the full length
 
 _COUNTS, _LENGTHS = (0.5, 2.0, 0.25, 4.0, 1 / 8, 1 / 16, 1 / 32, 1 / 64), (0.5, 0.25)
 """Multiples of the centre's primitives and length, in every task."""
@@ -34,8 +31,7 @@ _COUNTS, _LENGTHS = (0.5, 2.0, 0.25, 4.0, 1 / 8, 1 / 16, 1 / 32, 1 / 64), (0.5, 
 _MIN_LENGTH, _MIN_STEPS = 1 / 20, 100
 """Least training of the centre: this share of its steps, or so many steps where its budget is in seconds."""
 
-_STEPS_PER_TURN, _TURNS = 4, 6
-"""Step times: variant and centre alternate, so that load of the machine affects both."""
+_STEPS_PER_TURN, _TURNS = 4, 6  # step times: variant and centre alternate, so that load of the machine affects both
 
 
 @dataclass(frozen=True)
@@ -67,7 +63,7 @@ def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]
     knob = "model.primitives"
     variants = {knob: [Variant(knob, (quote_override(knob, n),)) for n in counts if n != centre.model.primitives]}
     for knob, values in call_task_tunable_settings(task, build_settings(task, centre.model, centre.options)).items():
-        now = None if knob in centre.unused else get_setting(centre, knob)
+        now = get_setting(centre, knob)
         others = [value for value in values if value != now]
         if now in values:
             others.sort(key=lambda value: abs(values.index(value) - values.index(now)))
@@ -76,14 +72,14 @@ def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]
     return variants
 
 
-def override(words: Sequence[str], over: Sequence[str]) -> list[str]:
+def merge_overrides(words: Sequence[str], over: Sequence[str]) -> list[str]:
     """Return overrides with others over them, each setting once."""
     again = {assignment.key for assignment in parse(over)}
     return [*(a.text for a in parse(words) if a.key not in again), *over]
 
 
 @dataclass
-class Plan:
+class AblationPlan:
     """Training lengths; a continued set keeps them.
 
     Attributes:
@@ -106,7 +102,7 @@ class Plan:
         scaled = max(1, round(every * steps / self.whole)) if self.whole else every
         if scaled != every and key not in {assignment.key for assignment in parse(words)}:
             budget.append(quote_override(key, scaled))
-        return override(words, [*variant.turned, *budget])
+        return merge_overrides(words, [*variant.turned, *budget])
 
     def describe(self) -> str:
         text = f"Every model trains for the same time, about {self.seconds:.3g} s: {self.steps:,} steps of the centre"
@@ -115,7 +111,7 @@ class Plan:
         return f"{text}, all of its configuration."
 
 
-def plan_lengths(centre: RunConfig, pace: float, available: float, lengths: Sequence[float]) -> Plan:
+def plan_training_lengths(centre: RunConfig, pace: float, available: float, lengths: Sequence[float]) -> AblationPlan:
     """Return the lengths with which trainings fit into the available seconds.
 
     Args:
@@ -129,7 +125,7 @@ def plan_lengths(centre: RunConfig, pace: float, available: float, lengths: Sequ
         most = whole = centre.train.iterations
         least = max(1.0, whole * _MIN_LENGTH)
     steps = max(1, int(min(most, max(available / sum(lengths) / pace, least))))
-    return Plan(steps, steps * pace, whole)
+    return AblationPlan(steps, steps * pace, whole)
 
 
 class StepTimes:
@@ -143,13 +139,13 @@ class StepTimes:
     def __init__(self, centre: RunConfig, dataset: Dataset) -> None:
         self.dataset, self.compiling = dataset, 0.0
         self._centre = self._prepare(centre)
-        self._identity = _identify_model(self._centre)
+        self._identity = _model_identity(self._centre)
         self.seconds = self._run_turns(self._centre)[1] / (_STEPS_PER_TURN * _TURNS)
 
     def measure(self, config: RunConfig) -> float | None:
         """Return the ratio of a configuration; None if it builds the same model as the centre."""
         trainer = self._prepare(config)
-        if _identify_model(trainer) == self._identity:
+        if _model_identity(trainer) == self._identity:
             return None
         own, base = self._run_turns(trainer)
         return own / base
@@ -178,13 +174,13 @@ class StepTimes:
         return total[0], total[1]
 
 
-def _identify_model(trainer: Trainer) -> tuple[Any, ...]:
+def _model_identity(trainer: Trainer) -> tuple[Any, ...]:
     model = trainer.model
     fields = [type(f).__name__ + repr(f.settings()) for f in (model.density, model.colour)]
     return (model.count, trainer.settings.population.grow_to, *fields)
 
 
-def combine_models(points: Sequence[Point], most: int) -> list[tuple[str, ...]]:
+def combine_models(points: Sequence[TradeoffPoint], most: int) -> list[tuple[str, ...]]:
     """Return at most ``most`` combinations of single changes: towards fewer bytes, less time, and better quality."""
     centre = points[0]
     smaller, faster, better = [], [], []
@@ -192,7 +188,7 @@ def combine_models(points: Sequence[Point], most: int) -> list[tuple[str, ...]]:
         if point.knob == COMBINED or point.length != 1.0 or len(point.turned) != 1:
             continue
         loss, bytes_gain = centre.quality["psnr"] - point.quality["psnr"], math.log(centre.bytes / point.bytes)
-        step = Step(point.knob, point.turned[0], bytes_gain, loss)
+        step = FrontStep(point.knob, point.turned[0], bytes_gain, loss)
         if bytes_gain > 0:
             smaller.append(step)
         if point.ratios and 0 < point.ratio < 1.0 - point.doubt:
@@ -200,4 +196,4 @@ def combine_models(points: Sequence[Point], most: int) -> list[tuple[str, ...]]:
         if loss < -0.02:
             better.append(step._replace(gain=-loss, loss=-bytes_gain))
     known = [point.turned for point in points]
-    return combine_steps((smaller, faster, better), known, most)
+    return combine_front_steps((smaller, faster, better), known, most)

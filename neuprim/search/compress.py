@@ -27,8 +27,7 @@ from neuprim.search.quantized_finetune import (
     quantize_within,
 )
 
-DEFAULT_TOLERANCE = 0.1
-"""dB that training views may lose."""
+DEFAULT_TOLERANCE = 0.1  # dB that training views may lose
 
 
 @dataclass(frozen=True)

@@ -24,21 +24,20 @@ def pareto_front(points: Sequence[T], objectives: Callable[[T], Objectives]) -> 
     Measured costs of equal points differ by chance. A point must therefore be cheaper than the next better one by more
     than the uncertainty of both. Of equally good points the first stays, unless another is cheaper by as much.
     """
-    known = [p for p in points if not (math.isnan(objectives(p).cost) or math.isnan(objectives(p).quality))]
-    front: list[T] = []
-    for point in sorted(known, key=lambda p: -objectives(p).quality):
-        here = objectives(point)
+    known = [(o, p) for p in points if not math.isnan((o := objectives(p)).cost) and not math.isnan(o.quality)]
+    front: list[tuple[Objectives, T]] = []
+    for here, point in sorted(known, key=lambda pair: -pair[0].quality):
         if front:
-            last = objectives(front[-1])
+            last = front[-1][0]
             if here.cost >= last.cost - (here.doubt + last.doubt):
                 continue
             if here.quality == last.quality:
                 front.pop()
-        front.append(point)
-    return front
+        front.append((here, point))
+    return [point for _, point in front]
 
 
-class Step(NamedTuple):
+class FrontStep(NamedTuple):
     """A single change: the knob, its override, the gain (log of the cost's reduction) and the loss of quality."""
 
     knob: str
@@ -47,42 +46,39 @@ class Step(NamedTuple):
     loss: float
 
 
-def chain_steps(steps: Sequence[Step], min_gain: float = 0.01) -> list[tuple[str, ...]]:
+def chain_front_steps(steps: Sequence[FrontStep], min_gain: float = 0.01) -> list[tuple[str, ...]]:
     """Return combinations of overrides along the expected front, one override per knob, two or more each.
 
     Gains and losses are assumed to add up; measuring the combinations corrects that. The next step is always the one
     with the least loss per gain, of another knob or further along the same.
     """
-    state: dict[str, Step] = {}
+    state: dict[str, FrontStep] = {}
     chain: list[tuple[str, ...]] = []
     while True:
         options = []
         for step in steps:
-            now = state.get(step.knob)
-            gain, loss = (step.gain, step.loss) if now is None else (step.gain - now.gain, step.loss - now.loss)
-            if gain > min_gain:
-                options.append((max(loss, 0.0) / gain, -gain, step.override, step))
+            now = state.get(step.knob, FrontStep(step.knob, "", 0.0, 0.0))
+            if (gain := step.gain - now.gain) > min_gain:
+                options.append((max(step.loss - now.loss, 0.0) / gain, -gain, step.override, step))
         if not options:
             return chain
-        best = min(options, key=lambda option: option[:3])[3]
+        best = min(options)[3]
         state[best.knob] = best
         if len(state) > 1:
             chain.append(tuple(step.override for step in state.values()))
 
 
-def combine_steps(
-    directions: Sequence[Sequence[Step]], known: Sequence[Sequence[str]], most: int
+def combine_front_steps(
+    directions: Sequence[Sequence[FrontStep]], known: Sequence[Sequence[str]], most: int
 ) -> list[tuple[str, ...]]:
     """Return at most ``most`` new combinations, alternating between directions and evenly spread along each."""
     taken = {frozenset(overrides) for overrides in known}
-    chains = [[way for way in chain_steps(steps) if frozenset(way) not in taken] for steps in directions]
-    chosen: list[tuple[str, ...]] = []
+    chains = [[way for way in chain_front_steps(steps) if frozenset(way) not in taken] for steps in directions]
+    chosen: dict[frozenset[str], tuple[str, ...]] = {}
     for rung in zip_longest(*(spread_evenly(chain, most) for chain in chains)):
-        for way in rung:
-            if way is not None and frozenset(way) not in taken and len(chosen) < most:
-                taken.add(frozenset(way))
-                chosen.append(way)
-    return chosen
+        for way in filter(None, rung):
+            chosen.setdefault(frozenset(way), way)
+    return list(chosen.values())[: max(most, 0)]
 
 
 def spread_evenly(items: Sequence[T], most: int) -> list[T]:

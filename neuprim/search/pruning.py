@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from neuprim.config import Job, RunConfig
 from neuprim.core.channels import find_channels
@@ -24,26 +23,16 @@ from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.finetune import fine_tuner, steps_in
 from neuprim.runs.fit import Fitted, keep_model_settings, make_loss, use_one_torch_thread
 from neuprim.runs.measure import measure_quality
-from neuprim.runs.open import (
-    PRUNED,
-    kept_shares,
-    load_dataset,
-    load_run,
-    model_file,
-    move_to_render_device,
-    read_metrics,
-)
+from neuprim.runs.open import PRUNED, kept_shares, load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.training import save_training
-from neuprim.search.eval_views import eval_views, measure_eval_views
+from neuprim.search.model_quality import TrainingQuality, eval_views, measure_eval_views
 from neuprim.search.pruning_cuts import count_stored_numbers, cut_to_loss, list_reductions, price_cuts, zero_masks
-from neuprim.search.training_quality import TrainingQuality
 
 MAX_ROUNDS, _LONG_ROUND, _MIN_ROUND = 3, 1300, 600
 """Rounds of fine-tuning, unless a round would be longer than these steps; least steps of a round. Every round ends at
 the rates of the run's end, so that evaluated models are as well trained."""
 
-_PATIENCE = 2.0
-"""A model that lost at most this many tolerances is trained for another round before it is taken back."""
+_PATIENCE = 2.0  # a model that lost at most this many tolerances is trained for another round before it is taken back
 
 _FIRST_CUT, _GROWTH, _LARGEST_CUT = 6.5, 1.5, 10.0
 """Loss of the first cut over the tolerance; factor of the next cut; dB up to which a cut without effect is doubled."""
@@ -261,41 +250,25 @@ class PruneRequest:
 
 @dataclass(frozen=True)
 class Pruning:
-    """Result of pruning.
+    """Result of pruning; the content of ``pruned.json``, but for ``run_dir``.
 
     Attributes:
         run_dir: the new run; None where nothing could be removed, and nothing was written.
         before, after: primitives, numbers, bytes, psnr and ssim of the test views, frames_per_second.
-        words: reductions of fields, as in ``model.reduced``.
+        reduced: reductions of fields, as in ``model.reduced``.
         kept: unit -> share of the primitives that have it.
-        judged: dB of the deciding training views, before and after.
+        judged_psnr: dB of the deciding training views, before and after.
     """
 
     run_dir: Path | None
-    before: dict[str, float]
-    after: dict[str, float]
-    words: tuple[str, ...]
-    kept: dict[str, float]
-    judged: tuple[float, float]
-    stages: tuple[PruningStage, ...]
     steps: int
     seconds: float
-
-    def to_dict(self, request: PruneRequest) -> dict[str, Any]:
-        """Return the content of ``pruned.json``."""
-        return {
-            "format": 1,
-            "pruned_from": str(request.run_dir),
-            "tolerance": request.tolerance,
-            "steps": self.steps,
-            "seconds": self.seconds,
-            "before": self.before,
-            "after": self.after,
-            "reduced": list(self.words),
-            "kept": self.kept,
-            "judged_psnr": list(self.judged),
-            "stages": [asdict(stage) for stage in self.stages],
-        }
+    before: dict[str, float]
+    after: dict[str, float]
+    reduced: tuple[str, ...]
+    kept: dict[str, float]
+    judged_psnr: tuple[float, float]
+    stages: tuple[PruningStage, ...]
 
 
 def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction: None) -> Pruning:
@@ -326,12 +299,13 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
         shrinker = ModelShrinker(config, task, dataset, request.tolerance, steps, progress)
         small, words = shrinker.shrink(model)
         seconds = time.monotonic() - begun
-        judged, stages = (shrinker.base, shrinker.quality(small)), tuple(shrinker.stages)
+        judged = shrinker.base, shrinker.quality(small)
         progress("measuring test views", 1.0)
         measured = measure_quality(model, task, dataset, config.renderer)
-        before = _describe(model, model_file(request.run_dir), measured, config, dataset)
+        before = _measure_pruned(model, model_file(request.run_dir), measured, config, dataset)
+        kept, stages = kept_shares(small), tuple(shrinker.stages)
         if count_stored_numbers(small) >= count_stored_numbers(model):
-            return Pruning(None, before, before, (), kept_shares(model), judged, stages, steps, seconds)
+            return Pruning(None, steps, seconds, before, before, (), kept_shares(model), judged, stages)
         progress("pictures and report", 1.0)
         fitted = _fit_pruned(replace(config, output_dir=final), task, dataset, small, words)
         fitted.trainer.step = int(header.get("iterations") or 0) + steps
@@ -339,16 +313,17 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
         final.mkdir(parents=True, exist_ok=True)
         write_text(final / "config.yaml", fitted.config.to_yaml())
         save_training(fitted)
-        evaluate_fitted(fitted, final)
-        metrics = read_metrics(final)
+        metrics = evaluate_fitted(fitted, final)
         measured = metrics["psnr"], metrics["ssim"]
-        after = _describe(small, final / "model.safetensors", measured, config, dataset)
-    result = Pruning(final, before, after, words, kept_shares(small), judged, stages, steps, seconds)
-    write_json(final / PRUNED, result.to_dict(request))
+        after = _measure_pruned(small, final / "model.safetensors", measured, config, dataset)
+    result = Pruning(final, steps, seconds, before, after, words, kept, judged, stages)
+    facts = {name: value for name, value in asdict(result).items() if name != "run_dir"}
+    origin = {"format": 1, "pruned_from": str(request.run_dir), "tolerance": request.tolerance}
+    write_json(final / PRUNED, origin | facts)
     return result
 
 
-def _describe(
+def _measure_pruned(
     model: Primitives, file: Path, measured: tuple[float, float], config: RunConfig, dataset: Dataset
 ) -> dict[str, float]:
     views = eval_views(dataset, _TIMED_VIEWS)
@@ -364,7 +339,7 @@ def _fit_pruned(
     """Return a pruned model as a fitted run, with the overrides that build it."""
     reduced = [*config.model.reduced, *words]
     own = [f"model.primitives={model.count}"]
-    own += [f"model.reduced=[{','.join(repr(word) for word in reduced)}]"] if reduced else []
+    own += [f"model.reduced=[{','.join(map(repr, reduced))}]"] if reduced else []
     replaced = ("model.primitives=", "model.reduced=", "output_dir=", "resume=")
     config = replace(
         config,

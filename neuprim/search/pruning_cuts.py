@@ -14,13 +14,12 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import PrunableUnit, count_numbers, nonzero_rows, zero_units
 from neuprim.core.model.reduction import reduce_model
 from neuprim.core.train.sensitivity import Sensitivity
-from neuprim.search.training_quality import TrainingQuality
+from neuprim.search.model_quality import TrainingQuality
 
 _CONTRAST = 0.05
 """Mean squared difference of a primitive's colour from its background, where :func:`price_cuts` cannot measure it."""
 
-_PROBE = 0.02
-"""Share of the primitives whose removal measures the contrast."""
+_PROBE = 0.02  # share of the primitives whose removal measures the contrast
 
 _HALVINGS = 14
 

@@ -21,27 +21,21 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.runs.finetune import fine_tuner
+from neuprim.search.model_quality import TrainingQuality
 from neuprim.search.pruning_cuts import zero_masks
-from neuprim.search.training_quality import TrainingQuality
 
 Progress = Callable[[str, float], None]
 
-_SENSITIVITY_VIEWS = 48
-"""Training views for the effects of numbers; sums over all primitives need few."""
-
-_FIRST_LOSS = 2.0
-"""Tolerances that a model may lose at once before training, to begin with."""
-
-_ROUND_STEPS, _MAX_ROUNDS = 500, 3
-"""Least steps of a round, and most rounds; each shows how much training recovers."""
+_SENSITIVITY_VIEWS = 48  # training views for the effects of numbers; sums over all primitives need few
+_FIRST_LOSS = 2.0  # tolerances that a model may lose at once before training, to begin with
+_ROUND_STEPS, _MAX_ROUNDS = 500, 3  # least steps of a round, and most rounds; each shows how much training recovers
 
 _SLOPE, _AIM = 0.7, 0.95
 """dB that a trained model loses for one more dB at once; share of the tolerance that the next round aims at."""
 
 _MAX_TRIES = 16
 
-_FINEST, _COARSEST = 1e-4, 30.0
-"""Limits of the added error, as shares of the model's squared error."""
+_FINEST, _COARSEST = 1e-4, 30.0  # limits of the added error, as shares of the model's squared error
 
 
 class TrainingData(NamedTuple):

@@ -8,9 +8,9 @@ from __future__ import annotations
 import hashlib
 import math
 import shlex
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,38 +19,32 @@ from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
-from neuprim.report.tradeoff import write_tradeoff
 from neuprim.runs.fit import use_one_torch_thread
 from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RenderConfig
-from neuprim.search.measuring import (
+from neuprim.search.pareto import FrontStep, combine_front_steps
+from neuprim.search.tradeoff_measuring import (
     EvaluationSetup,
     ExactImages,
-    TimedPoint,
+    TradeoffSession,
     describe_conditions,
     describe_setup,
     load_setup,
     measure_point,
-    render_exact,
-    render_front_pictures,
-    time_points,
 )
-from neuprim.search.pareto import Step, combine_steps
-from neuprim.search.points import (
+from neuprim.search.tradeoff_record import (
     COMBINED,
     REFERENCE,
     TRADEOFF_FILE,
     TRADEOFF_FOLDER,
-    Point,
-    Record,
-    read_record,
-    write_csv,
+    TradeoffPoint,
+    TradeoffRecord,
+    read_tradeoff_record,
 )
 
 _EXACT, _IMAGES, _TIMES, _COMBINED = 0.2, 0.45, 0.65, 0.85
 """Shares of the budget by which exact images, images and times of single changes, and combinations should be done."""
 
-_ONE_POINT = 0.1
-"""Share of the budget that the times of one point may take."""
+_ONE_POINT = 0.1  # share of the budget that the times of one point may take
 
 _COMBINATIONS = 24
 
@@ -85,8 +79,6 @@ class TradeoffRequest:
     lpips: Path | None = None
 
 
-# ---------------------------------------------------------------- knobs
-
 _VALUES: dict[str, tuple[Any, ...]] = {
     "alpha_min": (0.0, *(2.0**-k for k in (10, 9, 8, 7, 6, 5))),
     "transmittance_min": (0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1),
@@ -97,38 +89,33 @@ _VALUES: dict[str, tuple[Any, ...]] = {
 """Settings of the renderer and their values."""
 
 
-def list_knobs(reference: RenderConfig, model: Primitives) -> dict[str, list[RenderConfig]]:
+def list_render_knobs(reference: RenderConfig, model: Primitives) -> dict[str, list[RenderConfig]]:
     """Return knob -> the configurations that change it alone; reductions of fields are density.NAME and colour.NAME."""
-
-    def change(name: str, value: Any) -> RenderConfig:
-        return replace(reference, settings=replace(reference.settings, **{name: value}))
-
-    def store(groups: Sequence[str], name: str) -> RenderConfig:
-        return replace(reference, storage=dict(sorted((dict(reference.storage) | dict.fromkeys(groups, name)).items())))
-
-    def reduce(kind: str, name: str, value: int) -> RenderConfig:
-        return replace(reference, reduced=dict(sorted({**reference.reduced, (kind, name): value}.items())))
-
     cores = core_count()
     threads = sorted({1, 0, *(2**k for k in range(1, 7) if 2**k < cores)}) if cores > 1 else []
-    knobs = {name: [change(name, value) for value in values] for name, values in _VALUES.items()}
+    values = {**_VALUES, "backend": backends.backend_names(), "threads": threads}
+    knobs = {
+        name: [replace(reference, settings=replace(reference.settings, **{name: value})) for value in own]
+        for name, own in values.items()
+    }
     knobs["resolution"] = [replace(reference, resolution=part) for part in (1.0, 0.75, 0.5, 0.25)]
-    knobs["backend"] = [change("backend", name) for name in backends.backend_names()]
-    knobs["threads"] = [change("threads", count) for count in threads]
-    formats = [name for name in FORMATS if name != FLOAT32]
-    knobs["store"] = [store(groups, name) for name in formats for groups in (*((g,) for g in GROUPS), GROUPS)]
+    stored = [
+        dict(reference.storage) | dict.fromkeys(groups, name)
+        for name in FORMATS
+        if name != FLOAT32
+        for groups in (*((group,) for group in GROUPS), GROUPS)
+    ]
+    knobs["store"] = [replace(reference, storage=dict(sorted(storage.items()))) for storage in stored]
     for kind, own in (("density", model.density), ("colour", model.colour)):
-        for name, values in own.reductions().items():
-            knobs[f"{kind}.{name}"] = [reduce(kind, name, value) for value in values]
+        for name, counts in own.reductions().items():
+            reduced = [{**reference.reduced, (kind, name): count} for count in counts]
+            knobs[f"{kind}.{name}"] = [replace(reference, reduced=dict(sorted(one.items()))) for one in reduced]
     return {name: [one for one in configs if one != reference] for name, configs in knobs.items()}
-
-
-# ---------------------------------------------------------------- measuring
 
 
 def measure_tradeoff(
     request: TradeoffRequest, tell: Tell = lambda text: None, progress: Progress = lambda text, fraction: None
-) -> Record:
+) -> TradeoffRecord:
     """Measure, and write ``tradeoff.json``, ``tradeoff.csv``, ``tradeoff.html`` and ``front.png``.
 
     Args:
@@ -139,58 +126,49 @@ def measure_tradeoff(
         NeuprimError: no such run or knob, no test views, invalid overrides, or a damaged record.
     """
     setup = load_setup(request.run_dir, request.words, request.views, request.lpips)
-    knobs = list_knobs(setup.reference, setup.model)
+    knobs = list_render_knobs(setup.reference, setup.model)
     for name in request.knobs:
         if name not in knobs:
             raise ConfigError(f"--knobs {name}: no such knob of this run{nearest(name, knobs)}")
-    folder = request.run_dir / TRADEOFF_FOLDER
-    record = _resume_record(folder / TRADEOFF_FILE, _identity(setup), tell)
+    record = _resume_render_tradeoff(request.run_dir / TRADEOFF_FOLDER / TRADEOFF_FILE, _render_identity(setup), tell)
     with find_run_plugins(setup.config).attribute_errors(), use_one_torch_thread():
-        reason = setup.unsupported(setup.reference)
-        if reason is not None:
+        if (reason := setup.unsupported(setup.reference)) is not None:
             raise ConfigError(reason)
         record.facts |= {**describe_setup(setup), "primitives": setup.model.count}
-        session = _Session(request, setup, record, progress)
+        session = _RenderSession(request, setup, record, progress)
         session.measure([(REFERENCE, setup.reference), *session.single_changes(knobs)], _IMAGES)
         session.take_times(_TIMES)
         session.measure([(COMBINED, config) for config in session.combinations()], _COMBINED)
         session.take_times(1.0)
         record.find_fronts(session.stores_the_reference, session.draws_the_reference)
-        record.write(folder / TRADEOFF_FILE)
-        write_csv(folder / "tradeoff.csv", record, setup.model.count)
-        progress("pictures of the front", 0.0)
-        configs = [setup.parse(point.words) for point in record.points]
-        pictures = render_front_pictures(record, setup.views, lambda i: (setup, setup.renderer(configs[i])))
-    write_tradeoff(folder, record.to_dict(), pictures, lambda w: format_render_command(str(request.run_dir), w))
+        command = lambda words: format_render_command(str(request.run_dir), words)  # noqa: E731
+        session.write_results(command, setup.model.count)
     return record
 
 
-class _Session:
+class _RenderSession(TradeoffSession):
     """Measure points of one run within the budget."""
 
-    def __init__(self, request: TradeoffRequest, setup: EvaluationSetup, record: Record, progress: Progress) -> None:
-        self.request, self.setup, self.record, self.progress = request, setup, record, progress
-        self.begun, self.file = time.monotonic(), request.run_dir / TRADEOFF_FOLDER / TRADEOFF_FILE
-        self._exact: ExactImages | None = None
+    def __init__(
+        self, request: TradeoffRequest, setup: EvaluationSetup, record: TradeoffRecord, progress: Progress
+    ) -> None:
+        super().__init__(request.run_dir / TRADEOFF_FOLDER, request.budget, request.repeats, record, progress)
+        self.knobs, self.setup = request.knobs, setup
 
-    def _deadline(self, part: float) -> float:
-        return self.begun + part * self.request.budget
+    def point_setup(self, number: int) -> tuple[EvaluationSetup, RenderConfig]:
+        return self.setup, self.setup.parse(self.record.points[number].words)
 
-    @property
+    @cached_property
     def exact(self) -> ExactImages:
         """Exact images, rendered when the first point needs them."""
-        if self._exact is None:
-            self.progress("exact images", 0.0)
-            known = self.record.facts.get("exact", {}).get("float64")
-            self._exact = render_exact(self.setup, _EXACT * self.request.budget, known)
-            self.record.facts.setdefault("exact", self._exact.to_dict())
-        return self._exact
+        self.progress("exact images", 0.0)
+        return self.render_exact(self.setup, _EXACT)
 
     def single_changes(self, knobs: dict[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
         """Yield what can be drawn here and differs; the record says what is left out."""
         base = self.setup.backend(self.setup.reference).name
         for name, configs in knobs.items():
-            if self.request.knobs and name not in self.request.knobs:
+            if self.knobs and name not in self.knobs:
                 continue
             if not configs:
                 self.record.leave_out(name, (), "there is no other value")
@@ -205,11 +183,11 @@ class _Session:
         """Measure images and bytes of the configurations that the record lacks."""
         for number, (knob, config) in enumerate(wanted):
             words = self.setup.overrides(config)
-            if self.record.find(words) is not None:
+            if any(point.words == words for point in self.record.points):
                 continue
             reason = self._too_slow(knob, config)
-            if self.record.points and time.monotonic() > self._deadline(part):
-                reason = f"no time left of the budget of {self.request.budget:g} s"
+            if self.record.points and self.seconds_left(part) < 0:
+                reason = self.no_time
             if reason is None:
                 self.progress(f"images of point {number + 1} of {len(wanted)}", number / len(wanted))
                 try:
@@ -219,10 +197,10 @@ class _Session:
             if reason is not None:
                 self.record.leave_out(knob, words, reason)
                 continue
-            most = max(1, int(_ONE_POINT * self.request.budget / max(seconds, 1e-9)))
-            point.rounds = most if most < self.request.repeats else None
+            most = max(1, int(_ONE_POINT * self.budget / max(seconds, 1e-9)))
+            point.rounds = most if most < self.repeats else None
             self.record.points.append(point)
-            self.record.write(self.file)
+            self.write_record()
 
     def _too_slow(self, knob: str, config: RenderConfig) -> str | None:
         """Return why a point is not drawn: the float64 reference backend may take a thousand times as long."""
@@ -230,30 +208,16 @@ class _Session:
         if knob == REFERENCE or names[0] != backends.REFERENCE or names[1] == backends.REFERENCE:
             return None
         known = self.record.facts.get("exact") or self.exact.to_dict()
-        seconds, allowed = known["oracle_seconds"] * len(self.setup.views), _ONE_POINT * self.request.budget
+        seconds, allowed = known["oracle_seconds"] * len(self.setup.views), _ONE_POINT * self.budget
         if seconds <= allowed:
             return None
         return f"its images would take about {seconds:.0f} s, of {allowed:.0f} s that a point may have"
 
-    def take_times(self, part: float) -> None:
-        """Time all points that lack rounds."""
-        repeats, timed = self.request.repeats, list[TimedPoint]()
-        for point in self.record.points:
-            config = self.setup.parse(point.words)
-            rounds = min(repeats, point.rounds or repeats)
-            timed.append(TimedPoint(point, lambda config=config: self.setup.renderer(config), rounds))  # type: ignore[misc]
-
-        def done(number: int, count: int) -> None:
-            self.record.write(self.file)
-            self.progress(f"round {number} of {count}, {len(timed)} points", number / count)
-
-        time_points(timed, self.setup.views, self._deadline(part), done)
-
-    def stores_the_reference(self, point: Point) -> bool:
+    def stores_the_reference(self, point: TradeoffPoint) -> bool:
         """Return whether a point stores the model as the reference does: storage does not change times."""
         return self.setup.parse(point.words).storage == self.setup.reference.storage
 
-    def draws_the_reference(self, point: Point) -> bool:
+    def draws_the_reference(self, point: TradeoffPoint) -> bool:
         """Return whether a point draws as the reference does, so that only its bytes differ."""
         config, reference = self.setup.parse(point.words), self.setup.reference
         return config.settings == reference.settings and config.resolution == reference.resolution
@@ -269,18 +233,18 @@ class _Session:
                 continue
             knob, loss = turned[0].partition("=")[0], base.quality["psnr"] - point.quality["psnr"]
             if point.ratios and point.ratio < 1.0 - point.doubt and self.stores_the_reference(point):
-                faster.append(Step(knob, turned[0], -math.log(point.ratio), loss))
+                faster.append(FrontStep(knob, turned[0], -math.log(point.ratio), loss))
             if point.bytes < base.bytes and self.draws_the_reference(point):
-                smaller.append(Step(knob, turned[0], math.log(base.bytes / point.bytes), loss))
+                smaller.append(FrontStep(knob, turned[0], math.log(base.bytes / point.bytes), loss))
         configs = [self.setup.parse(point.words) for point in others if point.knob == COMBINED]
-        for way in combine_steps((faster, smaller), known, _COMBINATIONS):
+        for way in combine_front_steps((faster, smaller), known, _COMBINATIONS):
             changed = {word.partition("=")[0] for word in way}
             kept = [word for word in base.words if word.partition("=")[0] not in changed]
             configs.append(self.setup.parse([*kept, *way]))
         return configs
 
 
-def _identity(setup: EvaluationSetup) -> dict[str, Any]:
+def _render_identity(setup: EvaluationSetup) -> dict[str, Any]:
     """Return what must be equal to keep earlier points; JSON-able."""
     config, conditions = setup.config, describe_conditions(setup.views)
     conditions["machine"]["device"] = setup.backend(setup.reference).computing_on(setup.reference.settings)
@@ -294,15 +258,14 @@ def _identity(setup: EvaluationSetup) -> dict[str, Any]:
     }
 
 
-def _resume_record(path: Path, identity: dict[str, Any], tell: Tell) -> Record:
+def _resume_render_tradeoff(path: Path, identity: dict[str, Any], tell: Tell) -> TradeoffRecord:
     """Return the earlier record if nothing changed, else an empty one."""
-    before = read_record(path)
+    before = read_tradeoff_record(path)
     if before is None:
-        return Record(identity)
-    changed = [name for name in identity if before.same.get(name) != identity[name]]
-    if changed:
+        return TradeoffRecord(identity)
+    if changed := before.changes(identity):
         tell(f"{path}: made with another {' and '.join(changed)}; all is measured anew")
-        return Record(identity)
+        return TradeoffRecord(identity)
     tell(f"{path}: {len(before.points)} points measured already are kept; delete it to measure anew")
     before.left_out.clear()
     return before

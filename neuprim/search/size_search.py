@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from neuprim.config import RunConfig, task_of
@@ -16,48 +17,49 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.task import TaskSpec
 from neuprim.core.used_settings import build_settings
 from neuprim.plugins.returns import call_task_tunable_settings
-from neuprim.search.size_curve import Curve, Proposal, climb, fit_line, propose_size, to_decibels
-from neuprim.search.size_predictor import ALLOWANCE, MIN_MARGIN, SizePredictor, exceeded_limit, format_forecast
+from neuprim.search.size_forecast import (
+    ALLOWANCE,
+    MIN_MARGIN,
+    SizeCurve,
+    SizePredictor,
+    SizeProposal,
+    exceeded_limit,
+    fit_time_line,
+    format_forecast,
+    propose_best_size,
+    propose_size,
+    to_decibels,
+)
 from neuprim.search.target_record import Attempt, SettingChange, SettingValue, TargetRecord
-from neuprim.search.trial_runner import VIEWS, TrialRunner, get_setting, override_settings
+from neuprim.search.trial_runner import VIEWS, TrialRunner
+from neuprim.search.trials import get_setting, override_settings
 
 _MAX_MARGIN, _NEAR = 0.3, 1.08
 """A full run is good enough within these dB above the target, if at most this factor above the predicted size."""
 
-_TRIALS, _FULL = 0.33, 0.34
-"""Shares of the budget for trials and for a full run; the rest is for another one."""
+_TRIALS, _FULL = 0.33, 0.34  # shares of the budget for trials and for a full run; the rest is for another one
 
 _SHORTER, _PACE_STEPS, _MIN_STEPS = 8, 24, 16
 """Full runs have this many times the steps of a trial. Steps that measure the pace; least steps of a trial."""
 
 _MAX_SIZES, _MAX_CHANGES, _MAX_FULL = 6, 4, 5
 
-_MIN_SLOPE = 0.8
-"""dB that twice as many primitives gain in full runs, at least; short trials may show less."""
-
-_BEYOND, _BELOW = 2.0, 3.0
-"""A full run has at most and least this factor of the sizes tried."""
+_MIN_SLOPE = 0.8  # dB that twice as many primitives gain in full runs, at least; short trials may show less
+_BEYOND, _BELOW = 2.0, 3.0  # a full run has at most and least this factor of the sizes tried
 
 _MIN_STEP, _MORE_STEPS = 1.07, 0.75
 """Least factor between the sizes of two full runs, and least share of the steps of another to compare with it."""
 
-_MORE = 1.25
-"""Factor by which limits must allow more primitives for another full run."""
-
-_SLOWER = 1.5
-"""A full run that becomes this many times slower is cut short."""
-
-_PAYS = 0.97
-"""Share of the bytes that a changed setting must leave, at most."""
-
-_MAX_REFUSED = 2
-"""Values of a setting that may fail before it is left."""
+_MORE = 1.25  # factor by which limits must allow more primitives for another full run
+_SLOWER = 1.5  # a full run that becomes this many times slower is cut short
+_PAYS = 0.97  # share of the bytes that a changed setting must leave, at most
+_MAX_REFUSED = 2  # values of a setting that may fail before it is left
 
 
 # ---------------------------------------------------------------- settings that save bytes
 
 
-def smaller_values(config: RunConfig, task: TaskSpec, dataset: Dataset) -> dict[str, tuple[SettingValue, ...]]:
+def list_smaller_settings(config: RunConfig, task: TaskSpec, dataset: Dataset) -> dict[str, tuple[SettingValue, ...]]:
     """Return setting -> values with fewer numbers per primitive, the least first and the current one last.
 
     The setting with the largest saving comes first.
@@ -68,28 +70,23 @@ def smaller_values(config: RunConfig, task: TaskSpec, dataset: Dataset) -> dict[
         task.check(settings)
         return sum(spec.size for field in task.build(settings, dataset) for spec in field.parameters())
 
-    whole = count_numbers(config)
-    values: dict[str, tuple[SettingValue, ...]] = {}
-    least: dict[str, int] = {}
+    whole, found = count_numbers(config), []
     for key, offered in call_task_tunable_settings(task, build_settings(task, config.model, config.options)).items():
         now = get_setting(config, key)
-        if key in config.unused or now is None:
+        if now is None:  # not a setting of this configuration
             continue
         if key in ("model.sh_degree", "model.neurons"):  # any whole number is possible
             offered = tuple(range(min(offered), now))
         sizes: dict[SettingValue, int] = {}
         for value in offered:
-            try:
+            with suppress(ConfigError):  # not with the other settings
                 sizes[value] = count_numbers(override_settings(config, {key: value}))
-            except ConfigError:  # not with the other settings
-                continue
-        fewer = sorted((value for value in sizes if sizes[value] < whole), key=lambda value: sizes[value])
-        if fewer:
-            values[key], least[key] = (*fewer, now), sizes[fewer[0]]
-    return {key: values[key] for key in sorted(values, key=lambda key: least[key])}
+        if fewer := sorted((value for value in sizes if sizes[value] < whole), key=lambda value: sizes[value]):
+            found.append((sizes[fewer[0]], key, (*fewer, now)))
+    return {key: values for _, key, values in sorted(found, key=lambda one: one[0])}
 
 
-def next_change(
+def next_setting_change(
     values: Mapping[str, Sequence[SettingValue]], turns: Sequence[SettingChange]
 ) -> tuple[str, SettingValue, SettingValue] | None:
     """Return (setting, current value, value to try); None when all are done.
@@ -106,7 +103,7 @@ def next_change(
     return None
 
 
-def change_pays(loss: float, size: float, slope: float) -> bool:
+def setting_change_pays(loss: float, size: float, slope: float) -> bool:
     """Return whether a model is smaller with a change after primitives make up for the loss.
 
     Args:
@@ -146,7 +143,7 @@ class SizeSearch:
         """Run all stages that the record does not have."""
         kept = sum(a.outcome is not None for a in self.record.attempts)
         if kept:
-            self.runner.tell(f"{kept} earlier trainings are kept")
+            self.runner.notify(f"{kept} earlier trainings are kept")
         stages = (self._measure_pace, self._try_sizes, self._report_reach, self._change_settings, self._run_full)
         for number, stage in enumerate(stages, 1):
             if self.record.stage < number:
@@ -170,7 +167,7 @@ class SizeSearch:
                 "primitives to begin with (model.primitives) or smaller images"
             )
         self.record.length = round(possible / _SHORTER)
-        self.runner.tell(
+        self.runner.notify(
             f"{1e3 * pace:.1f} ms a step with {first.count:,} primitives: full runs of about {possible:,.0f} steps, "
             f"trials of {self.record.length:,}; one of {self.record.hold_out} training views is held out"
         )
@@ -195,7 +192,7 @@ class SizeSearch:
             known = [self.runner.is_finished(attempt) for attempt in several]
             for before, done in zip(known, self.runner.run(*several), strict=True):
                 if not before:
-                    self.runner.tell(_describe(done, self.predictor.predict(done.count)))
+                    self.runner.notify(_describe_attempt(done, self.predictor.predict(done.count)))
 
     def _try_sizes(self) -> None:
         """Try sizes until the one for the target is known, the share of the budget is used, or nothing helps."""
@@ -220,10 +217,10 @@ class SizeSearch:
             begun.append(proposal.primitives)
             self._try_size(proposal.primitives)
 
-    def _propose(self) -> Proposal:
+    def _propose(self) -> SizeProposal:
         predictor, highest = self.predictor, self._highest()
         if not self.target.quality:
-            return climb(predictor.margins(), highest)
+            return propose_best_size(predictor.margins(), highest)
         return propose_size(predictor.margins(), highest, ALLOWANCE, predictor.doubt)
 
     def _wanted(self) -> int:
@@ -231,11 +228,11 @@ class SizeSearch:
         predictor, highest = self.predictor, self._highest()
         margins = predictor.margins()
         if not self.target.quality:
-            proposal = climb(margins, highest)
+            proposal = propose_best_size(margins, highest)
             return proposal.primitives if proposal.kind == "take" else highest
         counts = [n for n, _ in margins]
         best = max(margins, key=lambda pair: pair[1])[0]
-        found = Curve.fit(margins).find_count(ALLOWANCE, highest)
+        found = SizeCurve.fit(margins).find_count(ALLOWANCE, highest)
         if found is None and not self.record.finished("full") and max(counts) > best:
             found = best  # a full run of it tells more than trials of larger ones
         more = min(highest, round(_BEYOND * max(counts)))
@@ -272,7 +269,7 @@ class SizeSearch:
             return
         predictor, best = self.predictor, self._wanted()
         margins = predictor.margins()
-        if max(Curve.fit(margins).at(best), *(m for _, m in margins)) + predictor.doubt >= ALLOWANCE:
+        if max(SizeCurve.fit(margins).at(best), *(m for _, m in margins)) + predictor.doubt >= ALLOWANCE:
             return
         expected = ", ".join(format_forecast(name, *pair) for name, pair in predictor.predict(best).items())
         limited = predictor.limit() is not None and self._highest() == predictor.limit()
@@ -280,15 +277,15 @@ class SizeSearch:
             f"{self.target} is out of reach: {expected} is the best that "
             f"{'the limits allow' if limited else 'the budget can train'}, of {best:,} primitives; that is made"
         )
-        self.runner.tell(self.record.out_of_reach)
+        self.runner.notify(self.record.out_of_reach)
 
     def _change_settings(self) -> None:
         """Try settings that save bytes, at the size nearest to the wanted one."""
         if self.record.out_of_reach or not (self.target.quality or self.target.megabytes is not None):
             return
-        values = smaller_values(self.config, task_of(self.config), self.dataset)
+        values = list_smaller_settings(self.config, task_of(self.config), self.dataset)
         for _ in range(_MAX_CHANGES):
-            change = next_change(values, self.record.turns)
+            change = next_setting_change(values, self.record.turns)
             wanted = self._wanted()
             bases = [
                 a
@@ -306,12 +303,12 @@ class SizeSearch:
             (tried,) = self.runner.run(Attempt("knob", words, base.primitives, self.record.length))
             loss = {n: to_decibels(n, base.measured(n)) - to_decibels(n, tried.measured(n)) for n in ("psnr", "ssim")}
             size = (tried.packed / tried.count) / (base.packed / base.count)
-            slope = max(Curve.fit(self.predictor.margins()).slope_at(wanted), 0.2)
-            adopted = change_pays(max(loss[name] for name in self.predictor.measures), size, slope)
+            slope = max(SizeCurve.fit(self.predictor.margins()).slope_at(wanted), 0.2)
+            adopted = setting_change_pays(max(loss[name] for name in self.predictor.measures), size, slope)
             self.record.turns.append(SettingChange(key, before, after, loss, size, adopted))
-            self.runner.write()
+            self.runner.write_record()
             end = "kept" if adopted else "not worth it"
-            self.runner.tell(f"{key}={after}: {size:.0%} of the bytes, {-loss['psnr']:+.2f} dB; {end}")
+            self.runner.notify(f"{key}={after}: {size:.0%} of the bytes, {-loss['psnr']:+.2f} dB; {end}")
 
     # ------------------------------------------------------------ full runs
 
@@ -326,8 +323,8 @@ class SizeSearch:
                 return
             expected = ", ".join(format_forecast(name, *pair) for name, pair in attempt.predicted.items())
             text = f"full run: {attempt.primitives:,} primitives, {attempt.steps:,} steps; expected {expected}"
-            self.runner.tell(text)
-            self.runner.tell(_describe(self.runner.run(attempt)[0], {}))
+            self.runner.notify(text)
+            self.runner.notify(_describe_attempt(self.runner.run(attempt)[0], {}))
 
     def _is_good(self, attempt: Attempt) -> bool:
         """Return whether a full run is about as good as another could be."""
@@ -341,7 +338,7 @@ class SizeSearch:
     def _plan_full(self) -> Attempt | None:
         """Return the next full run; None where another has no time or would not differ."""
         finished, wanted, budget = self.record.finished("full"), self._wanted(), self.record.asked["budget"]
-        pace, left = self.runner.pace(wanted), self.runner.left - self._reserve(wanted)
+        pace, left = self.runner.pace(wanted), self.runner.seconds_left - self._reserve(wanted)
         share = left if finished else max(left / 2, min(left, _FULL * budget))
         least = self.record.length * (4 if finished else 1)
         steps = int(min(self.max_steps, share / pace))
@@ -358,13 +355,13 @@ class SizeSearch:
     def _reserve(self, primitives: int) -> float:
         """Return the seconds for what follows a full run: evaluation, pictures, quantization."""
         trials = self.record.finished("size", "full")
-        frame = fit_line([(a.count, a.measured("ms_per_frame")) for a in trials], primitives) / 1e3
+        frame = fit_time_line([(a.count, a.measured("ms_per_frame")) for a in trials], primitives) / 1e3
         held_out = min(VIEWS, len(self.dataset.train) // self.record.hold_out)
         frames = 6 * held_out + 3 * len(self.dataset.test) + 40
         return 2 * frame * frames + 2 * max(self.runner.overhead(), 0.0)
 
 
-def _describe(attempt: Attempt, predicted: Mapping[str, Sequence[float]]) -> str:
+def _describe_attempt(attempt: Attempt, predicted: Mapping[str, Sequence[float]]) -> str:
     changes = "".join(f" {key.rpartition('.')[2]}={value}" for key, value in sorted(attempt.words.items()))
     expected = ", ".join(format_forecast(name, *pair) for name, pair in predicted.items())
     measured = f"held out {attempt.measured('psnr'):.2f} dB, ssim {attempt.measured('ssim'):.4f}"

@@ -31,20 +31,19 @@ from neuprim.runs.fit import Events, Finishing, Preparing, compile_kernels, igno
 from neuprim.runs.ground_truth import render_ground_truth_for_training
 from neuprim.runs.launch.launcher import use_launcher_threads
 from neuprim.runs.measure import measure_quality
-from neuprim.runs.open import COMPRESSED, load_dataset, move_to_render_device, read_metrics
+from neuprim.runs.open import COMPRESSED, load_dataset, move_to_render_device
 from neuprim.runs.run_directory import lock_directory
 from neuprim.runs.training import train_in_directory
-from neuprim.search.eval_views import eval_views, measure_eval_views
+from neuprim.search.model_quality import TrainingQuality, eval_views, measure_eval_views
 from neuprim.search.pruning import PruneRequest, prune_run
 from neuprim.search.quantized_finetune import QuantizationSearch, dequantize
-from neuprim.search.size_predictor import ALLOWANCE, MIN_MARGIN, SizePredictor, exceeded_limit
+from neuprim.search.size_forecast import ALLOWANCE, MIN_MARGIN, SizePredictor, exceeded_limit
 from neuprim.search.size_search import SizeSearch
 from neuprim.search.target_record import TARGET_FILE, Attempt, TargetRecord, read_target_record
-from neuprim.search.training_quality import TrainingQuality
 from neuprim.search.trial_runner import VIEWS, TrialRunner, default_compressed_bytes
+from neuprim.search.trials import NOT_TRAINED_WITH
 
-_FIRST_SHARE = 0.05
-"""Share of the squared error at which the search for coarse numbers begins."""
+_FIRST_SHARE = 0.05  # share of the squared error at which the search for coarse numbers begins
 
 _MAX_TUNING, _MIN_TUNING = 3, 600
 """Most steps of fine-tuning over those of the full run, and least steps with which a model is pruned."""
@@ -74,18 +73,18 @@ def run_target(
         KeyboardInterrupt: after Ctrl-C; the same call with ``resume`` continues.
         NeuprimError: invalid input, or a budget in which nothing can be trained.
     """
-    _check_config(config)
-    record = _resume_record(config, {**target.given(), "budget": budget})
+    _check_target_config(config)
+    record = _resume_target(config, {**target.given(), "budget": budget})
     if record.achieved:
         return record
     plugins, begun, task, folder = find_run_plugins(config), clock(), task_of(config), config.output_dir
     with lock_directory(folder, "search"), plugins.attribute_errors(), use_launcher_threads(launcher):
 
-        def progress(text: str, fraction: float) -> None:
+        def show_progress(text: str, fraction: float) -> None:
             events(Preparing(text, fraction))
 
-        render_ground_truth_for_training(config, launcher, progress)
-        dataset = load_dataset(Job(config, task), progress)
+        render_ground_truth_for_training(config, launcher, show_progress)
+        dataset = load_dataset(Job(config, task), show_progress)
         check_dataset(dataset, task.conditions)
         record.hold_out = choose_hold_out(dataset)
         loaded = clock()
@@ -95,9 +94,9 @@ def run_target(
         try:
             search = SizeSearch(config, target, dataset, record, runner)
             search.run()
-            _publish(runner, search.predictor)
+            _publish_target(runner, search.predictor)
         finally:
-            runner.write()
+            runner.write_record()
     return record
 
 
@@ -109,7 +108,7 @@ def choose_hold_out(dataset: Dataset) -> int:
     return min(8, max(2, count // 8))
 
 
-def _check_config(config: RunConfig) -> None:
+def _check_target_config(config: RunConfig) -> None:
     train, population = config.train, config.train.population
     if train.max_seconds is not None and "train.max_seconds" in config.non_default:
         raise ConfigError(
@@ -124,9 +123,9 @@ def _check_config(config: RunConfig) -> None:
         raise ConfigError(f"train.population.grow_to={population.grow_to}: {decides}; expected null")
 
 
-def _resume_record(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
+def _resume_target(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
     """Return the earlier record. Another target or budget keeps the trainings and starts its seconds anew."""
-    own, folder = ("output_dir", "resume", "overrides", "non_default", "made_by"), config.output_dir
+    folder, own = config.output_dir, (*NOT_TRAINED_WITH, "made_by")
     same: dict[str, Any] = json.loads(json.dumps({k: v for k, v in config.to_dict().items() if k not in own}))
     before = read_target_record(folder) if config.resume else None
     if before is None:
@@ -134,8 +133,7 @@ def _resume_record(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
             expected = "expected a new directory, or that of a target run"
             raise ConfigError(f"output_dir={folder}: holds a run without a target; {expected}")
         return TargetRecord(asked, same)
-    different = [key for key in same if before.same.get(key) != same[key]]
-    if different:
+    if different := [key for key in same if before.same.get(key) != same[key]]:
         expected = "expected the same overrides, or a new output_dir"
         raise ConfigError(f"{folder / TARGET_FILE}: begun with another {', '.join(different)}; {expected}")
     if before.asked == asked:
@@ -148,18 +146,19 @@ def _resume_record(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
 
 
 @dataclass(frozen=True)
-class _Result:
+class _TargetResult:
     """The model after a stage.
 
     Attributes:
         run_dir: the run directory, or that of the pruned model in it.
-        held: PSNR and SSIM of held-out views; test: of test views.
+        held: PSNR and SSIM of held-out views; before_storing, test: of test views, by the run and now.
         packed: bytes of the smallest file.
         facts: what the stages add to the record.
     """
 
     run_dir: Path
     held: dict[str, float]
+    before_storing: dict[str, float]
     test: dict[str, float]
     packed: int
     facts: dict[str, Any]
@@ -176,14 +175,14 @@ def choose_full_run(predictor: SizePredictor) -> Attempt:
     return max(within, key=predictor.margin_of)
 
 
-def _publish(runner: TrialRunner, predictor: SizePredictor) -> None:
+def _publish_target(runner: TrialRunner, predictor: SizePredictor) -> None:
     """Write the run directory of the best full run, prune and quantize its model, and record what is achieved."""
     record, target = runner.record, predictor.target
     attempt = choose_full_run(predictor)
     record.chosen = attempt.folder
-    result = _write_run(runner, attempt)
-    result = _prune(runner, predictor, attempt, result)
-    result = _quantize(runner, predictor, result)
+    result = _write_full_run(runner, attempt)
+    result = _prune_full_run(runner, predictor, attempt, result)
+    result = _quantize_result(runner, predictor, result)
     limit = exceeded_limit(target, attempt, result.packed)
     missed = [f"{n} {result.held[n]:.4g}" for n, goal in target.quality.items() if result.held[n] < goal]
     record.warning = None
@@ -197,29 +196,23 @@ def _publish(runner: TrialRunner, predictor: SizePredictor) -> None:
         "run_dir": str(result.run_dir),
         "primitives": result.facts.get("pruned", {}).get("primitives", attempt.count),
         "held_out": result.held,
-        "test_before_storing": _test_quality(result.run_dir),
+        "test_before_storing": result.before_storing,
         "test": result.test,
         "fps": 1e3 / attempt.measured("ms_per_frame"),
         "model_bytes": (result.run_dir / "model.safetensors").stat().st_size,
         "packed_bytes": result.packed,
         **result.facts,
         "predicted": attempt.predicted,
-        "seconds": runner.spent,
+        "seconds": runner.seconds_spent,
     }
 
 
-def _test_quality(run_dir: Path) -> dict[str, float]:
-    metrics = read_metrics(run_dir)
-    return {name: float(metrics[name]) for name in _MEASURES}
-
-
-def _write_run(runner: TrialRunner, attempt: Attempt) -> _Result:
+def _write_full_run(runner: TrialRunner, attempt: Attempt) -> _TargetResult:
     """Write the run directory from the training's."""
     config, folder = runner.configure(attempt), runner.config.output_dir
     runner.events(Finishing("measuring test views"))
-    fitted, _ = train_in_directory(
-        replace(config, resume=True), dataset=runner.dataset, hold_out=runner.record.hold_out
-    )
+    resumed = replace(config, resume=True)
+    fitted, _ = train_in_directory(resumed, dataset=runner.dataset, hold_out=runner.record.hold_out)
     for name in _KEPT:
         with atomic_path(folder / name) as temporary:
             shutil.copyfile(config.output_dir / name, temporary)
@@ -227,8 +220,8 @@ def _write_run(runner: TrialRunner, attempt: Attempt) -> _Result:
     write_text(folder / "config.yaml", final.to_yaml())
     dataset = replace(runner.dataset, train=fitted.dataset.train)
     metrics = evaluate_fitted(replace(fitted, config=final, dataset=dataset), folder)
-    held = {name: attempt.measured(name) for name in _MEASURES}
-    return _Result(folder, held, _test_quality(folder), int(metrics["model_bytes"]), {})
+    held, test = ({name: float(of(name)) for name in _MEASURES} for of in (attempt.measured, metrics.__getitem__))
+    return _TargetResult(folder, held, test, test, int(metrics["model_bytes"]), {})
 
 
 def _measure_held_out(runner: TrialRunner, model: Primitives) -> dict[str, float]:
@@ -241,14 +234,16 @@ def _measure_held_out(runner: TrialRunner, model: Primitives) -> dict[str, float
     return {"psnr": quality.psnr, "ssim": quality.ssim}
 
 
-def _prune(runner: TrialRunner, predictor: SizePredictor, attempt: Attempt, before: _Result) -> _Result:
+def _prune_full_run(
+    runner: TrialRunner, predictor: SizePredictor, attempt: Attempt, before: _TargetResult
+) -> _TargetResult:
     """Prune as far as the target allows, in half of the time left; returns the result before if that fails."""
     record, margin = runner.record, predictor.margin(before.held)
     if not predictor.target.quality or margin < 0:
         return before
-    steps = int(min(runner.left / 2 / runner.pace(attempt.count), _MAX_TUNING * attempt.steps))
+    steps = int(min(runner.seconds_left / 2 / runner.pace(attempt.count), _MAX_TUNING * attempt.steps))
     if steps < _MIN_TUNING:
-        record.why.append(f"no time to prune: {max(runner.left, 0):.0f} s are left")
+        record.why.append(f"no time to prune: {max(runner.seconds_left, 0):.0f} s are left")
         return before
     tolerance, folder = max(margin - MIN_MARGIN, MIN_MARGIN), before.run_dir / "pruned"
     request = PruneRequest(before.run_dir, tolerance, 0.0, steps, folder, True, record.hold_out)
@@ -261,18 +256,18 @@ def _prune(runner: TrialRunner, predictor: SizePredictor, attempt: Attempt, befo
     held = _measure_held_out(runner, model)
     old, new = (default_compressed_bytes(one, task) for one in (before.run_dir, made.run_dir))
     kept = predictor.margin(held) >= 0 and new < old
-    runner.tell(
+    runner.notify(
         f"pruned: {model.count:,} primitives, {new / 1e3:.1f} kB in place of {old / 1e3:.1f}, held out "
         f"{held['psnr']:.2f} dB, ssim {held['ssim']:.4f}; {'kept' if kept else 'not worth it'}"
     )
     if not kept:
         return before
-    pruned = {"primitives": model.count, "bytes_usual": new, "bytes_usual_before": old}
-    facts = {**before.facts, "pruned": pruned}
-    return _Result(made.run_dir, held, _test_quality(made.run_dir), int(made.after["bytes"]), facts)
+    test = {name: made.after[name] for name in _MEASURES}
+    facts = {"pruned": {"primitives": model.count, "bytes_usual": new, "bytes_usual_before": old}}
+    return _TargetResult(made.run_dir, held, test, test, int(made.after["bytes"]), facts)
 
 
-def _quantize(runner: TrialRunner, predictor: SizePredictor, before: _Result) -> _Result:
+def _quantize_result(runner: TrialRunner, predictor: SizePredictor, before: _TargetResult) -> _TargetResult:
     """Quantize as coarsely as the target allows, at little cost if it is missed anyway.
 
     With a limit of bytes alone, quantize as finely as it allows.
@@ -303,7 +298,6 @@ def _quantize(runner: TrialRunner, predictor: SizePredictor, before: _Result) ->
         quantizers, share = search.find_finest(lambda tried: save(tried) <= most, _FIRST_SHARE)
     size = save(quantizers)
     decoded, _ = load_model(file, task)
-    quality = measure_quality(decoded, task, runner.dataset, runner.config.renderer)
-    test = dict(zip(_MEASURES, quality, strict=True))
+    test = dict(zip(_MEASURES, measure_quality(decoded, task, runner.dataset, runner.config.renderer), strict=True))
     facts = {**before.facts, "rounding": share, "file": str(file)}
     return replace(before, held=_measure_held_out(runner, decoded), packed=size, test=test, facts=facts)

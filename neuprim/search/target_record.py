@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.files import read_json, write_json
+from neuprim.core.io.files import read_json_record, write_json
 from neuprim.core.validation import validate
 
-TARGET_FILE = "target.json"
-
-_FORMAT = 1
+TARGET_FILE, _FORMAT = "target.json", 1
 
 Purpose = Literal["pace", "size", "knob", "full"]
 
@@ -63,9 +61,8 @@ class Attempt:
 
     def repeats(self, other: Attempt) -> bool:
         """Return whether both are the same training."""
-        same = (self.words, self.primitives, self.steps, self.max_seconds)
-        full = (self.purpose == "full") == (other.purpose == "full")
-        return full and same == (other.words, other.primitives, other.steps, other.max_seconds)
+        mine, its = ((a.purpose == "full", a.words, a.primitives, a.steps, a.max_seconds) for a in (self, other))
+        return mine == its
 
 
 @dataclass
@@ -149,22 +146,15 @@ def read_target_record(folder: Path) -> TargetRecord | None:
     Raises:
         DataError: the file is damaged.
     """
-    file = folder / TARGET_FILE
-    data = read_json(file, "the record of a target run", "delete it to search anew")
-    if data is None:
-        return None
-    try:
-        if data["format"] != _FORMAT:
-            raise DataError(
-                f"{file}: format {data['format']!r}; this neuprim reads {_FORMAT}; delete it to search anew"
-            )
-        record = validate(TargetRecord, {f.name: data[f.name] for f in fields(TargetRecord)})
-        for attempt in record.attempts:
-            if not (attempt.primitives > 0 and attempt.steps > 0 and Path(attempt.folder).name == attempt.folder):
-                raise ValueError("attempts: expected positive primitives and steps, and settings that name a folder")
-            if attempt.outcome is not None:
-                [attempt.measured(name) for name in ("psnr", "ssim", "primitives", "bytes", "pace", "ms_per_frame")]
-        return record
-    except (KeyError, TypeError, AttributeError, ValueError, OverflowError, ConfigError) as error:
-        what = f"{type(error).__name__}: {error}"
-        raise DataError(f"{file}: not the record of a target run ({what}); delete it to search anew") from error
+    what, instead = "the record of a target run", "delete it to search anew"
+    return read_json_record(folder / TARGET_FILE, what, instead, _FORMAT, _parse_target_record)
+
+
+def _parse_target_record(data: Mapping[str, Any]) -> TargetRecord:
+    record = validate(TargetRecord, {f.name: data[f.name] for f in fields(TargetRecord)})
+    for attempt in record.attempts:
+        if not (attempt.primitives > 0 and attempt.steps > 0 and Path(attempt.folder).name == attempt.folder):
+            raise ValueError("attempts: expected positive primitives and steps, and settings that name a folder")
+        if attempt.outcome is not None:
+            [attempt.measured(name) for name in ("psnr", "ssim", "primitives", "bytes", "pace", "ms_per_frame")]
+    return record

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, is_dataclass, replace
-from dataclasses import fields as fields_of
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from neuprim.config import RunConfig, task_of
 from neuprim.config.command_settings import LauncherSettings
@@ -15,26 +13,16 @@ from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
-from neuprim.core.train.settings import PopulationSettings
 from neuprim.runs.fit import Events, Note, Preparing
 from neuprim.runs.launch.executors import count_parallel_jobs
-from neuprim.search.size_curve import fit_line
+from neuprim.search.size_forecast import fit_time_line
 from neuprim.search.target_record import Attempt, TargetRecord
-from neuprim.search.trials import Outcome, Trial, TrialFailed, launch_trials, run_trial
+from neuprim.search.trials import Outcome, Trial, TrialFailed, launch_trials, override_settings, run_trial
 
-TARGET_FOLDER = "target"
-"""Folder of the trainings, in the run directory."""
-
-VIEWS = 16
-"""Held-out views to evaluate, at most."""
-
-_PARALLEL = 2
-"""Trainings that a search requests together: the two lengths of a size."""
-
-_MIN_EVERY = 5
-"""Least steps between two interventions into the population, which need statistics."""
-
-_OPTIONS = "task.options."
+TARGET_FOLDER = "target"  # folder of the trainings, in the run directory
+VIEWS = 16  # held-out views to evaluate, at most
+_PARALLEL = 2  # trainings that a search requests together: the two lengths of a size
+_MIN_EVERY = 5  # least steps between two interventions into the population, which need statistics
 
 
 @dataclass
@@ -60,38 +48,37 @@ class TrialRunner:
         return self.launcher.name != "inline"
 
     @property
-    def spent(self) -> float:
+    def seconds_spent(self) -> float:
         return self.clock() - self.begun
 
     @property
-    def left(self) -> float:
-        return self.record.asked["budget"] - self.spent
+    def seconds_left(self) -> float:
+        return self.record.asked["budget"] - self.seconds_spent
 
-    def write(self) -> None:
-        self.record.spent = self.spent
+    def write_record(self) -> None:
+        self.record.spent = self.seconds_spent
         self.record.write(self.config.output_dir)
 
-    def tell(self, text: str) -> None:
+    def notify(self, text: str) -> None:
         self.events(Note(text))
 
     def configure(self, attempt: Attempt) -> RunConfig:
-        """Return the configuration of a training, in its folder."""
+        """Return the configuration of a training, in its folder.
+
+        It has as many interventions into the population as a full run: with fewer, short trials are half a dB worse.
+        """
+        whole, every = self.config.train.iterations, self.config.train.population.every
+        if whole is not None and attempt.steps < whole:
+            every = max(round(every * attempt.steps / whole), min(_MIN_EVERY, every))
         values = {
             **attempt.words,
             "model.primitives": attempt.primitives,
             "train.iterations": attempt.steps,
             "train.max_seconds": attempt.max_seconds,
-            "train.population": self._population(attempt.steps),
+            "train.population.every": every,
         }
         folder = self.config.output_dir / TARGET_FOLDER / attempt.folder
         return replace(override_settings(self.config, values), output_dir=folder, resume=attempt.purpose == "full")
-
-    def _population(self, steps: int) -> PopulationSettings:
-        """Return as many interventions as in a full run; with fewer, short trials are half a decibel worse."""
-        whole, settings = self.config.train.iterations, self.config.train.population
-        if whole is None or steps >= whole:
-            return settings
-        return replace(settings, every=max(round(settings.every * steps / whole), min(_MIN_EVERY, settings.every)))
 
     def is_finished(self, attempt: Attempt) -> bool:
         return any(a.repeats(attempt) and a.outcome is not None for a in self.record.attempts)
@@ -105,7 +92,7 @@ class TrialRunner:
         todo = [attempt for attempt in attempts if attempt.outcome is None]
         self.record.attempts += [attempt for attempt in todo if attempt not in self.record.attempts]
         if todo:
-            self.write()
+            self.write_record()
         if self.parallel and todo:
             self._launch(todo)
         else:
@@ -122,19 +109,15 @@ class TrialRunner:
             outcome = run_trial(self._trial(attempt), self.dataset, self.events)
         finally:
             attempt.seconds += self.clock() - start
-            self.write()
+            self.write_record()
         self._finish(attempt, outcome)
 
     def _launch(self, attempts: list[Attempt]) -> None:
         # The same number of threads for one or several, so that step times compare.
         settings = replace(self.launcher, threads=count_parallel_jobs(self.launcher, _PARALLEL)[1])
-        text = f"{len(attempts)} trainings at work"
-        results = launch_trials(
-            [self._trial(attempt) for attempt in attempts],
-            settings,
-            self.config.output_dir / TARGET_FOLDER,
-            lambda fraction: self.events(Preparing(text, fraction)),
-        )
+        text, folder = f"{len(attempts)} trainings at work", self.config.output_dir / TARGET_FOLDER
+        trials = [self._trial(attempt) for attempt in attempts]
+        results = launch_trials(trials, settings, folder, lambda part: self.events(Preparing(text, part)))
         for attempt, result in zip(attempts, results, strict=True):
             if result.state != "failed":
                 attempt.seconds += result.seconds
@@ -148,25 +131,23 @@ class TrialRunner:
         if attempt.purpose != "pace":
             config = self.configure(attempt)
             attempt.packed = default_compressed_bytes(config.output_dir, task_of(config))
-        self.write()
-
-    # ------------------------------------------------------------ time
+        self.write_record()
 
     def pace(self, primitives: float) -> float:
         """Return the expected seconds of a step."""
         # The few steps of the first attempt are the poorest estimate.
         trained = self.record.finished("size", "full") or self.record.finished("pace")
-        return fit_line(list({a.count: a.measured("pace") for a in trained}.items()), primitives)
+        return fit_time_line(list({a.count: a.measured("pace") for a in trained}.items()), primitives)
 
     def overhead(self) -> float:
         """Return the seconds of a trial beside its steps: initialization, evaluation."""
         finished = self.record.finished("size") or self.record.finished("pace")
-        return max((a.seconds - a.measured("pace") * a.steps for a in finished[-3:]), default=0.0)
+        return max([0.0, *(a.seconds - a.measured("pace") * a.steps for a in finished[-3:])])
 
     def fits(self, primitives: int, steps: float, share: float) -> bool:
         """Return whether a trial ends within a share of the budget."""
-        seconds = self.pace(primitives) * steps + max(self.overhead(), 0.0)
-        return self.spent + seconds <= share * self.record.asked["budget"]
+        seconds = self.pace(primitives) * steps + self.overhead()
+        return self.seconds_spent + seconds <= share * self.record.asked["budget"]
 
 
 def default_compressed_bytes(folder: Path, task: TaskSpec) -> int:
@@ -177,51 +158,3 @@ def default_compressed_bytes(folder: Path, task: TaskSpec) -> int:
     size = file.stat().st_size
     file.unlink()
     return size
-
-
-# ---------------------------------------------------------------- settings by dotted names
-
-
-def get_setting(config: RunConfig, key: str) -> Any:
-    """Return a setting below ``model``, ``train`` or ``task.options``; None where the configuration lacks it."""
-    group, path = _locate(key)
-    node = getattr(config, group)
-    for part in path:
-        node = node.get(part) if isinstance(node, Mapping) else getattr(node, part, None)
-    return node
-
-
-def override_settings(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
-    """Return the configuration with other settings, and with its record of what is not a default."""
-    for key, value in values.items():
-        non_default = dict(config.non_default)
-        for name, before, after in _flatten(key, get_setting(config, key), value):
-            default = non_default.pop(name, (before, before))[0]
-            if after != default:
-                non_default[name] = (default, after)
-        group, path = _locate(key)
-        changed = _replace_nested(getattr(config, group), path, value)
-        config = replace(config, **{group: changed}, non_default=non_default)
-    return config
-
-
-def _locate(key: str) -> tuple[str, list[str]]:
-    """Return the attribute of a configuration, and the path of a setting below it."""
-    if key.startswith(_OPTIONS):
-        return "options", key.removeprefix(_OPTIONS).split(".")
-    group, *path = key.split(".")
-    return group, path
-
-
-def _replace_nested(node: Any, path: list[str], value: Any) -> Any:
-    first, *rest = path
-    if isinstance(node, Mapping):
-        return {**node, first: _replace_nested(node.get(first), rest, value) if rest else value}
-    return replace(node, **{first: _replace_nested(getattr(node, first), rest, value) if rest else value})
-
-
-def _flatten(key: str, before: Any, after: Any) -> list[tuple[str, Any, Any]]:
-    """Return (dotted name, value before, value after) of a setting, or of every setting of a group."""
-    if not is_dataclass(before):
-        return [(key, before, after)]
-    return [(f"{key}.{f.name}", getattr(before, f.name), getattr(after, f.name)) for f in fields_of(before)]

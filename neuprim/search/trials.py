@@ -11,14 +11,17 @@ import json
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import reduce
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from neuprim.config import Job, RunConfig, find_run_plugins, made_now, task_of
 from neuprim.config.command_settings import LauncherSettings
+from neuprim.config.run_config import flatten
 from neuprim.core.data import Dataset
-from neuprim.core.errors import ConfigError, DataError, NeuprimError
-from neuprim.core.io.files import read_json, write_json
+from neuprim.core.errors import DataError, NeuprimError
+from neuprim.core.io.files import read_json_record, write_json
 from neuprim.core.validation import validate
 from neuprim.runs.fit import Event, Events, Finishing, Note, Preparing, Step, ignore_event
 from neuprim.runs.launch.jobs import ENDED, JobResult, JobStatus, LaunchJob
@@ -26,19 +29,14 @@ from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch
 from neuprim.runs.open import load_dataset
 from neuprim.runs.run_directory import lock_directory
 from neuprim.runs.training import train_in_directory
-from neuprim.search.eval_views import eval_views, measure_eval_views
+from neuprim.search.model_quality import eval_views, measure_eval_views
 
-TRIAL_FILE = "trial.json"
+TRIAL_FILE, _FORMAT = "trial.json", 1
 
-_FORMAT = 1
-
-_UNTRAINED = ("output_dir", "resume", "overrides", "non_default")
+NOT_TRAINED_WITH = ("output_dir", "resume", "overrides", "non_default")
 """Parts of a configuration that do not change the training."""
 
-_FEW_STEPS = 64
-"""With fewer steps, a single slow one would spoil the mean of their times."""
-
-Progress = Callable[[float], None]
+_FEW_STEPS = 64  # with fewer steps, a single slow one would spoil the mean of their times
 
 
 @dataclass(frozen=True)
@@ -77,27 +75,31 @@ class Outcome:
     ms_per_frame: float
 
 
+@dataclass(frozen=True)
+class TrialRecord:
+    """Content of ``trial.json``: the settings that were asked for, the most evaluation views, and the outcome."""
+
+    asked: dict[str, Any]
+    views: int
+    outcome: Outcome | None = None
+
+
 class TrialFailed(NeuprimError):
     """A launched trial failed; the text says why."""
 
 
-class _StepTimes:
-    """Pass events on, and collect the times of training steps."""
+def read_trial(folder: Path) -> TrialRecord | None:
+    """Return the record of the trial in a folder; None where there is none.
 
-    def __init__(self, events: Events) -> None:
-        self.events, self._ends = events, list[float]()
+    Raises:
+        DataError: ``trial.json`` is damaged.
+    """
+    what, instead = "the record of a trial", "delete its folder to train anew"
 
-    def __call__(self, event: Event) -> None:
-        self.events(event)
-        if isinstance(event, Step):
-            self._ends.append(event.report.seconds)
+    def parse(data: Mapping[str, Any]) -> TrialRecord:
+        return validate(TrialRecord, {name: data[name] for name in ("asked", "views", "outcome")})
 
-    def pace(self, usual: float) -> float:
-        """Return the seconds of a step: the mean, or the median of few; ``usual`` where none was made."""
-        steps = [b - a for a, b in zip(self._ends, self._ends[1:], strict=False)]
-        if not steps:
-            return usual
-        return max((statistics.median if len(steps) < _FEW_STEPS else statistics.fmean)(steps), 1e-9)
+    return read_json_record(folder / TRIAL_FILE, what, instead, _FORMAT, parse)
 
 
 def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ignore_event) -> Outcome:
@@ -113,25 +115,31 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
         NeuprimError: as :func:`neuprim.runs.run.run`.
     """
     config, folder = trial.config, trial.config.output_dir
-    file = folder / TRIAL_FILE
     with lock_directory(folder, "trial"):
-        asked, before = _request(trial), _read_record(file)
+        asked, before = _trial_request(trial), read_trial(folder)
         if before is None and (folder / "config.yaml").exists():
             raise DataError(f"{folder}: holds a run and no {TRIAL_FILE}; expected a new folder, or that of a trial")
-        changed = set() if before is None else _changed_keys(before["asked"], asked)
-        if changed:
-            events(Note(f"{folder}: made with another {', '.join(sorted(changed))}; trained anew"))
+        if before is not None and before.asked != asked:
+            a, b = flatten(before.asked), flatten(asked)
+            changed = sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name))
+            events(Note(f"{folder}: made with another {', '.join(changed)}; trained anew"))
             (folder / "checkpoint.safetensors").unlink(missing_ok=True)
-        same = before is not None and not changed
+            before = None
         complete = all((folder / name).exists() for name in ("config.yaml", "model.safetensors"))
-        if before is not None and same and complete and before["outcome"] and before["views"] == trial.views:
-            return _parse_outcome(file, before["outcome"])
-        record = {"format": _FORMAT, "asked": asked, "views": trial.views, "outcome": None}
-        write_json(file, record)
-        plugins = find_run_plugins(config)
-        with plugins.attribute_errors():
-            times = _StepTimes(events)
-            fitted, interrupted = train_in_directory(replace(config, resume=same), times, dataset, trial.hold_out)
+        if before is not None and complete and before.outcome and before.views == trial.views:
+            return before.outcome
+        record = TrialRecord(asked, trial.views)
+        write_json(folder / TRIAL_FILE, {"format": _FORMAT, **asdict(record)})
+        ends: list[float] = []  # of the steps
+
+        def note_steps(event: Event) -> None:
+            events(event)
+            if isinstance(event, Step):
+                ends.append(event.report.seconds)
+
+        with find_run_plugins(config).attribute_errors():
+            resumed = replace(config, resume=before is not None)
+            fitted, interrupted = train_in_directory(resumed, note_steps, dataset, trial.hold_out)
             if interrupted:
                 raise KeyboardInterrupt
             events(Finishing("measuring evaluation views"))
@@ -139,6 +147,9 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
             views = eval_views(fitted.dataset, trial.views)
             quality = measure_eval_views(fitted.model, views, config.renderer, fitted.dataset.background)
         steps, seconds = fitted.trainer.step, fitted.trainer.elapsed
+        times, pace = [b - a for a, b in pairwise(ends)], seconds / max(steps, 1)
+        if times:
+            pace = max((statistics.median if len(times) < _FEW_STEPS else statistics.fmean)(times), 1e-9)
         outcome = Outcome(
             psnr=quality.psnr,
             ssim=quality.ssim,
@@ -147,79 +158,38 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
             bytes=(folder / "model.safetensors").stat().st_size,
             steps=steps,
             seconds=seconds,
-            pace=times.pace(seconds / max(steps, 1)),
+            pace=pace,
             ms_per_frame=quality.ms_per_frame,
         )
-        write_json(file, {**record, "outcome": asdict(outcome)})
+        write_json(folder / TRIAL_FILE, {"format": _FORMAT, **asdict(replace(record, outcome=outcome))})
         return outcome
 
 
-def read_outcome(folder: Path) -> Outcome | None:
-    """Return the outcome of the trial in a folder; None where there is none yet.
-
-    Raises:
-        DataError: ``trial.json`` is damaged.
-    """
-    record = _read_record(folder / TRIAL_FILE)
-    return None if record is None or not record["outcome"] else _parse_outcome(folder / TRIAL_FILE, record["outcome"])
-
-
-def _request(trial: Trial) -> dict[str, Any]:
+def _trial_request(trial: Trial) -> dict[str, Any]:
     """Return the settings that must be equal to reuse a folder, as JSON reads them back."""
     config = replace(trial.config, made_by=made_now(trial.config, task_of(trial.config)))
-    settings = {name: value for name, value in config.to_dict().items() if name not in _UNTRAINED}
+    settings = {name: value for name, value in config.to_dict().items() if name not in NOT_TRAINED_WITH}
     request: dict[str, Any] = json.loads(json.dumps({**settings, "hold_out": trial.hold_out}))
     return request
 
 
-def _changed_keys(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> set[str]:
-    changed = set()
-    for key in a.keys() | b.keys():
-        before, after, name = a.get(key), b.get(key), f"{prefix}{key}"
-        if isinstance(before, Mapping) and isinstance(after, Mapping):
-            changed |= _changed_keys(before, after, f"{name}.")
-        elif before != after:
-            changed.add(name)
-    return changed
-
-
-def _read_record(file: Path) -> dict[str, Any] | None:
-    data = read_json(file, "the record of a trial", "delete its folder to train anew")
-    if data is None:
-        return None
-    if not isinstance(data, dict) or not isinstance(data.get("asked"), dict) or not {"outcome", "views"} <= data.keys():
-        raise DataError(f"{file}: not the record of a trial; delete its folder to train anew")
-    if data.get("format") != _FORMAT:
-        expected = f"this neuprim reads {_FORMAT}; delete its folder to train anew"
-        raise DataError(f"{file}: format {data.get('format')!r}; {expected}")
-    return data
-
-
-def _parse_outcome(file: Path, data: object) -> Outcome:
-    try:
-        return validate(Outcome, data, "outcome")
-    except ConfigError as error:
-        raise DataError(f"{file}: not the record of a trial ({error}); delete its folder to train anew") from error
-
-
 # ---------------------------------------------------------------- trials as jobs
 
-_datasets: dict[str, Dataset] = {}
-"""Scene of this worker's last trial; all trials of a search have one scene."""
+_trial_datasets: dict[str, Dataset] = {}  # scene of this worker's last trial; all trials of a search have one scene
 
 
 def run_trial_job(data: Mapping[str, Any], attempt: int, events: Events) -> Outcome:
     """Run the trial of a job; ``trial.json`` decides whether it resumes."""
     config = RunConfig.from_dict(data["config"])
     key = json.dumps([config.task, config.scene_name, config.scene, config.seed], sort_keys=True)
-    if key not in _datasets:
-        _datasets.clear()
-        _datasets[key] = load_dataset(Job.of(config), lambda text, part: events(Preparing(text, part)))
-    return run_trial(Trial(config, data["hold_out"], data["views"]), _datasets[key], events)
+    if key not in _trial_datasets:
+        _trial_datasets.clear()
+        _trial_datasets[key] = load_dataset(Job.of(config), lambda text, part: events(Preparing(text, part)))
+    return run_trial(Trial(config, data["hold_out"], data["views"]), _trial_datasets[key], events)
 
 
 def launch_trials(
-    trials: Sequence[Trial], settings: LauncherSettings, folder: Path, progress: Progress
+    trials: Sequence[Trial], settings: LauncherSettings, folder: Path, progress: Callable[[float], None]
 ) -> list[JobResult]:
     """Run trials as jobs in the folder of a search; returns results with outcomes, or why one failed, in their order.
 
@@ -230,22 +200,45 @@ def launch_trials(
         KeyboardInterrupt: after Ctrl-C; finished work is kept.
         RuntimeError: a bug in a job, with its traceback.
     """
-    call = f"{run_trial_job.__module__}:{run_trial_job.__name__}"
-    jobs = []
-    for number, one in enumerate(trials):
-        data = {"config": one.config.to_dict(), "hold_out": one.hold_out, "views": one.views}
-        jobs.append(LaunchJob(f"{number}-{one.config.output_dir.name}", call, data))
+    call, jobs = f"{run_trial_job.__module__}:{run_trial_job.__name__}", []
+    for number, trial in enumerate(trials):
+        data = {"config": trial.config.to_dict(), "hold_out": trial.hold_out, "views": trial.views}
+        jobs.append(LaunchJob(f"{number}-{trial.config.output_dir.name}", call, data))
     done = [0.0] * len(jobs)
 
-    def hear(number: int, status: JobStatus) -> None:
+    def add_progress(number: int, status: JobStatus) -> None:
         done[number] = 1.0 if status.state in ENDED else status.progress
         progress(sum(done) / len(done))
 
-    results = [result for result in launch(jobs, settings, folder / LAUNCH_FOLDER, hear) if result is not None]
-    results = [result for result in results if result.state != "interrupted"]
+    launched = launch(jobs, settings, folder / LAUNCH_FOLDER, add_progress)
+    results = [result for result in launched if result is not None and result.state != "interrupted"]
     for result in results:
         if result.trace:
             raise RuntimeError(f"in a worker of launcher={settings.name}:\n{result.trace}")
     if len(results) < len(jobs):
         raise KeyboardInterrupt
     return results
+
+
+# ---------------------------------------------------------------- settings by dotted names
+
+
+def get_setting(config: RunConfig, key: str) -> Any:
+    """Return a setting by its key on the command line; None where the configuration lacks it."""
+    node: Any = config.to_dict()
+    for part in key.split("."):
+        node = node.get(part) if isinstance(node, Mapping) else None
+    return node
+
+
+def override_settings(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
+    """Return the configuration with other settings, and with its record of what is not a default."""
+    tree = config.to_dict()
+    for key, value in values.items():
+        *path, name = key.split(".")
+        group = reduce(lambda node, part: node[part], path, tree)
+        default = tree["non_default"].pop(key, (group.get(name), None))[0]
+        group[name] = value
+        if value != default:
+            tree["non_default"][key] = [default, value]
+    return replace(RunConfig.from_dict(tree), source=config.source)

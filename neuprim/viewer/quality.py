@@ -14,7 +14,7 @@ from neuprim.core.errors import NeuprimError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.runs.render_config import RenderConfig, parse_render_config
-from neuprim.search.points import TRADEOFF_FOLDER, read_record
+from neuprim.search.tradeoff_record import TRADEOFF_FILE, TRADEOFF_FOLDER, read_tradeoff_record
 
 SMOOTH_SECONDS = 0.05  # that an image may take while the camera moves
 
@@ -28,7 +28,7 @@ Front = Sequence[tuple[tuple[str, ...], float]]
 def read_front(run_dir: Path, warn: Callable[[str], None] = lambda text: None) -> Front:
     """Read the measured front of time against quality; empty if there is none, or with a warning if it is unusable."""
     try:
-        record = read_record(run_dir / TRADEOFF_FOLDER / "tradeoff.json")
+        record = read_tradeoff_record(run_dir / TRADEOFF_FOLDER / TRADEOFF_FILE)
     except NeuprimError as error:
         warn(str(error))
         return ()

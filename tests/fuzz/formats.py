@@ -344,8 +344,8 @@ def _records(folder: Path) -> None:
     """What runs, sweeps, chunks, searches and launches keep."""
     from neuprim.runs.launch.jobs import JobStatus, write_status
     from neuprim.runs.launch_record import LaunchedRun, LaunchRecord
-    from neuprim.search.points import LeftOut, Point, Record
     from neuprim.search.target_record import SettingChange, TargetRecord
+    from neuprim.search.tradeoff_record import LeftOutPoint, TradeoffPoint, TradeoffRecord
     from neuprim.search.trials import Outcome
     from tests.search.simulated_search import attempt
 
@@ -367,11 +367,11 @@ def _records(folder: Path) -> None:
         folder / "target"
     )
     points = [
-        Point("reference", (), {"psnr": 30.0}, 100, [1.0, 1.1, 1.2], [1.0] * 3),
-        Point("sort", ("renderer.sort=entry",), {"psnr": 29.0}, 100, [0.5], [0.5]),
+        TradeoffPoint("reference", (), {"psnr": 30.0}, 100, [1.0, 1.1, 1.2], [1.0] * 3),
+        TradeoffPoint("sort", ("renderer.sort=entry",), {"psnr": 29.0}, 100, [0.5], [0.5]),
     ]
     (folder / "run/tradeoff").mkdir()
-    Record({"views": 1}, {}, points, [LeftOut("a", ("b=1",), "why")], [0, 1], [0]).write(
+    TradeoffRecord({"views": 1}, {}, points, [LeftOutPoint("a", ("b=1",), "why")], [0, 1], [0]).write(
         folder / "run/tradeoff/tradeoff.json"
     )
     outcome = Outcome(30.0, 0.9, 40, 12, 1000, 50, 1.5, 0.03, 10.0)
@@ -384,9 +384,9 @@ def _read_records(folder: Path) -> None:
     from neuprim.runs.run import read_chunk_record
     from neuprim.runs.sweep import read_sweep, read_sweep_runs, write_sweep_csv
     from neuprim.search import trials
-    from neuprim.search.points import read_record
-    from neuprim.search.points import write_csv as write_points
     from neuprim.search.target_record import read_target_record as read_target
+    from neuprim.search.tradeoff_record import read_tradeoff_record
+    from neuprim.search.tradeoff_record import write_tradeoff_csv as write_points
     from neuprim.viewer.quality import read_front
 
     _read_run(folder)
@@ -399,9 +399,9 @@ def _read_records(folder: Path) -> None:
         target.write(folder / "again")
         repr((target.words, target.finished("size"), [one.count for one in target.attempts if one.outcome]))
     read_front(folder / "run")
-    if (points := read_record(folder / "run/tradeoff/tradeoff.json")) is not None:
+    if (points := read_tradeoff_record(folder / "run/tradeoff/tradeoff.json")) is not None:
         write_points(folder / "out.csv", points, 40)
-    trials.read_outcome(folder)
+    trials.read_trial(folder)
     read_status(folder / "status.json")
 
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from neuprim.report.run_record import read_run
-from neuprim.report.sweep import COLOURS, SweepRun, better, write_sweep_page
+from neuprim.report.sweep_page import COLOURS, SweepRun, better, write_sweep_page
 from tests.browsers import browser
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from neuprim.config.command_settings import Target
 from neuprim.search import size_search
-from neuprim.search.size_predictor import SizePredictor
+from neuprim.search.size_forecast import SizePredictor
 from neuprim.search.size_search import SizeSearch
 from neuprim.search.target import choose_full_run
 from neuprim.search.target_record import Attempt, TargetRecord
@@ -85,10 +85,10 @@ class SimulatedRunner(TrialRunner):
     def __post_init__(self) -> None:
         self.clock = lambda: self.now
 
-    def write(self) -> None:
-        self.record.spent = self.spent
+    def write_record(self) -> None:
+        self.record.spent = self.seconds_spent
 
-    def tell(self, text: str) -> None:
+    def notify(self, text: str) -> None:
         self.notes.append(text)
 
     def _train(self, attempt: Attempt) -> None:
@@ -124,7 +124,7 @@ def simulate_search(
             ladder[key] = (int(value) if value.isdigit() else value, "usual")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(size_search, "task_of", lambda config: None)
-        patch.setattr(size_search, "smaller_values", lambda *args: ladder)
+        patch.setattr(size_search, "list_smaller_settings", lambda *args: ladder)
         search = SizeSearch(config, target, dataset, record, runner)
         search.run()
     predictor: SizePredictor = search.predictor

@@ -19,9 +19,9 @@ from neuprim.runs.launch.jobs import JobResult
 from neuprim.runs.open import load_run
 from neuprim.search import ablation, ablation_plan, trials
 from neuprim.search.ablation import TRIALS, AblationRequest, run_ablation
-from neuprim.search.ablation_plan import CENTRE, Plan, Variant, plan_lengths
-from neuprim.search.points import COMBINED, Record, read_record
-from neuprim.search.trials import Outcome, Trial, read_outcome, run_trial
+from neuprim.search.ablation_plan import CENTRE, AblationPlan, Variant, plan_training_lengths
+from neuprim.search.tradeoff_record import COMBINED, TradeoffRecord, read_tradeoff_record
+from neuprim.search.trials import Outcome, Trial, read_trial, run_trial
 from tests.core import tiny
 from tests.short_runs import words
 
@@ -54,19 +54,19 @@ def request(scene: Path, folder: Path, *more: str, **changes: Any) -> AblationRe
 
 
 @pytest.fixture(scope="module")
-def measured(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
+def measured(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TradeoffRecord]:
     return run_ablation(request(scene, tmp_path_factory.mktemp("sets") / "a set"))
 
 
-def names(record: Record) -> set[str]:
+def names(record: TradeoffRecord) -> set[str]:
     return {point.name for point in record.points if point.knob != COMBINED}
 
 
-def test_the_centre_every_knob_alone_and_some_together(measured: tuple[Path, Record]) -> None:
+def test_the_centre_every_knob_alone_and_some_together(measured: tuple[Path, TradeoffRecord]) -> None:
     folder, record = measured
     assert record.points[0].name == CENTRE and names(record) == SINGLES and record.left_out == []
     assert any(point.knob == COMBINED and len(point.turned) > 1 for point in record.points)
-    plan = Plan(**record.facts["plan"])
+    plan = AblationPlan(**record.facts["plan"])
     for point in record.points:
         stored = load_run(folder / point.run_dir)
         config, model = stored.config, stored.model
@@ -74,12 +74,12 @@ def test_the_centre_every_knob_alone_and_some_together(measured: tuple[Path, Rec
         assert point.steps == max(1, round(STEPS * point.length / plan.paces[point.name]))
         assert point.bytes == (folder / point.run_dir / "model.safetensors").stat().st_size
         assert point.seconds > 0 and len(point.ms) == len(point.ratios) >= 3 and point.seeds == (point.quality["psnr"],)
-    assert set(record.points[0].ratios) == {1.0} and read_record(folder / "tradeoff.json") == record
+    assert set(record.points[0].ratios) == {1.0} and read_tradeoff_record(folder / "tradeoff.json") == record
     page = (folder / "tradeoff.html").read_text(encoding="utf-8")
     assert "neuprim run" in page and (folder / "front.png").exists() and (folder / "tradeoff.csv").exists()
 
 
-def test_the_overrides_of_a_point_train_it(measured: tuple[Path, Record]) -> None:
+def test_the_overrides_of_a_point_train_it(measured: tuple[Path, TradeoffRecord]) -> None:
     point = measured[1].points[measured[1].size[-1]]
     again = fit(compose([*point.words, "output_dir=null"], check_output=False)).metrics()
     assert again["psnr"] == pytest.approx(point.quality["psnr"], abs=1e-6)
@@ -88,8 +88,8 @@ def test_the_overrides_of_a_point_train_it(measured: tuple[Path, Record]) -> Non
 
 def test_seeds_are_averaged_and_must_be_equal_to_continue(scene: Path, tmp_path: Path) -> None:
     folder, record = run_ablation(request(scene, tmp_path / "set", knobs=("train.iterations",), seeds=2))
-    outcomes = [read_outcome(folder / TRIALS / name) for name in (CENTRE, f"{CENTRE}_seed-4")]
-    seeds = [outcome.psnr for outcome in outcomes if outcome is not None]
+    trained = [read_trial(folder / TRIALS / name) for name in (CENTRE, f"{CENTRE}_seed-4")]
+    seeds = [one.outcome.psnr for one in trained if one is not None and one.outcome is not None]
     centre = record.points[0]
     assert list(centre.seeds) == seeds and seeds[0] != seeds[1]
     assert centre.quality["psnr"] == pytest.approx(sum(seeds) / 2)
@@ -125,7 +125,7 @@ def test_failures_and_equal_models_are_left_out(scene: Path, tmp_path: Path, mon
 
 
 def test_an_interrupted_set_continues_with_trainings_launched_together(
-    scene: Path, measured: tuple[Path, Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: Path, measured: tuple[Path, TradeoffRecord], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batches: list[int] = []
 
@@ -141,7 +141,7 @@ def test_an_interrupted_set_continues_with_trainings_launched_together(
     with pytest.raises(KeyboardInterrupt):
         run_ablation(again)
     monkeypatch.undo()
-    half = read_record(tmp_path / "set" / "tradeoff.json")
+    half = read_tradeoff_record(tmp_path / "set" / "tradeoff.json")
     assert batches == [2] and half is not None and names(half) == {CENTRE, "neurons=2"}
     _, record = run_ablation(replace(again, launcher=LauncherSettings()))
     assert names(record) == {CENTRE, "neurons=0", "neurons=2", "neurons=8"}
@@ -149,7 +149,7 @@ def test_an_interrupted_set_continues_with_trainings_launched_together(
 
 
 def test_folders_that_hold_something_else_are_refused(
-    scene: Path, tmp_path: Path, measured: tuple[Path, Record]
+    scene: Path, tmp_path: Path, measured: tuple[Path, TradeoffRecord]
 ) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "a").touch()
@@ -160,7 +160,7 @@ def test_folders_that_hold_something_else_are_refused(
         run_ablation(request(scene, tmp_path / "file"))
     with pytest.raises(ConfigError, match="holds a set with another centre"):
         run_ablation(request(scene, measured[0], "model.neurons=3"))
-    Record({}, {}, measured[1].points[:1]).write(tmp_path / "tradeoff.json")
+    TradeoffRecord({}, {}, measured[1].points[:1]).write(tmp_path / "tradeoff.json")
     with pytest.raises(DataError, match="of a finished run"):
         run_ablation(request(scene, tmp_path))
     with pytest.raises(ConfigError, match="no such knob of a model"):
@@ -179,9 +179,12 @@ def test_the_command(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
 
 def test_lengths_fit_the_budget(scene: Path, tmp_path: Path) -> None:
     centre = compose(words(scene, tmp_path / "a", 1000), check_output=False)
-    assert plan_lengths(centre, 0.1, 60.0, [1.0, 0.5, 0.5]).steps == 300
-    assert plan_lengths(centre, 0.1, 1e9, [1.0]).steps == 1000 and plan_lengths(centre, 0.1, 0.0, [1.0]).steps == 50
-    plan = plan_lengths(centre, 0.1, 60.0, [1.0, 0.5, 0.5])
+    assert plan_training_lengths(centre, 0.1, 60.0, [1.0, 0.5, 0.5]).steps == 300
+    assert (
+        plan_training_lengths(centre, 0.1, 1e9, [1.0]).steps == 1000
+        and plan_training_lengths(centre, 0.1, 0.0, [1.0]).steps == 50
+    )
+    plan = plan_training_lengths(centre, 0.1, 60.0, [1.0, 0.5, 0.5])
     plan.paces["neurons=8"] = 2.0
     trained = plan.overrides(Variant("model.neurons", ("model.neurons=8",)), ["model.neurons=4", "seed=3"], centre)
     assert trained[:3] == ["seed=3", "model.neurons=8", "train.iterations=150"]

@@ -19,7 +19,7 @@ from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run, model_file
 from neuprim.search import compress
 from neuprim.search.compress import Compression, CompressRequest
-from neuprim.search.training_quality import TrainingQuality
+from neuprim.search.model_quality import TrainingQuality
 from tests.search.tradeoff_runs import tiny_run
 
 

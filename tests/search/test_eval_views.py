@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neuprim.search.eval_views import eval_views, fill_masked
+from neuprim.search.model_quality import eval_views, fill_masked
 from tests.core import tiny
 
 

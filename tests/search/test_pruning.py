@@ -51,7 +51,7 @@ def left(made: Pruning) -> Path:
 
 def test_less_is_left_and_training_views_lose_no_more_than_the_tolerance(made: Pruning) -> None:
     assert made.after["numbers"] < 0.8 * made.before["numbers"] and made.after["bytes"] < made.before["bytes"]
-    assert made.judged[0] - made.judged[1] <= TOLERANCE + 1e-6
+    assert made.judged_psnr[0] - made.judged_psnr[1] <= TOLERANCE + 1e-6
     assert made.steps == 0 and all(stage.cut == stage.trained for stage in made.stages)
 
 
@@ -73,7 +73,7 @@ def test_the_run_of_what_is_left_is_a_run(whole: Path, left: Path, made: Pruning
     assert (
         record["pruned_from"] == str(whole)
         and record["tolerance"] == TOLERANCE
-        and record["reduced"] == list(made.words)
+        and record["reduced"] == list(made.reduced)
     )
 
 
@@ -103,7 +103,7 @@ def test_training_goes_on_where_it_was_left_and_what_is_gone_stays_gone(left: Pa
 
 def test_with_steps_more_may_go_and_the_result_is_the_same_again(whole: Path, made: Pruning, tmp_path: Path) -> None:
     runs = [prune_run(PruneRequest(whole, TOLERANCE, steps=100, out=tmp_path / str(i))) for i in range(2)]
-    assert runs[0].steps == 100 and runs[0].judged[0] - runs[0].judged[1] <= TOLERANCE + 1e-6
+    assert runs[0].steps == 100 and runs[0].judged_psnr[0] - runs[0].judged_psnr[1] <= TOLERANCE + 1e-6
     assert runs[0].after["numbers"] < made.before["numbers"] and runs[0].stages[0].cut < runs[0].stages[0].trained
     assert [s.numbers for s in runs[0].stages] == [s.numbers for s in runs[1].stages]
     a, b = (load_run(r.run_dir).model for r in runs if r.run_dir is not None)

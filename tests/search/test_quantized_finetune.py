@@ -15,6 +15,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.finetune import COOL, LEAST_START, LONG, START, fine_tuner
 from neuprim.runs.open import load_dataset, load_run
+from neuprim.search.model_quality import TrainingQuality
 from neuprim.search.quantized_finetune import (
     QuantizationSearch,
     TrainingData,
@@ -22,7 +23,6 @@ from neuprim.search.quantized_finetune import (
     finetune_for_table,
     quantize_within,
 )
-from neuprim.search.training_quality import TrainingQuality
 from tests.core import tiny
 from tests.short_runs import fit, words
 

@@ -14,9 +14,9 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.metrics import psnr
 from neuprim.runs.measure import evaluate_run
 from neuprim.search import render_tradeoff as engine
-from neuprim.search.measuring import TimedPoint, load_setup, measure_point, render_exact, time_points
-from neuprim.search.points import Point, Record, read_record
 from neuprim.search.render_tradeoff import TradeoffRequest, measure_tradeoff
+from neuprim.search.tradeoff_measuring import TimedPoint, load_setup, measure_point, render_exact, time_points
+from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord, read_tradeoff_record
 from tests.search.tradeoff_runs import copied, tiny_run
 
 QUICK = ("alpha_min", "resolution", "store", "colour.degree", "density.neurons")
@@ -29,12 +29,12 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def measured(bare: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
+def measured(bare: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TradeoffRecord]:
     run_dir = copied(bare, tmp_path_factory.mktemp("measured") / "run it")
     return run_dir, measure_tradeoff(TradeoffRequest(run_dir, 2, 3, QUICK, 120.0))
 
 
-def test_every_value_of_every_knob_is_measured(measured: tuple[Path, Record]) -> None:
+def test_every_value_of_every_knob_is_measured(measured: tuple[Path, TradeoffRecord]) -> None:
     _, record = measured
     knobs = [point.knob for point in record.points]
     counts = {name: knobs.count(name) for name in ("reference", "alpha_min", "resolution", "store", *QUICK[3:])}
@@ -54,24 +54,20 @@ def test_every_value_of_every_knob_is_measured(measured: tuple[Path, Record]) ->
     assert record.speed and record.size and set(record.points[0].ratios) == {1.0}
 
 
-def test_the_reference_has_the_numbers_of_eval(measured: tuple[Path, Record]) -> None:
+def test_the_reference_has_the_numbers_of_eval(measured: tuple[Path, TradeoffRecord]) -> None:
     run_dir, record = measured
     metrics, reference = evaluate_run(run_dir), record.points[0]
     assert all(reference.quality[name] == metrics[name] for name in ("psnr", "ssim", "ssim_3dgs"))
     assert reference.bytes == (run_dir / "model.safetensors").stat().st_size
 
 
-def test_coarser_points_are_farther_from_the_exact_image(measured: tuple[Path, Record]) -> None:
+def test_coarser_points_are_farther_from_the_exact_image(measured: tuple[Path, TradeoffRecord]) -> None:
     _, record = measured
 
-    def exactness(*words: str) -> float:
-        point = record.find(words)
-        assert point is not None
-        return point.quality["psnr_exact"]
-
-    values = [exactness(f"renderer.alpha_min={v}") for v in ("0", "0.0009765625", "0.0078125", "0.03125")]
+    exactness = {" ".join(point.words): point.quality["psnr_exact"] for point in record.points}
+    values = [exactness[f"renderer.alpha_min={v}"] for v in ("0", "0.0009765625", "0.0078125", "0.03125")]
     assert values == sorted(values, reverse=True) and values[0] > 90
-    sizes = [exactness(f"resolution={v}") for v in ("0.75", "0.5", "0.25")]
+    sizes = [exactness[f"resolution={v}"] for v in ("0.75", "0.5", "0.25")]
     assert sizes == sorted(sizes, reverse=True) and record.facts["exact"]["float64"] is True
 
 
@@ -84,10 +80,10 @@ def test_exact_images_without_float64_know_their_error(bare: Path) -> None:
     assert measure_point(setup, "alpha_min", uncut, fast)[0].quality["psnr_exact"] == fast.error
 
 
-def test_outputs_and_what_is_kept(measured: tuple[Path, Record], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outputs_and_what_is_kept(measured: tuple[Path, TradeoffRecord], monkeypatch: pytest.MonkeyPatch) -> None:
     run_dir, record = measured
     folder = run_dir / "tradeoff"
-    assert read_record(folder / "tradeoff.json") == record
+    assert read_tradeoff_record(folder / "tradeoff.json") == record
     page = (folder / "tradeoff.html").read_text(encoding="utf-8")
     assert "neuprim render" in page and (folder / "front.png").stat().st_size > 1000
     assert len((folder / "tradeoff.csv").read_text().splitlines()) == len(record.points) + 1
@@ -154,7 +150,7 @@ def test_rounds_time_the_reference_beside_each_point(bare: Path) -> None:
 
         return lambda: draw
 
-    points = [Point(name, (), {}, 0) for name in ("reference", "slow", "short")]
+    points = [TradeoffPoint(name, (), {}, 0) for name in ("reference", "slow", "short")]
     timed = [TimedPoint(p, renderer(s), n) for p, s, n in zip(points, (0.002, 0.008, 0.002), (3, 3, 1), strict=True)]
     rounds: list[tuple[int, int]] = []
     time_points(timed, setup.views, time.monotonic() + 60, lambda *one: rounds.append(one))

@@ -14,17 +14,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuprim.config.command_settings import Target
-from neuprim.search.size_curve import (
-    Curve,
-    climb,
-    fit_line,
+from neuprim.search.size_forecast import (
+    SizeCurve,
+    SizePredictor,
+    exceeded_limit,
+    fit_time_line,
     forecast_quality,
+    format_forecast,
     from_decibels,
+    propose_best_size,
     propose_size,
     to_decibels,
 )
-from neuprim.search.size_predictor import SizePredictor, exceeded_limit, format_forecast
-from neuprim.search.size_search import change_pays, next_change
+from neuprim.search.size_search import next_setting_change, setting_change_pays
 from neuprim.search.target_record import Attempt, SettingChange, TargetRecord
 from tests.search.simulated_search import attempt, from_grid, simulate_search
 
@@ -60,7 +62,7 @@ def test_replays_of_the_recorded_grids_find_the_smallest_model() -> None:
 def test_the_start_does_not_decide(start: int) -> None:
     grid = RESULTS["solids"]["grid"]
     chosen, runner = simulate_search(from_grid(grid), Target(psnr=26.0), start)
-    assert chosen.packed / smallest(grid, 26.0) <= 1.25 and runner.spent <= 60.0
+    assert chosen.packed / smallest(grid, 26.0) <= 1.25 and runner.seconds_spent <= 60.0
 
 
 def test_an_unreachable_target_is_reported_before_full_runs() -> None:
@@ -83,7 +85,7 @@ PAIRS = st.lists(st.tuples(st.integers(1, 10**6), st.floats(-20, 20)), min_size=
 def test_curves_never_fall_and_find_what_they_predict(
     pairs: list[tuple[int, float]], wanted: float, highest: int
 ) -> None:
-    curve = Curve.fit(pairs)
+    curve = SizeCurve.fit(pairs)
     values = [curve.at(2.0**k) for k in range(25)]
     assert all(b >= a - 1e-9 for a, b in pairwise(values))
     found = curve.find_count(wanted, highest)
@@ -95,7 +97,7 @@ def test_curves_never_fall_and_find_what_they_predict(
 
 @given(PAIRS, st.integers(1, 10**6), st.floats(0, 3))
 def test_proposals_stay_within_bounds(pairs: list[tuple[int, float]], highest: int, doubt: float) -> None:
-    for proposal in (propose_size(pairs, highest, 0.1, doubt), climb(pairs, highest)):
+    for proposal in (propose_size(pairs, highest, 0.1, doubt), propose_best_size(pairs, highest)):
         assert 1 <= proposal.primitives <= max(highest, *(count for count, _ in pairs))
 
 
@@ -111,10 +113,10 @@ def test_forecasts_follow_the_gains() -> None:
 
 
 def test_times_are_lines_that_neither_fall_nor_start_below_zero() -> None:
-    assert fit_line([(100, 2.0)], 200) == pytest.approx(3.0)
-    assert fit_line([(100, 2.0), (200, 3.0)], 400) == pytest.approx(5.0)
-    assert fit_line([(100, 3.0), (200, 2.0)], 400) == pytest.approx(2.5)
-    assert fit_line([(100, 1.0), (200, 5.0)], 1) >= 0
+    assert fit_time_line([(100, 2.0)], 200) == pytest.approx(3.0)
+    assert fit_time_line([(100, 2.0), (200, 3.0)], 400) == pytest.approx(5.0)
+    assert fit_time_line([(100, 3.0), (200, 2.0)], 400) == pytest.approx(2.5)
+    assert fit_time_line([(100, 1.0), (200, 5.0)], 1) >= 0
 
 
 # ---------------------------------------------------------------- the record, read with a target
@@ -172,12 +174,16 @@ def test_settings_are_halved_while_that_pays() -> None:
         return SettingChange(key, before, after, {}, 1.0, adopted)
 
     turns: list[SettingChange] = []
-    assert next_change(ladder, turns) == ("a", 4, 2)
+    assert next_setting_change(ladder, turns) == ("a", 4, 2)
     turns.append(change("a", 4, 2, True))
-    assert next_change(ladder, turns) == ("a", 2, 1)
+    assert next_setting_change(ladder, turns) == ("a", 2, 1)
     turns.append(change("a", 2, 1, False))
-    assert next_change(ladder, turns) == ("b", 1, 0)
+    assert next_setting_change(ladder, turns) == ("b", 1, 0)
     turns.append(change("b", 1, 0, True))
-    assert next_change(ladder, turns) is None
-    assert next_change(ladder, [change("a", 4, 2, False)]) == ("a", 4, 3)
-    assert change_pays(0.4, 0.7, 1.0) and not change_pays(0.6, 0.7, 1.0) and not change_pays(0.0, 0.98, 1.0)
+    assert next_setting_change(ladder, turns) is None
+    assert next_setting_change(ladder, [change("a", 4, 2, False)]) == ("a", 4, 3)
+    assert (
+        setting_change_pays(0.4, 0.7, 1.0)
+        and not setting_change_pays(0.6, 0.7, 1.0)
+        and not setting_change_pays(0.0, 0.98, 1.0)
+    )

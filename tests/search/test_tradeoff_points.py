@@ -10,15 +10,23 @@ from typing import Any
 import pytest
 
 from neuprim.core.errors import DataError
-from neuprim.search.points import COMBINED, REFERENCE, LeftOut, Point, Record, read_record, write_csv
+from neuprim.search.tradeoff_record import (
+    COMBINED,
+    REFERENCE,
+    LeftOutPoint,
+    TradeoffPoint,
+    TradeoffRecord,
+    read_tradeoff_record,
+    write_tradeoff_csv,
+)
 
 
-def drawn(*words: str, psnr: float = 30.0, ratio: float = 1.0, size: int = 100) -> Point:
+def drawn(*words: str, psnr: float = 30.0, ratio: float = 1.0, size: int = 100) -> TradeoffPoint:
     quality = {"psnr": psnr, "ssim": 0.9, "ssim_3dgs": 0.91, "psnr_exact": float("inf"), "lpips_3dgs": 0.2}
-    return Point(COMBINED if words else REFERENCE, words, quality, size, [10 * ratio] * 3, [ratio] * 3)
+    return TradeoffPoint(COMBINED if words else REFERENCE, words, quality, size, [10 * ratio] * 3, [ratio] * 3)
 
 
-def trained(name: str, psnr: float, seconds: float = 2.0) -> Point:
+def trained(name: str, psnr: float, seconds: float = 2.0) -> TradeoffPoint:
     point = drawn(f"model.neurons={name}", psnr=psnr)
     point.turned, point.run_dir, point.primitives, point.steps, point.seconds = (
         (f"model.neurons={name}",),
@@ -32,11 +40,14 @@ def trained(name: str, psnr: float, seconds: float = 2.0) -> Point:
 
 
 @pytest.mark.parametrize("points", [[drawn(), drawn("renderer.sort=entry", psnr=29, ratio=0.5)], [trained("1", 20.0)]])
-def test_what_is_written_is_read(points: list[Point], tmp_path: Path) -> None:
-    record = Record({"views": ["a"]}, {"task": "static"}, points, [LeftOut("a", ("b=1",), "why")])
+def test_what_is_written_is_read(points: list[TradeoffPoint], tmp_path: Path) -> None:
+    record = TradeoffRecord({"views": ["a"]}, {"task": "static"}, points, [LeftOutPoint("a", ("b=1",), "why")])
     record.find_fronts(lambda p: True, lambda p: p is points[0])
     record.write(tmp_path / "tradeoff.json")
-    assert read_record(tmp_path / "tradeoff.json") == record and read_record(tmp_path / "none.json") is None
+    assert (
+        read_tradeoff_record(tmp_path / "tradeoff.json") == record
+        and read_tradeoff_record(tmp_path / "none.json") is None
+    )
     assert record.size == [0] and record.speed == list(range(len(points)))
 
 
@@ -50,8 +61,10 @@ def test_derived_numbers() -> None:
 
 
 def test_the_table_has_the_columns_of_the_survey(tmp_path: Path) -> None:
-    record = Record({"lpips": "vgg"}, {}, [drawn(), drawn("renderer.sort=entry", ratio=0.5)], speed=[1], size=[0])
-    write_csv(tmp_path / "a.csv", record, 40)
+    record = TradeoffRecord(
+        {"lpips": "vgg"}, {}, [drawn(), drawn("renderer.sort=entry", ratio=0.5)], speed=[1], size=[0]
+    )
+    write_tradeoff_csv(tmp_path / "a.csv", record, 40)
     rows = list(csv.DictReader((tmp_path / "a.csv").open()))
     assert rows[0]["Submethod"] == "as the run draws" and rows[1]["Submethod"] == "sort=entry"
     assert (
@@ -59,7 +72,7 @@ def test_the_table_has_the_columns_of_the_survey(tmp_path: Path) -> None:
     )
     assert rows[1]["time ratio"] == "0.5000" and rows[1]["speed front"] == "1" and rows[1]["size front"] == "0"
     record.same["lpips"] = "alex"
-    write_csv(tmp_path / "a.csv", Record({}, {}, [trained("1", 20.0)]))
+    write_tradeoff_csv(tmp_path / "a.csv", TradeoffRecord({}, {}, [trained("1", 20.0)]))
     (row,) = csv.DictReader((tmp_path / "a.csv").open())
     assert row["command"] == "neuprim run model.neurons=1" and row["LPIPS"] == "" and row["training steps"] == "20"
 
@@ -80,9 +93,9 @@ def test_the_table_has_the_columns_of_the_survey(tmp_path: Path) -> None:
 )
 def test_damaged_records_are_refused(change: Any, tmp_path: Path) -> None:
     path = tmp_path / "tradeoff.json"
-    Record({}, {}, [drawn()], speed=[0], size=[0]).write(path)
+    TradeoffRecord({}, {}, [drawn()], speed=[0], size=[0]).write(path)
     data = json.loads(path.read_text())
     change(data)
     path.write_text(json.dumps(data))
     with pytest.raises(DataError, match=r"tradeoff\.json: .*delete it to measure anew"):
-        read_record(path)
+        read_tradeoff_record(path)

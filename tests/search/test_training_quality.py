@@ -13,8 +13,8 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.core.volumes.points import volume_values_at
+from neuprim.search.model_quality import TrainingQuality
 from neuprim.search.pruning_cuts import cut_to_loss, price_cuts
-from neuprim.search.training_quality import TrainingQuality
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core import tiny
 

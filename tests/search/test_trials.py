@@ -20,14 +20,7 @@ from neuprim.runs.fit import Event, Note, Step, fit
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.render_images import RenderRequest, render_run
-from neuprim.search.trials import (
-    TRIAL_FILE,
-    Outcome,
-    Trial,
-    launch_trials,
-    read_outcome,
-    run_trial,
-)
+from neuprim.search.trials import TRIAL_FILE, Outcome, Trial, launch_trials, read_trial, run_trial
 from neuprim.tasks.static import TASK
 from tests.core import tiny
 from tests.runs.launching import processes
@@ -73,7 +66,8 @@ def test_an_outcome_is_what_evaluating_the_folder_measures(done: tuple[Path, Out
     assert outcome.primitives == 40 and outcome.parameters_per_primitive == metrics["parameters_per_primitive"]
     assert outcome.bytes == (folder / "model.safetensors").stat().st_size and outcome.steps == STEPS
     assert 0 < outcome.pace < outcome.seconds and outcome.ms_per_frame > 0
-    assert outcome == read_outcome(folder)
+    record = read_trial(folder)
+    assert record is not None and record.outcome == outcome
 
 
 def test_what_is_done_is_read_back_and_nothing_is_loaded(
@@ -154,10 +148,9 @@ def test_interrupted_it_goes_on_to_the_same_end(
     with pytest.raises(KeyboardInterrupt):
         run_trial(Trial(config_of(scene, folder)))
     monkeypatch.undo()
-    assert (
-        checkpoint.read_header(folder / "checkpoint.safetensors", "checkpoint")["step"] == 16
-        and read_outcome(folder) is None
-    )
+    record = read_trial(folder)
+    assert checkpoint.read_header(folder / "checkpoint.safetensors", "checkpoint")["step"] == 16
+    assert record is not None and record.outcome is None
     outcome = run_trial(Trial(config_of(scene, folder)), events=heard.append)
     assert steps_of(heard) == STEPS - 16 and outcome.psnr == done[1].psnr
     assert (folder / "model.safetensors").read_bytes() != b"" and outcome.steps == STEPS
@@ -186,7 +179,7 @@ def test_a_damaged_outcome_is_refused(done: tuple[Path, Outcome], tmp_path: Path
     record = json.loads((done[0] / TRIAL_FILE).read_text())
     write_json(tmp_path / TRIAL_FILE, {**record, "outcome": {**record["outcome"], **change}})
     with pytest.raises(DataError, match=r"trial\.json: .*delete its folder"):
-        read_outcome(tmp_path)
+        read_trial(tmp_path)
 
 
 @posix

@@ -25,7 +25,7 @@ from neuprim.core.render import RenderSettings, render
 from neuprim.runs.measure import render_image
 from neuprim.runs.open import load_run
 from neuprim.runs.render_config import RenderConfig, parse_render_config
-from neuprim.search.points import Point, Record
+from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.static import TASK as STATIC
@@ -114,14 +114,14 @@ def test_levels_without_a_front_are_resolutions(model: Primitives) -> None:
 
 def test_levels_are_the_front_that_was_measured(model: Primitives, tmp_path: Path) -> None:
     points = [
-        Point("reference", (), {"psnr": 30.0}, 1, ms=[10.0], ratios=[1.0]),
-        Point("combined", ("renderer.alpha_min=0.05",), {"psnr": 29.0}, 1, ms=[5.0], ratios=[0.5]),
-        Point("combined", ("resolution=0.5", "density.neurons=1"), {"psnr": 28.0}, 1, ms=[2.0], ratios=[0.2]),
-        Point("combined", ("density.neurons=7",), {"psnr": 27.0}, 1, ms=[1.0], ratios=[0.1]),
+        TradeoffPoint("reference", (), {"psnr": 30.0}, 1, ms=[10.0], ratios=[1.0]),
+        TradeoffPoint("combined", ("renderer.alpha_min=0.05",), {"psnr": 29.0}, 1, ms=[5.0], ratios=[0.5]),
+        TradeoffPoint("combined", ("resolution=0.5", "density.neurons=1"), {"psnr": 28.0}, 1, ms=[2.0], ratios=[0.2]),
+        TradeoffPoint("combined", ("density.neurons=7",), {"psnr": 27.0}, 1, ms=[1.0], ratios=[0.1]),
     ]
     assert read_front(tmp_path) == ()
     (tmp_path / "tradeoff").mkdir()
-    Record({}, points=points, speed=[0, 1, 2, 3]).write(tmp_path / "tradeoff" / "tradeoff.json")
+    TradeoffRecord({}, points=points, speed=[0, 1, 2, 3]).write(tmp_path / "tradeoff" / "tradeoff.json")
     front = read_front(tmp_path)
     assert [ratio for _, ratio in front] == [0.5, 0.2, 0.1]
     told: list[str] = []

@@ -12,13 +12,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from neuprim.core.errors import ConfigError, DataError, NeuprimError
 from neuprim.core.io.plain import load_json
 
 if TYPE_CHECKING:
     import numpy as np
+
+T = TypeVar("T")
 
 
 def cache_directory() -> Path:
@@ -96,6 +98,19 @@ def read_json(path: Path, what: str, instead: str) -> Any:
     if data is None:
         raise DataError(f"{path}: not {what} (it holds null); {instead}")
     return data
+
+
+def read_json_record(path: Path, what: str, instead: str, version: int, parse: Callable[[Any], T]) -> T | None:
+    """Read a record with ``format: version`` as :func:`read_json` does; DataError also says where ``parse`` failed."""
+    data = read_json(path, what, instead)
+    if data is None:
+        return None
+    try:
+        if data["format"] != version:
+            raise DataError(f"{path}: format {data['format']!r}; this neuprim reads {version}; {instead}")
+        return parse(data)
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError, ConfigError) as error:
+        raise DataError(f"{path}: not {what} ({type(error).__name__}: {error}); {instead}") from error
 
 
 def write_json(path: Path, value: Any) -> None:

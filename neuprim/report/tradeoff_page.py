@@ -19,13 +19,12 @@ from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
 from neuprim.report.page import escape, format_bytes, format_count, format_decimal, note, section
 from neuprim.report.pictures import Inlined, color_bar, error_map, inline
 
-_SLOWEST = 12.0
-"""Multiples of the reference's time beyond which points are off the charts."""
+_SLOWEST = 12.0  # multiples of the reference's time beyond which points are off the charts
 
 Command = Callable[[Sequence[str]], str]
 
 
-class Picture(NamedTuple):
+class TradeoffPicture(NamedTuple):
     """Displayed image of a point, (H, W, 3) sRGB, and the image that it is compared with (None: not compared)."""
 
     image: Tensor
@@ -45,7 +44,9 @@ _RENDERED = _Texts("speed and accuracy of a finished run", "the reference", "the
 _TRAINED = _Texts("trade-offs of trained models", "the centre", "the ground truth", 0.2)
 
 
-def write_tradeoff(folder: Path, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Command) -> None:
+def write_tradeoff_page(
+    folder: Path, record: Mapping[str, Any], pictures: Mapping[int, TradeoffPicture], command: Command
+) -> None:
     """Write ``tradeoff.html`` and ``front.png`` into ``folder``.
 
     Args:
@@ -53,7 +54,7 @@ def write_tradeoff(folder: Path, record: Mapping[str, Any], pictures: Mapping[in
         pictures: number of a point -> its picture; -1 is the ground truth.
         command: overrides of a point -> the command that draws or trains it.
     """
-    page = _Page(record, pictures, command)
+    page = _TradeoffPage(record, pictures, command)
     title = f"{record['task']} / {record['scene']} – speed and accuracy"
     sections = [
         page.heading(),
@@ -69,8 +70,8 @@ def write_tradeoff(folder: Path, record: Mapping[str, Any], pictures: Mapping[in
     write_text(folder / "tradeoff.html", elements.render_page(title, sections, "compared"))
 
 
-class _Page:
-    def __init__(self, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Command) -> None:
+class _TradeoffPage:
+    def __init__(self, record: Mapping[str, Any], pictures: Mapping[int, TradeoffPicture], command: Command) -> None:
         self.record, self.points, self.pictures, self.command = record, record["points"], pictures, command
         self.front: dict[str, list[int]] = {name: list(record["front"][name]) for name in ("speed", "size")}
         self.trained = bool(self.points[0].get("run_dir"))
@@ -178,7 +179,7 @@ class _Page:
         numbers = f"{quality}, SSIM {ssim}; {ms} ms, {rate} frames/s; {size} {unit}"
         return f"{html}<p>{numbers}</p><code>{escape(self.command(point['words']))}</code></article>"
 
-    def _pair(self, picture: Picture, name: str) -> str:
+    def _pair(self, picture: TradeoffPicture, name: str) -> str:
         images = [(picture.image, escape(name))]
         if picture.against is not None:
             error = error_map(picture.image, picture.against, self.texts.difference)

@@ -1,4 +1,4 @@
-"""Measure models: images against ground truth and exact images, file size, and frame times in rounds."""
+"""Measure the points of a trade-off: images against ground truth and exact images, file size, frame times in rounds."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,27 +25,18 @@ from neuprim.core.metrics import psnr, ssim, ssim_3dgs
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
-from neuprim.report.tradeoff import Picture
+from neuprim.report.tradeoff_page import TradeoffPicture, write_tradeoff_page
 from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.render_config import RenderConfig, estimate_file_bytes, parse_render_config
-from neuprim.search.eval_views import EvalView, eval_views, fill_masked
-from neuprim.search.points import Point, Record
+from neuprim.search.model_quality import EvalView, eval_views, fill_masked
+from neuprim.search.tradeoff_record import TRADEOFF_FILE, TradeoffPoint, TradeoffRecord, write_tradeoff_csv
 from neuprim.version import __version__
 
-_MAX_CACHED = 1 << 29
-"""Bytes of prepared models that are kept between rounds."""
-
-_PER_REFERENCE = 6
-"""Points per drawing of the reference in a round."""
-
-_WARM_UP_SIZE = 16
-"""Pixels of the side of a first image, so that compiling and loading are no part of a frame's time."""
-
-_MAX_PSNR = 400.0
-"""dB of exact images that equal those in float64, as JSON has no infinity."""
-
-_CHECK_SIZE = 48
-"""Pixels of the longer side of the image that checks exact images against float64."""
+_MAX_CACHED = 1 << 29  # bytes of prepared models that are kept between rounds
+_PER_REFERENCE = 6  # points per drawing of the reference in a round
+_WARM_UP_SIZE = 16  # pixels of the side of a first image, so that compiling and loading are no part of a frame's time
+_MAX_PSNR = 400.0  # dB of exact images that equal those in float64, as JSON has no infinity
+_CHECK_SIZE = 48  # pixels of the longer side of the image that checks exact images against float64
 
 Renderer = Callable[[View], Tensor]
 
@@ -208,7 +200,7 @@ def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = 
         float64: whether to use the reference backend, where that is decided already.
     """
     settings = replace(setup.reference.settings, alpha_min=0.0, transmittance_min=0.0)
-    uncut, oracle = RenderConfig(settings), RenderConfig(replace(settings, backend=backends.REFERENCE, device="auto"))
+    oracle = RenderConfig(replace(settings, backend=backends.REFERENCE, device="auto"))
     model, view, background = setup.model, setup.views[0].view, setup.dataset.background.double()
     params = {name: value.detach().double() for name, value in model.params.items()}
     double = Primitives(model.density, model.colour, params)
@@ -224,7 +216,7 @@ def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = 
         start = time.perf_counter()
         images = [oracle.render_view(double, v.view, background) for v in setup.views]
         return ExactImages(images, True, None, size, (time.perf_counter() - start) / len(images))
-    draw = setup.renderer(uncut)
+    draw = setup.renderer(RenderConfig(settings))
     images = [draw(v.view).double() for v in setup.views]
     return ExactImages(images, False, min(psnr(draw(small).double(), check), _MAX_PSNR), size, expected)
 
@@ -232,7 +224,9 @@ def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = 
 # ---------------------------------------------------------------- one point
 
 
-def measure_point(setup: EvaluationSetup, knob: str, config: RenderConfig, exact: ExactImages) -> tuple[Point, float]:
+def measure_point(
+    setup: EvaluationSetup, knob: str, config: RenderConfig, exact: ExactImages
+) -> tuple[TradeoffPoint, float]:
     """Measure images and size of a configuration; returns the point, and the seconds of all images.
 
     Numbers are means over views. ``psnr_exact`` is that of the mean squared error over all views, and at most the
@@ -260,28 +254,7 @@ def measure_point(setup: EvaluationSetup, knob: str, config: RenderConfig, exact
     exactness = -10.0 * math.log10(error) if error > 0 else math.inf
     quality["psnr_exact"] = exactness if exact.error is None else min(exactness, exact.error)
     size = estimate_file_bytes(setup.file, setup.model, model, config.storage)
-    return Point(knob, setup.overrides(config), quality, size), seconds
-
-
-def render_front_pictures(
-    record: Record, views: Sequence[EvalView], renderer: Callable[[int], tuple[EvaluationSetup, Renderer]]
-) -> dict[int, Picture]:
-    """Return pictures of the fronts' points, of the view with most contrast, and the ground truth under -1.
-
-    Args:
-        renderer: number of a point -> its setup and what draws it.
-    """
-    setup, _ = renderer(0)
-    view = max(views, key=lambda one: float(setup.channels.display(one.image).var()))
-    truth = setup.display(view.image)
-    pictures = {-1: Picture(truth, None)}
-    trained = bool(record.points[0].run_dir)  # models are compared with the truth, ways to draw with the reference
-    for number in dict.fromkeys((0, *record.speed, *record.size)):
-        own, draw = renderer(number)
-        shown = own.display(fill_masked(draw(view.view), view))
-        against = truth if trained else None if number == 0 else pictures[0].image
-        pictures[number] = Picture(shown, against)
-    return pictures
+    return TradeoffPoint(knob, setup.overrides(config), quality, size), seconds
 
 
 # ---------------------------------------------------------------- frame times
@@ -290,7 +263,7 @@ def render_front_pictures(
 class TimedPoint(NamedTuple):
     """A point to time: what returns its renderer, and how many rounds it should have."""
 
-    point: Point
+    point: TradeoffPoint
     renderer: Callable[[], Renderer]
     rounds: int
 
@@ -312,30 +285,26 @@ def time_points(
     most = max(one.rounds - len(one.point.ms) for one in timed)
     for number in range(most):
         start = time.monotonic()
-        turn = [timed[0], *(one for one in timed[1:] if len(one.point.ms) < one.rounds)]
-        if number and len(turn) == 1:
+        due = [timed[0], *(one for one in timed[1:] if len(one.point.ms) < one.rounds)]
+        if number and len(due) == 1:
             return
         if number == 0:
-            for one in turn:
+            for one in due:
                 _warm_up(one.renderer(), views[0].view)
-        slots = torch.tensor([0] * (1 + (len(turn) - 1) // _PER_REFERENCE) + list(range(1, len(turn))))
-        milliseconds: list[list[float]] = [[] for _ in turn]
-        ratios: list[list[float]] = [[] for _ in turn]
+        slots = torch.tensor([0] * (1 + (len(due) - 1) // _PER_REFERENCE) + list(range(1, len(due))))
+        seconds = []  # view -> point -> median
         for view in views:
-            seconds: list[list[float]] = [[] for _ in turn]
+            times: list[list[float]] = [[] for _ in due]
             for i in slots[torch.randperm(len(slots), generator=order)].tolist():
-                draw = turn[i].renderer()
+                draw = due[i].renderer()
                 draw(view.view)
                 begin = time.perf_counter()
                 draw(view.view)
-                seconds[i].append(time.perf_counter() - begin)
-            base = statistics.median(seconds[0])
-            for i, own in enumerate(seconds):
-                milliseconds[i].append(1e3 * statistics.median(own))
-                ratios[i].append(statistics.median(own) / base)
-        for i, one in enumerate(turn):
-            one.point.ms.append(statistics.mean(milliseconds[i]))
-            one.point.ratios.append(statistics.median(ratios[i]))
+                times[i].append(time.perf_counter() - begin)
+            seconds.append([statistics.median(own) for own in times])
+        for one, own in zip(due, zip(*seconds, strict=True), strict=True):
+            one.point.ms.append(1e3 * statistics.mean(own))
+            one.point.ratios.append(statistics.median(a / row[0] for a, row in zip(own, seconds, strict=True)))
         done(number + 1, most)
         if time.monotonic() + (time.monotonic() - start) > deadline:
             return
@@ -343,3 +312,85 @@ def time_points(
 
 def _warm_up(draw: Renderer, view: View) -> None:
     draw(replace(view, camera=view.camera.resized(_WARM_UP_SIZE, _WARM_UP_SIZE)))
+
+
+# ---------------------------------------------------------------- the session
+
+
+class TradeoffSession:
+    """Measure points within a budget, find the fronts, and write record, table and page.
+
+    Attributes:
+        folder: of the record and its pages.
+        budget: seconds, about.
+        repeats: rounds of timing.
+    """
+
+    def __init__(
+        self, folder: Path, budget: float, repeats: int, record: TradeoffRecord, progress: Callable[[str, float], None]
+    ) -> None:
+        self.folder, self.budget, self.repeats, self.record, self.progress = folder, budget, repeats, record, progress
+        self.begun = time.monotonic()
+
+    def point_setup(self, number: int) -> tuple[EvaluationSetup, RenderConfig]:
+        """Return the setup of a point's model, and the configuration that draws the point."""
+        raise NotImplementedError
+
+    def seconds_left(self, part: float) -> float:
+        """Return the seconds until a share of the budget is used."""
+        return self.begun + part * self.budget - time.monotonic()
+
+    @property
+    def no_time(self) -> str:
+        """Why a point is not measured for which no time is left."""
+        return f"no time left of the budget of {self.budget:g} s"
+
+    def write_record(self) -> None:
+        self.record.write(self.folder / TRADEOFF_FILE)
+
+    def render_exact(self, setup: EvaluationSetup, share: float) -> ExactImages:
+        """Render exact images in a share of the budget; those of all models are made alike."""
+        float64 = self.record.facts.get("exact", {}).get("float64")
+        exact = render_exact(setup, share * self.budget, float64)
+        self.record.facts.setdefault("exact", exact.to_dict())
+        return exact
+
+    def take_times(self, part: float) -> None:
+        """Time all points that lack rounds, until a share of the budget is used."""
+        timed = []
+        for number, point in enumerate(self.record.points):
+            setup, config = self.point_setup(number)
+            rounds = min(self.repeats, point.rounds or self.repeats)
+            timed.append(TimedPoint(point, partial(setup.renderer, config), rounds))
+
+        def note_round(number: int, count: int) -> None:
+            self.write_record()
+            self.progress(f"round {number} of {count}, {len(timed)} points", number / count)
+
+        time_points(timed, self.point_setup(0)[0].views, time.monotonic() + self.seconds_left(part), note_round)
+
+    def write_results(self, command: Callable[[Sequence[str]], str], primitives: int = 0) -> None:
+        """Write record, table, page and chart of the fronts.
+
+        Args:
+            command: overrides of a point -> the command that draws or trains it.
+            primitives: of a finished run.
+        """
+        self.write_record()
+        write_tradeoff_csv(self.folder / "tradeoff.csv", self.record, primitives)
+        self.progress("pictures of the front", 0.0)
+        write_tradeoff_page(self.folder, self.record.to_dict(), self._render_front_pictures(), command)
+
+    def _render_front_pictures(self) -> dict[int, TradeoffPicture]:
+        """Return pictures of the fronts' points, of the view with most contrast, and the ground truth under -1."""
+        setup, _ = self.point_setup(0)
+        view = max(setup.views, key=lambda one: float(setup.channels.display(one.image).var()))
+        truth = setup.display(view.image)
+        pictures = {-1: TradeoffPicture(truth, None)}
+        trained = bool(self.record.points[0].run_dir)  # models are compared with the truth, others with the reference
+        for number in dict.fromkeys((0, *self.record.speed, *self.record.size)):
+            setup, config = self.point_setup(number)
+            shown = setup.display(fill_masked(setup.renderer(config)(view.view), view))
+            against = truth if trained else None if number == 0 else pictures[0].image
+            pictures[number] = TradeoffPicture(shown, against)
+        return pictures

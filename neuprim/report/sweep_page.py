@@ -34,12 +34,7 @@ _FIRST = (
 
 _TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "model_bytes": "model file", "train_seconds": "training"}
 
-_BEST = {
-    "psnr": "Best PSNR",
-    "ssim": "Best SSIM",
-    "model_bytes": "Smallest model",
-    "train_seconds": "Fastest training",
-}
+_BEST = {"psnr": "Best PSNR", "ssim": "Best SSIM", "model_bytes": "Smallest model", "train_seconds": "Fastest training"}
 
 _NOT_COMPARED = ("psnr_black_image", "seed", "vdb_bytes")
 """Beginning of names of numbers that say something of the data or the request."""
@@ -47,8 +42,7 @@ _NOT_COMPARED = ("psnr_black_image", "seed", "vdb_bytes")
 COLOURS = ("#4878a8", "#d9782d", "#4f9a56", "#c44e52", "#8a6fb3", "#8c6d52", "#cf79b0", "#7f7f7f", "#a3a23a", "#3fa6b5")
 """Of the first runs, on light and dark pages; of more runs than these a colour map's."""
 
-_MOST_PICTURES, _MOST_VIEWS = 8, 3
-"""Runs whose pictures are shown, and held-out views of each."""
+_MOST_PICTURES, _MOST_VIEWS = 8, 3  # runs whose pictures are shown, and held-out views of each
 
 
 @dataclass(frozen=True)
@@ -93,7 +87,7 @@ def write_sweep_page(folder: Path, runs: Sequence[SweepRun], words: Sequence[str
     Args:
         words: what the sweep was asked for, after ``neuprim run -m``.
     """
-    drawn = _Page(folder, runs, words)
+    drawn = _SweepPage(folder, runs, words)
     script = files("neuprim.report").joinpath("sweep.js").read_text(encoding="utf-8")
     sections = [
         drawn.heading(),
@@ -112,7 +106,7 @@ def write_sweep_page(folder: Path, runs: Sequence[SweepRun], words: Sequence[str
     return target
 
 
-class _Page:
+class _SweepPage:
     def __init__(self, folder: Path, runs: Sequence[SweepRun], words: Sequence[str]) -> None:
         self.folder, self.words = folder, words
         self.numbers = {run.name: run.numbers for run in runs}

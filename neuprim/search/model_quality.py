@@ -1,34 +1,87 @@
-"""Quality on training views and on points inside volumes; it decides what to prune and how coarsely to quantize."""
+"""Quality of models that searches compare: on evaluation views, and on training views that decide what to remove."""
 
 from __future__ import annotations
 
 import math
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from neuprim.config import RunConfig
-from neuprim.core.data import Dataset, PointSamples, PointSupervision
-from neuprim.core.metrics import psnr
+from neuprim.core.data import Dataset, PointSamples, PointSupervision, View
+from neuprim.core.data.dataset_check import check_pixels
+from neuprim.core.metrics import psnr, ssim
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.core.volumes.points import volume_values_at
 from neuprim.runs.measure import render_image
 
-_VIEWS, _QUICK_VIEWS = 24, 8
-"""Views that decide, and how many of them intermediate evaluations use."""
+MAX_PSNR = 200.0  # dB that stand for equal images, as JSON has no infinity
 
-_SENSITIVITY_VIEWS = 160
-"""Views for sensitivities, at most; primitives of a short time or a corner are in few views."""
 
-_MAX_PSNR = 200.0
-"""dB that stand for equal images."""
+@dataclass(frozen=True)
+class EvalView:
+    """A test view, its ground truth over the background, (H, W, C), and the pixels that count (None: all)."""
+
+    view: View
+    image: Tensor
+    mask: Tensor | None
+
+
+class EvalQuality(NamedTuple):
+    """Mean PSNR and SSIM over evaluation views, in the data set's colour space, and median milliseconds per frame."""
+
+    psnr: float
+    ssim: float
+    ms_per_frame: float
+
+
+def eval_views(dataset: Dataset, views: int) -> list[EvalView]:
+    """Return at most ``views`` of the test views, evenly spread."""
+    most, chosen = min(views, len(dataset.test)), []
+    for i in (k * len(dataset.test) // most for k in range(most)):
+        view, pixels = dataset.test.view(i), dataset.test.pixels(i)
+        check_pixels("test", view, pixels, dataset.channels)
+        chosen.append(EvalView(view, pixels.over(dataset.background), pixels.mask))
+    return chosen
+
+
+def fill_masked(image: Tensor, view: EvalView) -> Tensor:
+    """Replace the pixels that do not count by the ground truth."""
+    return image if view.mask is None else torch.where(view.mask[..., None], image, view.image.to(image))
+
+
+def measure_eval_views(
+    model: Primitives, views: Sequence[EvalView], settings: RenderSettings, background: Tensor
+) -> EvalQuality:
+    """Render all views and compare them with the ground truth."""
+    render_image(model, views[0].view, settings, background)  # the first frame loads and compiles
+    rows, seconds = [], []
+    for one in views:
+        start = time.perf_counter()
+        image = render_image(model, one.view, settings, background)
+        seconds.append(time.perf_counter() - start)
+        image = fill_masked(image, one)
+        rows.append((min(psnr(image, one.image, one.mask), MAX_PSNR), ssim(image, one.image)))
+    means = [statistics.fmean(column) for column in zip(*rows, strict=True)]
+    return EvalQuality(means[0], means[1], 1e3 * statistics.median(seconds))
+
+
+# ---------------------------------------------------------------- training views
+
+_VIEWS, _QUICK_VIEWS = 24, 8  # views that decide, and how many of them intermediate evaluations use
+_SENSITIVITY_VIEWS = 160  # views for sensitivities, at most; primitives of a short time or a corner are in few views
 
 _FRAMES, _QUICK_FRAMES, _POINTS = 64, 8, 4096
 """Frames with known extinction, how many of them intermediate evaluations use, and points of each."""
 
-_DRAWS_PER_FRAME = 6
-"""Each draw is of a random frame; so many times the frames find most of them."""
+_DRAWS_PER_FRAME = 6  # each draw is of a random frame; so many times the frames find most of them
 
 
 class TrainingQuality:
@@ -76,7 +129,7 @@ class TrainingQuality:
         for index in self.views[::step]:
             pixels = self.dataset.train.pixels(index)
             image = render_image(model, self.dataset.train.view(index), self.settings, self.dataset.background)
-            values.append(min(psnr(image, pixels.over(self.dataset.background), pixels.mask), _MAX_PSNR))
+            values.append(min(psnr(image, pixels.over(self.dataset.background), pixels.mask), MAX_PSNR))
         return float(np.mean(values))
 
     def inside_quality(self, model: Primitives, quick: bool = False) -> float:

@@ -14,8 +14,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.files import read_json, write_json, write_text
+from neuprim.core.io.files import read_json_record, write_json, write_text
 from neuprim.core.metrics import from_json, to_json
 from neuprim.core.validation import Range, coerce, validate
 from neuprim.search.pareto import Objectives, pareto_front
@@ -34,21 +33,20 @@ _COLUMNS = (
 )
 _MODEL_COLUMNS = ("numbers per primitive", "training steps", "training seconds", "ms per step", "command")
 
-_DIGITS = 2
-"""Decimals of PSNR that count on a front."""
-
-_Positive = Annotated[float, Range(above=0)]
+_DIGITS = 2  # decimals of PSNR that count on a front
 
 _DRAWN = ("knob", "words", "bytes", "ms", "ratios", "rounds")
 _TRAINED = (
     *("turned", "length", "primitives", "parameters_per_primitive", "steps", "seconds"),
-    *("centre_ms", "steps_in_turns", "seeds", "run_dir"),
+    *("centre_ms", "seeds", "run_dir"),
 )
 """Fields of every point, and those of trained models."""
 
+_Positive = Annotated[float, Range(above=0)]
+
 
 @dataclass
-class Point:
+class TradeoffPoint:
     """A measured point: a way to draw a finished model, or a trained model.
 
     Attributes:
@@ -56,12 +54,10 @@ class Point:
         words: overrides that reproduce it.
         quality: psnr, ssim, ssim_3dgs, psnr_exact, ssim_exact; lpips and lpips_3dgs where there are weights.
         bytes: size of the model file.
-        ms: mean milliseconds per frame of each round of timing.
-        ratios: the same over the reference's of that round.
+        ms: mean milliseconds per frame of each round of timing; ratios: the same over the reference's of that round.
         rounds: limit of rounds; None for the request's.
         turned, length: of a trained model, the overrides over the centre's, and the share of the full training.
         centre_ms: median milliseconds per frame of the centre over all rounds.
-        steps_in_turns: seconds per training step over the centre's.
         seeds: PSNR of each seed; ``quality`` has the means.
         run_dir: run directory of the first seed, relative to the record's folder; empty unless trained.
     """
@@ -80,7 +76,6 @@ class Point:
     steps: int = 0
     seconds: float = 0.0
     centre_ms: float = 0.0
-    steps_in_turns: tuple[float, ...] = ()
     seeds: tuple[float, ...] = ()
     run_dir: str = ""
 
@@ -128,10 +123,8 @@ class Point:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; times are derived, for readers of the file."""
-        quality: dict[str, Any] = {}
-        for name, value in self.quality.items():
-            quality |= to_json(name, value)
         fields = asdict(self)
+        quality = {key: entry for name, value in self.quality.items() for key, entry in to_json(name, value).items()}
         data = {"name": self.name, "quality": quality, **{name: fields[name] for name in _DRAWN}}
         if self.run_dir:
             data |= {name: fields[name] for name in _TRAINED} | {"ms_per_step": self.ms_per_step}
@@ -141,7 +134,7 @@ class Point:
         return data
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Point:
+    def from_dict(cls, data: Mapping[str, Any]) -> TradeoffPoint:
         """Invert :meth:`to_dict`; raises KeyError, TypeError, ValueError or ConfigError for anything else."""
         names = [name.removesuffix("_infinite") for name in data["quality"]]
         quality = {name: value for name in names if (value := from_json(data["quality"], name)) is not None}
@@ -156,7 +149,7 @@ def name_variant(turned: Sequence[str], length: float) -> str:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class LeftOutPoint:
     """A point that was not measured, and why."""
 
     knob: str
@@ -165,7 +158,7 @@ class LeftOut:
 
 
 @dataclass
-class Record:
+class TradeoffRecord:
     """Content of ``tradeoff.json``.
 
     Attributes:
@@ -177,38 +170,34 @@ class Record:
 
     same: dict[str, Any]
     facts: dict[str, Any] = field(default_factory=dict)
-    points: list[Point] = field(default_factory=list)
-    left_out: list[LeftOut] = field(default_factory=list)
+    points: list[TradeoffPoint] = field(default_factory=list)
+    left_out: list[LeftOutPoint] = field(default_factory=list)
     speed: list[int] = field(default_factory=list)
     size: list[int] = field(default_factory=list)
 
-    def find(self, words: Sequence[str]) -> Point | None:
-        """Return the point of these overrides."""
-        return next((point for point in self.points if point.words == tuple(words)), None)
+    def changes(self, same: Mapping[str, Any]) -> list[str]:
+        """Return the names of what is another than in ``same``."""
+        return [name for name in same if self.same.get(name) != same[name]]
 
     def leave_out(self, knob: str, words: Sequence[str], reason: str) -> None:
         """Note that a point is not measured; replaces an earlier note."""
         words = tuple(words)
         others = [one for one in self.left_out if (one.knob, one.words) != (knob, words)]
-        self.left_out = [*others, LeftOut(knob, words, reason)]
+        self.left_out = [*others, LeftOutPoint(knob, words, reason)]
 
     def find_fronts(
         self,
-        in_speed: Callable[[Point], bool] = lambda point: True,
-        in_size: Callable[[Point], bool] = lambda point: True,
+        in_speed: Callable[[TradeoffPoint], bool] = lambda point: True,
+        in_size: Callable[[TradeoffPoint], bool] = lambda point: True,
     ) -> None:
         """Compute both fronts, of the points that may be on each."""
-
-        quality = [round(point.quality["psnr"], _DIGITS) for point in self.points]
-        points = list(enumerate(self.points))
-        self.speed = pareto_front(
-            [i for i, point in points if point.ratios and in_speed(point)],
-            lambda i: Objectives(self.points[i].ratio, quality[i], self.points[i].doubt),
-        )
-        self.size = pareto_front(
-            [i for i, point in points if in_size(point)],
-            lambda i: Objectives(float(self.points[i].bytes), quality[i]),
-        )
+        costs = [
+            (Objectives(p.ratio, psnr := round(p.quality["psnr"], _DIGITS), p.doubt), Objectives(float(p.bytes), psnr))
+            for p in self.points
+        ]
+        timed = [i for i, point in enumerate(self.points) if point.ratios and in_speed(point)]
+        self.speed = pareto_front(timed, lambda i: costs[i][0])
+        self.size = pareto_front([i for i, p in enumerate(self.points) if in_size(p)], lambda i: costs[i][1])
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values."""
@@ -225,33 +214,27 @@ class Record:
         write_json(path, self.to_dict())
 
 
-def read_record(path: Path) -> Record | None:
+def read_tradeoff_record(path: Path) -> TradeoffRecord | None:
     """Read ``tradeoff.json``; None where there is none.
 
     Raises:
         DataError: the file is damaged.
     """
-    data = read_json(path, "a record of `neuprim tradeoff`", "delete it to measure anew")
-    if data is None:
-        return None
-    try:
-        if data["format"] != _FORMAT:
-            expected = f"this neuprim reads {_FORMAT}; delete it to measure anew"
-            raise DataError(f"{path}: format {data['format']!r}; {expected}")
-        points = [Point.from_dict(entry) for entry in data["points"]]
-        left_out = [validate(LeftOut, entry, "left_out") for entry in data["left_out"]]
+
+    def parse(data: Mapping[str, Any]) -> TradeoffRecord:
+        points = [TradeoffPoint.from_dict(entry) for entry in data["points"]]
+        left_out = [validate(LeftOutPoint, entry, "left_out") for entry in data["left_out"]]
         speed, size = (coerce(data["front"][name], list[int], f"front.{name}") for name in ("speed", "size"))
         if not points or not all(0 <= number < len(points) for number in (*speed, *size)):
             raise ValueError(f"front: expected numbers of the {len(points)} points")
         known = ("format", "same", "points", "left_out", "front")
         facts = {key: value for key, value in data.items() if key not in known}
-        return Record(dict(data["same"]), facts, points, left_out, speed, size)
-    except (KeyError, TypeError, AttributeError, ValueError, ConfigError) as error:
-        what = f"{type(error).__name__}: {error}"
-        raise DataError(f"{path}: not a record of `neuprim tradeoff` ({what}); delete it to measure anew") from error
+        return TradeoffRecord(dict(data["same"]), facts, points, left_out, speed, size)
+
+    return read_json_record(path, "a record of `neuprim tradeoff`", "delete it to measure anew", _FORMAT, parse)
 
 
-def write_csv(path: Path, record: Record, primitives: int = 0) -> None:
+def write_tradeoff_csv(path: Path, record: TradeoffRecord, primitives: int = 0) -> None:
     """Write the table, a row per point; empty cells are not measured.
 
     Args:

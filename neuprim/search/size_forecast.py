@@ -1,0 +1,362 @@
+"""Predict quality, bytes and time of full runs of every size from trials, and propose the size to try next.
+
+Every doubling of the steps gains a share of what the doubling before gained; so does every doubling of primitives
+beyond the sizes tried. Predictions are rough, about 0.6 dB over two doublings, so full runs check them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal, NamedTuple
+
+from neuprim.config.command_settings import Target
+from neuprim.search.target_record import Attempt, Purpose, SettingChange, TargetRecord
+
+ALLOWANCE, MIN_MARGIN = 0.1, 0.05
+"""dB above the target that full runs aim at, and need at least: the cost of quantization."""
+
+_FULL_FILE = 0.97  # share of the allowed bytes to plan with
+
+_STEP_RATIO, _MIN_RATIO, _MAX_RATIO = 0.75, 0.5, 1.0
+"""Gain of a doubling of steps over that of the doubling before: usual, least and largest measured."""
+
+_SIZE_RATIO = 0.65  # gain of a doubling of primitives over that of the doubling before, beyond the sizes tried
+_FIRST_GAIN, _FIRST_SLOPE = 1.3, 1.0  # dB that a doubling of steps, and of primitives, gains where nothing is known
+_SEED_NOISE = 0.1  # dB between two seeds of one configuration
+
+_FURTHEST, _APART, _CLOSE = 3.0, 0.5, 0.3
+"""Doublings from the sizes tried to the next, at most; between two sizes that give a slope, at least; and between two
+sizes of which the second gives no new information."""
+
+_FIXED_SHARE = 0.5  # share of a time that does not depend on the number of primitives, where only one number was tried
+
+
+class Forecast(NamedTuple):
+    """Predicted quality in dB (:func:`to_decibels`), and half the width of its likely range."""
+
+    value: float
+    doubt: float
+
+
+def to_decibels(name: str, value: float) -> float:
+    """Return PSNR as it is, and SSIM as -10 log10(1 - ssim), on which equal steps need about equal work."""
+    return value if name == "psnr" else -10 * math.log10(max(1.0 - value, 1e-6))
+
+
+def from_decibels(name: str, value: float) -> float:
+    """Invert :func:`to_decibels`."""
+    return value if name == "psnr" else 1.0 - 10 ** (-value / 10)
+
+
+def forecast_quality(lengths: Mapping[int, float], steps: float, gain: float = _FIRST_GAIN) -> Forecast:
+    """Predict the quality after ``steps`` from trials of one configuration.
+
+    Args:
+        lengths: steps of a trial -> its quality, dB.
+        gain: dB of the doubling that ends with the trial, where only one length was tried.
+    """
+    tried = sorted(lengths)
+    gains = [(lengths[b] - lengths[a]) / math.log2(b / a) for a, b in pairwise(tried)]
+    last, longest = max(gains[-1] if gains else gain, 0.0), tried[-1]
+    doublings = math.log2(max(steps / longest, 1e-6))
+    if doublings <= 0:
+        return Forecast(lengths[longest] + last * max(doublings, -1.0), _SEED_NOISE)
+    ratio = _STEP_RATIO
+    if len(gains) > 1 and gains[-2] > _SEED_NOISE:
+        ratio = min(max((_STEP_RATIO + gains[-1] / gains[-2]) / 2, _MIN_RATIO), _MAX_RATIO)
+    low, middle, high = (_sum_gains(last, r, doublings) for r in (_MIN_RATIO, ratio, _MAX_RATIO))
+    return Forecast(lengths[longest] + middle, _SEED_NOISE + (high - low) / 2)
+
+
+def _sum_gains(gain: float, ratio: float, doublings: float) -> float:
+    """Return gain (ratio + ratio^2 + ...), for a number of doublings that need not be whole."""
+    return gain * doublings if ratio == 1 else gain * ratio * (1 - ratio**doublings) / (1 - ratio)
+
+
+def fit_time_line(known: Sequence[tuple[int, float]], primitives: float) -> float:
+    """Return a time at a number of primitives, by a least-squares line that neither falls nor starts below zero."""
+    counts, times = [float(n) for n, _ in known], [t for _, t in known]
+    mean_n, mean_t = sum(counts) / len(counts), sum(times) / len(times)
+    spread = sum((n - mean_n) ** 2 for n in counts)
+    slope = (1 - _FIXED_SHARE) * mean_t / mean_n
+    if spread > 0:
+        slope = sum((n - mean_n) * (t - mean_t) for n, t in zip(counts, times, strict=True)) / spread
+    slope = min(max(slope, 0.0), mean_t / mean_n)
+    return mean_t + slope * (primitives - mean_n)
+
+
+def _bisect_count(low: float, high: float, is_low: Callable[[float], bool]) -> tuple[float, float]:
+    """Return two close numbers of primitives, of which the first is low; bisects their logarithms."""
+    for _ in range(60):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if is_low(middle) else (low, middle)
+    return low, high
+
+
+@dataclass(frozen=True)
+class SizeCurve:
+    """Margin (predicted quality less the target, dB) over log2 of the number of primitives; it never falls."""
+
+    nodes: tuple[tuple[float, float], ...]
+
+    @classmethod
+    def fit(cls, tried: Sequence[tuple[int, float]]) -> SizeCurve:
+        """Fit (primitives, margin) pairs; neighbours that would make the curve fall get their mean."""
+        blocks: list[tuple[list[float], float]] = []
+        for count, margin in sorted(tried):
+            blocks.append(([math.log2(count)], margin))
+            while len(blocks) > 1 and blocks[-2][1] >= blocks[-1][1]:
+                (before, low), (after, high) = blocks[-2:]
+                mean = (len(before) * low + len(after) * high) / (len(before) + len(after))
+                blocks[-2:] = [(before + after, mean)]
+        return cls(tuple((place, value) for places, value in blocks for place in places))
+
+    def _end_slope(self, end: int) -> float:
+        """Return dB per doubling at the first (0) or last (-1) node."""
+        place, value = self.nodes[end]
+        apart = [node for node in self.nodes if abs(node[0] - place) >= _APART / 2]
+        if not apart:
+            return _FIRST_SLOPE
+        return max((value - apart[end][1]) / (place - apart[end][0]), 0.0)
+
+    @property
+    def slope(self) -> float:
+        """dB per doubling at the upper end."""
+        return self._end_slope(-1)
+
+    def at(self, primitives: float) -> float:
+        """Return the margin of a number of primitives."""
+        place = math.log2(primitives)
+        (first, low), (last, high) = self.nodes[0], self.nodes[-1]
+        if place <= first:
+            return low - self._end_slope(0) * (first - place)
+        if place >= last:
+            return high + _sum_gains(self.slope, _SIZE_RATIO, place - last)
+        (a, at_a), (b, at_b) = next(pair for pair in pairwise(self.nodes) if place <= pair[1][0])
+        return at_b if b == a else at_a + (at_b - at_a) * (place - a) / (b - a)
+
+    def slope_at(self, primitives: float) -> float:
+        """Return dB per doubling around a number of primitives."""
+        return self.at(primitives * 2**_APART) - self.at(primitives / 2**_APART)
+
+    def find_count(self, wanted: float, highest: int) -> int | None:
+        """Return the least number of primitives with a margin, at most ``highest``; None if there is none."""
+        if self.at(1) >= wanted:
+            return 1
+        if self.at(max(highest, 1)) < wanted:
+            return None
+        return math.ceil(_bisect_count(1.0, highest, lambda count: self.at(count) < wanted)[1])
+
+
+class SizeProposal(NamedTuple):
+    """Try another size, take this one, or report the target as unreachable with this one as the best."""
+
+    kind: Literal["try", "take", "unreachable"]
+    primitives: int
+
+
+def propose_size(tried: Sequence[tuple[int, float]], highest: int, wanted: float, doubt: float) -> SizeProposal:
+    """Return the next step towards the least size with a margin.
+
+    Args:
+        tried: (primitives, margin) pairs, one or more.
+        doubt: dB by which margins may be wrong; only a target missed by more is unreachable.
+    """
+    curve, counts = SizeCurve.fit(tried), sorted({count for count, _ in tried})
+    found = curve.find_count(wanted, highest)
+    if found is None and len(counts) > 1:
+        best = curve.at(highest)
+        final = math.log2(highest / counts[-1]) <= _CLOSE or best + 2 * doubt + _FIRST_SLOPE < wanted
+        if final and best + doubt < wanted:
+            return SizeProposal("unreachable", min(counts[-1], highest))
+        if final:
+            return SizeProposal("take", highest)
+    found = highest if found is None else found
+    found = round(min(max(found, counts[0] / 2.0**_FURTHEST, 1), highest, 2.0**_FURTHEST * counts[-1]))
+    if len(counts) == 1:
+        return SizeProposal("try" if highest > 1 else "take", _move_apart(counts[0], found, highest))
+    near = any(abs(math.log2(found / count)) <= _CLOSE for count in counts)
+    return SizeProposal("take" if near else "try", found)
+
+
+def _move_apart(tried: int, found: int, highest: int) -> int:
+    """Return ``found``, moved so far from the only size tried that both give a slope."""
+    step = math.log2(found / tried)
+    if abs(step) < _APART:
+        up, down = round(tried * 2**_APART), round(tried / 2**_APART)
+        found = up if (step > 0 and up <= highest) or down < 1 else down
+    return min(max(found, 1), highest)
+
+
+def propose_best_size(tried: Sequence[tuple[int, float]], highest: int, worth: float = 0.1) -> SizeProposal:
+    """Return the next step towards the best quality within ``highest`` primitives.
+
+    Args:
+        worth: dB per doubling that more primitives must gain.
+    """
+    curve, counts = SizeCurve.fit(tried), sorted({count for count, _ in tried})
+    if highest < counts[0] / 2**_CLOSE:  # all sizes tried are above the limit
+        return SizeProposal("try", max(highest, round(counts[0] / 2**_FURTHEST), 1))
+    at_limit = counts[-1] >= highest / 2**_CLOSE
+    further = min(highest, round(counts[-1] * 2**_FURTHEST / 2))
+    if len(counts) == 1 and highest > 1:
+        return SizeProposal("try", max(1, round(highest / 2)) if at_limit else further)
+    if at_limit or curve.slope < worth:
+        enough = None if curve.slope >= worth else curve.find_count(curve.nodes[-1][1] - worth, highest)
+        return SizeProposal("take", highest if enough is None else enough)
+    return SizeProposal("try", further)
+
+
+# ---------------------------------------------------------------- from the record of a search
+
+
+@dataclass(frozen=True)
+class SizePredictor:
+    """Predict the margin of every size from the record of a target search.
+
+    Attributes:
+        steps: primitives -> steps of a full run.
+    """
+
+    target: Target
+    record: TargetRecord
+    steps: Callable[[int], float]
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """The target's measures of quality, else PSNR."""
+        return tuple(self.target.quality) or ("psnr",)
+
+    def margin(self, values: Mapping[str, float]) -> float:
+        """Return the least dB above the target; without measures of quality the PSNR itself."""
+        wanted = self.target.quality
+        if not wanted:
+            return values["psnr"]
+        return min(to_decibels(name, values[name]) - to_decibels(name, goal) for name, goal in wanted.items())
+
+    def margin_of(self, attempt: Attempt) -> float:
+        return self.margin({name: attempt.measured(name) for name in self.measures})
+
+    def forecasts(self) -> dict[int, dict[str, Forecast]]:
+        """Return primitives -> measure -> forecast of a full run with the current settings."""
+        by_name = {name: self._forecast(name) for name in self.measures}
+        return {
+            count: {name: own[count] for name, own in by_name.items()} for count in sorted(by_name[self.measures[0]])
+        }
+
+    def _forecast(self, name: str) -> dict[int, Forecast]:
+        lengths: dict[int, dict[int, float]] = {}
+        for attempt in self._relevant("size", "knob"):
+            steps = int(attempt.measured("steps"))
+            lengths.setdefault(attempt.count, {})[steps] = self._with_current_settings(name, attempt)
+        gains = []
+        for values in lengths.values():
+            if len(values) > 1:
+                a, b = sorted(values)[-2:]
+                gains.append((values[b] - values[a]) / math.log2(b / a))
+        mean = sum(gains) / len(gains) if gains else _FIRST_GAIN
+        forecasts = {}
+        for n, values in lengths.items():
+            doublings = max(math.log2(max(values) / max(self.record.length, 1)), 0.0)
+            forecasts[n] = forecast_quality(values, self.steps(n), mean * _STEP_RATIO**doublings)
+        full = {a.count: self._with_current_settings(name, a) for a in self._relevant("full")}
+        if full and forecasts:  # full runs show how much all forecasts are off
+            curve = SizeCurve.fit([(n, f.value) for n, f in forecasts.items()])
+            miss = sum(value - curve.at(n) for n, value in full.items()) / len(full)
+            forecasts = {n: Forecast(f.value + miss, 2 * ALLOWANCE) for n, f in forecasts.items()}
+        return forecasts | {n: Forecast(value, ALLOWANCE) for n, value in full.items()}
+
+    def _relevant(self, *purposes: Purpose) -> list[Attempt]:
+        """Return trainings with the current settings, or with earlier values of the settings changed since."""
+        history = self.record.history
+        finished = self.record.finished(*purposes)
+        return [a for a in finished if all(value in history(key) for key, value in a.words.items())]
+
+    def _changes_since(self, attempt: Attempt) -> list[SettingChange]:
+        changes = []
+        for turn in self.record.turns:
+            values = self.record.history(turn.key)
+            if turn.adopted and values.index(attempt.words.get(turn.key, values[0])) < values.index(turn.after):
+                changes.append(turn)
+        return changes
+
+    def _with_current_settings(self, name: str, attempt: Attempt) -> float:
+        loss = sum(turn.loss.get(name, 0.0) for turn in self._changes_since(attempt))
+        return to_decibels(name, attempt.measured(name)) - loss
+
+    def margins(self) -> list[tuple[int, float]]:
+        """Return (primitives, margin) of every size.
+
+        A size that is only forecast is no worse than a smaller full run and no better than a larger one. Between a full
+        run that is too small and one that is large enough, only full runs count.
+        """
+        margins = {
+            n: self.margin({name: from_decibels(name, f.value) for name, f in values.items()})
+            for n, values in self.forecasts().items()
+        }
+        known = {a.count for a in self._relevant("full")}
+        full = {n: margin for n, margin in margins.items() if n in known}
+        for n in margins.keys() - full.keys():
+            least = max((m for count, m in full.items() if count < n), default=margins[n])
+            most = min((m for count, m in full.items() if count > n), default=max(margins[n], least))
+            margins[n] = min(max(margins[n], least), max(most, least))
+        too_small = max((n for n, margin in full.items() if margin < ALLOWANCE), default=None)
+        enough = min((n for n, margin in full.items() if margin >= ALLOWANCE), default=None)
+        if too_small is None or enough is None:
+            return sorted(margins.items())
+        low, high = sorted((too_small, enough))
+        return [(n, margin) for n, margin in sorted(margins.items()) if n in full or not low < n < high]
+
+    @property
+    def doubt(self) -> float:
+        """dB by which a margin may be wrong, at the size that is known best."""
+        return min((max(f.doubt for f in values.values()) for values in self.forecasts().values()), default=1.0)
+
+    def predict(self, primitives: int) -> dict[str, list[float]]:
+        """Return measure -> [value, doubt in dB] of a full run."""
+        forecasts = self.forecasts()
+        nearest = min(forecasts, key=lambda n: abs(math.log2(n / primitives)))
+        predicted = {}
+        for name in self.measures:
+            curve = SizeCurve.fit([(n, values[name].value) for n, values in forecasts.items()])
+            predicted[name] = [from_decibels(name, curve.at(primitives)), forecasts[nearest][name].doubt]
+        return predicted
+
+    def limit(self) -> int | None:
+        """Return the primitives that the limits of bytes and speed allow; None without limits or trials."""
+        trials = [a for a in self._relevant("size", "full") if a.packed]
+        limits: list[tuple[list[tuple[int, float]], float]] = []
+        if self.target.megabytes is not None:
+            sizes = [(a.count, a.packed * math.prod(t.size for t in self._changes_since(a))) for a in trials]
+            limits.append((sizes, _FULL_FILE * 1e6 * self.target.megabytes))
+        if self.target.fps is not None:
+            limits.append(([(a.count, a.measured("ms_per_frame")) for a in trials], 1e3 / self.target.fps))
+        if not limits or not trials:
+            return None
+        most = [
+            _bisect_count(1.0, 1e8, lambda n, known=known, allowed=allowed: fit_time_line(known, n) <= allowed)[0]  # type: ignore[misc]
+            for known, allowed in limits
+        ]
+        return max(int(min(most)), 1)
+
+
+def format_forecast(name: str, value: float, doubt: float) -> str:
+    """Format a predicted measure, with its doubt (dB) in the measure's unit."""
+    if name == "psnr":
+        return f"{name} {value:.2f} ± {doubt:.2g} dB"
+    low, high = (from_decibels(name, to_decibels(name, value) + sign * doubt) for sign in (-1, 1))
+    return f"{name} {value:.4f} ± {(high - low) / 2:.2g}"
+
+
+def exceeded_limit(target: Target, attempt: Attempt, packed: int | None = None) -> str | None:
+    """Return which limit of a target a model exceeds; None if none."""
+    size = attempt.packed if packed is None else packed
+    if target.megabytes is not None and size > 1e6 * target.megabytes:
+        return f"{size / 1e6:.3f} MB are more than target.megabytes={target.megabytes:g}"
+    speed = 1e3 / attempt.measured("ms_per_frame")
+    if target.fps is not None and speed < 0.9 * target.fps:
+        return f"{speed:.1f} frames per second are fewer than target.fps={target.fps:g}"
+    return None

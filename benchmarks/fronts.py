@@ -24,7 +24,8 @@ from shared.tables import DOCS, ROOT, between_markers, make_table
 from neuprim.config.command_settings import parse_duration
 from neuprim.core.compute.threads import cpu_name
 from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
-from neuprim.search.ablation import AblationRequest, run_ablation
+from neuprim.search.ablation import run_ablation
+from neuprim.search.tradeoff_measuring import TradeoffRequest
 
 VIEWS = 25  # held-out views, evenly spread: as many as the chair has
 
@@ -76,7 +77,7 @@ def measure(name: str, data: Path | None, out: Path) -> dict[str, Any]:
     where = [] if data is None else [f"{scene.data}={data.resolve()}"]
     words = [*scene.words, *where, "renderer.threads=1", f"output_dir={(out / name).resolve()}"]
     _, record = run_ablation(
-        AblationRequest(words, parse_duration(scene.budget, scene.budget), VIEWS, knobs=scene.knobs), print
+        TradeoffRequest(words, parse_duration(scene.budget, scene.budget), VIEWS, knobs=scene.knobs), tell=print
     )
     whole = record.to_dict()
     models = [

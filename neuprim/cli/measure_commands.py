@@ -297,19 +297,20 @@ def _tradeoff(args: argparse.Namespace) -> int:
 def _render_tradeoff(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.config.command_settings import parse_duration
-    from neuprim.search.render_tradeoff import TradeoffRequest, format_render_command, measure_tradeoff
+    from neuprim.search.render_tradeoff import format_render_command, measure_tradeoff
+    from neuprim.search.tradeoff_measuring import TradeoffRequest
     from neuprim.search.tradeoff_record import TRADEOFF_FOLDER
 
-    run_dir, views, repeats = Path(args.run_dir), args.views, args.repeats
+    run_dir = Path(args.run_dir)
     check_run_directory(run_dir)
     if args.seeds is not None:
         raise ConfigError("--seeds: of models that are trained (neuprim tradeoff task=NAME ...); a run has one")
     budget = parse_duration(args.budget or "5m", f"--budget {args.budget}")
-    request = TradeoffRequest(run_dir, views, repeats, args.knobs, budget, args.words, args.lpips)
+    request = TradeoffRequest(args.words, budget, args.views, args.repeats, args.knobs, args.lpips)
     folder = run_dir / TRADEOFF_FOLDER
     try:
         with DrawProgress() as progress:
-            record = measure_tradeoff(request, progress.note, progress.show)
+            record = measure_tradeoff(run_dir, request, progress.note, progress.show)
     except KeyboardInterrupt:
         if not (folder / "tradeoff.json").exists():
             raise
@@ -324,7 +325,8 @@ def _train_tradeoff(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.config.command_settings import parse_duration, take_launcher
     from neuprim.config.overrides import parse
-    from neuprim.search.ablation import AblationRequest, format_run_command, run_ablation
+    from neuprim.search.ablation import format_run_command, run_ablation
+    from neuprim.search.tradeoff_measuring import TradeoffRequest
 
     launcher, words = take_launcher([args.run_dir, *args.words])
     said = [str(a.value) for a in parse(words) if a.key == "budget"]
@@ -332,11 +334,10 @@ def _train_tradeoff(args: argparse.Namespace) -> int:
         raise ConfigError(f"budget={said[-1]} and --budget {args.budget}: expected one of them")
     asked = f"budget={said[-1]}" if said else f"--budget {args.budget}"
     budget = parse_duration(said[-1] if said else args.budget or "20m", asked)
-    seeds = args.seeds or 1
-    request = AblationRequest(words, budget, args.views, args.repeats, args.knobs, seeds, args.lpips, launcher)
+    request = TradeoffRequest(words, budget, args.views, args.repeats, args.knobs, args.lpips)
     try:
         with DrawProgress() as progress:
-            folder, record = run_ablation(request, progress.note, progress.show)
+            folder, record = run_ablation(request, args.seeds or 1, launcher, progress.note, progress.show)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("; what is trained is kept, and the same command goes on") from None
     _print_fronts(folder, record, [format_run_command(point.words) for point in record.points])

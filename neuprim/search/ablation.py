@@ -10,7 +10,7 @@ import math
 import shlex
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,7 +25,7 @@ from neuprim.config.overrides import parse, quote_override
 from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset_check import check_dataset
-from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
+from neuprim.core.errors import ConfigError, DataError, NeuprimError
 from neuprim.core.validation import validate
 from neuprim.runs.fit import use_one_torch_thread
 from neuprim.runs.ground_truth import render_ground_truth_for_training
@@ -47,7 +47,11 @@ from neuprim.search.ablation_plan import (
 from neuprim.search.model_quality import EvalView, eval_views
 from neuprim.search.tradeoff_measuring import (
     EvaluationSetup,
+    Progress,
+    Tell,
+    TradeoffRequest,
     TradeoffSession,
+    check_knobs,
     describe_conditions,
     describe_setup,
     load_setup,
@@ -68,34 +72,6 @@ _EXACT = 0.004  # share of the budget for one model's exact images
 
 _MAX_COMBINATIONS = 12
 
-Progress = Callable[[str, float], None]
-Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class AblationRequest:
-    """What to train and measure.
-
-    Attributes:
-        words: overrides of ``neuprim run``; they define the centre and, with ``output_dir``, the folder of the set.
-        budget: seconds for everything, about; what does not fit is left out.
-        views: evaluation views, evenly spread.
-        repeats: rounds of timing.
-        knobs: names of those to change; empty for all.
-        seeds: trainings of every model.
-        lpips: weights for LPIPS; None for those of the configuration.
-        launcher: where models are trained; they are measured here.
-    """
-
-    words: Sequence[str]
-    budget: float = 1200.0
-    views: int = 5
-    repeats: int = 15
-    knobs: Sequence[str] = ()
-    seeds: int = 1
-    lpips: Path | None = None
-    launcher: LauncherSettings = LauncherSettings()  # noqa: RUF009 (frozen)
-
 
 def format_run_command(overrides: Sequence[str]) -> str:
     """Return the command that trains a model."""
@@ -103,53 +79,65 @@ def format_run_command(overrides: Sequence[str]) -> str:
 
 
 def run_ablation(
-    request: AblationRequest, tell: Tell = lambda text: None, progress: Progress = lambda text, fraction: None
+    request: TradeoffRequest,
+    seeds: int = 1,
+    launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
+    tell: Tell = lambda text: None,
+    progress: Progress = lambda text, fraction: None,
 ) -> tuple[Path, TradeoffRecord]:
     """Train, measure, and write ``tradeoff.json``, ``tradeoff.csv``, ``tradeoff.html`` and ``front.png``.
 
     Returns the folder of the set and its record. A larger budget adds what did not fit.
 
+    Args:
+        request: its overrides are those of ``neuprim run``, and ``output_dir`` among them is the folder of the set.
+        seeds: trainings of every model.
+        launcher: where models are trained; they are measured here.
+
     Raises:
         NeuprimError: invalid overrides, no such knob, data that cannot be read, or a folder that holds something else.
     """
-    models = _compose_model_set(request)
+    models = _compose_model_set(request.words, seeds, launcher)
     folder, centre, task = models.folder, models.centre, task_of(models.centre)
-    with use_one_torch_thread(), use_launcher_threads(request.launcher), ExitStack() as stack:
+    with use_one_torch_thread(), use_launcher_threads(launcher), ExitStack() as stack:
         stack.enter_context(find_run_plugins(centre).attribute_errors())
         variants = list_variants(centre, task)
-        for name in request.knobs:
-            if name not in variants:
-                known = nearest(name, variants)
-                raise ConfigError(f"--knobs {name}: no such knob of a model of task {task.name!r}{known}")
+        check_knobs(request, variants, f"a model of task {task.name!r}")
         before = read_tradeoff_record(folder / TRADEOFF_FILE)
-        _check_set_folder(models, before, request.seeds)
+        _check_set_folder(models, before)
         stack.enter_context(lock_directory(folder, "set"))
         plan = None if before is None else _parse_plan(folder / TRADEOFF_FILE, before)
-        render_ground_truth_for_training(centre, request.launcher, progress)
+        render_ground_truth_for_training(centre, launcher, progress)
         dataset = load_dataset(Job(centre, task), progress)
         check_dataset(dataset, task.conditions)
         views = eval_views(dataset, request.views)
         if not views:
             raise DataError(f"{dataset.name} has no test views; expected some to measure on")
-        record = _resume_model_set(folder, before, _set_identity(centre, views, request), tell)
-        session = _AblationSession(request, models, (dataset, views), plan, record, progress)
-        chosen = {name: own for name, own in variants.items() if not request.knobs or name in request.knobs}
-        for name, own in chosen.items():
-            if not own:
-                record.leave_out(name, (), "the centre has no other value")
+        lpips = str(request.lpips or centre.metrics.lpips or "")
+        identity = {"kind": "models", **models.identity(), "lpips": lpips, **describe_conditions(views)}
+        record = _resume_model_set(folder, before, identity, tell)
+        session = _AblationSession(models, (dataset, views), request, record, progress, plan)
         # The first of every knob, then the second, so that short budgets change as many knobs as possible.
-        rungs = [variant for rung in zip_longest(*chosen.values()) for variant in rung if variant is not None]
-        session.run([Variant(CENTRE), *rungs])
+        rungs = zip_longest(*session.choose_knobs(variants).values())
+        session.run([Variant(CENTRE), *(variant for rung in rungs for variant in rung if variant is not None)])
     return folder, record
 
 
 @dataclass(frozen=True)
 class _ModelSet:
-    """A set of models: its folder, the centre's overrides and configuration."""
+    """A set of models: its folder, the centre's overrides and configuration, trainings of each, and where they run."""
 
     folder: Path
     words: list[str]
     centre: RunConfig
+    seeds: int
+    launcher: LauncherSettings
+
+    def identity(self) -> dict[str, Any]:
+        """Return what must be equal to continue a set; JSON-able."""
+        own = (*NOT_TRAINED_WITH, "made_by")
+        settings = {name: value for name, value in self.centre.to_dict().items() if name not in own}
+        return {"centre": settings, "seeds": self.seeds}
 
 
 class _AblationSession(TradeoffSession):
@@ -157,20 +145,20 @@ class _AblationSession(TradeoffSession):
 
     def __init__(
         self,
-        request: AblationRequest,
         models: _ModelSet,
         loaded: tuple[Dataset, list[EvalView]],
-        plan: AblationPlan | None,
+        request: TradeoffRequest,
         record: TradeoffRecord,
         progress: Progress,
+        plan: AblationPlan | None,
     ) -> None:
-        super().__init__(models.folder, request.budget, request.repeats, record, progress)
-        self.request, self.words, self.centre, self._loaded = request, models.words, models.centre, loaded
-        self._plan, self._planned_at, self._compiling = plan, 0.0, 0.0
+        super().__init__(models.folder, request, record, progress)
+        self.words, self.centre, self.seeds, self.launcher = models.words, models.centre, models.seeds, models.launcher
+        self._loaded, self._plan, self._planned_at, self._compiling = loaded, plan, 0.0, 0.0
         spent = record.facts.get("spent_seconds", 0.0)
         self.begun -= float(spent) if isinstance(spent, int | float) else 0.0
         self._setups: dict[str, EvaluationSetup] = {}
-        self._workers, self._threads = count_parallel_jobs(request.launcher, 1000)
+        self._workers, self._threads = count_parallel_jobs(self.launcher, 1000)
 
     @property
     def plan(self) -> AblationPlan:
@@ -184,7 +172,7 @@ class _AblationSession(TradeoffSession):
 
     def seconds_left(self, part: float) -> float:
         """Return the seconds until a share of what remained after planning is used."""
-        return self._planned_at + part * max(self.budget - self._planned_at, 0.0) - self.spent
+        return self._planned_at + part * max(self.request.budget - self._planned_at, 0.0) - self.spent
 
     def run(self, wanted: Sequence[Variant]) -> None:
         """Train single changes, then combinations, find the fronts and write them."""
@@ -201,8 +189,8 @@ class _AblationSession(TradeoffSession):
             **describe_setup(self.point_setup(0)[0]),
             "preset": self.centre.preset,
             "words": list(self.words),
-            "seeds": self.request.seeds,
-            "budget_seconds": self.budget,
+            "seeds": self.seeds,
+            "budget_seconds": self.request.budget,
             "length": self.plan.describe(),
         }
         self.record.find_fronts()
@@ -216,7 +204,7 @@ class _AblationSession(TradeoffSession):
 
     def _measure_step_times(self, wanted: Sequence[Variant]) -> list[Variant]:
         """Return the variants whose step time is known; makes the plan."""
-        kept, latest = list[Variant](), self.spent + _PACES * (self.budget - self.spent)
+        kept, latest = list[Variant](), self.spent + _PACES * (self.request.budget - self.spent)
         paces = {CENTRE: 1.0} if self._plan is None else dict(self._plan.paces)
         for number, variant in enumerate(wanted):
             self.progress(f"step time of {variant.name}", number / len(wanted))
@@ -227,8 +215,8 @@ class _AblationSession(TradeoffSession):
             else:
                 self.record.leave_out(variant.knob, variant.label, reason)
         if self._plan is None:
-            lengths = [variant.length for variant in kept for _ in range(self.request.seeds)]
-            seconds = _TRAINING * (self.budget - self.spent) * self._workers
+            lengths = [variant.length for variant in kept for _ in range(self.seeds)]
+            seconds = _TRAINING * (self.request.budget - self.spent) * self._workers
             self._plan = plan_training_lengths(self.centre, self._step_times.seconds, seconds, lengths)
         self._plan.paces.update(paces)
         return kept
@@ -261,7 +249,7 @@ class _AblationSession(TradeoffSession):
         """Train and measure what is missing and fits; the centre and begun trainings always do."""
         known = {(point.turned, point.length) for point in self.record.points}
         todo = [variant for variant in wanted if (variant.turned, variant.length) not in known]
-        seeds = self.request.seeds
+        seeds = self.seeds
         several = max(self._workers // seeds, 1)
         for first in range(0, len(todo), several):
             batch: list[Variant] = []
@@ -278,7 +266,7 @@ class _AblationSession(TradeoffSession):
             text = f"training {first + 1} of {len(todo)}, {', '.join(variant.name for variant in batch)}"
             trials = [self._trial(variant, seed) for variant in batch for seed in range(seeds)]
             show = lambda fraction, text=text: self.progress(text, fraction)  # noqa: E731
-            results = launch_trials(trials, self.request.launcher, self.folder, show)
+            results = launch_trials(trials, self.launcher, self.folder, show)
             for i, variant in enumerate(batch):
                 own = results[i * seeds : (i + 1) * seeds]
                 failed = next((result for result in own if result.state == "failed"), None)
@@ -314,7 +302,7 @@ class _AblationSession(TradeoffSession):
     def _measure_model(self, variant: Variant, outcomes: Sequence[Outcome]) -> None:
         first, run_dir = outcomes[0], self._run_dir(variant, 0).relative_to(self.folder).as_posix()
         setup = self._setup(run_dir)
-        point, _ = measure_point(setup, variant.knob, setup.reference, self.render_exact(setup, _EXACT))
+        point = measure_point(setup, variant.knob, setup.reference, self.render_exact(setup, _EXACT))
         means = {name: statistics.fmean(getattr(one, name) for one in outcomes) for name in ("psnr", "ssim")}
         trained = replace(
             point,
@@ -341,7 +329,7 @@ class _AblationSession(TradeoffSession):
         """Return combinations of earlier sessions, and as many new ones as there is time for."""
         points = self.record.points
         allowed = [Variant(COMBINED, point.turned) for point in points if point.knob == COMBINED]
-        rounds = self.seconds_left(_COMBINED) / max(self.plan.seconds * self.request.seeds, 1e-9)
+        rounds = self.seconds_left(_COMBINED) / max(self.plan.seconds * self.seeds, 1e-9)
         most = min(int(self._workers * rounds), _MAX_COMBINATIONS - len(allowed))
         for variant in (Variant(COMBINED, way) for way in combine_models(points, most)):
             reason = self._find_pace(variant, self.plan.paces)
@@ -355,40 +343,28 @@ class _AblationSession(TradeoffSession):
 # ---------------------------------------------------------------- the folder
 
 
-def _compose_model_set(request: AblationRequest) -> _ModelSet:
-    typed = parse(request.words)
+def _compose_model_set(overrides: Sequence[str], seeds: int, launcher: LauncherSettings) -> _ModelSet:
+    typed = parse(overrides)
     words = [a.text for a in typed if a.key not in ("output_dir", "resume", "budget")]
     places = [a.value for a in typed if a.key == "output_dir" and a.value is not None]
     centre = compose([*words, "output_dir=null"], check_output=False)
     folder = Path(str(places[-1])).expanduser() if places else ROOT / f"tradeoff-{centre.task}-{centre.scene_name}"
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"output_dir={folder}: is a file; expected a directory")
-    return _ModelSet(folder, words, centre)
+    return _ModelSet(folder, words, centre, seeds, launcher)
 
 
-def _centre_settings(centre: RunConfig) -> dict[str, Any]:
-    return {name: value for name, value in centre.to_dict().items() if name not in (*NOT_TRAINED_WITH, "made_by")}
-
-
-def _check_set_folder(models: _ModelSet, before: TradeoffRecord | None, seeds: int) -> None:
+def _check_set_folder(models: _ModelSet, before: TradeoffRecord | None) -> None:
     """Refuse a folder that holds something else, or another set."""
     folder = models.folder
     if before is None:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / TRIALS).is_dir():
             raise ConfigError(f"output_dir={folder}: holds something else; expected a new directory, or that of a set")
-        return
-    if before.same.get("kind") != "models":
+    elif before.same.get("kind") != "models":
         raise DataError(f"{folder / TRADEOFF_FILE}: of a finished run; expected another output_dir=DIR for trainings")
-    if changed := before.changes({"centre": _centre_settings(models.centre), "seeds": seeds}):
+    elif changed := before.changes(models.identity()):
         expected = "expected the same overrides, or another output_dir=DIR"
         raise ConfigError(f"{folder}: holds a set with another {' and '.join(changed)}; {expected}")
-
-
-def _set_identity(centre: RunConfig, views: Sequence[EvalView], request: AblationRequest) -> dict[str, Any]:
-    """Return what must be equal to keep earlier measurements; JSON-able."""
-    lpips = str(request.lpips or centre.metrics.lpips or "")
-    own = {"kind": "models", "centre": _centre_settings(centre), "seeds": request.seeds, "lpips": lpips}
-    return {**own, **describe_conditions(views)}
 
 
 def _resume_model_set(

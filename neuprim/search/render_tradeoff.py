@@ -8,15 +8,15 @@ from __future__ import annotations
 import hashlib
 import math
 import shlex
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 from neuprim.config import find_run_plugins
 from neuprim.core.compute.threads import core_count
-from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.runs.fit import use_one_torch_thread
@@ -25,7 +25,11 @@ from neuprim.search.pareto import FrontStep, combine_front_steps
 from neuprim.search.tradeoff_measuring import (
     EvaluationSetup,
     ExactImages,
+    Progress,
+    Tell,
+    TradeoffRequest,
     TradeoffSession,
+    check_knobs,
     describe_conditions,
     describe_setup,
     load_setup,
@@ -44,39 +48,13 @@ from neuprim.search.tradeoff_record import (
 _EXACT, _IMAGES, _TIMES, _COMBINED = 0.2, 0.45, 0.65, 0.85
 """Shares of the budget by which exact images, images and times of single changes, and combinations should be done."""
 
-_ONE_POINT = 0.1  # share of the budget that the times of one point may take
 
 _COMBINATIONS = 24
-
-Progress = Callable[[str, float], None]
-Tell = Callable[[str], None]
 
 
 def format_render_command(run_dir: str, overrides: Sequence[str]) -> str:
     """Return the command that draws the test views so."""
     return shlex.join(["neuprim", "render", run_dir, "--camera", "test", *overrides])
-
-
-@dataclass(frozen=True)
-class TradeoffRequest:
-    """What to measure.
-
-    Attributes:
-        views: evaluation views, evenly spread.
-        repeats: rounds of timing.
-        knobs: names of the settings to change; empty for all.
-        budget: seconds, about; points that do not fit are left out.
-        words: overrides of the reference configuration, over how the run draws.
-        lpips: weights for LPIPS; None for those of the run.
-    """
-
-    run_dir: Path
-    views: int = 5
-    repeats: int = 15
-    knobs: Sequence[str] = ()
-    budget: float = 300.0
-    words: Sequence[str] = ()
-    lpips: Path | None = None
 
 
 _VALUES: dict[str, tuple[Any, ...]] = {
@@ -91,9 +69,9 @@ _VALUES: dict[str, tuple[Any, ...]] = {
 
 def list_render_knobs(reference: RenderConfig, model: Primitives) -> dict[str, list[RenderConfig]]:
     """Return knob -> the configurations that change it alone; reductions of fields are density.NAME and colour.NAME."""
-    cores = core_count()
+    cores, compared = core_count(), [name for name in backends.backend_names() if name != backends.REFERENCE]
     threads = sorted({1, 0, *(2**k for k in range(1, 7) if 2**k < cores)}) if cores > 1 else []
-    values = {**_VALUES, "backend": backends.backend_names(), "threads": threads}
+    values = {**_VALUES, "backend": compared, "threads": threads}
     knobs = {
         name: [replace(reference, settings=replace(reference.settings, **{name: value})) for value in own]
         for name, own in values.items()
@@ -114,35 +92,31 @@ def list_render_knobs(reference: RenderConfig, model: Primitives) -> dict[str, l
 
 
 def measure_tradeoff(
-    request: TradeoffRequest, tell: Tell = lambda text: None, progress: Progress = lambda text, fraction: None
+    run_dir: Path,
+    request: TradeoffRequest,
+    tell: Tell = lambda text: None,
+    progress: Progress = lambda text, fraction: None,
 ) -> TradeoffRecord:
     """Measure, and write ``tradeoff.json``, ``tradeoff.csv``, ``tradeoff.html`` and ``front.png``.
-
-    Args:
-        tell: called with lines for the user.
-        progress: called with (text, fraction 0..1 of what the text names).
 
     Raises:
         NeuprimError: no such run or knob, no test views, invalid overrides, or a damaged record.
     """
-    setup = load_setup(request.run_dir, request.words, request.views, request.lpips)
+    setup, folder = load_setup(run_dir, request.words, request.views, request.lpips), run_dir / TRADEOFF_FOLDER
     knobs = list_render_knobs(setup.reference, setup.model)
-    for name in request.knobs:
-        if name not in knobs:
-            raise ConfigError(f"--knobs {name}: no such knob of this run{nearest(name, knobs)}")
-    record = _resume_render_tradeoff(request.run_dir / TRADEOFF_FOLDER / TRADEOFF_FILE, _render_identity(setup), tell)
+    check_knobs(request, knobs, "this run")
+    record = _resume_render_tradeoff(folder / TRADEOFF_FILE, _render_identity(setup), tell)
     with find_run_plugins(setup.config).attribute_errors(), use_one_torch_thread():
         if (reason := setup.unsupported(setup.reference)) is not None:
             raise ConfigError(reason)
         record.facts |= {**describe_setup(setup), "primitives": setup.model.count}
-        session = _RenderSession(request, setup, record, progress)
+        session = _RenderSession(folder, request, record, progress, setup)
         session.measure([(REFERENCE, setup.reference), *session.single_changes(knobs)], _IMAGES)
         session.take_times(_TIMES)
         session.measure([(COMBINED, config) for config in session.combinations()], _COMBINED)
         session.take_times(1.0)
         record.find_fronts(session.stores_the_reference, session.draws_the_reference)
-        command = lambda words: format_render_command(str(request.run_dir), words)  # noqa: E731
-        session.write_results(command, setup.model.count)
+        session.write_results(partial(format_render_command, str(run_dir)), setup.model.count)
     return record
 
 
@@ -150,10 +124,15 @@ class _RenderSession(TradeoffSession):
     """Measure points of one run within the budget."""
 
     def __init__(
-        self, request: TradeoffRequest, setup: EvaluationSetup, record: TradeoffRecord, progress: Progress
+        self,
+        folder: Path,
+        request: TradeoffRequest,
+        record: TradeoffRecord,
+        progress: Progress,
+        setup: EvaluationSetup,
     ) -> None:
-        super().__init__(request.run_dir / TRADEOFF_FOLDER, request.budget, request.repeats, record, progress)
-        self.knobs, self.setup = request.knobs, setup
+        super().__init__(folder, request, record, progress)
+        self.setup = setup
 
     def point_setup(self, number: int) -> tuple[EvaluationSetup, RenderConfig]:
         return self.setup, self.setup.parse(self.record.points[number].words)
@@ -164,14 +143,10 @@ class _RenderSession(TradeoffSession):
         self.progress("exact images", 0.0)
         return self.render_exact(self.setup, _EXACT)
 
-    def single_changes(self, knobs: dict[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
+    def single_changes(self, knobs: Mapping[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
         """Yield what can be drawn here and differs; the record says what is left out."""
         base = self.setup.backend(self.setup.reference).name
-        for name, configs in knobs.items():
-            if self.knobs and name not in self.knobs:
-                continue
-            if not configs:
-                self.record.leave_out(name, (), "there is no other value")
+        for name, configs in self.choose_knobs(knobs).items():
             for config in configs:
                 reason = self.setup.unsupported(config)
                 if reason is not None:
@@ -182,36 +157,18 @@ class _RenderSession(TradeoffSession):
     def measure(self, wanted: Sequence[tuple[str, RenderConfig]], part: float) -> None:
         """Measure images and bytes of the configurations that the record lacks."""
         for number, (knob, config) in enumerate(wanted):
-            words = self.setup.overrides(config)
-            if any(point.words == words for point in self.record.points):
+            words, points = self.setup.overrides(config), self.record.points
+            if any(point.words == words for point in points):
                 continue
-            reason = self._too_slow(knob, config)
-            if self.record.points and self.seconds_left(part) < 0:
-                reason = self.no_time
-            if reason is None:
-                self.progress(f"images of point {number + 1} of {len(wanted)}", number / len(wanted))
-                try:
-                    point, seconds = measure_point(self.setup, knob, config, self.exact)
-                except ConfigError as error:  # a format that does not hold the model's values
-                    reason = str(error)
-            if reason is not None:
-                self.record.leave_out(knob, words, reason)
+            if points and self.seconds_left(part) < 0:
+                self.record.leave_out(knob, words, self.no_time)
                 continue
-            most = max(1, int(_ONE_POINT * self.budget / max(seconds, 1e-9)))
-            point.rounds = most if most < self.repeats else None
-            self.record.points.append(point)
+            self.progress(f"images of point {number + 1} of {len(wanted)}", number / len(wanted))
+            try:
+                points.append(measure_point(self.setup, knob, config, self.exact))
+            except ConfigError as error:  # a format that does not hold the model's values
+                self.record.leave_out(knob, words, str(error))
             self.write_record()
-
-    def _too_slow(self, knob: str, config: RenderConfig) -> str | None:
-        """Return why a point is not drawn: the float64 reference backend may take a thousand times as long."""
-        names = [self.setup.backend(one).name for one in (config, self.setup.reference)]
-        if knob == REFERENCE or names[0] != backends.REFERENCE or names[1] == backends.REFERENCE:
-            return None
-        known = self.record.facts.get("exact") or self.exact.to_dict()
-        seconds, allowed = known["oracle_seconds"] * len(self.setup.views), _ONE_POINT * self.budget
-        if seconds <= allowed:
-            return None
-        return f"its images would take about {seconds:.0f} s, of {allowed:.0f} s that a point may have"
 
     def stores_the_reference(self, point: TradeoffPoint) -> bool:
         """Return whether a point stores the model as the reference does: storage does not change times."""

@@ -6,11 +6,11 @@ import math
 import platform
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from neuprim.config import RunConfig
 from neuprim.core.channels import Channels, find_channels
 from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.data import Dataset, View
-from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
+from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, nearest
 from neuprim.core.metrics import psnr, ssim, ssim_3dgs
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.primitives import Primitives
@@ -39,6 +39,9 @@ _MAX_PSNR = 400.0  # dB of exact images that equal those in float64, as JSON has
 _CHECK_SIZE = 48  # pixels of the longer side of the image that checks exact images against float64
 
 Renderer = Callable[[View], Tensor]
+Progress = Callable[[str, float], None]  # text, fraction 0..1 of what it names
+Tell = Callable[[str], None]  # a line for the user
+T = TypeVar("T")
 
 
 @dataclass
@@ -171,14 +174,12 @@ class ExactImages(NamedTuple):
         images: (H, W, C) float64, one per view.
         float64: whether the reference backend drew them in float64. Otherwise the reference configuration's backend
             did in float32, and ``error`` is its PSNR against float64 on an image of ``checked`` pixels.
-        oracle_seconds: estimated seconds of an image of the reference backend.
     """
 
     images: list[Tensor]
     float64: bool
     error: float | None
     checked: tuple[int, int]
-    oracle_seconds: float
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able facts."""
@@ -187,7 +188,6 @@ class ExactImages(NamedTuple):
             "float64": self.float64,
             "psnr_against_float64": self.error,
             "checked_size": list(self.checked),
-            "oracle_seconds": self.oracle_seconds,
         }
 
 
@@ -213,34 +213,26 @@ def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = 
     pixels = sum(v.view.camera.width * v.view.camera.height for v in setup.views) / len(setup.views)
     expected = (time.perf_counter() - start) * pixels / (size[0] * size[1])
     if float64 or (float64 is None and expected * len(setup.views) <= allowed):
-        start = time.perf_counter()
         images = [oracle.render_view(double, v.view, background) for v in setup.views]
-        return ExactImages(images, True, None, size, (time.perf_counter() - start) / len(images))
+        return ExactImages(images, True, None, size)
     draw = setup.renderer(RenderConfig(settings))
     images = [draw(v.view).double() for v in setup.views]
-    return ExactImages(images, False, min(psnr(draw(small).double(), check), _MAX_PSNR), size, expected)
+    return ExactImages(images, False, min(psnr(draw(small).double(), check), _MAX_PSNR), size)
 
 
 # ---------------------------------------------------------------- one point
 
 
-def measure_point(
-    setup: EvaluationSetup, knob: str, config: RenderConfig, exact: ExactImages
-) -> tuple[TradeoffPoint, float]:
-    """Measure images and size of a configuration; returns the point, and the seconds of all images.
+def measure_point(setup: EvaluationSetup, knob: str, config: RenderConfig, exact: ExactImages) -> TradeoffPoint:
+    """Measure images and size of a configuration.
 
     Numbers are means over views. ``psnr_exact`` is that of the mean squared error over all views, and at most the
     accuracy of the exact images themselves.
     """
     model, draw = setup.prepare_model(config), setup.renderer(config)
     rows: list[dict[str, float]] = []
-    seconds = 0.0
-    _warm_up(draw, setup.views[0].view)
     for view, ideal in zip(setup.views, exact.images, strict=True):
-        start = time.perf_counter()
-        image = draw(view.view)
-        seconds += time.perf_counter() - start
-        image = fill_masked(image, view)
+        image = fill_masked(draw(view.view), view)
         shown, wanted = setup.display(image), setup.display(view.image)
         row = {"psnr": psnr(image, view.image, view.mask), "ssim": ssim(image, view.image)}
         row |= {"ssim_3dgs": ssim_3dgs(shown, wanted), "ssim_exact": ssim(image.double(), ideal)}
@@ -254,22 +246,25 @@ def measure_point(
     exactness = -10.0 * math.log10(error) if error > 0 else math.inf
     quality["psnr_exact"] = exactness if exact.error is None else min(exactness, exact.error)
     size = estimate_file_bytes(setup.file, setup.model, model, config.storage)
-    return TradeoffPoint(knob, setup.overrides(config), quality, size), seconds
+    return TradeoffPoint(knob, setup.overrides(config), quality, size)
 
 
 # ---------------------------------------------------------------- frame times
 
 
 class TimedPoint(NamedTuple):
-    """A point to time: what returns its renderer, and how many rounds it should have."""
+    """A point to time, and what returns its renderer."""
 
     point: TradeoffPoint
     renderer: Callable[[], Renderer]
-    rounds: int
 
 
 def time_points(
-    timed: Sequence[TimedPoint], views: Sequence[EvalView], deadline: float, done: Callable[[int, int], None]
+    timed: Sequence[TimedPoint],
+    repeats: int,
+    views: Sequence[EvalView],
+    deadline: float,
+    done: Callable[[int, int], None],
 ) -> None:
     """Time points in rounds. The first is the reference, which is drawn several times in every round.
 
@@ -278,16 +273,15 @@ def time_points(
     over views of its time over the reference's in the same view, so that brief load of the machine has no effect.
 
     Args:
+        repeats: rounds that each point should have, with those that it has already.
         deadline: of :func:`time.monotonic`; no round starts after it, except the first.
         done: called with (round, of how many) after each.
     """
     order = torch.Generator().manual_seed(len(timed[0].point.ms))
-    most = max(one.rounds - len(one.point.ms) for one in timed)
+    most = max(repeats - len(one.point.ms) for one in timed)
     for number in range(most):
         start = time.monotonic()
-        due = [timed[0], *(one for one in timed[1:] if len(one.point.ms) < one.rounds)]
-        if number and len(due) == 1:
-            return
+        due = [timed[0], *(one for one in timed[1:] if len(one.point.ms) < repeats)]
         if number == 0:
             for one in due:
                 _warm_up(one.renderer(), views[0].view)
@@ -317,19 +311,36 @@ def _warm_up(draw: Renderer, view: View) -> None:
 # ---------------------------------------------------------------- the session
 
 
+@dataclass(frozen=True)
+class TradeoffRequest:
+    """What to measure.
+
+    Attributes:
+        words: overrides of the reference configuration, over how the run draws; of trained models, those of the centre.
+        budget: seconds, about; points that do not fit are left out.
+        views: evaluation views, evenly spread.
+        repeats: rounds of timing.
+        knobs: names of the settings to change; empty for all.
+        lpips: weights for LPIPS; None for those of the run.
+    """
+
+    words: Sequence[str] = ()
+    budget: float = 300.0
+    views: int = 5
+    repeats: int = 15
+    knobs: Sequence[str] = ()
+    lpips: Path | None = None
+
+
 class TradeoffSession:
     """Measure points within a budget, find the fronts, and write record, table and page.
 
-    Attributes:
+    Args:
         folder: of the record and its pages.
-        budget: seconds, about.
-        repeats: rounds of timing.
     """
 
-    def __init__(
-        self, folder: Path, budget: float, repeats: int, record: TradeoffRecord, progress: Callable[[str, float], None]
-    ) -> None:
-        self.folder, self.budget, self.repeats, self.record, self.progress = folder, budget, repeats, record, progress
+    def __init__(self, folder: Path, request: TradeoffRequest, record: TradeoffRecord, progress: Progress) -> None:
+        self.folder, self.request, self.record, self.progress = folder, request, record, progress
         self.begun = time.monotonic()
 
     def point_setup(self, number: int) -> tuple[EvaluationSetup, RenderConfig]:
@@ -338,20 +349,28 @@ class TradeoffSession:
 
     def seconds_left(self, part: float) -> float:
         """Return the seconds until a share of the budget is used."""
-        return self.begun + part * self.budget - time.monotonic()
+        return self.begun + part * self.request.budget - time.monotonic()
 
     @property
     def no_time(self) -> str:
         """Why a point is not measured for which no time is left."""
-        return f"no time left of the budget of {self.budget:g} s"
+        return f"no time left of the budget of {self.request.budget:g} s"
 
     def write_record(self) -> None:
         self.record.write(self.folder / TRADEOFF_FILE)
 
+    def choose_knobs(self, knobs: Mapping[str, list[T]]) -> dict[str, list[T]]:
+        """Return the values of the requested knobs; the record says which have no other value."""
+        chosen = {name: own for name, own in knobs.items() if not self.request.knobs or name in self.request.knobs}
+        for name, own in chosen.items():
+            if not own:
+                self.record.leave_out(name, (), "there is no other value")
+        return chosen
+
     def render_exact(self, setup: EvaluationSetup, share: float) -> ExactImages:
         """Render exact images in a share of the budget; those of all models are made alike."""
         float64 = self.record.facts.get("exact", {}).get("float64")
-        exact = render_exact(setup, share * self.budget, float64)
+        exact = render_exact(setup, share * self.request.budget, float64)
         self.record.facts.setdefault("exact", exact.to_dict())
         return exact
 
@@ -360,14 +379,14 @@ class TradeoffSession:
         timed = []
         for number, point in enumerate(self.record.points):
             setup, config = self.point_setup(number)
-            rounds = min(self.repeats, point.rounds or self.repeats)
-            timed.append(TimedPoint(point, partial(setup.renderer, config), rounds))
+            timed.append(TimedPoint(point, partial(setup.renderer, config)))
 
         def note_round(number: int, count: int) -> None:
             self.write_record()
             self.progress(f"round {number} of {count}, {len(timed)} points", number / count)
 
-        time_points(timed, self.point_setup(0)[0].views, time.monotonic() + self.seconds_left(part), note_round)
+        deadline, views = time.monotonic() + self.seconds_left(part), self.point_setup(0)[0].views
+        time_points(timed, self.request.repeats, views, deadline, note_round)
 
     def write_results(self, command: Callable[[Sequence[str]], str], primitives: int = 0) -> None:
         """Write record, table, page and chart of the fronts.
@@ -394,3 +413,10 @@ class TradeoffSession:
             against = truth if trained else None if number == 0 else pictures[0].image
             pictures[number] = TradeoffPicture(shown, against)
         return pictures
+
+
+def check_knobs(request: TradeoffRequest, known: Iterable[str], owner: str) -> None:
+    """Refuse a knob that a run, or a task's models, do not have."""
+    for name in request.knobs:
+        if name not in (names := list(known)):
+            raise ConfigError(f"--knobs {name}: no such knob of {owner}{nearest(name, names)}")

@@ -35,7 +35,7 @@ _MODEL_COLUMNS = ("numbers per primitive", "training steps", "training seconds",
 
 _DIGITS = 2  # decimals of PSNR that count on a front
 
-_DRAWN = ("knob", "words", "bytes", "ms", "ratios", "rounds")
+_DRAWN = ("knob", "words", "bytes", "ms", "ratios")
 _TRAINED = (
     *("turned", "length", "primitives", "parameters_per_primitive", "steps", "seconds"),
     *("centre_ms", "seeds", "run_dir"),
@@ -55,7 +55,6 @@ class TradeoffPoint:
         quality: psnr, ssim, ssim_3dgs, psnr_exact, ssim_exact; lpips and lpips_3dgs where there are weights.
         bytes: size of the model file.
         ms: mean milliseconds per frame of each round of timing; ratios: the same over the reference's of that round.
-        rounds: limit of rounds; None for the request's.
         turned, length: of a trained model, the overrides over the centre's, and the share of the full training.
         centre_ms: median milliseconds per frame of the centre over all rounds.
         seeds: PSNR of each seed; ``quality`` has the means.
@@ -68,7 +67,6 @@ class TradeoffPoint:
     bytes: int
     ms: list[_Positive] = field(default_factory=list)
     ratios: list[_Positive] = field(default_factory=list)
-    rounds: int | None = None
     turned: tuple[str, ...] = ()
     length: float = 1.0
     primitives: int = 0

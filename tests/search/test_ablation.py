@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,9 @@ from neuprim.runs.fit import Events, fit
 from neuprim.runs.launch.jobs import JobResult
 from neuprim.runs.open import load_run
 from neuprim.search import ablation, ablation_plan, trials
-from neuprim.search.ablation import TRIALS, AblationRequest, run_ablation
+from neuprim.search.ablation import TRIALS, run_ablation
 from neuprim.search.ablation_plan import CENTRE, AblationPlan, Variant, plan_training_lengths
+from neuprim.search.tradeoff_measuring import TradeoffRequest
 from neuprim.search.tradeoff_record import COMBINED, TradeoffRecord, read_tradeoff_record
 from neuprim.search.trials import Outcome, Trial, read_trial, run_trial
 from tests.core import tiny
@@ -48,9 +48,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny.write_blender(tmp_path_factory.mktemp("data") / "two")
 
 
-def request(scene: Path, folder: Path, *more: str, **changes: Any) -> AblationRequest:
+def request(scene: Path, folder: Path, *more: str, **changes: Any) -> TradeoffRequest:
     values: dict[str, Any] = {"budget": 600.0, "views": 2, "repeats": 3, "knobs": KNOBS, **changes}
-    return AblationRequest([*words(scene, folder, STEPS), *more], **values)
+    return TradeoffRequest([*words(scene, folder, STEPS), *more], **values)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_the_overrides_of_a_point_train_it(measured: tuple[Path, TradeoffRecord]
 
 
 def test_seeds_are_averaged_and_must_be_equal_to_continue(scene: Path, tmp_path: Path) -> None:
-    folder, record = run_ablation(request(scene, tmp_path / "set", knobs=("train.iterations",), seeds=2))
+    folder, record = run_ablation(request(scene, tmp_path / "set", knobs=("train.iterations",)), 2)
     trained = [read_trial(folder / TRIALS / name) for name in (CENTRE, f"{CENTRE}_seed-4")]
     seeds = [one.outcome.psnr for one in trained if one is not None and one.outcome is not None]
     centre = record.points[0]
@@ -137,13 +137,13 @@ def test_an_interrupted_set_continues_with_trainings_launched_together(
 
     monkeypatch.setattr(ablation, "launch_trials", launch)
     monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
-    again = request(scene, tmp_path / "set", knobs=("model.neurons",), launcher=LauncherSettings("processes"))
+    again = request(scene, tmp_path / "set", knobs=("model.neurons",))
     with pytest.raises(KeyboardInterrupt):
-        run_ablation(again)
+        run_ablation(again, launcher=LauncherSettings("processes"))
     monkeypatch.undo()
     half = read_tradeoff_record(tmp_path / "set" / "tradeoff.json")
     assert batches == [2] and half is not None and names(half) == {CENTRE, "neurons=2"}
-    _, record = run_ablation(replace(again, launcher=LauncherSettings()))
+    _, record = run_ablation(again)
     assert names(record) == {CENTRE, "neurons=0", "neurons=2", "neurons=8"}
     assert record.points[0].quality["psnr"] == measured[1].points[0].quality["psnr"]
 

@@ -14,8 +14,15 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.metrics import psnr
 from neuprim.runs.measure import evaluate_run
 from neuprim.search import render_tradeoff as engine
-from neuprim.search.render_tradeoff import TradeoffRequest, measure_tradeoff
-from neuprim.search.tradeoff_measuring import TimedPoint, load_setup, measure_point, render_exact, time_points
+from neuprim.search.render_tradeoff import measure_tradeoff
+from neuprim.search.tradeoff_measuring import (
+    TimedPoint,
+    TradeoffRequest,
+    load_setup,
+    measure_point,
+    render_exact,
+    time_points,
+)
 from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord, read_tradeoff_record
 from tests.search.tradeoff_runs import copied, tiny_run
 
@@ -31,7 +38,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def measured(bare: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TradeoffRecord]:
     run_dir = copied(bare, tmp_path_factory.mktemp("measured") / "run it")
-    return run_dir, measure_tradeoff(TradeoffRequest(run_dir, 2, 3, QUICK, 120.0))
+    return run_dir, measure_tradeoff(run_dir, TradeoffRequest((), 120.0, 2, 3, QUICK))
 
 
 def test_every_value_of_every_knob_is_measured(measured: tuple[Path, TradeoffRecord]) -> None:
@@ -77,7 +84,7 @@ def test_exact_images_without_float64_know_their_error(bare: Path) -> None:
     assert slow.float64 and slow.error is None and not fast.float64 and fast.checked == (24, 24)
     assert fast.error is not None and 100 < fast.error <= psnr(fast.images[0], slow.images[0]) + 1e-6
     uncut = setup.parse(["renderer.alpha_min=0", "renderer.transmittance_min=0"])
-    assert measure_point(setup, "alpha_min", uncut, fast)[0].quality["psnr_exact"] == fast.error
+    assert measure_point(setup, "alpha_min", uncut, fast).quality["psnr_exact"] == fast.error
 
 
 def test_outputs_and_what_is_kept(measured: tuple[Path, TradeoffRecord], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,16 +96,16 @@ def test_outputs_and_what_is_kept(measured: tuple[Path, TradeoffRecord], monkeyp
     assert len((folder / "tradeoff.csv").read_text().splitlines()) == len(record.points) + 1
     monkeypatch.setattr(engine, "measure_point", lambda *args: pytest.fail("measured again"))
     told: list[str] = []
-    again = measure_tradeoff(TradeoffRequest(run_dir, 2, 3, QUICK, 120.0), told.append)
+    again = measure_tradeoff(run_dir, TradeoffRequest((), 120.0, 2, 3, QUICK), told.append)
     assert len(told) == 1 and "are kept" in told[0] and again.points == record.points
 
 
 def test_another_reference_is_measured_anew_and_nothing_fits_no_budget(bare: Path, tmp_path: Path) -> None:
     run_dir = copied(bare, tmp_path / "run")
-    measure_tradeoff(TradeoffRequest(run_dir, 1, 1, ("sort",), 0.001))
+    measure_tradeoff(run_dir, TradeoffRequest((), 0.001, 1, 1, ("sort",)))
     told: list[str] = []
     words = ["resolution=0.5"]
-    record = measure_tradeoff(TradeoffRequest(run_dir, 1, 1, ("resolution",), 0.001, words), told.append)
+    record = measure_tradeoff(run_dir, TradeoffRequest(words, 0.001, 1, 1, ("resolution",)), told.append)
     assert "made with another reference" in told[0] and [p.words for p in record.points] == [("resolution=0.5",)]
     assert {one.reason for one in record.left_out} == {"no time left of the budget of 0.001 s"}
 
@@ -137,7 +144,7 @@ def test_the_command_prints_the_fronts(bare: Path, tmp_path: Path, capsys: pytes
 
 def test_a_word_that_cannot_be_drawn_is_refused(bare: Path) -> None:
     with pytest.raises(ConfigError, match=r"colour\.degree"):
-        measure_tradeoff(TradeoffRequest(bare, 1, 1, words=["colour.degree=9"]))
+        measure_tradeoff(bare, TradeoffRequest(["colour.degree=9"]))
 
 
 def test_rounds_time_the_reference_beside_each_point(bare: Path) -> None:
@@ -150,11 +157,12 @@ def test_rounds_time_the_reference_beside_each_point(bare: Path) -> None:
 
         return lambda: draw
 
-    points = [TradeoffPoint(name, (), {}, 0) for name in ("reference", "slow", "short")]
-    timed = [TimedPoint(p, renderer(s), n) for p, s, n in zip(points, (0.002, 0.008, 0.002), (3, 3, 1), strict=True)]
+    points = [TradeoffPoint(name, (), {}, 0) for name in ("reference", "slow", "timed before")]
+    points[2].ms, points[2].ratios = [1.0, 1.0], [1.0, 1.0]
+    timed = [TimedPoint(p, renderer(s)) for p, s in zip(points, (0.002, 0.008, 0.002), strict=True)]
     rounds: list[tuple[int, int]] = []
-    time_points(timed, setup.views, time.monotonic() + 60, lambda *one: rounds.append(one))
-    assert [len(p.ms) for p in points] == [3, 3, 1] and rounds == [(1, 3), (2, 3), (3, 3)]
+    time_points(timed, 3, setup.views, time.monotonic() + 60, lambda *one: rounds.append(one))
+    assert [len(p.ms) for p in points] == [3, 3, 3] and rounds == [(1, 3), (2, 3), (3, 3)]
     assert set(points[0].ratios) == {1.0} and all(2 < ratio < 6 for ratio in points[1].ratios)
-    time_points([one._replace(rounds=9) for one in timed], setup.views, 0.0, lambda *one: None)
+    time_points(timed, 9, setup.views, 0.0, lambda *one: None)
     assert len(points[0].ms) == 4, "one round after the deadline"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 
 

@@ -1,7 +1,4 @@
-"""Generated scenes: solids, a room, lit solids and smoke, and what they share (shapes, ray casting, image sets).
-
-Scenes write files in a layout that loaders read. They know no task: tasks register them and load what they wrote.
-"""
+"""Generated scenes, written in layouts that loaders read: solids, room, lit solids and smoke. They know no task."""
 
 __all__ = ["PIXEL_CLASSES"]
 

@@ -54,13 +54,9 @@ def camera_pose(eye: NDArray[np.float64]) -> NDArray[np.float64]:
 def ray_bands(
     pose: NDArray[np.float64], field_of_view: float, size: int, samples: int
 ) -> Iterator[NDArray[np.float64]]:
-    """(N, 3) unit directions in the scene, whole rows of pixels at a time from the top, row by row of rays.
+    """Yield (N, 3) unit directions in the scene, rows of pixels from the top, ``samples`` rays per pixel side.
 
-    Args:
-        pose: (4, 4) camera to world, OpenGL axes.
-        field_of_view: radians, along both axes.
-        size: width and height in pixels.
-        samples: rays per pixel along each axis, through the middles of its cells.
+    ``pose`` (4, 4) is camera to world, OpenGL axes; ``field_of_view`` in radians holds along both axes.
     """
     fine = size * samples
     plane = ((np.arange(fine) + 0.5) / fine * 2 - 1) * math.tan(field_of_view / 2)  # at distance 1
@@ -81,8 +77,7 @@ def average_rays(values: NDArray[np.float32], size: int, samples: int) -> NDArra
 
 
 def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: Callable[[float], None]) -> None:
-    """Do the work for every job in threads; ``progress`` receives the fraction done. Errors cancel what has not
-    begun."""
+    """Do the work for every job in threads; ``progress`` receives the fraction done. An error cancels waiting jobs."""
     pool = ThreadPoolExecutor(min(_MAX_THREADS, os.cpu_count() or 1))
     try:
         for done, _ in enumerate(pool.map(work, jobs), start=1):
@@ -98,13 +93,7 @@ def drawing_text(name: str, scene: Scene, width: int, height: int) -> str:
 
 
 def write_cached_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
-    """Have ``write`` fill the folder ``final`` unless all ``files`` exist; return it.
-
-    The folder appears under its name only when complete, so an interrupted run leaves nothing.
-
-    Raises:
-        DataError: ``what`` cannot be written.
-    """
+    """Have ``write`` fill the folder ``final``, which appears when complete, unless all ``files`` exist."""
     names = tuple(files)
     try:
         publish_folder(final, write, lambda folder: all((folder / name).is_file() for name in names))
@@ -140,11 +129,7 @@ class ImageSet(Generic[V]):
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {}
 
     def generate(self, cache_dir: Path, progress: Progress) -> Path:
-        """Write the data set unless it is complete; return its folder ``cache_dir/NAME-KEY``.
-
-        Raises:
-            DataError: the cache directory cannot be written.
-        """
+        """Write the data set unless it is complete; return its folder ``cache_dir/NAME-KEY``."""
         names = [f"transforms_{split}.json" for split in self.splits]
         names += [f"{split}/{file}" for split, views in self.splits.items() for v in views for file in self.files(v)]
         folder = Path(cache_dir) / f"{self.name}-{self.key}"

@@ -46,8 +46,7 @@ from neuprim.scenes.shapes import FLOOR, Solid, build_solids, lathe, ring, unifo
 GENERATOR_VERSION = 1
 """Part of the cache's key: raise it with every change to solids, cameras, lights, shading or file layout."""
 
-DISTANCE = (4.0, 5.0)
-"""Least and largest distance of cameras and lights from the origin, scene units."""
+DISTANCE = (4.0, 5.0)  # least and largest distance of cameras and lights from the origin, scene units
 
 FIELD_OF_VIEW = 2 * float(np.arcsin(1.19 / DISTANCE[0]))
 """Radians; from the nearest camera it holds the sphere of radius 1.19 about the whole scene."""
@@ -59,8 +58,7 @@ default settings."""
 PARTS = ("new_view", "new_light", "new_both")
 """Parts of the test split: new camera under a training light, training camera under a new light, and both new."""
 
-NEAR_LIGHTS = 25
-"""The baseline "nearest light" knows the lights of this many training images, the first ones."""
+NEAR_LIGHTS = 25  # the baseline "nearest light" knows the lights of this many training images, the first ones
 
 CIRCLE_FRAMES = 36
 _CAMERA_POLAR, _LIGHT_POLAR = math.radians(75.0), math.radians(60.0)
@@ -97,8 +95,7 @@ class LitView(NamedTuple):
 
 
 class LitImage(NamedTuple):
-    """One image: (size, size, 4) premultiplied linear radiance and coverage, the same without cast shadows, and
-    (size, size) indices into :data:`neuprim.scenes.PIXEL_CLASSES`."""
+    """Premultiplied radiance and coverage (size, size, 4), the same without cast shadows, and pixel classes."""
 
     rgba: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
@@ -108,11 +105,7 @@ class LitImage(NamedTuple):
 def generate_lit_solids(
     settings: LitSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None
 ) -> Path:
-    """Write the data set unless it is complete; return its folder ``cache_dir/lit_solids-KEY``.
-
-    Raises:
-        DataError: the cache directory cannot be written.
-    """
+    """Write the data set unless it is complete; return its folder ``cache_dir/lit_solids-KEY``."""
 
     def draw(scene: Scene, view: LitView, paths: Sequence[Path]) -> None:
         pose, quality = camera_pose(view.camera), (settings.size, settings.supersampling)
@@ -236,8 +229,7 @@ def draw_lit_solids(
 
 
 class ShadedRays(NamedTuple):
-    """Of N rays: (N, 3) linear radiance, zero where nothing is hit, the same without cast shadows, and (N,) indices
-    into :data:`neuprim.scenes.PIXEL_CLASSES`."""
+    """(N, 3) linear radiance of N rays, the same without cast shadows, and (N,) pixel classes."""
 
     rgb: NDArray[np.float32]
     unshadowed: NDArray[np.float32]

@@ -1,9 +1,4 @@
-"""Ray casting against solids: first hits and occlusion.
-
-Embree does the work where the package ``embreex`` has a wheel. Elsewhere (Linux and Windows on ARM) a hierarchy
-compiled with numba gives the same answers, about ten times slower: median splits along the longest axis, nearest
-child first, and Möller and Trumbore's intersection (1997) in double precision. Both sides of a triangle count.
-"""
+"""Ray casting against solids by Embree (``embreex``), or where it has no wheel by a hierarchy compiled with numba."""
 
 from __future__ import annotations
 
@@ -62,14 +57,7 @@ class Hits:
 
 
 class Scene:
-    """Solids ready for ray queries; read-only after construction, so threads may share it.
-
-    Attributes:
-        engine: "embree" or "numba".
-
-    Raises:
-        BackendUnavailable: ``engine="embree"`` without the package ``embreex``.
-    """
+    """Solids ready for ray queries, by ``engine`` "embree" or "numba"; read-only, so threads may share it."""
 
     def __init__(self, solids: Sequence[Solid], engine: Engine = "auto") -> None:
         self.solids = tuple(solids)
@@ -109,10 +97,7 @@ class Scene:
         return self._search.first(o, d)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
-        """(N,) whether a surface lies within ``distance`` (in lengths of the direction) of the points (N, 3).
-
-        Start from :meth:`Hits.lifted`: a point on a triangle may meet that triangle.
-        """
+        """(N,) whether a surface lies within ``distance`` (in lengths of the direction) of points off a surface."""
         o, d = _rays(points, directions)
         return self._search.any(o, d, np.broadcast_to(np.asarray(distance, dtype=np.float32), len(o)))
 
@@ -177,10 +162,7 @@ class _Hierarchy:
 
 
 def _build_boxes(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Order of triangles, node boxes, and per node (first child, 0) or (first triangle, count).
-
-    Children are neighbours. Plain numpy: compiling a sort takes longer than this takes.
-    """
+    """Order of triangles, node boxes, and per node (first of two children, 0) or (first triangle, count)."""
     order = np.arange(len(low))
     middle = (low + high) / 2
     boxes: list[tuple[NDArray, NDArray]] = [(low[:0], high[:0])]

@@ -41,10 +41,7 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Array]:
-    """(M,) cosine to the light, at least 0, and (M,) pi times the highlight's reflectance.
-
-    ``to_eye`` and ``to_light`` are (M, 3) or (3,) unit vectors away from the surface.
-    """
+    """(M,) cosine to the light, at least 0, and pi times the highlight's reflectance; directions are unit vectors."""
     eye, light = np.asarray(to_eye, dtype=np.float32), np.asarray(to_light, dtype=np.float32)
     cosine = np.maximum(dot(hits.normal, light), 0)
     half: Array = eye + light
@@ -63,10 +60,7 @@ def reflect_light(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
 def daylight_radiance(
     scene: Scene, origins: ArrayLike, directions: ArrayLike, light: Daylight = DAYLIGHT
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """What N rays see: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits.
-
-    ``origins`` are (N, 3) or (3,), ``directions`` (N, 3) unit vectors.
-    """
+    """(N, 3) linear RGB that N rays see, zero where nothing is hit, and (N,) bool of hits."""
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)
     to_eye = -d[hits.hit]

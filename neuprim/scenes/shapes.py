@@ -1,7 +1,4 @@
-"""Closed triangle meshes, their normals, and the solids that are built from them.
-
-Every builder returns a watertight :class:`trimesh.Trimesh` in scene units with outward faces.
-"""
+"""Closed triangle meshes in scene units with outward faces, their normals, and the solids that are built from them."""
 
 from __future__ import annotations
 
@@ -17,8 +14,7 @@ from scipy import sparse
 Albedo = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """(M, 3) positions in scene units -> (M, 3) linear RGB reflectance 0..1."""
 
-FLOOR = -0.52
-"""Height of the plate's upper side, on which everything stands."""
+FLOOR = -0.52  # height of the plate's upper side, on which everything stands
 
 _CREASE = np.cos(np.radians(24.0))
 """Faces that meet at a larger angle keep their own normals: chamfers stay hard, facets of round parts blend."""
@@ -132,10 +128,7 @@ def merge_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def corner_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
-    """(F, 3, 3) unit normals at each face's corners: the mean over faces around the vertex that turn by little.
-
-    Faces are weighted by their angle at the vertex, so that it does not matter how a flat part is cut into triangles.
-    """
+    """(F, 3, 3) unit normals at corners: the angle-weighted mean of the vertex's faces that turn by little."""
     faces, flat = mesh.faces.view(np.ndarray), mesh.face_normals.view(np.ndarray)
     corners, angles = faces.size, mesh.face_angles.view(np.ndarray).ravel()
     places = (np.arange(corners), faces.ravel())

@@ -37,8 +37,7 @@ from neuprim.scenes.shapes import build_solids
 Radiance = Callable[[Any, NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float32], NDArray[np.bool_]]]
 """(scene, origins, directions) -> what :func:`~neuprim.scenes.shading.daylight_radiance` returns."""
 
-GENERATOR_VERSION = 1
-"""Part of the cache's key: raise it with every change to shapes, light, cameras or file layout."""
+GENERATOR_VERSION = 1  # part of the cache's key: raise it with every change to shapes, light, cameras or file layout
 
 FIELD_OF_VIEW = math.radians(40.0)
 _DISTANCE = 4.0
@@ -69,11 +68,7 @@ class _View(NamedTuple):
 def generate_solids(
     settings: SolidsSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None
 ) -> Path:
-    """Write the data set unless it is complete; return its folder ``cache_dir/solids-KEY``.
-
-    Raises:
-        DataError: the cache directory cannot be written.
-    """
+    """Write the data set unless it is complete; return its folder ``cache_dir/solids-KEY``."""
     images = make_image_set("solids", settings.key(), settings, lambda: Scene(build_solids()))
     return images.generate(cache_dir, progress)
 

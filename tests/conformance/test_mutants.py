@@ -24,8 +24,7 @@ from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.core.task import SceneSpec, Supervision, TaskSpec
 from neuprim.core.train.losses import photometric
-from neuprim.tasks.static import TASK
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import TASK, SphericalHarmonics
 
 MODEL = {"neurons": 2, "sh_degree": 0, "init": {}}
 

@@ -21,8 +21,7 @@ from neuprim.core.errors import CheckpointError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
-from neuprim.tasks.static import TASK
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import TASK, SphericalHarmonics
 from tests import scenes
 
 

@@ -26,7 +26,7 @@ from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 
 SIZE = 24
 

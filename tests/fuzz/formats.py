@@ -50,7 +50,7 @@ def _reader(module: str, function: str, *arguments: Any) -> Callable[[Path], Non
     ]
 
 
-def _loader(module: str, function: str = "load") -> Callable[[Path], None]:
+def _loader(module: str, function: str) -> Callable[[Path], None]:
     """Load the folder as a scene, and look at every view."""
 
     def read(folder: Path) -> None:
@@ -184,10 +184,10 @@ def _mesh(name: str) -> tuple[Callable[[Path], Any], Callable[[Path], None]]:
             {".glb": models.write_glb, ".gltf": models.write_gltf, ".obj": models.write_obj}[path.suffix](path)
 
     def read(folder: Path) -> None:
-        from neuprim.tasks.static.mesh.generate import MeshSettings, generate
+        from neuprim.tasks.static.mesh import MeshSettings, generate_mesh_images
 
         settings = MeshSettings(path=folder / name, size=8, train_views=1, test_views=1, supersampling=1)
-        generate(settings, folder / "cache")
+        generate_mesh_images(settings, folder / "cache")
 
     return make, read
 
@@ -469,7 +469,7 @@ FORMATS: dict[str, Format] = {
         {"transforms.json": m.json_of, "points.ply": m.text_of, "mask.png": m.png},
     ),
     "multiview": Format(_multiview, _loader("neuprim.tasks.dynamic.multiview", "load_multiview"), _SPLITS, slow=True),
-    "olat": Format(_olat, _loader("neuprim.tasks.relight.olat"), _SPLITS),
+    "olat": Format(_olat, _loader("neuprim.tasks.relight.datasets", "load_olat"), _SPLITS),
     "colmap": Format(
         _colmap(False), _loader(_DATASETS, "load_colmap"), {f"sparse/0/{part}.bin": m.lies(0, 400) for part in _PARTS}
     ),

@@ -23,7 +23,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.tensors import MOST_UNITS
 from neuprim.core.render import RenderSettings, render, render_lowered
 from neuprim.core.volumes.density_grid import density_at, density_grid
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 from tests.backends import BACKENDS, FAST, SLOW_HERE, by
 

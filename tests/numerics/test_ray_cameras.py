@@ -153,7 +153,7 @@ def test_a_task_s_model_through_a_fisheye() -> None:
     """``render`` lowers view-dependent colours for such a camera as for any other."""
     from neuprim.core.model.densities.cosine import CosineDensity
     from neuprim.core.model.primitives import Primitives
-    from neuprim.tasks.static.fields import SphericalHarmonics
+    from neuprim.tasks.static import SphericalHarmonics
 
     t = ball((0.0, 0.0, -2.0), 0.5, 3.0)
     params = {k: t[k].float() for k in ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")}

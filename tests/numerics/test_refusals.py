@@ -10,7 +10,7 @@ from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render, render_lowered
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 from tests.backends import BACKENDS, by
 

@@ -16,7 +16,7 @@ import pytest
 
 from neuprim.scenes.image_set import ImageSet, draw_in_parallel
 from neuprim.scenes.lit import LitSettings
-from neuprim.scenes.room.generate import RoomSettings
+from neuprim.scenes.room import RoomSettings
 from neuprim.scenes.solids import SolidsSettings
 
 

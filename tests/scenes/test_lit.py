@@ -29,9 +29,10 @@ from neuprim.scenes.lit import (
 )
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shapes import Solid, ball, chamfered_box, parse_srgb, uniform_colour
-from neuprim.tasks.relight import evaluation, olat
+from neuprim.tasks import relight
+from neuprim.tasks.relight.datasets import load_lit_solids as load
+from neuprim.tasks.relight.datasets import load_olat, read_classes
 from neuprim.tasks.relight.lighting import lighting_of
-from neuprim.tasks.relight.lit_solids import load, read_classes
 
 GREY = "#808080"
 FLOOR = Solid("floor", chamfered_box([4, 4, 0.1], [0, 0, -0.05], 0.001), uniform_colour(GREY), 0.0)
@@ -150,7 +151,7 @@ def forty(context: SceneContext, one_scene: None) -> Dataset:
 
 def test_the_loader_of_the_layout_reads_the_same_pixels_and_lights(context: SceneContext, scene: Scene) -> None:
     dataset, folder = load(SMALL, context), generate_lit_solids(LitSettings(**SMALL), context.cache_dir)
-    plain = olat.load({"path": str(folder), "falloff": "inverse_square"}, context)
+    plain = load_olat({"path": str(folder), "falloff": "inverse_square"}, context)
     assert len(dataset.train) == 4 and [dataset.test.view(i).name for i in range(3)] == [f"{part}_00" for part in PARTS]
     for mine, theirs in ((dataset.train, plain.train), (dataset.test, plain.test)):
         for i in range(len(mine)):
@@ -176,10 +177,10 @@ def test_the_data_set_says_what_it_is(context: SceneContext) -> None:
     assert conditions["light"].shape == (3,) and 4.0 <= float(conditions["light"].norm()) <= 5.0
     assert conditions["light_intensity"].tolist() == pytest.approx([INTENSITY] * 3)
     assert all(value.dtype == torch.float32 for value in conditions.values())
-    (clip,) = evaluation.clips(dataset)
+    (clip,) = relight.relight_clips(dataset)
     assert clip.source is not None and len(clip.views) == len(clip.source) == FEW_FRAMES
     assert clip.name == "light_round" and clip.source.view(1).name == "light_01"
-    lights = torch.stack([v.conditions["light"] for v in evaluation.orbit(dataset, 5)])
+    lights = torch.stack([v.conditions["light"] for v in relight.light_orbit(dataset, 5)])
     assert len(lights.unique(dim=0)) == 5 and bool((lights[:, 2] > 2.0).all())
     assert bool((lights.norm(dim=1) >= 4.0).all() and (lights.norm(dim=1) <= 5.0).all())
 
@@ -205,7 +206,7 @@ def test_classes_agree_with_the_images(forty: Dataset) -> None:
 
 
 def test_baselines_rank_as_they_should(forty: Dataset) -> None:
-    numbers = evaluation.diagnose(forty, None)  # type: ignore[arg-type]  # nothing here depends on the model
+    numbers = relight.diagnose_lighting(forty, None)  # type: ignore[arg-type]  # nothing here depends on the model
     scores = {name: entry["psnr_linear_clamped"] for name, entry in numbers["baselines"].items()}
     assert set(scores) == {"black", "no_cast_shadows", "nearest_light_of_25"}
     assert 8 < scores["black"] < scores["no_cast_shadows"] - 3 < 30

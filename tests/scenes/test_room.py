@@ -16,7 +16,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.data.distortion import Radial, resample_image, undistortion_grid
 from neuprim.core.io.ply import read_ply
 from neuprim.core.task import SceneContext
-from neuprim.scenes.room.generate import (
+from neuprim.scenes.room import (
     LENS,
     Lens,
     RoomSettings,
@@ -28,7 +28,7 @@ from neuprim.scenes.room.generate import (
     room_camera_poses,
     room_lens,
 )
-from neuprim.scenes.room.interior import (
+from neuprim.scenes.room_interior import (
     ABOVE,
     HIGH,
     LAMP,
@@ -38,10 +38,11 @@ from neuprim.scenes.room.interior import (
     Room,
     furnish_room,
     lamplight_radiance,
+    noise,
+    speckled,
 )
-from neuprim.scenes.room.textures import noise, speckled
 from neuprim.scenes.shapes import ball, build_solids, chamfered_box, parse_srgb
-from neuprim.tasks.static.generated import load_room
+from neuprim.tasks.static.datasets import load_room
 
 SMALL = {"size": 40, "train_views": 6, "test_views": 3, "supersampling": 1, "points": 300}
 

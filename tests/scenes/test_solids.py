@@ -19,7 +19,7 @@ from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shading import DAYLIGHT, daylight_radiance
 from neuprim.scenes.shapes import Solid, ball, build_solids, chamfered_box, parse_srgb, uniform_colour
 from neuprim.scenes.solids import SolidsSettings, generate_solids
-from neuprim.tasks.static.generated import load_solids
+from neuprim.tasks.static.datasets import load_solids
 
 SMALL = {"size": 32, "train_views": 3, "test_views": 2, "supersampling": 2}
 

@@ -15,7 +15,7 @@ from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.core.volumes.points import volume_values_at
 from neuprim.search.model_quality import TrainingQuality
 from neuprim.search.pruning_cuts import cut_to_loss, price_cuts
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests.core import tiny
 
 SETTINGS = RenderSettings(threads=1)

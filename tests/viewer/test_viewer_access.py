@@ -28,8 +28,7 @@ from neuprim.core.channels import Channels
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
-from neuprim.tasks.static import TASK
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import TASK, SphericalHarmonics
 from neuprim.viewer.auth import TokenAuth, is_known_protocol, refuse_message
 from neuprim.viewer.render_queue import RenderQueue
 from neuprim.viewer.server import PageServer, is_loopback

@@ -29,7 +29,7 @@ from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.static import TASK as STATIC
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from neuprim.viewer.ellipsoids import describe_primitive, list_ellipsoids, make_ellipsoid, pick_primitive
 from neuprim.viewer.quality import QualityLadder, QualityLevel, read_front
 from neuprim.viewer.render_queue import RenderQueue

@@ -21,7 +21,7 @@ from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from neuprim.webpage import PageView
 from tests.browsers import Tab, open_tab
 from tests.page_models import LIGHT, SETTINGS, camera_at, page_of, random_model

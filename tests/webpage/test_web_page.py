@@ -17,7 +17,7 @@ from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.edge import profile
 from neuprim.tasks.relight import visibility
 from neuprim.tasks.relight.colour import LightNetwork
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from neuprim.webpage import PageView
 from neuprim.webpage.constants import shader_constants
 from neuprim.webpage.numbers import pack_model

@@ -42,12 +42,11 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
     * .usd, .usda, .usdc, .usdz (:mod:`~neuprim.core.cameras.usd`); ``FILE#/PRIM`` chooses one of several cameras;
     * a COLMAP model: its folder, one of its files, or a project (:mod:`~neuprim.core.cameras.colmap`).
 
+    Raises DataError: names the file and the field that is missing or wrong; BackendUnavailable: the package that reads
+    the format is missing.
+
     Args:
         size: (width, height) where the file names none.
-
-    Raises:
-        DataError: names the file and the field that is missing or wrong.
-        BackendUnavailable: the package that reads the format is missing.
     """
     text, hash_, prim = str(path).partition("#")
     path, prim = (Path(text), prim) if hash_ and not path.exists() else (path, "")

@@ -1,8 +1,4 @@
-"""COLMAP's sparse models, text or binary, read by its own package (the extra ``neuprim[colmap]``).
-
-Binary files are checked record by record first. COLMAP's reader accepts truncated files, and a damaged count can keep
-it busy for hours.
-"""
+"""COLMAP's sparse models, read by pycolmap. As it hangs on damaged counts, binary files are checked first."""
 
 from __future__ import annotations
 
@@ -42,12 +38,7 @@ def _kind(folder: Path) -> str | None:
 
 
 def read_colmap_model(folder: Path) -> Any:
-    """Read the ``pycolmap.Reconstruction`` in a folder.
-
-    Raises:
-        BackendUnavailable: pycolmap is not installed.
-        DataError: a file is missing or damaged.
-    """
+    """Read the ``pycolmap.Reconstruction`` in a folder; raises DataError for a missing or damaged file."""
     pycolmap = import_pycolmap()
     kind = _kind(folder)
     if kind is None:
@@ -89,11 +80,7 @@ def _parameter_count(model: int) -> int:
 
 
 def pinhole_parameters(lens: Any, where: str) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx, cy in pixels of a ``pycolmap.Camera``, ignoring distortion.
-
-    Raises:
-        DataError: a model without focal lengths.
-    """
+    """Return fx, fy, cx, cy in pixels of a ``pycolmap.Camera``, ignoring distortion."""
     # asking a panorama for its focal length ends the process, so the parameters are taken by their names
     named: dict[str, float | None] = dict(
         zip((n.strip() for n in lens.params_info.split(",")), map(float, lens.params), strict=False)
@@ -115,10 +102,7 @@ def colmap_viewmat(image: Any) -> Tensor:
 
 
 def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
-    """Return the model with most images in a project's ``sparse`` (or None) and a line for the user.
-
-    COLMAP writes one model per group of images that it cannot join.
-    """
+    """Return the model with most images in a project's ``sparse`` (or None) and a line for the user."""
     place = project / "sparse"
     models = sorted((p for p in place.glob("*") if _kind(p) is not None), key=lambda p: (len(p.name), p.name))
     if not models:
@@ -152,12 +136,7 @@ def find_colmap_model(path: Path) -> Path | None:
 
 
 def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
-    """Return (name without suffix, camera) of all posed images, by name, and lines for the user.
-
-    Raises:
-        BackendUnavailable: pycolmap is not installed.
-        DataError: as :func:`read_colmap_model`; no poses, impossible cameras, or lenses that are no pinholes.
-    """
+    """Return (name without suffix, camera) of all posed images, by name, and lines for the user."""
     reconstruction = _without_points(folder)
     images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
     if not images:
@@ -231,13 +210,7 @@ class _Bytes:
 
 
 def check_binary_model(folder: Path, parameter_count: Callable[[int], int]) -> None:
-    """Check all ``.bin`` files of a model from first to last record; ``rigs`` and ``frames`` are optional.
-
-    ``parameter_count`` maps the number of a camera model to its number of parameters, or -1.
-
-    Raises:
-        DataError: a file is unreadable, truncated, too long, or names an unknown camera model.
-    """
+    """Check all ``.bin`` files of a model record by record; ``parameter_count`` knows a camera model's, or -1."""
     records = (lambda file: _camera(file, parameter_count), _image, _point, _rig, _frame)
     for part, skip_record in zip(_PARTS, records, strict=True):
         path = folder / f"{part}.bin"

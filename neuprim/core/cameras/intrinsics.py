@@ -89,13 +89,12 @@ def read_camera(
 ) -> Camera:
     """Read the pinhole of a frame.
 
+    Raises DataError: missing or wrong fields, or fields that contradict each other or the image.
+
     Args:
         file: fields of the file, for what the frame leaves out.
         viewmat: (4, 4) world to camera, OpenCV axes; None reads ``transform_matrix`` (camera to world, OpenGL axes).
         say: receives lines for the user.
-
-    Raises:
-        DataError: missing or wrong fields, or fields that contradict each other or the image.
     """
     of_file = _Level(file, _size(file, target.size))
     of_frame = _Level(frame, _size(frame, of_file.size))
@@ -270,10 +269,7 @@ def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, flo
 
 
 def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
-    """Whether the lens is OpenCV's fisheye; raises DataError for a camera model that is neither that nor a pinhole.
-
-    ``others`` are further models that messages offer.
-    """
+    """Whether the lens is OpenCV's fisheye; refuses models that are no pinhole, offering ``others`` too."""
     record = _owner(("camera_model", "is_fisheye"), frame, file)
     model = record.text("camera_model") if record.has("camera_model") else "OPENCV"
     if model == "OPENCV_FISHEYE" or record.values.get("is_fisheye") is True:

@@ -23,10 +23,8 @@ class RayCamera:
     their centres from the camera. Images therefore differ from a pinhole's where a near plane cuts chords or where the
     two orders disagree. Only the reference backend draws these cameras; gradients reach ``viewmat`` and ``directions``.
 
-    A zero vector marks a pixel that has no ray (outside a fisheye's image circle) and shows the background.
-
-    Raises:
-        DataError: a matrix that is no rigid transform, or directions of another shape or not of unit length.
+    A zero vector marks a pixel that has no ray (outside a fisheye's image circle) and shows the background. Raises
+    DataError: a matrix that is no rigid transform, or directions of another shape or not of unit length.
     """
 
     viewmat: Tensor  # (4, 4) world to camera, OpenCV axes
@@ -62,10 +60,8 @@ class RayCamera:
         """An equidistant fisheye: the angle to the axis is proportional to the distance from the image centre.
 
         ``fov_degrees``, at most 360, spans the shorter side. Pixels towards the corners go on by the same law up to 180
-        degrees off the axis, straight backwards; beyond that they have no ray.
-
-        Raises:
-            DataError: impossible size or field of view.
+        degrees off the axis, straight backwards; beyond that they have no ray. Raises DataError: impossible size or
+        field of view.
         """
         _check_size("fisheye", width, height)
         if not 0.0 < fov_degrees <= 360.0:

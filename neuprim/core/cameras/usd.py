@@ -1,9 +1,4 @@
-"""Cameras of USD stages (.usd, .usda, .usdc, .usdz), by Pixar's library (the extra ``neuprim[usd]``).
-
-The library is C++ that was not written for files of strangers, so a process of its own reads them
-(:mod:`neuprim.core.cameras.usd_stage`), with limits of time and memory, and what it prints is checked like any other
-file.
-"""
+"""Cameras of USD stages, read by Pixar's library in a process of its own with limits of time and memory."""
 
 from __future__ import annotations
 
@@ -47,16 +42,14 @@ def is_usd(path: Path) -> bool:
 def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = None) -> CameraViews:
     """The camera of a stage, at every whole time code of its range where it moves.
 
-    Axes and units are those of the stage. The image shows the whole aperture: where its shape differs, it shows more
-    on two sides ("expandAperture" of UsdRender). Lens distortion, depth of field and exposure are not read.
+    Axes and units are those of the stage. The image shows the whole aperture: where its shape differs, it shows more on
+    two sides ("expandAperture" of UsdRender). Lens distortion, depth of field and exposure are not read. Raises
+    BackendUnavailable: the package is missing; DataError: a file that cannot be read, no or several cameras, an
+    orthographic, sheared or mirrored one, no size.
 
     Args:
         prim: path of the camera in a stage with several.
         size: (width, height) in pixels; None for that of the stage's render settings.
-
-    Raises:
-        BackendUnavailable: the package is missing.
-        DataError: a file that cannot be read, no or several cameras, an orthographic, sheared or mirrored one, no size.
     """
     if importlib.util.find_spec("pxr") is None:
         raise BackendUnavailable(f"{path}: USD files need the package usd-core: pip install 'neuprim[usd]'")

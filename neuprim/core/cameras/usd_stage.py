@@ -1,9 +1,6 @@
-"""Reads the camera of a USD stage and prints it as JSON; run as a process of its own, so that a damaged file can end no
-other.
+"""Read the camera of a USD stage and print it as JSON, in a process of its own without any import of neuprim.
 
-It imports nothing of neuprim, and Pixar's ``pxr`` alone. USD's cameras look along -z with y up, as OpenGL's, and its
-matrices multiply row vectors. Arguments: file, path of the camera's prim or nothing, and the most frames; a line on
-standard error says what is wrong.
+Arguments: file, the camera's prim or nothing, and the most frames; a line on standard error says what is wrong.
 """
 
 from __future__ import annotations

@@ -15,8 +15,7 @@ from neuprim.core.cameras.pinhole import Camera
 from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import DataError
 
-_ROTATION = 1e-6
-"""How far a matrix over its scale may be from a rotation."""
+_ROTATION = 1e-6  # how far a matrix over its scale may be from a rotation
 
 _Camera = TypeVar("_Camera", Camera, RayCamera)
 

@@ -1,8 +1,4 @@
-"""Data sets: posed images that load on demand, starting points, and points to learn from.
-
-A :class:`Dataset` only describes data. Metrics, films and headers are the task's
-(:class:`~neuprim.core.task.TaskSpec`).
-"""
+"""Data sets: posed images that load on demand, starting points, and points to learn from."""
 
 from __future__ import annotations
 
@@ -204,24 +200,18 @@ class Dataset:
             views = [replace(cameras[0], viewmat=look_at(eye, eye + d, up)) for eye, d in eyes]
         else:
             views = orbit(cameras[0], self.center, self.up, radius, elevation, frames)
-        first, values = dict(self.train.view(0).conditions), self._scalar_conditions()
-        found = []
-        for i, camera in enumerate(views):
-            share = i / max(frames - 1, 1)
-            between = {
-                name: v.min(0).values + share * (v.max(0).values - v.min(0).values) for name, v in values.items()
-            }
-            found.append(View(f"orbit_{i:03d}", camera, first | between))
-        return found
-
-    def _scalar_conditions(self) -> dict[str, Tensor]:
-        """The training values of each condition that is a single number."""
-        found: dict[str, list[Tensor]] = {}
+        scalars: dict[str, list[Tensor]] = {}
         for i in range(len(self.train)):
             for name, value in self.train.view(i).conditions.items():
                 if value.numel() == 1:
-                    found.setdefault(name, []).append(value)
-        return {name: torch.stack(values) for name, values in found.items()}
+                    scalars.setdefault(name, []).append(value)
+        ranges = {name: torch.stack(v).aminmax(dim=0) for name, v in scalars.items()}
+        found = []
+        for i, camera in enumerate(views):
+            share = i / max(frames - 1, 1)
+            between = {name: r.min + share * (r.max - r.min) for name, r in ranges.items()}
+            found.append(View(f"orbit_{i:03d}", camera, dict(self.train.view(0).conditions) | between))
+        return found
 
 
 @dataclass(frozen=True)
@@ -235,9 +225,7 @@ class PointSamples:
     source: Tensor | None  # (M, C) float32 extinction times isotropic source radiance; None trains the extinction only
     sigma_scale: float  # typical value inside matter, by which errors are divided
     source_scale: float = 1.0
-    components: Mapping[str, tuple[Tensor, float]] = field(
-        default_factory=dict
-    )  # grid -> (M,) part of sigma, and scale
+    components: Mapping[str, tuple[Tensor, float]] = field(default_factory=dict)  # grid -> (M,) part of sigma, scale
 
 
 class PointSupervision(ABC):
@@ -254,10 +242,8 @@ def hold_out_views(dataset: Dataset, every: int) -> Dataset:
     """Replace the test split by every ``every``-th training view, which is no longer trained on.
 
     The position within each group of ``every`` views advances by one from group to group. So no single moment of a
-    multi-camera sequence is missing from all cameras.
-
-    Raises:
-        ConfigError: ``every`` < 2, or fewer than two training views.
+    multi-camera sequence is missing from all cameras. Raises ConfigError: ``every`` < 2, or fewer than two training
+    views.
     """
     count = len(dataset.train)
     if every < 2 or count < 2:
@@ -269,19 +255,12 @@ def hold_out_views(dataset: Dataset, every: int) -> Dataset:
 
 
 class GroundTruth(ABC):
-    """Images of a scene that are rendered frame by frame, possibly by several processes.
+    """Images of a scene that are rendered frame by frame, possibly by several processes."""
 
-    Attributes:
-        frames: names, in order.
-        key: hash of everything the images depend on; all processes must agree on it.
-        place: folder or URL of the images.
-        known: plain values that save other processes repeated work; passed to the scene's ``truth``.
-    """
-
-    frames: Sequence[str]
-    key: str
-    place: str
-    known: Mapping[str, Any]
+    frames: Sequence[str]  # names, in order
+    key: str  # hash of everything the images depend on; all processes must agree on it
+    place: str  # folder or URL of the images
+    known: Mapping[str, Any]  # plain values that save other processes repeated work; passed to the scene's ``truth``
 
     @abstractmethod
     def missing(self) -> list[int]:
@@ -295,11 +274,10 @@ class GroundTruth(ABC):
     def make(self, frame: int, tell: Callable[[str], None]) -> None:
         """Make a frame unless it exists. Writes are atomic, so processes may overlap.
 
+        Raises DataError: the source cannot be read, or the place cannot be written.
+
         Args:
             tell: receives a line while the place is unavailable.
-
-        Raises:
-            DataError: the source cannot be read, or the place cannot be written.
         """
 
     @abstractmethod

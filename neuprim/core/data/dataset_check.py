@@ -1,7 +1,4 @@
-"""Checks that a data set keeps the promises of :class:`~neuprim.core.data.dataset.Dataset`.
-
-Shapes and dtypes are checked whenever pixels are drawn. Values are checked once, for the first view of each split.
-"""
+"""Checks that a data set keeps the promises of :class:`~neuprim.core.data.dataset.Dataset`."""
 
 from __future__ import annotations
 
@@ -28,11 +25,7 @@ class DatasetError(DataError):
 
 
 def check_dataset(dataset: Dataset, conditions: Sequence[ConditionSpec]) -> None:
-    """Check members, all views without pixels, and the pixels of the first view of both splits.
-
-    Raises:
-        DatasetError: names the member or view, what was found and what was expected.
-    """
+    """Check members, all views without pixels, and the pixels of the first view of both splits."""
     _check_members(dataset)
     for split in ("train", "test"):
         views: ViewSet = getattr(dataset, split)
@@ -42,8 +35,7 @@ def check_dataset(dataset: Dataset, conditions: Sequence[ConditionSpec]) -> None
             _check_view(views.view(i), f"{split} view {i}", conditions)
         view, pixels = views.view(0), views.pixels(0)
         check_pixels(split, view, pixels, dataset.channels)
-        for name in ("rgb", "alpha"):
-            value = getattr(pixels, name)
+        for name, value in (("rgb", pixels.rgb), ("alpha", pixels.alpha)):
             if value is not None:
                 _check_finite(value, f"{split} view {view.name}: {name}")
 
@@ -112,7 +104,7 @@ def _check_members(dataset: Dataset) -> None:
     _check_class(f"{who}: train", dataset.train, ViewSet)
     _check_class(f"{who}: test", dataset.test, ViewSet)
     if not callable(dataset.start):
-        found = _describe(dataset.start)
+        found = _describe_value(dataset.start)
         raise DatasetError(f"{who}: start is {found}; expected a function of (views, count, generator)")
     if not isinstance(channels, int) or channels < 1:
         raise DatasetError(f"{who}: channels is {channels!r}; expected a whole number, 1 or more")
@@ -126,13 +118,12 @@ def _check_members(dataset: Dataset) -> None:
     _check_floats(f"{who}: center", dataset.center, (3,))
     if dataset.bounds is not None:
         _check_floats(f"{who}: bounds", dataset.bounds, (2, 3), ", lower and upper corner, or None")
-    if dataset.points is not None:
-        _check_class(f"{who}: points", dataset.points, PointSupervision, ", or None")
     _check_positive(f"{who}: exposure", dataset.exposure)
     _check_class(f"{who}: world", dataset.world, World)
     dataset.world.validate(f"{who}: world")
-    if dataset.placement is not None:
-        _check_class(f"{who}: placement", dataset.placement, Placement, ", or None")
+    for name, kind in (("points", PointSupervision), ("placement", Placement)):
+        if getattr(dataset, name) is not None:
+            _check_class(f"{who}: {name}", getattr(dataset, name), kind, ", or None")
 
 
 def _check_view(view: View, where: str, conditions: Sequence[ConditionSpec]) -> None:
@@ -162,7 +153,7 @@ def _check_camera(camera: AnyCamera, where: str) -> None:
         return
     _check_class(f"{where}: camera", camera, Camera)
     if not isinstance(camera.viewmat, Tensor):
-        found = _describe(camera.viewmat)
+        found = _describe_value(camera.viewmat)
         raise DatasetError(f"{where}: camera: viewmat is {found}; expected a tensor (4, 4)")
     try:
         camera.validate(f"{where}: camera")
@@ -176,7 +167,7 @@ def _check_camera(camera: AnyCamera, where: str) -> None:
 def _check_class(where: str, value: object, kind: type, more: str = "") -> None:
     if not isinstance(value, kind):
         expected = f"{kind.__module__}.{kind.__qualname__}"
-        raise DatasetError(f"{where} is {_describe(value)}; expected a {expected}{more}")
+        raise DatasetError(f"{where} is {_describe_value(value)}; expected a {expected}{more}")
 
 
 def _check_positive(where: str, value: object, more: str = "") -> None:
@@ -206,10 +197,10 @@ def _check_finite(value: Tensor, where: str) -> None:
 
 def _refuse(where: str, value: Any, dtype: torch.dtype, shape: tuple[int | str, ...], more: str = "") -> None:
     expected = str(dtype).removeprefix("torch.")
-    raise DatasetError(f"{where} is {_describe(value)}; expected {expected} {shape}{more}")
+    raise DatasetError(f"{where} is {_describe_value(value)}; expected {expected} {shape}{more}")
 
 
-def _describe(value: Any) -> str:
+def _describe_value(value: Any) -> str:
     if isinstance(value, Tensor):
         return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
     kind = type(value)

@@ -1,8 +1,4 @@
-"""Lens distortion: where an undistorted pixel lies in the photograph, and resampling the photograph there.
-
-Only the forward map (undistorted direction -> photographed pixel) is needed. The undistorted view keeps focal
-lengths, principal point and size; pixels outside of the photograph are masked.
-"""
+"""Lens distortion: where an undistorted pixel lies in the photograph, and resampling the photograph there."""
 
 from __future__ import annotations
 
@@ -75,25 +71,22 @@ def undistortion_grid(camera: Camera, distortion: Distortion) -> tuple[Tensor, T
     points = np.stack(np.meshgrid(x, y), axis=-1)
     with np.errstate(over="ignore", invalid="ignore"):
         source = distortion.project(points.reshape(-1, 2), camera).reshape(points.shape)
-        valid = _unfolded(camera, source)
+        valid = _unfolded_pixels(camera, source)
         valid &= ((source >= 0.0) & (source <= (camera.width, camera.height))).all(axis=-1)
     # far-off and infinite targets are masked, but must stay finite for the sampler
     source = np.nan_to_num(source, nan=-1.0, posinf=-1.0, neginf=-1.0).clip(-1e6, 1e6)
     return torch.from_numpy(source.astype(np.float32)), torch.from_numpy(valid)
 
 
-def _unfolded(camera: Camera, source: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels joined to the one nearest the principal point by pixels where the map keeps its orientation.
-
-    Polynomial lens models turn back beyond some radius and would mirror the middle of the photograph into the corners.
-    """
+def _unfolded_pixels(camera: Camera, source: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels joined to the principal point's by pixels where the map keeps its orientation."""
+    # polynomial lens models turn back beyond some radius and would mirror the middle of the photograph into the corners
     if min(source.shape[:2]) < 2:
         return np.isfinite(source).all(axis=-1)
     dy, dx = np.gradient(source, axis=(0, 1))
     upright = dx[..., 0] * dy[..., 1] - dx[..., 1] * dy[..., 0] > 0.0
     regions, _ = ndimage.label(upright)
-    row = min(max(int(camera.cy), 0), camera.height - 1)
-    column = min(max(int(camera.cx), 0), camera.width - 1)
+    row, column = (min(max(int(c), 0), n - 1) for c, n in ((camera.cy, camera.height), (camera.cx, camera.width)))
     return (regions == regions[row, column]) & upright
 
 

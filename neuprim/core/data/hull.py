@@ -1,8 +1,4 @@
-"""The visual hull: voxels that no alpha mask rules out (Laurentini, 1994), refined coarse to fine.
-
-A voxel is tested by the pixels around its projection, counted in a summed-area table. Coarse levels use a box that
-covers the voxel, so thin parts survive until the finest grid.
-"""
+"""The visual hull: voxels that no alpha mask rules out (Laurentini, 1994), refined coarse to fine."""
 
 from __future__ import annotations
 
@@ -122,11 +118,9 @@ def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float, seen_view
     keep = _test_points(points, poses, lenses, np.cumsum(sizes) - sizes, tables, reach * grid.voxel, allowed, needed)
     cells = cells[torch.from_numpy(keep)]
     if len(cells) == 0:
-        found = "no point in front of the cameras is opaque in all views"
-        raise EmptyHull(
-            f"the visual hull of {len(silhouettes)} alpha masks is empty: {found}; "
-            "expected masks of one scene and poses that agree with them"
-        )
+        found = f"the visual hull of {len(silhouettes)} alpha masks is empty"
+        expected = "masks of one scene and poses that agree with them"
+        raise EmptyHull(f"{found}: no point in front of the cameras is opaque in all views; expected {expected}")
     full = torch.zeros_like(grid.full)
     full[tuple(cells.unbind(-1))] = True
     return _Grid(grid.corner, grid.voxel, full)
@@ -138,10 +132,9 @@ def _test_points(
 ) -> Any:
     """(M,) bool of the points that ``needed`` views look at and at most ``allowed`` of those rule out.
 
-    Args:
-        points: (M, 3). poses: (V, 3, 4) world to camera. lenses: (V, 6) fx fy cx cy width height, all float64.
-        offsets: (V,) where a view's summed-area table, (height+1, width+1), begins in ``tables``.
-        reach: half the side of the cube around a point whose projection is searched for matter.
+    ``points`` (M, 3), ``poses`` (V, 3, 4) world to camera, ``lenses`` (V, 6) fx fy cx cy width height, all float64. A
+    view's summed-area table (height+1, width+1) begins in ``tables`` at its of the (V,) ``offsets``. ``reach`` is half
+    the side of the cube around a point whose projection is searched for matter.
     """
     keep = np.zeros(len(points), dtype=np.bool_)
     for i in range(len(points)):

@@ -36,12 +36,9 @@ def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) 
 
     ``images/a/b.jpg`` has ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg`` (COLMAP, nerfstudio). Of
     ``images_4``, ``masks_4`` is tried first. ``dynamic_mask_b.png`` beside the image (instant-ngp) is inverted.
-
-    Args:
-        folder: the data set's.
-        images: folder of the images; None for the first part of their paths if it begins with "images".
+    ``images`` is the folder of the images; None takes the first part of their paths if it begins with "images".
     """
-    masks = [_mask(folder, file, images) for file in files]
+    masks = [_find_mask(folder, file, images) for file in files]
     found = [m for m in masks if m is not None]
     if found:
         what = f"what is {'not ' if found[0].inverted else ''}black there does not count"
@@ -49,7 +46,7 @@ def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) 
     return masks
 
 
-def _mask(folder: Path, file: Path, images: Path | None) -> Mask | None:
+def _find_mask(folder: Path, file: Path, images: Path | None) -> Mask | None:
     try:
         if images is None:
             first = file.relative_to(folder).parts[0]
@@ -95,7 +92,7 @@ class ImageFrame:
 
 
 @dataclass(frozen=True)
-class _Stored:
+class _StoredImage:
     """Final pixels of a view, (H, W, C) uint8, half or float, and which of them count."""
 
     data: Tensor
@@ -142,10 +139,10 @@ class ImageViews(ViewSet):
         self._to_linear = to_linear
         self.scale = 1.0  # of linear colours
         self._factor = downsample
-        self._cameras = [_reduced(f, downsample) for f in self._frames]
+        self._cameras = [_reduced_camera(f, downsample) for f in self._frames]
         self._cache_bytes = cache_bytes
         self._used = 0
-        self._stored: dict[int, _Stored] = {}
+        self._stored: dict[int, _StoredImage] = {}
         self._grids: dict[tuple[object, ...], tuple[Tensor, Tensor]] = {}
         self._lock = threading.Lock()
 
@@ -161,9 +158,9 @@ class ImageViews(ViewSet):
 
     def pixels(self, index: int) -> Pixels:
         """Read a view; raises DataError if the file is missing, damaged or changed, or its mask leaves nothing."""
-        stored = self._load(range(len(self))[index])
+        stored = self._load_image(range(len(self))[index])
         if self._to_linear:
-            return self._linear(stored)
+            return self._linear_pixels(stored)
         if stored.data.dtype == torch.uint8 and stored.data.shape[-1] == 4 and not stored.premultiplied:
             return Pixels(*_premultiplied(stored.data), stored.mask)
         data = stored.data.float()
@@ -175,7 +172,7 @@ class ImageViews(ViewSet):
         rgb = rgb.contiguous() if stored.premultiplied else rgb * alpha[..., None]
         return Pixels(rgb, alpha.contiguous(), stored.mask)
 
-    def _linear(self, stored: _Stored) -> Pixels:
+    def _linear_pixels(self, stored: _StoredImage) -> Pixels:
         rgb, alpha = stored.data[..., :3], stored.data[..., 3] if stored.data.shape[-1] == 4 else None
         rgb = _LINEAR[rgb.int()] if rgb.dtype == torch.uint8 else rgb.float()
         if alpha is not None:
@@ -186,26 +183,24 @@ class ImageViews(ViewSet):
     def preload(
         self, progress: Callable[[float], None] = lambda fraction: None, empty: bool = True
     ) -> dict[int, DataError]:
-        """Decode all images, cache what fits, and return the errors of bad ones by index.
+        """Decode all images, cache what fits, and return errors of bad ones; ``empty`` allows transparent images."""
 
-        Unless ``empty``, a fully transparent image is bad.
-        """
+        def fault(index: int) -> DataError | None:
+            try:
+                data = self._load_image(index).data
+            except DataError as error:
+                return error
+            if empty or data.shape[-1] == 3 or bool(data[..., 3].any()):
+                return None
+            return DataError(f"{self.file(index)}: image is transparent everywhere; expected something to see")
+
         faults = {}
         with ThreadPoolExecutor(4) as pool:
-            for index, fault in enumerate(pool.map(self._fault, range(len(self)), [empty] * len(self))):
-                if fault is not None:
-                    faults[index] = fault
+            for index, error in enumerate(pool.map(fault, range(len(self)))):
+                if error is not None:
+                    faults[index] = error
                 progress((index + 1) / len(self))
         return faults
-
-    def _fault(self, index: int, empty: bool) -> DataError | None:
-        try:
-            data = self._load(index).data
-        except DataError as error:
-            return error
-        if empty or data.shape[-1] == 3 or bool(data[..., 3].any()):
-            return None
-        return DataError(f"{self.file(index)}: image is transparent everywhere; expected something to see")
 
     def drop(self, indices: Container[int]) -> None:
         """Remove views; later ones move up."""
@@ -213,11 +208,11 @@ class ImageViews(ViewSet):
         self._frames, self._cameras = [self._frames[i] for i in left], [self._cameras[i] for i in left]
         self._stored = {new: self._stored[old] for new, old in enumerate(left) if old in self._stored}
 
-    def _load(self, index: int) -> _Stored:
+    def _load_image(self, index: int) -> _StoredImage:
         found = self._stored.get(index)
         if found is not None:
             return found
-        stored = self._read(self._frames[index])
+        stored = self._read_frame(self._frames[index])
         size = stored.data.nbytes + (0 if stored.mask is None else stored.mask.nbytes)
         with self._lock:
             if index not in self._stored and self._used + size <= self._cache_bytes:
@@ -225,7 +220,7 @@ class ImageViews(ViewSet):
                 self._used += size
         return stored
 
-    def _read(self, frame: ImageFrame) -> _Stored:
+    def _read_frame(self, frame: ImageFrame) -> _StoredImage:
         size = (frame.info.width, frame.info.height)
         image = read_image(frame.path, size)
         if image.shape[-1] != frame.info.channels or (image.dtype != torch.uint8) != frame.info.linear:
@@ -236,7 +231,7 @@ class ImageViews(ViewSet):
             if not bool(((alpha >= -1e-3) & (alpha <= 1.001)).all()):
                 raise DataError(f"{frame.path}: alpha reaches {alpha.float().abs().max().item():.4g}; expected 0..1")
         if frame.distortion is not None or self._factor > 1:
-            image, mask = self._process(frame, image, mask)
+            image, mask = self._resample_frame(frame, image, mask)
             premultiplied = True
         else:
             premultiplied = frame.info.linear
@@ -244,9 +239,9 @@ class ImageViews(ViewSet):
             raise DataError(f"{frame.path}: mask and lens distortion leave no pixel that counts; expected at least one")
         if image.dtype == torch.float32 and image.abs().max() <= 65504.0:
             image = image.half()
-        return _Stored(image, premultiplied, mask)
+        return _StoredImage(image, premultiplied, mask)
 
-    def _process(self, frame: ImageFrame, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    def _resample_frame(self, frame: ImageFrame, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Undistort and reduce; colours become premultiplied, the number type stays."""
         eight_bit = image.dtype == torch.uint8
         if eight_bit and self._to_linear:
@@ -260,7 +255,7 @@ class ImageViews(ViewSet):
         if eight_bit and values.shape[-1] == 4:
             values = torch.cat([values[..., :3] * (values[..., 3:] / 255.0), values[..., 3:]], dim=-1)
         if frame.distortion is not None:
-            source, valid = self._grid(frame.camera, frame.distortion)
+            source, valid = self._lens_grid(frame.camera, frame.distortion)
             values = resample_image(values, source)
             mask = valid if mask is None else valid & (resample_image(mask[..., None].float(), source)[..., 0] > 0.999)
         n = self._factor
@@ -269,7 +264,7 @@ class ImageViews(ViewSet):
             mask = None if mask is None else reduce_mask(mask, n)
         return (values.round().clamp(0.0, 255.0).to(torch.uint8) if eight_bit else values), mask
 
-    def _grid(self, camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
+    def _lens_grid(self, camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
         key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, distortion)
         with self._lock:
             if key not in self._grids:
@@ -279,7 +274,7 @@ class ImageViews(ViewSet):
             return self._grids[key]
 
 
-def _reduced(frame: ImageFrame, factor: int) -> Camera:
+def _reduced_camera(frame: ImageFrame, factor: int) -> Camera:
     camera = frame.camera
     if min(camera.width, camera.height) < factor:
         found = f"{frame.path} has only {camera.width}x{camera.height} pixels"

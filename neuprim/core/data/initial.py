@@ -16,9 +16,7 @@ from neuprim.core.data.ray_points import count_seeing_views, ray_points
 from neuprim.core.data.scene_frame import focus_point, optical_axes_meet
 from neuprim.core.errors import ConfigError
 
-_FPS_WORK = (
-    5e8  # distances that exact farthest-point sampling may evaluate (about 1.5 s); above, a grid thins the points
-)
+_FPS_WORK = 5e8  # distances that exact farthest-point sampling may evaluate (1.5 s); above, a grid thins the points
 _COLOR_VIEWS = 100
 _CHUNK = 20_000
 _ROUNDS = 8  # times that a box is filled, for points that cameras see
@@ -28,12 +26,9 @@ def initial_points(views: ViewSet, points: PointCloud | None, count: int, genera
     """Return at most ``count`` distinct starting points of a static scene.
 
     Given points win. Cameras that do not look at one point start along their rays
-    (:func:`~neuprim.core.data.ray_points.ray_points`). Otherwise data with alpha use the surface of the visual
-    hull, and data without use a box around the focus. Inferred points are seen by at least two cameras.
-
-    Raises:
-        ConfigError: ``count`` is not positive.
-        DataError: the alpha masks have no common volume, or an image is damaged.
+    (:func:`~neuprim.core.data.ray_points.ray_points`). Otherwise data with alpha use the surface of the visual hull,
+    and data without use a box around the focus. Inferred points are seen by at least two cameras. Raises ConfigError:
+    ``count`` is not positive; DataError: the alpha masks have no common volume, or an image is damaged.
     """
     check_point_count(count)
     if points is not None:
@@ -53,11 +48,8 @@ def check_point_count(count: int) -> None:
 
 def views_have_alpha(views: ViewSet) -> bool:
     """Whether one of the first eight views is transparent somewhere."""
-    for index in range(min(len(views), 8)):
-        alpha = views.pixels(index).alpha
-        if alpha is not None and bool((alpha < 0.5).any()):
-            return True
-    return False
+    alphas = (views.pixels(i).alpha for i in range(min(len(views), 8)))
+    return any(alpha is not None and bool((alpha < 0.5).any()) for alpha in alphas)
 
 
 def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
@@ -69,25 +61,16 @@ def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> P
 
 
 def hull_points(views: ViewSet, count: int, generator: torch.Generator, resolution: int = 128) -> PointCloud:
-    """Spread ``count`` points over the surface of the visual hull, with sub-voxel jitter and pixel colours.
-
-    ``resolution`` is in voxels along the hull's longest side. Raises DataError if the masks have no common volume.
-    """
+    """Spread ``count`` points over the visual hull's surface, with sub-voxel jitter and pixel colours."""
     centers, voxel = hull_surface(views, resolution)
-    if count <= len(centers):
-        rows = farthest_points(centers, count, generator)
-    else:
-        rows = torch.arange(count) % len(centers)
-    jitter = torch.rand((len(rows), 3), generator=generator) - 0.5
-    means = centers[rows] + jitter * voxel
+    spread = count <= len(centers)
+    rows = farthest_points(centers, count, generator) if spread else torch.arange(count) % len(centers)
+    means = centers[rows] + (torch.rand((len(rows), 3), generator=generator) - 0.5) * voxel
     return drop_repeated_points(PointCloud(means, median_colors(views, means)))
 
 
 def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
-    """Draw at most ``count`` points uniformly in a cube around the focus, with pixel colours.
-
-    Its half side is half the median camera distance. Each point is seen by two cameras, or by the only one.
-    """
+    """Draw points in a cube around the focus, half the median camera distance to a side, seen by two cameras."""
     cameras = [views.view(i).camera for i in range(len(views))]
     center = focus_point(cameras)
     half = 0.5 * torch.stack([c.position for c in cameras]).sub(center).norm(dim=-1).median()
@@ -116,10 +99,7 @@ def _distinct_rows(points: PointCloud) -> Tensor:
 
 
 def farthest_points(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Choose (count,) int64 rows of ``points`` (M, 3), M >= count, far from each other.
-
-    Exact farthest-point sampling while that is fast; for large sets one point per grid cell, then random ones.
-    """
+    """Choose (count,) rows of ``points`` (M, 3) far from each other; approximately for large sets."""
     if count * len(points) > _FPS_WORK:
         return _thinned(points, count, generator)
     start = int(torch.randint(len(points), (1,), generator=generator))

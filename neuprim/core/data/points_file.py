@@ -40,10 +40,8 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     view-dependent colour too. Colours get the data set's ``channels`` and ``color_space`` ("srgb" or "linear").
 
     A vertex that stands for no point is left out, and all such are counted in one warning: a NaN among what is read, a
-    size or rotation that is none, a place far from all others.
-
-    Raises:
-        DataError: a damaged or compressed file, or one without usable points.
+    size or rotation that is none, a place far from all others. Raises DataError: a damaged or compressed file, or one
+    without usable points.
     """
     if path.suffix.lower() in COMPRESSED:
         raise _compressed(path, f"{path.suffix} is a compressed format of Gaussians")

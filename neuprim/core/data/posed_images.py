@@ -71,11 +71,7 @@ _T = TypeVar("_T")
 
 
 class BadViews:
-    """Collects damaged views: unreadable images, impossible poses, masks that leave nothing.
-
-    A few are left out with a warning each; if ``strict``, the first is raised. ``where`` names a file or folder in
-    messages. Contradictory keys are not damage, and are refused elsewhere.
-    """
+    """Collects damaged views, which are left out with a warning each; if ``strict``, the first is raised."""
 
     def __init__(self, where: str, strict: bool) -> None:
         self._where, self._strict = where, strict
@@ -217,9 +213,8 @@ def assemble_dataset(
 ) -> Dataset:
     """Make a data set of two splits of image files; errors name the file or folder ``where``.
 
-    Raises:
-        DataError: an empty split, mixed kinds of images, most images damaged, or any with ``settings.strict``.
-        ConfigError: a random background without alpha, or a down-sampling factor larger than an image.
+    Raises DataError: an empty split, mixed kinds of images, most images damaged, or any with ``settings.strict``;
+    ConfigError: a random background without alpha, or a down-sampling factor larger than an image.
     """
     _check_splits(where, train, test, settings)
     both = [*train, *test]

@@ -37,13 +37,10 @@ def ray_points(
 ) -> tuple[PointCloud, Tensor]:
     """Place at most ``count`` points on rays through random pixels, uniform in 1/z, with pixel colours.
 
-    Depths range over those at which other views show the same colours. If no depth fits better than infinity,
-    the cameras count as one and the depth unit is arbitrary. Points must be seen by two cameras, unless the
-    cameras count as one. A pixel shows matter where alpha is above ``matter``. Returned are the points, and the (N,)
-    views that they come from.
-
-    Raises:
-        DataError: no two cameras see the same place, or no pixel shows matter.
+    Depths range over those at which other views show the same colours. If no depth fits better than infinity, the
+    cameras count as one and the depth unit is arbitrary. Points must be seen by two cameras, unless the cameras count
+    as one. A pixel shows matter where alpha is above ``matter``. Returned are the points, and the (N,) views that they
+    come from. Raises DataError: no two cameras see the same place, or no pixel shows matter.
     """
     depths, mean, needed = _fitting(views, generator, matter)
     found: list[tuple[Tensor, Tensor, Tensor]] = []

@@ -14,10 +14,7 @@ from neuprim.core.notices import warn_once
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """Radius of the bounding sphere of the cameras about their mean, times 1.1 (3D Gaussian splatting).
-
-    1.0 if it is zero. Outliers (:func:`find_outliers`) are ignored.
-    """
+    """Radius of the cameras' bounding sphere about their mean without outliers, times 1.1; 1.0 if zero."""
     positions = torch.stack([c.position.detach().double() for c in cameras])
     positions = positions[~find_outliers(positions)]
     radius = (positions - positions.mean(0)).norm(dim=-1).max().item() * 1.1
@@ -29,20 +26,14 @@ _OUTLYING_SHARE = 0.05
 
 
 def find_outliers(positions: Tensor) -> Tensor:
-    """Mark (N,) camera centres of (N, 3) that are mistakes of a reconstruction.
-
-    These are at most one, or 5 %, farther from the median centre than 100 times the median distance.
-    """
+    """Mark at most one or 5 % of (N, 3) camera centres that lie beyond 100 median distances from the median."""
     distance = (positions - positions.median(0).values).norm(dim=-1)
     far = (distance > _OUTLYING * distance.median()) & (distance.median() > 0)
     return far if int(far.sum()) <= max(1, _OUTLYING_SHARE * len(far)) else torch.zeros_like(far)
 
 
 def focus_point(cameras: Sequence[Camera]) -> Tensor:
-    """Return the (3,) float64 point nearest to all optical axes (least squares), scene units.
-
-    A weak pull towards one extent in front of the mean camera resolves (nearly) parallel axes.
-    """
+    """(3,) float64 point nearest to all optical axes (least squares), pulled weakly to one extent in front."""
     positions, forward = _axes(cameras)
     eye = torch.eye(3, dtype=torch.float64)
     planes = eye - forward[:, :, None] * forward[:, None, :]

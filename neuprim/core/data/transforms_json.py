@@ -72,14 +72,13 @@ def read_transforms_frames(
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
     """Read the good frames whose images exist, with their records, in the order of ``records``.
 
+    Raises DataError: missing images or masks, wrong, missing, contradictory or unsupported fields, most views bad, or
+    any bad view with ``settings.strict``.
+
     Args:
         folder: root of the paths of images and masks.
         document: the whole file, which provides what frames leave out.
         skip_missing: leave frames without an image out, unless that leaves none.
-
-    Raises:
-        DataError: missing images or masks, wrong, missing, contradictory or unsupported fields, most views bad, or
-            any bad view with ``settings.strict``.
     """
     for record in (document, *records):
         refuse_unsupported_keys(record)
@@ -170,11 +169,7 @@ def _distortion(record: JsonReader, document: JsonReader, fisheye: bool) -> Dist
 def read_transforms_splits(
     folder: Path, train: str, test: str, hold_out: int, read: Callable[[str], list[ImageFrame]]
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """Read (training, test) frames of ``transforms_SPLIT.json`` files.
-
-    With ``hold_out`` every so many training views are the test split; raises ConfigError if there is nothing to hold
-    out.
-    """
+    """Read (training, test) frames of ``transforms_SPLIT.json``; ``hold_out`` tests every so many views."""
     frames = read(train)
     if hold_out:
         if len(frames) < 2:
@@ -197,10 +192,8 @@ def split_named_frames(
     """Split frames into (training, test) by the lists of names in the file, else every n-th is a test view.
 
     Test views are those of ``test_filenames``, else of ``val_filenames``, else all that do not train. Training views
-    are those of ``train_filenames``, else all that no list names. Validation views never train.
-
-    Raises:
-        DataError: a list names an unknown image, or training and test lists overlap.
+    are those of ``train_filenames``, else all that no list names. Validation views never train. Raises DataError: a
+    list names an unknown image, or training and test lists overlap.
     """
     keys = [key for key in ("train_filenames", "val_filenames", "test_filenames") if document.has(key)]
     lists = {key: set(map(_plain, document.texts(key))) for key in keys}

@@ -1,18 +1,34 @@
-"""The relighting task: images under one point light each in, a model that takes any light out."""
+"""The relighting task: images under one point light each in, a model that takes any light out.
+
+Images are linear light over the exposure, in which 1 is as bright as a display shows. Scores clamp them to 0..1 first,
+as one highlight of 20 would dominate an image's error. "linear_clamped" compares these values, "display" their sRGB
+values. FLIP is measured where its package is installed (``neuprim[flip]``).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
-from neuprim.core.data import Dataset
-from neuprim.core.errors import ConfigError
+import torch
+from torch import Tensor
+
+from neuprim.core.data import Clip, Dataset, View
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.images import linear_to_srgb
+from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
+from neuprim.core.metrics import means as mean_metrics
+from neuprim.core.metrics import psnr, ssim
+from neuprim.core.metrics.flip import flip, flip_available
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
 from neuprim.core.validation import validate_choices
-from neuprim.tasks.relight import evaluation
+from neuprim.scenes import PIXEL_CLASSES
 from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightHarmonics, LightNetwork
 from neuprim.tasks.relight.lighting import (
     illuminate,
@@ -20,6 +36,7 @@ from neuprim.tasks.relight.lighting import (
     orbit_in_frames,
     parse_intensities,
     parse_lights,
+    summarize_lights,
     typical_light,
 )
 
@@ -65,19 +82,156 @@ def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, Co
     return density, _colour(model, falloff, typical_light(dataset, falloff))
 
 
-# Loaders are imported when used: each pulls in modules of its own.
+def _load(function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """Import the loaders when one is used and call it."""
+    from neuprim.tasks.relight import datasets
+
+    loader: Callable[..., Dataset] = getattr(datasets, function)
+    return loader(settings, context)
 
 
-def _lit_solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.relight.lit_solids import load
-
-    return load(settings, context)
+_MIN_ALPHA = 1.0 / 255.0  # of a pixel that shows matter
 
 
-def _olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    from neuprim.tasks.relight.olat import load
+def matter_mask(dataset: Dataset, index: int) -> Tensor | None:
+    """Pixels of a test view that show matter; None for images without alpha."""
+    alpha = dataset.test.pixels(index).alpha
+    return None if alpha is None else alpha > _MIN_ALPHA
 
-    return load(settings, context)
+
+def relight_metrics(
+    dataset: Dataset, index: int, rendered: Tensor, truth: Tensor, structure: bool = True
+) -> dict[str, float]:
+    """:func:`relight_scores`, with errors per pixel class and the PSNR of its part where the dataset has them."""
+    known, result = lighting_of(dataset), relight_scores(rendered, truth, structure)
+    part = next((p for p in known.parts if dataset.test.view(index).name.startswith(p)), None)
+    if part is not None:
+        result[f"psnr_linear_clamped_{part}"] = result["psnr_linear_clamped"]
+    return result if known.classes is None else result | pixel_class_errors(rendered, truth, known.classes(index))
+
+
+def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
+    """Exposure, falloff, scores of images without a model, and pixel classes in percent of the pixels with matter."""
+    known = lighting_of(dataset)
+    result: dict[str, Any] = {"exposure": dataset.exposure, "falloff": known.falloff}
+    result["baselines"] = baseline_scores(dataset)
+    if not flip_available():
+        result["flip_missing"] = "pip install 'neuprim[flip]'"
+    if known.classes is not None:
+        result["class_percent"] = pixel_class_shares([known.classes(i) for i in range(len(dataset.test))])
+    return result
+
+
+def baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
+    """Mean scores over the test views of images without a model, by name; without SSIM and FLIP, which are slow."""
+
+    def mean_of(guess: Callable[[int], Tensor] | None) -> dict[str, Any]:
+        entries = []
+        for i in range(len(dataset.test)):
+            truth = dataset.test.pixels(i).over(dataset.background)
+            image = torch.zeros_like(truth) if guess is None else guess(i)
+            entries.append(relight_metrics(dataset, i, image, truth, structure=False))
+        return mean_metrics(entries)
+
+    return {"black": mean_of(None)} | {name: mean_of(guess) for name, guess in lighting_of(dataset).baselines.items()}
+
+
+def relight_clips(dataset: Dataset) -> Sequence[Clip]:
+    """The dataset's films."""
+    return lighting_of(dataset).clips
+
+
+def light_facts(dataset: Dataset) -> dict[str, Any]:
+    """Summary of the training lights for the model's header."""
+    lights = torch.stack([dataset.train.view(i).conditions["light"] for i in range(len(dataset.train))])
+    return {"lights": summarize_lights(lights, dataset.center, lighting_of(dataset).falloff, dataset.exposure)}
+
+
+def light_orbit(dataset: Dataset, frames: int) -> list[View]:
+    """Views that circle the scene while the light circles it the other way at its mean distance and height."""
+    training = [dataset.train.view(i).conditions for i in range(len(dataset.train))]
+    up, center = dataset.up.double() / dataset.up.double().norm(), dataset.center.double()
+    offsets = torch.stack([c["light"] for c in training]).double() - center
+    radius, sine = offsets.norm(dim=-1).mean(), ((offsets @ up) / offsets.norm(dim=-1).clamp_min(1e-30)).mean()
+    side = torch.linalg.cross(up, torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())])
+    side = side / side.norm()
+    other = torch.linalg.cross(up, side)
+    intensity = torch.stack([c["light_intensity"] for c in training]).mean(0)
+    views = []
+    for i, view in enumerate(dataset.orbit(frames)):
+        turn = -2.0 * math.pi * i / frames
+        across = math.cos(turn) * side + math.sin(turn) * other
+        light = center + radius * (sine * up + (1.0 - sine * sine).clamp_min(0.0).sqrt() * across)
+        views.append(View(view.name, view.camera, {"light": light.float(), "light_intensity": intensity}))
+    return views
+
+
+# ---------------------------------------------------------------- scores
+
+
+def relight_scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> dict[str, float]:
+    """PSNR of linear light clamped to 0..1 and of display values, with ``structure`` also SSIM and FLIP."""
+    first, second = rendered.clamp(0.0, 1.0), truth.clamp(0.0, 1.0)
+    result = {"psnr_linear_clamped": psnr(first, second)}
+    first, second = linear_to_srgb(first), linear_to_srgb(second)
+    result["psnr_display"] = psnr(first, second)
+    if structure:
+        result["ssim_display"] = ssim(first, second)
+        if flip_available():
+            result["flip"] = flip(first, second)
+    return result
+
+
+def pixel_class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, float]:
+    """Errors and pixel counts of every class that the (H, W) map ``classes`` has; raises DataError for others."""
+    if classes.shape != truth.shape[:2] or int(classes.max()) >= len(PIXEL_CLASSES):
+        raise DataError(
+            f"pixel classes: found {tuple(classes.shape)} with values up to {int(classes.max())}; "
+            f"expected {tuple(truth.shape[:2])} with values below {len(PIXEL_CLASSES)}"
+        )
+    squares = (rendered.clamp(0.0, 1.0) - truth.clamp(0.0, 1.0)).double().square().mean(-1)
+    result: dict[str, float] = {}
+    for value, name in enumerate(PIXEL_CLASSES):
+        inside = classes == value
+        if bool(inside.any()):
+            result |= {f"mse_{name}": float(squares[inside].mean()), f"pixels_{name}": float(inside.sum())}
+    return result
+
+
+def pixel_class_shares(maps: list[Tensor]) -> dict[str, float]:
+    """Share of each class, in percent of the pixels that are not background."""
+    counts = torch.stack([torch.bincount(m.reshape(-1).long(), minlength=len(PIXEL_CLASSES)) for m in maps]).sum(0)
+    whole = max(float(counts[1:].sum()), 1.0)
+    return {name: 100.0 * float(counts[i]) / whole for i, name in enumerate(PIXEL_CLASSES) if i}
+
+
+# ---------------------------------------------------------------- layers
+
+
+def unshadowed_layer(frame: LayerFrame) -> Tensor | None:
+    """(H, W, C) the frame without shadows; None for colours without shadows."""
+    return None if frame.shading is None else frame.unshaded
+
+
+def visibility_layer(frame: LayerFrame) -> Tensor | None:
+    """(H, W) mean visibility of the light; None for colours without shadows."""
+    return None if frame.shading is None else frame.shading.clamp(0.0, 1.0)  # rounding may exceed 1
+
+
+LAYERS = (
+    LayerSpec(
+        "unshadowed",
+        "the image as if the light arrived everywhere, linear light, premultiplied by alpha",
+        unshadowed_layer,
+    ),
+    LayerSpec(
+        "visibility",
+        "how much of the light arrives, 0 to 1: the mean over what the pixel shows, "
+        "weighted by its part in the pixel; 0 where alpha is 0",
+        visibility_layer,
+        ("Y",),
+    ),
+)
 
 
 TASK = TaskSpec(
@@ -87,9 +241,15 @@ TASK = TaskSpec(
     config_package="neuprim.tasks.relight.conf",
     scenes=(
         SceneSpec(
-            "lit_solids", "built in: solids and a glossy ring under moving point lights, with shadows", _lit_solids
+            "lit_solids",
+            "built in: solids and a glossy ring under moving point lights, with shadows",
+            partial(_load, "load_lit_solids"),
         ),
-        SceneSpec("olat", "GS3 / NRHints layout: a light position per image, PNG or EXR: scene.path=DIR", _olat),
+        SceneSpec(
+            "olat",
+            "GS3 / NRHints layout: a light position per image, PNG or EXR: scene.path=DIR",
+            partial(_load, "load_olat"),
+        ),
     ),
     build=_build,
     loss=l1,
@@ -111,11 +271,11 @@ TASK = TaskSpec(
     fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},
     environment=illuminate,
     uses=("model.neurons",),
-    mask=evaluation.mask,
-    metrics=evaluation.metrics,
-    diagnose=evaluation.diagnose,
-    clips=evaluation.clips,
-    facts=evaluation.facts,
-    orbit=evaluation.orbit,
-    layers=evaluation.LAYERS,
+    mask=matter_mask,
+    metrics=relight_metrics,
+    diagnose=diagnose_lighting,
+    clips=relight_clips,
+    facts=light_facts,
+    orbit=light_orbit,
+    layers=LAYERS,
 )

@@ -35,8 +35,7 @@ FORMS = ("additive", "multiplicative")
 VISIBILITY = ("none", "primitive", "pixel")
 """Where the light's depth images are read: nowhere, at centres of primitives, or at the point that a pixel shows."""
 
-_DARKEST = 1e-3
-"""Smallest initial colour: at zero and below, max(0, .) passes no gradient and black stays black."""
+_DARKEST = 1e-3  # smallest initial colour: at zero and below, max(0, .) passes no gradient and black stays black
 
 
 def _require_count(value: object, low: int, high: float, name: str) -> None:
@@ -217,10 +216,7 @@ def prune_hidden_units(
 
 
 class LightHarmonics(ColourField):
-    """c = E max(0, SH(direction mu -> light)): the baseline for equation 14, without view dependence or shadows.
-
-    C (degree + 1)^2 parameters; degree 5 has as many as the network of 8 units.
-    """
+    """c = E max(0, SH(direction mu -> light)): a baseline without view dependence and shadows."""
 
     def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False, typical: float = 1.0) -> None:
         _require_count(degree, 0, 8, "spherical-harmonics degree")
@@ -299,10 +295,7 @@ _MIN_LIGHT_DISTANCE = 1e-4  # in units of a primitive's size; a nearer light doe
 
 
 def normalize_direction(vector: Tensor, size: Tensor | float = 1.0) -> Tensor:
-    """(..., 3) unit vectors; vectors shorter than 1e-6 of ``size`` (..., 1) are scaled by 1e6/size.
-
-    So zero stays zero, and no square leaves float32's range.
-    """
+    """(..., 3) unit vectors; those shorter than 1e-6 of ``size`` (..., 1) are scaled by 1e6/size."""
     scaled = vector / vector.detach().abs().amax(-1, keepdim=True).clamp_min(_MIN_LENGTH * size)
     return scaled / scaled.norm(dim=-1, keepdim=True).clamp_min(1.0)
 

@@ -1,7 +1,6 @@
 """Lights of datasets, of the command line, and of environments.
 
-Every view has two conditions: "light", (3,) float32, the point light's position in scene units, and "light_intensity",
-(3,) float32, its radiant intensity per colour as the files give it, else 1. Images are linear light over the exposure.
+Every view has two conditions: "light" (3,), the position in scene units, and "light_intensity" (3,), radiant.
 """
 
 from __future__ import annotations
@@ -26,12 +25,8 @@ if TYPE_CHECKING:
 
 Falloff = Literal["none", "inverse_square"]
 
-EXPOSURE_PERCENTILE = 99.5
-"""An automatic exposure lets this percentile of the training images' values be 1."""
-
-MAX_LIGHT_ANGLE = 15.0
-"""Degrees from every training light beyond which a direction counts as unseen."""
-
+EXPOSURE_PERCENTILE = 99.5  # an automatic exposure lets this percentile of the training images' values be 1
+MAX_LIGHT_ANGLE = 15.0  # degrees from every training light beyond which a direction counts as unseen
 _ORBIT = (4.5, 40.0, 60)  # distance in scene units, polar angle in degrees, frames
 _MAX_DIRECTIONS = 256  # of training lights in a model's header
 
@@ -59,22 +54,12 @@ class Lighting:
 
 
 def lighting_of(dataset: Dataset) -> Lighting:
-    """The dataset's facts about its light, or the defaults.
-
-    Raises:
-        DatasetFault: its ``extra`` is something else.
-    """
+    """The dataset's facts about its light, or the defaults. Raises DatasetFault: its ``extra`` is something else."""
     return get_extra(dataset, Lighting) or Lighting()
 
 
 def percentile_exposure(views: ImageViews, where: str) -> float:
-    """The percentile :data:`EXPOSURE_PERCENTILE` of all premultiplied colour values of some views, before scaling.
-
-    Values are rounded to half precision and clamped at zero; one image is in memory at a time.
-
-    Raises:
-        DataError: it is zero, so almost everything is black; ``where`` names the data.
-    """
+    """The 99.5th percentile of all premultiplied values, in half precision; raises DataError if it is zero."""
     # counts per bit pattern, as patterns of non-negative half floats ascend with their values
     counts = torch.zeros(1 << 15, dtype=torch.int64)
     for i in range(len(views)):
@@ -93,8 +78,7 @@ def percentile_exposure(views: ImageViews, where: str) -> float:
 
 
 def typical_light(dataset: Dataset, falloff: bool) -> float:
-    """Median over the training views of the light's mean intensity, with ``falloff`` over its squared distance; 1 if
-    that is zero, as for a dataset in the dark."""
+    """Median over training views of the intensity, with ``falloff`` over the squared distance; 1 in the dark."""
     values = []
     for i in range(len(dataset.train)):
         conditions = dataset.train.view(i).conditions
@@ -108,14 +92,7 @@ def typical_light(dataset: Dataset, falloff: bool) -> float:
 
 
 def parse_lights(text: str, world: World | None = None) -> list[Tensor]:
-    """Parse ``--light``: positions (3,) float32 in scene units.
-
-    "x,y,z" is one, in the coordinates of the data's files; "orbit", or "orbit:DISTANCE:POLAR:FRAMES", circles the
-    scene's z axis.
-
-    Raises:
-        ConfigError: another form, or numbers that are not finite.
-    """
+    """Parse ``--light``: (3,) scene positions of "x,y,z" in world units, or "orbit[:DISTANCE:POLAR:FRAMES]" about z."""
     expected = "expected x,y,z or orbit or orbit:DISTANCE:POLAR_DEGREES:FRAMES"
     kind, *parts = text.split(":")
     if kind != "orbit":
@@ -141,11 +118,7 @@ def orbit_in_frames(text: str, count: int) -> str | None:
 
 
 def parse_intensities(text: str) -> list[Tensor]:
-    """Parse ``--light-intensity``: (3,) float32 from "r,g,b" or one number.
-
-    Raises:
-        ConfigError: another form, or numbers that are negative or not finite.
-    """
+    """Parse ``--light-intensity``: (3,) float32 from "r,g,b" or one number, 0 or more."""
     expected = "expected r,g,b or one number, 0 or more"
     found = _numbers(f"{text},{text},{text}" if "," not in text else text, "light-intensity", expected).float()
     if bool((found < 0).any()):
@@ -167,11 +140,7 @@ def _numbers(text: str, name: str, expected: str) -> Tensor:
 
 
 def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: float) -> dict[str, Any]:
-    """Summarise the training lights (L, 3) for a model's header.
-
-    Gives the mean ``distance`` from the scene's centre, at most 256 ``directions`` by farthest-point sampling,
-    ``falloff`` and ``exposure``.
-    """
+    """Summarise lights (L, 3) for a model's header: mean distance, at most 256 directions, farthest-point sampled."""
     offsets = lights.double() - center.double()
     distance = offsets.norm(dim=-1)
     units = offsets / distance.clamp_min(1e-30)[:, None]
@@ -200,12 +169,10 @@ def illuminate(environment: Environment, count: int, facts: Mapping[str, Any]) -
 
     In both, a uniform environment of radiance 1 gives an unshaded white matt surface the value 1. Light from a finite
     distance is not parallel: away from the centre it differs from that of a distant environment by about 2 offset/r.
+    Raises DataError: facts that are missing or damaged.
 
     Args:
         facts: of the dataset, from the model's header.
-
-    Raises:
-        DataError: facts that are missing or damaged.
     """
     data = JsonReader(dict(facts), "the model's header: data")
     center, up = (data.array(name, (3,), "3 numbers") for name in ("center", "up"))

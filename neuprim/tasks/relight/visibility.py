@@ -30,9 +30,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.slabs import render_slabs
 
-SIZE = 192
-"""Pixels of the depth images, square."""
-
+SIZE = 192  # pixels of the depth images, square
 LAYERS = 4  # of equal depth; more of them separate depths better and take longer
 
 BIAS, SOFTNESS = 1 / 20, 1 / 20
@@ -117,13 +115,7 @@ def sample_visibility(
 
 @exact_kernel
 def _sample_kernel(start, stop, points, view, near, focal, alphas, depths, bias, softness, found):  # type: ignore[no-untyped-def]
-    """Visibility of points start:stop.
-
-    Args:
-        points: (M, 3) float64. view: (3, 4) world to light camera, whose principal point is the middle of the images.
-        alphas, depths: (slabs, S, S) float32 opacity and mean depth.
-        bias, softness: scene units. found: (M,) float32, filled.
-    """
+    """Visibility of the points start:stop, as :func:`sample_visibility`, into ``found``."""
     size = alphas.shape[1]
     for p in range(start, stop):
         x = view[0, 0] * points[p, 0] + view[0, 1] * points[p, 1] + view[0, 2] * points[p, 2] + view[0, 3]

@@ -1,9 +1,9 @@
-"""Load data sets of posed images: NeRF-synthetic ("blender"), nerfstudio and COLMAP folders."""
+"""Load data sets of posed images: NeRF-synthetic ("blender"), nerfstudio and COLMAP folders, and generated scenes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -54,6 +54,8 @@ from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.notices import warn_once
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import nonempty_text, validate
+from neuprim.scenes.room import RoomSettings, generate_room
+from neuprim.scenes.solids import SolidsSettings, generate_solids
 
 
 @dataclass(frozen=True)
@@ -71,10 +73,7 @@ class BlenderSettings(FolderSettings):
 
 
 def load_blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load a NeRF-synthetic folder; straight-alpha PNG is premultiplied in its stored sRGB values.
-
-    Raises ConfigError for settings, and DataError for missing or damaged files, wrong fields or mixed image sizes.
-    """
+    """Load a NeRF-synthetic folder; straight-alpha PNG is premultiplied in its stored sRGB values."""
     asked = validate(BlenderSettings, settings, "scene")
     folder = find_data_folder(asked.path)
 
@@ -97,22 +96,14 @@ def load_blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
 @dataclass(frozen=True)
 class NerfstudioSettings(FolderSettings):
-    """Settings of ``scene=nerfstudio``.
+    """Settings of ``scene=nerfstudio``."""
 
-    Attributes:
-        skip_missing: leave out frames whose image is missing; otherwise they are an error.
-        test_every: every n-th frame by name is a test view, where the file has no lists of names.
-    """
-
-    skip_missing: bool = False
-    test_every: EveryNth = 8
+    skip_missing: bool = False  # leave out frames whose image is missing; otherwise they are an error
+    test_every: EveryNth = 8  # every n-th frame by name is a test view, where the file has no lists of names
 
 
 def load_nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load a nerfstudio or instant-ngp capture; photographs are undistorted and masked.
-
-    Raises ConfigError for settings, and DataError for missing or damaged files, wrong fields or empty splits.
-    """
+    """Load a nerfstudio or instant-ngp capture; photographs are undistorted and masked."""
     asked = validate(NerfstudioSettings, settings, "scene")
     folder = find_data_folder(asked.path)
     path = folder / "transforms.json"
@@ -148,13 +139,7 @@ class ColmapSettings(FolderSettings):
 
 
 def load_colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load a COLMAP project; its 3-D points are the starting points.
-
-    Distorted models become pinholes of the same focal lengths. Pixels that a photograph does not show are masked.
-
-    Raises ConfigError for settings, BackendUnavailable without pycolmap, and DataError for missing or damaged files,
-    impossible cameras, image sizes that are no reduction of the model's, no posed images or empty splits.
-    """
+    """Load a COLMAP project with its points; photographs are undistorted, and what they do not show is masked."""
     asked = validate(ColmapSettings, settings, "scene")
     folder = find_data_folder(asked.path)
     model = folder / asked.model
@@ -265,3 +250,16 @@ def _read_colmap_points(reconstruction: Any, model: Path) -> PointCloud | None:
         found = f"{int((~keep).sum())} of {len(points)} points are not finite"
         raise DataError(f"{model}: points3D: {found}; expected finite coordinates")
     return PointCloud(torch.from_numpy(means), torch.from_numpy(colors).float())
+
+
+def load_solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """Load ``scene=solids``: drawn on first use, read from ``context.cache_dir`` afterwards."""
+    folder = generate_solids(validate(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
+    return replace(load_blender({"path": str(folder)}, context), name="solids", data_source="generated")
+
+
+def load_room(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """Load ``scene=room``: drawn on first use, read from ``context.cache_dir`` afterwards."""
+    folder = generate_room(validate(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
+    dataset = load_nerfstudio({"path": str(folder)}, context)
+    return replace(dataset, name="room", data_source="generated", up=torch.tensor([0.0, 0.0, 1.0]))

@@ -98,8 +98,7 @@ def test_contradictions_are_refused(frame: Any, file: Any, words: str) -> None:
 
 
 def test_the_sensors_angles_of_blender_give_way_to_lengths_in_pixels() -> None:
-    """BlenderNeRF writes angle_x of the longer side of the image, and angle_y of a sensor that the image does not
-    fill."""
+    """BlenderNeRF writes angle_x of the image's longer side, and angle_y of a sensor that the image does not fill."""
     angle = 2 * math.atan(36 / 2 / 50)
     focal = 72 * 50 / 36
     lengths = {"fl_x": focal, "fl_y": focal, "cx": 24, "cy": 36}

@@ -14,17 +14,12 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import PointCloud, PointSamples
-from neuprim.core.data.dataset_check import (
-    DatasetError,
-    check_dataset,
-    check_points,
-    check_samples,
-)
+from neuprim.core.data.dataset_check import DatasetError, check_dataset, check_points, check_samples
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.settings import ModelSettings
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests.core import tiny
 
 N = tiny.SIZE

@@ -21,7 +21,7 @@ from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.settings import ModelSettings
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests.core import tiny
 
 

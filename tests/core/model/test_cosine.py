@@ -17,7 +17,7 @@ from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.reference.rays import pixel_directions
 from neuprim.core.train.splitting import split_primitives
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 
 EXACT = RenderSettings(backend="reference", alpha_min=0.0, alpha_max=0.9999)

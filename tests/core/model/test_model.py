@@ -13,7 +13,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext, ParameterSpec
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 
 
 def build(count: int = 4, neurons: int = 8, degree: int = 3, channels: int = 3) -> Primitives:

@@ -21,7 +21,7 @@ from neuprim.plugins.registry import load_task
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests.core.model.shaken import CONDITIONS, COUNT, camera, made
 
 PAIRS = [

@@ -19,7 +19,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests.core.model.shaken import CONDITIONS, COUNT, camera, made
 
 PAIRS = [

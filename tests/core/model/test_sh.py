@@ -14,7 +14,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import Constant
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 
 pytestmark = pytest.mark.usefixtures("either_way")

@@ -14,7 +14,7 @@ from neuprim.core.model.fields import Constant, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.layer_frame import LayerFrame
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 from tests.chords import chords
 

@@ -20,7 +20,7 @@ from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests.core import tiny
 from tests.short_runs import fit, words
 

@@ -21,7 +21,7 @@ from neuprim.core.train.population import (
 )
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.core.train.splitting import SPLIT_GAUSSIAN, SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT, split_primitives
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 
 COUNT = 20

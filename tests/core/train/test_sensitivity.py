@@ -13,7 +13,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import zero_units
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.train.sensitivity import sensitivity
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests.core import tiny
 from tests.core.model.shaken import made
 

@@ -13,7 +13,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.volumes.density_grid import density_at, density_grid
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests import timed_models
 from tests.cosine_models import model
 

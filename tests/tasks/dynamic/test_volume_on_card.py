@@ -19,7 +19,7 @@ from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.dynamic.volume.capture_density import compare_extinction
 from neuprim.tasks.dynamic.volume.raymarch import render_medium
 from neuprim.tasks.dynamic.volume.volume_scene import open_volumes
-from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics
 from tests.tasks.dynamic.sequences import dataset, recorded, write_blobs
 from tests.tasks.dynamic.volumes import camera, ragged
 

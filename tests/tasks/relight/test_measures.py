@@ -12,8 +12,8 @@ import torch
 from neuprim.core.errors import DataError
 from neuprim.core.metrics import means, psnr
 from neuprim.scenes import PIXEL_CLASSES
-from neuprim.tasks.relight import evaluation
-from neuprim.tasks.relight.evaluation import class_errors, class_shares, scores
+from neuprim.tasks import relight
+from neuprim.tasks.relight import pixel_class_errors, pixel_class_shares, relight_scores
 
 
 def images(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -23,20 +23,20 @@ def images(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_what_a_display_cannot_show_does_not_count() -> None:
     rendered, truth = images()
-    plain = scores(rendered, truth)
+    plain = relight_scores(rendered, truth)
     bright, dark = rendered.clone(), rendered.clone()
     truth = truth.clone()
     truth[3, 4], bright[3, 4], dark[3, 4] = 20.0, 5.0, 1.0
-    assert scores(bright, truth) == scores(dark, truth) != plain
+    assert relight_scores(bright, truth) == relight_scores(dark, truth) != plain
     assert plain["psnr_linear_clamped"] == pytest.approx(psnr(*images()))
-    assert scores(truth, truth)["psnr_display"] == float("inf")
+    assert relight_scores(truth, truth)["psnr_display"] == float("inf")
 
 
 def test_classes_pool_by_their_pixels() -> None:
     rendered, truth = images()
     first, second = torch.zeros(16, 16, dtype=torch.uint8), torch.full((16, 16), 2, dtype=torch.uint8)
     first[:4], second[:2] = 2, 0
-    entries = [class_errors(rendered, truth, first), class_errors(rendered + 0.1, truth, second)]
+    entries = [pixel_class_errors(rendered, truth, first), pixel_class_errors(rendered + 0.1, truth, second)]
     assert set(entries[0]) == {"mse_background", "pixels_background", "mse_cast_shadow", "pixels_cast_shadow"}
     pooled = means(entries)
     squares = torch.cat(
@@ -44,16 +44,16 @@ def test_classes_pool_by_their_pixels() -> None:
     )  # one pool over both views
     assert pooled["psnr_pooled_cast_shadow"] == pytest.approx(-10 * torch.log10(squares.mean()).item(), abs=1e-4)
     assert pooled["pixels_cast_shadow"] == 64 + 224
-    shares = class_shares([first, second])
+    shares = pixel_class_shares([first, second])
     assert shares == {"lit": 0.0, "cast_shadow": 100.0, "attached_shadow": 0.0, "highlight": 0.0}
 
 
 def test_wrong_class_maps_are_refused() -> None:
     rendered, truth = images()
     with pytest.raises(DataError, match="pixel classes"):
-        class_errors(rendered, truth, torch.zeros(8, 16, dtype=torch.uint8))
+        pixel_class_errors(rendered, truth, torch.zeros(8, 16, dtype=torch.uint8))
     with pytest.raises(DataError, match="values up to 5"):
-        class_errors(rendered, truth, torch.full((16, 16), len(PIXEL_CLASSES), dtype=torch.uint8))
+        pixel_class_errors(rendered, truth, torch.full((16, 16), len(PIXEL_CLASSES), dtype=torch.uint8))
 
 
 def test_flip_joins_the_scores_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,9 +64,9 @@ def test_flip_joins_the_scores_where_it_is_installed(monkeypatch: pytest.MonkeyP
         return None, 0.25, {}
 
     monkeypatch.setitem(sys.modules, "flip_evaluator", types.SimpleNamespace(evaluate=evaluate, __spec__=None))
-    monkeypatch.setattr(evaluation, "flip_available", lambda: True)
+    monkeypatch.setattr(relight, "flip_available", lambda: True)
     rendered, truth = images()
-    assert scores(rendered, truth)["flip"] == 0.25
+    assert relight_scores(rendered, truth)["flip"] == 0.25
     reference, test, dynamic_range, options = calls[0]
     assert dynamic_range == "LDR" and options["applyMagma"] is False and reference.dtype == test.dtype == "float32"
-    assert abs(reference.mean() - evaluation.linear_to_srgb(truth).numpy().mean()) < 1e-6
+    assert abs(reference.mean() - relight.linear_to_srgb(truth).numpy().mean()) < 1e-6

@@ -17,9 +17,9 @@ from neuprim.core.data import Dataset
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.images import srgb_to_linear, write_png
 from neuprim.core.task import SceneContext
-from neuprim.tasks.relight import evaluation
+from neuprim.tasks import relight
+from neuprim.tasks.relight.datasets import load_olat as load
 from neuprim.tasks.relight.lighting import lighting_of
-from neuprim.tasks.relight.olat import load
 
 SIZE = 12
 FX, FY, CX, CY = 20.0, 21.0, 5.0, 6.5
@@ -95,7 +95,7 @@ def test_the_plainest_variant(folder: Path, context: SceneContext) -> None:
     assert all(v.dtype == torch.float32 and v.shape == (3,) for v in view.conditions.values())
     focal = 0.5 * SIZE / math.tan(0.4)
     assert (view.camera.fx, view.camera.fy, view.camera.cx) == (pytest.approx(focal), pytest.approx(focal), SIZE / 2)
-    mask = evaluation.mask(dataset, 0)
+    mask = relight.matter_mask(dataset, 0)
     assert mask is not None and not mask[0, 0] and mask[5, 5]
 
 
@@ -233,7 +233,7 @@ def test_starting_points_and_orbit(folder: Path, context: SceneContext) -> None:
     dataset = read(folder, context)
     points = dataset.initial_points(20, torch.Generator().manual_seed(0))
     assert 0 < len(points.means) <= 20 and (points.colors > 0.9).all()
-    views = evaluation.orbit(dataset, 4)
+    views = relight.light_orbit(dataset, 4)
     lights = torch.stack([v.conditions["light"] for v in views])
     assert torch.isfinite(lights).all() and len(lights.unique(dim=0)) == 4
     torch.testing.assert_close(lights[:, 2], lights[:1, 2].expand(4))

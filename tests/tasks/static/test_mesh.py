@@ -17,24 +17,23 @@ from neuprim.core.cameras import Camera
 from neuprim.core.data import Dataset
 from neuprim.core.task import SceneContext
 from neuprim.scenes.shading import encode_srgb
-from neuprim.tasks.static.mesh import generate as generator
-from neuprim.tasks.static.mesh.generate import MeshSettings, generate, load
-from neuprim.tasks.static.mesh.materials import Texture, read_surfaces
+from neuprim.tasks.static import mesh as generator
+from neuprim.tasks.static.mesh import MeshSettings, generate_mesh_images, load_mesh
 from neuprim.tasks.static.mesh.model import ModelFolder
 from neuprim.tasks.static.mesh.obj import read_obj
-from neuprim.tasks.static.mesh.surface import FARTHEST, Surface
+from neuprim.tasks.static.mesh.surface import FARTHEST, Surface, Texture, read_surfaces
 from tests.models import BLUE, GREEN, RED, YELLOW, quarters, textured, write_glb, write_obj
 
 SMALL = {"size": 48, "train_views": 4, "test_views": 2, "supersampling": 2}
 
 
 def read(path: Path, cache: Path, **settings: object) -> Dataset:
-    return load({"path": path, **SMALL, **settings}, SceneContext(seed=0, cache_dir=cache))
+    return load_mesh({"path": path, **SMALL, **settings}, SceneContext(seed=0, cache_dir=cache))
 
 
 def surface(path: Path, upward: str | None = None) -> Surface:
     """The model as rays meet it, sharp."""
-    model = generator._READERS[path.suffix](ModelFolder(path))
+    model = generator.MODEL_READERS[path.suffix](ModelFolder(path))
     return Surface(model, read_surfaces(model), upward or model.upward, 1e-6)
 
 
@@ -166,7 +165,7 @@ def test_it_stands_upright_in_the_box_and_can_be_put_back(tmp_path: Path, case: 
     path.write_bytes(data.encode() if isinstance(data, str) else data)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # no colours
-        folder = generate(MeshSettings(path=path, up=up, **SMALL), tmp_path / "cache")
+        folder = generate_mesh_images(MeshSettings(path=path, up=up, **SMALL), tmp_path / "cache")
     matrix = np.array(json.loads((folder / "transforms_test.json").read_text())["scene_from_file"])
     corners = np.c_[pole.vertices, np.ones(8)] @ matrix.T
     np.testing.assert_allclose(np.abs(corners[:, :3]), np.broadcast_to([1 / 30, 1 / 30, 1], (8, 3)), atol=1e-12)
@@ -198,20 +197,22 @@ def test_normals_of_the_file_are_used_and_others_follow_from_the_angles(tmp_path
 def test_images_are_kept_by_contents_and_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, cache = write_obj(tmp_path / "square.obj"), tmp_path / "cache"
     settings = MeshSettings(path=path, **SMALL)
-    first = generate(settings, cache)
+    first = generate_mesh_images(settings, cache)
     monkeypatch.setattr(generator, "read_surfaces", None)  # a second time nothing is parsed
-    assert generate(settings, cache) == first
+    assert generate_mesh_images(settings, cache) == first
     monkeypatch.undo()
     (tmp_path / "copy").mkdir()
     for file in (path, path.with_suffix(".mtl"), tmp_path / "skin.png"):
         (tmp_path / "copy" / file.name).write_bytes(file.read_bytes())
-    assert generate(MeshSettings(path=tmp_path / "copy" / "square.obj", **SMALL), cache) == first  # wherever it lies
+    assert (
+        generate_mesh_images(MeshSettings(path=tmp_path / "copy" / "square.obj", **SMALL), cache) == first
+    )  # wherever it lies
     folders = {first}
     changes = {"size": 40, "train_views": 3, "test_views": 1, "supersampling": 1, "up": "z", "shading": "flat"}
     for name, value in changes.items():
-        folders.add(generate(MeshSettings(**{"path": path, **SMALL, name: value}), cache))
+        folders.add(generate_mesh_images(MeshSettings(**{"path": path, **SMALL, name: value}), cache))
     quarters(alpha=255).save(tmp_path / "skin.png")
-    folders.add(generate(settings, cache))
+    folders.add(generate_mesh_images(settings, cache))
     path.with_suffix(".mtl").write_text("newmtl skin\nKd 1 1 1\nnewmtl back\n")
-    folders.add(generate(settings, cache))
+    folders.add(generate_mesh_images(settings, cache))
     assert len(folders) == 9 == len(list(cache.iterdir()))

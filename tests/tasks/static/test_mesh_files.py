@@ -19,9 +19,9 @@ from PIL import Image
 from neuprim.core import notices
 from neuprim.core.errors import DataError
 from neuprim.core.notices import NeuprimWarning
+from neuprim.tasks.static.mesh import MeshSettings, generate_mesh_images
 from neuprim.tasks.static.mesh import gltf as gltf_reader
-from neuprim.tasks.static.mesh import materials
-from neuprim.tasks.static.mesh.generate import MeshSettings, generate
+from neuprim.tasks.static.mesh import surface as materials
 from tests.models import cube, gltf, quarters, write_gltf, write_obj, write_ply
 
 SMALL: dict[str, Any] = {"size": 16, "train_views": 1, "test_views": 1, "supersampling": 1}
@@ -39,7 +39,7 @@ def refusal(path: Path, **settings: Any) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeuprimWarning)
         with pytest.raises(DataError) as caught:
-            generate(MeshSettings(path=path, **SMALL, **settings), cache)
+            generate_mesh_images(MeshSettings(path=path, **SMALL, **settings), cache)
     text = str(caught.value)
     assert "\n" not in text and path.name in text and len(text) < 500, text
     assert (sorted(cache.iterdir()) if cache.exists() else []) == before
@@ -50,7 +50,7 @@ def notes(path: Path, **settings: Any) -> list[str]:
     """What is said while the model is drawn."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        generate(MeshSettings(path=path, **SMALL, **settings), path.parent / "cache")
+        generate_mesh_images(MeshSettings(path=path, **SMALL, **settings), path.parent / "cache")
     return [str(warning.message) for warning in caught if issubclass(warning.category, NeuprimWarning)]
 
 
@@ -133,7 +133,7 @@ def test_more_than_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suff
     else:
         data = trimesh.Scene(trimesh.Trimesh(*cube()[:2], process=False)).export(file_type=suffix[1:])
         path.write_bytes(data.encode() if isinstance(data, str) else data)
-    for module in ("gltf", "obj", "ply_stl", "materials"):
+    for module in ("gltf", "obj", "ply_stl", "surface"):
         monkeypatch.setattr(f"neuprim.tasks.static.mesh.{module}.{limit}", 11)
     found = refusal(path)
     assert text in found or (suffix == ".stl" and "36 vertices; expected at most 11" in found)

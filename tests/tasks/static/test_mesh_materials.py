@@ -16,10 +16,9 @@ import trimesh
 from neuprim.core import notices
 from neuprim.core.errors import DataError
 from neuprim.scenes.shading import daylight_radiance, encode_srgb
-from neuprim.tasks.static.mesh import generate as generator
-from neuprim.tasks.static.mesh.materials import GREY, SurfacePart, read_surfaces
+from neuprim.tasks.static import mesh as generator
 from neuprim.tasks.static.mesh.model import ModelFolder
-from neuprim.tasks.static.mesh.surface import Surface
+from neuprim.tasks.static.mesh.surface import GREY, Surface, SurfacePart, read_surfaces
 from tests.models import BLUE, GREEN, RED, YELLOW, cube, quarters
 
 DOWN = [[0.0, 0.0, -1.0]]
@@ -31,11 +30,11 @@ def every_note(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def parts_of(path: Path) -> list[SurfacePart]:
-    return read_surfaces(generator._READERS[path.suffix](ModelFolder(path)))
+    return read_surfaces(generator.MODEL_READERS[path.suffix](ModelFolder(path)))
 
 
 def surface(path: Path, upward: str = "z") -> Surface:
-    model = generator._READERS[path.suffix](ModelFolder(path))
+    model = generator.MODEL_READERS[path.suffix](ModelFolder(path))
     return Surface(model, read_surfaces(model), upward, 1e-6)  # type: ignore[arg-type]
 
 
@@ -90,7 +89,7 @@ def shown(path: Path, lit: bool = False) -> list[int]:
     scene = surface(path)
     at = np.array([[-0.5, 0.5, 3.0]], np.float32)
     image, hit = (
-        daylight_radiance(scene, at, DOWN) if lit else generator._colours(scene, at, np.array(DOWN, np.float32))
+        daylight_radiance(scene, at, DOWN) if lit else generator.unlit_radiance(scene, at, np.array(DOWN, np.float32))
     )
     assert hit.all()
     return np.round(encode_srgb(image[0]) * 255).astype(int).tolist()

@@ -1,9 +1,107 @@
-"""The scene ``mesh``: anybody's model, ray-cast as the built-in solids are.
+"""The scene ``mesh``: a user's model under the cameras and the light of the solids."""
 
-``model`` reads files from the model's own folder; ``gltf``, ``obj`` and ``ply_stl`` parse them; ``materials`` resolves
-colours and textures; ``surface`` is what rays meet; ``generate`` writes the data set.
-"""
+from __future__ import annotations
 
-from neuprim.tasks.static.mesh.generate import load
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-__all__ = ["load"]
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neuprim.core.cameras.world import World
+from neuprim.core.data import Dataset
+from neuprim.core.io.json_reader import JsonReader
+from neuprim.core.task import SceneContext
+from neuprim.core.validation import nonempty_text, validate
+from neuprim.scenes.image_set import Progress, hash_settings
+from neuprim.scenes.raycast import Scene
+from neuprim.scenes.shading import DAYLIGHT, Daylight, daylight_radiance
+from neuprim.scenes.solids import FIELD_OF_VIEW, Radiance, SolidsSettings, make_image_set
+from neuprim.tasks.static.mesh.gltf import read_gltf
+from neuprim.tasks.static.mesh.model import Model, ModelFolder, Up, find_model_file
+from neuprim.tasks.static.mesh.obj import read_obj
+from neuprim.tasks.static.mesh.ply_stl import read_ply_mesh, read_stl
+from neuprim.tasks.static.mesh.surface import Surface, read_surfaces
+
+# Part of the cache's key: to be raised with every change to how models are read, placed, lit or looked at.
+GENERATOR_VERSION = 2
+
+MODEL_READERS: dict[str, Callable[[ModelFolder], Model]] = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
+MODEL_READERS |= {".ply": read_ply_mesh, ".stl": read_stl}
+
+
+def _dimmed_daylight(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+    r, g, b = (0.8 * value for value in colour)
+    return r, g, b
+
+
+# the daylight of the solids, as bright as white in the sun can be shown
+LIGHT = Daylight(
+    DAYLIGHT.direction, *(_dimmed_daylight(colour) for colour in (DAYLIGHT.sun, DAYLIGHT.sky, DAYLIGHT.ground))
+)
+
+
+@dataclass(frozen=True)
+class MeshSettings(SolidsSettings):
+    """Settings of ``scene=mesh`` beyond those of ``solids``.
+
+    Attributes:
+        path: the model, .glb, .gltf, .obj, .ply or .stl.
+        up: axis of the file that points up; "auto" is y for glTF and OBJ, z for PLY and STL.
+        shading: "daylight" (sun with shadows and a soft sky) or "flat" (unlit colours).
+        skip_missing: leave out missing or refused textures and material files instead of raising.
+    """
+
+    path: Annotated[Path, nonempty_text("the model's file")] = field(kw_only=True)
+    up: Literal["auto", "y", "z"] = "auto"
+    shading: Literal["daylight", "flat"] = "daylight"
+    skip_missing: bool = False
+
+
+def load_mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """Load ``scene=mesh``, drawn on first use; raises DataError for a damaged model or files outside its folder."""
+    asked = validate(MeshSettings, settings, "scene")
+    folder = generate_mesh_images(asked, context.cache_dir, context.progress)
+    from neuprim.tasks.static.datasets import load_blender
+
+    known = JsonReader.open(folder / "transforms_train.json")
+    facts = {name: known.values[name] for name in ("rendered_from", "scene_from_file")}
+    world = World(torch.tensor(facts["scene_from_file"], dtype=torch.float64)).validate(f"{folder}: scene_from_file")
+    dataset = load_blender({"path": str(folder)}, replace(context, world=None))  # the images are of the scene itself
+    return replace(dataset, name=facts["rendered_from"], data_source="generated", world=world, extra=facts)
+
+
+def generate_mesh_images(
+    settings: MeshSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None
+) -> Path:
+    """Write the data set unless it is complete; return its folder ``cache_dir/mesh-KEY``."""
+    path = find_model_file(settings.path)
+    progress(f"mesh: reading {path.name}", 0.0)
+    model = MODEL_READERS[path.suffix.lower()](ModelFolder(path, settings.skip_missing))
+    upward: Up = model.upward if settings.up == "auto" else settings.up
+    key = hash_settings(replace(settings, path=Path(f"{path.name} {model.digest}"), up=upward), GENERATOR_VERSION)
+    spacing = 2 * math.tan(FIELD_OF_VIEW / 2) / (settings.size * settings.supersampling)
+
+    def build() -> Scene:
+        return Surface(model, read_surfaces(model), upward, spacing)
+
+    def facts(scene: Surface) -> dict[str, Any]:
+        return {"rendered_from": path.name, "scene_from_file": scene.scene_from_file.tolist()}
+
+    seen: Radiance = partial(daylight_radiance, light=LIGHT) if settings.shading == "daylight" else unlit_radiance
+    return make_image_set("mesh", key, settings, build, seen, facts).generate(cache_dir, progress)
+
+
+def unlit_radiance(
+    scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Unlit colours of N rays: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits."""
+    hits = scene.intersect(origins, directions)
+    image = np.zeros(directions.shape, dtype=np.float32)
+    image[hits.hit] = hits.albedo if hits.emission is None else hits.albedo + hits.emission
+    return image, hits.hit

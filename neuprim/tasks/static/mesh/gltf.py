@@ -1,7 +1,4 @@
-"""glTF 2 (.gltf, .glb): materials, and triangles in their places.
-
-Morph targets get their default weights, and skins the pose of their joints' nodes. Animations, lights and cameras are
-ignored."""
+"""glTF 2 (.gltf, .glb): materials and triangles. Animations, lights and cameras are ignored."""
 
 from __future__ import annotations
 

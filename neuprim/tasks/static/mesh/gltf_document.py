@@ -1,7 +1,4 @@
-"""The JSON document of a glTF file and its binary data: extensions, buffers, views and accessors.
-
-Every index and size is checked against the bytes that are there.
-"""
+"""The JSON of a glTF file and its binary data; every index and size is checked against the bytes that are there."""
 
 from __future__ import annotations
 
@@ -73,11 +70,7 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
 
 
 class GltfDocument:
-    """A document whose version and extensions are checked, and its arrays.
-
-    Extensions of ``_READ`` are honoured and those of ``_HARMLESS`` change nothing that is drawn. Required extensions
-    that are in neither are refused; those that are only used are named in a warning.
-    """
+    """A document whose version and extensions are checked, and its arrays."""
 
     def __init__(self, folder: ModelFolder) -> None:
         data = folder.read_model()
@@ -136,10 +129,8 @@ class GltfDocument:
         return data[start : start + size], to_index(view.get("byteStride", 0))
 
     def array(self, index: int, kinds: Sequence[str], length: int | None = None) -> NDArray:
-        """Return the (N, C) values of an accessor; normalized integers as floats 0..1 or -1..1.
-
-        ``kinds`` are accepted types, e.g. "VEC3"; ``length`` is the number of values, where there must be so many.
-        """
+        """Return (N, C) values of an accessor of one of the types ``kinds``; normalized integers as floats 0..1 or
+        -1..1."""
         accessor = self.content["accessors"][to_index(index)]
         where, count, kind = f"accessors[{index}]", to_index(accessor["count"]), accessor["type"]
         if kind not in kinds:

@@ -93,10 +93,7 @@ def find_model_file(path: Path) -> Path:
 
 
 class ModelFolder:
-    """Reads a mesh file and the files beside and below it within a byte budget, and hashes everything it reads.
-
-    With ``skip_missing`` missing or refused textures and material files are a warning instead of an error.
-    """
+    """Reads a mesh file and the files below its folder, up to a total size, and hashes all that it reads."""
 
     def __init__(self, file: Path, skip_missing: bool = False, budget: int = MAX_BYTES) -> None:
         self.file, self.skip_missing = file, skip_missing

@@ -1,9 +1,4 @@
-"""Wavefront OBJ with its material libraries (.mtl).
-
-Of a library, colours (``Kd``), emitted light (``Ke``), their textures and opacity (``d``, else 1 - ``Tr``) are read;
-colours and textures are taken for sRGB, and a texture stands in the place of the colour, as many exporters write a
-colour of 0 beside it.
-"""
+"""Wavefront OBJ with material libraries (.mtl): sRGB colours, textures, which replace colours, and opacity."""
 
 from __future__ import annotations
 
@@ -63,11 +58,7 @@ def read_obj(folder: ModelFolder) -> Model:
 
 
 def _read_faces(path: Path, text: str) -> tuple[list[Faces], int]:
-    """Read all triangles, by material, and count the vertices.
-
-    Raises:
-        DataError: a line that is damaged, a face with a vertex that is not there, or polygons that cross themselves.
-    """
+    """Read all triangles, by material, and count the vertices."""
     text = re.sub(r"\\\r?\n", " ", text)
     numbers, lengths = {key: array("d") for key in _WIDTHS}, {key: array("q") for key in _WIDTHS}
     indices, sizes, owners = array("q"), array("q"), array("q")

@@ -33,10 +33,7 @@ _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute",
 
 
 def read_ply_mesh(folder: ModelFolder) -> Model:
-    """Read a .ply file with its faces, and the texture that a comment ``TextureFile`` names.
-
-    Raises DataError for a file that is too large, no PLY, or has a texture that leads nowhere.
-    """
+    """Read a .ply file with its faces, and the texture that a comment ``TextureFile`` names."""
     data = folder.read_model()
     end = data.find(b"end_header", 0, _HEADER)
     if not data.startswith(b"ply"):
@@ -59,11 +56,7 @@ def read_ply_mesh(folder: ModelFolder) -> Model:
 
 
 def _read_ply_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
-    """Read all triangles and count the vertices.
-
-    Raises:
-        DataError: a damaged file, a face with a vertex that is not there, or polygons that cross themselves.
-    """
+    """Read all triangles and count the vertices."""
     elements = read_elements(io.BytesIO(data), len(data), path, ("vertex", "face", "tristrips"))
     vertices = elements["vertex"]
     if not {"x", "y", "z"} <= set(vertices.names):
@@ -138,11 +131,7 @@ def _read_stl_text(path: Path, data: bytes) -> tuple[list[Faces], int]:
 
 
 def _read_stl_binary(path: Path, data: bytes) -> tuple[list[Faces], int]:
-    """Read all triangles of a binary file and count their corners.
-
-    The two bytes after each may be its colour: with bit 15 set red, green and blue from bit 10 down; in files whose
-    header says COLOR= (Materialise Magics) red, green and blue from bit 0 up where bit 15 is clear, else the header's.
-    """
+    """Read triangles of a binary file, with the colours of VisCAM (bit 15 set) or Materialise Magics (COLOR=)."""
     rows = np.frombuffer(data, _STL, offset=84)
     bits = rows["attribute"].astype(np.int64)
     fives = np.stack([(bits >> shift & 31) / 31 for shift in (10, 5, 0)], axis=-1)

@@ -1,9 +1,4 @@
-"""Polygons of any number of corners as triangles that cover the same surface.
-
-A division of a polygon into triangles that all turn as the polygon does covers every point as often as the polygon
-winds around it: once, where it does not cross itself, whether it is convex, concave or touches itself. So fans are
-tried first, then ears are cut off, and what cannot be divided that way crosses itself and is refused.
-"""
+"""Polygons as triangles that cover the same surface: fans, else ears; polygons that cross themselves are refused."""
 
 from __future__ import annotations
 
@@ -100,12 +95,7 @@ def _flattened(points: NDArray, normal: NDArray) -> NDArray[np.float64]:
 
 
 def _ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | None, int]:
-    """Triangles cut off a polygon one after the other (Meisters 1975), None where that ends too soon; and how many
-    tests are left.
-
-    An ear is a corner that turns left and whose triangle holds no other corner. Corners in the same place as one of its
-    own do not count, nor, where there is no other ear, those on its edges: polygons may touch themselves.
-    """
+    """Cut triangles off a polygon (Meisters 1975): None where that ends too soon; and how many tests are left."""
     left, found = list(range(len(points))), []
     place, strict, failed = 0, True, 0
     while len(left) >= 3:

@@ -1,4 +1,4 @@
-"""One light at a time: ``transforms_SPLIT.json`` in the layout of GS³ and NRHints.
+"""Load relighting data: one light at a time in the layout of GS³ and NRHints, and the generated ``lit_solids``.
 
 In the file or in a frame, which wins:
 
@@ -23,16 +23,19 @@ PNG and JPEG hold sRGB with straight alpha and become linear light; OpenEXR is l
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from neuprim.core.cameras import opengl_to_viewmat
-from neuprim.core.data import Dataset
-from neuprim.core.data.image_views import ImageFrame
+from neuprim.core.data import Clip, Dataset
+from neuprim.core.data.image_views import ImageFrame, ImageViews
 from neuprim.core.data.posed_images import (
     IMAGE_SUFFIXES,
     Background,
@@ -43,12 +46,15 @@ from neuprim.core.data.posed_images import (
     assemble_dataset,
     find_data_folder,
     find_image,
+    frame_in_scene,
 )
 from neuprim.core.data.transforms_json import TransformsLayout, read_transforms_frames, read_transforms_splits
 from neuprim.core.errors import DataError
+from neuprim.core.io.images import read_image
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
-from neuprim.core.validation import Range, validate
+from neuprim.core.validation import Accepts, Range, validate
+from neuprim.scenes.lit import NEAR_LIGHTS, PARTS, LitSettings, generate_lit_solids
 from neuprim.tasks.relight.lighting import Lighting, percentile_exposure
 
 _KEYS = ("camera_near", "camera_far", "img_path", "file_ext", "pl_pos", "pl_intensity", "R_opt", "T_opt")
@@ -75,14 +81,8 @@ class OlatSettings(FolderSettings):
     ignore_corrections: bool = False
 
 
-def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load the scene in the folder ``settings["path"]``, in linear light over the exposure.
-
-    Raises:
-        ConfigError: unknown or impossible settings.
-        DataError: missing or damaged files, wrong or missing fields, impossible cameras, empty splits, black images
-            with exposure=auto.
-    """
+def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """Load the OLAT scene in the folder ``settings["path"]``, in linear light over the exposure."""
     options = validate(OlatSettings, settings, "scene")
     folder = find_data_folder(options.path)
     train, test = read_transforms_splits(
@@ -105,11 +105,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
 
 def read_split(folder: Path, split: str, options: OlatSettings) -> list[ImageFrame]:
-    """The frames of one split, with their lights as conditions.
-
-    Raises:
-        DataError: as :func:`load`.
-    """
+    """The frames of one split, with their lights as conditions. Raises DataError: as :func:`load_olat`."""
     document = JsonReader.open(folder / f"transforms_{split}.json")
     near = document.number_or("camera_near", 3.0, "a distance above 0", 0.0)
     if document.number_or("camera_far", max(10.0, 2.0 * near), f"a distance above camera_near, {near:g}") <= near:
@@ -181,3 +177,69 @@ def _intensity(source: JsonReader) -> Tensor:
     if bool((value < 0).any()):
         raise DataError(f"{source.where}: pl_intensity is {source.values['pl_intensity']}; expected {expected}")
     return value.float()
+
+
+_Background = Annotated[
+    str, Accepts(("black", "random").__contains__, "black or random: nothing but the light shines here")
+]
+
+
+@dataclass(frozen=True)
+class LitSolidsSettings(LitSettings):
+    """Settings of ``scene=lit_solids``: what changes the images, and how they are read."""
+
+    background: _Background = "black"  # "black", or "random": training composites random colours
+    hold_out: HoldOut = 0  # n: every n-th training view is the test split, for tuning; 0 for the split that is drawn
+
+
+def load_lit_solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """Load ``scene=lit_solids``: drawn on first use, read from ``context.cache_dir`` afterwards."""
+    options = validate(LitSolidsSettings, settings, "scene")
+    drawn = LitSettings(**{f.name: getattr(options, f.name) for f in fields(LitSettings)})
+    folder = generate_lit_solids(drawn, context.cache_dir, context.progress)
+    reading = {"background": options.background, "hold_out": options.hold_out}
+    dataset = load_olat({"path": str(folder), "falloff": "inverse_square", **reading}, context)
+    rays = drawn.supersampling
+    return replace(
+        dataset,
+        name="lit_solids",
+        data_source="generated",
+        background=torch.zeros(3),
+        bounds=torch.tensor([[-1.0, -1.0, -0.65], [1.0, 1.0, 1.0]]),
+        downsampling=f"rendered at {drawn.size}x{drawn.size}, {rays}x{rays} rays per pixel",
+        extra=_lighting(dataset, folder),
+    )
+
+
+def _lighting(dataset: Dataset, folder: Path) -> Lighting:
+    """Pixel classes, parts of the test split, two baselines without a model, and a film of the light going round."""
+    test = dataset.test
+    assert isinstance(test, ImageViews)  # as posed_images makes them
+    baselines = {"no_cast_shadows": partial(_read_companion, test, "unshadowed.exr")}
+    if _companion(test, "nearest.exr", 0).is_file():  # not where training views are held out
+        baselines[f"nearest_light_of_{NEAR_LIGHTS}"] = partial(_read_companion, test, "nearest.exr")
+    views = read_split(folder, "circle", OlatSettings(path=folder))
+    circle = ImageViews([frame_in_scene(f, dataset.world, ("light",)) for f in views], to_linear=True)
+    film = Clip("light_round", range(len(circle)), 12.0, circle)
+    return Lighting("inverse_square", partial(read_classes, test), PARTS, baselines, (film,))
+
+
+def read_classes(views: ImageViews, index: int) -> Tensor:
+    """(H, W) uint8 pixel classes of a view, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`."""
+    path = _companion(views, "classes.png", index)
+    try:
+        with Image.open(path, formats=("PNG",)) as image:
+            return torch.from_numpy(np.array(image))
+    except (OSError, SyntaxError) as error:
+        raise DataError(f"{path}: damaged ({error}); delete its folder to draw the scene again") from None
+
+
+def _read_companion(views: ImageViews, ending: str, index: int) -> Tensor:
+    """(H, W, 3) a further image of a view, linear light over the exposure."""
+    camera = views.view(index).camera
+    return read_image(_companion(views, ending, index), (camera.width, camera.height))[..., :3].float()
+
+
+def _companion(views: ImageViews, ending: str, index: int) -> Path:
+    file = views.file(index)
+    return file.with_name(f"{file.stem}_{ending}")

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from neuprim.core.cameras import Camera, look_at
@@ -35,52 +35,38 @@ from neuprim.scenes.image_set import (
     hash_settings,
     write_cached_folder,
 )
-from neuprim.scenes.room.interior import Room, furnish_room, lamplight_radiance
-from neuprim.scenes.shading import encode_srgb
-from neuprim.scenes.shapes import build_solids
+from neuprim.scenes.raycast import Engine, Hits, Scene
+from neuprim.scenes.room_interior import ABOVE, BELOW, BULB, LAMP, LAMP_POWER, Furnishing, Texture, furnish_room
+from neuprim.scenes.shading import add_surroundings, dot, encode_srgb, reflect_light, visible_light
+from neuprim.scenes.shapes import Solid, build_solids, uniform_colour
 
 GENERATOR_VERSION = 1
 """Part of the cache's key: raise it with every change to the room, its light, cameras or file layout."""
 
 LENS = Radial(k1=-0.08, k2=0.02, p1=0.001, p2=-0.0005)
 
-NOISE = 0.005
-"""Root of the mean squared displacement of a point, over its distance to the camera that found it."""
-
-OUTLIERS = 0.02
-"""Share of points that lie anywhere between their camera and the surface."""
-
-_PLAIN = 0.03
-"""Chance of a pixel without detail to become a point, over that of one with the mean detail."""
-
+NOISE = 0.005  # root of the mean squared displacement of a point, over its distance to the camera that found it
+OUTLIERS = 0.02  # share of points that lie anywhere between their camera and the surface
+_PLAIN = 0.03  # chance of a pixel without detail to become a point, over that of one with the mean detail
 _ROUNDS = 40  # of drawing points
 _WALKS_SEEDS = {"train": 20250311, "test": 20250312}
 _POINTS_SEED, _EXPOSURE_SEED = 20250313, 20250314
 _LUMA = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 
-_Shot = tuple[str, NDArray[np.float64], float]
-"""Name of the image's file, pose, gain."""
+_Shot = tuple[str, NDArray[np.float64], float]  # name of the image's file, pose, gain
 
 
 @dataclass(frozen=True)
 class RoomSettings:
-    """Settings of ``scene=room``.
+    """Settings of ``scene=room``."""
 
-    Attributes:
-        size: width of the images in pixels; the height is three quarters of it.
-        supersampling: rays per pixel along each axis.
-        exposure: stops by which training images are brighter or darker at most.
-        points: how many points a reconstruction has found.
-        distortion: whether the lens bends the images.
-    """
-
-    size: ImageSize = 200
+    size: ImageSize = 200  # width of the images in pixels; the height is three quarters of it
     train_views: Annotated[int, Range(2, 10000)] = 80
     test_views: Annotated[int, Range(1, 10000)] = 20
-    supersampling: Supersampling = 2
-    exposure: Annotated[float, Range(0, 2)] = 0.15
-    points: Annotated[int, Range(1, 1000000)] = 3000
-    distortion: bool = True
+    supersampling: Supersampling = 2  # rays per pixel along each axis
+    exposure: Annotated[float, Range(0, 2)] = 0.15  # stops by which training images are brighter or darker at most
+    points: Annotated[int, Range(1, 1000000)] = 3000  # how many points a reconstruction has found
+    distortion: bool = True  # whether the lens bends the images
 
     def __post_init__(self) -> None:
         validate_fields(self, "scene")
@@ -90,12 +76,7 @@ class RoomSettings:
 
 
 def generate_room(settings: RoomSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:
-    """Write the data set unless it is complete; return its folder ``cache_dir/room-KEY``.
-
-    Raises:
-        ConfigError: too few views for the points.
-        DataError: the cache directory cannot be written.
-    """
+    """Write the data set unless it is complete; return its folder ``cache_dir/room-KEY``."""
     poses = room_camera_poses(settings.train_views, settings.test_views)
     gains = exposure_gains(settings.train_views, settings.exposure).tolist()
     shots = [(f"train_{i:04d}.png", pose, gains[i]) for i, pose in enumerate(poses["train"])]
@@ -169,10 +150,7 @@ def _transforms(lens: Lens, shots: list[_Shot]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of images ``width`` pixels wide; the height is three quarters of it.
-
-    ``distortion`` is OpenCV's model; all zeros is a pinhole.
-    """
+    """Intrinsics of images ``width`` pixels wide; all-zero ``distortion`` is a pinhole."""
 
     width: int
     distortion: Radial = LENS
@@ -197,8 +175,7 @@ class Lens:
         return self.distortion.project(points, self.camera)
 
     def rays(self, pose: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(M, 3) unit directions in the scene of (M, 2) photographed pixels; ``pose`` is camera to world, OpenGL
-        axes."""
+        """(M, 3) unit directions in the scene of (M, 2) photographed pixels; ``pose`` (4, 4) as everywhere."""
         x, y = self._undistort(pixels).T
         local = np.stack([x, -y, -np.ones_like(x)], axis=1)
         local /= np.sqrt(np.einsum("nc,nc->n", local, local))[:, None]
@@ -244,10 +221,7 @@ def photograph_room(
 
 
 def camera_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
-    """Where on the walk, 0 to 1, the photographs of each split are taken: (train,) and (test,).
-
-    The test ones divide the walk evenly, whatever the training ones are; these fill the gaps, evenly in each.
-    """
+    """Where on the walk, 0 to 1, photographs are taken: test ones evenly, training ones between them."""
     held_out = (np.arange(test) + 0.5) / test
     gap = np.arange(train) * test // train
     first = np.searchsorted(gap, gap)
@@ -265,10 +239,7 @@ def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float6
 
 
 def _pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) at ``t`` of the walk, two rounds; ``shake`` (7,) of -1..1 moves the hand, the aim and the horizon.
-
-    The subject's middle, the origin, is 2.6 to 4.5 units away and 0.3 to 2 units below.
-    """
+    """(4, 4) at ``t`` of two rounds; ``shake`` (7,) of -1..1 moves hand, aim and horizon."""
     turn = 2 * math.pi
     distance = 3.55 + 0.8 * math.sin(turn * (5 * t + 0.15)) + 0.12 * shake[0]
     height = 1.1 - 0.6 * math.cos(turn * t) + 0.1 * math.sin(turn * 7 * t) + 0.06 * shake[1]
@@ -306,12 +277,11 @@ def reconstruct_points(
 ) -> ReconstructedPoints:
     """``count`` points, each seen by the camera that found it and at least one other.
 
+    Raises ConfigError: the cameras have too little in view together.
+
     Args:
         poses: (4, 4) camera to world, OpenGL axes, of the training cameras.
         luma: camera -> (H, W) brightness of its photograph, in which detail is looked for.
-
-    Raises:
-        ConfigError: the cameras have too little in view together.
     """
     chances = [_detail_chances(luma(i)) for i in range(len(poses))]
     directions, finders = np.zeros((0, 3)), np.zeros(0, np.intp)
@@ -375,3 +345,55 @@ def _seen_by_another(
     visible = np.zeros(len(directions), dtype=np.bool_)
     visible[hits.hit] = seen
     return visible
+
+
+# ---------------------------------------------------------------- rays in the room
+
+_GRAZING = np.float32(0.04)  # least cosine between a ray and a surface's normal for the width that the ray stands for
+
+
+class Room(Scene):
+    """Solids, and furnishings whose textures are averaged over what a ray covers; rays are ``spacing`` apart at
+    distance 1."""
+
+    def __init__(
+        self, solids: Sequence[Solid], around: Sequence[Furnishing], spacing: float, engine: Engine = "auto"
+    ) -> None:
+        black = uniform_colour("#000000")
+        super().__init__([*solids, *(Solid(f.name, f.mesh, black, f.gloss) for f in around)], engine)
+        self.glow = np.array([0.0] * len(solids) + [f.glow for f in around], dtype=np.float32)
+        self._textures: list[Texture | None] = [*(None for _ in solids), *(f.texture for f in around)]
+        self._spacing = np.float32(spacing)
+
+    def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
+        """As of any scene, for directions of unit length."""
+        hits = super().intersect(origins, directions)
+        towards = np.asarray(directions, dtype=np.float32)[hits.hit]
+        # A pixel covers an ellipse of the surface; its area decides, so grazing views blur across rather than flicker
+        # along.
+        root: NDArray[np.float32] = np.sqrt(np.maximum(np.abs(dot(hits.face, towards)), _GRAZING))
+        width = hits.distance * self._spacing / root
+        albedo = hits.albedo.copy()
+        for index in np.unique(hits.solid):
+            if (texture := self._textures[index]) is not None:
+                mine = np.flatnonzero(hits.solid == index)
+                albedo[mine] = texture(hits.position[mine], width[mine])
+        return replace(hits, albedo=albedo)
+
+
+def lamplight_radiance(room: Room, origins: ArrayLike, directions: ArrayLike) -> NDArray[np.float32]:
+    """(N, 3) linear RGB that N rays (``origins`` (N, 3) or (3,), unit ``directions``) see."""
+    d = np.asarray(directions, dtype=np.float32)
+    hits = room.intersect(origins, d)
+    to_eye = -d[hits.hit]
+    to_lamp = np.array(LAMP, dtype=np.float32) - hits.position
+    away = np.sqrt(dot(to_lamp, to_lamp))
+    to_lamp /= away[:, None]
+    beside_bulb = np.maximum(away - np.float32(1.2 * BULB), 0)  # the bulb itself is no obstacle
+    lit = visible_light(room, hits, to_lamp, beside_bulb)
+    rgb = reflect_light(hits, to_eye, to_lamp) * (np.array(LAMP_POWER, dtype=np.float32) * (lit / away**2)[:, None])
+    add_surroundings(rgb, hits, to_eye, ABOVE, BELOW)
+    glow = room.glow[hits.solid][:, None]
+    image = np.zeros(d.shape, dtype=np.float32)
+    image[hits.hit] = np.where(glow > 0, glow * hits.albedo, rgb)
+    return image

@@ -34,7 +34,7 @@ from neuprim.runs.measure import render_light_sum
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.scenes.lit import INTENSITY, build_lit_solids, draw_lit_solids
 from neuprim.scenes.raycast import Scene
-from neuprim.tasks.relight.lighting import illuminate
+from neuprim.tasks.relight.lighting import lights_from_environment
 
 MANY, DISTANT = 1024, 1e4
 PIXELS = 176  # of one image in the picture
@@ -103,7 +103,7 @@ def main() -> None:
     def picture(radiance: Tensor) -> Tensor:
         """The environment, the truth and the model below each other."""
         camera = views[-1].camera.resized(PIXELS, PIXELS)
-        lights = list(illuminate(Environment(radiance), 64, facts).frames(False))
+        lights = list(lights_from_environment(Environment(radiance), 64, facts).frames(False))
         planes, size = radiance.clamp(0, 1).movedim(-1, 0)[None], (PIXELS // 2, PIXELS)
         small = torch.nn.functional.interpolate(planes, size=size, mode="bilinear", antialias=True)[0].movedim(0, -1)
         images = [small, truth(scene, camera, lights, 3).float(), draw(View("picture", camera), lights)]
@@ -112,9 +112,11 @@ def main() -> None:
     table = Table("environment", "lights", "same lights", "seen lights", "distant", "lights alone")
     for name, radiance in environments().items():
         environment = Environment(radiance)
-        distant = [truth(scene, v.camera, list(illuminate(environment, MANY, far).conditions), 1) for v in views]
+        distant = [
+            truth(scene, v.camera, list(lights_from_environment(environment, MANY, far).conditions), 1) for v in views
+        ]
         for count in args.lights:
-            around = illuminate(environment, count, facts)
+            around = lights_from_environment(environment, count, facts)
             lights, seen = list(around.conditions), list(around.frames(False))
             scores = []
             for view, reference in zip(views, distant, strict=True):

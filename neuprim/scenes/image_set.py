@@ -134,9 +134,9 @@ class ImageSet(Generic[V]):
         names += [f"{split}/{file}" for split, views in self.splits.items() for v in views for file in self.files(v)]
         folder = Path(cache_dir) / f"{self.name}-{self.key}"
         what = f"scene {self.name}: cannot write the generated images"
-        return write_cached_folder(folder, names, lambda folder: self._write(folder, progress), what)
+        return write_cached_folder(folder, names, lambda folder: self._write_images(folder, progress), what)
 
-    def _write(self, folder: Path, progress: Progress) -> None:
+    def _write_images(self, folder: Path, progress: Progress) -> None:
         progress(f"{self.name}: building the scene", 0.0)
         scene = self.build()
         for split, views in self.splits.items():

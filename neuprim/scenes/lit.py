@@ -124,18 +124,18 @@ def generate_lit_solids(
         splits=place_cameras_and_lights(settings.train_views, settings.test_views),
         lens={"camera_angle_x": FIELD_OF_VIEW, "camera_near": DISTANCE[0] - 1.5, "camera_far": DISTANCE[1] + 1.5},
         build=lambda: Scene(build_lit_solids()),
-        frame=_frame,
-        files=_files,
+        frame=_lit_frame_entry,
+        files=_lit_image_files,
         draw=draw,
     ).generate(cache_dir, progress)
 
 
-def _files(view: LitView) -> list[str]:
+def _lit_image_files(view: LitView) -> list[str]:
     nearest = [] if view.near_light is None else [f"{view.name}_nearest.exr"]
     return [f"{view.name}.exr", f"{view.name}_unshadowed.exr", f"{view.name}_classes.png", *nearest]
 
 
-def _frame(split: str, view: LitView) -> dict[str, Any]:
+def _lit_frame_entry(split: str, view: LitView) -> dict[str, Any]:
     return {
         "file_path": f"./{split}/{view.name}",
         "file_ext": ".exr",
@@ -156,9 +156,9 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
     equal :data:`PARTS`. ``circle`` is a film: one new camera and a light that goes round once.
     """
     digits = max(4, len(str(train_views)))
-    cameras, lights = _draw(1, train_views)
+    cameras, lights = _draw_lit_positions(1, train_views)
     train = [LitView(f"r_{i:0{digits}d}", cameras[i], lights[i]) for i in range(train_views)]
-    new_cameras, new_lights = _draw(2, test_views)
+    new_cameras, new_lights = _draw_lit_positions(2, test_views)
     # The baseline's own lights are no test of it, so training ones come from the rest where there is one.
     first = NEAR_LIGHTS if train_views > NEAR_LIGHTS else 0
     counts = [(test_views + 2 - part) // 3 for part in range(3)]
@@ -180,13 +180,15 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
     return {"train": train, "test": test, "circle": circle}
 
 
-def _draw(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
+def _draw_lit_positions(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
     """Positions of ``count`` cameras and lights; longer lists begin with shorter ones."""
     numbers = np.random.default_rng([20241208, key]).random((count, 6))
-    return [_position(n[:3], _CAMERA_POLAR) for n in numbers], [_position(n[3:], _LIGHT_POLAR) for n in numbers]
+    return [_position_on_cap(n[:3], _CAMERA_POLAR) for n in numbers], [
+        _position_on_cap(n[3:], _LIGHT_POLAR) for n in numbers
+    ]
 
 
-def _position(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]:
+def _position_on_cap(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]:
     """Map three numbers 0..1 to a point in a direction uniform on the cap of half-angle ``polar`` about the zenith."""
     cosine = 1.0 - numbers[0] * (1.0 - math.cos(polar))
     return (DISTANCE[0] + numbers[2] * (DISTANCE[1] - DISTANCE[0])) * unit_direction(cosine, 2 * math.pi * numbers[1])

@@ -71,12 +71,12 @@ class Scene:
         self._owner = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         self._gloss = np.array([solid.gloss for solid in self.solids], dtype=np.float32)
         self._specular = np.array([solid.specular for solid in self.solids], dtype=np.float32)
-        self.engine, self._search = _open_engine(vertices, np.concatenate(faces).astype(np.int32), engine)
+        self.engine, self._search = _open_ray_engine(vertices, np.concatenate(faces).astype(np.int32), engine)
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
         """The first surface that each ray meets; (N, 3) scene units, directions of any length."""
-        o, d = _rays(origins, directions)
-        triangle, u, v, distance = self._first(o, d)
+        o, d = _broadcast_rays(origins, directions)
+        triangle, u, v, distance = self._first_hits(o, d)
         hit = triangle >= 0
         rows = np.flatnonzero(hit)
         triangle, distance = triangle[rows], distance[rows]
@@ -92,34 +92,34 @@ class Scene:
         face, gloss, specular = self._face_normals[triangle], self._gloss[owner], self._specular[owner]
         return Hits(hit, position, distance, normal, face, albedo, gloss, specular, owner, triangle, weight)
 
-    def _first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    def _first_hits(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """(N,) each: triangle or -1, barycentric u and v, distance in lengths of ``d`` (N, 3)."""
         return self._search.first(o, d)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
         """(N,) whether a surface lies within ``distance`` (in lengths of the direction) of points off a surface."""
-        o, d = _rays(points, directions)
+        o, d = _broadcast_rays(points, directions)
         return self._search.any(o, d, np.broadcast_to(np.asarray(distance, dtype=np.float32), len(o)))
 
 
-def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _broadcast_rays(origins: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     d = np.ascontiguousarray(directions, dtype=np.float32)
     return np.ascontiguousarray(np.broadcast_to(np.asarray(origins, dtype=np.float32), d.shape)), d
 
 
-def _open_engine(vertices: NDArray, faces: NDArray, engine: Engine) -> tuple[Literal["embree", "numba"], Any]:
+def _open_ray_engine(vertices: NDArray, faces: NDArray, engine: Engine) -> tuple[Literal["embree", "numba"], Any]:
     if engine != "numba":
         try:
-            return "embree", _Embree(vertices, faces)
+            return "embree", _EmbreeEngine(vertices, faces)
         except ImportError as error:
             if engine == "embree":
                 raise BackendUnavailable(
                     f"ray casting with embree needs the package 'embreex' (pip install embreex): {error}"
                 ) from error
-    return "numba", _Hierarchy(vertices, faces)
+    return "numba", _BoxHierarchy(vertices, faces)
 
 
-class _Embree:
+class _EmbreeEngine:
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
@@ -141,27 +141,27 @@ class _Embree:
 # ---------------------------------------------------------------- the hierarchy in numba
 
 
-class _Hierarchy:
-    """Triangles ``faces`` (F, 3) of ``vertices`` (V, 3), with the queries of :class:`_Embree`."""
+class _BoxHierarchy:
+    """Triangles ``faces`` (F, 3) of ``vertices`` (V, 3), with the queries of :class:`_EmbreeEngine`."""
 
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
         corners = vertices[faces].astype(np.float64)
-        self._order, *boxes_and_links = _build_boxes(corners.min(1), corners.max(1))
+        self._order, *boxes_and_links = _build_box_tree(corners.min(1), corners.max(1))
         self._tree: Any = (corners[self._order], *boxes_and_links)  # leaves read neighbouring memory
 
     def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        index, u, v, distance = self._trace(o, d, np.full(len(o), np.inf), False)
+        index, u, v, distance = self._trace_rays(o, d, np.full(len(o), np.inf), False)
         return np.where(index >= 0, self._order[index], -1), u, v, distance
 
     def any(self, o: NDArray, d: NDArray, distance: NDArray) -> NDArray[np.bool_]:
-        return self._trace(o, d, distance.astype(np.float64), True)[0] >= 0
+        return self._trace_rays(o, d, distance.astype(np.float64), True)[0] >= 0
 
-    def _trace(self, o: NDArray, d: NDArray, limits: NDArray, any_hit: bool) -> Any:
+    def _trace_rays(self, o: NDArray, d: NDArray, limits: NDArray, any_hit: bool) -> Any:
         corners, low, high, links = self._tree
-        return _trace(corners, low, high, links, o, d, limits, any_hit)
+        return _trace_rays(corners, low, high, links, o, d, limits, any_hit)
 
 
-def _build_boxes(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+def _build_box_tree(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Order of triangles, node boxes, and per node (first of two children, 0) or (first triangle, count)."""
     order = np.arange(len(low))
     middle = (low + high) / 2
@@ -201,7 +201,7 @@ def _enter_box(low, high, node, o, inverse, limit):  # type: ignore[no-untyped-d
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _meet_triangle(corner, o, d):  # type: ignore[no-untyped-def]
+def _intersect_triangle(corner, o, d):  # type: ignore[no-untyped-def]
     """Barycentric u and v of a ray's meeting with a triangle (3, 3), and its distance; -1 where there is none."""
     ex, ey, ez = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     fx, fy, fz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
@@ -218,7 +218,7 @@ def _meet_triangle(corner, o, d):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _trace(corners, low, high, links, origins, directions, limits, any_hit):  # type: ignore[no-untyped-def]
+def _trace_rays(corners, low, high, links, origins, directions, limits, any_hit):  # type: ignore[no-untyped-def]
     rays = len(origins)
     found = np.full(rays, -1, np.int64)
     us, vs, distances = np.zeros(rays, np.float32), np.zeros(rays, np.float32), np.full(rays, np.inf, np.float32)
@@ -250,7 +250,7 @@ def _trace(corners, low, high, links, origins, directions, limits, any_hit):  # 
                     top += 1
                 continue
             for i in range(links[node, 0], links[node, 0] + links[node, 1]):
-                u, v, t = _meet_triangle(corners[i], o, d)
+                u, v, t = _intersect_triangle(corners[i], o, d)
                 if 0 < t < best:
                     best = t
                     found[ray], us[ray], vs[ray], distances[ray] = i, u, v, t

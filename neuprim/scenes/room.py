@@ -84,7 +84,7 @@ def generate_room(settings: RoomSettings, cache_dir: Path, progress: Progress = 
     files = ["transforms.json", "points.ply", "exposures.json", *(f"images/{name}" for name, _, _ in shots)]
     folder = Path(cache_dir) / f"room-{settings.key()}"
     what = "scene room: cannot write the generated images"
-    return write_cached_folder(folder, files, lambda folder: _write(folder, settings, shots, progress), what)
+    return write_cached_folder(folder, files, lambda folder: _write_room(folder, settings, shots, progress), what)
 
 
 def build_room(settings: RoomSettings) -> Room:
@@ -97,7 +97,7 @@ def exposure_gains(count: int, stops: float) -> NDArray[np.float64]:
     return 2.0 ** (stops * (2 * np.random.default_rng(_EXPOSURE_SEED).random(count) - 1))
 
 
-def _write(folder: Path, settings: RoomSettings, shots: list[_Shot], progress: Progress) -> None:
+def _write_room(folder: Path, settings: RoomSettings, shots: list[_Shot], progress: Progress) -> None:
     progress("room: building the scene", 0.0)
     room, lens = build_room(settings), room_lens(settings)
     images = folder / "images"
@@ -124,10 +124,10 @@ def _write(folder: Path, settings: RoomSettings, shots: list[_Shot], progress: P
         rows[axis], rows[channel] = points.position[:, i], points.rgb[:, i]
     write_ply(folder / "points.ply", rows)
     write_json(folder / "exposures.json", {f"images/{name}": gain for name, _, gain in shots})
-    write_json(folder / "transforms.json", _transforms(lens, shots))
+    write_json(folder / "transforms.json", _transforms_document(lens, shots))
 
 
-def _transforms(lens: Lens, shots: list[_Shot]) -> dict[str, Any]:
+def _transforms_document(lens: Lens, shots: list[_Shot]) -> dict[str, Any]:
     camera, names = lens.camera, [f"images/{name}" for name, _, _ in shots]
     return {
         "camera_model": "OPENCV",
@@ -220,7 +220,7 @@ def photograph_room(
 # ---------------------------------------------------------------- the walk
 
 
-def camera_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
+def walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
     """Where on the walk, 0 to 1, photographs are taken: test ones evenly, training ones between them."""
     held_out = (np.arange(test) + 0.5) / test
     gap = np.arange(train) * test // train
@@ -232,13 +232,13 @@ def camera_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
 def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float64]]]:
     """Camera-to-world matrices (4, 4), OpenGL axes, of both splits; the test ones depend on their own number alone."""
     poses = {}
-    for split, times in camera_positions(train, test).items():
+    for split, times in walk_positions(train, test).items():
         shake = 2 * np.random.default_rng(_WALKS_SEEDS[split]).random((len(times), 7)) - 1
-        poses[split] = [_pose(float(t), s) for t, s in zip(times, shake, strict=True)]
+        poses[split] = [_walk_pose(float(t), s) for t, s in zip(times, shake, strict=True)]
     return poses
 
 
-def _pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
+def _walk_pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4) at ``t`` of two rounds; ``shake`` (7,) of -1..1 moves hand, aim and horizon."""
     turn = 2 * math.pi
     distance = 3.55 + 0.8 * math.sin(turn * (5 * t + 0.15)) + 0.12 * shake[0]
@@ -283,7 +283,7 @@ def reconstruct_points(
         poses: (4, 4) camera to world, OpenGL axes, of the training cameras.
         luma: camera -> (H, W) brightness of its photograph, in which detail is looked for.
     """
-    chances = [_detail_chances(luma(i)) for i in range(len(poses))]
+    chances = [_pixel_detail_chances(luma(i)) for i in range(len(poses))]
     directions, finders = np.zeros((0, 3)), np.zeros(0, np.intp)
     each = -(-count // len(poses))
     for attempt in range(_ROUNDS):
@@ -317,7 +317,7 @@ def reconstruct_points(
     return ReconstructedPoints(surface, position, np.round(colours * 255).astype(np.uint8), finders)
 
 
-def _detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
+def _pixel_detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
     """(H * W,) running sum, up to 1, of the chance of every pixel: as much as brightness changes there."""
     down, across = np.gradient(luma.astype(np.float64))
     detail = np.hypot(down, across)

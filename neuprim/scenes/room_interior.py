@@ -27,21 +27,23 @@ Texture = Callable[[Array, Array], Array]
 _PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
 
 
-def stripes(x: Array, period: float, part: float, width: Array) -> Array:
+def stripe_pattern(x: Array, period: float, part: float, width: Array) -> Array:
     """(M,) share of intervals of ``width`` about ``x`` that the first ``part`` (0..1) of every ``period`` covers."""
     half = np.maximum(width / np.float32(period), np.float32(1e-4)) / 2
     t = x / np.float32(period)
-    return ((_filled(t + half, part) - _filled(t - half, part)) / (2 * half)).astype(np.float32, copy=False)
+    return ((_stripe_coverage(t + half, part) - _stripe_coverage(t - half, part)) / (2 * half)).astype(
+        np.float32, copy=False
+    )
 
 
-def _filled(t: Array, part: float) -> NDArray[np.float64]:
+def _stripe_coverage(t: Array, part: float) -> NDArray[np.float64]:
     """How much of 0..t is covered; double precision, as nearly equal values are subtracted."""
     wide = t.astype(np.float64)
     whole = np.floor(wide)
     return whole * part + np.minimum(wide - whole, part)
 
 
-def noise(points: Array, width: Array, cell: float, seed: int, octaves: int = 4, fall: float = 0.55) -> Array:
+def lattice_noise(points: Array, width: Array, cell: float, seed: int, octaves: int = 4, fall: float = 0.55) -> Array:
     """(M,) smooth noise about -1..1 of mean 0 at ``points`` (M, D), on lattices of edge ``cell``, ``cell``/2, ...
 
     Each is ``fall`` times weaker. An octave is left out where its cells are smaller than about ``width`` (M,).
@@ -53,14 +55,14 @@ def noise(points: Array, width: Array, cell: float, seed: int, octaves: int = 4,
         weight = np.clip(1.5 - width / np.float32(edge), 0, 1) * np.float32(strength)
         seen = np.flatnonzero(weight > 0)
         if len(seen) == len(points):
-            total += weight * _lattice(points / np.float32(edge), seed + octave)
+            total += weight * _lattice_noise(points / np.float32(edge), seed + octave)
         else:
-            total[seen] += weight[seen] * _lattice(points[seen] / np.float32(edge), seed + octave)
+            total[seen] += weight[seen] * _lattice_noise(points[seen] / np.float32(edge), seed + octave)
         strength *= fall
     return total
 
 
-def cells(index: NDArray[np.integer], seed: int) -> Array:
+def cell_random(index: NDArray[np.integer], seed: int) -> Array:
     """(M,) numbers 0..1, evenly spread and without pattern, one for each of the whole coordinates ``index`` (M, D)."""
     h = np.full(len(index), (seed * 0x27D4EB2F + 0x165667B1) & 0xFFFFFFFF, dtype=np.uint32)
     for axis in range(index.shape[1]):
@@ -73,13 +75,13 @@ def cells(index: NDArray[np.integer], seed: int) -> Array:
     return (h >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
 
 
-def mix(one: Array, other: Array, share: Array) -> Array:
+def mix_colours(one: Array, other: Array, share: Array) -> Array:
     """(M, 3) from ``one`` where ``share`` (M,) is 0 to ``other`` where it is 1; both (3,) or (M, 3)."""
     t = np.clip(share, 0, 1)[:, None].astype(np.float32, copy=False)
     return one + t * (other - one)
 
 
-def _lattice(points: Array, seed: int) -> Array:
+def _lattice_noise(points: Array, seed: int) -> Array:
     """(M,) values of -1..1 at integer coordinates, blended in between by a quintic with two smooth derivatives."""
     base = np.floor(points)
     t = points - base
@@ -91,7 +93,7 @@ def _lattice(points: Array, seed: int) -> Array:
         weight = np.ones(len(points), dtype=np.float32)
         for axis, up in enumerate(step):
             weight *= t[:, axis] if up else 1 - t[:, axis]
-        total += weight * cells(corner + step, seed)
+        total += weight * cell_random(corner + step, seed)
     return 2 * total - 1
 
 
@@ -101,7 +103,7 @@ def _lattice(points: Array, seed: int) -> Array:
 def speckled(code: str, seed: int, strength: float = 0.12, cell: float = 0.5) -> Texture:
     """One colour, unevenly painted."""
     colour = parse_srgb(code)
-    return lambda p, w: np.clip(colour * (1 + np.float32(strength) * noise(p, w, cell, seed))[:, None], 0, 1)
+    return lambda p, w: np.clip(colour * (1 + np.float32(strength) * lattice_noise(p, w, cell, seed))[:, None], 0, 1)
 
 
 def planks(
@@ -112,14 +114,14 @@ def planks(
 
     def texture(p: Array, w: Array) -> Array:
         row = np.floor(p[:, across] / width)
-        x: Array = p[:, along] + np.float32(length) * cells(row[:, None].astype(np.int64), seed)
+        x: Array = p[:, along] + np.float32(length) * cell_random(row[:, None].astype(np.int64), seed)
         board = np.stack([row, np.floor(x / length)], axis=1).astype(np.int64)
-        grain = noise(np.stack([x / 9, p[:, across]], axis=1), w, 0.12, seed + 1, octaves=3, fall=0.7)
-        knots = noise(np.stack([x / 3, p[:, across]], axis=1), w, 0.5, seed + 7, octaves=2)
-        tone = 0.15 + 0.6 * cells(board, seed + 2) + 0.22 * grain + 0.15 * knots
-        side = stripes(p[:, across] + 0.007, width, 0.014 / width, w)
-        gap = np.maximum(side, stripes(x + 0.007, length, 0.014 / length, w))
-        return mix(one, other, tone) * (1 - np.float32(0.75) * gap)[:, None]
+        grain = lattice_noise(np.stack([x / 9, p[:, across]], axis=1), w, 0.12, seed + 1, octaves=3, fall=0.7)
+        knots = lattice_noise(np.stack([x / 3, p[:, across]], axis=1), w, 0.5, seed + 7, octaves=2)
+        tone = 0.15 + 0.6 * cell_random(board, seed + 2) + 0.22 * grain + 0.15 * knots
+        side = stripe_pattern(p[:, across] + 0.007, width, 0.014 / width, w)
+        gap = np.maximum(side, stripe_pattern(x + 0.007, length, 0.014 / length, w))
+        return mix_colours(one, other, tone) * (1 - np.float32(0.75) * gap)[:, None]
 
     return texture
 
@@ -133,10 +135,12 @@ def bricks(u: int, v: int, seed: int, width: float = 0.62, height: float = 0.22,
         x = p[:, u] + np.float32(width / 2) * (row % 2)
         brick = np.stack([np.floor(x / width), row], axis=1).astype(np.int64)
         flat = p[:, [u, v]]
-        fine, coarse = noise(flat, w, 0.12, seed + 1, octaves=3), noise(flat, w, 2.5, seed + 2, 2)
-        tone = 0.1 + 0.8 * cells(brick, seed) + 0.2 * fine + 0.15 * coarse
-        joint = 1 - stripes(x, width, 1 - mortar / width, w) * stripes(p[:, v], height, 1 - mortar / height, w)
-        return mix(mix(dark, light, tone), grout, joint)
+        fine, coarse = lattice_noise(flat, w, 0.12, seed + 1, octaves=3), lattice_noise(flat, w, 2.5, seed + 2, 2)
+        tone = 0.1 + 0.8 * cell_random(brick, seed) + 0.2 * fine + 0.15 * coarse
+        joint = 1 - stripe_pattern(x, width, 1 - mortar / width, w) * stripe_pattern(
+            p[:, v], height, 1 - mortar / height, w
+        )
+        return mix_colours(mix_colours(dark, light, tone), grout, joint)
 
     return texture
 
@@ -147,10 +151,12 @@ def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> T
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
-        across, up = stripes(p[:, u], 2 * cell, 0.5, w) - 0.5, stripes(p[:, v], 2 * cell, 0.5, w) - 0.5
-        colour = mix(first, second, (0.5 + 2 * across * up).astype(np.float32))
-        joint = np.maximum(stripes(p[:, u] + 0.01, cell, 0.02 / cell, w), stripes(p[:, v] + 0.01, cell, 0.02 / cell, w))
-        worn = 1 + 0.14 * noise(flat, w, 1.4, seed, octaves=6, fall=0.7)
+        across, up = stripe_pattern(p[:, u], 2 * cell, 0.5, w) - 0.5, stripe_pattern(p[:, v], 2 * cell, 0.5, w) - 0.5
+        colour = mix_colours(first, second, (0.5 + 2 * across * up).astype(np.float32))
+        joint = np.maximum(
+            stripe_pattern(p[:, u] + 0.01, cell, 0.02 / cell, w), stripe_pattern(p[:, v] + 0.01, cell, 0.02 / cell, w)
+        )
+        worn = 1 + 0.14 * lattice_noise(flat, w, 1.4, seed, octaves=6, fall=0.7)
         return np.clip(colour * (worn * (1 - 0.5 * joint))[:, None], 0, 1)
 
     return texture
@@ -162,16 +168,16 @@ def wallpaper(u: int, v: int, seed: int) -> Texture:
 
     def texture(p: Array, w: Array) -> Array:
         x, y = p[:, u], p[:, v]
-        colour = mix(ground, broad, stripes(x, 0.8, 0.5, w))
-        colour = mix(colour, narrow, stripes(x + 0.06, 0.4, 0.06, w))
-        # dots in the middle of the broad stripes, moved by half a step from one to the next
+        colour = mix_colours(ground, broad, stripe_pattern(x, 0.8, 0.5, w))
+        colour = mix_colours(colour, narrow, stripe_pattern(x + 0.06, 0.4, 0.06, w))
+        # dots in the middle of the broad stripe_pattern, moved by half a step from one to the next
         column = np.floor(x / 0.8)
         across = x - 0.8 * column - 0.2
         up = (y / 0.4 + 0.5 * (column % 2)) % 1 * 0.4 - 0.2
         edge = np.maximum(w, 0.005)
         inside = np.clip((0.075 - np.hypot(across, up)) / edge + 0.5, 0, 1) * np.minimum(1, 0.15 / edge) ** 2
-        faded = 1 + 0.1 * noise(p[:, [u, v]], w, 2.0, seed, octaves=6, fall=0.7)
-        return np.clip(mix(colour, dot, inside) * faded[:, None], 0, 1)
+        faded = 1 + 0.1 * lattice_noise(p[:, [u, v]], w, 2.0, seed, octaves=6, fall=0.7)
+        return np.clip(mix_colours(colour, dot, inside) * faded[:, None], 0, 1)
 
     return texture
 
@@ -183,12 +189,12 @@ def plaster(u: int, v: int, seed: int, panel: float) -> Texture:
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
-        rough = mix(light, dark, 0.45 + 0.5 * noise(flat, w, 1.6, seed, octaves=7, fall=0.72))
-        boards = mix(board, seam, stripes(p[:, u], 0.32, 0.12, w))
-        boards = boards * (1 + 0.1 * noise(flat * narrow, w, 0.12, seed + 9, octaves=2))[:, None]
+        rough = mix_colours(light, dark, 0.45 + 0.5 * lattice_noise(flat, w, 1.6, seed, octaves=7, fall=0.72))
+        boards = mix_colours(board, seam, stripe_pattern(p[:, u], 0.32, 0.12, w))
+        boards = boards * (1 + 0.1 * lattice_noise(flat * narrow, w, 0.12, seed + 9, octaves=2))[:, None]
         rail: Array = np.clip((0.06 - np.abs(p[:, v] - panel)) / np.maximum(w, 0.005) + 0.5, 0, 1)
         below: Array = np.clip((panel - p[:, v]) / np.maximum(w, 0.005) + 0.5, 0, 1)
-        return np.clip(mix(mix(rough, boards, below), edge, rail), 0, 1)
+        return np.clip(mix_colours(mix_colours(rough, boards, below), edge, rail), 0, 1)
 
     return texture
 
@@ -199,11 +205,11 @@ def painting(u: int, v: int, seed: int) -> Texture:
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
-        fields = [noise(flat, w, 0.7, seed + 17 * i, octaves=4, fall=0.5) for i in range(3)]
+        fields = [lattice_noise(flat, w, 0.7, seed + 17 * i, octaves=4, fall=0.5) for i in range(3)]
         colour = np.broadcast_to(ground, p.shape)
         for field, other in zip(fields, colours, strict=True):
-            colour = mix(colour, other, 0.5 + 1.6 * field)
-        lines = stripes(fields[0], 0.35, 0.14, 3 * w)
+            colour = mix_colours(colour, other, 0.5 + 1.6 * field)
+        lines = stripe_pattern(fields[0], 0.35, 0.14, 3 * w)
         return np.clip(colour * (1 - 0.55 * lines)[:, None], 0, 1)
 
     return texture
@@ -216,13 +222,13 @@ def books(u: int, v: int, seed: int, thickness: float = 0.11, shelf: float = 0.5
 
     def texture(p: Array, w: Array) -> Array:
         index = np.stack([np.floor(p[:, u] / thickness), np.floor(p[:, v] / shelf)], axis=1).astype(np.int64)
-        own = colours[np.minimum((cells(index, seed) * len(colours)).astype(np.int64), len(colours) - 1)]
+        own = colours[np.minimum((cell_random(index, seed) * len(colours)).astype(np.int64), len(colours) - 1)]
         far = np.clip(w / np.float32(thickness) - 0.5, 0, 1)  # where one ray stands for several spines
-        colour = mix(own, colours.mean(0), far)
+        colour = mix_colours(own, colours.mean(0), far)
         height = (p[:, v] / shelf) % 1
-        band = (np.abs(height - 0.35 - 0.3 * cells(index, seed + 1)) < 0.06) * (1 - far)
-        gap = stripes(p[:, u] + 0.008, thickness, 0.016 / thickness, w)
-        return mix(colour, parse_srgb("#f1e4b8"), 0.8 * band) * (1 - 0.8 * gap)[:, None]
+        band = (np.abs(height - 0.35 - 0.3 * cell_random(index, seed + 1)) < 0.06) * (1 - far)
+        gap = stripe_pattern(p[:, u] + 0.008, thickness, 0.016 / thickness, w)
+        return mix_colours(colour, parse_srgb("#f1e4b8"), 0.8 * band) * (1 - 0.8 * gap)[:, None]
 
     return texture
 
@@ -232,9 +238,9 @@ def marble(seed: int) -> Texture:
     light, vein = parse_srgb("#e4e0d8"), parse_srgb("#5a6470")
 
     def texture(p: Array, w: Array) -> Array:
-        flow = noise(p, w, 0.9, seed, octaves=5, fall=0.6)
-        fine = noise(p, w, 0.25, seed + 11, octaves=3)
-        return mix(light, vein, 0.75 * (1 - np.abs(np.sin(3.0 * p[:, 2] + 4.0 * flow))) ** 2 + 0.15 * fine)
+        flow = lattice_noise(p, w, 0.9, seed, octaves=5, fall=0.6)
+        fine = lattice_noise(p, w, 0.25, seed + 11, octaves=3)
+        return mix_colours(light, vein, 0.75 * (1 - np.abs(np.sin(3.0 * p[:, 2] + 4.0 * flow))) ** 2 + 0.15 * fine)
 
     return texture
 
@@ -247,11 +253,13 @@ def rug(radius: float, seed: int) -> Texture:
         r: Array = np.hypot(p[:, 0], p[:, 1])
         turn = (np.arctan2(p[:, 1], p[:, 0]) / np.float32(2 * np.pi)).astype(np.float32)
         around: Array = w / np.maximum(np.float32(2 * np.pi) * r, np.float32(0.1))  # what the width is in turns
-        ring = stripes(r, radius / 4, 0.5, w)
-        wedge = stripes(turn, 1 / 36, 0.5, around)
-        colour = mix(mix(red, cream, wedge), navy, ring)
-        colour = mix(colour, cream, stripes(r + 0.03, radius / 4, 0.2, w) * (1 - stripes(r, radius / 2, 0.5, w)))
-        yarn = 1 + 0.2 * noise(p[:, :2], w, 0.16, seed, octaves=3, fall=0.8)
+        ring = stripe_pattern(r, radius / 4, 0.5, w)
+        wedge = stripe_pattern(turn, 1 / 36, 0.5, around)
+        colour = mix_colours(mix_colours(red, cream, wedge), navy, ring)
+        colour = mix_colours(
+            colour, cream, stripe_pattern(r + 0.03, radius / 4, 0.2, w) * (1 - stripe_pattern(r, radius / 2, 0.5, w))
+        )
+        yarn = 1 + 0.2 * lattice_noise(p[:, :2], w, 0.16, seed, octaves=3, fall=0.8)
         return np.clip(colour * yarn[:, None], 0, 1)
 
     return texture
@@ -262,9 +270,9 @@ def sky(seed: int, low: float, high: float) -> Texture:
     zenith, horizon, cloud = parse_srgb("#4f8fd6"), parse_srgb("#cfe3f2"), parse_srgb("#ffffff")
 
     def texture(p: Array, w: Array) -> Array:
-        blue = mix(horizon, zenith, (p[:, 2] - low) / (high - low))
+        blue = mix_colours(horizon, zenith, (p[:, 2] - low) / (high - low))
         spread = p * np.array([1, 1, 2], np.float32)
-        return mix(blue, cloud, 0.25 + 1.1 * noise(spread, w, 0.8, seed, octaves=5))
+        return mix_colours(blue, cloud, 0.25 + 1.1 * lattice_noise(spread, w, 0.8, seed, octaves=5))
 
     return texture
 
@@ -299,30 +307,30 @@ class Furnishing(NamedTuple):
 def furnish_room() -> list[Furnishing]:
     """All of the room but the solids, the same at every call. A cylinder of radius 4.7 about z is free of furniture."""
     return [
-        *_shell(),
-        *_table(),
-        *_lamp(),
-        *_by_the_bricks(),
-        *_by_the_plaster(),
-        *_by_the_wallpaper(),
-        *_by_the_tiles(),
+        *_wall_furnishings(),
+        *_table_furnishings(),
+        *_lamp_furnishings(),
+        *_brick_side_furnishings(),
+        *_plaster_side_furnishings(),
+        *_wallpaper_side_furnishings(),
+        *_tile_side_furnishings(),
     ]
 
 
-def _box(low: Corner, high: Corner, chamfer: float = 0.02) -> trimesh.Trimesh:
+def _corner_box(low: Corner, high: Corner, chamfer: float = 0.02) -> trimesh.Trimesh:
     """A box with these opposite corners."""
     return chamfered_box(np.subtract(high, low), np.add(low, high) / 2, chamfer)
 
 
-def _slab(low: Corner, high: Corner) -> trimesh.Trimesh:
+def _wall_slab(low: Corner, high: Corner) -> trimesh.Trimesh:
     """A box whose edges are not cut."""
     mesh = trimesh.creation.box(extents=np.subtract(high, low))
     mesh.apply_translation(np.add(low, high) / 2)
     return mesh
 
 
-def _boxes(*corners: tuple[Corner, Corner], chamfer: float = 0.02) -> trimesh.Trimesh:
-    return merge_meshes([_box(low, high, chamfer) for low, high in corners])
+def _corner_boxes(*corners: tuple[Corner, Corner], chamfer: float = 0.02) -> trimesh.Trimesh:
+    return merge_meshes([_corner_box(low, high, chamfer) for low, high in corners])
 
 
 def _picture_frame(
@@ -341,24 +349,24 @@ def _picture_frame(
     return merge_meshes(bars)
 
 
-def _shell() -> list[Furnishing]:
+def _wall_furnishings() -> list[Furnishing]:
     (x0, y0, z0), (x1, y1, z1) = LOW, HIGH
     t = 0.3
     below, above = (x0 - t, y0 - t), (x1 + t, y1 + t)
-    skirting = _boxes(
+    skirting = _corner_boxes(
         ((x0, y0, z0), (x1, y0 + 0.05, z0 + 0.16)),
         ((x0, y1 - 0.05, z0), (x1, y1, z0 + 0.16)),
         ((x0, y0, z0), (x0 + 0.05, y1, z0 + 0.16)),
         ((x1 - 0.05, y0, z0), (x1, y1, z0 + 0.16)),
     )
-    beams = _boxes(*(((x0, y - 0.14, z1 - 0.22), (x1, y + 0.14, z1)) for y in (-4.2, -0.6, 3.0)))
-    brick = _slab((x1, y0 - t, z0 - t), (x1 + t, y1 + t, z1 + t))
-    papered = _slab((x0 - t, y0 - t, z0 - t), (x0, y1 + t, z1 + t))
-    plastered = _slab((x0 - t, y1, z0 - t), (x1 + t, y1 + t, z1 + t))
-    tiled = _slab((x0 - t, y0 - t, z0 - t), (x1 + t, y0, z1 + t))
+    beams = _corner_boxes(*(((x0, y - 0.14, z1 - 0.22), (x1, y + 0.14, z1)) for y in (-4.2, -0.6, 3.0)))
+    brick = _wall_slab((x1, y0 - t, z0 - t), (x1 + t, y1 + t, z1 + t))
+    papered = _wall_slab((x0 - t, y0 - t, z0 - t), (x0, y1 + t, z1 + t))
+    plastered = _wall_slab((x0 - t, y1, z0 - t), (x1 + t, y1 + t, z1 + t))
+    tiled = _wall_slab((x0 - t, y0 - t, z0 - t), (x1 + t, y0, z1 + t))
     return [
-        Furnishing("floor", _slab((*below, z0 - t), (*above, z0)), planks("#6b4426", "#c08a52", 0, 1, 11), 0.25),
-        Furnishing("ceiling", _slab((*below, z1), (*above, z1 + t)), speckled("#ece6da", 23, 0.08, 1.0)),
+        Furnishing("floor", _wall_slab((*below, z0 - t), (*above, z0)), planks("#6b4426", "#c08a52", 0, 1, 11), 0.25),
+        Furnishing("ceiling", _wall_slab((*below, z1), (*above, z1 + t)), speckled("#ece6da", 23, 0.08, 1.0)),
         Furnishing("brick wall", brick, bricks(1, 2, 31)),
         Furnishing("papered wall", papered, wallpaper(1, 2, 41)),
         Furnishing("plastered wall", plastered, plaster(0, 2, 51, z0 + 1.5)),
@@ -368,7 +376,7 @@ def _shell() -> list[Furnishing]:
     ]
 
 
-def _table() -> list[Furnishing]:
+def _table_furnishings() -> list[Furnishing]:
     """A round table under the plate of the solids, on a rug."""
     top, foot, radius = FLOOR - 0.08, LOW[2], 1.3
     disc = [(0, radius - 0.04), (0.03, radius), (0.06, radius), (0.09, radius - 0.03)]
@@ -382,7 +390,7 @@ def _table() -> list[Furnishing]:
     ]
 
 
-def _lamp() -> list[Furnishing]:
+def _lamp_furnishings() -> list[Furnishing]:
     x, y, z = LAMP
     shade = [(0.0, 0.05), (0.05, 0.42), (0.08, 0.42), (0.2, 0.1), (0.22, 0.03)]
     return [
@@ -392,17 +400,17 @@ def _lamp() -> list[Furnishing]:
     ]
 
 
-def _by_the_bricks() -> list[Furnishing]:
+def _brick_side_furnishings() -> list[Furnishing]:
     """The wall at x = 6: a window with four panes, and crates below."""
     x, low, high = HIGH[0], 0.2, 2.4
-    pane = _box((x - 0.02, -1.4, low), (x + 0.05, 1.4, high), 0.005)
+    pane = _corner_box((x - 0.02, -1.4, low), (x + 0.05, 1.4, high), 0.005)
     upright, level = (
-        _box((x - 0.1, -0.05, low), (x, 0.05, high), 0.01),
-        _box((x - 0.1, -1.4, 1.25), (x, 1.4, 1.35), 0.01),
+        _corner_box((x - 0.1, -0.05, low), (x, 0.05, high), 0.01),
+        _corner_box((x - 0.1, -1.4, 1.25), (x, 1.4, 1.35), 0.01),
     )
     window = merge_meshes([_picture_frame(x, 0, low, high, 1.4, 1, 0.14, 0.2), upright, level])
-    sill = _box((x - 0.3, -1.65, low - 0.24), (x, 1.65, low - 0.14))
-    crates = _boxes(
+    sill = _corner_box((x - 0.3, -1.65, low - 0.24), (x, 1.65, low - 0.14))
+    crates = _corner_boxes(
         ((5.0, 3.6, -1.6), (5.9, 4.9, -0.7)),
         ((5.1, 3.8, -0.7), (5.8, 4.7, 0.0)),
         ((5.2, -4.4, -1.6), (5.9, -3.2, -0.9)),
@@ -416,7 +424,7 @@ def _by_the_bricks() -> list[Furnishing]:
     ]
 
 
-def _by_the_plaster() -> list[Furnishing]:
+def _plaster_side_furnishings() -> list[Furnishing]:
     """The wall at y = 6: a shelf full of books, and a picture in a frame."""
     y0, y1, left, right, z, step = 5.3, 6.0, -4.6, -1.6, -1.6, 0.62
     boards = [((left, y0, z + step * i), (right, y1, z + step * i + 0.06)) for i in range(6)]
@@ -427,24 +435,30 @@ def _by_the_plaster() -> list[Furnishing]:
         for i, (gap, height) in enumerate([(0.0, 0.5), (0.5, 0.46), (0.0, 0.52), (1.1, 0.44), (0.2, 0.5)])
     ]
     picture, frame = (
-        _box((1.2, 5.93, 0.5), (4.0, 6.0, 2.5), 0.005),
+        _corner_box((1.2, 5.93, 0.5), (4.0, 6.0, 2.5), 0.005),
         _picture_frame(2.6, 6.0, 0.5, 2.5, 1.4, 0, 0.14, 0.24),
     )
     shelf = planks("#4d3524", "#7d5a3c", 0, 1, 111, width=0.4)
     return [
-        Furnishing("shelf", _boxes(*boards, chamfer=0.005), shelf),
-        Furnishing("books", _boxes(*rows, chamfer=0.005), books(0, 2, 113, shelf=step)),
+        Furnishing("shelf", _corner_boxes(*boards, chamfer=0.005), shelf),
+        Furnishing("books", _corner_boxes(*rows, chamfer=0.005), books(0, 2, 113, shelf=step)),
         Furnishing("picture", picture, painting(0, 2, 115)),
         Furnishing("frame", frame, speckled("#b8892f", 117, 0.2, 0.2), 0.6),
     ]
 
 
-def _by_the_wallpaper() -> list[Furnishing]:
+def _wallpaper_side_furnishings() -> list[Furnishing]:
     """The wall at x = -6: a long bench, two pictures above it, and a pillar in the corner."""
     column = [(0.0, 0.62), (0.2, 0.62), (0.3, 0.45), (4.7, 0.42), (4.8, 0.6), (5.0, 0.6)]
-    bench = [_box((-5.95, -2.6, -1.35), (-5.15, 1.4, -1.1), 0.05), _box((-5.95, -2.6, -1.1), (-5.75, 1.4, -0.3), 0.05)]
-    bench += [_box((-5.9, y, -1.6), (-5.2, y + 0.25, -1.35)) for y in (-2.5, 1.05)]
-    small, tall = _box((-6.0, -2.4, 0.3), (-5.94, -0.8, 1.5), 0.005), _box((-6.0, 0.3, 0.1), (-5.94, 1.4, 2.0), 0.005)
+    bench = [
+        _corner_box((-5.95, -2.6, -1.35), (-5.15, 1.4, -1.1), 0.05),
+        _corner_box((-5.95, -2.6, -1.1), (-5.75, 1.4, -0.3), 0.05),
+    ]
+    bench += [_corner_box((-5.9, y, -1.6), (-5.2, y + 0.25, -1.35)) for y in (-2.5, 1.05)]
+    small, tall = (
+        _corner_box((-6.0, -2.4, 0.3), (-5.94, -0.8, 1.5), 0.005),
+        _corner_box((-6.0, 0.3, 0.1), (-5.94, 1.4, 2.0), 0.005),
+    )
     small_frame = _picture_frame(-6.0, -1.6, 0.3, 1.5, 0.8, 1, 0.1, 0.2)
     tall_frame = _picture_frame(-6.0, 0.85, 0.1, 2.0, 0.55, 1, 0.1, 0.2)
     return [
@@ -457,14 +471,14 @@ def _by_the_wallpaper() -> list[Furnishing]:
     ]
 
 
-def _by_the_tiles() -> list[Furnishing]:
+def _tile_side_furnishings() -> list[Furnishing]:
     """The wall at y = -6: a cupboard, a door and a big pot."""
     places = [(x, z) for x in (-4.3, -3.55, -2.8) for z in (-1.4, -0.3)]
-    panels = _boxes(*(((x, -5.27, z), (x + 0.62, -5.22, z + 0.95)) for x, z in places))
+    panels = _corner_boxes(*(((x, -5.27, z), (x + 0.62, -5.22, z + 0.95)) for x, z in places))
     places = [(x, z) for x in (1.45, 2.2) for z in (-1.4, 0.1)]
     fields = (((x, -5.93, z), (x + 0.55, -5.88, z + 1.1)) for x, z in places)
-    door = _boxes(((1.3, -6.0, -1.6), (2.9, -5.92, 1.5)), *fields)
-    cupboard = _box((-4.5, -6.0, -1.6), (-2.0, -5.25, 0.8), 0.03)
+    door = _corner_boxes(((1.3, -6.0, -1.6), (2.9, -5.92, 1.5)), *fields)
+    cupboard = _corner_box((-4.5, -6.0, -1.6), (-2.0, -5.25, 0.8), 0.03)
     pot = [(0.0, 0.3), (0.2, 0.42), (0.5, 0.48), (0.75, 0.4), (0.85, 0.45), (0.9, 0.45)]
     glaze = bricks(0, 2, 145, width=0.2, height=0.15, mortar=0.02)
     door_frame = _picture_frame(2.1, -6.0, -1.8, 1.5, 0.8, 0, 0.12, 0.24)

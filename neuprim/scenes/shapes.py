@@ -73,7 +73,7 @@ def lathe(
     heights, radii = np.array(profile, dtype=np.float64).T
     path = np.asarray(start, dtype=np.float64) + heights[:, None] * direction
     sides, half = np.broadcast_to(side, path.shape), np.stack([radii, radii], axis=1)
-    return _tube(path, sides, np.cross(direction, side), half, sections)
+    return _tube_mesh(path, sides, np.cross(direction, side), half, sections)
 
 
 def arc_tube(
@@ -99,10 +99,12 @@ def arc_tube(
     if half.ndim < 2:
         half = np.broadcast_to(half.reshape(-1, 1), (len(angles), 2))
     # outward x across must point along the path, as side x other does along a lathe's axis.
-    return _tube(np.asarray(centre, dtype=np.float64) + radius * outward, outward, np.cross(two, one), half, sections)
+    return _tube_mesh(
+        np.asarray(centre, dtype=np.float64) + radius * outward, outward, np.cross(two, one), half, sections
+    )
 
 
-def _tube(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sections: int) -> trimesh.Trimesh:
+def _tube_mesh(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sections: int) -> trimesh.Trimesh:
     """Rings about ``path`` (n, 3) in the planes of ``side`` (n, 3) and ``across`` (3,), joined and capped."""
     turn = 2 * np.pi * np.arange(sections) / sections
     in_plane = (half[:, :1] * np.cos(turn))[..., None] * side[:, None]
@@ -194,10 +196,16 @@ def build_solids() -> list[Solid]:
     pose = trimesh.transformations.rotation_matrix(np.radians(24.0), [0.0, 0.0, 1.0])
     pose[:3, :3] *= 1.16
     pose[:3, 3] = pose[:3, :3] @ [-0.2, 0.0, -FLOOR] + [0.0, 0.0, FLOOR]
-    return [_plate(), *(_placed(solid, pose) for solid in _drill()), *_wire_cube(), *_pins(), *_small_things()]
+    return [
+        _plate_solid(),
+        *(_place_solid(solid, pose) for solid in _drill_solids()),
+        *_wire_cube_solids(),
+        *_pin_solids(),
+        *_small_solids(),
+    ]
 
 
-def _placed(solid: Solid, pose: NDArray[np.float64]) -> Solid:
+def _place_solid(solid: Solid, pose: NDArray[np.float64]) -> Solid:
     """The solid moved by a (4, 4) similarity ``pose``, its pattern moving along."""
     mesh = solid.mesh.copy()
     mesh.apply_transform(pose)
@@ -205,7 +213,7 @@ def _placed(solid: Solid, pose: NDArray[np.float64]) -> Solid:
     return replace(solid, mesh=mesh, albedo=lambda position: solid.albedo(position @ back[:3, :3].T + back[:3, 3]))
 
 
-def _plate() -> Solid:
+def _plate_solid() -> Solid:
     half, thickness, rim, cell = 0.84, 0.08, 0.78, 0.195
     ivory, slate, edge = parse_srgb("#f2ead8"), parse_srgb("#33415c"), parse_srgb("#1f9e89")
 
@@ -219,7 +227,7 @@ def _plate() -> Solid:
     return Solid("plate", mesh, albedo, 0.25)
 
 
-def _drill() -> list[Solid]:
+def _drill_solids() -> list[Solid]:
     """The drill in its own frame: bit along +x, symmetric in y, standing on its battery."""
     x, z, axis_z = [1, 0, 0], [0, 0, 1], 0.44
     grip_arc, grip_centre = np.linspace(np.radians(149.0), np.radians(211.0), 64), np.array([0.33, 0.0, -0.05])
@@ -257,7 +265,7 @@ def _drill() -> list[Solid]:
     ]
 
 
-def _wire_cube() -> list[Solid]:
+def _wire_cube_solids() -> list[Solid]:
     """Twelve rods and eight knots around a polished ball."""
     side, thick = 0.40, 0.013
     centre = np.array([0.46, 0.46, FLOOR + side / 2 + 2 * thick])
@@ -273,7 +281,7 @@ def _wire_cube() -> list[Solid]:
     ]
 
 
-def _pins() -> list[Solid]:
+def _pin_solids() -> list[Solid]:
     """A row of ever thinner and taller pins with coloured heads."""
     solids = []
     for i, colour in enumerate(("#e63946", "#ff9f1c", "#ffe14d", "#2ec4b6", "#7b2cbf")):
@@ -285,7 +293,7 @@ def _pins() -> list[Solid]:
     return solids
 
 
-def _small_things() -> list[Solid]:
+def _small_solids() -> list[Solid]:
     major, minor = 0.21, 0.068
     span = np.radians(np.linspace(20.0, 140.0, 96))
     thickness = 0.012 + 0.062 * np.abs(np.sin(np.pi * np.linspace(0.0, 1.0, 96))) ** 0.6

@@ -60,7 +60,7 @@ class SolidsSettings:
         return hash_settings(self, GENERATOR_VERSION)
 
 
-class _View(NamedTuple):
+class _SolidsView(NamedTuple):
     name: str
     pose: NDArray[np.float64]
 
@@ -69,24 +69,24 @@ def generate_solids(
     settings: SolidsSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None
 ) -> Path:
     """Write the data set unless it is complete; return its folder ``cache_dir/solids-KEY``."""
-    images = make_image_set("solids", settings.key(), settings, lambda: Scene(build_solids()))
+    images = describe_solids_images("solids", settings.key(), settings, lambda: Scene(build_solids()))
     return images.generate(cache_dir, progress)
 
 
-def make_image_set(
+def describe_solids_images(
     name: str,
     key: str,
     settings: SolidsSettings,
     build: Callable[[], Scene],
     seen: Radiance = daylight_radiance,
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {},
-) -> ImageSet[_View]:
+) -> ImageSet[_SolidsView]:
     """Describe images of the scene that ``build`` makes, taken by the cameras of the solids."""
 
-    def views(split: str, count: int) -> list[_View]:
-        return [_View(f"r_{i}", pose) for i, pose in enumerate(solids_camera_poses(split, count))]
+    def views(split: str, count: int) -> list[_SolidsView]:
+        return [_SolidsView(f"r_{i}", pose) for i, pose in enumerate(solids_camera_poses(split, count))]
 
-    def draw(scene: Scene, view: _View, paths: Sequence[Path]) -> None:
+    def draw(scene: Scene, view: _SolidsView, paths: Sequence[Path]) -> None:
         Image.fromarray(draw_solids(scene, view.pose, settings.size, settings.supersampling, seen)).save(paths[0])
 
     return ImageSet(

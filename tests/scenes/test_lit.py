@@ -31,8 +31,8 @@ from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shapes import Solid, ball, chamfered_box, parse_srgb, uniform_colour
 from neuprim.tasks import relight
 from neuprim.tasks.relight.datasets import load_lit_solids as load
-from neuprim.tasks.relight.datasets import load_olat, read_classes
-from neuprim.tasks.relight.lighting import lighting_of
+from neuprim.tasks.relight.datasets import load_olat, read_pixel_classes
+from neuprim.tasks.relight.lighting import dataset_lighting
 
 GREY = "#808080"
 FLOOR = Solid("floor", chamfered_box([4, 4, 0.1], [0, 0, -0.05], 0.001), uniform_colour(GREY), 0.0)
@@ -164,12 +164,12 @@ def test_the_loader_of_the_layout_reads_the_same_pixels_and_lights(context: Scen
     stored = fresh.rgba[..., :3].astype(np.float16).astype(np.float32)
     np.testing.assert_array_equal(dataset.train.pixels(2).rgb.numpy(), stored)
     assert isinstance(dataset.train, ImageViews)
-    np.testing.assert_array_equal(read_classes(dataset.train, 2).numpy(), fresh.classes)
+    np.testing.assert_array_equal(read_pixel_classes(dataset.train, 2).numpy(), fresh.classes)
 
 
 def test_the_data_set_says_what_it_is(context: SceneContext) -> None:
     dataset = load({**SMALL, "background": "random"}, context)
-    kind = (dataset.name, dataset.data_source, dataset.color_space, lighting_of(dataset).falloff)
+    kind = (dataset.name, dataset.data_source, dataset.color_space, dataset_lighting(dataset).falloff)
     assert kind == ("lit_solids", "generated", "linear", "inverse_square")
     assert dataset.background.tolist() == [0.0, 0.0, 0.0] and dataset.random_background and dataset.exposure == 1.0
     assert not load(SMALL, context).random_background
@@ -186,7 +186,7 @@ def test_the_data_set_says_what_it_is(context: SceneContext) -> None:
 
 
 def test_classes_agree_with_the_images(forty: Dataset) -> None:
-    known = lighting_of(forty)
+    known = dataset_lighting(forty)
     assert known.classes is not None
     shown, rgb, free = [], [], []
     for i in range(len(forty.test)):

@@ -19,14 +19,16 @@ from neuprim.core.task import SceneContext
 from neuprim.scenes.room import (
     LENS,
     Lens,
+    Room,
     RoomSettings,
     build_room,
-    camera_positions,
     exposure_gains,
+    lamplight_radiance,
     photograph_room,
     reconstruct_points,
     room_camera_poses,
     room_lens,
+    walk_positions,
 )
 from neuprim.scenes.room_interior import (
     ABOVE,
@@ -35,10 +37,8 @@ from neuprim.scenes.room_interior import (
     LAMP_POWER,
     LOW,
     Furnishing,
-    Room,
     furnish_room,
-    lamplight_radiance,
-    noise,
+    lattice_noise,
     speckled,
 )
 from neuprim.scenes.shapes import ball, build_solids, chamfered_box, parse_srgb
@@ -77,10 +77,10 @@ def still(count: int, width: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize("dimensions", [2, 3])
 def test_noise_is_smooth_centred_and_fades_with_the_width(dimensions: int) -> None:
     points = np.random.default_rng(0).uniform(-6, 6, (20000, dimensions)).astype(np.float32)
-    sharp = noise(points, still(20000), 0.5, 7)
+    sharp = lattice_noise(points, still(20000), 0.5, 7)
     assert abs(sharp.mean()) < 0.03 and 0.2 < sharp.std() < 0.6 and np.abs(sharp).max() < 2.5
-    assert np.abs(noise(points + np.float32(1e-4), still(20000), 0.5, 7) - sharp).max() < 0.02
-    strength = [noise(points, still(20000, w), 0.5, 7).std() for w in (0.0, 0.1, 0.3, 0.6, 0.8)]
+    assert np.abs(lattice_noise(points + np.float32(1e-4), still(20000), 0.5, 7) - sharp).max() < 0.02
+    strength = [lattice_noise(points, still(20000, w), 0.5, 7).std() for w in (0.0, 0.1, 0.3, 0.6, 0.8)]
     assert all(a > b for a, b in pairwise(strength)) and strength[-1] == 0
 
 
@@ -163,7 +163,7 @@ def test_cameras_are_in_the_room_and_see_the_whole_subject(train: int, test: int
 
 def test_test_cameras_lie_between_training_ones_and_are_the_same_for_any_number_of_them() -> None:
     for train in (80, 20, 7):
-        found = camera_positions(train, 20)
+        found = walk_positions(train, 20)
         both = np.sort(np.concatenate([found["train"], found["test"]]))
         assert len(both) == train + 20 and np.diff(both).min() > 0.3 / (train + 20)
         np.testing.assert_array_equal(room_camera_poses(train, 20)["test"], room_camera_poses(80, 20)["test"])

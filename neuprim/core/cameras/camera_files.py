@@ -66,7 +66,7 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
         return _read_camera_path(document, size)
     if not document.has("frames"):
         raise document.fail("frames", "a non-empty list of objects (or camera_path, as nerfstudio's viewer writes it)")
-    return _read_frames(document, size)
+    return _read_camera_frames(document, size)
 
 
 def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[tuple[str, Camera]]:
@@ -74,14 +74,14 @@ def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[tuple[
     return list(read_camera_file(path, size).named)
 
 
-def _listed_cameras(document: JsonReader, key: str) -> list[JsonReader]:
+def _camera_records(document: JsonReader, key: str) -> list[JsonReader]:
     records = list(document.objects(key))
     if len(records) > MAX_CAMERAS:
         raise DataError(f"{document.where}: {key} has {len(records)} cameras; expected at most {MAX_CAMERAS}")
     return records
 
 
-def _stated_size(record: JsonReader, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
+def _read_image_size(record: JsonReader, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
     found = []
     for key, fallback in zip(keys, size or (0, 0), strict=True):
         value = record.count(key) if record.has(key) or size is None else fallback
@@ -91,12 +91,12 @@ def _stated_size(record: JsonReader, keys: tuple[str, str], size: tuple[int, int
     return found[0], found[1]
 
 
-def _times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
+def _camera_times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
     """The times of all cameras, where all have one."""
     return tuple(r.number(key, "a time") for r in records) if all(r.has(key) for r in records) else None
 
 
-def _rate(document: JsonReader, count: int) -> float | None:
+def _read_frame_rate(document: JsonReader, count: int) -> float | None:
     """``fps``, else ``count`` frames over ``seconds``; None without either."""
     for key in ("fps", "seconds"):
         if document.has(key):
@@ -108,9 +108,9 @@ def _rate(document: JsonReader, count: int) -> float | None:
     return None
 
 
-def _read_frames(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
+def _read_camera_frames(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
     """Read ``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``."""
-    records, found, bent = _listed_cameras(document, "frames"), [], 0
+    records, found, bent = _camera_records(document, "frames"), [], 0
     notes: dict[str, None] = {}
     refuse_unsupported_keys(document)
     for i, record in enumerate(records):
@@ -120,14 +120,16 @@ def _read_frames(document: JsonReader, size: tuple[int, int] | None) -> CameraVi
             raise DataError(f"{record.where}: {what}; expected one of {', '.join(MODELS)}")
         bent += any(read_lens_coefficients(record, document).values())
         stated = {key: r.values[key] for r in (document, record) for key in ("w", "h") if r.has(key)}
-        target = Target(*_stated_size(JsonReader(stated, record.where), ("w", "h"), size))
+        target = Target(*_read_image_size(JsonReader(stated, record.where), ("w", "h"), size))
         own = record.has("transform_matrix") or not document.has("transform_matrix")
         view = None if own else opengl_to_viewmat(document.matrix("transform_matrix"))
         camera = read_camera(record, document, target, view, lambda text: notes.update({text: None}))
         found.append((f"camera_{i:03d}", camera.validate(record.where)))
     if bent:
         notes[f"the lens distortion of {bent} of {len(found)} cameras is left out"] = None
-    return CameraViews(tuple(found), _times(records, "time"), _rate(document, len(found)), tuple(notes))
+    return CameraViews(
+        tuple(found), _camera_times(records, "time"), _read_frame_rate(document, len(found)), tuple(notes)
+    )
 
 
 def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
@@ -138,19 +140,21 @@ def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> Cam
     """
     if document.values.get("camera_type", "perspective") != "perspective":
         raise document.fail("camera_type", "perspective; others are not drawn")
-    records = _listed_cameras(document, "camera_path")
-    width, height = _stated_size(document, ("render_width", "render_height"), size)
+    records = _camera_records(document, "camera_path")
+    width, height = _read_image_size(document, ("render_width", "render_height"), size)
     found = []
     for i, record in enumerate(records):
         fov = record.number("fov", "a vertical field of view in degrees, between 0 and 180", 0.0, 180.0)
         focal = 0.5 * height / math.tan(math.radians(fov) / 2)
-        view = opengl_to_viewmat(_flat_matrix(record, "camera_to_world"))
+        view = opengl_to_viewmat(_read_camera_matrix(record, "camera_to_world"))
         camera = Camera(view, focal, focal, 0.5 * width, 0.5 * height, width, height)
         found.append((f"camera_{i:03d}", camera.validate(f"{record.where}.camera_to_world")))
-    return CameraViews(tuple(found), _times(records, "render_time"), _rate(document, len(found)), (_VIEWER_NOTE,))
+    return CameraViews(
+        tuple(found), _camera_times(records, "render_time"), _read_frame_rate(document, len(found)), (_VIEWER_NOTE,)
+    )
 
 
-def _flat_matrix(record: JsonReader, key: str) -> Tensor:
+def _read_camera_matrix(record: JsonReader, key: str) -> Tensor:
     """(4, 4) of 16 numbers row by row, or of rows."""
     value = record.values.get(key)
     if isinstance(value, list) and len(value) == 16:

@@ -51,7 +51,7 @@ class Target:
 
 
 @dataclass(frozen=True)
-class _Level:
+class _KeySource:
     """Fields of a frame or file, and the size in pixels that its lengths belong to."""
 
     record: JsonReader
@@ -63,13 +63,14 @@ class _Level:
     def scales(self, keys: str, target: Target) -> tuple[float, float]:
         """Target pixels per pixel of this size, horizontally and vertically."""
         if not is_resized_copy(self.size, target.size):
-            found = f"{keys} belong to w, h {_format_size(self.size)}, and the image is {_format_size(target.size)}"
+            own, other = _format_image_size(self.size), _format_image_size(target.size)
+            found = f"{keys} belong to w, h {own}, and the image is {other}"
             expected = f"them in the frame, beside its own w, h{target.hint}"
             raise DataError(f"{self.record.where}: {found}; expected {expected}")
         return target.width / self.size[0], target.height / self.size[1]
 
 
-def _format_size(size: tuple[int, int]) -> str:
+def _format_image_size(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
 
 
@@ -79,7 +80,7 @@ def is_resized_copy(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(size[0] * scale - other[0]) <= 1.0 and abs(size[1] * scale - other[1]) <= 1.0
 
 
-def _owner(group: tuple[str, ...], frame: JsonReader, file: JsonReader) -> JsonReader:
+def _record_with_keys(group: tuple[str, ...], frame: JsonReader, file: JsonReader) -> JsonReader:
     """The record that provides a whole group of keys."""
     return frame if any(frame.has(key) for key in group) else file
 
@@ -96,18 +97,18 @@ def read_camera(
         viewmat: (4, 4) world to camera, OpenCV axes; None reads ``transform_matrix`` (camera to world, OpenGL axes).
         say: receives lines for the user.
     """
-    of_file = _Level(file, _size(file, target.size))
-    of_frame = _Level(frame, _size(frame, of_file.size))
+    of_file = _KeySource(file, _stated_image_size(file, target.size))
+    of_frame = _KeySource(frame, _stated_image_size(frame, of_file.size))
     if target.image and of_frame.size != target.size:
-        stated, image = _format_size(of_frame.size), _format_size(target.size)
+        stated, image = _format_image_size(of_frame.size), _format_image_size(target.size)
         if not is_resized_copy(of_frame.size, target.size):
-            where = _owner(SIZE, frame, file).where
+            where = _record_with_keys(SIZE, frame, file).where
             expected = f"{stated} (w, h in {where}) or a reduction of it"
             raise DataError(f"{target.image}: image is {image}; expected {expected}{target.hint}")
         say(f"{file.where}: w, h are {stated} and the image {image}; cameras are scaled to the images")
     focal = of_frame if of_frame.has(FOCAL) else of_file
-    fx, fy = _focal(frame, focal, target, say)
-    cx, cy = _middle(of_frame, of_file, focal, target)
+    fx, fy = _read_focal_lengths(frame, focal, target, say)
+    cx, cy = _read_principal_point(of_frame, of_file, focal, target)
     if focal is of_frame:
         _check_one_lens(of_frame, of_file, target)
     if viewmat is None:
@@ -115,7 +116,7 @@ def read_camera(
     return Camera(viewmat, fx, fy, cx, cy, target.width, target.height)
 
 
-def _size(record: JsonReader, default: tuple[int, int]) -> tuple[int, int]:
+def _stated_image_size(record: JsonReader, default: tuple[int, int]) -> tuple[int, int]:
     """The size that a record states."""
     return record.count("w") if record.has("w") else default[0], record.count("h") if record.has("h") else default[1]
 
@@ -123,9 +124,9 @@ def _size(record: JsonReader, default: tuple[int, int]) -> tuple[int, int]:
 # ---------------------------------------------------------------- focal lengths
 
 
-def _focal(frame: JsonReader, level: _Level, target: Target, say: Say) -> tuple[float, float]:
+def _read_focal_lengths(frame: JsonReader, level: _KeySource, target: Target, say: Say) -> tuple[float, float]:
     """fx, fy in pixels of the target."""
-    x, y = _stated(level, 0, target), _stated(level, 1, target)
+    x, y = _stated_focal_lengths(level, 0, target), _stated_focal_lengths(level, 1, target)
     if not x and not y:
         keys = "camera_angle_x (radians), fl_x (pixels), camera_intrinsics or x_fov (degrees)"
         raise DataError(f"{frame.where}: no focal length: expected {keys}, in the frame or in the file")
@@ -133,12 +134,12 @@ def _focal(frame: JsonReader, level: _Level, target: Target, say: Say) -> tuple[
     fx, fy = fx or fy, fy or fx
     where, lengths = level.record.where, f"{fx:.5g} and {fy:.5g}"
     if min(fx / target.width, fy / target.height) < _SHORTEST:
-        stated = f"focal lengths of {lengths} pixels on {_format_size(target.size)}"
+        stated = f"focal lengths of {lengths} pixels on {_format_image_size(target.size)}"
         raise DataError(
             f"{where}: {', '.join((*x, *y))} mean {stated}, a field of view of more than 170 degrees; "
             "expected a pinhole, and lengths in pixels, not in shares of the image"
         )
-    if not {*x, *y} & {"fl_x", "fl_y", "camera_intrinsics"} and not _agree(fx, fy):
+    if not {*x, *y} & {"fl_x", "fl_y", "camera_intrinsics"} and not _lengths_agree(fx, fy):
         keys = f"{next(iter(x))} and {next(iter(y))}"
         expected = "square pixels, or fl_x and fl_y (Blender's angle_y is the sensor's, not the image's: leave it out)"
         raise DataError(
@@ -148,13 +149,15 @@ def _focal(frame: JsonReader, level: _Level, target: Target, say: Say) -> tuple[
     for found, other in ((x, y), (y, x)):
         first, value = next(iter(found.items()), ("", 0.0))
         for key in found:
-            if _agree(found[key], value):
+            if _lengths_agree(found[key], value):
                 continue
             text = f"{where}: {first} means a focal length of {value:.5g} pixels, and {key} {found[key]:.5g}"
             # BlenderNeRF writes the angles of Blender's sensor beside the right fl_x and fl_y: angle_x is that of the
             # image's longer side, and angle_y has nothing to do with the image
-            explained = key == "camera_angle_x" and _agree(found[key] * portrait, value)
-            explained |= key == "camera_angle_y" and first == "fl_y" and _agree(fx, fy) and "camera_angle_x" in other
+            explained = key == "camera_angle_x" and _lengths_agree(found[key] * portrait, value)
+            explained |= (
+                key == "camera_angle_y" and first == "fl_y" and _lengths_agree(fx, fy) and "camera_angle_x" in other
+            )
             if not explained:
                 remedy = "take out the wrong one, or give w, h of the images they are for"
                 raise DataError(f"{text}; expected the same within {_TOLERANCE:.0%}: {remedy}")
@@ -162,7 +165,7 @@ def _focal(frame: JsonReader, level: _Level, target: Target, say: Say) -> tuple[
     return fx, fy
 
 
-def _stated(level: _Level, axis: int, target: Target) -> dict[str, float]:
+def _stated_focal_lengths(level: _KeySource, axis: int, target: Target) -> dict[str, float]:
     """Every focal length along an axis that a record states, in target pixels, by key; lengths in pixels first."""
     record, name, side = level.record, "xy"[axis], target.size[axis]
     found = {}
@@ -170,7 +173,7 @@ def _stated(level: _Level, axis: int, target: Target) -> dict[str, float]:
         length = record.number(key, "a focal length in pixels above 0", 0.0)
         found[key] = length * level.scales("fl_x, fl_y", target)[axis]
     if record.has(key := "camera_intrinsics"):
-        found[key] = _intrinsics(record)[2 + axis] * level.scales(key, target)[axis]
+        found[key] = _read_camera_intrinsics(record)[2 + axis] * level.scales(key, target)[axis]
     for key, unit, expected in (
         (f"camera_angle_{name}", 1.0, "field of view in radians, between 0 and pi"),
         (f"{name}_fov", math.pi / 180.0, "field of view in degrees, between 0 and 180"),
@@ -181,7 +184,7 @@ def _stated(level: _Level, axis: int, target: Target) -> dict[str, float]:
     return found
 
 
-def _intrinsics(record: JsonReader) -> list[float]:
+def _read_camera_intrinsics(record: JsonReader) -> list[float]:
     """[cx, cy, fx, fy] of ``camera_intrinsics``, pixels."""
     values: list[float] = record.array("camera_intrinsics", (4,), "[cx, cy, fx, fy] in pixels").tolist()
     if not (values[2] > 0 and values[3] > 0):
@@ -190,14 +193,16 @@ def _intrinsics(record: JsonReader) -> list[float]:
     return values
 
 
-def _agree(a: float, b: float) -> bool:
+def _lengths_agree(a: float, b: float) -> bool:
     return abs(a - b) <= _TOLERANCE * max(abs(a), abs(b))
 
 
 # ---------------------------------------------------------------- principal point
 
 
-def _middle(frame: _Level, file: _Level, focal: _Level, target: Target) -> tuple[float, float]:
+def _read_principal_point(
+    frame: _KeySource, file: _KeySource, focal: _KeySource, target: Target
+) -> tuple[float, float]:
     """cx, cy in pixels of the target."""
     array = focal.record.has("camera_intrinsics")
     level = frame if frame.has(PRINCIPAL_POINT) else focal if array else file
@@ -210,7 +215,7 @@ def _middle(frame: _Level, file: _Level, focal: _Level, target: Target) -> tuple
         raise DataError(f"{record.where}: {found}; expected both in the frame")
     scale = level.scales(keys, target)
     plain = [record.number_or(key, 0.5 * side) for key, side in zip(PRINCIPAL_POINT, level.size, strict=True)]
-    stated = _intrinsics(record)[:2] if array else plain
+    stated = _read_camera_intrinsics(record)[:2] if array else plain
     cx, cy = stated[0] * scale[0], stated[1] * scale[1]
     if array and level.has(PRINCIPAL_POINT):
         differences = (abs(cx - plain[0] * scale[0]), abs(cy - plain[1] * scale[1]))
@@ -218,11 +223,11 @@ def _middle(frame: _Level, file: _Level, focal: _Level, target: Target) -> tuple
             found = f"cx, cy are {plain}, and camera_intrinsics begins with {stated}"
             raise DataError(f"{record.where}: {found}; expected the same")
     if target.image or not (frame.has(SIZE) or file.has(SIZE)):  # a picture of a stated size may look past its edge
-        _check_middle(record.where, keys, (cx, cy), frame.has(SIZE) or file.has(SIZE), target)
+        _check_principal_point(record.where, keys, (cx, cy), frame.has(SIZE) or file.has(SIZE), target)
     return cx, cy
 
 
-def _check_middle(where: str, keys: str, point: tuple[float, float], stated: bool, target: Target) -> None:
+def _check_principal_point(where: str, keys: str, point: tuple[float, float], stated: bool, target: Target) -> None:
     """Refuse a principal point outside of the image, or in the middle of an image of another size."""
     (cx, cy), image = point, f"{target.image or 'the picture'} ({target.width}x{target.height})"
     kx, ky = 2.0 * cx / target.width, 2.0 * cy / target.height
@@ -242,7 +247,7 @@ def _check_middle(where: str, keys: str, point: tuple[float, float], stated: boo
 # ---------------------------------------------------------------- lenses
 
 
-def _check_one_lens(frame: _Level, file: _Level, target: Target) -> None:
+def _check_one_lens(frame: _KeySource, file: _KeySource, target: Target) -> None:
     """Refuse a frame with its own focal length that takes principal point or distortion from the file."""
     if file.record.has("camera_intrinsics") or not file.has(FOCAL):
         return
@@ -255,22 +260,23 @@ def _check_one_lens(frame: _Level, file: _Level, target: Target) -> None:
     if not left:
         return
     own, other = (
-        [*_stated(level, 0, target).values(), *_stated(level, 1, target).values()][0] for level in (frame, file)
+        [*_stated_focal_lengths(level, 0, target).values(), *_stated_focal_lengths(level, 1, target).values()][0]
+        for level in (frame, file)
     )
-    if not _agree(own, other):
+    if not _lengths_agree(own, other):
         found = f"has a focal length of its own, and {', '.join(left)} of the file belong to another one"
         raise DataError(f"{frame.record.where}: {found}; expected {', '.join(left)} in the frame, too")
 
 
 def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, float]:
     """Read the distortion coefficients by name; 0 where none is given."""
-    record = _owner(COEFFICIENTS, frame, file)
+    record = _record_with_keys(COEFFICIENTS, frame, file)
     return {key: record.number_or(key, 0.0) for key in COEFFICIENTS}
 
 
 def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
     """Whether the lens is OpenCV's fisheye; refuses models that are no pinhole, offering ``others`` too."""
-    record = _owner(("camera_model", "is_fisheye"), frame, file)
+    record = _record_with_keys(("camera_model", "is_fisheye"), frame, file)
     model = record.text("camera_model") if record.has("camera_model") else "OPENCV"
     if model == "OPENCV_FISHEYE" or record.values.get("is_fisheye") is True:
         return True
@@ -333,7 +339,7 @@ _LISTED = 8
 def refuse_unsupported_keys(record: JsonReader) -> None:
     """Raise DataError for a key that changes the picture and is not supported."""
     for key, states in _REFUSED.items():
-        if key in record.values and _says(record.values[key]):
+        if key in record.values and _is_set(record.values[key]):
             raise DataError(f"{record.where}: {key} states {states}")
     pinholes = ("perspective", "persp", "none", *(m.lower() for m in MODELS))
     for key in _KINDS:
@@ -344,9 +350,9 @@ def refuse_unsupported_keys(record: JsonReader) -> None:
         raise record.fail("n_frames", f"{len(frames)}, as there are frames; take out those that should not count")
 
 
-def _says(value: Any) -> bool:
+def _is_set(value: Any) -> bool:
     """Whether a value is more than zeros, false or nothing."""
-    return any(map(_says, value)) if isinstance(value, list) else bool(value)
+    return any(map(_is_set, value)) if isinstance(value, list) else bool(value)
 
 
 def describe_unknown_keys(file: JsonReader, frames: Iterable[JsonReader], read: Iterable[str]) -> str:

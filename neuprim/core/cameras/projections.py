@@ -63,11 +63,11 @@ class RayCamera:
         degrees off the axis, straight backwards; beyond that they have no ray. Raises DataError: impossible size or
         field of view.
         """
-        _check_size("fisheye", width, height)
+        _check_image_size("fisheye", width, height)
         if not 0.0 < fov_degrees <= 360.0:
             raise DataError(f"RayCamera.fisheye: fov_degrees={fov_degrees!r}; expected a number in (0, 360]")
         per_pixel = math.radians(fov_degrees) / min(width, height)
-        y, x = _grid(width, height)
+        y, x = _pixel_centre_grid(width, height)
         x, y = x - width / 2, y - height / 2
         radius = torch.hypot(x, y)
         theta = radius * per_pixel
@@ -82,8 +82,8 @@ class RayCamera:
         The image centre looks along +z, its right half to +x. Pixels are square at the equator if ``width`` is twice
         ``height``. Raises DataError for an impossible size.
         """
-        _check_size("equirectangular", width, height)
-        y, x = _grid(width, height)
+        _check_image_size("equirectangular", width, height)
+        y, x = _pixel_centre_grid(width, height)
         longitude, latitude = (x / width - 0.5) * (2 * math.pi), (0.5 - y / height) * math.pi
         flat = latitude.cos()
         return cls(viewmat, torch.stack([longitude.sin() * flat, -latitude.sin(), longitude.cos() * flat], -1))
@@ -93,12 +93,12 @@ AnyCamera = Camera | RayCamera
 """What the renderer and the colour fields accept; both have ``viewmat``, ``position``, ``width`` and ``height``."""
 
 
-def _check_size(name: str, width: int, height: int) -> None:
+def _check_image_size(name: str, width: int, height: int) -> None:
     if width <= 0 or height <= 0:
         raise DataError(f"RayCamera.{name}: image size {width}x{height}; expected positive")
 
 
-def _grid(width: int, height: int) -> tuple[Tensor, Tensor]:
+def _pixel_centre_grid(width: int, height: int) -> tuple[Tensor, Tensor]:
     """(y, x) of the pixel centres, each (H, W), float64."""
     ys, xs = torch.arange(height, dtype=torch.float64) + 0.5, torch.arange(width, dtype=torch.float64) + 0.5
     y, x = torch.meshgrid(ys, xs, indexing="ij")

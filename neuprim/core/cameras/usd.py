@@ -53,12 +53,12 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
     """
     if importlib.util.find_spec("pxr") is None:
         raise BackendUnavailable(f"{path}: USD files need the package usd-core: pip install 'neuprim[usd]'")
-    stage = _stage(path, prim)
+    stage = _read_usd_stage(path, prim)
     where = f"{path}: {stage.text('path')}"
-    wanted = size or _resolution(stage, path)
+    wanted = size or _usd_image_size(stage, path)
     records = list(stage.objects("frames"))
     cameras = [
-        _camera(JsonReader(r.values, where if len(records) == 1 else f"{where}, frame {i}"), wanted)
+        _usd_camera(JsonReader(r.values, where if len(records) == 1 else f"{where}, frame {i}"), wanted)
         for i, r in enumerate(records)
     ]
     note = (
@@ -71,7 +71,7 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
     return CameraViews(tuple((f"camera_{i:03d}", camera) for i, camera in enumerate(cameras)), None, fps, (note,))
 
 
-def _stage(path: Path, prim: str) -> JsonReader:
+def _read_usd_stage(path: Path, prim: str) -> JsonReader:
     """What the process printed."""
     if path.stat().st_size > _MAX_BYTES:
         raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {_MAX_BYTES}")
@@ -94,7 +94,7 @@ def _stage(path: Path, prim: str) -> JsonReader:
         raise DataError(f"{path}: not a readable USD file ({error})") from None
 
 
-def _resolution(stage: JsonReader, path: Path) -> tuple[int, int]:
+def _usd_image_size(stage: JsonReader, path: Path) -> tuple[int, int]:
     if not stage.has("resolution"):
         raise DataError(f"{path}: names no size of an image (renderSettingsPrimPath); give --size WxH")
     width, height = (int(x) for x in stage.array("resolution", (2,), "width and height").tolist())
@@ -103,7 +103,7 @@ def _resolution(stage: JsonReader, path: Path) -> tuple[int, int]:
     return width, height
 
 
-def _camera(record: JsonReader, size: tuple[int, int]) -> Camera:
+def _usd_camera(record: JsonReader, size: tuple[int, int]) -> Camera:
     if record.text("projection") != "perspective":
         raise record.fail("projection", "perspective; others are not drawn")
     focal = record.number("focal", "a focal length above 0", 0.0)
@@ -112,14 +112,14 @@ def _camera(record: JsonReader, size: tuple[int, int]) -> Camera:
         raise DataError(f"{record.where}: aperture is {wide:g} x {high:g}; expected numbers above 0")
     width, height = size
     scale = min(width / wide, height / high)  # pixels per unit of the aperture; all of it is in the image
-    pose = opengl_to_viewmat(_rigid(record.matrix("transform_matrix"), record.where))
+    pose = opengl_to_viewmat(_remove_pose_scale(record.matrix("transform_matrix"), record.where))
     camera = Camera(
         pose, focal * scale, focal * scale, width / 2 - right * scale, height / 2 + up * scale, width, height
     )
     return camera.validate(record.where)
 
 
-def _rigid(matrix: Tensor, where: str) -> Tensor:
+def _remove_pose_scale(matrix: Tensor, where: str) -> Tensor:
     """The pose without the one scale of all its axes, which a camera's image does not depend on."""
     lengths = matrix[:3, :3].norm(dim=0)
     mean = lengths.mean()

@@ -35,7 +35,7 @@ class _Silhouette:
 
 
 @dataclass(frozen=True)
-class _Grid:
+class _VoxelGrid:
     """Cubic voxels: lower corner (3,), side, and (X, Y, Z) bool of the voxels that remain."""
 
     corner: Tensor
@@ -59,20 +59,22 @@ def hull_surface(
 
     Raises EmptyHull if no voxel is left.
     """
-    silhouettes = _silhouettes(views, matter)
+    silhouettes = _read_silhouettes(views, matter)
     cameras = [s.camera for s in silhouettes]
     center = focus_point(cameras)
     half = torch.stack([c.position.double() for c in cameras]).sub(center).norm(dim=-1).median().item() or 1.0
     everything = torch.ones((_COARSE,) * 3, dtype=torch.bool)
-    grid = _carved(_Grid(center - half, 2.0 * half / _COARSE, everything), silhouettes, 0.87, seen_views, wrong_views)
-    grid = _carved(_refined(grid, _COARSE), silhouettes, 0.87, seen_views, wrong_views)
+    grid = _carve_voxels(
+        _VoxelGrid(center - half, 2.0 * half / _COARSE, everything), silhouettes, 0.87, seen_views, wrong_views
+    )
+    grid = _carve_voxels(_refine_voxels(grid, _COARSE), silhouettes, 0.87, seen_views, wrong_views)
     # wider than 0.25 and the hull swells, narrower and it tears
-    grid = _carved(_refined(grid, resolution), silhouettes, 0.25, seen_views, wrong_views)
+    grid = _carve_voxels(_refine_voxels(grid, resolution), silhouettes, 0.25, seen_views, wrong_views)
     core = -F.max_pool3d(-F.pad(grid.full[None].float(), (1,) * 6), 3, stride=1)[0] > 0.5
     return grid.centers((grid.full & ~core).nonzero()).float(), grid.voxel
 
 
-def _silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
+def _read_silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
     """Masks of evenly chosen views, ordered so that neighbours look from different sides."""
     chosen = sorted(evenly_spaced(len(views), _VIEWS), key=lambda i: i * 0.6180339887 % 1.0)
     found = []
@@ -91,7 +93,7 @@ def _silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
     return found
 
 
-def _refined(grid: _Grid, resolution: int) -> _Grid:
+def _refine_voxels(grid: _VoxelGrid, resolution: int) -> _VoxelGrid:
     """Refine to ``resolution`` voxels along the longest side of the box of full cells."""
     cells = grid.full.nonzero()
     low, high = cells.min(0).values, cells.max(0).values + 1
@@ -102,10 +104,12 @@ def _refined(grid: _Grid, resolution: int) -> _Grid:
         for n, lo, hi in zip(counts, low, high, strict=True)
     ]
     full = grid.full[parents[0]][:, parents[1]][:, :, parents[2]]
-    return _Grid(grid.corner + low.double() * grid.voxel, voxel, full)
+    return _VoxelGrid(grid.corner + low.double() * grid.voxel, voxel, full)
 
 
-def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float, seen_views: float, wrong_views: float) -> _Grid:
+def _carve_voxels(
+    grid: _VoxelGrid, silhouettes: list[_Silhouette], reach: float, seen_views: float, wrong_views: float
+) -> _VoxelGrid:
     """Remove voxels that the masks rule out; ``reach`` is half the side of the tested box, in voxels."""
     cells = grid.full.nonzero()
     poses = torch.stack([s.camera.viewmat[:3].double() for s in silhouettes]).numpy()
@@ -115,7 +119,9 @@ def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float, seen_view
     tables = torch.cat([s.table.reshape(-1) for s in silhouettes]).numpy()
     allowed, needed = int(wrong_views * len(silhouettes)), max(1.0, seen_views * len(silhouettes))
     points = grid.centers(cells).numpy()
-    keep = _test_points(points, poses, lenses, np.cumsum(sizes) - sizes, tables, reach * grid.voxel, allowed, needed)
+    keep = _test_voxel_centers(
+        points, poses, lenses, np.cumsum(sizes) - sizes, tables, reach * grid.voxel, allowed, needed
+    )
     cells = cells[torch.from_numpy(keep)]
     if len(cells) == 0:
         found = f"the visual hull of {len(silhouettes)} alpha masks is empty"
@@ -123,11 +129,11 @@ def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float, seen_view
         raise EmptyHull(f"{found}: no point in front of the cameras is opaque in all views; expected {expected}")
     full = torch.zeros_like(grid.full)
     full[tuple(cells.unbind(-1))] = True
-    return _Grid(grid.corner, grid.voxel, full)
+    return _VoxelGrid(grid.corner, grid.voxel, full)
 
 
 @exact_kernel
-def _test_points(
+def _test_voxel_centers(
     points: Any, poses: Any, lenses: Any, offsets: Any, tables: Any, reach: float, allowed: int, needed: float
 ) -> Any:
     """(M,) bool of the points that ``needed`` views look at and at most ``allowed`` of those rule out.

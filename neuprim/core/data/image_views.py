@@ -101,7 +101,7 @@ class _StoredImage:
 
 
 @exact_kernel
-def _premultiply(rgba, rgb, alpha):  # type: ignore[no-untyped-def]
+def _premultiply_kernel(rgba, rgb, alpha):  # type: ignore[no-untyped-def]
     scale = np.float32(1.0 / 255.0)
     for i in range(rgba.shape[0]):
         a = np.float32(rgba[i, 3]) * scale
@@ -110,10 +110,10 @@ def _premultiply(rgba, rgb, alpha):  # type: ignore[no-untyped-def]
             rgb[i, c] = np.float32(rgba[i, c]) * scale * a
 
 
-def _premultiplied(rgba: Tensor) -> tuple[Tensor, Tensor]:
+def _premultiply_pixels(rgba: Tensor) -> tuple[Tensor, Tensor]:
     """(H, W, 3) and (H, W) floats of straight-alpha 8-bit pixels, in one pass, as every step needs them."""
     rgb, alpha = torch.empty(*rgba.shape[:2], 3), torch.empty(rgba.shape[:2])
-    _premultiply(rgba.reshape(-1, 4).numpy(), rgb.reshape(-1, 3).numpy(), alpha.reshape(-1).numpy())
+    _premultiply_kernel(rgba.reshape(-1, 4).numpy(), rgb.reshape(-1, 3).numpy(), alpha.reshape(-1).numpy())
     return rgb, alpha
 
 
@@ -162,7 +162,7 @@ class ImageViews(ViewSet):
         if self._to_linear:
             return self._linear_pixels(stored)
         if stored.data.dtype == torch.uint8 and stored.data.shape[-1] == 4 and not stored.premultiplied:
-            return Pixels(*_premultiplied(stored.data), stored.mask)
+            return Pixels(*_premultiply_pixels(stored.data), stored.mask)
         data = stored.data.float()
         if stored.data.dtype == torch.uint8:
             data = data / 255.0

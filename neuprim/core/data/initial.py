@@ -54,7 +54,7 @@ def views_have_alpha(views: ViewSet) -> bool:
 
 def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
     """Draw at most ``count`` distinct points uniformly, in their own order."""
-    rows = _distinct_rows(points)
+    rows = _distinct_point_rows(points)
     if len(rows) > count:
         rows = rows[torch.randperm(len(rows), generator=generator)[:count]].sort().values
     return points.rows(rows)
@@ -89,11 +89,11 @@ def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointC
 
 def drop_repeated_points(points: PointCloud) -> PointCloud:
     """Remove repeated positions."""
-    rows = _distinct_rows(points)
+    rows = _distinct_point_rows(points)
     return points if len(rows) == len(points.means) else points.rows(rows)
 
 
-def _distinct_rows(points: PointCloud) -> Tensor:
+def _distinct_point_rows(points: PointCloud) -> Tensor:
     _, first = np.unique(points.means.numpy(), axis=0, return_index=True)
     return torch.from_numpy(np.sort(first))
 
@@ -101,7 +101,7 @@ def _distinct_rows(points: PointCloud) -> Tensor:
 def farthest_points(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Choose (count,) rows of ``points`` (M, 3) far from each other; approximately for large sets."""
     if count * len(points) > _FPS_WORK:
-        return _thinned(points, count, generator)
+        return _thin_points_by_grid(points, count, generator)
     start = int(torch.randint(len(points), (1,), generator=generator))
     x, y, z = (np.ascontiguousarray(points[:, i].float().numpy()) for i in range(3))
     nearest = np.full(len(points), np.inf, dtype=np.float32)
@@ -120,7 +120,7 @@ def farthest_points(points: Tensor, count: int, generator: torch.Generator) -> T
     return torch.from_numpy(rows)
 
 
-def _thinned(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def _thin_points_by_grid(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     shuffled = torch.randperm(len(points), generator=generator).numpy()
     low = points.min(0).values
     unit = ((points - low) / (points - low).max().clamp_min(1e-30)).double().numpy()[shuffled]
@@ -142,14 +142,16 @@ def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
     the median of the others, or mid-grey.
     """
     indices = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(len(views), _COLOR_VIEWS))})
-    samples = torch.stack([_sample(views, i, means, matter) for i in indices])  # (V, N, C), NaN where none counts
+    samples = torch.stack(
+        [_sample_point_colors(views, i, means, matter) for i in indices]
+    )  # (V, N, C), NaN where none counts
     colors = torch.cat([samples[:, i : i + _CHUNK].nanmedian(dim=0).values for i in range(0, len(means), _CHUNK)])
     hidden = colors.isnan().any(dim=-1)
     typical = colors.nanmedian(dim=0).values.nan_to_num(nan=0.5)
     return torch.where(hidden[:, None], typical, colors)
 
 
-def _sample(views: ViewSet, index: int, means: Tensor, matter: float) -> Tensor:
+def _sample_point_colors(views: ViewSet, index: int, means: Tensor, matter: float) -> Tensor:
     camera, pixels = views.view(index).camera, views.pixels(index)
     inside = camera.sees(means)
     column, row = torch.where(inside[:, None], camera.project(means)[0], 0.0).long().unbind(-1)
@@ -181,8 +183,8 @@ def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator
     """
     if count <= 0 or not len(points.means):
         return points.rows(torch.zeros(0, dtype=torch.int64))
-    shell = _shell(views, points.means, max(round(_SHELL * count), 1), generator)
-    lifted = _lifted(views, points.means, count, generator)
+    shell = _surrounding_shell(views, points.means, max(round(_SHELL * count), 1), generator)
+    lifted = _lift_uncovered_pixels(views, points.means, count, generator)
     wanted = count - len(shell.means)
     if len(lifted.means) > wanted:
         lifted = lifted.rows(torch.randperm(len(lifted.means), generator=generator)[:wanted].sort().values)
@@ -190,7 +192,7 @@ def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator
     return drop_repeated_points(both)
 
 
-def _lifted(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
+def _lift_uncovered_pixels(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
     """Lift pixels without nearby points, coarse grids first, so that the largest gaps are filled first."""
     order = torch.randperm(len(views), generator=generator)[:_VIEWS].tolist()
     known = given.double().numpy()
@@ -199,7 +201,7 @@ def _lifted(views: ViewSet, given: Tensor, count: int, generator: torch.Generato
     side = max(views.view(order[0]).camera.width, views.view(order[0]).camera.height)
     for cells in _CELLS:
         for index in order:
-            found, seen = _gaps(views, index, known, side / cells)
+            found, seen = _find_uncovered_pixels(views, index, known, side / cells)
             known, means = np.concatenate([known, found]), np.concatenate([means, found])
             colors = np.concatenate([colors, seen])
         if len(means) >= count:
@@ -207,13 +209,13 @@ def _lifted(views: ViewSet, given: Tensor, count: int, generator: torch.Generato
     return PointCloud(torch.from_numpy(means[:count]).float(), torch.from_numpy(colors[:count]).float())
 
 
-def _gaps(
+def _find_uncovered_pixels(
     views: ViewSet, index: int, known: NDArray[np.float64], cell: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Positions and colours of pixels ``cell`` apart without a known point that near, in image and space."""
     camera, image = views.view(index).camera, views.pixels(index)
     rotation, shift = camera.viewmat[:3, :3].double().numpy(), camera.viewmat[:3, 3].double().numpy()
-    spots = _grid(camera.width, camera.height, cell)
+    spots = _pixel_grid(camera.width, camera.height, cell)
     cols, rows = spots.astype(np.int64).T
     counts = np.ones(len(spots), dtype=bool)
     if image.mask is not None:
@@ -235,14 +237,14 @@ def _gaps(
     return found[fresh], image.rgb.numpy()[rows[keep], cols[keep]][fresh]
 
 
-def _grid(width: int, height: int, cell: float) -> NDArray[np.float64]:
+def _pixel_grid(width: int, height: int, cell: float) -> NDArray[np.float64]:
     """(N, 2) pixel positions (x, y), about ``cell`` apart."""
     across, down = max(round(width / cell), 1), max(round(height / cell), 1)
     x, y = (np.arange(across) + 0.5) * width / across, (np.arange(down) + 0.5) * height / down
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def _shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
+def _surrounding_shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
     """At most ``count`` points on a sphere around cameras and points, where some view looks."""
     cameras = [views.view(i).camera for i in range(len(views))]
     center = focus_point(cameras)

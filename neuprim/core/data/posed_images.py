@@ -118,7 +118,7 @@ def find_image(folder: Path, text: str) -> Path | None:
     text = str(folder / text.replace("\\", "/"))
     try:
         found = next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
-        return found or _other_case(folder, Path(text))
+        return found or _find_other_case(folder, Path(text))
     except OSError:  # a name longer than the file system can hold
         return None
 
@@ -133,7 +133,7 @@ def _warn_of_outside_images(where: str, home: Path, paths: Iterable[Path]) -> No
         warn_once(f"{where}: {found}; they are read as it says")
 
 
-def _other_case(folder: Path, path: Path) -> Path | None:
+def _find_other_case(folder: Path, path: Path) -> Path | None:
     """The only file whose path differs from ``path`` in upper and lower case alone."""
     if not path.is_relative_to(folder):
         return None
@@ -170,15 +170,15 @@ def unique_view_names(paths: Iterable[str], where: str) -> list[str]:
     path, count = max(Counter(texts).items(), key=lambda item: item[1], default=("", 0))
     if count > 1:
         raise DataError(f"{where}: image {path!r} is listed {count} times; expected once")
-    stems = [_without_suffix(p.rstrip("/").rsplit("/", 1)[-1]) for p in texts]
+    stems = [_drop_image_suffix(p.rstrip("/").rsplit("/", 1)[-1]) for p in texts]
     if len(set(stems)) < len(stems):
-        stems = [_without_suffix(p.strip("/")).replace("/", "_") for p in texts]
+        stems = [_drop_image_suffix(p.strip("/")).replace("/", "_") for p in texts]
     if len(set(stems)) < len(stems):  # a_b.png beside a/b.png, or b.png beside b.jpg
         stems = [f"{i:04d}_{s}" for i, s in enumerate(stems)]
     return stems
 
 
-def _without_suffix(text: str) -> str:
+def _drop_image_suffix(text: str) -> str:
     return next((text.removesuffix(s) for s in IMAGE_SUFFIXES if text.endswith(s)), text)
 
 
@@ -216,7 +216,7 @@ def assemble_dataset(
     Raises DataError: an empty split, mixed kinds of images, most images damaged, or any with ``settings.strict``;
     ConfigError: a random background without alpha, or a down-sampling factor larger than an image.
     """
-    _check_splits(where, train, test, settings)
+    _check_image_splits(where, train, test, settings)
     both = [*train, *test]
     _warn_of_outside_images(where, details.home or Path(where), [frame.path for frame in both])
     background = _choose_background(where, settings.background, alpha=both[0].info.channels == 4)
@@ -227,8 +227,8 @@ def assemble_dataset(
     views = [ImageViews(frames, factor, to_linear=details.to_linear) for frames in (train, test)]
     if settings.preload:
         at_rest = details.start is None  # scenes that move may show nothing at some moments
-        _preload(where, views[0], "training", settings.strict, not at_rest, context.progress)
-        _preload(where, views[1], "test", settings.strict, True, context.progress)
+        _preload_split(where, views[0], "training", settings.strict, not at_rest, context.progress)
+        _preload_split(where, views[1], "test", settings.strict, True, context.progress)
     exposure = details.exposure(views[0]) if callable(details.exposure) else details.exposure
     for images in views:
         images.scale = 1.0 / exposure
@@ -244,7 +244,7 @@ def assemble_dataset(
         background=torch.full((3,), 0.0 if background == "black" else 1.0),
         random_background=background == "random",
         downsampling=", then ".join(text for text in reductions if text) or "none",
-        up=_mean_up(cameras) if details.up is None else details.up,
+        up=_mean_camera_up(cameras) if details.up is None else details.up,
         center=focus_point(cameras).float(),
         exposure=exposure,
         world=world,
@@ -252,7 +252,7 @@ def assemble_dataset(
     )
 
 
-def _check_splits(
+def _check_image_splits(
     where: str, train: Sequence[ImageFrame], test: Sequence[ImageFrame], settings: FolderSettings
 ) -> None:
     for split, frames in (("training", train), ("test", test)):
@@ -280,7 +280,7 @@ def _choose_background(where: str, background: str, alpha: bool) -> str:
     return ("white" if alpha else "black") if background == "auto" else background
 
 
-def _preload(
+def _preload_split(
     where: str, images: ImageViews, split: str, strict: bool, empty: bool, progress: Callable[[str, float], None]
 ) -> None:
     """Decode all images of a split and leave out the damaged ones; ``empty`` ones may show nothing."""
@@ -309,7 +309,7 @@ def _describe_reduction(frames: Sequence[ImageFrame], reduced: Camera, factor: i
     return f"{reduced.width}x{reduced.height} from {width}x{height} by area"
 
 
-def _mean_up(cameras: Sequence[Camera]) -> Tensor:
+def _mean_camera_up(cameras: Sequence[Camera]) -> Tensor:
     """(3,) mean of the cameras' upward directions; +z where they cancel."""
     up = -torch.stack([c.viewmat[1, :3] for c in cameras]).mean(0)
     if up.norm() < 1e-3:

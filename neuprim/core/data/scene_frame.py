@@ -34,7 +34,7 @@ def find_outliers(positions: Tensor) -> Tensor:
 
 def focus_point(cameras: Sequence[Camera]) -> Tensor:
     """(3,) float64 point nearest to all optical axes (least squares), pulled weakly to one extent in front."""
-    positions, forward = _axes(cameras)
+    positions, forward = _optical_axes(cameras)
     eye = torch.eye(3, dtype=torch.float64)
     planes = eye - forward[:, :, None] * forward[:, None, :]
     pull = 1e-4 * len(positions)
@@ -49,7 +49,7 @@ def optical_axes_meet(cameras: Sequence[Camera]) -> bool:
     They pass it closer than half the spread of the centres, and 9 of 10 cameras look towards it. Parallel axes, outward
     rings and tripods do not.
     """
-    positions, forward = _axes(cameras)
+    positions, forward = _optical_axes(cameras)
     offsets = focus_point(cameras) - positions
     depths = (offsets * forward).sum(-1)
     miss = (offsets - depths[:, None] * forward).square().sum(-1).mean()
@@ -58,7 +58,7 @@ def optical_axes_meet(cameras: Sequence[Camera]) -> bool:
     return bool((miss < 0.25 * spread) & (turned > 1e-3) & ((depths > 0).double().mean() >= 0.9))
 
 
-def _axes(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
+def _optical_axes(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
     """(N, 3) centres and (N, 3) viewing directions, float64, of all cameras but outliers."""
     positions = torch.stack([c.position.detach().double() for c in cameras])
     forward = torch.stack([c.viewmat[2, :3].detach().double() for c in cameras])

@@ -43,11 +43,11 @@ from neuprim.core.notices import warn_once
 _POSES = ("transform_matrix", "R_opt", "T_opt")
 
 
-def _file_path(record: JsonReader) -> str:
+def _frame_file_path(record: JsonReader) -> str:
     return record.text("file_path")
 
 
-def _viewmat(record: JsonReader) -> Tensor:
+def _frame_viewmat(record: JsonReader) -> Tensor:
     return opengl_to_viewmat(record.matrix("transform_matrix"))
 
 
@@ -56,9 +56,9 @@ class TransformsLayout:
     """What differs between formats."""
 
     keys: tuple[str, ...] = ()  # further keys that the loader reads
-    name: Callable[[JsonReader], str] = _file_path  # path of a frame's image, as the file has it
-    image: Callable[[Path, JsonReader], Path | None] = lambda folder, frame: find_image(folder, _file_path(frame))
-    viewmat: Callable[[JsonReader], Tensor] = _viewmat  # (4, 4) world to camera, OpenCV axes
+    name: Callable[[JsonReader], str] = _frame_file_path  # path of a frame's image, as the file has it
+    image: Callable[[Path, JsonReader], Path | None] = lambda folder, frame: find_image(folder, _frame_file_path(frame))
+    viewmat: Callable[[JsonReader], Tensor] = _frame_viewmat  # (4, 4) world to camera, OpenCV axes
     masks: bool = False  # whether a folder ``masks`` beside the images counts where the file names no mask
 
 
@@ -89,17 +89,17 @@ def read_transforms_frames(
         hint = "; scene.skip_missing=true leaves such frames out" if offered else ""
         raise missing_files_error(document.where, absent, hint)
     present = [(r, file) for r, file in images if file is not None]
-    masks = _masks(folder, document, present, layout)
+    masks = _find_frame_masks(folder, document, present, layout)
     names = unique_view_names([layout.name(r) for r, _ in present], document.where)
     kept: list[JsonReader] = []
     frames: list[ImageFrame] = []
     bad = BadViews(document.where, settings.strict)
     for (record, file), mask, name in zip(present, masks, names, strict=True):
         fisheye = has_fisheye_lens(record, document)  # first, as other keys mean nothing to a lens that is not known
-        if not _damaged(record):
+        if not _is_pose_damaged(record):
             layout.viewmat(record)  # a field that is missing or of another kind is no damage, and refused
         info = bad.read(name, image_info, file)
-        viewmat = None if info is None else bad.read(name, _pose, record, layout)
+        viewmat = None if info is None else bad.read(name, _read_checked_pose, record, layout)
         if info is None or viewmat is None:
             continue
         target = Target(info.width, info.height, str(file), exif_hint(info))
@@ -110,7 +110,7 @@ def read_transforms_frames(
             what = "images with an EXIF orientation are read as they are stored, as COLMAP reads them"
             warn_once(f"{file.parent}: {what}")
         kept.append(record)
-        frames.append(ImageFrame(name, file, camera, info, mask, _distortion(record, document, fisheye)))
+        frames.append(ImageFrame(name, file, camera, info, mask, _read_distortion(record, document, fisheye)))
     bad.settle(len(present))
     unknown = describe_unknown_keys(document, records, layout.keys)
     if unknown:
@@ -118,28 +118,28 @@ def read_transforms_frames(
     return kept, frames
 
 
-def _pose(record: JsonReader, layout: TransformsLayout) -> Tensor:
+def _read_checked_pose(record: JsonReader, layout: TransformsLayout) -> Tensor:
     viewmat = layout.viewmat(record)
     check_viewmat(viewmat, record.where)
     return viewmat
 
 
-def _damaged(record: JsonReader) -> bool:
+def _is_pose_damaged(record: JsonReader) -> bool:
     """Whether a pose has numbers that are not finite, or only zeros."""
-    poses = [_numbers(record.values.get(key)) for key in _POSES]
+    poses = [_flatten_numbers(record.values.get(key)) for key in _POSES]
     return any(not all(map(math.isfinite, numbers)) for numbers in poses) or bool(poses[0] and not any(poses[0]))
 
 
-def _numbers(value: object) -> list[float]:
+def _flatten_numbers(value: object) -> list[float]:
     """All numbers in nested lists."""
     if isinstance(value, list):
-        return [n for item in value for n in _numbers(item)]
+        return [n for item in value for n in _flatten_numbers(item)]
     if isinstance(value, int) and not isinstance(value, bool):
         return [float(value)] if abs(value) < 2**1000 else [math.inf]
     return [value] if isinstance(value, float) else []
 
 
-def _masks(
+def _find_frame_masks(
     folder: Path, document: JsonReader, present: Sequence[tuple[JsonReader, Path]], layout: TransformsLayout
 ) -> list[Mask | None]:
     """The mask of every frame: what ``mask_path`` of frame or file names, else what lies beside the images."""
@@ -157,7 +157,7 @@ def _masks(
     return masks
 
 
-def _distortion(record: JsonReader, document: JsonReader, fisheye: bool) -> Distortion | None:
+def _read_distortion(record: JsonReader, document: JsonReader, fisheye: bool) -> Distortion | None:
     """The lens; None where all of its coefficients are zero."""
     lens = read_lens_coefficients(record, document)
     k, p = [lens[f"k{i}"] for i in (1, 2, 3, 4)], [lens["p1"], lens["p2"]]
@@ -196,11 +196,11 @@ def split_named_frames(
     list names an unknown image, or training and test lists overlap.
     """
     keys = [key for key in ("train_filenames", "val_filenames", "test_filenames") if document.has(key)]
-    lists = {key: set(map(_plain, document.texts(key))) for key in keys}
+    lists = {key: set(map(_plain_path, document.texts(key))) for key in keys}
     if not lists:
         return split_every_nth(frames, every)
-    listed = {_plain(r.text("file_path")): f for r, f in zip(records, frames, strict=True)}
-    everything = {_plain(r.text("file_path")) for r in document.objects("frames")}
+    listed = {_plain_path(r.text("file_path")): f for r, f in zip(records, frames, strict=True)}
+    everything = {_plain_path(r.text("file_path")) for r in document.objects("frames")}
     for key, names in lists.items():
         unknown = sorted(names - everything)
         if unknown:
@@ -216,5 +216,5 @@ def split_named_frames(
     return [f for n, f in listed.items() if n in train_names], [f for n, f in listed.items() if n in test_names]
 
 
-def _plain(text: str) -> str:
+def _plain_path(text: str) -> str:
     return text.replace("\\", "/").removeprefix("./")

@@ -31,8 +31,8 @@ from neuprim.core.validation import validate_choices
 from neuprim.scenes import PIXEL_CLASSES
 from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightHarmonics, LightNetwork
 from neuprim.tasks.relight.lighting import (
-    illuminate,
-    lighting_of,
+    dataset_lighting,
+    lights_from_environment,
     orbit_in_frames,
     parse_intensities,
     parse_lights,
@@ -49,7 +49,7 @@ _SETTINGS: dict[str, tuple[Any, ...] | type] = {
 }
 
 
-def _colour(model: Mapping[str, Any], falloff: bool = False, typical: float = 1.0) -> ColourField:
+def _light_colour_field(model: Mapping[str, Any], falloff: bool = False, typical: float = 1.0) -> ColourField:
     chosen = {"form": "additive", "degree": 5, **model["colour"]}
     degree = chosen.pop("degree")
     if chosen["form"] == "harmonics":
@@ -57,11 +57,11 @@ def _colour(model: Mapping[str, Any], falloff: bool = False, typical: float = 1.
     return LightNetwork(falloff=falloff, typical=typical, **chosen)
 
 
-def _check(model: Mapping[str, Any]) -> None:
+def _check_relight_model(model: Mapping[str, Any]) -> None:
     validate_choices(model["density"], "model.density", DENSITY_OPTIONS)
     validate_choices(model["colour"], "model.colour", _SETTINGS)
     try:
-        _colour(model)
+        _light_colour_field(model)
     except ValueError as error:
         raise ConfigError(f"model.colour: {error}") from error
 
@@ -72,17 +72,17 @@ def _tunable_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
     return {**DENSITY_TRADE, "model.colour.hidden": (0, 4, 8, 12), "model.colour.visibility": VISIBILITY}
 
 
-def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
+def _build_relight_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     if dataset.channels != 3:
         raise ConfigError(
             f"{dataset.name}: {dataset.channels} colour channels; task relight expects 3, as light_intensity has"
         )
-    falloff = lighting_of(dataset).falloff == "inverse_square"
+    falloff = dataset_lighting(dataset).falloff == "inverse_square"
     density = CosineDensity(model["neurons"], **model["density"])
-    return density, _colour(model, falloff, typical_light(dataset, falloff))
+    return density, _light_colour_field(model, falloff, typical_light(dataset, falloff))
 
 
-def _load(function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def _load_relight_scene(function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Import the loaders when one is used and call it."""
     from neuprim.tasks.relight import datasets
 
@@ -103,7 +103,7 @@ def relight_metrics(
     dataset: Dataset, index: int, rendered: Tensor, truth: Tensor, structure: bool = True
 ) -> dict[str, float]:
     """:func:`relight_scores`, with errors per pixel class and the PSNR of its part where the dataset has them."""
-    known, result = lighting_of(dataset), relight_scores(rendered, truth, structure)
+    known, result = dataset_lighting(dataset), relight_scores(rendered, truth, structure)
     part = next((p for p in known.parts if dataset.test.view(index).name.startswith(p)), None)
     if part is not None:
         result[f"psnr_linear_clamped_{part}"] = result["psnr_linear_clamped"]
@@ -112,7 +112,7 @@ def relight_metrics(
 
 def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
     """Exposure, falloff, scores of images without a model, and pixel classes in percent of the pixels with matter."""
-    known = lighting_of(dataset)
+    known = dataset_lighting(dataset)
     result: dict[str, Any] = {"exposure": dataset.exposure, "falloff": known.falloff}
     result["baselines"] = baseline_scores(dataset)
     if not flip_available():
@@ -133,18 +133,20 @@ def baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
             entries.append(relight_metrics(dataset, i, image, truth, structure=False))
         return mean_metrics(entries)
 
-    return {"black": mean_of(None)} | {name: mean_of(guess) for name, guess in lighting_of(dataset).baselines.items()}
+    return {"black": mean_of(None)} | {
+        name: mean_of(guess) for name, guess in dataset_lighting(dataset).baselines.items()
+    }
 
 
 def relight_clips(dataset: Dataset) -> Sequence[Clip]:
     """The dataset's films."""
-    return lighting_of(dataset).clips
+    return dataset_lighting(dataset).clips
 
 
 def light_facts(dataset: Dataset) -> dict[str, Any]:
     """Summary of the training lights for the model's header."""
     lights = torch.stack([dataset.train.view(i).conditions["light"] for i in range(len(dataset.train))])
-    return {"lights": summarize_lights(lights, dataset.center, lighting_of(dataset).falloff, dataset.exposure)}
+    return {"lights": summarize_lights(lights, dataset.center, dataset_lighting(dataset).falloff, dataset.exposure)}
 
 
 def light_orbit(dataset: Dataset, frames: int) -> list[View]:
@@ -243,17 +245,17 @@ TASK = TaskSpec(
         SceneSpec(
             "lit_solids",
             "built in: solids and a glossy ring under moving point lights, with shadows",
-            partial(_load, "load_lit_solids"),
+            partial(_load_relight_scene, "load_lit_solids"),
         ),
         SceneSpec(
             "olat",
             "GS3 / NRHints layout: a light position per image, PNG or EXR: scene.path=DIR",
-            partial(_load, "load_olat"),
+            partial(_load_relight_scene, "load_olat"),
         ),
     ),
-    build=_build,
+    build=_build_relight_fields,
     loss=l1,
-    check=_check,
+    check=_check_relight_model,
     tunable_settings=_tunable_settings,
     conditions=(
         ConditionSpec(
@@ -269,7 +271,7 @@ TASK = TaskSpec(
         ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_intensities),
     ),
     fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},
-    environment=illuminate,
+    environment=lights_from_environment,
     uses=("model.neurons",),
     mask=matter_mask,
     metrics=relight_metrics,

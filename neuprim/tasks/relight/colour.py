@@ -38,13 +38,13 @@ VISIBILITY = ("none", "primitive", "pixel")
 _DARKEST = 1e-3  # smallest initial colour: at zero and below, max(0, .) passes no gradient and black stays black
 
 
-def _require_count(value: object, low: int, high: float, name: str) -> None:
+def _check_network_count(value: object, low: int, high: float, name: str) -> None:
     if not isinstance(value, int) or not low <= value <= high:
         expected = f"at least {low}" if high == math.inf else f"{low}..{high}"
         raise ValueError(f"{name} {value!r}; expected {expected}")
 
 
-def _require_typical(typical: float) -> None:
+def _check_typical_light(typical: float) -> None:
     if not 0 < typical < math.inf:
         raise ValueError(f"typical light {typical!r}; expected a number above 0")
 
@@ -73,9 +73,9 @@ class LightNetwork(ColourField):
         falloff: bool = False,
         typical: float = 1.0,
     ) -> None:
-        _require_count(hidden, 0, 16, "hidden units")
-        _require_count(channels, 1, math.inf, "colour channels")
-        _require_typical(typical)
+        _check_network_count(hidden, 0, 16, "hidden units")
+        _check_network_count(channels, 1, math.inf, "colour channels")
+        _check_typical_light(typical)
         if form not in FORMS:
             raise ValueError(f"form {form!r}; expected {' or '.join(FORMS)}")
         if visibility not in VISIBILITY:
@@ -219,8 +219,8 @@ class LightHarmonics(ColourField):
     """c = E max(0, SH(direction mu -> light)): a baseline without view dependence and shadows."""
 
     def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False, typical: float = 1.0) -> None:
-        _require_count(degree, 0, 8, "spherical-harmonics degree")
-        _require_typical(typical)
+        _check_network_count(degree, 0, 8, "spherical-harmonics degree")
+        _check_typical_light(typical)
         self.degree, self.channels, self.falloff, self.typical = degree, channels, bool(falloff), float(typical)
 
     def settings(self) -> dict[str, Any]:

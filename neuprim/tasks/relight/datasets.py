@@ -90,7 +90,7 @@ def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         options.train_split,
         options.test_split,
         options.hold_out,
-        lambda split: read_split(folder, split, options),
+        lambda split: read_olat_split(folder, split, options),
     )
     details = SceneDetails(
         up=torch.tensor([0.0, 0.0, 1.0]),
@@ -104,32 +104,34 @@ def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     return assemble_dataset(str(folder), folder.resolve().name, train, test, options, context, details)
 
 
-def read_split(folder: Path, split: str, options: OlatSettings) -> list[ImageFrame]:
+def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[ImageFrame]:
     """The frames of one split, with their lights as conditions. Raises DataError: as :func:`load_olat`."""
     document = JsonReader.open(folder / f"transforms_{split}.json")
     near = document.number_or("camera_near", 3.0, "a distance above 0", 0.0)
     if document.number_or("camera_far", max(10.0, 2.0 * near), f"a distance above camera_near, {near:g}") <= near:
         raise document.fail("camera_far", f"a distance above camera_near, {near:g}")
-    layout = TransformsLayout(_KEYS, _name, _image, lambda record: _viewmat(record, options.ignore_corrections))
+    layout = TransformsLayout(
+        _KEYS, _olat_frame_name, _find_olat_image, lambda record: _olat_viewmat(record, options.ignore_corrections)
+    )
     records, frames = read_transforms_frames(folder, document, list(document.objects("frames")), options, layout)
     lit = []
     for record, frame in zip(records, frames, strict=True):
         light = record.array("pl_pos", (3,), "the point light's position, 3 numbers")
-        intensity = _intensity(record if record.has("pl_intensity") else document)
+        intensity = _light_intensity(record if record.has("pl_intensity") else document)
         lit.append(replace(frame, conditions={"light": light, "light_intensity": intensity}))
     return lit
 
 
-def _name(record: JsonReader) -> str:
+def _olat_frame_name(record: JsonReader) -> str:
     return record.text("file_path" if record.has("file_path") or not record.has("img_path") else "img_path")
 
 
-def _image(folder: Path, record: JsonReader) -> Path | None:
+def _find_olat_image(folder: Path, record: JsonReader) -> Path | None:
     """A frame's file, or None."""
     if record.has("img_path"):
         parts = record.text("img_path").replace("\\", "/").split("/")
         tails = (
-            _file(folder / "/".join(parts[i:])) for i in range(len(parts))
+            _existing_file(folder / "/".join(parts[i:])) for i in range(len(parts))
         )  # an absolute path stays one when joined
         found = next((file for file in tails if file is not None), None)
         if found is not None or not record.has("file_path"):
@@ -140,17 +142,17 @@ def _image(folder: Path, record: JsonReader) -> Path | None:
     suffix = "." + record.text("file_ext").removeprefix(".")
     if suffix not in IMAGE_SUFFIXES:
         raise record.fail("file_ext", "one of .png, .jpg, .jpeg, .webp, .exr")
-    return _file(folder / (name.removesuffix(suffix).replace("\\", "/") + suffix))
+    return _existing_file(folder / (name.removesuffix(suffix).replace("\\", "/") + suffix))
 
 
-def _file(path: Path) -> Path | None:
+def _existing_file(path: Path) -> Path | None:
     try:
         return path if path.is_file() else None
     except OSError:  # a name longer than the file system can hold
         return None
 
 
-def _viewmat(record: JsonReader, ignore_corrections: bool) -> Tensor:
+def _olat_viewmat(record: JsonReader, ignore_corrections: bool) -> Tensor:
     """(4, 4) float64 world-to-camera matrix, OpenCV axes."""
     corrected = record.has("R_opt") or record.has("T_opt")
     if not corrected or ignore_corrections:
@@ -165,7 +167,7 @@ def _viewmat(record: JsonReader, ignore_corrections: bool) -> Tensor:
     return view
 
 
-def _intensity(source: JsonReader) -> Tensor:
+def _light_intensity(source: JsonReader) -> Tensor:
     """(3,) float32."""
     expected = "3 numbers of at least 0, or one"
     if not source.has("pl_intensity"):
@@ -207,26 +209,26 @@ def load_lit_solids(settings: Mapping[str, Any], context: SceneContext) -> Datas
         background=torch.zeros(3),
         bounds=torch.tensor([[-1.0, -1.0, -0.65], [1.0, 1.0, 1.0]]),
         downsampling=f"rendered at {drawn.size}x{drawn.size}, {rays}x{rays} rays per pixel",
-        extra=_lighting(dataset, folder),
+        extra=_lit_solids_lighting(dataset, folder),
     )
 
 
-def _lighting(dataset: Dataset, folder: Path) -> Lighting:
+def _lit_solids_lighting(dataset: Dataset, folder: Path) -> Lighting:
     """Pixel classes, parts of the test split, two baselines without a model, and a film of the light going round."""
     test = dataset.test
     assert isinstance(test, ImageViews)  # as posed_images makes them
-    baselines = {"no_cast_shadows": partial(_read_companion, test, "unshadowed.exr")}
-    if _companion(test, "nearest.exr", 0).is_file():  # not where training views are held out
-        baselines[f"nearest_light_of_{NEAR_LIGHTS}"] = partial(_read_companion, test, "nearest.exr")
-    views = read_split(folder, "circle", OlatSettings(path=folder))
+    baselines = {"no_cast_shadows": partial(_read_companion_image, test, "unshadowed.exr")}
+    if _companion_path(test, "nearest.exr", 0).is_file():  # not where training views are held out
+        baselines[f"nearest_light_of_{NEAR_LIGHTS}"] = partial(_read_companion_image, test, "nearest.exr")
+    views = read_olat_split(folder, "circle", OlatSettings(path=folder))
     circle = ImageViews([frame_in_scene(f, dataset.world, ("light",)) for f in views], to_linear=True)
     film = Clip("light_round", range(len(circle)), 12.0, circle)
-    return Lighting("inverse_square", partial(read_classes, test), PARTS, baselines, (film,))
+    return Lighting("inverse_square", partial(read_pixel_classes, test), PARTS, baselines, (film,))
 
 
-def read_classes(views: ImageViews, index: int) -> Tensor:
+def read_pixel_classes(views: ImageViews, index: int) -> Tensor:
     """(H, W) uint8 pixel classes of a view, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`."""
-    path = _companion(views, "classes.png", index)
+    path = _companion_path(views, "classes.png", index)
     try:
         with Image.open(path, formats=("PNG",)) as image:
             return torch.from_numpy(np.array(image))
@@ -234,12 +236,12 @@ def read_classes(views: ImageViews, index: int) -> Tensor:
         raise DataError(f"{path}: damaged ({error}); delete its folder to draw the scene again") from None
 
 
-def _read_companion(views: ImageViews, ending: str, index: int) -> Tensor:
+def _read_companion_image(views: ImageViews, ending: str, index: int) -> Tensor:
     """(H, W, 3) a further image of a view, linear light over the exposure."""
     camera = views.view(index).camera
-    return read_image(_companion(views, ending, index), (camera.width, camera.height))[..., :3].float()
+    return read_image(_companion_path(views, ending, index), (camera.width, camera.height))[..., :3].float()
 
 
-def _companion(views: ImageViews, ending: str, index: int) -> Path:
+def _companion_path(views: ImageViews, ending: str, index: int) -> Path:
     file = views.file(index)
     return file.with_name(f"{file.stem}_{ending}")

@@ -53,7 +53,7 @@ class Lighting:
     clips: tuple[Clip, ...] = ()
 
 
-def lighting_of(dataset: Dataset) -> Lighting:
+def dataset_lighting(dataset: Dataset) -> Lighting:
     """The dataset's facts about its light, or the defaults. Raises DatasetFault: its ``extra`` is something else."""
     return get_extra(dataset, Lighting) or Lighting()
 
@@ -96,7 +96,7 @@ def parse_lights(text: str, world: World | None = None) -> list[Tensor]:
     expected = "expected x,y,z or orbit or orbit:DISTANCE:POLAR_DEGREES:FRAMES"
     kind, *parts = text.split(":")
     if kind != "orbit":
-        return [(world or World()).scene_points(_numbers(text, "light", expected)).float()]
+        return [(world or World()).scene_points(_parse_three_numbers(text, "light", expected)).float()]
     try:
         values = [float(p) for p in parts] + list(_ORBIT[len(parts) :])
         distance, polar, frames = values[0], values[1], int(values[2])
@@ -120,13 +120,15 @@ def orbit_in_frames(text: str, count: int) -> str | None:
 def parse_intensities(text: str) -> list[Tensor]:
     """Parse ``--light-intensity``: (3,) float32 from "r,g,b" or one number, 0 or more."""
     expected = "expected r,g,b or one number, 0 or more"
-    found = _numbers(f"{text},{text},{text}" if "," not in text else text, "light-intensity", expected).float()
+    found = _parse_three_numbers(
+        f"{text},{text},{text}" if "," not in text else text, "light-intensity", expected
+    ).float()
     if bool((found < 0).any()):
         raise ConfigError(f"--light-intensity {text}: {expected}")
     return [found]
 
 
-def _numbers(text: str, name: str, expected: str) -> Tensor:
+def _parse_three_numbers(text: str, name: str, expected: str) -> Tensor:
     try:
         values = [float(p) for p in text.split(",")]
     except ValueError:
@@ -158,7 +160,7 @@ def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: flo
     }
 
 
-def illuminate(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
+def lights_from_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
     """Approximate an environment by point lights like those of the training; a black one gives one of intensity 0.
 
     Each direction becomes a point light at the training lights' mean distance r from the scene's centre, of the

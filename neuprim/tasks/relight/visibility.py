@@ -82,7 +82,7 @@ def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor,
             return sample_visibility(points, device.to_like(view, points), near, focal, opacities, distances, *limits)
         found = np.empty(len(points), np.float32)
         places, images = (points.numpy(), view.numpy(), near, focal), (opacities.numpy(), distances.numpy())
-        parallel_for(_sample_kernel, len(found), _CHUNK, settings.threads, *places, *images, *limits, found)
+        parallel_for(_visibility_kernel, len(found), _CHUNK, settings.threads, *places, *images, *limits, found)
         return torch.from_numpy(found)
 
     return visibility
@@ -114,7 +114,7 @@ def sample_visibility(
 
 
 @exact_kernel
-def _sample_kernel(start, stop, points, view, near, focal, alphas, depths, bias, softness, found):  # type: ignore[no-untyped-def]
+def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, bias, softness, found):  # type: ignore[no-untyped-def]
     """Visibility of the points start:stop, as :func:`sample_visibility`, into ``found``."""
     size = alphas.shape[1]
     for p in range(start, stop):

@@ -76,14 +76,14 @@ class SphericalHarmonics(ColourField):
         return Constant(sh.colors(geometry.means, params["sh_dc"], params.get("sh_rest"), camera.position, self.active))
 
 
-def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
+def _build_static_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     chosen = dict(model["density"])
     gaussian = chosen.pop("form", "cosine") == "gaussian"
     density = GaussianDensity() if gaussian else CosineDensity(model["neurons"], **chosen)
     return density, SphericalHarmonics(model["sh_degree"], dataset.channels, model["sh_every"])
 
 
-def _check(model: Mapping[str, Any]) -> None:
+def _check_static_model(model: Mapping[str, Any]) -> None:
     validate_choices(model["density"], "model.density", {"form": ("cosine", "gaussian"), **DENSITY_OPTIONS})
     others = [key for key in model["density"] if key != "form"]
     if model["density"].get("form") == "gaussian" and others:
@@ -97,21 +97,21 @@ def _tunable_settings(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
     return {**(DENSITY_TRADE if cosine else {}), "model.sh_degree": (0, 1, 2, 3)}
 
 
-def _load(module: str, function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def _load_scene(module: str, function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Import a loader when it is used, as each pulls in a library of its own, and call it."""
     loader: Callable[..., Dataset] = getattr(import_module(f"neuprim.tasks.static.{module}"), function)
     return loader(settings, context)
 
 
-def _mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def _load_mesh_scene(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     try:
         import trimesh  # noqa: F401
     except ImportError as error:
         raise BackendUnavailable(f"scene=mesh needs the package trimesh ({error}): pip install trimesh") from error
-    return _load("mesh", "load_mesh", settings, context)
+    return _load_scene("mesh", "load_mesh", settings, context)
 
 
-def _facts(dataset: Dataset) -> Mapping[str, Any]:
+def _generated_scene_facts(dataset: Dataset) -> Mapping[str, Any]:
     """Of generated data, which file they show and where its points are."""
     return dataset.extra if isinstance(dataset.extra, dict) else {}
 
@@ -125,32 +125,38 @@ TASK = TaskSpec(
         SceneSpec(
             "solids",
             "built in: sharp edges, thin rods, a curved handle; generated in seconds",
-            partial(_load, "datasets", "load_solids"),
+            partial(_load_scene, "datasets", "load_solids"),
         ),
         SceneSpec(
             "room",
             "built in: the solids in a textured room, taken like photographs: lens, exposures, points",
-            partial(_load, "datasets", "load_room"),
+            partial(_load_scene, "datasets", "load_room"),
         ),
-        SceneSpec("mesh", "your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE", _mesh),
+        SceneSpec(
+            "mesh", "your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE", _load_mesh_scene
+        ),
         SceneSpec(
             "blender",
             "NeRF-synthetic layout: transforms_train.json, RGBA images",
-            partial(_load, "datasets", "load_blender"),
+            partial(_load_scene, "datasets", "load_blender"),
         ),
         SceneSpec(
-            "nerfstudio", "instant-ngp / nerfstudio transforms.json", partial(_load, "datasets", "load_nerfstudio")
+            "nerfstudio",
+            "instant-ngp / nerfstudio transforms.json",
+            partial(_load_scene, "datasets", "load_nerfstudio"),
         ),
         SceneSpec(
-            "colmap", "COLMAP sparse/0 and images (needs neuprim[colmap])", partial(_load, "datasets", "load_colmap")
+            "colmap",
+            "COLMAP sparse/0 and images (needs neuprim[colmap])",
+            partial(_load_scene, "datasets", "load_colmap"),
         ),
     ),
-    build=_build,
+    build=_build_static_fields,
     loss=photometric,
-    check=_check,
+    check=_check_static_model,
     tunable_settings=_tunable_settings,
-    facts=_facts,
-    diagnose=lambda dataset, model: _facts(dataset),
+    facts=_generated_scene_facts,
+    diagnose=lambda dataset, model: _generated_scene_facts(dataset),
     fields={
         "CosineDensity": CosineDensity,
         "GaussianDensity": GaussianDensity,

@@ -177,13 +177,13 @@ def _read_colmap_frames(model: Path, folder: Path, reconstruction: Any, asked: C
     bad = BadViews(str(model), asked.strict)
     for (image, file), mask, name in zip(present, masks, names, strict=True):
         where = f"{model}: camera {image.camera_id} of image {image.name}"
-        read = bad.read(name, _info_and_pose, image, file, where)
+        read = bad.read(name, _read_colmap_image, image, file, where)
         if read is None:
             continue
         info, viewmat = read
         camera = _colmap_camera(where, image, viewmat, file, info)
         lens = reconstruction.cameras[image.camera_id]
-        distortion = None if lens.model_name in PINHOLES else _Lens.of(lens, info)
+        distortion = None if lens.model_name in PINHOLES else _ColmapLens.of(lens, info)
         frames.append(ImageFrame(name, file, camera.validate(where), info, mask, distortion))
     bad.settle(len(present))
     return frames
@@ -198,7 +198,7 @@ def _warn_of_unposed_images(place: Path, posed: set[Path], model: Path) -> None:
         warn_once(f"{place}: {found}; left out")
 
 
-def _info_and_pose(image: Any, file: Path, where: str) -> tuple[ImageInfo, Tensor]:
+def _read_colmap_image(image: Any, file: Path, where: str) -> tuple[ImageInfo, Tensor]:
     info, viewmat = image_info(file), colmap_viewmat(image)
     check_viewmat(viewmat, where)
     return info, viewmat
@@ -217,7 +217,7 @@ def _colmap_camera(where: str, image: Any, viewmat: Tensor, file: Path, info: Im
 
 
 @dataclass(frozen=True)
-class _Lens(Distortion):
+class _ColmapLens(Distortion):
     """Any COLMAP camera model, scaled to the files' size; the projection is COLMAP's own."""
 
     model: str
@@ -227,9 +227,9 @@ class _Lens(Distortion):
     scale: tuple[float, float]
 
     @staticmethod
-    def of(lens: Any, info: ImageInfo) -> _Lens:
+    def of(lens: Any, info: ImageInfo) -> _ColmapLens:
         scale = (info.width / lens.width, info.height / lens.height)
-        return _Lens(lens.model_name, int(lens.width), int(lens.height), tuple(map(float, lens.params)), scale)
+        return _ColmapLens(lens.model_name, int(lens.width), int(lens.height), tuple(map(float, lens.params)), scale)
 
     def project(self, points: np.ndarray, camera: Camera) -> np.ndarray:
         size = {"width": self.width, "height": self.height}

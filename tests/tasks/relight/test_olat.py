@@ -19,7 +19,7 @@ from neuprim.core.io.images import srgb_to_linear, write_png
 from neuprim.core.task import SceneContext
 from neuprim.tasks import relight
 from neuprim.tasks.relight.datasets import load_olat as load
-from neuprim.tasks.relight.lighting import lighting_of
+from neuprim.tasks.relight.lighting import dataset_lighting
 
 SIZE = 12
 FX, FY, CX, CY = 20.0, 21.0, 5.0, 6.5
@@ -88,7 +88,11 @@ def each(change: Edit) -> Edit:
 def test_the_plainest_variant(folder: Path, context: SceneContext) -> None:
     dataset = read(folder, context)
     assert (len(dataset.train), len(dataset.test), dataset.color_space, dataset.name) == (3, 2, "linear", "scene")
-    assert (lighting_of(dataset).falloff, dataset.exposure, dataset.background.tolist()) == ("none", 1.0, [0.0] * 3)
+    assert (dataset_lighting(dataset).falloff, dataset.exposure, dataset.background.tolist()) == (
+        "none",
+        1.0,
+        [0.0] * 3,
+    )
     view = dataset.train.view(1)
     assert view.name == "r_1" and view.conditions["light"].tolist() == [2.0, 2.0, 4.0]
     assert view.conditions["light_intensity"].tolist() == [1.0, 1.0, 1.0]
@@ -211,7 +215,7 @@ def test_exposure(folder: Path, context: SceneContext) -> None:
     dataset = read(folder, context, exposure="auto", falloff="inverse_square")
     assert (
         dataset.exposure == pytest.approx(values.quantile(0.995).item(), rel=5e-3)
-        and lighting_of(dataset).falloff == "inverse_square"
+        and dataset_lighting(dataset).falloff == "inverse_square"
     )
     torch.testing.assert_close(dataset.test.pixels(0).rgb * dataset.exposure, plain.test.pixels(0).rgb)
     torch.testing.assert_close(dataset.test.pixels(0).alpha, plain.test.pixels(0).alpha)

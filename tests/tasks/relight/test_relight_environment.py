@@ -31,7 +31,7 @@ from neuprim.scenes.lit import build_lit_solids, shade_point_light
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import LightNetwork
-from neuprim.tasks.relight.lighting import MAX_LIGHT_ANGLE, illuminate, summarize_lights
+from neuprim.tasks.relight.lighting import MAX_LIGHT_ANGLE, lights_from_environment, summarize_lights
 from tests import scenes
 
 UNSHADOWED = "none"  # LightNetwork's ``visibility``
@@ -72,7 +72,7 @@ def some_model() -> Primitives:
 )
 def test_intensity_gives_the_centre_the_environments_irradiance(falloff: str, exposure: float, factor: float) -> None:
     environment = Environment(texel())
-    (light,) = illuminate(environment, 64, facts(3.0, falloff, exposure)).conditions
+    (light,) = lights_from_environment(environment, 64, facts(3.0, falloff, exposure)).conditions
     (beam,) = zip(*vars(environment.beams(64)).values(), strict=True)
     offset = light["light"].double() - torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     assert torch.allclose(offset, 3.0 * beam[0], atol=1e-6)
@@ -84,7 +84,7 @@ def test_a_white_sky_shows_albedo() -> None:
     albedo."""
     scene = Scene([s for s in build_lit_solids() if s.name == "slab"])
     told = {**facts(1e4), "center": [0.0, 0.0, 0.0]}
-    lights = illuminate(Environment(torch.ones(64, 128, 3)), 600, told).conditions
+    lights = lights_from_environment(Environment(torch.ones(64, 128, 3)), 600, told).conditions
     total = np.zeros(3)
     for light in lights:
         seen = shade_point_light(scene, [0.2, 0.1, 3.0], [[0.0, 0.0, -1.0]], light["light"].numpy(), 1.0)
@@ -102,7 +102,7 @@ def test_energy_through_the_model_for_any_number_of_lights(count: int) -> None:
     t |= {"means": torch.tensor([[0.1, 0.2, 0.3]]), "c_dc": torch.tensor([[0.3, 0.2, 0.1]])}
     t |= {s.name: torch.zeros(1, *s.shape) for s in field.parameters() if s.name != "c_dc"}
     model = Primitives(CosineDensity(1), field, t)
-    lights = illuminate(Environment(torch.ones(32, 64, 3)), count, facts()).conditions
+    lights = lights_from_environment(Environment(torch.ones(32, 64, 3)), count, facts()).conditions
     view = View("v", scenes.camera(12, 10))
     seen = render_light_sum(model, view, lights, SETTINGS, torch.zeros(3))
     alpha = render(model, view.camera, lights[0], SETTINGS).alpha[..., None]
@@ -115,7 +115,7 @@ def test_energy_through_the_model_for_any_number_of_lights(count: int) -> None:
 
 def test_one_texel_is_one_light_and_the_background_counts_once() -> None:
     model, view, sky = some_model(), View("v", scenes.camera(16, 12)), torch.tensor([0.5, 0.7, 0.9])
-    (light,) = illuminate(Environment(texel()), 64, facts()).conditions
+    (light,) = lights_from_environment(Environment(texel()), 64, facts()).conditions
     one = render(model, view.camera, light, SETTINGS, sky).rgb
     assert one.max() > 1.0
     assert torch.allclose(render_light_sum(model, view, [light], SETTINGS, sky), one, atol=1e-6)
@@ -124,7 +124,7 @@ def test_one_texel_is_one_light_and_the_background_counts_once() -> None:
 
 
 def test_darkness_is_one_light_of_no_intensity() -> None:
-    found = illuminate(Environment(torch.zeros(4, 8, 3)), 64, facts())
+    found = lights_from_environment(Environment(torch.zeros(4, 8, 3)), 64, facts())
     assert [c["light_intensity"].tolist() for c in found.conditions] == [[0, 0, 0]]
     assert found.notes == ("the environment is black",)
 
@@ -135,10 +135,10 @@ def test_darkness_is_one_light_of_no_intensity() -> None:
 def test_light_from_below_is_announced() -> None:
     below = torch.zeros(32, 64, 3)
     below[24:] = 1.0
-    (note,) = illuminate(Environment(below), 16, facts()).notes
+    (note,) = lights_from_environment(Environment(below), 16, facts()).notes
     assert note.startswith(f"100% of the environment's light comes from more than {MAX_LIGHT_ANGLE:g} degrees")
     above = below.flip(0)
-    assert illuminate(Environment(above), 16, facts()).notes == ()
+    assert lights_from_environment(Environment(above), 16, facts()).notes == ()
 
 
 def test_the_summary_covers_the_lights() -> None:
@@ -172,7 +172,7 @@ def test_the_summary_covers_the_lights() -> None:
 )
 def test_damaged_headers(change: dict[str, Any], message: str) -> None:
     with pytest.raises(DataError, match=f"the model's header: data.*{message}"):
-        illuminate(Environment(texel()), 4, {**facts(), **change})
+        lights_from_environment(Environment(texel()), 4, {**facts(), **change})
 
 
 def test_a_data_set_tells_where_its_lights_were(tmp_path: Path) -> None:
@@ -183,7 +183,7 @@ def test_a_data_set_tells_where_its_lights_were(tmp_path: Path) -> None:
     assert 4.0 < told["lights"]["distance"] < 5.0 and told["lights"]["falloff"] == "inverse_square"
     above = torch.zeros(32, 64, 3)
     above[:5] = 1.0
-    assert illuminate(Environment(above), 8, told).notes == ()
+    assert lights_from_environment(Environment(above), 8, told).notes == ()
 
 
 # ---------------------------------------------------------------- commands
@@ -213,7 +213,7 @@ def drawn(run: Path, name: str, *flags: str) -> Tensor:
 
 
 def test_one_texel_is_the_flag_light(finished: Path) -> None:
-    (light,) = illuminate(Environment(texel()), 1, facts()).conditions
+    (light,) = lights_from_environment(Environment(texel()), 1, facts()).conditions
     words = {k: ",".join(f"{x:.9g}" for x in v.tolist()) for k, v in light.items()}
     one = drawn(finished, "light", f"--light={words['light']}", f"--light-intensity={words['light_intensity']}")
     file = str(finished.parent / "texel.exr")

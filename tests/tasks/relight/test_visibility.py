@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.tasks.relight.visibility import _sample_kernel, sample_visibility
+from neuprim.tasks.relight.visibility import _visibility_kernel, sample_visibility
 
 SIZE, NEAR, FOCAL = 24, 0.05, 20.0
 
@@ -35,7 +35,7 @@ def test_both_read_the_same(slabs: int) -> None:
     points = torch.cat([points, (local - view[:, 3]) @ view[:, :3]])
     found = np.full(len(points), -1.0, np.float32)
     images = (alphas.numpy(), depths.numpy())
-    _sample_kernel(0, len(points), points.numpy(), view.numpy(), NEAR, FOCAL, *images, 0.2, 0.3, found)
+    _visibility_kernel(0, len(points), points.numpy(), view.numpy(), NEAR, FOCAL, *images, 0.2, 0.3, found)
     wanted = sample_visibility(points, view, NEAR, FOCAL, alphas, depths, 0.2, 0.3)
     assert wanted.dtype == torch.float32 and torch.allclose(torch.from_numpy(found), wanted, rtol=0, atol=5e-7)
     assert 0.1 < float((wanted < 0.99).float().mean()) and float(wanted.min()) < 0.3

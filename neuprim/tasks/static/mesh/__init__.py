@@ -21,7 +21,7 @@ from neuprim.core.validation import nonempty_text, validate
 from neuprim.scenes.image_set import Progress, hash_settings
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shading import DAYLIGHT, Daylight, daylight_radiance
-from neuprim.scenes.solids import FIELD_OF_VIEW, Radiance, SolidsSettings, make_image_set
+from neuprim.scenes.solids import FIELD_OF_VIEW, Radiance, SolidsSettings, describe_solids_images
 from neuprim.tasks.static.mesh.gltf import read_gltf
 from neuprim.tasks.static.mesh.model import Model, ModelFolder, Up, find_model_file
 from neuprim.tasks.static.mesh.obj import read_obj
@@ -94,7 +94,7 @@ def generate_mesh_images(
         return {"rendered_from": path.name, "scene_from_file": scene.scene_from_file.tolist()}
 
     seen: Radiance = partial(daylight_radiance, light=LIGHT) if settings.shading == "daylight" else unlit_radiance
-    return make_image_set("mesh", key, settings, build, seen, facts).generate(cache_dir, progress)
+    return describe_solids_images("mesh", key, settings, build, seen, facts).generate(cache_dir, progress)
 
 
 def unlit_radiance(

@@ -41,7 +41,7 @@ _MAX_JOINTS = 32  # per vertex
 _ROWS = 50_000  # vertices that are skinned at once, which bounds the memory
 
 
-class _Primitive(NamedTuple):
+class _GltfPrimitive(NamedTuple):
     """Indexed triangles in the space of their mesh: faces (F, 3), and values per vertex."""
 
     material: str
@@ -57,7 +57,7 @@ def read_gltf(folder: ModelFolder) -> Model:
     """Read a .gltf or .glb file; raises DataError if damaged, compressed, or with references that lead nowhere."""
 
     def read() -> Model:
-        reader = _Reader(GltfDocument(folder))
+        reader = _GltfReader(GltfDocument(folder))
         materials = {str(i): reader.read_material(m) for i, m in enumerate(reader.document.entries("materials"))}
         materials["none"] = Material()
         faces = partial(refuse_damaged_gltf, folder.file, partial(reader.read_faces, materials))
@@ -66,7 +66,7 @@ def read_gltf(folder: ModelFolder) -> Model:
     return refuse_damaged_gltf(folder.file, read)
 
 
-class _Reader:
+class _GltfReader:
     """Reads materials and surfaces of one document."""
 
     def __init__(self, document: GltfDocument) -> None:
@@ -78,9 +78,9 @@ class _Reader:
         """Read all triangles of the scene that is shown, in place, and count their vertices."""
         nodes = self.document.entries("nodes")
         check_limits(self.path, {"nodes": (len(nodes), MAX_PARTS)})
-        matrices = self._world_matrices(nodes)
+        matrices = self._node_matrices(nodes)
         found: list[Faces] = []
-        plain: dict[int, list[_Primitive]] = {}
+        plain: dict[int, list[_GltfPrimitive]] = {}
         for i, matrix in matrices.items():
             node = nodes[i]
             if "mesh" not in node:
@@ -88,25 +88,25 @@ class _Reader:
             number, places = to_index(node["mesh"]), [np.eye(4)]
             if "skin" in node:  # the surface is where its joints are, wherever its node is
                 pose = self._joint_matrices(self.document.content["skins"][to_index(node["skin"])], matrices)
-                primitives = self._read_mesh(number, node, materials, pose)
+                primitives = self._read_gltf_mesh(number, node, materials, pose)
             else:
-                places = self._places(node, matrix)
+                places = self._instance_matrices(node, matrix)
                 if number in plain and "weights" not in node:
                     primitives = plain[number]
                 else:
-                    primitives = self._read_mesh(number, node, materials)
+                    primitives = self._read_gltf_mesh(number, node, materials)
                     if "weights" not in node:
                         plain[number] = primitives
             for place in places:
                 for primitive in primitives:
-                    self._count(primitive)
+                    self._count_primitive(primitive)
                     if len(primitive.faces):
-                        found.append(self._place(primitive, place))
+                        found.append(self._place_primitive(primitive, place))
         if self.skipped:
             warn_once(f"{self.path}: {self.skipped} parts are points or lines; only triangles are drawn")
         return found, self.vertices
 
-    def _count(self, primitive: _Primitive) -> None:
+    def _count_primitive(self, primitive: _GltfPrimitive) -> None:
         """Count one use of a primitive against the limits."""
         self.vertices += len(primitive.positions)
         self.triangles += len(primitive.faces)
@@ -114,9 +114,9 @@ class _Reader:
         vertices, faces, parts = (self.vertices, MAX_VERTICES), (self.triangles, MAX_FACES), (self.parts, MAX_PARTS)
         check_limits(self.path, {"vertices": vertices, "faces": faces, "parts": parts})
 
-    def _read_mesh(
+    def _read_gltf_mesh(
         self, number: int, node: Mapping[str, Any], materials: Mapping[str, Material], pose: NDArray | None = None
-    ) -> list[_Primitive]:
+    ) -> list[_GltfPrimitive]:
         """Read the triangles of a node's mesh, with (J, 4, 4) transforms of the joints of a skin."""
         mesh = self.document.content["meshes"][number]
         weights = [finite_number(w) for w in node.get("weights", mesh.get("weights", []))]
@@ -140,7 +140,7 @@ class _Reader:
         materials: Mapping[str, Material],
         weights: Sequence[float],
         pose: NDArray | None,
-    ) -> _Primitive:
+    ) -> _GltfPrimitive:
         attributes: Mapping[str, int] = primitive["attributes"]
         positions = self.document.array(attributes["POSITION"], ["VEC3"])
         count = len(positions)
@@ -155,7 +155,7 @@ class _Reader:
         normals, colour, uv, glow_uv = None, None, None, None
         if "NORMAL" in attributes:
             given = self.document.array(attributes["NORMAL"], ["VEC3"], count)
-            normals = self._posed(primitive, "NORMAL", given, weights, pose)
+            normals = self._pose_vertices(primitive, "NORMAL", given, weights, pose)
         if "COLOR_0" in attributes:
             colour = self.document.array(attributes["COLOR_0"], ["VEC3", "VEC4"], count)
             colour = (colour / np.float32(1 if colour.dtype.kind == "f" else np.iinfo(colour.dtype).max)).astype("f4")
@@ -163,14 +163,16 @@ class _Reader:
             uv = self._texture_coordinates(primitive, name, "baseColorTexture")
         if material.glow is not None and material.glow.texture is not None:
             glow_uv = self._texture_coordinates(primitive, name, "emissiveTexture")
-        positions = self._posed(primitive, "POSITION", positions, weights, pose)
-        faces = _triangles(index.astype(np.int64), primitive.get("mode", _TRIANGLES))
-        return _Primitive(name, faces, positions, normals, colour, uv, glow_uv)
+        positions = self._pose_vertices(primitive, "POSITION", positions, weights, pose)
+        faces = _index_triangles(index.astype(np.int64), primitive.get("mode", _TRIANGLES))
+        return _GltfPrimitive(name, faces, positions, normals, colour, uv, glow_uv)
 
     def _texture_coordinates(self, primitive: Mapping[str, Any], name: str, key: str) -> NDArray[np.float32] | None:
         """(V, 2) coordinates, v upward, of the set that a texture of a material reads."""
         material = self.document.content["materials"][int(name)]
-        texture = {**_base_colour(material), "emissiveTexture": material.get("emissiveTexture", {})}.get(key, {})
+        texture = {**_base_colour_properties(material), "emissiveTexture": material.get("emissiveTexture", {})}.get(
+            key, {}
+        )
         moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
         attribute = f"TEXCOORD_{to_index(moved.get('texCoord', texture.get('texCoord', 0)))}"
         attributes = primitive["attributes"]
@@ -181,7 +183,7 @@ class _Reader:
         uv[:, 1] = 1 - uv[:, 1]
         return uv
 
-    def _posed(
+    def _pose_vertices(
         self, primitive: Mapping[str, Any], name: str, values: NDArray, weights: Sequence[float], pose: NDArray | None
     ) -> NDArray[np.float64]:
         """(V, 3) positions or normals with morph targets added and joints applied."""
@@ -209,7 +211,7 @@ class _Reader:
                 moved[rows] += shares[rows, k, None] * at
         return moved
 
-    def _place(self, primitive: _Primitive, matrix: NDArray[np.float64]) -> Faces:
+    def _place_primitive(self, primitive: _GltfPrimitive, matrix: NDArray[np.float64]) -> Faces:
         """Move a primitive to its place in the scene."""
         faces = primitive.faces
         with np.errstate(all="ignore"):
@@ -220,7 +222,7 @@ class _Reader:
         of_corners = (None if value is None else value[faces] for value in values)
         return Faces(positions[faces], primitive.material, *of_corners)
 
-    def _world_matrices(self, nodes: Sequence[Mapping[str, Any]]) -> dict[int, NDArray[np.float64]]:
+    def _node_matrices(self, nodes: Sequence[Mapping[str, Any]]) -> dict[int, NDArray[np.float64]]:
         """(4, 4) scene from node, of the nodes of the scene that is shown."""
         children = [[to_index(child) for child in node.get("children", [])] for node in nodes]
         scenes = self.document.entries("scenes")
@@ -237,11 +239,11 @@ class _Reader:
                 raise ValueError("a node is its own ancestor or has two parents")
             if depth > _MAX_DEPTH:
                 raise DataError(f"{self.path}: nodes are nested deeper than {_MAX_DEPTH}; expected fewer levels")
-            found[node] = parent @ _local_matrix(nodes[node], f"nodes[{node}]")
+            found[node] = parent @ _node_matrix(nodes[node], f"nodes[{node}]")
             stack += [(child, found[node], depth + 1) for child in children[node]]
         return found
 
-    def _places(self, node: Mapping[str, Any], matrix: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    def _instance_matrices(self, node: Mapping[str, Any], matrix: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """The transforms of a node's mesh: one, or one for each instance."""
         instancing = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
         if instancing is None:
@@ -257,7 +259,7 @@ class _Reader:
         count = lengths.pop()
         check_limits(self.path, {"instances": (count, MAX_PARTS)})
         places = [{name: values[k] for name, values in columns.items()} for k in range(count)]
-        return [matrix @ _local_matrix(place, "an instance") for place in places]
+        return [matrix @ _node_matrix(place, "an instance") for place in places]
 
     def _joint_matrices(self, skin: Mapping[str, Any], matrices: Mapping[int, NDArray]) -> NDArray[np.float64]:
         """(J, 4, 4) from the place where a vertex was bound to each joint to where the joint is."""
@@ -273,20 +275,20 @@ class _Reader:
 
     def read_material(self, material: Mapping[str, Any]) -> Material:
         """Read a material and its textures."""
-        base, extensions = _base_colour(material), material.get("extensions", {})
+        base, extensions = _base_colour_properties(material), material.get("extensions", {})
         factor = [finite_number(x) for x in base.get("baseColorFactor", (1.0, 1.0, 1.0))]
         mode = material.get("alphaMode", "OPAQUE")
         cutoff = finite_number(material.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
         opacity = factor[3] if len(factor) > 3 and mode != "OPAQUE" else 1.0
         strength = finite_number(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
         light = [strength * finite_number(x) for x in material.get("emissiveFactor", (0.0, 0.0, 0.0))]
-        glow = self._textured(light, material.get("emissiveTexture")) if any(light) else None
-        found = self._textured(factor, base.get("baseColorTexture"))
+        glow = self._textured_material(light, material.get("emissiveTexture")) if any(light) else None
+        found = self._textured_material(factor, base.get("baseColorTexture"))
         unlit = "KHR_materials_unlit" in extensions
         found = replace(found, opacity=opacity, cutoff=None if mode == "OPAQUE" else cutoff)
         return replace(found, blend=mode == "BLEND", glow=glow, unlit=unlit)
 
-    def _textured(self, factor: Sequence[float], texture_info: Mapping[str, Any] | None) -> Material:
+    def _textured_material(self, factor: Sequence[float], texture_info: Mapping[str, Any] | None) -> Material:
         """A colour factor with the texture that it multiplies."""
         colour = (factor[0], factor[1], factor[2])
         if texture_info is None:
@@ -302,9 +304,9 @@ class _Reader:
         wrap = _WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat")
         moved = texture_info.get("extensions", {}).get("KHR_texture_transform")
         transform = None if moved is None else _texture_transform(moved)
-        return Material(colour, self._read_image(to_index(source)), wrap, transform)
+        return Material(colour, self._read_gltf_image(to_index(source)), wrap, transform)
 
-    def _read_image(self, index: int) -> str | None:
+    def _read_gltf_image(self, index: int) -> str | None:
         """Read an image and return its key in :attr:`images`; None where it is missing and that is allowed."""
         name = f"image {index}"
         if name not in self.images:
@@ -319,7 +321,7 @@ class _Reader:
         return name
 
 
-def _base_colour(material: Mapping[str, Any]) -> Mapping[str, Any]:
+def _base_colour_properties(material: Mapping[str, Any]) -> Mapping[str, Any]:
     """Base colour and its texture in either notation; where a material has both, specular-glossiness wins."""
     glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
     if glossy is None:
@@ -328,7 +330,7 @@ def _base_colour(material: Mapping[str, Any]) -> Mapping[str, Any]:
     return {renamed[k]: v for k, v in glossy.items() if k in renamed}
 
 
-def _local_matrix(place: Mapping[str, Any], where: str) -> NDArray[np.float64]:
+def _node_matrix(place: Mapping[str, Any], where: str) -> NDArray[np.float64]:
     """(4, 4) parent from node, of a matrix or of translation, rotation and scale."""
     matrix = np.eye(4)
     lengths = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
@@ -347,7 +349,7 @@ def _local_matrix(place: Mapping[str, Any], where: str) -> NDArray[np.float64]:
     return matrix
 
 
-def _triangles(index: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
+def _index_triangles(index: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
     """(F, 3) triangles of a list, strip or fan of vertices."""
     if mode == _TRIANGLES:
         return index[: len(index) // 3 * 3].reshape(-1, 3)

@@ -106,14 +106,14 @@ class ModelFolder:
 
     def read_model(self) -> bytes:
         """Read the mesh file itself."""
-        data = self._read(self.file, self.file.suffix.lower())
+        data = self._read_within_budget(self.file, self.file.suffix.lower())
         if not data:
             raise DataError(f"{self.file}: file is empty; expected a model, {_SUFFIX_LIST}")
         return data
 
     def read_required(self, reference: str, what: str) -> bytes:
         """Read a needed file; raises DataError for one that leaves the model's folder, is missing or too large."""
-        found, fault = self._resolve(reference, what)
+        found, fault = self._resolve_reference(reference, what)
         if found is None:
             raise DataError(fault)
         return found
@@ -122,7 +122,7 @@ class ModelFolder:
         """Read the first existing spelling of a name; None, with a warning, if ``skip_missing`` allows it."""
         faults = []
         for reference in references:
-            found, fault = self._resolve(reference, what)
+            found, fault = self._resolve_reference(reference, what)
             if found is not None:
                 return found
             faults.append(fault)
@@ -132,7 +132,7 @@ class ModelFolder:
         warn_once(f"{faults[0]}; drawn without it")
         return None
 
-    def _resolve(self, reference: str, what: str) -> tuple[bytes | None, str]:
+    def _resolve_reference(self, reference: str, what: str) -> tuple[bytes | None, str]:
         """Return the bytes, or None and the reason why the reference is refused."""
         shown = reference if len(reference) <= 80 else reference[:77] + "..."
         if reference.startswith("data:"):
@@ -151,7 +151,7 @@ class ModelFolder:
             return None, f"{where} leads out of the model's folder, and is not read; expected a file inside"
         if not there:
             return None, f"{where} not found; expected it in the model's folder"
-        return self._read(target, name), ""
+        return self._read_within_budget(target, name), ""
 
     def _decode_data_uri(self, uri: str, what: str) -> bytes:
         head, comma, body = uri.partition(",")
@@ -163,7 +163,7 @@ class ModelFolder:
             found = f"embedded {what} is damaged ({error})"
             raise DataError(f"{self.file}: {found}; expected data:...;base64,...") from None
 
-    def _read(self, path: Path, name: str) -> bytes:
+    def _read_within_budget(self, path: Path, name: str) -> bytes:
         try:
             with open(path, "rb") as file:
                 size = os.fstat(file.fileno()).st_size

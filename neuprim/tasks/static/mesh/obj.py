@@ -52,12 +52,12 @@ def read_obj(folder: ModelFolder) -> Model:
     for library in libraries:
         content = folder.read_optional([library, PurePosixPath(library.replace("\\", "/")).name], "material file")
         if content is not None:
-            materials |= _library(content.decode("utf-8", "replace"), folder, images)
-    faces = partial(_read_faces, folder.file, text)
+            materials |= _read_mtl_library(content.decode("utf-8", "replace"), folder, images)
+    faces = partial(_read_obj_faces, folder.file, text)
     return Model(folder.file, faces, folder.digest, materials, images, "y")
 
 
-def _read_faces(path: Path, text: str) -> tuple[list[Faces], int]:
+def _read_obj_faces(path: Path, text: str) -> tuple[list[Faces], int]:
     """Read all triangles, by material, and count the vertices."""
     text = re.sub(r"\\\r?\n", " ", text)
     numbers, lengths = {key: array("d") for key in _WIDTHS}, {key: array("q") for key in _WIDTHS}
@@ -92,7 +92,7 @@ def _read_faces(path: Path, text: str) -> tuple[list[Faces], int]:
             found = f"{' '.join(line.split())[:60]!r} ({' '.join(str(error).split())[:80]})"
             expected = "numbers, or f v/vt/vn ... with vertices that are there"
             raise DataError(f"{path}: line {number} is {found}; expected {expected}") from None
-    v, vt, vn = (_table(key, np.array(numbers.pop(key)), np.array(lengths.pop(key))) for key in _WIDTHS)
+    v, vt, vn = (_obj_number_table(key, np.array(numbers.pop(key)), np.array(lengths.pop(key))) for key in _WIDTHS)
     used = np.array(indices, np.int64).reshape(-1, 3)
     check_vertices(path, v[:, :3], used[:, 0])
     for column, table, what in ((1, vt, "texture coordinates"), (2, vn, "normal")):
@@ -101,23 +101,23 @@ def _read_faces(path: Path, text: str) -> tuple[list[Faces], int]:
             raise DataError(f"{path}: {found}; expected one that is there")
     faces, polygon = triangulate_polygons(path, v[used[:, 0], :3], np.array(sizes, np.int64))
     owner = np.array(owners, np.int64)[polygon]
-    colours = _vertex_colours(path, v)
+    colours = _obj_vertex_colours(path, v)
     parts = []
     for name, index in names.items():
         mine = used[faces[owner == index]]
         if len(mine):
-            normals = _looked_up(vn, mine[..., 2], 0.0) if len(vn) else None
-            uv = _looked_up(vt[:, :2], mine[..., 1], np.nan) if (mine[..., 1] != _NONE).any() else None
+            normals = _look_up_corners(vn, mine[..., 2], 0.0) if len(vn) else None
+            uv = _look_up_corners(vt[:, :2], mine[..., 1], np.nan) if (mine[..., 1] != _NONE).any() else None
             colour = None if colours is None else colours[mine[..., 0]]
             parts.append(Faces(v[mine[..., 0], :3], name, normals, colour, uv, uv))
     return parts, len(v)
 
 
-def _looked_up(table: NDArray[np.float64], index: NDArray[np.int64], missing: float) -> NDArray[np.float64]:
+def _look_up_corners(table: NDArray[np.float64], index: NDArray[np.int64], missing: float) -> NDArray[np.float64]:
     return np.where((index == _NONE)[..., None], missing, table[index])
 
 
-def _table(key: str, numbers: NDArray[np.float64], lengths: NDArray[np.integer]) -> NDArray[np.float64]:
+def _obj_number_table(key: str, numbers: NDArray[np.float64], lengths: NDArray[np.integer]) -> NDArray[np.float64]:
     """(N, 2 or more) NaN where a row has fewer numbers; texture coordinates without v are at 0."""
     width = min(max(2, int(lengths.max(initial=2))), _WIDTHS[key][1])
     table = np.full((len(lengths), width), 0.0 if key == "vt" else np.nan)
@@ -128,7 +128,7 @@ def _table(key: str, numbers: NDArray[np.float64], lengths: NDArray[np.integer])
     return table
 
 
-def _vertex_colours(path: Path, v: NDArray[np.float64]) -> NDArray[np.float32] | None:
+def _obj_vertex_colours(path: Path, v: NDArray[np.float64]) -> NDArray[np.float32] | None:
     """(V, 3) colours of vertices, which stand after x y z; None without."""
     if v.shape[1] < 6:
         return None
@@ -141,7 +141,7 @@ def _vertex_colours(path: Path, v: NDArray[np.float64]) -> NDArray[np.float32] |
     return np.clip(found / scale, 0, 1).astype(np.float32)
 
 
-def _library(text: str, folder: ModelFolder, images: dict[str, bytes]) -> dict[str, Material]:
+def _read_mtl_library(text: str, folder: ModelFolder, images: dict[str, bytes]) -> dict[str, Material]:
     found: dict[str, Material] = {}
     name = ""
     with_d = set[str]()  # materials whose d is known, which wins over Tr
@@ -156,27 +156,27 @@ def _library(text: str, folder: ModelFolder, images: dict[str, bytes]) -> dict[s
         old = found[name]
         glow = old.glow or Material()
         if key == "kd" and len(words) >= 3:
-            found[name] = replace(old, colour=_colour(words, folder, name))
+            found[name] = replace(old, colour=_mtl_colour(words, folder, name))
         elif key == "ke" and len(words) >= 3:
-            found[name] = replace(old, glow=replace(glow, colour=_colour(words, folder, name)))
+            found[name] = replace(old, glow=replace(glow, colour=_mtl_colour(words, folder, name)))
         elif key in ("map_kd", "map_ke"):
-            image = _texture(words, rest, folder, images)
+            image = _read_mtl_texture(words, rest, folder, images)
             if image is not None and key == "map_kd":
                 own = replace(image, colour=old.colour, opacity=old.opacity, glow=old.glow)
                 found[name] = replace(own, cutoff=0.5, blend=True)
             elif image is not None:
                 found[name] = replace(old, glow=replace(image, colour=glow.colour))
         elif key == "d" or (key == "tr" and name not in with_d):
-            value = _opacity(words[-1], folder, name)
+            value = _mtl_opacity(words[-1], folder, name)
             with_d |= {name} if key == "d" else set()
             found[name] = replace(old, opacity=value if key == "d" else 1 - value, cutoff=0.5, blend=True)
-        elif key == "map_d" and _file_name(words, rest)[0] != old.texture:
+        elif key == "map_d" and _texture_file_name(words, rest)[0] != old.texture:
             what = f"map_d of material {name[:40]!r} is not read"
             warn_once(f"{folder.file}: {what}; drawn as opaque as d and the alpha of map_Kd say")
-    return {name: _textured(material) for name, material in found.items()}
+    return {name: _finish_mtl_material(material) for name, material in found.items()}
 
 
-def _textured(material: Material) -> Material:
+def _finish_mtl_material(material: Material) -> Material:
     """Without the colour that a texture stands in the place of, and without emitted light of no strength."""
     white = (1.0, 1.0, 1.0)
     glow = material.glow
@@ -187,9 +187,9 @@ def _textured(material: Material) -> Material:
     return replace(material, colour=white if material.texture is not None else material.colour, glow=glow)
 
 
-def _texture(words: list[str], rest: str, folder: ModelFolder, images: dict[str, bytes]) -> Material | None:
+def _read_mtl_texture(words: list[str], rest: str, folder: ModelFolder, images: dict[str, bytes]) -> Material | None:
     """The texture that a line names, with its place; None where it is missing and that is allowed."""
-    image, options = _file_name(words, rest)
+    image, options = _texture_file_name(words, rest)
     spellings = [image, PurePosixPath(image.replace("\\", "/")).name]
     if image not in images:
         data = folder.read_optional(spellings[:1] if spellings[0] == spellings[1] else spellings, "texture")
@@ -203,7 +203,7 @@ def _texture(words: list[str], rest: str, folder: ModelFolder, images: dict[str,
     return Material(texture=image, wrap=wrap, transform=((su, 0.0, ou), (0.0, sv, 1 - sv - ov)) if moved else None)
 
 
-def _file_name(words: list[str], rest: str) -> tuple[str, dict[str, tuple[float, float]]]:
+def _texture_file_name(words: list[str], rest: str) -> tuple[str, dict[str, tuple[float, float]]]:
     """A texture's name, which may hold blanks, without the options before it; and those of them that move it."""
     place, last = 0, len(words) - 1
     options: dict[str, tuple[float, float]] = {}
@@ -215,7 +215,7 @@ def _file_name(words: list[str], rest: str) -> tuple[str, dict[str, tuple[float,
             place += 1
             continue
         values: list[float] = []
-        while len(values) < _NUMBERS[option] and place < last and _number(words[place]):
+        while len(values) < _NUMBERS[option] and place < last and _is_mtl_number(words[place]):
             values.append(float(words[place]))
             place += 1
         default = 1.0 if option == "-s" else 0.0
@@ -223,18 +223,18 @@ def _file_name(words: list[str], rest: str) -> tuple[str, dict[str, tuple[float,
     return rest.strip() if place == 0 else " ".join(words[place:]), options
 
 
-def _number(word: str) -> bool:
+def _is_mtl_number(word: str) -> bool:
     return re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", word) is not None
 
 
-def _opacity(word: str, folder: ModelFolder, name: str) -> float:
-    if not _number(word):
+def _mtl_opacity(word: str, folder: ModelFolder, name: str) -> float:
+    if not _is_mtl_number(word):
         found = f"material {name[:40]!r} has the opacity {word[:20]!r}"
         raise DataError(f"{folder.file}: {found}; expected a number from 0 to 1")
     return min(max(float(word), 0.0), 1.0)
 
 
-def _colour(words: list[str], folder: ModelFolder, name: str) -> tuple[float, float, float]:
+def _mtl_colour(words: list[str], folder: ModelFolder, name: str) -> tuple[float, float, float]:
     try:
         values = torch.tensor([float(word) for word in words[:3]])
         if not values.isfinite().all():

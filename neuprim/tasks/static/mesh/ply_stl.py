@@ -77,9 +77,9 @@ def _read_ply_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
     triangles, polygon = triangulate_polygons(path, xyz[index], corners.sizes)
     used = index[triangles]
     normals = vertices.columns(("nx", "ny", "nz"))[used] if {"nx", "ny", "nz"} <= set(vertices.names) else None
-    colour = _colours(vertices, path)
+    colour = _ply_colours(vertices, path)
     colour = None if colour is None else colour[used]
-    if colour is None and (of_faces := _colours(face, path)) is not None:
+    if colour is None and (of_faces := _ply_colours(face, path)) is not None:
         colour = np.repeat(of_faces[polygon][:, None], 3, axis=1)
     uv: NDArray[np.float64] | None = None
     coordinates = lists.get("texcoord")
@@ -92,7 +92,7 @@ def _read_ply_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
     return [Faces(xyz[used], "", normals, colour, uv)], count
 
 
-def _colours(element: PlyElement, path: Path) -> NDArray[np.float32] | None:
+def _ply_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | None:
     """(N, 3) 0..1 of vertices or faces; None without."""
     if not set(_RGB) <= set(element.names):
         return None

@@ -42,9 +42,13 @@ def triangulate_polygons(
             normal = np.where(length > _FLAT, normal / length, 0.0)
         left = np.arange(len(rows))
         for start in range(min(size, _FANS)):
-            fan = _fan(size, start)
-            areas = _areas(points[left], normal[left], fan)
-            line = np.linalg.norm(_crosses(points[left], fan), axis=2).max(axis=1) <= _FLAT if start == 0 else np.False_
+            fan = _triangle_fan(size, start)
+            areas = _signed_triangle_areas(points[left], normal[left], fan)
+            line = (
+                np.linalg.norm(_triangle_normals(points[left], fan), axis=2).max(axis=1) <= _FLAT
+                if start == 0
+                else np.False_
+            )
             good = ((areas >= -_FLAT).all(axis=1) & (length[left, 0] > _FLAT)) | line
             # triangles without area are no faces of the file
             shown = good[:, None] & ((areas > _FLAT) | np.reshape(line, (-1, 1)))
@@ -54,7 +58,9 @@ def triangulate_polygons(
             if not len(left):
                 break
         for i in left.tolist():
-            ears, tests = _ears(_flattened(points[i], normal[i]), tests) if length[i] > _FLAT else (None, tests)
+            ears, tests = (
+                _cut_ears(_flatten_polygon(points[i], normal[i]), tests) if length[i] > _FLAT else (None, tests)
+            )
             if ears is None:
                 crossed.append(rows[i])
                 continue
@@ -71,30 +77,30 @@ def triangulate_polygons(
     return np.concatenate(found)[order], owner[order]
 
 
-def _fan(size: int, start: int) -> NDArray[np.intp]:
+def _triangle_fan(size: int, start: int) -> NDArray[np.intp]:
     """(size - 2, 3) corners of the triangles around the corner ``start``."""
     around = (start + np.arange(1, size)) % size
     return np.stack([np.full(size - 2, start), around[:-1], around[1:]], axis=1)
 
 
-def _crosses(points: NDArray, triangles: NDArray) -> NDArray[np.float64]:
+def _triangle_normals(points: NDArray, triangles: NDArray) -> NDArray[np.float64]:
     a, b, c = (points[:, triangles[:, i]] for i in range(3))
     return np.cross(b - a, c - a)
 
 
-def _areas(points: NDArray, normal: NDArray, triangles: NDArray) -> NDArray[np.float64]:
+def _signed_triangle_areas(points: NDArray, normal: NDArray, triangles: NDArray) -> NDArray[np.float64]:
     """(M, T) twice the areas of triangles, seen along the polygons' normals; negative where they turn the other way."""
-    return np.einsum("mtc,mc->mt", _crosses(points, triangles), normal)
+    return np.einsum("mtc,mc->mt", _triangle_normals(points, triangles), normal)
 
 
-def _flattened(points: NDArray, normal: NDArray) -> NDArray[np.float64]:
+def _flatten_polygon(points: NDArray, normal: NDArray) -> NDArray[np.float64]:
     """(size, 2) as seen along the normal, counterclockwise."""
     side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     side /= np.linalg.norm(side)
     return np.stack([points @ side, points @ np.cross(normal, side)], axis=1)
 
 
-def _ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | None, int]:
+def _cut_ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | None, int]:
     """Cut triangles off a polygon (Meisters 1975): None where that ends too soon; and how many tests are left."""
     left, found = list(range(len(points))), []
     place, strict, failed = 0, True, 0
@@ -108,11 +114,13 @@ def _ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | 
             return None, tests
         i = place % len(left)
         a, b, c = left[i - 1], left[i], left[(i + 1) % len(left)]
-        area = _cross(points[b] - points[a], points[c] - points[a])
+        area = _cross_product(points[b] - points[a], points[c] - points[a])
         ear = bool(area > _FLAT)
         if ear:
             others = points[left]
-            weights = np.stack([_cross(points[q] - points[p], others - points[p]) for p, q in ((a, b), (b, c), (c, a))])
+            weights = np.stack(
+                [_cross_product(points[q] - points[p], others - points[p]) for p, q in ((a, b), (b, c), (c, a))]
+            )
             own = np.any([(np.abs(others - points[p]) <= _FLAT).all(axis=1) for p in (a, b, c)], axis=0)
             ear = not bool(np.any((weights >= -_FLAT if strict else weights > _FLAT).all(axis=0) & ~own))
         if ear:
@@ -126,6 +134,6 @@ def _ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | 
     return np.array(found, np.int64).reshape(-1, 3), tests
 
 
-def _cross(p: NDArray, q: NDArray) -> NDArray[np.float64]:
+def _cross_product(p: NDArray, q: NDArray) -> NDArray[np.float64]:
     product: NDArray[np.float64] = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
     return product

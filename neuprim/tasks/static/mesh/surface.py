@@ -60,16 +60,16 @@ def read_surfaces(model: Model) -> list[SurfacePart]:
         raise DataError(f"{model.path}: has {found}; expected a mesh with triangles")
     parts = (len(faces), MAX_PARTS)
     check_limits(model.path, {"faces": (count, MAX_FACES), "vertices": (vertices, MAX_VERTICES), "parts": parts})
-    surfaces = [_make_surface(model, part) for part in faces]
+    surfaces = [_make_surface_part(model, part) for part in faces]
     bare = sum(len(part.colour) for part in surfaces if part.bare)
     if bare:
         warn_once(f"{model.path}: {bare} of {count} faces have no colour; drawn grey")
     return surfaces
 
 
-def _make_surface(model: Model, faces: Faces) -> SurfacePart:
+def _make_surface_part(model: Model, faces: Faces) -> SurfacePart:
     material = model.materials.get(faces.material, model.materials.get("", Material()))
-    uv = _coordinates(model, faces.uv, material, len(faces.corners))
+    uv = _texture_coordinates(model, faces.uv, material, len(faces.corners))
     shape, own = faces.corners.shape, faces.colour
     bare = own is None and material.colour is None
     colour = np.broadcast_to(GREY if bare else np.array(material.colour or (1.0, 1.0, 1.0), np.float32), shape)
@@ -85,12 +85,12 @@ def _make_surface(model: Model, faces: Faces) -> SurfacePart:
         glow, colour = SurfacePart(faces.corners, None, colour, uv, material, False), np.zeros(shape, np.float32)
     elif material.glow is not None:
         light = np.broadcast_to(np.array(material.glow.colour or (0.0, 0.0, 0.0), np.float32), shape)
-        places = _coordinates(model, faces.glow_uv, material.glow, len(faces.corners))
+        places = _texture_coordinates(model, faces.glow_uv, material.glow, len(faces.corners))
         glow = SurfacePart(faces.corners, None, light, places, material.glow, False)
     return SurfacePart(faces.corners, faces.normals, colour, uv, material, bare, alpha, glow)
 
 
-def _coordinates(
+def _texture_coordinates(
     model: Model, uv: NDArray[np.floating] | None, material: Material, faces: int
 ) -> NDArray[np.float32] | None:
     """(F, 3, 2) coordinates of the corners in the material's texture; None without."""
@@ -101,11 +101,11 @@ def _coordinates(
         warn_once(f"{model.path}: {found}; drawn without it")
         return None
     with np.errstate(all="ignore"):
-        moved = _moved(np.asarray(uv, np.float32), material)
+        moved = _transform_texture_coordinates(np.asarray(uv, np.float32), material)
     return np.where(np.abs(moved) < _FARTHEST_UV, moved, np.float32(0))
 
 
-def _moved(uv: NDArray[np.float32], material: Material) -> NDArray[np.float32]:
+def _transform_texture_coordinates(uv: NDArray[np.float32], material: Material) -> NDArray[np.float32]:
     """Apply the material's texture transform, which is written for a v that points down."""
     if material.transform is None:
         return uv
@@ -127,7 +127,7 @@ class Texture:
         self.wrap = wrap
         self.levels: list[NDArray] = [pixels]
         while max(self.levels[-1].shape[:2]) > 1:
-            self.levels.append(_halved(self.levels[-1]))
+            self.levels.append(_halve_texture(self.levels[-1]))
 
     @property
     def texels(self) -> int:
@@ -143,23 +143,23 @@ class Texture:
         found = np.empty((len(uv), 4), dtype=np.float32)
         for index in np.unique(level):
             mine = np.flatnonzero(level == index)
-            found[mine] = self._bilinear(self.levels[index], uv[mine])
+            found[mine] = self._sample_bilinear(self.levels[index], uv[mine])
         return found
 
-    def _bilinear(self, image: NDArray, uv: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _sample_bilinear(self, image: NDArray, uv: NDArray[np.float32]) -> NDArray[np.float32]:
         height, width = image.shape[:2]
         x, y = uv[:, 0].astype(np.float64) * width - 0.5, (1.0 - uv[:, 1].astype(np.float64)) * height - 0.5
         left, top = np.floor(x), np.floor(y)
         across, down = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
-        x0, x1 = (_wrapped(left + i, width, self.wrap[0]) for i in (0, 1))
-        y0, y1 = (_wrapped(top + i, height, self.wrap[1]) for i in (0, 1))
-        upper = (1 - across) * _linear(image[y0, x0]) + across * _linear(image[y0, x1])
-        lower = (1 - across) * _linear(image[y1, x0]) + across * _linear(image[y1, x1])
+        x0, x1 = (_wrap_texels(left + i, width, self.wrap[0]) for i in (0, 1))
+        y0, y1 = (_wrap_texels(top + i, height, self.wrap[1]) for i in (0, 1))
+        upper = (1 - across) * _linear_texels(image[y0, x0]) + across * _linear_texels(image[y0, x1])
+        lower = (1 - across) * _linear_texels(image[y1, x0]) + across * _linear_texels(image[y1, x1])
         mixed: NDArray[np.float32] = (1 - down) * upper + down * lower
         return mixed
 
 
-def _wrapped(index: NDArray[np.float64], size: int, wrap: str) -> NDArray[np.intp]:
+def _wrap_texels(index: NDArray[np.float64], size: int, wrap: str) -> NDArray[np.intp]:
     if wrap == "clamp":
         return np.clip(index, 0, size - 1).astype(np.intp)
     if wrap == "mirror":
@@ -168,7 +168,7 @@ def _wrapped(index: NDArray[np.float64], size: int, wrap: str) -> NDArray[np.int
     return np.minimum(np.mod(index, size), size - 1).astype(np.intp)
 
 
-def _linear(pixels: NDArray) -> NDArray[np.float32]:
+def _linear_texels(pixels: NDArray) -> NDArray[np.float32]:
     """(..., 4) float32 linear values of uint8 sRGB ones; floats are linear already."""
     if pixels.dtype != np.uint8:
         return pixels.astype(np.float32)
@@ -178,14 +178,14 @@ def _linear(pixels: NDArray) -> NDArray[np.float32]:
     return values
 
 
-def _halved(image: NDArray) -> NDArray[np.float16]:
+def _halve_texture(image: NDArray) -> NDArray[np.float16]:
     """Average 2 x 2 pixels in linear light; the last row or column of an odd size counts twice."""
     height, width = image.shape[:2]
     half = np.empty(((height + 1) // 2, (width + 1) // 2, 4), np.float16)
     for top in range(0, len(half), _ROWS):
         rows = np.minimum(np.arange(2 * top, min(2 * (top + _ROWS), 2 * len(half))), height - 1)
         columns = np.minimum(np.arange(2 * half.shape[1]), width - 1)
-        part = _linear(image[rows][:, columns])
+        part = _linear_texels(image[rows][:, columns])
         half[top : top + _ROWS] = part.reshape(len(rows) // 2, 2, half.shape[1], 2, 4).mean(axis=(1, 3))
     return half
 
@@ -220,7 +220,7 @@ def decode_texture(path: Path, name: str, data: bytes, left: int = MAX_TEXELS) -
 FARTHEST = 1.3  # of any vertex from the origin, in scene units: what the cameras of ``solids`` have in view
 _DIGITS = 6  # after the point, of positions in scene units that count as one
 _LEAST_AREA = 1e-12  # of a face, in square scene units: below that it has no normal in single precision
-_LAYERS = 64  # of holes that a ray passes at most
+_MAX_HOLES = 64  # of holes that a ray passes at most
 _MOST_AROUND = 64  # faces around a vertex that are smoothed over; work and memory grow with their square
 
 _Pool = dict[tuple[str, tuple[str, str]], Texture]
@@ -272,17 +272,17 @@ class Surface(Scene):
             found = "no face has an opacity of at least 0.5"
             raise DataError(f"{model.path}: {found}; expected a model that is not all clear (alpha, d, Tr)")
         kept &= ~faint
-        mesh = _mesh(points, faces[kept])
+        mesh = _separate_crowded_vertices(points, faces[kept])
         turn = matrix[:3, :3].T  # to the axes of the scene; 0 where the file has no normal
         given = [np.zeros_like(part.corners) if part.normals is None else part.normals @ turn for part in parts]
-        normals = _smooth(np.concatenate(given)[kept], across[kept], mesh)
+        normals = _smooth_normals(np.concatenate(given)[kept], across[kept], mesh)
         super().__init__([Solid("mesh", mesh, uniform_colour("#ffffff"), 0.0, normals=normals)], engine)
         pool: _Pool = {}
         area = double / spacing**2
-        self._base = _Layer(model, parts, kept, area, pool)
-        _say_translucent(model, parts, pool)
+        self._base = _ColourLayer(model, parts, kept, area, pool)
+        _warn_of_translucent_faces(model, parts, pool)
         glows = [p.glow or replace(p, colour=np.zeros_like(p.colour), uv=None, alpha=None) for p in parts]
-        self._glow = _Layer(model, glows, kept, area, pool) if any(p.glow for p in parts) else None
+        self._glow = _ColourLayer(model, glows, kept, area, pool) if any(p.glow for p in parts) else None
         cutoffs = [np.nan if p.uv is None and p.alpha is None else p.material.cutoff for p in parts]
         self._cutoff = np.repeat(np.array(cutoffs, np.float32), [len(part.colour) for part in parts])[kept]
         self._holes = bool((self._cutoff > 0).any())
@@ -292,8 +292,10 @@ class Surface(Scene):
         hits = super().intersect(origins, directions)
         towards = np.asarray(directions, dtype=np.float32)[hits.hit]
         side = np.where(dot(hits.face, towards) > 0, np.float32(-1), np.float32(1))[:, None]
-        albedo = self._base.seen(hits.triangle, hits.weight, hits.distance)[:, :3]
-        emission = None if self._glow is None else self._glow.seen(hits.triangle, hits.weight, hits.distance)[:, :3]
+        albedo = self._base.sample_colours(hits.triangle, hits.weight, hits.distance)[:, :3]
+        emission = (
+            None if self._glow is None else self._glow.sample_colours(hits.triangle, hits.weight, hits.distance)[:, :3]
+        )
         return replace(hits, normal=side * hits.normal, face=side * hits.face, albedo=albedo, emission=emission)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
@@ -302,37 +304,39 @@ class Surface(Scene):
             return super().occluded(points, directions, distance)
         d = np.ascontiguousarray(directions, dtype=np.float32)
         o = np.ascontiguousarray(np.broadcast_to(np.asarray(points, dtype=np.float32), d.shape))
-        triangle, _, _, found = self._first(o, d)
+        triangle, _, _, found = self._first_hits(o, d)
         return (triangle >= 0) & (found < np.broadcast_to(np.asarray(distance, dtype=np.float32), len(o)))
 
-    def _first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        triangle, u, v, distance = (np.array(a) for a in super()._first(o, d))
+    def _first_hits(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        triangle, u, v, distance = (np.array(a) for a in super()._first_hits(o, d))
         if not self._holes:
             return triangle, u, v, distance
         passing = np.flatnonzero(triangle >= 0)
         step = np.float32(LIFT) / np.sqrt(dot(d, d))
-        for _ in range(_LAYERS):
-            passing = passing[self._open(triangle[passing], u[passing], v[passing], distance[passing])]
+        for _ in range(_MAX_HOLES):
+            passing = passing[self._is_hole(triangle[passing], u[passing], v[passing], distance[passing])]
             if not len(passing):
                 return triangle, u, v, distance
             start = distance[passing] + step[passing]
-            t, u[passing], v[passing], further = super()._first(o[passing] + start[:, None] * d[passing], d[passing])
+            t, u[passing], v[passing], further = super()._first_hits(
+                o[passing] + start[:, None] * d[passing], d[passing]
+            )
             triangle[passing], distance[passing] = t, start + further
             passing = passing[t >= 0]
         triangle[passing] = -1
         return triangle, u, v, distance
 
-    def _open(self, triangle: NDArray, u: NDArray, v: NDArray, distance: NDArray) -> NDArray[np.bool_]:
+    def _is_hole(self, triangle: NDArray, u: NDArray, v: NDArray, distance: NDArray) -> NDArray[np.bool_]:
         """(M,) whether the texture has a hole there."""
         weight = np.stack([1 - u - v, u, v], axis=1, dtype=np.float32)
         cutoff = self._cutoff[triangle]
         able = np.flatnonzero(cutoff > 0)
         through = np.zeros(len(triangle), dtype=np.bool_)
-        through[able] = self._base.seen(triangle[able], weight[able], distance[able])[:, 3] < cutoff[able]
+        through[able] = self._base.sample_colours(triangle[able], weight[able], distance[able])[:, 3] < cutoff[able]
         return through
 
 
-class _Layer:
+class _ColourLayer:
     """Colours of the faces ``kept`` (F,): corner values times textures; ``area`` (F,) is twice a face's, in rays."""
 
     def __init__(
@@ -360,7 +364,7 @@ class _Layer:
         texels = np.array([texture.texels for texture in self._textures] + [0], np.float64)
         self._blur = np.sqrt(inside * texels[self._texture] / area[kept]).astype(np.float32)
 
-    def seen(self, triangle: NDArray, weight: NDArray[np.float32], distance: NDArray) -> NDArray[np.float32]:
+    def sample_colours(self, triangle: NDArray, weight: NDArray[np.float32], distance: NDArray) -> NDArray[np.float32]:
         """(M, 4) linear RGB and alpha."""
         found: NDArray[np.float32] = np.einsum("nk,nkc->nc", weight, self._colour[triangle])
         texture = self._texture[triangle]
@@ -379,7 +383,7 @@ def _transparent_faces(part: SurfacePart) -> NDArray[np.bool_]:
     return clear
 
 
-def _say_translucent(model: Model, parts: Sequence[SurfacePart], pool: _Pool) -> None:
+def _warn_of_translucent_faces(model: Model, parts: Sequence[SurfacePart], pool: _Pool) -> None:
     """Warn once of translucent faces, which are drawn opaque or left out."""
     soft = {key for key, texture in pool.items() if np.any((0 < texture.alpha) & (texture.alpha < 255))}
     count = 0
@@ -393,7 +397,7 @@ def _say_translucent(model: Model, parts: Sequence[SurfacePart], pool: _Pool) ->
         warn_once(f"{model.path}: {found}; drawn opaque where their opacity is at least 0.5, left out elsewhere")
 
 
-def _mesh(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
+def _separate_crowded_vertices(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
     """Give faces their own vertices where too many touch to be smoothed over."""
     around = np.bincount(faces.ravel(), minlength=len(points))
     crowded = around[faces] > _MOST_AROUND
@@ -403,7 +407,9 @@ def _mesh(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trim
     return trimesh.Trimesh(np.concatenate([points, points[alone]]), own, process=False)
 
 
-def _smooth(given: NDArray[np.float64], across: NDArray[np.float64], mesh: trimesh.Trimesh) -> NDArray[np.float64]:
+def _smooth_normals(
+    given: NDArray[np.float64], across: NDArray[np.float64], mesh: trimesh.Trimesh
+) -> NDArray[np.float64]:
     """(F, 3, 3) unit normals: the file's, turned to the side of their face; else from the angles between faces."""
     with np.errstate(all="ignore"):
         length = np.linalg.norm(given, axis=2, keepdims=True)

@@ -27,20 +27,17 @@ Texture = Callable[[Array, Array], Array]
 _PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
 
 
-def stripe_pattern(x: Array, period: float, part: float, width: Array) -> Array:
+def stripes(x: Array, period: float, part: float, width: Array) -> Array:
     """(M,) share of intervals of ``width`` about ``x`` that the first ``part`` (0..1) of every ``period`` covers."""
+
+    def covered(t: Array) -> NDArray[np.float64]:  # of 0..t, in double precision, as nearly equal values are subtracted
+        wide = t.astype(np.float64)
+        whole = np.floor(wide)
+        return whole * part + np.minimum(wide - whole, part)
+
     half = np.maximum(width / np.float32(period), np.float32(1e-4)) / 2
     t = x / np.float32(period)
-    return ((_stripe_coverage(t + half, part) - _stripe_coverage(t - half, part)) / (2 * half)).astype(
-        np.float32, copy=False
-    )
-
-
-def _stripe_coverage(t: Array, part: float) -> NDArray[np.float64]:
-    """How much of 0..t is covered; double precision, as nearly equal values are subtracted."""
-    wide = t.astype(np.float64)
-    whole = np.floor(wide)
-    return whole * part + np.minimum(wide - whole, part)
+    return ((covered(t + half) - covered(t - half)) / (2 * half)).astype(np.float32, copy=False)
 
 
 def lattice_noise(points: Array, width: Array, cell: float, seed: int, octaves: int = 4, fall: float = 0.55) -> Array:
@@ -48,16 +45,12 @@ def lattice_noise(points: Array, width: Array, cell: float, seed: int, octaves: 
 
     Each is ``fall`` times weaker. An octave is left out where its cells are smaller than about ``width`` (M,).
     """
-    total = np.zeros(len(points), dtype=np.float32)
-    strength = 1.0
+    total, strength = np.zeros(len(points), dtype=np.float32), 1.0
     for octave in range(octaves):
         edge = cell / 2**octave
         weight = np.clip(1.5 - width / np.float32(edge), 0, 1) * np.float32(strength)
         seen = np.flatnonzero(weight > 0)
-        if len(seen) == len(points):
-            total += weight * _lattice_noise(points / np.float32(edge), seed + octave)
-        else:
-            total[seen] += weight[seen] * _lattice_noise(points[seen] / np.float32(edge), seed + octave)
+        total[seen] += weight[seen] * _lattice_noise(points[seen] / np.float32(edge), seed + octave)
         strength *= fall
     return total
 
@@ -119,8 +112,8 @@ def planks(
         grain = lattice_noise(np.stack([x / 9, p[:, across]], axis=1), w, 0.12, seed + 1, octaves=3, fall=0.7)
         knots = lattice_noise(np.stack([x / 3, p[:, across]], axis=1), w, 0.5, seed + 7, octaves=2)
         tone = 0.15 + 0.6 * cell_random(board, seed + 2) + 0.22 * grain + 0.15 * knots
-        side = stripe_pattern(p[:, across] + 0.007, width, 0.014 / width, w)
-        gap = np.maximum(side, stripe_pattern(x + 0.007, length, 0.014 / length, w))
+        side = stripes(p[:, across] + 0.007, width, 0.014 / width, w)
+        gap = np.maximum(side, stripes(x + 0.007, length, 0.014 / length, w))
         return mix_colours(one, other, tone) * (1 - np.float32(0.75) * gap)[:, None]
 
     return texture
@@ -137,9 +130,7 @@ def bricks(u: int, v: int, seed: int, width: float = 0.62, height: float = 0.22,
         flat = p[:, [u, v]]
         fine, coarse = lattice_noise(flat, w, 0.12, seed + 1, octaves=3), lattice_noise(flat, w, 2.5, seed + 2, 2)
         tone = 0.1 + 0.8 * cell_random(brick, seed) + 0.2 * fine + 0.15 * coarse
-        joint = 1 - stripe_pattern(x, width, 1 - mortar / width, w) * stripe_pattern(
-            p[:, v], height, 1 - mortar / height, w
-        )
+        joint = 1 - stripes(x, width, 1 - mortar / width, w) * stripes(p[:, v], height, 1 - mortar / height, w)
         return mix_colours(mix_colours(dark, light, tone), grout, joint)
 
     return texture
@@ -151,11 +142,9 @@ def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> T
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
-        across, up = stripe_pattern(p[:, u], 2 * cell, 0.5, w) - 0.5, stripe_pattern(p[:, v], 2 * cell, 0.5, w) - 0.5
+        across, up = stripes(p[:, u], 2 * cell, 0.5, w) - 0.5, stripes(p[:, v], 2 * cell, 0.5, w) - 0.5
         colour = mix_colours(first, second, (0.5 + 2 * across * up).astype(np.float32))
-        joint = np.maximum(
-            stripe_pattern(p[:, u] + 0.01, cell, 0.02 / cell, w), stripe_pattern(p[:, v] + 0.01, cell, 0.02 / cell, w)
-        )
+        joint = np.maximum(stripes(p[:, u] + 0.01, cell, 0.02 / cell, w), stripes(p[:, v] + 0.01, cell, 0.02 / cell, w))
         worn = 1 + 0.14 * lattice_noise(flat, w, 1.4, seed, octaves=6, fall=0.7)
         return np.clip(colour * (worn * (1 - 0.5 * joint))[:, None], 0, 1)
 
@@ -168,9 +157,9 @@ def wallpaper(u: int, v: int, seed: int) -> Texture:
 
     def texture(p: Array, w: Array) -> Array:
         x, y = p[:, u], p[:, v]
-        colour = mix_colours(ground, broad, stripe_pattern(x, 0.8, 0.5, w))
-        colour = mix_colours(colour, narrow, stripe_pattern(x + 0.06, 0.4, 0.06, w))
-        # dots in the middle of the broad stripe_pattern, moved by half a step from one to the next
+        colour = mix_colours(ground, broad, stripes(x, 0.8, 0.5, w))
+        colour = mix_colours(colour, narrow, stripes(x + 0.06, 0.4, 0.06, w))
+        # dots in the middle of the broad stripes, moved by half a step from one to the next
         column = np.floor(x / 0.8)
         across = x - 0.8 * column - 0.2
         up = (y / 0.4 + 0.5 * (column % 2)) % 1 * 0.4 - 0.2
@@ -190,7 +179,7 @@ def plaster(u: int, v: int, seed: int, panel: float) -> Texture:
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
         rough = mix_colours(light, dark, 0.45 + 0.5 * lattice_noise(flat, w, 1.6, seed, octaves=7, fall=0.72))
-        boards = mix_colours(board, seam, stripe_pattern(p[:, u], 0.32, 0.12, w))
+        boards = mix_colours(board, seam, stripes(p[:, u], 0.32, 0.12, w))
         boards = boards * (1 + 0.1 * lattice_noise(flat * narrow, w, 0.12, seed + 9, octaves=2))[:, None]
         rail: Array = np.clip((0.06 - np.abs(p[:, v] - panel)) / np.maximum(w, 0.005) + 0.5, 0, 1)
         below: Array = np.clip((panel - p[:, v]) / np.maximum(w, 0.005) + 0.5, 0, 1)
@@ -209,7 +198,7 @@ def painting(u: int, v: int, seed: int) -> Texture:
         colour = np.broadcast_to(ground, p.shape)
         for field, other in zip(fields, colours, strict=True):
             colour = mix_colours(colour, other, 0.5 + 1.6 * field)
-        lines = stripe_pattern(fields[0], 0.35, 0.14, 3 * w)
+        lines = stripes(fields[0], 0.35, 0.14, 3 * w)
         return np.clip(colour * (1 - 0.55 * lines)[:, None], 0, 1)
 
     return texture
@@ -227,7 +216,7 @@ def books(u: int, v: int, seed: int, thickness: float = 0.11, shelf: float = 0.5
         colour = mix_colours(own, colours.mean(0), far)
         height = (p[:, v] / shelf) % 1
         band = (np.abs(height - 0.35 - 0.3 * cell_random(index, seed + 1)) < 0.06) * (1 - far)
-        gap = stripe_pattern(p[:, u] + 0.008, thickness, 0.016 / thickness, w)
+        gap = stripes(p[:, u] + 0.008, thickness, 0.016 / thickness, w)
         return mix_colours(colour, parse_srgb("#f1e4b8"), 0.8 * band) * (1 - 0.8 * gap)[:, None]
 
     return texture
@@ -253,12 +242,11 @@ def rug(radius: float, seed: int) -> Texture:
         r: Array = np.hypot(p[:, 0], p[:, 1])
         turn = (np.arctan2(p[:, 1], p[:, 0]) / np.float32(2 * np.pi)).astype(np.float32)
         around: Array = w / np.maximum(np.float32(2 * np.pi) * r, np.float32(0.1))  # what the width is in turns
-        ring = stripe_pattern(r, radius / 4, 0.5, w)
-        wedge = stripe_pattern(turn, 1 / 36, 0.5, around)
+        ring = stripes(r, radius / 4, 0.5, w)
+        wedge = stripes(turn, 1 / 36, 0.5, around)
         colour = mix_colours(mix_colours(red, cream, wedge), navy, ring)
-        colour = mix_colours(
-            colour, cream, stripe_pattern(r + 0.03, radius / 4, 0.2, w) * (1 - stripe_pattern(r, radius / 2, 0.5, w))
-        )
+        rings = stripes(r + 0.03, radius / 4, 0.2, w) * (1 - stripes(r, radius / 2, 0.5, w))
+        colour = mix_colours(colour, cream, rings)
         yarn = 1 + 0.2 * lattice_noise(p[:, :2], w, 0.16, seed, octaves=3, fall=0.8)
         return np.clip(colour * yarn[:, None], 0, 1)
 
@@ -279,17 +267,10 @@ def sky(seed: int, low: float, high: float) -> Texture:
 
 Corner = tuple[float, float, float]
 
-LOW, HIGH = (-6.0, -6.0, -1.6), (6.0, 6.0, 3.4)
-"""Opposite corners of the room's inside, scene units; the solids stand in [-1, 1]^3."""
-
+LOW, HIGH = (-6.0, -6.0, -1.6), (6.0, 6.0, 3.4)  # opposite corners of the room's inside; solids are in [-1, 1]^3
 LAMP = (1.5, -1.9, 2.55)  # the middle of the lamp's bulb, which is a point for shading
-
-LAMP_POWER = (39.0, 35.8, 30.0)
-"""Linear RGB irradiance of a surface that faces the lamp at distance 1; it falls with the distance squared."""
-
-ABOVE, BELOW = (0.31, 0.32, 0.34), (0.27, 0.25, 0.23)
-"""Linear RGB radiance from straight above and straight below, blended in between."""
-
+LAMP_POWER = (39.0, 35.8, 30.0)  # linear RGB irradiance at distance 1; it falls with the distance squared
+ABOVE, BELOW = (0.31, 0.32, 0.34), (0.27, 0.25, 0.23)  # linear RGB radiance from straight above and straight below
 BULB = 0.14
 _UP = [0, 0, 1]
 
@@ -306,15 +287,9 @@ class Furnishing(NamedTuple):
 
 def furnish_room() -> list[Furnishing]:
     """All of the room but the solids, the same at every call. A cylinder of radius 4.7 about z is free of furniture."""
-    return [
-        *_wall_furnishings(),
-        *_table_furnishings(),
-        *_lamp_furnishings(),
-        *_brick_side_furnishings(),
-        *_plaster_side_furnishings(),
-        *_wallpaper_side_furnishings(),
-        *_tile_side_furnishings(),
-    ]
+    inside = [*_wall_furnishings(), *_table_furnishings(), *_lamp_furnishings()]
+    inside += [*_brick_side_furnishings(), *_plaster_side_furnishings()]
+    return [*inside, *_wallpaper_side_furnishings(), *_tile_side_furnishings()]
 
 
 def _corner_box(low: Corner, high: Corner, chamfer: float = 0.02) -> trimesh.Trimesh:
@@ -404,10 +379,8 @@ def _brick_side_furnishings() -> list[Furnishing]:
     """The wall at x = 6: a window with four panes, and crates below."""
     x, low, high = HIGH[0], 0.2, 2.4
     pane = _corner_box((x - 0.02, -1.4, low), (x + 0.05, 1.4, high), 0.005)
-    upright, level = (
-        _corner_box((x - 0.1, -0.05, low), (x, 0.05, high), 0.01),
-        _corner_box((x - 0.1, -1.4, 1.25), (x, 1.4, 1.35), 0.01),
-    )
+    upright = _corner_box((x - 0.1, -0.05, low), (x, 0.05, high), 0.01)
+    level = _corner_box((x - 0.1, -1.4, 1.25), (x, 1.4, 1.35), 0.01)
     window = merge_meshes([_picture_frame(x, 0, low, high, 1.4, 1, 0.14, 0.2), upright, level])
     sill = _corner_box((x - 0.3, -1.65, low - 0.24), (x, 1.65, low - 0.14))
     crates = _corner_boxes(
@@ -434,10 +407,8 @@ def _plaster_side_furnishings() -> list[Furnishing]:
         ((left, y0 + 0.12, z + step * i + 0.05), (right - gap, y1, z + step * i + height))
         for i, (gap, height) in enumerate([(0.0, 0.5), (0.5, 0.46), (0.0, 0.52), (1.1, 0.44), (0.2, 0.5)])
     ]
-    picture, frame = (
-        _corner_box((1.2, 5.93, 0.5), (4.0, 6.0, 2.5), 0.005),
-        _picture_frame(2.6, 6.0, 0.5, 2.5, 1.4, 0, 0.14, 0.24),
-    )
+    picture = _corner_box((1.2, 5.93, 0.5), (4.0, 6.0, 2.5), 0.005)
+    frame = _picture_frame(2.6, 6.0, 0.5, 2.5, 1.4, 0, 0.14, 0.24)
     shelf = planks("#4d3524", "#7d5a3c", 0, 1, 111, width=0.4)
     return [
         Furnishing("shelf", _corner_boxes(*boards, chamfer=0.005), shelf),

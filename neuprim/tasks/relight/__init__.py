@@ -18,13 +18,13 @@ from torch import Tensor
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import linear_to_srgb
-from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
 from neuprim.core.metrics import means as mean_metrics
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.metrics.flip import flip, flip_available
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
 from neuprim.core.validation import validate_choices
